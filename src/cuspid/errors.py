@@ -1,0 +1,32 @@
+"""The one error family of cuspid.
+
+    CuspidError                 every known error: one line that says what, where, what to change
+    ├── InputError              a file, folder or value that the user gave cannot be used
+    ├── OutputError             the output cannot be written (other run's folder, full disk)
+    ├── ReconstructionError     the images do not carry enough to locate the frames or build a surface
+    └── MissingDependencyError  an optional program or package is not there
+
+The command line prints the message of a ``CuspidError`` on one line and exits with status 1.
+"""
+
+from __future__ import annotations
+
+
+class CuspidError(Exception):
+    """Root of the family. ``str(error)`` is the one line shown to the user."""
+
+
+class InputError(CuspidError):
+    """A file, folder or value that was given cannot be used."""
+
+
+class OutputError(CuspidError):
+    """The output folder belongs to another run, or the disk is full or read-only."""
+
+
+class ReconstructionError(CuspidError):
+    """The images do not carry enough information; says how many frames failed and why."""
+
+
+class MissingDependencyError(CuspidError):
+    """An optional program, package or system library is missing; says how to get it."""

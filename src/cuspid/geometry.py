@@ -1,0 +1,100 @@
+"""Rigid motions in three dimensions.
+
+Notation: a transform is named ``target_from_source``; ``x_in_target = target_from_source @ x_in_source``.
+Lengths are millimetres. There is no similarity transform on purpose: the rig fixes the scale.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+_Array = TypeVar("_Array", bound=np.ndarray)
+
+
+def read_only(array: _Array) -> _Array:
+    """A contiguous read-only copy of ``array`` (itself, where it is one already)."""
+    if array.flags.writeable or not array.flags.c_contiguous:
+        array = array.copy(order="C")  # type: ignore[assignment]
+        array.flags.writeable = False
+    return array
+
+
+@dataclass(frozen=True, eq=False)
+class Rigid3:
+    """A rotation followed by a translation."""
+
+    rotation: Float[np.ndarray, "3 3"]
+    """Proper orthonormal matrix."""
+    translation: Float[np.ndarray, "3"]
+    """Translation in mm."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rotation", read_only(np.asarray(self.rotation, dtype=np.float64)))
+        object.__setattr__(self, "translation", read_only(np.asarray(self.translation, dtype=np.float64)))
+
+    @staticmethod
+    def identity() -> Rigid3:
+        """The transform that moves nothing."""
+        return Rigid3(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def from_quaternion(
+        wxyz: Float[np.ndarray, "4"], translation: Float[np.ndarray, "3"]
+    ) -> Rigid3:
+        """From a quaternion in COLMAP's order (w, x, y, z), of any positive length, and a translation in mm."""
+        return Rigid3(Rotation.from_quat(wxyz, scalar_first=True).as_matrix(), translation)
+
+    @staticmethod
+    def from_rotation_vector(
+        rotation_vector: Float[np.ndarray, "3"], translation: Float[np.ndarray, "3"]
+    ) -> Rigid3:
+        """From an axis-angle vector in radians and a translation in mm."""
+        return Rigid3(Rotation.from_rotvec(rotation_vector).as_matrix(), translation)
+
+    @staticmethod
+    def from_matrix(matrix: Float[np.ndarray, "r 4"]) -> Rigid3:
+        """From a 3x4 or 4x4 homogeneous matrix."""
+        return Rigid3(matrix[:3, :3], matrix[:3, 3])
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "4 4"]:
+        """Homogeneous matrix."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.rotation, self.translation
+        return matrix
+
+    @property
+    def quaternion(self) -> Float[np.ndarray, "4"]:
+        """Unit quaternion (w, x, y, z), w >= 0."""
+        return np.asarray(Rotation.from_matrix(self.rotation).as_quat(canonical=True, scalar_first=True))
+
+    @property
+    def rotation_vector(self) -> Float[np.ndarray, "3"]:
+        """Axis-angle vector in radians, of length at most pi."""
+        return np.asarray(Rotation.from_matrix(self.rotation).as_rotvec())
+
+    @property
+    def angle_deg(self) -> float:
+        """Angle of the rotation in degrees, 0 to 180."""
+        return float(np.rad2deg(np.linalg.norm(self.rotation_vector)))
+
+    def inverse(self) -> Rigid3:
+        """``source_from_target``."""
+        return Rigid3(self.rotation.T, -self.rotation.T @ self.translation)
+
+    def __matmul__(self, other: Rigid3) -> Rigid3:
+        """``a_from_b @ b_from_c`` is ``a_from_c``."""
+        return Rigid3(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
+
+    def apply(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Move points (mm)."""
+        return points @ self.rotation.T + self.translation
+
+    def rotate(self, directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Turn directions, without translation."""
+        return directions @ self.rotation.T

@@ -1,0 +1,68 @@
+"""A jaw: a mesh in the occlusal frame with a tooth number for each face.
+
+Occlusal frame: origin at the arch centroid, occlusal plane = XY, +Z out of the gum, +Y anterior; right-handed, so +X is
+the patient's right in a lower jaw and the left in an upper one. Teeth carry FDI numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from cuspid.errors import InputError
+from cuspid.geometry import read_only
+from cuspid.mesh import Mesh
+
+Arch = Literal["lower", "upper"]
+GUM = 0
+"""The label of faces that are not a tooth."""
+
+UNIVERSAL_FROM_FDI = {
+    **{11 + k: 8 - k for k in range(8)},
+    **{21 + k: 9 + k for k in range(8)},
+    **{31 + k: 24 - k for k in range(8)},
+    **{41 + k: 25 + k for k in range(8)},
+}
+"""FDI tooth number to the Universal one (permanent teeth)."""
+
+FDI_FROM_UNIVERSAL = {universal: fdi for fdi, universal in UNIVERSAL_FROM_FDI.items()}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Jaw:
+    """What is scanned, or the reference that a scan is judged by."""
+
+    mesh: Mesh
+    """Surface in the occlusal frame."""
+    face_labels: Int[np.ndarray, "f"] | None = None
+    """FDI number for each face, 0 for gum; None where the file has none."""
+    arch: Arch | None = None
+    """Which jaw, where it is known."""
+    landmarks: Mapping[str, Float[np.ndarray, "3"]] = field(default_factory=dict)
+    """Named points in the occlusal frame, mm."""
+
+    def __post_init__(self) -> None:
+        if self.face_labels is not None:
+            object.__setattr__(self, "face_labels", read_only(np.asarray(self.face_labels, dtype=np.int64)))
+            if len(self.face_labels) != len(self.mesh.faces):
+                raise InputError(
+                    f"jaw: {len(self.face_labels)} labels for {len(self.mesh.faces)} faces; one for each is needed"
+                )
+
+    @property
+    def teeth(self) -> tuple[int, ...]:
+        """FDI numbers that occur, in ascending order; empty without labels."""
+        if self.face_labels is None:
+            return ()
+        return tuple(int(label) for label in np.unique(self.face_labels) if label != GUM)
+
+    def tooth_faces(self, fdi: int) -> np.ndarray:
+        """Boolean mask over the faces of a tooth."""
+        if self.face_labels is None or fdi not in self.teeth:
+            known = ", ".join(map(str, self.teeth)) or "no labels"
+            raise InputError(f"jaw: no tooth {fdi} (FDI); it has {known}")
+        return self.face_labels == fdi

@@ -1,0 +1,154 @@
+"""A triangle mesh in millimetres that also answers rays (Embree) and distances (libigl).
+
+Visibility, rendering and evaluation all ask here, so that there is one way to ask.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import igl
+import numpy as np
+from embreex import rtcore_scene
+from embreex.mesh_construction import TriangleMesh
+from jaxtyping import Bool, Float, Int, UInt8
+
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3, read_only
+
+
+@dataclass(frozen=True, eq=False)
+class RayHits:
+    """First intersections of rays with a mesh."""
+
+    faces: Int[np.ndarray, "n"]
+    """Index of the face that was hit, -1 for a miss."""
+    distances: Float[np.ndarray, "n"]
+    """Distance along the ray in units of its direction's length; infinite for a miss."""
+    barycentric: Float[np.ndarray, "n 3"]
+    """Weights of the face's three vertices at the hit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Vertices and triangles."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    """Positions in mm."""
+    faces: Int[np.ndarray, "f 3"]
+    """Vertex indices, counter-clockwise seen from outside."""
+    colors: UInt8[np.ndarray, "v 3"] | None = None
+    """sRGB colour per vertex."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "vertices", read_only(np.asarray(self.vertices, dtype=np.float64)))
+        object.__setattr__(self, "faces", read_only(np.asarray(self.faces, dtype=np.int64)))
+        if self.colors is not None:
+            object.__setattr__(self, "colors", read_only(np.asarray(self.colors, dtype=np.uint8)))
+        if self.faces.size and (self.faces.min() < 0 or self.faces.max() >= len(self.vertices)):
+            raise InputError(f"mesh: a face names a vertex outside 0..{len(self.vertices) - 1}")
+
+    @cached_property
+    def face_cross(self) -> Float[np.ndarray, "f 3"]:
+        """Cross product of two edges of each face: along its outward normal, twice its area long (mm^2)."""
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        return read_only(np.cross(b - a, c - a))
+
+    @cached_property
+    def face_normals(self) -> Float[np.ndarray, "f 3"]:
+        """Unit outward normals; zero for a degenerate face."""
+        norms = np.linalg.norm(self.face_cross, axis=1, keepdims=True)
+        return read_only(self.face_cross / np.where(norms > 0, norms, 1))
+
+    @cached_property
+    def face_areas(self) -> Float[np.ndarray, "f"]:
+        """Areas in mm^2."""
+        return read_only(0.5 * np.linalg.norm(self.face_cross, axis=1))
+
+    @cached_property
+    def face_centres(self) -> Float[np.ndarray, "f 3"]:
+        """Centroids in mm."""
+        return read_only(self.vertices[self.faces].mean(axis=1))
+
+    @cached_property
+    def vertex_normals(self) -> Float[np.ndarray, "v 3"]:
+        """Unit normals, the area-weighted mean of the adjoining faces."""
+        summed = np.zeros_like(self.vertices)
+        for corner in range(3):
+            for axis in range(3):
+                summed[:, axis] += np.bincount(
+                    self.faces[:, corner], self.face_cross[:, axis], minlength=len(self.vertices)
+                )
+        norms = np.linalg.norm(summed, axis=1, keepdims=True)
+        return read_only(summed / np.where(norms > 0, norms, 1))
+
+    @property
+    def bounds(self) -> Float[np.ndarray, "2 3"]:
+        """Lower and upper corner of the box around the vertices, mm."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    def transformed(self, target_from_source: Rigid3) -> Mesh:
+        """The same mesh in another frame."""
+        return replace(self, vertices=target_from_source.apply(self.vertices))
+
+    def submesh(self, keep: Bool[np.ndarray, "f"]) -> Mesh:
+        """The faces where ``keep`` is true, with only the vertices that they use."""
+        faces = self.faces[keep]
+        used, inverse = np.unique(faces, return_inverse=True)
+        colors = None if self.colors is None else self.colors[used]
+        return Mesh(self.vertices[used], inverse.reshape(-1, 3), colors)
+
+    def sample(
+        self, count: int, rng: np.random.Generator
+    ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
+        """Points spread evenly by area (stratified over the faces), and the face of each."""
+        cumulative = np.cumsum(self.face_areas)
+        picks = (np.arange(count) + rng.random(count)) / count * cumulative[-1]
+        faces = np.minimum(np.searchsorted(cumulative, picks), len(self.faces) - 1)
+        u, v = rng.random((2, count))
+        flip = u + v > 1
+        u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
+        corners = self.vertices[self.faces[faces]]
+        weights = np.stack([1 - u - v, u, v], axis=1)
+        return np.einsum("nk,nkd->nd", weights, corners), faces
+
+    @cached_property
+    def _scene(self) -> rtcore_scene.EmbreeScene:
+        scene = rtcore_scene.EmbreeScene()
+        TriangleMesh(scene, self.vertices[self.faces].astype(np.float32))
+        return scene
+
+    def cast(self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> RayHits:
+        """First hit of each ray (Embree, single precision)."""
+        hits = self._scene.run(
+            np.ascontiguousarray(origins, dtype=np.float32),
+            np.ascontiguousarray(directions, dtype=np.float32),
+            output=True,
+        )
+        faces = hits["primID"].astype(np.int64)
+        u, v = hits["u"].astype(np.float64), hits["v"].astype(np.float64)
+        distances = np.where(faces >= 0, hits["tfar"].astype(np.float64), np.inf)
+        return RayHits(faces, distances, np.stack([1 - u - v, u, v], axis=1))
+
+    def occluded(
+        self,
+        points: Float[np.ndarray, "n 3"],
+        towards: Float[np.ndarray, "n 3"],
+        tolerance_mm: float = 1e-3,
+    ) -> Bool[np.ndarray, "n"]:
+        """True where the open segment from ``points`` to ``towards`` meets the mesh farther than the tolerance."""
+        # The segment is shot backwards: a hit nearer than the surface point is an occluder.
+        reach = points - towards
+        length = np.linalg.norm(reach, axis=1)
+        hits = self.cast(towards, reach / length[:, None])
+        return hits.distances < length - tolerance_mm
+
+    def closest(
+        self, points: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
+        """Exact closest point on the mesh: unsigned distances (mm), face indices, positions (libigl's AABB tree)."""
+        squared, faces, positions = igl.point_mesh_squared_distance(
+            np.ascontiguousarray(points, dtype=np.float64), self.vertices, self.faces
+        )
+        return np.sqrt(squared), np.asarray(faces, dtype=np.int64), positions

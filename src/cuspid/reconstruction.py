@@ -1,0 +1,98 @@
+"""What is recovered from the images: depth maps and located frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from cuspid.camera import Camera
+from cuspid.geometry import Rigid3
+from cuspid.rig import Rig
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DepthMap:
+    """Depth along the axis of a (virtual, distortion-free) camera that is fixed in the rig."""
+
+    frame: str
+    """Name of the frame."""
+    camera_name: str
+    """Name of the reference camera in the rig (for messages and file names)."""
+    camera: Camera
+    """The pinhole without distortion in which the pixels of ``depth_mm`` lie; may be coarser than the image."""
+    cam_from_rig: Rigid3
+    """Its place in the rig."""
+    depth_mm: Float[np.ndarray, "h w"]
+    """Z of the surface at each pixel centre, NaN where unknown. float32."""
+    confidence: Float[np.ndarray, "h w"]
+    """0 (unknown) to 1; inverse-variance-like weight relative to the best pixels. float32."""
+    color: UInt8[np.ndarray, "h w 3"] | None = None
+    """RGB seen at each pixel."""
+
+    def points_in_rig(self) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
+        """Known points in the rig frame (mm) and their flat pixel indices."""
+        known = np.flatnonzero(np.isfinite(self.depth_mm.ravel()) & (self.confidence.ravel() > 0))
+        rays = self.camera.rays(self.camera.pixel_centres().reshape(-1, 2)[known])
+        in_cam = rays * self.depth_mm.ravel()[known, None].astype(np.float64)
+        return self.cam_from_rig.inverse().apply(in_cam), known
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dropped:
+    """A frame, camera or point set that was left out, and why."""
+
+    what: str
+    """For example ``frame 00012`` or ``camera b2``."""
+    reason: str
+    """One line for people."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Tracks:
+    """Sparse points and where they were seen."""
+
+    points: Float[np.ndarray, "p 3"]
+    """World positions, mm."""
+    colors: UInt8[np.ndarray, "p 3"]
+    """RGB."""
+    point_index: Int[np.ndarray, "o"]
+    """For each observation: which point."""
+    frame_index: Int[np.ndarray, "o"]
+    """For each observation: which frame, an index into ``Reconstruction.frames``."""
+    camera_index: Int[np.ndarray, "o"]
+    """For each observation: which camera, an index into ``rig.names``."""
+    pixels: Float[np.ndarray, "o 2"]
+    """For each observation: where, in px of the (distorted) image."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Reconstruction:
+    """Located frames, in millimetres. The world frame is the rig frame of the first located frame."""
+
+    rig: Rig
+    """Refined calibration (the given one where it was held fixed)."""
+    rig_from_world: Mapping[str, Rigid3]
+    """Pose for each located frame, in the order of capture."""
+    tracks: Tracks | None = None
+    """Sparse model, where features were used."""
+    dropped: tuple[Dropped, ...] = ()
+    """What was left out, each with its reason."""
+    pose_covariance: Float[np.ndarray, "n 6 6"] | None = None
+    """Covariance of each pose, relative to the first frame: (rotation vector rad, translation mm) of a small motion
+    on the left of ``rig_from_world``."""
+    reprojection_rms_px: float | None = None
+    """RMS reprojection error of the sparse model."""
+    log: Mapping[str, float] = field(default_factory=dict)
+    """Counts and seconds of the stages, units in the keys."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rig_from_world", MappingProxyType(dict(self.rig_from_world)))
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Names of the located frames."""
+        return tuple(self.rig_from_world)

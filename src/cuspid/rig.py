@@ -1,0 +1,182 @@
+"""A handpiece: cameras rigidly mounted together, lights and the sensor's character.
+
+Frames: ``rig`` is the frame of the handpiece, ``cam`` that of one camera; ``cam_from_rig`` is constant. The rig frame
+is free; COLMAP wants it to be the frame of a reference camera, see :meth:`Rig.rebased`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from types import MappingProxyType
+
+import numpy as np
+from jaxtyping import Float
+
+from cuspid.camera import Camera
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3, read_only
+
+
+@dataclass(frozen=True, eq=False)
+class MountedCamera:
+    """A camera and its place in the handpiece."""
+
+    camera: Camera
+    """Intrinsic calibration."""
+    cam_from_rig: Rigid3
+    """Extrinsic calibration."""
+    covariance: Float[np.ndarray, "6 6"] | None = None
+    """Covariance of a small motion (rotation vector rad, translation mm) applied on the left of ``cam_from_rig``;
+    None for an extrinsic calibration that is held fixed."""
+
+    @property
+    def centre_in_rig(self) -> Float[np.ndarray, "3"]:
+        """Projection centre in the rig frame, mm."""
+        return self.cam_from_rig.inverse().translation
+
+    @property
+    def axis_in_rig(self) -> Float[np.ndarray, "3"]:
+        """Unit viewing direction in the rig frame."""
+        return self.cam_from_rig.rotation[2]
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Cameras by name, in a fixed order."""
+
+    cameras: Mapping[str, MountedCamera]
+    """Name to mounted camera; the order is kept and the first one is the reference for COLMAP."""
+
+    def __post_init__(self) -> None:
+        if not self.cameras:
+            raise InputError("rig: at least one camera is needed")
+        object.__setattr__(self, "cameras", MappingProxyType(dict(self.cameras)))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the cameras in order."""
+        return tuple(self.cameras)
+
+    def __getitem__(self, name: str) -> MountedCamera:
+        if name not in self.cameras:
+            raise InputError(f"rig: no camera named {name!r}; it has {', '.join(self.cameras)}")
+        return self.cameras[name]
+
+    def rebased(self, reference: str | None = None) -> tuple[Rig, Rigid3]:
+        """The same rig in the frame of one of its cameras (default: the first), and ``reference_from_rig``."""
+        reference_from_rig = self[reference or self.names[0]].cam_from_rig
+        rig_from_reference = reference_from_rig.inverse()
+        moved = {
+            name: replace(mounted, cam_from_rig=mounted.cam_from_rig @ rig_from_reference)
+            for name, mounted in self.cameras.items()
+        }
+        return Rig(moved), reference_from_rig
+
+    def overlap(self, first: str, second: str, distance_mm: float) -> float:
+        """Share (0 to 1) of the first camera's image, of a plane across its axis at a distance, that the second sees."""
+        one, other = self[first], self[second]
+        grid = np.stack(np.meshgrid(*(np.linspace(0, size, 12) for size in (one.camera.width, one.camera.height))), -1)
+        plane = one.camera.rays(grid.reshape(-1, 2)) * distance_mm
+        in_other = (other.cam_from_rig @ one.cam_from_rig.inverse()).apply(plane)
+        return float(np.mean(other.camera.contains(other.camera.project(in_other))))
+
+    def stereo_pairs(
+        self, distance_mm: float, *, minimum_overlap: float = 0.4, maximum_angle_deg: float = 30.0
+    ) -> tuple[tuple[str, str], ...]:
+        """Pairs of cameras that see the same surface at the working distance, from about the same side."""
+        return tuple(
+            (first, second)
+            for first, second in combinations(self.names, 2)
+            if self[first].axis_in_rig @ self[second].axis_in_rig >= np.cos(np.deg2rad(maximum_angle_deg))
+            and min(self.overlap(first, second, distance_mm), self.overlap(second, first, distance_mm))
+            >= minimum_overlap
+        )
+
+    def groups(self, distance_mm: float) -> tuple[tuple[str, ...], ...]:
+        """Cameras that are joined by stereo pairs, in the order of the rig; a lone camera is a group of one."""
+        group_of = {name: {name} for name in self.names}
+        for first, second in self.stereo_pairs(distance_mm):
+            merged = group_of[first] | group_of[second]
+            for name in merged:
+                group_of[name] = merged
+        unique = {min(map(self.names.index, group)): group for group in group_of.values()}
+        return tuple(
+            tuple(sorted(unique[key], key=self.names.index)) for key in sorted(unique)
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Light:
+    """A small LED on the handpiece: a point with a cosine-power lobe and 1/d^2 falloff."""
+
+    position_mm: Float[np.ndarray, "3"]
+    """Place in the rig frame."""
+    direction: Float[np.ndarray, "3"]
+    """Unit axis of the lobe in the rig frame."""
+    power: float = 1.0
+    """Relative radiant intensity on the axis."""
+    colour: Float[np.ndarray, "3"] = field(default_factory=lambda: np.ones(3))
+    """Linear RGB."""
+    lobe_exponent: float = 1.0
+    """Intensity falls as cos(angle)^exponent; 1 is a bare Lambertian LED."""
+
+    def __post_init__(self) -> None:
+        direction = np.asarray(self.direction, dtype=np.float64)
+        object.__setattr__(self, "direction", read_only(direction / np.linalg.norm(direction)))
+        object.__setattr__(self, "position_mm", read_only(np.asarray(self.position_mm, dtype=np.float64)))
+        object.__setattr__(self, "colour", read_only(np.asarray(self.colour, dtype=np.float64)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """What turns light into numbers."""
+
+    noise_dn: float = 1.5
+    """Standard deviation of the noise at mid grey, in digital numbers of 255."""
+    shot_noise_share: float = 0.5
+    """Share (0 to 1) of the noise variance at mid grey that grows with the signal; the rest is constant."""
+    gamma: float = 2.2
+    """Encoding exponent from linear light to digital numbers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exposure:
+    """Which lights are on while all cameras expose together."""
+
+    name: str = "all"
+    """Name that frames refer to."""
+    lights: tuple[str, ...] = ()
+    """Names of the lights that are on."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Handpiece:
+    """Everything that is built into the probe."""
+
+    rig: Rig
+    """The cameras."""
+    lights: Mapping[str, Light] = field(default_factory=dict)
+    """Lights by name."""
+    exposures: tuple[Exposure, ...] = ()
+    """What is lit in turn at each position; empty means nothing is known of the lights."""
+    sensor: Sensor = field(default_factory=Sensor)
+    """Common to all cameras."""
+    working_distance_mm: float = 5.0
+    """Nominal distance from a camera to the surface that it looks at."""
+    depth_range_mm: tuple[float, float] = (2.5, 9.0)
+    """Nearest and farthest depth in a camera that is in focus."""
+    name: str = "handpiece"
+    """For people."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "lights", MappingProxyType(dict(self.lights)))
+        unknown = {light for exposure in self.exposures for light in exposure.lights} - set(self.lights)
+        if unknown:
+            raise InputError(f"handpiece: exposures name unknown lights {', '.join(sorted(unknown))}")
+        near, far = self.depth_range_mm
+        if not 0 < near < self.working_distance_mm < far:
+            raise InputError(
+                f"handpiece: depth range {near}-{far} mm must enclose the working distance {self.working_distance_mm} mm"
+            )
