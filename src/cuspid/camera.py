@@ -18,9 +18,7 @@ OPENCV_PIXEL_OFFSET = 0.5
 """COLMAP's pixel coordinate minus OpenCV's for the same place in an image."""
 
 
-def distort(
-    normalized: Float[np.ndarray, "*n 2"], distortion: Float[np.ndarray, "4"]
-) -> Float[np.ndarray, "*n 2"]:
+def distort(normalized: Float[np.ndarray, "*n 2"], distortion: Float[np.ndarray, "4"]) -> Float[np.ndarray, "*n 2"]:
     """Ideal normalised coordinates to distorted ones: COLMAP's OPENCV model (k1, k2, p1, p2)."""
     k1, k2, p1, p2 = distortion
     x, y = normalized[..., 0], normalized[..., 1]
@@ -54,9 +52,7 @@ def undistort(
     return ideal
 
 
-def project_orthographic(
-    points: Float[np.ndarray, "*n 3"], scale_px_per_mm: float = 1.0
-) -> Float[np.ndarray, "*n 2"]:
+def project_orthographic(points: Float[np.ndarray, "*n 3"], scale_px_per_mm: float = 1.0) -> Float[np.ndarray, "*n 2"]:
     """Scaled orthographic projection x = s X, y = s Y (errata to Eq 3.1)."""
     return scale_px_per_mm * points[..., :2]
 

@@ -54,8 +54,9 @@ def triangulate(
     projections: Float[np.ndarray, "k 3 4"], pixels: Float[np.ndarray, "k *n 2"]
 ) -> Float[np.ndarray, "*n 3"]:
     """Linear (DLT) triangulation of undistorted pixels of k views to points in the world, mm."""
-    rows = pixels[..., :, None] * projections[:, *(None,) * (pixels.ndim - 2), 2:, :] - (
-        projections[:, *(None,) * (pixels.ndim - 2), :2, :]
+    rows = (
+        pixels[..., :, None] * projections[:, *(None,) * (pixels.ndim - 2), 2:, :]
+        - (projections[:, *(None,) * (pixels.ndim - 2), :2, :])
     )
     system = np.moveaxis(rows, 0, -3).reshape(*pixels.shape[1:-1], -1, 4)
     homogeneous = np.linalg.svd(system)[2][..., -1, :]

@@ -19,7 +19,7 @@ _Array = TypeVar("_Array", bound=np.ndarray)
 def read_only(array: _Array) -> _Array:
     """A contiguous read-only copy of ``array`` (itself, where it is one already)."""
     if array.flags.writeable or not array.flags.c_contiguous:
-        array = array.copy(order="C")  # type: ignore[assignment]
+        array = array.copy(order="C")
         array.flags.writeable = False
     return array
 
@@ -43,16 +43,12 @@ class Rigid3:
         return Rigid3(np.eye(3), np.zeros(3))
 
     @staticmethod
-    def from_quaternion(
-        wxyz: Float[np.ndarray, "4"], translation: Float[np.ndarray, "3"]
-    ) -> Rigid3:
+    def from_quaternion(wxyz: Float[np.ndarray, "4"], translation: Float[np.ndarray, "3"]) -> Rigid3:
         """From a quaternion in COLMAP's order (w, x, y, z), of any positive length, and a translation in mm."""
         return Rigid3(Rotation.from_quat(wxyz, scalar_first=True).as_matrix(), translation)
 
     @staticmethod
-    def from_rotation_vector(
-        rotation_vector: Float[np.ndarray, "3"], translation: Float[np.ndarray, "3"]
-    ) -> Rigid3:
+    def from_rotation_vector(rotation_vector: Float[np.ndarray, "3"], translation: Float[np.ndarray, "3"]) -> Rigid3:
         """From an axis-angle vector in radians and a translation in mm."""
         return Rigid3(Rotation.from_rotvec(rotation_vector).as_matrix(), translation)
 

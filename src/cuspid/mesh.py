@@ -99,9 +99,7 @@ class Mesh:
         colors = None if self.colors is None else self.colors[used]
         return Mesh(self.vertices[used], inverse.reshape(-1, 3), colors)
 
-    def sample(
-        self, count: int, rng: np.random.Generator
-    ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
         """Points spread evenly by area (stratified over the faces), and the face of each."""
         cumulative = np.cumsum(self.face_areas)
         picks = (np.arange(count) + rng.random(count)) / count * cumulative[-1]

@@ -75,7 +75,7 @@ class Rig:
         return Rig(moved), reference_from_rig
 
     def overlap(self, first: str, second: str, distance_mm: float) -> float:
-        """Share (0 to 1) of the first camera's image, of a plane across its axis at a distance, that the second sees."""
+        """Share (0 to 1) of a plane across the first camera's axis, filling its image, that the second sees too."""
         one, other = self[first], self[second]
         grid = np.stack(np.meshgrid(*(np.linspace(0, size, 12) for size in (one.camera.width, one.camera.height))), -1)
         plane = one.camera.rays(grid.reshape(-1, 2)) * distance_mm
@@ -102,9 +102,7 @@ class Rig:
             for name in merged:
                 group_of[name] = merged
         unique = {min(map(self.names.index, group)): group for group in group_of.values()}
-        return tuple(
-            tuple(sorted(unique[key], key=self.names.index)) for key in sorted(unique)
-        )
+        return tuple(tuple(sorted(unique[key], key=self.names.index)) for key in sorted(unique))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -178,5 +176,5 @@ class Handpiece:
         near, far = self.depth_range_mm
         if not 0 < near < self.working_distance_mm < far:
             raise InputError(
-                f"handpiece: depth range {near}-{far} mm must enclose the working distance {self.working_distance_mm} mm"
+                f"handpiece: depth range {near}-{far} mm must enclose the working distance {self.working_distance_mm}"
             )
