@@ -86,7 +86,7 @@ class Reconstruction:
     on the left of ``rig_from_world``."""
     reprojection_rms_px: float | None = None
     """RMS reprojection error of the sparse model."""
-    log: Mapping[str, float] = field(default_factory=dict)
+    log: Mapping[str, float | int] = field(default_factory=dict)
     """Counts and seconds of the stages, units in the keys."""
 
     def __post_init__(self) -> None:

@@ -1,0 +1,99 @@
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
+from cuspid.jaw import FDI_FROM_UNIVERSAL, UNIVERSAL_FROM_FDI, Jaw
+from cuspid.mesh import Mesh
+from strategies import rigid3s
+
+
+def sphere(radius: float = 10.0, subdivisions: int = 4) -> Mesh:
+    shape = trimesh.creation.icosphere(subdivisions, radius)
+    return Mesh(np.asarray(shape.vertices), np.asarray(shape.faces))
+
+
+def test_areas_and_normals_of_a_sphere():
+    mesh = sphere()
+    assert 0.995 < mesh.face_areas.sum() / (4 * np.pi * 100) < 1
+    np.testing.assert_allclose(mesh.vertex_normals, mesh.vertices / 10, atol=1e-2)
+    assert np.all(np.sum(mesh.face_normals * mesh.face_centres, axis=1) > 9.9)
+
+
+def test_rays_hit_where_they_should():
+    mesh = sphere()
+    rng = np.random.default_rng(0)
+    origins, directions = rng.normal(size=(500, 3)), rng.normal(size=(500, 3))
+    hits = mesh.cast(origins, directions)
+    at = np.einsum("nk,nkd->nd", hits.barycentric, mesh.vertices[mesh.faces[hits.faces]])
+    np.testing.assert_allclose(origins + hits.distances[:, None] * directions, at, atol=2e-5)
+    away = mesh.cast(np.array([[20.0, 0, 0]]), np.array([[1.0, 0, 0]]))
+    assert away.faces[0] == -1
+    assert np.isinf(away.distances[0])
+
+
+def test_occlusion_is_of_the_open_segment():
+    mesh = sphere()
+    near, far = mesh.face_centres[:50], -mesh.face_centres[:50]
+    eye = near * 2
+    assert not mesh.occluded(near, eye).any()
+    assert mesh.occluded(far, eye).all()
+
+
+def test_closest_points_on_a_sphere():
+    mesh = sphere(subdivisions=6)
+    points = np.random.default_rng(0).normal(size=(200, 3)) * 20
+    distances, faces, positions = mesh.closest(points)
+    np.testing.assert_allclose(distances, np.abs(np.linalg.norm(points, axis=1) - 10), atol=2e-3)
+    np.testing.assert_allclose(np.linalg.norm(points - positions, axis=1), distances, atol=1e-9)
+    assert ((faces >= 0) & (faces < len(mesh.faces))).all()
+
+
+def test_samples_are_even_by_area():
+    corners = np.array([[0.0, 0, 0], [3, 0, 0], [0, 1, 0], [0, 0, 0], [-1, 0, 0], [0, -1, 0]])
+    mesh = Mesh(corners, np.array([[0, 1, 2], [3, 4, 5]]))
+    points, faces = mesh.sample(4000, np.random.default_rng(0))
+    assert np.mean(faces == 0) == pytest.approx(0.75, abs=2e-3)
+    np.testing.assert_allclose(points[faces == 0].mean(axis=0), [1, 1 / 3, 0], atol=0.03)
+    assert mesh.closest(points)[0].max() < 1e-12
+
+
+@given(rigid3s())
+def test_moving_a_mesh_moves_its_normals(target_from_source: Rigid3):
+    mesh = sphere(subdivisions=1)
+    moved = mesh.transformed(target_from_source)
+    np.testing.assert_allclose(moved.face_normals, target_from_source.rotate(mesh.face_normals), atol=1e-9)
+    np.testing.assert_allclose(moved.face_areas, mesh.face_areas, rtol=1e-9)
+
+
+def test_submesh_keeps_only_what_it_uses():
+    mesh = sphere(subdivisions=2)
+    upper = mesh.face_centres[:, 2] > 0
+    part = mesh.submesh(upper)
+    np.testing.assert_allclose(part.face_centres, mesh.face_centres[upper])
+    assert len(np.unique(part.faces)) == len(part.vertices) < len(mesh.vertices)
+
+
+def test_a_face_must_name_existing_vertices():
+    with pytest.raises(InputError, match="outside 0..2"):
+        Mesh(np.zeros((3, 3)), np.array([[0, 1, 3]]))
+
+
+def test_tooth_numbers_of_the_thesis():
+    assert [FDI_FROM_UNIVERSAL[number] for number in (19, 20, 26, 29, 30)] == [36, 35, 42, 45, 46]
+    assert sorted(UNIVERSAL_FROM_FDI.values()) == list(range(1, 33))
+
+
+def test_a_jaw_knows_its_teeth():
+    mesh = sphere(subdivisions=1)
+    labels = np.zeros(len(mesh.faces), dtype=int)
+    labels[:5], labels[5:9] = 46, 45
+    jaw = Jaw(mesh=mesh, face_labels=labels)
+    assert jaw.teeth == (45, 46)
+    assert jaw.tooth_faces(46).sum() == 5
+    with pytest.raises(InputError, match="no tooth 11 .FDI.; it has 45, 46"):
+        jaw.tooth_faces(11)
+    with pytest.raises(InputError, match="labels for"):
+        Jaw(mesh=mesh, face_labels=labels[1:])

@@ -1,0 +1,70 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cuspid.camera import Camera
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
+from cuspid.rig import Exposure, Handpiece, Light, MountedCamera, Rig
+from strategies import rigid3s
+
+CAMERA = Camera.from_field_of_view(500, 500, 62.0)
+
+
+def rig_of(**cam_from_rig: Rigid3) -> Rig:
+    return Rig({name: MountedCamera(CAMERA, transform) for name, transform in cam_from_rig.items()})
+
+
+def shifted(x: float, y: float = 0.0) -> Rigid3:
+    return Rigid3(np.eye(3), np.array([-x, -y, 0.0]))
+
+
+@given(st.lists(rigid3s(), min_size=2, max_size=4))
+def test_rebasing_keeps_the_relative_poses(transforms):
+    rig = rig_of(**{f"c{index}": transform for index, transform in enumerate(transforms)})
+    rebased, reference_from_rig = rig.rebased("c1")
+    np.testing.assert_allclose(rebased["c1"].cam_from_rig.matrix, np.eye(4), atol=1e-9)
+    for name in rig.names:
+        np.testing.assert_allclose(
+            (rebased[name].cam_from_rig @ reference_from_rig).matrix, rig[name].cam_from_rig.matrix, atol=1e-8
+        )
+
+
+def test_overlap_of_a_parallel_pair_is_the_textbook_value():
+    rig = rig_of(a=shifted(0), b=shifted(2.5))
+    expected = 1 - 2.5 / (2 * 5 * np.tan(np.deg2rad(31)))
+    assert rig.overlap("a", "b", 5.0) == pytest.approx(expected, abs=0.09)
+
+
+def test_groups_join_cameras_that_see_the_same():
+    side = Rigid3.from_rotation_vector(np.array([0, np.pi / 2, 0]), np.array([0, 0, 0.0]))
+    rig = rig_of(o1=shifted(-1.25), o2=shifted(1.25), s1=side, s2=shifted(1.5) @ side, lone=shifted(40))
+    assert rig.groups(5.0) == (("o1", "o2"), ("s1", "s2"), ("lone",))
+    assert rig.stereo_pairs(5.0) == (("o1", "o2"), ("s1", "s2"))
+
+
+def test_place_and_axis_in_the_rig():
+    mounted = MountedCamera(CAMERA, Rigid3.from_rotation_vector(np.array([np.pi, 0, 0]), np.array([0, 0, 7.0])))
+    np.testing.assert_allclose(mounted.centre_in_rig, [0, 0, 7], atol=1e-12)
+    np.testing.assert_allclose(mounted.axis_in_rig, [0, 0, -1], atol=1e-12)
+
+
+def test_unknown_names_are_named():
+    rig = rig_of(a=shifted(0))
+    with pytest.raises(InputError, match="no camera named 'z'; it has a"):
+        rig["z"]
+    with pytest.raises(InputError, match="unknown lights blue"):
+        Handpiece(rig=rig, exposures=(Exposure(lights=("blue",)),))
+    with pytest.raises(InputError, match="at least one camera"):
+        Rig({})
+
+
+def test_the_depth_range_encloses_the_working_distance():
+    with pytest.raises(InputError, match="must enclose"):
+        Handpiece(rig=rig_of(a=shifted(0)), working_distance_mm=5.0, depth_range_mm=(6.0, 9.0))
+
+
+def test_a_light_has_a_unit_direction():
+    light = Light(position_mm=np.zeros(3), direction=np.array([0, 0, 4.0]))
+    np.testing.assert_array_equal(light.direction, [0, 0, 1])

@@ -1,0 +1,275 @@
+import dataclasses
+import errno
+import json
+import os
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from cuspid import storage
+from cuspid.camera import Camera
+from cuspid.capture import Capture, Frame
+from cuspid.errors import CuspidError, InputError, OutputError
+from cuspid.geometry import Rigid3
+from cuspid.jaw import Jaw
+from cuspid.mesh import Mesh
+from cuspid.reconstruction import DepthMap, Dropped, Reconstruction
+from cuspid.rig import Exposure, Handpiece, Light, MountedCamera, Rig
+from strategies import cameras, rigid3s
+
+CAMERA = Camera.from_field_of_view(16, 12, 62.0)
+
+
+def box_mesh() -> Mesh:
+    box = trimesh.creation.box((60, 40, 10))
+    return Mesh(np.asarray(box.vertices), np.asarray(box.faces))
+
+
+def handpiece(*names: str) -> Handpiece:
+    rig = Rig({name: MountedCamera(CAMERA, Rigid3(np.eye(3), np.array([-k, 0, 0.0]))) for k, name in enumerate(names)})
+    return Handpiece(
+        rig=rig,
+        lights={"led": Light(position_mm=np.array([1.0, 2, 3]), direction=np.array([0, 0, 1.0]), power=2.0)},
+        exposures=(Exposure(name="all", lights=("led",)),),
+    )
+
+
+def make_capture(folder, names=("a", "b"), stems=("00000", "00001")) -> Capture:
+    capture = Capture(folder=folder, handpiece=handpiece(*names), frames=tuple(Frame(name=stem) for stem in stems))
+    rng = np.random.default_rng(0)
+    for name in names:
+        for stem in stems:
+            storage.write_image(capture.image_path(stem, name), rng.integers(0, 255, (12, 16, 3), dtype=np.uint8))
+    storage.write_capture(capture)
+    return capture
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".ply", ".obj"])
+@pytest.mark.parametrize("unit", ["mm", "m", "in", "um"])
+def test_meshes_return_from_every_format_and_unit(tmp_path, suffix, unit):
+    mesh = box_mesh()
+    path = tmp_path / f"box{suffix}"
+    storage.write_mesh(path, dataclasses.replace(mesh, vertices=mesh.vertices / storage.MM_PER_UNIT[unit]))
+    again = storage.read_mesh(path, unit)
+    assert len(again.vertices) == 8
+    np.testing.assert_allclose(again.bounds, mesh.bounds, rtol=1e-6)
+    assert again.face_areas.sum() == pytest.approx(mesh.face_areas.sum(), rel=1e-5)
+
+
+def test_a_jaw_keeps_labels_colours_and_landmarks(tmp_path):
+    mesh = box_mesh()
+    colored = dataclasses.replace(mesh, colors=np.arange(24, dtype=np.uint8).reshape(8, 3))
+    jaw = Jaw(mesh=colored, face_labels=np.arange(12) % 2 * 46, arch="lower", landmarks={"tip": np.array([1.0, 2, 3])})
+    storage.write_jaw(tmp_path / "jaw.ply", jaw)
+    again = storage.read_jaw(tmp_path / "jaw.ply")
+    np.testing.assert_allclose(again.mesh.face_centres, mesh.face_centres, atol=1e-5)
+    np.testing.assert_array_equal(again.face_labels, jaw.face_labels)
+    assert again.arch == "lower"
+    np.testing.assert_array_equal(again.landmarks["tip"], [1, 2, 3])
+    order = np.lexsort(again.mesh.vertices.T)
+    np.testing.assert_array_equal(again.mesh.colors[order], colored.colors[np.lexsort(mesh.vertices.T)])
+
+
+def test_labels_beside_the_mesh_may_be_universal(tmp_path):
+    storage.write_mesh(tmp_path / "box.ply", box_mesh())
+    np.save(tmp_path / "box_facelabels.npy", np.array([0, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12]))
+    _, labels, _ = storage.read_labelled_mesh(tmp_path / "box.ply")
+    assert list(labels) == [0, 17, 16, 15, 14, 13, 12, 11, 21, 22, 23, 24]
+    np.save(tmp_path / "box_facelabels.npy", np.array([0, 36, 35, 42, 45, 46, 0, 0, 0, 0, 0, 0]))
+    _, labels, _ = storage.read_labelled_mesh(tmp_path / "box.ply")
+    assert set(labels) == {0, 36, 35, 42, 45, 46}
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("jaw.txt", b"hello", "not a mesh file"),
+        ("jaw.stl", b"hello", "jaw.stl: (not a mesh|the mesh is empty)"),
+        ("jaw.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "jaw.ply: (not a mesh|the mesh is empty)"),
+        ("jaw.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "jaw.obj: (not a mesh|the mesh is empty)"),
+        ("jaw.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "jaw.obj: (not a mesh|some coordinates are not finite)"),
+    ],
+)
+def test_what_is_no_mesh_is_refused_in_one_line(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        storage.read_mesh(tmp_path / name)
+    assert "\n" not in str(caught.value)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
+@given(cut=st.floats(0, 0.999), flips=st.lists(st.tuples(st.floats(0, 0.999), st.integers(0, 255)), max_size=4))
+def test_broken_mesh_files_never_crash(tmp_path, cut, flips):
+    path = tmp_path / "box.ply"
+    storage.write_mesh(path, box_mesh())
+    data = bytearray(path.read_bytes())
+    for place, value in flips:
+        data[int(place * len(data))] = value
+    path.write_bytes(bytes(data[: int(cut * len(data))]))
+    try:
+        storage.read_mesh(path)
+    except CuspidError as error:
+        assert str(path) in str(error)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        storage.read_mesh(tmp_path / "jaw.stl")
+
+
+@given(camera=cameras(), transform=rigid3s(), other=rigid3s())
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25, deadline=None)
+def test_handpiece_and_rig_config_return(tmp_path, camera, transform, other):
+    rig = Rig({"o1": MountedCamera(camera, transform, 1e-4 * np.eye(6)), "o2": MountedCamera(camera, other)})
+    original = dataclasses.replace(handpiece("x"), rig=rig, depth_range_mm=(2.0, 9.5))
+    storage.write_handpiece(tmp_path / "handpiece.json", original)
+    again = storage.read_handpiece(tmp_path / "handpiece.json")
+    np.testing.assert_allclose(again.rig["o1"].covariance, 1e-4 * np.eye(6))
+    assert again.rig["o2"].covariance is None
+    assert again.depth_range_mm == (2.0, 9.5)
+    assert again.exposures == original.exposures
+    np.testing.assert_allclose(again.lights["led"].position_mm, [1, 2, 3])
+    storage.write_rig_config(tmp_path / "rig_config.json", rig)
+    colmap = storage.read_rig_config(tmp_path / "rig_config.json")
+    expected, _ = rig.rebased()
+    for name in rig.names:
+        np.testing.assert_allclose(again.rig[name].cam_from_rig.matrix, rig[name].cam_from_rig.matrix, atol=1e-9)
+        np.testing.assert_allclose(colmap[name].cam_from_rig.matrix, expected[name].cam_from_rig.matrix, atol=1e-8)
+        np.testing.assert_allclose(colmap[name].camera.parameters, camera.parameters)
+        assert (colmap[name].camera.width, colmap[name].camera.height) == (camera.width, camera.height)
+
+
+def test_a_rig_config_of_colmap_without_sizes(tmp_path):
+    entry = {
+        "image_prefix": "cam1/",
+        "ref_sensor": True,
+        "camera_model_name": "SIMPLE_RADIAL",
+        "camera_params": [400, 250, 200, 0.1],
+    }
+    storage.write_json(tmp_path / "rig.json", [{"cameras": [entry]}])
+    camera = storage.read_rig_config(tmp_path / "rig.json")["cam1"].camera
+    np.testing.assert_array_equal(camera.parameters, [400, 400, 250, 200, 0.1, 0, 0, 0])
+    assert (camera.width, camera.height) == (500, 400)
+    storage.write_json(tmp_path / "rig.json", [{"cameras": [{**entry, "camera_model_name": "FISHEYE"}]}])
+    with pytest.raises(InputError, match="FISHEYE"):
+        storage.read_rig_config(tmp_path / "rig.json")
+
+
+def test_a_missing_field_is_named(tmp_path):
+    storage.write_handpiece(tmp_path / "h.json", handpiece("a"))
+    value = storage.read_json(tmp_path / "h.json")
+    del value["cameras"]["a"]["focal_px"]
+    storage.write_json(tmp_path / "h.json", value)
+    with pytest.raises(InputError, match="'focal_px' is missing"):
+        storage.read_handpiece(tmp_path / "h.json")
+
+
+def test_a_capture_returns(tmp_path):
+    capture = make_capture(tmp_path)
+    again = storage.read_capture(tmp_path)
+    assert again.frames == capture.frames
+    np.testing.assert_array_equal(again.image("00001", "b"), capture.image("00001", "b"))
+    assert again.gray("00000", "a").shape == (12, 16)
+    (tmp_path / "capture.json").unlink()
+    assert [frame.name for frame in storage.read_capture(tmp_path).frames] == ["00000", "00001"]
+
+
+def test_broken_captures_are_refused(tmp_path):
+    capture = make_capture(tmp_path)
+    path = capture.image_path("00001", "b")
+    whole = path.read_bytes()
+
+    path.write_bytes(whole[:-20])
+    with pytest.raises(InputError, match="truncated PNG"):
+        capture.image("00001", "b")
+    storage.write_image(path, np.zeros((9, 9, 3), dtype=np.uint8))
+    with pytest.raises(InputError, match="9 x 9 px, but camera b has 16 x 12 px"):
+        capture.image("00001", "b")
+    path.write_bytes(b"")
+    with pytest.raises(InputError, match="truncated"):
+        capture.image("00001", "b")
+    path.unlink()
+    with pytest.raises(InputError, match="frames differ between cameras: 00001"):
+        storage.read_capture(tmp_path)
+    path.write_bytes(whole)
+    (tmp_path / "images" / "zz").mkdir()
+    with pytest.raises(InputError, match="folder zz is no camera of the handpiece"):
+        storage.read_capture(tmp_path)
+    (tmp_path / "images" / "zz").rmdir()
+    (tmp_path / "images" / "b").rename(tmp_path / "b")
+    with pytest.raises(InputError, match="no folder for camera b"):
+        storage.read_capture(tmp_path)
+    with pytest.raises(InputError, match="no folder 'images'"):
+        storage.read_capture(tmp_path / "images")
+
+
+def test_depth_maps_return(tmp_path):
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(4, 6, (12, 16)).astype(np.float32)
+    depth[3, 4] = np.nan
+    original = DepthMap(
+        frame="00000",
+        camera_name="o1",
+        camera=CAMERA,
+        cam_from_rig=Rigid3.from_rotation_vector(np.array([0.1, 0.2, 0.3]), np.ones(3)),
+        depth_mm=depth,
+        confidence=rng.random((12, 16)).astype(np.float32),
+        color=rng.integers(0, 255, (12, 16, 3), dtype=np.uint8),
+    )
+    storage.write_depth_maps(tmp_path / "d.npz", [original, dataclasses.replace(original, color=None)])
+    first, second = storage.read_depth_maps(tmp_path / "d.npz")
+    np.testing.assert_array_equal(first.depth_mm, depth)
+    np.testing.assert_allclose(first.confidence, original.confidence, atol=1e-3)
+    np.testing.assert_array_equal(first.color, original.color)
+    assert second.color is None
+    points, known = first.points_in_rig()
+    assert len(points) == 12 * 16 - 1
+    in_cam = original.cam_from_rig.apply(points)
+    np.testing.assert_allclose(in_cam[:, 2], depth.ravel()[known], atol=1e-6)
+    np.testing.assert_allclose(CAMERA.project(in_cam), CAMERA.pixel_centres().reshape(-1, 2)[known], atol=1e-4)
+
+
+def test_a_reconstruction_returns(tmp_path):
+    device = handpiece("a", "b")
+    original = Reconstruction(
+        rig=device.rig,
+        rig_from_world={"1": Rigid3.identity(), "0": Rigid3(np.eye(3), np.ones(3))},
+        dropped=(Dropped(what="frame 2", reason="blank"),),
+        pose_covariance=np.stack([np.eye(6)] * 2),
+        reprojection_rms_px=0.3,
+        log={"pairs": 12},
+    )
+    storage.write_reconstruction(tmp_path, original, device)
+    again = storage.read_reconstruction(tmp_path)
+    assert again.frames == ("1", "0")
+    assert again.dropped == original.dropped
+    np.testing.assert_array_equal(again.pose_covariance, original.pose_covariance)
+    np.testing.assert_allclose(again.rig_from_world["0"].matrix, original.rig_from_world["0"].matrix)
+
+
+def test_a_folder_belongs_to_one_run(tmp_path):
+    folder = tmp_path / "scan"
+    storage.claim_folder(folder, "simulate", {"seed": 0}, {"jaw": "abc"})
+    storage.claim_folder(folder, "simulate", {"seed": 0}, {"jaw": "abc"})
+    storage.claim_folder(folder, "reconstruct", {"voxel_mm": 0.05}, {})
+    with pytest.raises(OutputError, match=r"another run of 'simulate' \(settings.seed differs\)"):
+        storage.claim_folder(folder, "simulate", {"seed": 1}, {"jaw": "abc"})
+    assert set(json.loads((folder / "run.json").read_text())) == {"simulate", "reconstruct"}
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.doc").write_text("precious")
+    with pytest.raises(OutputError, match="files that are not from cuspid"):
+        storage.claim_folder(tmp_path / "other", "simulate", {}, {})
+
+
+def test_files_are_whole_or_absent(tmp_path):
+    path = tmp_path / "value.json"
+    storage.write_json(path, {"a": float("nan"), "b": np.float32(0.5)})
+    assert storage.read_json(path) == {"a": None, "b": 0.5}
+    with pytest.raises(OutputError, match="disk is full"), storage.whole_file(path) as temporary:
+        temporary.write_text("half")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert storage.read_json(path) == {"a": None, "b": 0.5}
+    assert [item.name for item in tmp_path.iterdir()] == ["value.json"]
