@@ -142,11 +142,17 @@ class Mesh:
         hits = self.cast(towards, reach / length[:, None])
         return hits.distances < length - tolerance_mm
 
+    @cached_property
+    def _tree(self) -> igl.AABB:
+        tree = igl.AABB()
+        tree.init(self.vertices, self.faces)
+        return tree
+
     def closest(
         self, points: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
         """Exact closest point on the mesh: unsigned distances (mm), face indices, positions (libigl's AABB tree)."""
-        squared, faces, positions = igl.point_mesh_squared_distance(
-            np.ascontiguousarray(points, dtype=np.float64), self.vertices, self.faces
+        squared, faces, positions = self._tree.squared_distance(
+            self.vertices, self.faces, np.ascontiguousarray(points, dtype=np.float64)
         )
         return np.sqrt(squared), np.asarray(faces, dtype=np.int64), positions
