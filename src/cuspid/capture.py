@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,8 +10,6 @@ import numpy as np
 from jaxtyping import UInt8
 
 from cuspid.errors import InputError
-from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
 from cuspid.rig import Handpiece
 
 
@@ -73,15 +70,3 @@ class Capture:
     def gray(self, frame: Frame | str, camera: str) -> UInt8[np.ndarray, "h w"]:
         """The image in grey (Rec. 601), as :meth:`image`."""
         return np.asarray(cv2.cvtColor(self.image(frame, camera), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class GroundTruth:
-    """What only the simulator knows. Reconstruction never sees it. The world frame is the jaw's occlusal frame."""
-
-    jaw: Jaw
-    """What was scanned."""
-    handpiece: Handpiece
-    """The handpiece as it really was (the capture may hold a nominal one)."""
-    rig_from_world: Mapping[str, Rigid3]
-    """Pose of the handpiece for each frame."""

@@ -24,14 +24,14 @@ from jaxtyping import Bool, Int, UInt8
 
 import cuspid
 from cuspid.camera import Camera
-from cuspid.capture import Capture, Frame, GroundTruth
+from cuspid.capture import Capture, Frame
 from cuspid.errors import CuspidError, InputError, OutputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import FDI_FROM_UNIVERSAL, Arch, Jaw
 from cuspid.mesh import Mesh
 from cuspid.reconstruction import DepthMap, Dropped, Reconstruction
 from cuspid.rig import Exposure, Handpiece, Light, MountedCamera, Rig, Sensor
-from cuspid.trueness import Trueness
+from cuspid.trueness import GroundTruth, Trueness
 
 Unit = Literal["mm", "cm", "m", "in", "um"]
 MM_PER_UNIT: Mapping[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "um": 0.001}

@@ -1,4 +1,7 @@
-"""How far a scan is from its reference, as errata.md and ISO 5725 measure it. Micrometres throughout."""
+"""What is true, and how far a scan is from it.
+
+Deviations are measured as the field does (ISO 5725), in micrometres throughout.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,20 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.geometry import Rigid3
+from cuspid.jaw import Jaw
+from cuspid.rig import Handpiece
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GroundTruth:
+    """What only the simulator knows. Reconstruction never sees it. The world frame is the jaw's occlusal frame."""
+
+    jaw: Jaw
+    """What was scanned."""
+    handpiece: Handpiece
+    """The handpiece as it really was (the capture may hold a nominal one)."""
+    rig_from_world: Mapping[str, Rigid3]
+    """Pose of the handpiece for each frame."""
 
 
 @dataclass(frozen=True, kw_only=True)

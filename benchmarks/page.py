@@ -1,0 +1,160 @@
+"""Make docs/benchmarks.md from the JSON files in benchmarks/results.
+
+    python benchmarks/page.py
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).parent
+
+Result = Mapping[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bar:
+    """A limit that a figure should keep."""
+
+    name: str
+    path: tuple[str, ...]
+    limit: float
+    at_least: bool = False
+
+    def value(self, result: Result) -> float | None:
+        """The figure in a result, None where it was not measured."""
+        found: Any = result
+        for key in self.path:
+            found = found.get(key) if isinstance(found, Mapping) else None
+        return None if found is None else float(found)
+
+    def met(self, value: float) -> bool:
+        """Whether a figure keeps the limit; errors of a length count by their size."""
+        return value >= self.limit if self.at_least else abs(value) <= self.limit
+
+
+TIME, MEMORY = ("images_to_mesh", "wall_s"), ("images_to_mesh", "peak_gib")
+MEAN, P95 = ("trueness", "mean_abs_um"), ("trueness", "p95_um")
+WITHIN_50 = ("trueness", "completeness_pct", "50")
+
+BARS: Mapping[str, tuple[Bar, ...]] = {
+    "molar": (
+        Bar(name="mean |deviation| um", path=MEAN, limit=8),
+        Bar(name="P95 um", path=P95, limit=25),
+        Bar(name="complete within 50 um, %", path=WITHIN_50, limit=96, at_least=True),
+        Bar(name="images to mesh, s", path=TIME, limit=75),
+        Bar(name="peak memory, GiB", path=MEMORY, limit=6),
+    ),
+    "arch": (
+        Bar(name="mean |deviation| um", path=MEAN, limit=15),
+        Bar(name="P95 um", path=P95, limit=45),
+        Bar(name="complete within 50 um, %", path=WITHIN_50, limit=92, at_least=True),
+        Bar(name="inter-molar error um", path=("trueness", "inter_molar_error_um"), limit=25),
+        Bar(name="images to mesh, s", path=TIME, limit=720),
+        Bar(name="peak memory, GiB", path=MEMORY, limit=6),
+    ),
+    "real-arch": (
+        Bar(name="mean |deviation| um", path=MEAN, limit=20),
+        Bar(name="images to mesh, s", path=TIME, limit=720),
+        Bar(name="peak memory, GiB", path=MEMORY, limit=6),
+    ),
+}
+
+
+def bars_of(case: str) -> tuple[Bar, ...]:
+    """The bars that a case stands under."""
+    return next((bars for name, bars in BARS.items() if case.startswith(name)), ())
+
+
+def cell(bar: Bar, result: Result) -> str:
+    """One figure, marked where it misses its bar."""
+    value = bar.value(result)
+    if value is None:
+        return "not measured"
+    return f"{value:.1f}" if bar.met(value) else f"**{value:.1f}** (missed)"
+
+
+def table(results: list[Result]) -> str:
+    """Figures of cases that share their bars, a row each, the bar on top."""
+    bars = bars_of(results[0]["case"])
+    lines = [
+        "| case | " + " | ".join(bar.name for bar in bars) + " |",
+        "|---" * (len(bars) + 1) + "|",
+        "| bar | " + " | ".join(f"{'>=' if bar.at_least else '<='} {bar.limit:g}" for bar in bars) + " |",
+    ]
+    lines += [f"| {result['case']} | " + " | ".join(cell(bar, result) for bar in bars) + " |" for result in results]
+    return "\n".join(lines)
+
+
+def detail(result: Result) -> str:
+    """How one result came about."""
+    trueness, condition = result["trueness"], result["versions"]
+    return "\n".join(
+        [
+            f"### {result['case']}",
+            "",
+            *(f"    {command}" for command in result["commands"]),
+            "",
+            f"Seed {result['seed']}, commit {result['commit']}, Python {result['python']}, {result['cores']} cores, "
+            + ", ".join(f"{name} {number}" for name, number in condition.items())
+            + ".",
+            "",
+            f"Signed mean {trueness['signed_mean_um']:.1f} um, SD {trueness['std_um']:.1f} um, RMS {trueness['rms_um']:.1f} um, "
+            f"max {trueness['max_um']:.0f} um; complete within 50/100/200 um: "
+            + "/".join(f"{trueness['completeness_pct'][key]:.1f}" for key in ("50", "100", "200"))
+            + f" %; scale error {trueness['scale_error_ppm']:.0f} ppm; scannable {trueness['scannable_pct']:.1f} % of the "
+            "reference.",
+        ]
+    )
+
+
+def motion_table(rows: list[Result]) -> str:
+    """Ours beside COLMAP on the same images in the same run."""
+    lines = [
+        "| capture | method | models | frames located | seconds | position error um (median) |",
+        "|---|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {row['capture']} | {row['method']} | {row['models']} | {row['located']} of {row['frames']} | "
+        f"{row['seconds']:.0f} | {row['position_error_um']:.1f} |"
+        for row in rows
+    ]
+    return "\n".join(lines)
+
+
+def page(results: list[Result], motions: list[Result]) -> str:
+    """The whole page."""
+    parts = [
+        "# Benchmarks",
+        "",
+        "Generated by `python benchmarks/page.py` from `benchmarks/results/*.json`; do not edit. Conditions of the thesis: "
+        "texture `artificial`, twelve cameras with exact calibration, noise 1.5 DN, 120 images for a tooth and at least 1200 "
+        "for an arch. Trueness is scan to reference over the surface that two cameras of one exposure could see (rule: "
+        "`cuspid.handpiece.visibility`). Times are wall seconds of `cuspid reconstruct` on 2 cores with numba's compiled code "
+        "cached.",
+        "",
+    ]
+    for group in BARS:
+        chosen = [result for result in results if result["case"].split("-seed")[0] == group]
+        if chosen:
+            parts += [f"## {group}", "", table(chosen), ""]
+    for motion in motions:
+        parts += ["## Against COLMAP", "", motion_table(motion["rows"]), "", f"Commit {motion['commit']}.", ""]
+    parts += ["## Conditions", "", *(f"{detail(result)}\n" for result in results)]
+    return "\n".join(parts)
+
+
+def main() -> None:
+    """Read the results, write the page."""
+    loaded = [json.loads(path.read_text()) for path in sorted((HERE / "results").glob("*.json"))]
+    results = [value for value in loaded if "case" in value]
+    motions = [value for value in loaded if "rows" in value]
+    (HERE.parent / "docs" / "benchmarks.md").write_text(page(results, motions))
+
+
+if __name__ == "__main__":
+    main()
