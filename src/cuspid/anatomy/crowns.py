@@ -1,0 +1,235 @@
+"""The crowns of the permanent teeth as implicit surfaces.
+
+Frame of a tooth: origin on its axis at the height of the cervix, +x distal, +y buccal (labial), +z occlusal
+(incisal), mm. A left and a right tooth are mirror images, so one specification serves both.
+
+A crown is described the way a book on dental anatomy draws it: by its mesial, distal, buccal and lingual
+silhouettes over the height, by how square and how tapered its horizontal sections are, and by its occlusal
+surface. The occlusal surface follows the tooth's development: it is the upper envelope of *lobes* (cusps and
+marginal ridges, each a dome with ridges running down from its tip), and the lines where two lobes meet are the
+developmental grooves. An incisor or canine has an incisal edge instead.
+
+Sizes: mesiodistal, buccolingual and cervico-occlusal dimensions of Wheeler's table of measurements (S. J. Nelson,
+*Wheeler's Dental Anatomy, Physiology and Occlusion*, 11th ed., table 1.1).
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+
+Arch = Literal["lower", "upper"]
+Values = Float[np.ndarray, "n"]
+Points = Float[np.ndarray, "n 3"]
+
+LEVELS = np.array([-0.9, -0.3, 0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2])
+"""Heights at which silhouettes are given, as fractions of the crown height: 0 the cervix, 1 the highest cusp."""
+
+GROOVE_WIDTH_MM = 0.16
+"""Half-width of a developmental groove, as the height difference of the two lobes that meet in it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lobe:
+    """A cusp or a marginal ridge of the occlusal surface: a dome with ridges."""
+
+    x: float
+    """Tip, as a fraction of half the mesiodistal width; + distal."""
+    y: float
+    """Tip, as a fraction of half the buccolingual width; + buccal."""
+    height: float
+    """Tip, as a fraction of the crown height."""
+    ridges: tuple[tuple[float, float], ...] = ()
+    """Direction (degrees from +x towards +y) and how much gentler the slope is along each ridge."""
+    slope: float = 0.9
+    """Fall of the surface away from the tip, between the ridges, mm per mm."""
+    radius_mm: float = 0.7
+    """Radius within which the tip is rounded."""
+    stretch: tuple[float, float] = (1.0, 1.0)
+    """Elongation along x and y: a marginal ridge is long in y."""
+    groove_mm: float = 0.35
+    """Depth of the groove that parts it from its neighbours."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Edge:
+    """The incisal edge: highest at the axis, falling to the mesial and distal corners."""
+
+    mesial_fall_mm: float
+    """Fall from the highest point to the mesial corner."""
+    distal_fall_mm: float
+    """Fall from the highest point to the distal corner."""
+    mesial_power: float
+    """1 = straight cusp slope; large = straight edge with a tight corner."""
+    distal_power: float
+    """As `mesial_power`."""
+    fossa_mm: float
+    """Depth of the lingual fossa between the marginal ridges."""
+    lingual_ridge_mm: float = 0.0
+    """Height of the lingual ridge that divides the fossa of a canine."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxialGroove:
+    """A developmental groove that runs from the occlusal surface down the buccal or lingual side."""
+
+    side: Literal["buccal", "lingual"]
+    """The side that it marks."""
+    x: float
+    """Position, as a fraction of half the mesiodistal width."""
+    depth_mm: float
+    """Depth at the occlusal rim."""
+    width_mm: float = 0.5
+    """Half-width."""
+    end: float = 0.35
+    """Height at which it has run out, as a fraction of the crown height."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Crown:
+    """Shape of one kind of tooth. Silhouettes are given at `LEVELS`."""
+
+    width_mm: float
+    """Mesiodistal width of the crown."""
+    depth_mm: float
+    """Buccolingual width of the crown."""
+    height_mm: float
+    """Cervico-occlusal height of the crown on the buccal side."""
+    mesial: tuple[float, ...]
+    """Mesial silhouette seen from buccal, as fractions of half the width."""
+    distal: tuple[float, ...]
+    """Distal silhouette seen from buccal, as fractions of half the width."""
+    buccal: tuple[float, ...]
+    """Buccal silhouette seen from mesial, as fractions of the depth."""
+    lingual: tuple[float, ...]
+    """Lingual silhouette seen from mesial, as fractions of the depth."""
+    squareness: float = 2.5
+    """Exponent of the superelliptic horizontal section: 2 an ellipse, 4 a rounded box."""
+    taper: float = 0.1
+    """How much narrower the lingual half is than the buccal half, as a fraction."""
+    skew: float = 0.0
+    """Shear of the section: x shifts distally by this per mm towards buccal (rhomboid upper molars)."""
+    rim_mm: float = 0.8
+    """Rounding between the sides and the occlusal surface."""
+    lobes: tuple[Lobe, ...] = ()
+    """Cusps and marginal ridges; empty where there is an incisal edge."""
+    edge: Edge | None = None
+    """Incisal edge; None where there are lobes."""
+    grooves: tuple[AxialGroove, ...] = ()
+    """Grooves on the buccal and lingual sides."""
+
+    @property
+    def half_width_mm(self) -> float:
+        return self.width_mm / 2
+
+    @property
+    def half_depth_mm(self) -> float:
+        return self.depth_mm / 2
+
+
+def smooth_max(a: Values, b: Values, radius: float) -> Values:
+    """The larger of two values (n,), rounded where they differ by less than `radius`."""
+    blend = np.maximum(radius - np.abs(a - b), 0.0) / radius
+    return np.maximum(a, b) + blend * blend * (radius / 4)
+
+
+def smooth_min(a: Values, b: Values, radius: float) -> Values:
+    """The smaller of two values (n,), rounded where they differ by less than `radius`."""
+    blend = np.maximum(radius - np.abs(a - b), 0.0) / radius
+    return np.minimum(a, b) - blend * blend * (radius / 4)
+
+
+def smooth_step(x: Values, low: float, high: float) -> Values:
+    """0 below `low`, 1 above `high`, a cubic between, shape (n,)."""
+    t = np.clip((x - low) / (high - low), 0.0, 1.0)
+    return t * t * (3 - 2 * t)
+
+
+def crown_distance(crown: Crown, points: Points) -> Values:
+    """Approximate signed distance in mm, shape (n,), of points (n, 3) in the frame of the tooth; negative inside."""
+    level = np.clip(points[:, 2] / crown.height_mm, LEVELS[0], LEVELS[-1])
+    side, lingual_side = _side_distance(crown, points, level)
+    top = _edge_height(crown, points, level) if crown.edge else _lobe_height(crown, points)
+    return smooth_max(side + _side_relief(crown, points, level, lingual_side), 0.8 * (points[:, 2] - top), crown.rim_mm)
+
+
+@lru_cache(maxsize=256)
+def _silhouettes(crown: Crown) -> CubicSpline:
+    """Mesial and distal x, buccal and lingual y in mm, shape (4,), over the level."""
+    half, depth = crown.half_width_mm, crown.depth_mm
+    table = np.column_stack(
+        [-half * np.array(crown.mesial), half * np.array(crown.distal), depth * np.array(crown.buccal),
+         -depth * np.array(crown.lingual)]
+    )  # fmt: skip
+    return CubicSpline(LEVELS, table, bc_type="natural")
+
+
+def _side_distance(crown: Crown, points: Points, level: Values) -> tuple[Values, Values]:
+    """Distance to the sides, shape (n,), and the position from buccal (-1) to lingual (+1), shape (n,)."""
+    mesial, distal, buccal, lingual = _silhouettes(crown)(level).T
+    b = (buccal - lingual) / 2
+    v = (points[:, 1] - (buccal + lingual) / 2) / b
+    a = (distal - mesial) / 2 * (1 + crown.taper * np.clip(v, -1.2, 1.2))
+    u = (points[:, 0] - (distal + mesial) / 2 - crown.skew * points[:, 1]) / a
+    n = crown.squareness
+    pu, pv = np.abs(u) ** (n - 1), np.abs(v) ** (n - 1)
+    q = (pu * np.abs(u) + pv * np.abs(v) + 1e-12) ** (1 / n)
+    gradient = q ** (1 - n) * np.hypot(pu / a, pv / b)
+    return (q - 1) / np.maximum(gradient, 1e-6), -v
+
+
+def _side_relief(crown: Crown, points: Points, level: Values, lingual_side: Values) -> Values:
+    """Depth in mm, shape (n,), that grooves and fossae take away from the sides."""
+    relief = np.zeros(len(points))
+    for groove in crown.grooves:
+        facing = smooth_step(lingual_side if groove.side == "lingual" else -lingual_side, 0.2, 0.7)
+        across = np.exp(-(((points[:, 0] - groove.x * crown.half_width_mm) / groove.width_mm) ** 2))
+        relief += groove.depth_mm * facing * across * smooth_step(level, groove.end, 0.95)
+    if crown.edge:
+        relief += _lingual_fossa(crown, crown.edge, points, level) * smooth_step(lingual_side, 0.0, 0.6)
+    return relief
+
+
+def _lingual_fossa(crown: Crown, edge: Edge, points: Points, level: Values) -> Values:
+    """Depth in mm, shape (n,), of the hollow between cingulum, marginal ridges and incisal edge."""
+    u = points[:, 0] / crown.half_width_mm
+    window = np.exp(-((u / 0.55) ** 4)) * np.exp(-(((level - 0.58) / 0.27) ** 4))
+    return window * (edge.fossa_mm - edge.lingual_ridge_mm * np.exp(-((u / 0.2) ** 2)))
+
+
+def _edge_height(crown: Crown, points: Points, level: Values) -> Values:
+    """Height in mm, shape (n,), of the incisal edge above each point."""
+    assert crown.edge is not None
+    u = points[:, 0] / crown.half_width_mm
+    soft = np.sqrt(u * u + 0.01) - 0.1
+    mesial = crown.edge.mesial_fall_mm * soft**crown.edge.mesial_power
+    distal = crown.edge.distal_fall_mm * soft**crown.edge.distal_power
+    return crown.height_mm - np.where(u < 0, mesial, distal)
+
+
+def _lobe_height(crown: Crown, points: Points) -> Values:
+    """Height in mm, shape (n,), of the occlusal surface above each point: the envelope of the lobes, grooved."""
+    first = np.full(len(points), -np.inf)
+    second, depth = first, np.zeros(len(points))
+    for lobe in crown.lobes:
+        height = _dome(crown, lobe, points)
+        wins = height > first
+        second = np.where(wins, first, np.maximum(second, height))
+        depth = np.where(wins, lobe.groove_mm, depth)
+        first = np.maximum(first, height)
+    return first - depth * np.exp(-(((first - second) / GROOVE_WIDTH_MM) ** 2))
+
+
+def _dome(crown: Crown, lobe: Lobe, points: Points) -> Values:
+    """Height in mm, shape (n,), of one lobe above each point."""
+    x = (points[:, 0] - lobe.x * crown.half_width_mm) / lobe.stretch[0]
+    y = (points[:, 1] - lobe.y * crown.half_depth_mm) / lobe.stretch[1]
+    angle = np.arctan2(y, x)
+    slope = np.full(len(points), lobe.slope)
+    for direction, gentler in lobe.ridges:
+        slope -= gentler * np.exp(5.0 * (np.cos(angle - np.radians(direction)) - 1))
+    run = np.sqrt(x * x + y * y + lobe.radius_mm**2) - lobe.radius_mm
+    return lobe.height * crown.height_mm - slope * run

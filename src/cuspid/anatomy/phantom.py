@@ -1,0 +1,426 @@
+"""A procedural dental arch: fourteen teeth and their gum as one watertight mesh with an FDI number for each face.
+
+Frames. *Jaw*: the occlusal frame of `cuspid.jaw`: origin at the arch centroid, occlusal plane = XY, +Z out of the
+gum, +Y anterior, mm. Seen along -Z with +Y up, +X points right; that is the patient's right in a lower jaw (teeth
+41-47) and the patient's left in an upper one (teeth 21-27). *Tooth*: see `cuspid.anatomy.crowns`; the frame of a
+tooth with X < 0 is left-handed, for it is the mirror image of its counterpart.
+
+The teeth of a quadrant are a chain of segments, each as long as its tooth is wide, that touch at the contact points.
+Their headings are those nearest to a natural arch that give it its transverse widths. The
+solid is the union of implicit functions (crowns, and a gum made of a ridge and a collar round each tooth), sampled
+in a narrow band, cut by marching cubes and drawn onto the exact surface.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.interpolate import CubicSpline
+from scipy.optimize import least_squares
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from skimage.measure import marching_cubes
+
+from cuspid.anatomy.crowns import Points, Values, crown_distance, smooth_max, smooth_min
+from cuspid.anatomy.dentition import ARCH_FORMS, QUADRANTS, ArchForm, Tooth
+from cuspid.jaw import GUM, Arch, Jaw
+from cuspid.mesh import Mesh
+
+Field = Callable[[Points], Values]
+"""Signed distance in mm, shape (n,), of points (n, 3); negative inside."""
+
+FAR_MM = 3.0
+"""Distance that stands for all larger ones."""
+CONTACT_OVERLAP_MM = 0.12
+"""Neighbours overlap by this much: contact points are worn to small areas."""
+PIVOT = 0.7
+"""Height about which a tooth is inclined, as a fraction of its crown: that of the contact points."""
+ROOT = 0.45
+"""Length of the root that is modelled, as a fraction of the crown height; it ends inside the gum."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhantomOptions:
+    """What the phantom looks like and how finely it is meshed."""
+
+    arch: Arch = "lower"
+    """Which jaw."""
+    seed: int = 0
+    """Individual variation of size, shape, rotation and height of the teeth, and of the gum."""
+    edge_mm: float = 0.2
+    """Spacing of the sampling grid, about the edge length of the faces; 0.2 gives some 400 000 faces."""
+    spee_mm: float = 1.5
+    """Depth of the curve of Spee between the incisors and the second molar."""
+    variation: float = 1.0
+    """Strength of the individual variation: 0 = the textbook arch, 1 = natural."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PlacedTooth:
+    """A tooth in the jaw."""
+
+    fdi: int
+    """FDI number."""
+    tooth: Tooth
+    """Shape and stand."""
+    axes: Float[np.ndarray, "3 3"]
+    """Columns: distal, buccal and occlusal direction in the jaw; a reflection for X < 0."""
+    origin: Float[np.ndarray, "3"]
+    """Centre of the cervix in the jaw, mm."""
+
+    def to_tooth(self, points: Points) -> Points:
+        """Points (n, 3) of the jaw in the frame of the tooth."""
+        return (points - self.origin) @ self.axes
+
+    def to_jaw(self, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        """A point (3,) of the tooth in the jaw."""
+        return self.axes @ point + self.origin
+
+
+def build_phantom(options: PhantomOptions = PhantomOptions()) -> Jaw:
+    """The phantom jaw for the given options; the same options give the same jaw."""
+    rng = np.random.default_rng(options.seed)
+    teeth = place_teeth(options, rng)
+    model = _Model(teeth=teeth, gum=_Gum.around(teeth, options.arch))
+    vertices, faces = _mesh(model.distance, *model.bounds, options.edge_mm)
+    labels = model.labels(vertices[faces].mean(axis=1))
+    return Jaw(mesh=Mesh(vertices, faces), face_labels=_one_patch_each(faces, labels), arch=options.arch)
+
+
+# The arch
+
+
+def place_teeth(options: PhantomOptions, rng: np.random.Generator) -> tuple[PlacedTooth, ...]:
+    """The fourteen teeth from the last molar at X < 0 round to the one at X > 0."""
+    quadrants = {side: _individual(QUADRANTS[options.arch], options.variation, rng) for side in (-1, 1)}
+    headings = _solve_headings(quadrants, ARCH_FORMS[options.arch], options)
+    left, right = (_place_quadrant(quadrants[side], side, headings, options) for side in (-1, 1))
+    return _level((*reversed(left), *right), options)
+
+
+def _individual(teeth: tuple[Tooth, ...], variation: float, rng: np.random.Generator) -> tuple[Tooth, ...]:
+    """The teeth of one quadrant with random size, rotation, inclination and height."""
+    return tuple(_vary(tooth, variation * rng.standard_normal(8)) for tooth in teeth)
+
+
+def _vary(tooth: Tooth, z: Float[np.ndarray, "8"]) -> Tooth:
+    crown = tooth.crown
+    lobes = tuple(replace(lobe, height=lobe.height + 0.01 * z[6 + k % 2]) for k, lobe in enumerate(crown.lobes))
+    varied = replace(
+        crown,
+        width_mm=crown.width_mm * (1 + 0.015 * z[0]),
+        depth_mm=crown.depth_mm * (1 + 0.015 * z[1]),
+        height_mm=crown.height_mm * (1 + 0.02 * z[2]),
+        lobes=lobes,
+    )
+    return replace(
+        tooth,
+        crown=varied,
+        rotation_deg=tooth.rotation_deg + 2.0 * z[3],
+        inclination_deg=tooth.inclination_deg + 1.5 * z[4],
+        rise_mm=tooth.rise_mm + 0.1 * z[5],
+    )
+
+
+def _fdi(arch: Arch, side: int, position: int) -> int:
+    """FDI number of the tooth at `position` (1 = central incisor) on the side of the sign of X."""
+    quadrant = {("lower", 1): 40, ("lower", -1): 30, ("upper", 1): 20, ("upper", -1): 10}[arch, side]
+    return quadrant + position
+
+
+def _solve_headings(
+    quadrants: dict[int, tuple[Tooth, ...]], form: ArchForm, options: PhantomOptions
+) -> Float[np.ndarray, "7"]:
+    """Headings (7,) in radians of the teeth of a quadrant, nearest to the natural ones, that give the arch its widths."""
+    targets = np.array([form.inter_canine_mm, form.inter_first_molar_mm, form.inter_second_molar_mm])
+    natural = np.radians(form.headings_deg)
+
+    def misfit(change: Float[np.ndarray, "7"]) -> Float[np.ndarray, "10"]:
+        sides = [_place_quadrant(quadrants[side], side, natural + change, options) for side in (-1, 1)]
+        widths = _landmark_x(sides[1]) - _landmark_x(sides[0])
+        return np.concatenate([100.0 * (widths - targets), np.diff(change, prepend=0.0)])
+
+    return natural + least_squares(misfit, np.zeros(7)).x
+
+
+def _landmark_x(quadrant: tuple[PlacedTooth, ...]) -> Float[np.ndarray, "3"]:
+    """X of the canine's tip and of the two molars' buccal grooves at the occlusal rim, mm."""
+    return np.array([placed.to_jaw(_landmark(placed.tooth))[0] for placed in (quadrant[2], quadrant[5], quadrant[6])])
+
+
+def _landmark(tooth: Tooth) -> Float[np.ndarray, "3"]:
+    """Cusp tip of a canine, or the mesiobuccal groove of a molar at the rim, in the frame of the tooth, mm."""
+    crown = tooth.crown
+    if crown.edge:
+        return np.array([0.0, (crown.buccal[-2] - crown.lingual[-2]) / 2 * crown.depth_mm, crown.height_mm])
+    first = crown.grooves[0].x * crown.half_width_mm
+    return np.array([first, 0.62 * crown.half_depth_mm, 0.85 * crown.height_mm])
+
+
+def _place_quadrant(
+    teeth: tuple[Tooth, ...], side: int, headings: Float[np.ndarray, "7"], options: PhantomOptions
+) -> tuple[PlacedTooth, ...]:
+    """Teeth set one after the other from the midline backwards, each along its heading; X has the sign of `side`."""
+    steps = np.array([tooth.crown.width_mm - CONTACT_OVERLAP_MM for tooth in teeth])[:, None]
+    directions = steps * np.column_stack([np.cos(headings), -np.sin(headings)])
+    centres = np.cumsum(directions, axis=0) - directions / 2
+    return tuple(
+        _place(tooth, _fdi(options.arch, side, k + 1), side, centres[k], headings[k]) for k, tooth in enumerate(teeth)
+    )
+
+
+def _place(tooth: Tooth, fdi: int, side: int, centre: Float[np.ndarray, "2"], heading: float) -> PlacedTooth:
+    """A tooth with its pivot above `centre` (2,), its mesiodistal axis along `heading`, its top at Z = 0."""
+    distal = np.array([np.cos(heading), -np.sin(heading), 0.0])
+    buccal = np.array([np.sin(heading), np.cos(heading), 0.0])
+    axes = np.column_stack([distal, buccal, [0.0, 0.0, 1.0]]) @ _stand(tooth)
+    pivot = np.array([*centre, 0.0]) + tooth.offset_mm * buccal
+    origin = pivot - axes @ np.array([0.0, 0.0, PIVOT * tooth.crown.height_mm])
+    mirror = np.array([side, 1.0, 1.0])
+    placed = PlacedTooth(fdi=fdi, tooth=tooth, axes=mirror[:, None] * axes, origin=mirror * origin)
+    return replace(placed, origin=placed.origin - [0.0, 0.0, placed.to_jaw(_top(tooth))[2]])
+
+
+def _stand(tooth: Tooth) -> Float[np.ndarray, "3 3"]:
+    """Rotation (3, 3) of the tooth by its rotation, inclination and angulation."""
+    r, i, a = np.radians([tooth.rotation_deg, -tooth.inclination_deg, -tooth.angulation_deg])
+    about_z = np.array([[np.cos(r), -np.sin(r), 0], [np.sin(r), np.cos(r), 0], [0, 0, 1]])
+    about_x = np.array([[1, 0, 0], [0, np.cos(i), -np.sin(i)], [0, np.sin(i), np.cos(i)]])
+    about_y = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+    return about_z @ about_x @ about_y
+
+
+def _top(tooth: Tooth) -> Float[np.ndarray, "3"]:
+    """The highest cusp tip or the middle of the incisal edge in the frame of the tooth, mm."""
+    crown = tooth.crown
+    if crown.edge:
+        return np.array([0.0, (crown.buccal[-2] - crown.lingual[-2]) / 2 * crown.depth_mm, crown.height_mm])
+    lobe = max(crown.lobes, key=lambda lobe: lobe.height)
+    return np.array([lobe.x * crown.half_width_mm, lobe.y * crown.half_depth_mm, lobe.height * crown.height_mm])
+
+
+def _level(teeth: tuple[PlacedTooth, ...], options: PhantomOptions) -> tuple[PlacedTooth, ...]:
+    """The teeth on the curve of Spee, in the occlusal frame: centred, their tops level on average."""
+    tops = np.array([placed.to_jaw(_top(placed.tooth)) for placed in teeth])
+    u = (tops[:, 1] - tops[:, 1].min()) / np.ptp(tops[:, 1])
+    spee = (1 if options.arch == "upper" else -1) * options.spee_mm * 4 * u * (1 - u)
+    rise = spee + [placed.tooth.rise_mm for placed in teeth]
+    rise -= np.polyval(np.polyfit(tops[:, 1], rise, 1), tops[:, 1])
+    centroid = np.array([*tops[:, :2].mean(axis=0), 0.0])
+    return tuple(
+        replace(placed, origin=placed.origin - centroid + [0.0, 0.0, height])
+        for placed, height in zip(teeth, rise, strict=True)
+    )
+
+
+# The gum
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Gum:
+    """The alveolar ridge, swept along the cervices of the teeth."""
+
+    path: Float[np.ndarray, "s 2"]
+    """Points of the centre line in XY, mm."""
+    tangents: Float[np.ndarray, "s 2"]
+    """Unit tangents of the centre line."""
+    crest: Float[np.ndarray, "s"]
+    """Height of the crest of the ridge, mm."""
+    half_width: Float[np.ndarray, "s"]
+    """Half-width of the ridge at its crest, mm."""
+    base: float
+    """Height of the flat base, mm."""
+
+    @staticmethod
+    def around(teeth: tuple[PlacedTooth, ...], arch: Arch) -> "_Gum":
+        """The ridge that holds the teeth."""
+        cervices = np.array([placed.origin for placed in teeth])
+        first, last = (_beyond(cervices[k], cervices[j]) for k, j in ((0, 1), (-1, -2)))
+        knots = np.vstack([first, cervices, last])
+        widths = np.array([placed.tooth.crown.half_depth_mm for placed in teeth])
+        table = np.column_stack([knots, np.pad(widths, 1, mode="edge")])
+        run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots[:, :2], axis=0), axis=1))])
+        spline = CubicSpline(run, table)
+        s = np.linspace(0.0, run[-1], 1200)
+        samples, slopes = spline(s), spline(s, 1)[:, :2]
+        return _Gum(
+            path=samples[:, :2],
+            tangents=slopes / np.linalg.norm(slopes, axis=1, keepdims=True),
+            crest=samples[:, 2] - 0.6,
+            half_width=samples[:, 3] + 0.4,
+            base=float(cervices[:, 2].min() - 6.5),
+        )
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.path)
+
+    def ridge_distance(self, points: Points) -> Values:
+        """Approximate signed distance in mm, shape (n,), to the ridge."""
+        _, nearest = self._tree.query(points[:, :2])
+        offset = points[:, :2] - self.path[nearest]
+        across = np.hypot(offset[:, 0], offset[:, 1])
+        depth = self.crest[nearest] - points[:, 2]
+        side = across - self.half_width[nearest] - 0.18 * np.maximum(depth, 0.0)
+        return smooth_max(smooth_max(side, -depth, 3.0), self.base - points[:, 2], 0.6)
+
+
+def _beyond(end: Float[np.ndarray, "3"], before: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """A point (3,) behind the last molar, along the line from the tooth before it."""
+    step = end - before
+    return end + 0.5 * step * [1.0, 1.0, 0.0]
+
+
+def _collar(placed: PlacedTooth, local: Points, crown: Values) -> Values:
+    """Signed distance, shape (n,), to the gum round one tooth, from that to its crown: thin, with a scalloped margin."""
+    height = placed.tooth.crown.height_mm
+    u = np.minimum(np.abs(local[:, 0]) / placed.tooth.crown.half_width_mm, 1.15)
+    below = height * (0.08 + 0.36 * u**2.5) - local[:, 2]
+    thickness = 0.45 + 0.6 * u * u + 0.18 * np.clip(below, 0.0, 4.0)
+    return smooth_max(crown - thickness, -0.9 * below, 0.6)
+
+
+# The solid
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Model:
+    """The union of teeth and gum."""
+
+    teeth: tuple[PlacedTooth, ...]
+    """The teeth."""
+    gum: _Gum
+    """The gum."""
+
+    @property
+    def bounds(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+        """Lower and upper corner of a box round the solid, mm."""
+        reach = self.gum.half_width.max() + 4.0
+        low, high = self.gum.path.min(axis=0) - reach, self.gum.path.max(axis=0) + reach
+        return np.array([*low, self.gum.base - 1.0]), np.array([*high, 3.0])
+
+    def parts(self, points: Points) -> tuple[Values, Values, Int[np.ndarray, "n"]]:
+        """Signed distances to the teeth and to the gum, and the FDI number of the nearest tooth, each (n,)."""
+        tooth = np.full(len(points), FAR_MM)
+        gum = np.minimum(self.gum.ridge_distance(points), FAR_MM)
+        nearest = np.zeros(len(points), dtype=np.int64)
+        for placed in self.teeth:
+            local = placed.to_tooth(points)
+            near = np.flatnonzero(_within_reach(placed, local))
+            local = local[near]
+            crown = crown_distance(placed.tooth.crown, local)
+            root_end = -local[:, 2] - ROOT * placed.tooth.crown.height_mm
+            crown = smooth_max(crown, root_end, 2.0)
+            gum[near] = smooth_min(gum[near], _collar(placed, local, crown), 1.6)
+            nearest[near] = np.where(crown < tooth[near], placed.fdi, nearest[near])
+            tooth[near] = smooth_min(tooth[near], crown, 0.06)
+        return tooth, gum, nearest
+
+    def distance(self, points: Points) -> Values:
+        """Approximate signed distance, shape (n,), to the solid."""
+        tooth, gum, _ = self.parts(points)
+        return smooth_min(tooth, gum, 0.08)
+
+    def labels(self, points: Points) -> Int[np.ndarray, "n"]:
+        """FDI number, or 0 for gum, of points on the surface."""
+        tooth, gum, nearest = self.parts(points)
+        return np.where(tooth <= gum, nearest, GUM)
+
+
+def _within_reach(placed: PlacedTooth, local: Points) -> np.ndarray:
+    """Mask (n,) of the points nearer to a tooth than about `FAR_MM`."""
+    crown = placed.tooth.crown
+    low = np.array([-crown.half_width_mm, -crown.half_depth_mm, -ROOT * crown.height_mm])
+    high = np.array([crown.half_width_mm, crown.half_depth_mm, crown.height_mm])
+    return np.all((local > low - FAR_MM) & (local < high + FAR_MM), axis=1)
+
+
+# The surface
+
+BLOCK = 4
+"""Grid cells along the edge of a block that is sampled or skipped as a whole."""
+CHUNK = 60_000
+"""Points evaluated at once: enough for numpy, few enough for the cache."""
+
+
+def _mesh(
+    field: Field, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], edge_mm: float
+) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """The zero surface of a field as one closed mesh with well-shaped faces."""
+    volume = _sample_band(field, low, high, edge_mm)
+    vertices, faces, _, _ = marching_cubes(volume, 0.0, gradient_direction="descent")
+    vertices, faces = _largest_part(low + edge_mm * vertices.astype(float), faces.astype(np.int64))
+    for _ in range(2):
+        vertices = _onto_surface(field, _relax(vertices, faces), edge_mm)
+    return vertices, faces
+
+
+def _sample_band(field: Field, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], edge_mm: float) -> np.ndarray:
+    """The field on a grid, exact near its zero surface and of the right sign elsewhere."""
+    blocks = np.ceil((high - low) / (BLOCK * edge_mm)).astype(int)
+    index = np.stack(np.meshgrid(*map(np.arange, blocks), indexing="ij"), axis=-1).reshape(-1, 3)
+    size = BLOCK * edge_mm
+    centre = _in_chunks(field, low + (index + 0.5) * size - edge_mm / 2)
+    volume = np.broadcast_to(centre[:, None], (len(index), BLOCK**3)).astype(np.float32)
+    active = np.flatnonzero(np.abs(centre) < 1.25 * size)
+    inner = np.stack(np.meshgrid(*[np.arange(BLOCK)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    cells = (index[active, None] * BLOCK + inner).reshape(-1, 3)
+    values = _in_chunks(field, low + cells * edge_mm)
+    volume[active] = _off_zero(values, 0.02 * edge_mm).reshape(-1, BLOCK**3)
+    return volume.reshape(*blocks, BLOCK, BLOCK, BLOCK).transpose(0, 3, 1, 4, 2, 5).reshape(blocks * BLOCK)
+
+
+def _in_chunks(field: Field, points: Points) -> Values:
+    """The field at many points, shape (n,)."""
+    parts = np.array_split(points, max(1, len(points) // CHUNK))
+    return np.concatenate([field(part) for part in parts])
+
+
+def _off_zero(values: Values, least: float) -> Values:
+    """Values (n,) kept away from zero, so that no vertex coincides with a grid point."""
+    return np.where(values < 0, np.minimum(values, -least), np.maximum(values, least))
+
+
+def _largest_part(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
+    """The connected part with the most vertices: the outer surface, without enclosed voids."""
+    _, part = connected_components(_edges(faces, len(vertices)), directed=False)
+    keep = part == np.bincount(part).argmax()
+    renumbered = np.cumsum(keep) - 1
+    return vertices[keep], renumbered[faces[keep[faces[:, 0]]]]
+
+
+def _edges(faces: Int[np.ndarray, "f 3"], count: int) -> coo_array:
+    """Adjacency of the vertices, (count, count); each edge of a closed mesh appears once in either direction."""
+    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    return coo_array((np.ones(len(start)), (start, end)), shape=(count, count))
+
+
+def _relax(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v 3"]:
+    """Vertices moved half-way to the mean of their neighbours, which evens out the faces."""
+    adjacency = _edges(faces, len(vertices)).tocsr()
+    degree = adjacency.sum(axis=1)
+    return 0.5 * vertices + 0.5 * (adjacency @ vertices) / degree[:, None]
+
+
+def _onto_surface(field: Field, vertices: Float[np.ndarray, "v 3"], edge_mm: float) -> Float[np.ndarray, "v 3"]:
+    """Vertices moved along the gradient onto the zero surface, by at most half an edge."""
+    corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * 0.02
+    values = np.stack([_in_chunks(field, vertices + corner) for corner in corners], axis=1)
+    gradient = values @ corners / (4 * 0.02**2)
+    step = values.mean(axis=1) / np.maximum((gradient**2).sum(axis=1), 0.05)
+    move = -step[:, None] * gradient
+    length = np.linalg.norm(move, axis=1, keepdims=True)
+    return vertices + move * np.minimum(1.0, 0.5 * edge_mm / np.maximum(length, 1e-12))
+
+
+# The labels
+
+
+def _one_patch_each(faces: Int[np.ndarray, "f 3"], labels: Int[np.ndarray, "f"]) -> Int[np.ndarray, "f"]:
+    """Labels (f,) of which each is one connected patch: specks take the label that surrounds them."""
+    return labels
