@@ -12,7 +12,7 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
@@ -134,23 +134,41 @@ def hash_file(path: Path) -> str:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def claim_folder(folder: Path, stage: str, settings: Mapping[str, object], inputs: Mapping[str, str]) -> None:
+def hash_capture(capture: Capture) -> dict[str, str]:
+    """SHA-256 of a capture's handpiece and of its list of frames with the sizes of their images.
+
+    The contents of the images are not read: that would take longer than finding a broken one when it is used.
+    """
+    listing = [
+        (path.name, path.stat().st_size)
+        for name in capture.handpiece.rig.names
+        for frame in capture.frames
+        if (path := capture.image_path(frame, name)).exists()
+    ]
+    parts = {"handpiece": _handpiece_to_json(capture.handpiece), "images": listing}
+    return {name: hashlib.sha256(json.dumps(_plain(part)).encode()).hexdigest() for name, part in parts.items()}
+
+
+def claim_folder(
+    folder: Path, stage: str, settings: Mapping[str, object], inputs: Mapping[str, str], *, replace: bool = False
+) -> None:
     """Make ``folder`` the home of one run of a stage, or find that it is already.
 
     ``run.json`` keeps for each stage the version, the settings and the hashes of the inputs. Raises OutputError where
-    the folder holds the same stage made from something else, or files that no run of cuspid wrote.
+    the folder holds files that no run of cuspid wrote, or the same stage made from something else (unless it may be
+    replaced, since it is made anew as a whole).
     """
     manifest_path = folder / "run.json"
     entry = _plain({"cuspid": cuspid.__version__, "settings": settings, "inputs_sha256": inputs})
     manifest = read_json(manifest_path) if manifest_path.exists() else {}
     if not manifest and folder.exists() and any(folder.iterdir()):
         raise OutputError(f"{folder}: holds files that are not from cuspid; give an empty or new folder as --out")
-    if stage in manifest and manifest[stage] != entry:
+    if stage in manifest and manifest[stage] != entry and not replace:
         changed = _first_difference(manifest[stage], entry)
         raise OutputError(
             f"{folder}: holds another run of '{stage}' ({changed} differs); give another --out or delete the folder"
         )
-    if stage not in manifest:
+    if manifest.get(stage) != entry:
         write_json(manifest_path, {**manifest, stage: entry})
 
 
@@ -316,8 +334,7 @@ def _camera_from_json(value: Mapping[str, Any]) -> Camera:
     )
 
 
-def write_handpiece(path: Path, handpiece: Handpiece) -> None:
-    """Write ``handpiece.json``."""
+def _handpiece_to_json(handpiece: Handpiece) -> dict[str, Any]:
     cameras = {
         name: {
             **_camera_to_json(mounted.camera),
@@ -326,18 +343,20 @@ def write_handpiece(path: Path, handpiece: Handpiece) -> None:
         }
         for name, mounted in handpiece.rig.cameras.items()
     }
-    write_json(
-        path,
-        {
-            "name": handpiece.name,
-            "working_distance_mm": handpiece.working_distance_mm,
-            "depth_range_mm": handpiece.depth_range_mm,
-            "cameras": cameras,
-            "lights": handpiece.lights,
-            "exposures": handpiece.exposures,
-            "sensor": handpiece.sensor,
-        },
-    )
+    return {
+        "name": handpiece.name,
+        "working_distance_mm": handpiece.working_distance_mm,
+        "depth_range_mm": handpiece.depth_range_mm,
+        "cameras": cameras,
+        "lights": handpiece.lights,
+        "exposures": handpiece.exposures,
+        "sensor": handpiece.sensor,
+    }
+
+
+def write_handpiece(path: Path, handpiece: Handpiece) -> None:
+    """Write ``handpiece.json``."""
+    write_json(path, _handpiece_to_json(handpiece))
 
 
 def _light_from_json(value: Mapping[str, Any]) -> Light:
@@ -660,9 +679,3 @@ def trueness_summary(trueness: Trueness) -> dict[str, Any]:
 def write_trueness(path: Path, trueness: Trueness) -> None:
     """Write ``trueness.json``."""
     write_json(path, trueness_summary(trueness))
-
-
-def resumable(path: Path, make: Callable[[], None]) -> None:
-    """Run ``make``, which writes ``path`` last, unless the file is there already."""
-    if not path.exists():
-        make()

@@ -1,0 +1,277 @@
+"""The command line: a verb is load, one call, save."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from tyro.conf import Positional, arg
+
+from cuspid import pipeline, storage
+from cuspid.anatomy.phantom import PhantomOptions, build_phantom
+from cuspid.capture import Capture
+from cuspid.errors import CuspidError, InputError
+from cuspid.evaluation.deviation import EvaluationOptions
+from cuspid.handpiece.designs import DESIGNS, DesignOptions
+from cuspid.jaw import Arch, Jaw
+from cuspid.pipeline import ReconstructionOptions, SimulationOptions
+from cuspid.reconstruction import Reconstruction
+from cuspid.reporting.figures import draw_deviation, draw_mesh
+from cuspid.rig import Handpiece
+from cuspid.trueness import Trueness
+
+console = Console(stderr=True)
+
+Flat = arg(name="")
+"""The fields of a nested options value appear without a prefix."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """What is scanned."""
+
+    unit: storage.Unit = "mm"
+    """Length unit of the mesh file."""
+    arch: Arch | None = None
+    """Which jaw the file holds, where its teeth are to be numbered; of the phantom: lower unless said otherwise."""
+    jaw_seed: int = 0
+    """Individual of the built-in phantom."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Probe:
+    """What scans it."""
+
+    design: Literal["four", "twelve"] = "twelve"
+    """Built-in design: the essential four cameras, or the twelve."""
+    handpiece: Path | None = None
+    """A handpiece.json of your own, instead of a built-in design."""
+
+
+@contextmanager
+def _progress() -> Iterator[pipeline.Progress]:
+    columns = (TextColumn("{task.description:>12}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def report(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total)
+            bars.update(tasks[stage], completed=done, total=total)
+
+        yield report
+
+
+def _load_source(mesh: Path | None, source: Source) -> tuple[Jaw, dict[str, str]]:
+    if mesh is None:
+        return build_phantom(PhantomOptions(arch=source.arch or "lower", seed=source.jaw_seed)), {}
+    jaw, notes = pipeline.load_jaw(mesh, unit=source.unit, arch=source.arch)
+    for note in notes:
+        console.print(f"note: {note}")
+    return jaw, {"jaw": storage.hash_file(mesh)}
+
+
+def _load_probe(probe: Probe) -> tuple[Handpiece, dict[str, str]]:
+    if probe.handpiece is None:
+        return DESIGNS[probe.design](DesignOptions()), {}
+    return storage.read_handpiece(probe.handpiece), {"handpiece": storage.hash_file(probe.handpiece)}
+
+
+def run(
+    jaw: Annotated[Path | None, Positional, arg(metavar="[JAW]")] = None,
+    *,
+    out: Path,
+    source: Annotated[Source, Flat] = Source(),
+    probe: Annotated[Probe, Flat] = Probe(),
+    simulation: Annotated[SimulationOptions, Flat] = SimulationOptions(),
+    reconstruction: Annotated[ReconstructionOptions, Flat] = ReconstructionOptions(),
+    evaluation: EvaluationOptions = EvaluationOptions(),
+) -> None:
+    """Scan a jaw in simulation, reconstruct it, and measure the trueness.
+
+    Args:
+        jaw: Mesh of a jaw (STL, PLY, OBJ); without it the built-in phantom.
+        out: Folder for everything that is made. A killed run goes on when the same command is given again.
+        evaluation: How the trueness is measured.
+    """
+    _simulate(jaw, out, source, probe, simulation)
+    _reconstruct(storage.read_capture(out / "capture"), out, reconstruction, None)
+    _evaluate(out / "mesh.ply", out / "truth", out, Source(), evaluation)
+
+
+def phantom(*, out: Path, options: Annotated[PhantomOptions, Flat] = PhantomOptions()) -> None:
+    """Make the built-in phantom jaw: a mesh with tooth labels, and a picture of it.
+
+    Args:
+        out: Mesh file to write (.ply keeps the labels; .stl, .obj).
+    """
+    made = build_phantom(options)
+    if out.suffix.lower() not in storage.MESH_SUFFIXES:
+        raise InputError(f"{out}: give a file name that ends in .ply, .stl or .obj")
+    if out.suffix.lower() == ".ply":
+        storage.write_jaw(out, made)
+    else:
+        storage.write_mesh(out, made.mesh)
+    draw_mesh(out.with_suffix(".png"), made)
+    console.print(f"{out}: {len(made.mesh.faces):,} faces, teeth {', '.join(map(str, made.teeth))}")
+
+
+def handpiece(
+    *,
+    out: Path,
+    design: Literal["four", "twelve"] = "twelve",
+    options: Annotated[DesignOptions, Flat] = DesignOptions(),
+) -> None:
+    """Write a built-in handpiece as handpiece.json and COLMAP's rig_config.json, to use or to change.
+
+    Args:
+        out: Folder.
+        design: The essential four cameras, or the twelve.
+    """
+    made = DESIGNS[design](options)
+    storage.write_handpiece(out / "handpiece.json", made)
+    storage.write_rig_config(out / "rig_config.json", made.rig)
+    console.print(f"{out / 'handpiece.json'}: {len(made.rig.names)} cameras, {len(made.lights)} lights")
+
+
+def simulate(
+    jaw: Annotated[Path | None, Positional, arg(metavar="[JAW]")] = None,
+    *,
+    out: Path,
+    source: Annotated[Source, Flat] = Source(),
+    probe: Annotated[Probe, Flat] = Probe(),
+    simulation: Annotated[SimulationOptions, Flat] = SimulationOptions(),
+) -> None:
+    """Render what the handpiece sees: OUT/capture (images, calibration) and OUT/truth (what only the simulator knows).
+
+    Args:
+        jaw: Mesh of a jaw (STL, PLY, OBJ); without it the built-in phantom.
+        out: Folder.
+    """
+    _simulate(jaw, out, source, probe, simulation)
+
+
+def reconstruct(
+    capture: Annotated[Path, Positional],
+    *,
+    out: Path,
+    handpiece: Path | None = None,
+    from_poses: Path | None = None,
+    reconstruction: Annotated[ReconstructionOptions, Flat] = ReconstructionOptions(),
+) -> None:
+    """Images and a handpiece file to poses and a mesh in millimetres.
+
+    Args:
+        capture: Folder with images/<camera>/<frame>.png.
+        out: Folder for depth/, motion/, mesh.ply and mesh.stl.
+        handpiece: Calibration (default: handpiece.json in the capture folder).
+        from_poses: Folder of a COLMAP model whose poses are used instead of our own.
+    """
+    _reconstruct(storage.read_capture(capture, handpiece), out, reconstruction, from_poses)
+
+
+def evaluate(
+    mesh: Annotated[Path, Positional],
+    reference: Annotated[Path, Positional],
+    *,
+    out: Path,
+    source: Annotated[Source, Flat] = Source(),
+    options: Annotated[EvaluationOptions, Flat] = EvaluationOptions(),
+) -> None:
+    """Trueness of a mesh against a reference: trueness.json, and the colour map as PLY and PNG.
+
+    Args:
+        mesh: The scan (STL, PLY, OBJ), in any pose.
+        reference: A mesh, or the folder truth/ of a simulation, which knows what could be seen.
+        out: Folder for the results.
+    """
+    _evaluate(mesh, reference, out, source, options)
+
+
+def _simulate(mesh: Path | None, out: Path, source: Source, probe: Probe, options: SimulationOptions) -> None:
+    jaw, jaw_hash = _load_source(mesh, source)
+    device, device_hash = _load_probe(probe)
+    storage.claim_folder(
+        out, "simulate", {"source": source, "probe": probe, "simulation": options}, jaw_hash | device_hash
+    )
+    with _progress() as progress:
+        pipeline.simulate(jaw, device, out, options, progress=progress)
+
+
+def _reconstruct(capture: Capture, out: Path, options: ReconstructionOptions, model: Path | None) -> None:
+    storage.claim_folder(
+        out, "reconstruct", {"reconstruction": options, "from_poses": model}, storage.hash_capture(capture)
+    )
+    with _progress() as progress:
+        reconstruction, mesh = pipeline.reconstruct(capture, out, options, colmap_model=model, progress=progress)
+    _print_located(reconstruction, capture)
+    console.print(f"{out / 'mesh.ply'}: {len(mesh.faces):,} faces")
+
+
+def _evaluate(mesh: Path, reference: Path, out: Path, source: Source, options: EvaluationOptions) -> None:
+    scan = storage.read_mesh(mesh, source.unit)
+    known, scannable, hashes = pipeline.load_reference(reference, unit=source.unit, arch=source.arch)
+    hashes |= {"mesh": storage.hash_file(mesh)}
+    storage.claim_folder(out, "evaluate", {"evaluation": options}, hashes, replace=True)
+    trueness = pipeline.evaluate(scan, known, options, scannable=scannable)
+    draw_deviation(out, scan, trueness)
+    storage.write_trueness(out / "trueness.json", trueness)
+    _print_trueness(trueness)
+
+
+def _print_located(reconstruction: Reconstruction, capture: Capture) -> None:
+    console.print(f"located {len(reconstruction.frames)} of {len(capture.frames)} frames")
+    for dropped in reconstruction.dropped:
+        console.print(f"  left out {dropped.what}: {dropped.reason}")
+
+
+def _print_trueness(trueness: Trueness) -> None:
+    table = Table(title="Trueness in µm, scan to reference", title_justify="left")
+    for column in ("region", "mean |d|", "signed mean", "SD", "RMS", "P95", "max", "within 50 µm, %"):
+        table.add_column(column, justify="left" if column == "region" else "right")
+    rows = [("all", trueness.accuracy, trueness.completeness_pct)]
+    rows += [
+        (str(fdi), statistics, trueness.per_tooth_completeness_pct[fdi])
+        for fdi, statistics in sorted(trueness.per_tooth.items())
+    ]
+    for region, d, complete in rows:
+        figures = (d.mean_abs_um, d.signed_mean_um, d.std_um, d.rms_um, d.p95_um, d.max_um, complete["50"])
+        table.add_row(region, *(f"{figure:.1f}" for figure in figures))
+    Console().print(table)
+    for note in trueness.notes:
+        console.print(f"note: {note}")
+
+
+COMMANDS = {
+    "run": run,
+    "phantom": phantom,
+    "handpiece": handpiece,
+    "simulate": simulate,
+    "reconstruct": reconstruct,
+    "evaluate": evaluate,
+}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run a verb; a known error is one line on stderr and exit status 1."""
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog="cuspid",
+            description="Passive intra-oral 3D scanning: simulate, reconstruct, and prove the accuracy.",
+            args=arguments,
+        )
+    except CuspidError as error:
+        console.print(f"cuspid: {error}", style="red", soft_wrap=True, markup=False, highlight=False)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        console.print("cuspid: interrupted; the same command goes on where it stopped")
+        sys.exit(130)

@@ -1,0 +1,289 @@
+"""The whole flow, one function a stage. Each reads and writes folders (docs/formats.md) and goes on where it stopped.
+
+jaw            = load_jaw(path)  or  make_phantom(options)
+capture, truth = simulate(jaw, folder)
+depths         = measure_depth(capture, folder)
+reconstruction = locate(capture, folder)
+mesh           = fuse(depths, reconstruction, folder)
+trueness       = evaluate(mesh, truth.jaw, scannable=...)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool
+
+from cuspid import storage
+from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, labels_from_colors
+from cuspid.capture import Capture, Frame
+from cuspid.errors import ReconstructionError
+from cuspid.evaluation.deviation import EvaluationOptions
+from cuspid.evaluation.deviation import evaluate as compare_with_reference
+from cuspid.handpiece.visibility import VisibilityOptions, scannable_faces
+from cuspid.jaw import Arch, Jaw
+from cuspid.mesh import Mesh
+from cuspid.motion.colmap import locate_with_colmap, read_model, write_model
+from cuspid.motion.odometry import MotionOptions
+from cuspid.motion.odometry import locate as locate_with_rig
+from cuspid.reconstruction import DepthMap, Reconstruction
+from cuspid.rig import Handpiece
+from cuspid.simulation.appearance import APPEARANCES, Preset
+from cuspid.simulation.blender import render_with_blender
+from cuspid.simulation.raycast import Scene, render_capture
+from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path
+from cuspid.stereo.matching import DepthEstimator, StereoOptions
+from cuspid.surface.cleaning import CleaningOptions, clean
+from cuspid.surface.fusion import FusionOptions
+from cuspid.surface.fusion import fuse as fuse_depth_maps
+from cuspid.trueness import GroundTruth, Trueness
+
+Progress = Callable[[str, int, int], None]
+"""Told the stage, how much of it is done and how much there is."""
+
+MotionMethod = Literal["rig", "colmap", "colmap-rig"]
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """A :data:`Progress` that says nothing."""
+
+
+# --- What is scanned -----------------------------------------------------------------------------------------------
+
+
+def load_jaw(path: Path, *, unit: storage.Unit = "mm", arch: Arch | None = None) -> tuple[Jaw, tuple[str, ...]]:
+    """A user's jaw mesh, brought into the occlusal frame, and notes on what was found or is unsure.
+
+    Raises InputError where the file is no mesh, or its width is not that of a jaw in the given unit.
+    """
+    mesh, labels, colors = storage.read_labelled_mesh(path, unit)
+    check_scale(mesh, unit)
+    occlusal = find_occlusal_frame(mesh)
+    moved = mesh.transformed(occlusal.occlusal_from_mesh)
+    if labels is None and colors is not None:
+        labels = labels_from_colors(moved, colors, arch)
+    return Jaw(mesh=moved, face_labels=labels, arch=arch), occlusal.notes
+
+
+def load_reference(
+    path: Path, *, unit: storage.Unit = "mm", arch: Arch | None = None
+) -> tuple[Jaw, Bool[np.ndarray, "f"] | None, dict[str, str]]:
+    """What a scan is compared with: a mesh file, or the ``truth`` folder of a simulation, which also knows which faces
+    could be seen (None for a mesh file). Also the hashes of the files."""
+    if not path.is_dir():
+        mesh, labels, _ = storage.read_labelled_mesh(path, unit)
+        return Jaw(mesh=mesh, face_labels=labels, arch=arch), None, {"reference": storage.hash_file(path)}
+    truth = storage.read_truth(path)
+    hashes = {name: storage.hash_file(path / name) for name in ("jaw.ply", "poses.json", "handpiece.json")}
+    return truth.jaw, scannable(truth, VisibilityOptions()), hashes
+
+
+# --- Simulation ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationOptions:
+    """How a jaw is scanned in simulation."""
+
+    texture: Preset = "artificial"
+    """Surface: artificial (strong matte texture, the thesis' condition), powder (weak speckle), enamel (plain, wet)."""
+    renderer: Literal["embree", "blender"] = "embree"
+    """Embree rays (default), or Blender Cycles with subsurface scattering (needs an environment of its own)."""
+    supersampling: int = 2
+    """Rays through a pixel along each side."""
+    seed: int = 0
+    """Chooses texture, hand jitter and sensor noise."""
+    path: ScanPathOptions = field(default_factory=ScanPathOptions)
+    """How the handpiece moves."""
+
+
+def simulate(
+    jaw: Jaw, handpiece: Handpiece, folder: Path, options: SimulationOptions, *, progress: Progress = silent
+) -> tuple[Capture, GroundTruth]:
+    """Scan a jaw: images to ``folder/capture``, what only the simulator knows to ``folder/truth``.
+
+    Images that are there already are kept; a run that goes on gives the same bits as one that was not interrupted.
+    """
+    path = plan_scan_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
+    truth = GroundTruth(jaw=jaw, handpiece=handpiece, rig_from_world=path.rig_from_world)
+    storage.write_truth(folder / "truth", truth)
+    capture = Capture(
+        folder=folder / "capture", handpiece=handpiece, frames=tuple(Frame(name=name) for name in path.rig_from_world)
+    )
+    storage.write_capture(capture)
+    for done, total in _render(capture, truth, options):
+        progress("images", done, total)
+    return capture, truth
+
+
+def _render(capture: Capture, truth: GroundTruth, options: SimulationOptions) -> Iterator[tuple[int, int]]:
+    names = truth.handpiece.rig.names
+    total = len(capture.frames) * len(names)
+    present = sum(capture.image_path(frame, name).exists() for frame in capture.frames for name in names)
+    scene = Scene(
+        jaw=truth.jaw,
+        handpiece=truth.handpiece,
+        appearance=APPEARANCES[options.texture],
+        supersampling=options.supersampling,
+        seed=options.seed,
+    )
+    render = render_with_blender if options.renderer == "blender" else render_capture
+    rendered = render(
+        scene,
+        truth.rig_from_world,
+        lambda frame, camera, image: storage.write_image(capture.image_path(frame, camera), image),
+        skip=lambda frame, camera: capture.image_path(frame, camera).exists(),
+        processes=os.cpu_count() or 1,
+    )
+    for done, _ in enumerate(rendered, start=present + 1):
+        yield done, total
+
+
+def scannable(truth: GroundTruth, options: VisibilityOptions) -> Bool[np.ndarray, "f"]:
+    """The faces of the true jaw that at least two cameras of one exposure could see."""
+    return scannable_faces(truth.jaw.mesh, truth.handpiece, truth.rig_from_world.values(), options)
+
+
+# --- Reconstruction: sees images and calibration alone -------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructionOptions:
+    """How images become a mesh."""
+
+    motion: MotionMethod = "rig"
+    """How the frames are located: rig (ours), or COLMAP's own mapper without (colmap) and with the rig (colmap-rig)."""
+    stereo: StereoOptions = field(default_factory=StereoOptions)
+    """Depth within an exposure."""
+    tracking: MotionOptions = field(default_factory=MotionOptions)
+    """Features, odometry and adjustment of the method ``rig``."""
+    fusion: FusionOptions = field(default_factory=FusionOptions)
+    """Depth maps to one surface."""
+    cleaning: CleaningOptions = field(default_factory=CleaningOptions)
+    """What is removed from the surface."""
+
+
+@dataclass(frozen=True)
+class StoredDepthMaps:
+    """Depth maps on disk, read when they are iterated, as often as need be."""
+
+    files: Sequence[Path]
+    """One file a frame."""
+
+    def __iter__(self) -> Iterator[DepthMap]:
+        for file in self.files:
+            yield from storage.read_depth_maps(file)
+
+
+def measure_depth(
+    capture: Capture, folder: Path, options: StereoOptions, *, progress: Progress = silent
+) -> StoredDepthMaps:
+    """Depth maps of every frame, exposure by exposure, kept in ``folder``."""
+    estimator = DepthEstimator(capture.handpiece, options)
+    files = [folder / f"{frame.name}.npz" for frame in capture.frames]
+
+    def measure(frame: Frame, file: Path) -> None:
+        if not file.exists():
+            images = {name: capture.image(frame, name) for name in capture.handpiece.rig.names}
+            storage.write_depth_maps(file, estimator.measure(images, frame.name))
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for done, _ in enumerate(pool.map(measure, capture.frames, files), start=1):
+            progress("depth", done, len(files))
+    return StoredDepthMaps(files)
+
+
+def locate(
+    capture: Capture, folder: Path, options: ReconstructionOptions, *, progress: Progress = silent
+) -> Reconstruction:
+    """Metric poses of the frames, kept in ``folder`` together with a COLMAP model."""
+    if (folder / "reconstruction.json").exists():
+        return storage.read_reconstruction(folder)
+    if options.motion == "rig":
+        found = locate_with_rig(capture, options.tracking, progress=progress, cache=folder / "cache")
+    else:
+        found = locate_with_colmap(capture, folder / "colmap", with_rig=options.motion == "colmap-rig")
+    write_model(folder / "sparse", found, capture)
+    storage.write_reconstruction(folder, found, capture.handpiece)
+    return found
+
+
+def fuse(
+    depths: StoredDepthMaps,
+    reconstruction: Reconstruction,
+    folder: Path,
+    options: ReconstructionOptions,
+    *,
+    progress: Progress = silent,
+) -> Mesh:
+    """One clean mesh: ``mesh.ply`` with colour, ``mesh.stl``, and what was removed in ``mesh.json``."""
+    if (folder / "mesh.ply").exists():
+        return storage.read_mesh(folder / "mesh.ply")
+    raw = fuse_depth_maps(depths, reconstruction.rig_from_world, options.fusion, progress=progress)
+    if not len(raw.faces):
+        raise ReconstructionError(
+            "no surface: the depth maps are empty; the images need texture (spray, powder) or sharper focus"
+        )
+    mesh, report = clean(raw, options.cleaning)
+    storage.write_json(folder / "mesh.json", report)
+    storage.write_mesh(folder / "mesh.stl", mesh)
+    storage.write_mesh(folder / "mesh.ply", mesh)
+    return mesh
+
+
+def reconstruct(
+    capture: Capture,
+    folder: Path,
+    options: ReconstructionOptions,
+    *,
+    colmap_model: Path | None = None,
+    progress: Progress = silent,
+) -> tuple[Reconstruction, Mesh]:
+    """Images and calibration to poses and a mesh. With a COLMAP model its poses are taken instead of found."""
+    depths = measure_depth(capture, folder / "depth", options.stereo, progress=progress)
+    if colmap_model is None:
+        reconstruction = locate(capture, folder / "motion", options, progress=progress)
+    else:
+        reconstruction = read_model(colmap_model, capture)
+        storage.write_reconstruction(folder / "motion", reconstruction, capture.handpiece)
+    if _moved(capture.handpiece, reconstruction):
+        refined = dataclasses.replace(capture, handpiece=dataclasses.replace(capture.handpiece, rig=reconstruction.rig))
+        depths = measure_depth(refined, folder / "depth-refined", options.stereo, progress=progress)
+    return reconstruction, fuse(depths, reconstruction, folder, options, progress=progress)
+
+
+def _moved(handpiece: Handpiece, reconstruction: Reconstruction, tolerance_px: float = 0.02) -> bool:
+    """Whether the refined calibration moves a point at the working distance by more than a tolerance in any image."""
+    for name, before in handpiece.rig.cameras.items():
+        after = reconstruction.rig[name]
+        corners = np.array([[0.1, 0.1], [0.9, 0.1], [0.1, 0.9], [0.9, 0.9], [0.5, 0.5]])
+        rays = before.camera.rays(corners * [before.camera.width, before.camera.height])
+        in_rig = before.cam_from_rig.inverse().apply(rays * handpiece.working_distance_mm)
+        shift = after.camera.project(after.cam_from_rig.apply(in_rig)) - before.camera.project(
+            before.cam_from_rig.apply(in_rig)
+        )
+        if np.abs(shift).max() > tolerance_px:
+            return True
+    return False
+
+
+# --- Evaluation ----------------------------------------------------------------------------------------------------
+
+
+def evaluate(
+    mesh: Mesh,
+    reference: Jaw,
+    options: EvaluationOptions,
+    *,
+    scannable: Bool[np.ndarray, "f"] | None = None,
+    seed: int = 0,
+) -> Trueness:
+    """Trueness of a mesh against its reference (:func:`cuspid.evaluation.deviation.evaluate`)."""
+    return compare_with_reference(mesh, reference, options, scannable=scannable, rng=np.random.default_rng(seed))
