@@ -1,0 +1,332 @@
+"""Bundle adjustment: derivatives, and closed loops on synthetic scenes with a known truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cuspid.camera import Camera
+from cuspid.errors import ReconstructionError
+from cuspid.geometry import Rigid3
+from cuspid.motion import adjustment
+from cuspid.motion.adjustment import AdjustmentOptions, adjust, covariance_factor, left_jacobian
+from cuspid.reconstruction import Reconstruction, Tracks
+from cuspid.rig import MountedCamera, Rig
+
+SIGMA_PX = 0.3
+EXTRINSIC_SIGMA = np.array([2e-3, 2e-3, 2e-3, 0.02, 0.02, 0.02])
+PARAMETER_SIGMA = np.array([2.0, 2.0, 2.0, 2.0, 5e-3, 2e-3, 1e-3, 1e-3])
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What truly was, with the world in the first frame."""
+
+    rig: Rig
+    rig_from_world: dict[str, Rigid3]
+    tracks: Tracks
+
+
+def make_camera() -> Camera:
+    """A small camera with a noticeable distortion."""
+    camera = Camera.from_field_of_view(500, 500, 62.0)
+    return camera.with_parameters(np.array([416.0, 415, 251, 248, -0.12, 0.03, 2e-3, -1e-3]))
+
+
+def make_rig() -> Rig:
+    """Four cameras that look at a patch from above and one from each side."""
+    above = [Rigid3(np.eye(3), -np.array([x, y, 0.0])) for x in (-1.2, 1.2) for y in (-1.0, 1.0)]
+    sides = [
+        Rigid3.from_rotation_vector(np.array([0, sign * 0.7, 0]), np.array([0, 0, 5.0]))
+        @ Rigid3(np.eye(3), np.array([0, 0, -5.0]))
+        for sign in (-1, 1)
+    ]
+    return Rig({f"c{k}": MountedCamera(make_camera(), pose) for k, pose in enumerate(above + sides)})
+
+
+def make_path(frames: int) -> dict[str, Rigid3]:
+    """A gently turning walk over the surface; the first pose is the identity."""
+    return {
+        f"{k:05d}": Rigid3.from_rotation_vector(
+            np.array([0.02 * np.sin(k), 0.015 * k, 0.03 * k]), np.array([-0.6 * k, 0.1 * k, 0.05 * k])
+        )
+        for k in range(frames)
+    }
+
+
+def observe(rig: Rig, path: dict[str, Rigid3], points: np.ndarray) -> Tracks:
+    """Noise-free observations of points by all cameras at all frames."""
+    rows = []
+    for f, pose in enumerate(path.values()):
+        for c, mounted in enumerate(rig.cameras.values()):
+            pixels = mounted.camera.project((mounted.cam_from_rig @ pose).apply(points))
+            seen = np.flatnonzero(mounted.camera.contains(pixels))
+            rows += [(p, f, c, *pixels[p]) for p in seen]
+    table = np.array(rows)
+    index = table[:, :3].astype(np.int64)
+    colors = np.zeros((len(points), 3), np.uint8)
+    return Tracks(
+        points=points,
+        colors=colors,
+        point_index=index[:, 0],
+        frame_index=index[:, 1],
+        camera_index=index[:, 2],
+        pixels=table[:, 3:],
+    )
+
+
+def make_scene(*, rig: Rig | None = None, frames: int = 6, points: int = 250) -> Scene:
+    """A wavy patch of surface five millimetres below the cameras."""
+    rig, path = rig or make_rig(), make_path(frames)
+    rng = np.random.default_rng(1)
+    xy = rng.uniform([-3, -3], [6, 3], (points, 2))
+    surface = np.column_stack([xy, 5 + 0.6 * np.sin(xy[:, 0] * 1.5) * np.cos(xy[:, 1])])
+    return Scene(rig, path, observe(rig, path, surface))
+
+
+def disturbed(scene: Scene, rng: np.random.Generator, *, rig: Rig | None = None) -> Reconstruction:
+    """Noisy observations and a rough start."""
+    tracks = replace(
+        scene.tracks,
+        points=scene.tracks.points + rng.normal(0, 0.03, scene.tracks.points.shape),
+        pixels=scene.tracks.pixels + rng.normal(0, SIGMA_PX, scene.tracks.pixels.shape),
+    )
+    path = {
+        name: pose if k == 0 else Rigid3.from_rotation_vector(rng.normal(0, 3e-3, 3), rng.normal(0, 0.02, 3)) @ pose
+        for k, (name, pose) in enumerate(scene.rig_from_world.items())
+    }
+    return Reconstruction(rig=rig or scene.rig, rig_from_world=path, tracks=tracks)
+
+
+def pose_errors(found: Reconstruction, truth: dict[str, Rigid3]) -> np.ndarray:
+    """(frames, 6): small motion on the left from the true pose to the found one."""
+    motions = [found.rig_from_world[name] @ true.inverse() for name, true in truth.items()]
+    return np.array([[*motion.rotation_vector, *motion.translation] for motion in motions])
+
+
+def normalised_squares(errors: np.ndarray, covariances: np.ndarray) -> np.ndarray:
+    """Squared Mahalanobis lengths."""
+    return np.einsum("ni,ni->n", errors, np.linalg.solve(covariances, errors[..., None])[..., 0])
+
+
+def with_priors(rig: Rig) -> Rig:
+    """The rig with a covariance on every camera."""
+    return Rig(
+        {
+            name: replace(
+                mounted,
+                camera=replace(mounted.camera, covariance=np.diag(PARAMETER_SIGMA**2)),
+                covariance=np.diag(EXTRINSIC_SIGMA**2),
+            )
+            for name, mounted in rig.cameras.items()
+        }
+    )
+
+
+def calibration_errors(found: Rig, truth: Rig) -> tuple[np.ndarray, np.ndarray]:
+    """(cameras, 6) motion on the left from the true extrinsics and (cameras, 8) difference of the parameters."""
+    pairs = [(found[name], truth[name]) for name in truth.names]
+    motions = [f.cam_from_rig @ t.cam_from_rig.inverse() for f, t in pairs]
+    return (
+        np.array([[*motion.rotation_vector, *motion.translation] for motion in motions]),
+        np.array([f.camera.parameters - t.camera.parameters for f, t in pairs]),
+    )
+
+
+def drawn_from_priors(rig: Rig, rng: np.random.Generator) -> Rig:
+    """A rig as the priors allow it to be."""
+    cameras = {}
+    for name, mounted in rig.cameras.items():
+        motion = rng.normal(0, EXTRINSIC_SIGMA)
+        camera = mounted.camera.with_parameters(mounted.camera.parameters + rng.normal(0, PARAMETER_SIGMA))
+        pose = Rigid3.from_rotation_vector(motion[:3], motion[3:]) @ mounted.cam_from_rig
+        cameras[name] = replace(mounted, camera=camera, cam_from_rig=pose)
+    return Rig(cameras)
+
+
+# --- derivatives -------------------------------------------------------------------------------------------------
+
+
+def linearised(state, frame, camera, point):
+    """Pixel and Jacobian of one observation."""
+    pixel, jacobian = np.zeros(2), np.zeros((2, 23))
+    assert adjustment._linearise(state, point, frame, camera, True, adjustment._scratch(), pixel, jacobian)
+    return pixel, jacobian
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_jacobian_agrees_with_finite_differences(seed: int) -> None:
+    """By point, pose, extrinsics and intrinsics, with distortion, away from the prior."""
+    rng = np.random.default_rng(seed)
+    rig = with_priors(make_rig())
+    prior = adjustment._Prior.of(rig)
+    scene = Reconstruction(rig=rig, rig_from_world=make_path(2))
+    point = np.array([*rng.uniform(-1, 1, 2), rng.uniform(4, 6)])
+    whitened = 10 * rng.normal(size=(len(rig.names), 14))
+    start = adjustment._with_calibration(adjustment._initial_state(scene, point[None], prior), prior, whitened)
+    camera = int(rng.integers(4))
+    nothing = adjustment._Observations(
+        np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(2, np.int64)
+    )
+    weighting = adjustment._Weighting(1.0, 2.0, True)
+
+    def pixel_after(step: np.ndarray) -> np.ndarray:
+        unknowns = np.zeros(6 + whitened.size)
+        unknowns[:6] = step[3:9]
+        unknowns[6 + 14 * camera : 20 + 14 * camera] = step[9:]
+        moved = adjustment._moved(start, nothing, weighting, prior, 0.0, unknowns)
+        return linearised(moved._replace(points=start.points + step[:3]), 1, camera, 0)[0]
+
+    _, jacobian = linearised(start, 1, camera, 0)
+    width = 1e-5
+    numeric = np.stack(
+        [(pixel_after(width * row) - pixel_after(-width * row)) / (2 * width) for row in np.eye(23)], axis=1
+    )
+    np.testing.assert_allclose(jacobian, numeric, atol=2e-5, rtol=1e-6)
+
+
+@given(
+    vector=st.lists(st.floats(-2, 2), min_size=3, max_size=3), step=st.lists(st.floats(-1, 1), min_size=3, max_size=3)
+)
+def test_left_jacobian_composes_rotations(vector: list[float], step: list[float]) -> None:
+    """exp(w + dw) = exp(J dw) exp(w) to first order."""
+    start, change, zero = np.array(vector), 1e-6 * np.array(step), np.zeros(3)
+    direct = Rigid3.from_rotation_vector(start + change, zero)
+    composed = Rigid3.from_rotation_vector(left_jacobian(start) @ change, zero) @ Rigid3.from_rotation_vector(
+        start, zero
+    )
+    np.testing.assert_allclose(direct.rotation, composed.rotation, atol=1e-11)
+
+
+@given(rank=st.integers(0, 6), seed=st.integers(0, 1000))
+def test_covariance_factor_squares_to_the_covariance(rank: int, seed: int) -> None:
+    """Also where the covariance is singular."""
+    root = np.random.default_rng(seed).normal(size=(6, rank)) * EXTRINSIC_SIGMA[:, None]
+    factor = covariance_factor(root @ root.T, 6)
+    np.testing.assert_allclose(factor @ factor.T, root @ root.T, atol=1e-12)
+
+
+# --- closed loops ------------------------------------------------------------------------------------------------
+
+
+def test_perfect_observations_give_the_truth() -> None:
+    """Without noise the truth is the minimum, and it is found from a rough start."""
+    scene = make_scene()
+    start = disturbed(scene, np.random.default_rng(0))
+    found = adjust(replace(start, tracks=replace(start.tracks, pixels=scene.tracks.pixels)))
+    assert np.abs(pose_errors(found, scene.rig_from_world)).max() < 1e-6
+    assert len(found.tracks.pixels) == len(scene.tracks.pixels)
+
+
+def test_poses_are_as_uncertain_as_their_covariance_says() -> None:
+    """Mean normalised error squared (NEES) over seeds is that of chi-square with six degrees of freedom."""
+    scene = make_scene()
+    squares = []
+    for seed in range(12):
+        found = adjust(disturbed(scene, np.random.default_rng(seed)))
+        errors = pose_errors(found, scene.rig_from_world)
+        assert not errors[0].any()
+        squares.append(normalised_squares(errors[1:], found.pose_covariance[1:]))
+        assert found.log["observation_sigma_px"] == pytest.approx(SIGMA_PX, rel=0.05)
+        assert found.reprojection_rms_px < 2 * SIGMA_PX
+    assert 4.6 < np.mean(squares) < 7.6
+
+
+def test_calibration_is_as_uncertain_as_its_covariance_says() -> None:
+    """Truth drawn from the priors: poses, extrinsics and intrinsics are recovered within their covariance."""
+    nominal = with_priors(make_rig())
+    poses, extrinsics, parameters, before, after = [], [], [], [], []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        scene = make_scene(rig=drawn_from_priors(nominal, rng), points=150)
+        found = adjust(disturbed(scene, rng, rig=nominal))
+        motions, shifts = calibration_errors(found.rig, scene.rig)
+        mounted = list(found.rig.cameras.values())
+        extrinsics.append(normalised_squares(motions, np.stack([m.covariance for m in mounted])))
+        parameters.append(normalised_squares(shifts, np.stack([m.camera.covariance for m in mounted])))
+        errors = pose_errors(found, scene.rig_from_world)
+        poses.append(normalised_squares(errors[1:], found.pose_covariance[1:]))
+        before.append(calibration_errors(nominal, scene.rig)[1])
+        after.append(shifts)
+    assert 4.5 < np.mean(poses) < 7.8
+    assert 4.8 < np.mean(extrinsics) < 7.4
+    assert 6.6 < np.mean(parameters) < 9.6
+    assert np.std(after, axis=(0, 1))[4] < 0.5 * np.std(before, axis=(0, 1))[4]
+
+
+def test_calibration_without_prior_is_held() -> None:
+    """Only the focal length of one camera is free; all else comes back as given."""
+    scene = make_scene()
+    focal = Camera(**{**vars(make_camera()), "covariance": np.diag([4.0, 4, 0, 0, 0, 0, 0, 0])})
+    nominal = Rig(
+        {
+            **scene.rig.cameras,
+            "c1": replace(
+                scene.rig["c1"], camera=focal.with_parameters(focal.parameters + np.array([2.0, -1, 0, 0, 0, 0, 0, 0]))
+            ),
+        }
+    )
+    found = adjust(disturbed(scene, np.random.default_rng(3), rig=nominal)).rig
+    _, shifts = calibration_errors(found, scene.rig)
+    assert 0 < np.abs(shifts[1, :2]).max() < 1
+    shifts[1, :2] = 0
+    assert not shifts.any()
+    np.testing.assert_array_equal(found["c0"].cam_from_rig.matrix, scene.rig["c0"].cam_from_rig.matrix)
+    assert found["c0"].covariance is None
+    assert 0 < found["c1"].camera.covariance[0, 0] < 1
+
+
+def test_outliers_are_rejected() -> None:
+    """A tenth of the observations is wrong; they go, the rest stays and the poses do not notice."""
+    scene, rng = make_scene(), np.random.default_rng(5)
+    start = disturbed(scene, rng)
+    wrong = rng.random(len(start.tracks.pixels)) < 0.1
+    pixels = start.tracks.pixels + wrong[:, None] * rng.choice([-1, 1], (len(wrong), 2)) * rng.uniform(
+        5, 60, (len(wrong), 2)
+    )
+    found = adjust(replace(start, tracks=replace(start.tracks, pixels=pixels)))
+    kept = {tuple(pixel) for pixel in found.tracks.pixels}
+    survived = np.array([tuple(pixel) in kept for pixel in pixels])
+    assert survived[wrong].mean() < 0.02
+    assert survived[~wrong].mean() > 0.97
+    squares = normalised_squares(pose_errors(found, scene.rig_from_world)[1:], found.pose_covariance[1:])
+    assert np.mean(squares) < 20
+
+
+def test_result_does_not_depend_on_the_gauge() -> None:
+    """Moving the whole start by a rigid motion moves the result by it and leaves the rest."""
+    scene = make_scene()
+    start = disturbed(scene, np.random.default_rng(7))
+    new_from_old = Rigid3.from_rotation_vector(np.array([0.5, -1.0, 0.3]), np.array([10.0, -20, 5]))
+    moved = replace(
+        start,
+        rig_from_world={n: p @ new_from_old.inverse() for n, p in start.rig_from_world.items()},
+        tracks=replace(start.tracks, points=new_from_old.apply(start.tracks.points)),
+    )
+    one, other = adjust(start), adjust(moved)
+    for name, pose in one.rig_from_world.items():
+        np.testing.assert_allclose((other.rig_from_world[name] @ new_from_old).matrix, pose.matrix, atol=2e-6)
+    np.testing.assert_allclose(other.pose_covariance, one.pose_covariance, rtol=1e-3, atol=1e-12)
+    assert other.reprojection_rms_px == pytest.approx(one.reprojection_rms_px, rel=1e-6)
+
+
+def test_result_is_repeatable() -> None:
+    """Bit for bit, for the sums have a fixed order."""
+    start = disturbed(make_scene(), np.random.default_rng(8))
+    one, other = adjust(start), adjust(start)
+    np.testing.assert_array_equal(one.tracks.points, other.tracks.points)
+
+
+def test_a_frame_without_observations_is_an_error() -> None:
+    """Not a singular matrix."""
+    start = disturbed(make_scene(), np.random.default_rng(9))
+    kept = start.tracks.frame_index != 3
+    names = ("point_index", "frame_index", "camera_index", "pixels")
+    tracks = replace(start.tracks, **{name: getattr(start.tracks, name)[kept] for name in names})
+    with pytest.raises(ReconstructionError, match="overlap"):
+        adjust(replace(start, tracks=tracks), AdjustmentOptions(rounds=1))
