@@ -23,7 +23,7 @@ PACKAGES = ("cuspid", "numpy", "numba", "opencv-contrib-python-headless", "pycol
 
 
 def run_timed(*arguments: str) -> dict[str, float]:
-    """Run ``cuspid`` and return wall seconds, CPU seconds and peak memory in GiB of its process tree's largest process."""
+    """Run ``cuspid``; wall seconds, CPU seconds and peak memory in GiB."""
     begin = time.perf_counter()
     process = subprocess.Popen([sys.executable, "-m", "cuspid", *arguments])
     _, status, usage = os.wait4(process.pid, 0)

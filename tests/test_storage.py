@@ -1,3 +1,4 @@
+import contextlib
 import dataclasses
 import errno
 import json
@@ -5,46 +6,17 @@ import os
 
 import numpy as np
 import pytest
-import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from builders import CAMERA, box_mesh, handpiece, make_capture
 from cuspid import storage
-from cuspid.camera import Camera
-from cuspid.capture import Capture, Frame
 from cuspid.errors import CuspidError, InputError, OutputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
 from cuspid.reconstruction import DepthMap, Dropped, Reconstruction
-from cuspid.rig import Exposure, Handpiece, Light, MountedCamera, Rig
+from cuspid.rig import MountedCamera, Rig
 from strategies import cameras, rigid3s
-
-CAMERA = Camera.from_field_of_view(16, 12, 62.0)
-
-
-def box_mesh() -> Mesh:
-    box = trimesh.creation.box((60, 40, 10))
-    return Mesh(np.asarray(box.vertices), np.asarray(box.faces))
-
-
-def handpiece(*names: str) -> Handpiece:
-    rig = Rig({name: MountedCamera(CAMERA, Rigid3(np.eye(3), np.array([-k, 0, 0.0]))) for k, name in enumerate(names)})
-    return Handpiece(
-        rig=rig,
-        lights={"led": Light(position_mm=np.array([1.0, 2, 3]), direction=np.array([0, 0, 1.0]), power=2.0)},
-        exposures=(Exposure(name="all", lights=("led",)),),
-    )
-
-
-def make_capture(folder, names=("a", "b"), stems=("00000", "00001")) -> Capture:
-    capture = Capture(folder=folder, handpiece=handpiece(*names), frames=tuple(Frame(name=stem) for stem in stems))
-    rng = np.random.default_rng(0)
-    for name in names:
-        for stem in stems:
-            storage.write_image(capture.image_path(stem, name), rng.integers(0, 255, (12, 16, 3), dtype=np.uint8))
-    storage.write_capture(capture)
-    return capture
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".ply", ".obj"])
@@ -88,7 +60,11 @@ def test_labels_beside_the_mesh_may_be_universal(tmp_path):
     [
         ("jaw.txt", b"hello", "not a mesh file"),
         ("jaw.stl", b"hello", "jaw.stl: (not a mesh|the mesh is empty)"),
-        ("jaw.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "jaw.ply: (not a mesh|the mesh is empty)"),
+        (
+            "jaw.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n",
+            "jaw.ply: (not a mesh|the mesh is empty)",
+        ),
         ("jaw.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "jaw.obj: (not a mesh|the mesh is empty)"),
         ("jaw.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "jaw.obj: (not a mesh|some coordinates are not finite)"),
     ],
@@ -109,10 +85,8 @@ def test_broken_mesh_files_never_crash(tmp_path, cut, flips):
     for place, value in flips:
         data[int(place * len(data))] = value
     path.write_bytes(bytes(data[: int(cut * len(data))]))
-    try:
-        storage.read_mesh(path)
-    except CuspidError as error:
-        assert str(path) in str(error)
+    with contextlib.suppress(CuspidError):
+        assert len(storage.read_mesh(path).faces) > 0
 
 
 def test_a_missing_file_is_named(tmp_path):
@@ -268,8 +242,13 @@ def test_files_are_whole_or_absent(tmp_path):
     path = tmp_path / "value.json"
     storage.write_json(path, {"a": float("nan"), "b": np.float32(0.5)})
     assert storage.read_json(path) == {"a": None, "b": 0.5}
-    with pytest.raises(OutputError, match="disk is full"), storage.whole_file(path) as temporary:
-        temporary.write_text("half")
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def fill_the_disk() -> None:
+        with storage.whole_file(path) as temporary:
+            temporary.write_text("half")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(OutputError, match="disk is full"):
+        fill_the_disk()
     assert storage.read_json(path) == {"a": None, "b": 0.5}
     assert [item.name for item in tmp_path.iterdir()] == ["value.json"]

@@ -1,0 +1,117 @@
+"""The command line as a user meets it: what bad input gets, and that each verb is documented."""
+
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from builders import box_mesh, handpiece, make_capture
+from cuspid import cli, storage
+from cuspid.geometry import Rigid3
+from cuspid.mesh import Mesh
+
+
+def refused(capsys, *arguments: object) -> str:
+    """The one line that a refused command prints; its exit status must be 1."""
+    with pytest.raises(SystemExit) as caught:
+        cli.main([str(argument) for argument in arguments])
+    assert caught.value.code == 1
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("cuspid: ")]
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+@pytest.mark.parametrize("verb", sorted(cli.COMMANDS))
+def test_every_verb_has_help(capsys, verb):
+    with pytest.raises(SystemExit) as caught:
+        cli.main([verb, "--help"])
+    assert caught.value.code == 0
+    printed = capsys.readouterr().out
+    assert cli.COMMANDS[verb].__doc__.split(".")[0].split()[0] in printed
+    assert "--out" in printed
+
+
+def test_what_is_no_jaw_is_refused_and_nothing_is_written(tmp_path, capsys):
+    (tmp_path / "notes.txt").write_text("hello")
+    (tmp_path / "empty.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
+    out = tmp_path / "scan"
+    assert "not a mesh file" in refused(capsys, "run", tmp_path / "notes.txt", "--out", out)
+    assert "empty.ply" in refused(capsys, "run", tmp_path / "empty.ply", "--out", out)
+    assert "no such file" in refused(capsys, "run", tmp_path / "missing.stl", "--out", out)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("unit", ["m", "in", "um"])
+def test_a_mesh_in_another_unit_is_told_its_unit(tmp_path, capsys, unit):
+    box = box_mesh()
+    storage.write_mesh(tmp_path / "jaw.stl", Mesh(box.vertices / storage.MM_PER_UNIT[unit], box.faces))
+    message = refused(capsys, "run", tmp_path / "jaw.stl", "--out", tmp_path / "scan")
+    assert f"--unit {unit}" in message
+    assert "40-90 mm" in message
+    assert not (tmp_path / "scan").exists()
+
+
+def test_a_tooth_that_is_not_there(tmp_path, capsys):
+    message = refused(capsys, "simulate", "--tooth", 16, "--out", tmp_path / "scan")
+    assert "no tooth 16" in message
+    assert not (tmp_path / "scan" / "capture").exists()
+
+
+def test_broken_captures(tmp_path, capsys):
+    capture = make_capture(tmp_path / "capture")
+    out = tmp_path / "scan"
+    image = capture.image_path("00001", "b")
+    whole = image.read_bytes()
+
+    image.write_bytes(whole[: len(whole) // 2])
+    assert "truncated PNG" in refused(capsys, "reconstruct", capture.folder, "--out", out)
+    image.unlink()
+    assert "frames differ between cameras" in refused(capsys, "reconstruct", capture.folder, "--out", out)
+    shutil.rmtree(capture.folder / "images" / "b")
+    assert "no folder for camera b" in refused(capsys, "reconstruct", capture.folder, "--out", out)
+    assert not (out / "mesh.ply").exists()
+
+
+def test_images_of_a_wrong_size(tmp_path, capsys):
+    capture = make_capture(tmp_path / "capture")
+    storage.write_image(capture.image_path("00000", "a"), np.zeros((9, 9, 3), dtype=np.uint8))
+    message = refused(capsys, "reconstruct", capture.folder, "--out", tmp_path / "scan")
+    assert "9 x 9 px, but camera a has 16 x 12 px" in message
+
+
+def test_a_handpiece_with_an_unknown_camera(tmp_path, capsys):
+    capture = make_capture(tmp_path / "capture")
+    storage.write_handpiece(tmp_path / "other.json", handpiece("a", "z"))
+    message = refused(
+        capsys, "reconstruct", capture.folder, "--handpiece", tmp_path / "other.json", "--out", tmp_path / "scan"
+    )
+    assert "no folder for camera z" in message
+
+
+def test_a_folder_that_holds_another_run(tmp_path, capsys):
+    storage.claim_folder(tmp_path, "simulate", {"seed": 5}, {})
+    message = refused(capsys, "simulate", "--tooth", 46, "--out", tmp_path)
+    assert "holds another run of 'simulate'" in message
+
+
+def test_evaluate_works_on_meshes_that_cuspid_never_saw(tmp_path, capsys, jaw_like):
+    storage.write_mesh(tmp_path / "reference.stl", jaw_like)
+    turned = jaw_like.transformed(Rigid3.from_rotation_vector(np.array([1.0, 2, 0.5]), np.array([100.0, 5, -30])))
+    storage.write_mesh(tmp_path / "scan.obj", turned)
+    cli.main(
+        ["evaluate", str(tmp_path / "scan.obj"), str(tmp_path / "reference.stl"), "--out", str(tmp_path / "result")]
+    )
+    trueness = storage.read_json(tmp_path / "result" / "trueness.json")
+    assert 0 <= trueness["mean_abs_um"] < 0.5
+    assert trueness["completeness_pct"]["50"] > 99.9
+    assert abs(trueness["scale_error_ppm"]) < 10
+    assert trueness["inter_molar_error_um"] is None
+    assert (tmp_path / "result" / "deviation.png").stat().st_size > 10_000
+    assert "Trueness" in capsys.readouterr().out
+
+
+def test_the_module_runs():
+    done = subprocess.run([sys.executable, "-m", "cuspid", "--help"], capture_output=True, text=True, check=True)
+    assert all(verb in done.stdout for verb in cli.COMMANDS)
