@@ -28,8 +28,18 @@ Points = Float[np.ndarray, "n 3"]
 LEVELS = np.array([-0.9, -0.3, 0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2])
 """Heights at which silhouettes are given, as fractions of the crown height: 0 the cervix, 1 the highest cusp."""
 
-GROOVE_WIDTH_MM = 0.16
-"""Half-width of a developmental groove, as the height difference of the two lobes that meet in it."""
+GROOVE_WIDTH_MM = 0.38
+"""Half-width of a developmental groove, as the height difference of the two cusps that meet in it."""
+FILLET_MM = 0.35
+"""Height difference within which the valley between two cusps is rounded."""
+RIDGE_BLEND_MM = 0.5
+"""Height difference within which a marginal ridge blends into the cusps."""
+RIDGE_SHARPNESS = 3.0
+"""Concentration of a ridge about its direction: larger is narrower."""
+SECONDARY = 0.07
+"""Slope added and taken by the secondary ridges and grooves of a cusp."""
+WANDER_MM = 0.14
+"""How far grooves and ridges stray from straight lines."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,12 +124,16 @@ class Crown:
     """Shear of the section: x shifts distally by this per mm towards buccal (rhomboid upper molars)."""
     rim_mm: float = 0.8
     """Rounding between the sides and the occlusal surface."""
-    lobes: tuple[Lobe, ...] = ()
-    """Cusps and marginal ridges; empty where there is an incisal edge."""
+    cusps: tuple[Lobe, ...] = ()
+    """Cusps; empty where there is an incisal edge."""
+    marginal_ridges: tuple[Lobe, ...] = ()
+    """Mesial and distal marginal ridges."""
     edge: Edge | None = None
-    """Incisal edge; None where there are lobes."""
+    """Incisal edge; None where there are cusps."""
     grooves: tuple[AxialGroove, ...] = ()
     """Grooves on the buccal and lingual sides."""
+    phase: float = 0.0
+    """Individual wandering of the occlusal grooves, radians."""
 
     @property
     def half_width_mm(self) -> float:
@@ -150,15 +164,20 @@ def smooth_step(x: Values, low: float, high: float) -> Values:
 
 def crown_distance(crown: Crown, points: Points) -> Values:
     """Approximate signed distance in mm, shape (n,), of points (n, 3) in the frame of the tooth; negative inside."""
-    level = np.clip(points[:, 2] / crown.height_mm, LEVELS[0], LEVELS[-1])
+    level = points[:, 2] / crown.height_mm
     side, lingual_side = _side_distance(crown, points, level)
-    top = _edge_height(crown, points, level) if crown.edge else _lobe_height(crown, points)
+    top = _edge_height(crown, points, level) if crown.edge else _occlusal_height(crown, points)
     return smooth_max(side + _side_relief(crown, points, level, lingual_side), 0.8 * (points[:, 2] - top), crown.rim_mm)
 
 
+def silhouettes(crown: Crown, level: Values) -> tuple[Values, Values, Values, Values]:
+    """Mesial and distal x, buccal and lingual y of the outline in mm, each (n,), at heights given as in `LEVELS`."""
+    mesial, distal, buccal, lingual = _silhouette_spline(crown)(np.clip(level, LEVELS[0], LEVELS[-1])).T
+    return mesial, distal, buccal, lingual
+
+
 @lru_cache(maxsize=256)
-def _silhouettes(crown: Crown) -> CubicSpline:
-    """Mesial and distal x, buccal and lingual y in mm, shape (4,), over the level."""
+def _silhouette_spline(crown: Crown) -> CubicSpline:
     half, depth = crown.half_width_mm, crown.depth_mm
     table = np.column_stack(
         [-half * np.array(crown.mesial), half * np.array(crown.distal), depth * np.array(crown.buccal),
@@ -169,7 +188,7 @@ def _silhouettes(crown: Crown) -> CubicSpline:
 
 def _side_distance(crown: Crown, points: Points, level: Values) -> tuple[Values, Values]:
     """Distance to the sides, shape (n,), and the position from buccal (-1) to lingual (+1), shape (n,)."""
-    mesial, distal, buccal, lingual = _silhouettes(crown)(level).T
+    mesial, distal, buccal, lingual = silhouettes(crown, level)
     b = (buccal - lingual) / 2
     v = (points[:, 1] - (buccal + lingual) / 2) / b
     a = (distal - mesial) / 2 * (1 + crown.taper * np.clip(v, -1.2, 1.2))
@@ -210,26 +229,45 @@ def _edge_height(crown: Crown, points: Points, level: Values) -> Values:
     return crown.height_mm - np.where(u < 0, mesial, distal)
 
 
-def _lobe_height(crown: Crown, points: Points) -> Values:
-    """Height in mm, shape (n,), of the occlusal surface above each point: the envelope of the lobes, grooved."""
-    first = np.full(len(points), -np.inf)
-    second, depth = first, np.zeros(len(points))
-    for lobe in crown.lobes:
-        height = _dome(crown, lobe, points)
-        wins = height > first
-        second = np.where(wins, first, np.maximum(second, height))
-        depth = np.where(wins, lobe.groove_mm, depth)
+def _occlusal_height(crown: Crown, points: Points) -> Values:
+    """Height in mm, shape (n,), of the occlusal surface above each point."""
+    x, y = _wander(crown, points)
+    height = _cusp_envelope(crown, x, y)
+    for ridge in crown.marginal_ridges:
+        height = smooth_max(height, _dome(crown, ridge, x, y), RIDGE_BLEND_MM)
+    return height
+
+
+def _wander(crown: Crown, points: Points) -> tuple[Values, Values]:
+    """X and Y of the points, each (n,), displaced so that grooves and ridges do not run straight."""
+    x, y = points[:, 0], points[:, 1]
+    return (
+        x + WANDER_MM * (np.sin(1.5 * y + crown.phase) + 0.5 * np.sin(3.1 * y - 0.9 * x + 2 * crown.phase)),
+        y + WANDER_MM * (np.sin(1.4 * x - crown.phase) + 0.5 * np.sin(2.9 * x + 1.1 * y + 3 * crown.phase)),
+    )
+
+
+def _cusp_envelope(crown: Crown, x: Values, y: Values) -> Values:
+    """Height in mm, shape (n,), of the highest cusp at each point, with a groove wherever two cusps meet."""
+    first = np.full(len(x), -np.inf)
+    second, depth = first, np.zeros(len(x))
+    for cusp in crown.cusps:
+        height = _dome(crown, cusp, x, y)
+        depth = np.where(height > first, cusp.groove_mm, depth)
+        second = np.maximum(second, np.minimum(first, height))
         first = np.maximum(first, height)
-    return first - depth * np.exp(-(((first - second) / GROOVE_WIDTH_MM) ** 2))
+    lead = first - second
+    fillet = np.maximum(FILLET_MM - lead, 0.0) ** 2 / (4 * FILLET_MM)
+    return first + fillet - depth * np.exp(-((lead / GROOVE_WIDTH_MM) ** 2))
 
 
-def _dome(crown: Crown, lobe: Lobe, points: Points) -> Values:
-    """Height in mm, shape (n,), of one lobe above each point."""
-    x = (points[:, 0] - lobe.x * crown.half_width_mm) / lobe.stretch[0]
-    y = (points[:, 1] - lobe.y * crown.half_depth_mm) / lobe.stretch[1]
+def _dome(crown: Crown, lobe: Lobe, x: Values, y: Values) -> Values:
+    """Height in mm, shape (n,), of one lobe at each point."""
+    x = (x - lobe.x * crown.half_width_mm) / lobe.stretch[0]
+    y = (y - lobe.y * crown.half_depth_mm) / lobe.stretch[1]
     angle = np.arctan2(y, x)
-    slope = np.full(len(points), lobe.slope)
+    slope = lobe.slope + SECONDARY * np.sin(6 * angle + crown.phase + 9 * lobe.x)
     for direction, gentler in lobe.ridges:
-        slope -= gentler * np.exp(5.0 * (np.cos(angle - np.radians(direction)) - 1))
+        slope -= gentler * np.exp(RIDGE_SHARPNESS * (np.cos(angle - np.radians(direction)) - 1))
     run = np.sqrt(x * x + y * y + lobe.radius_mm**2) - lobe.radius_mm
     return lobe.height * crown.height_mm - slope * run

@@ -59,16 +59,16 @@ ARCH_FORMS = MappingProxyType(
 """Mean arch widths of adults."""
 
 
-def _cusp(x: float, y: float, height: float, towards_deg: float, groove_mm: float = 0.25, slope: float = 1.2) -> Lobe:
+def _cusp(x: float, y: float, height: float, towards_deg: float, groove_mm: float = 0.3, slope: float = 1.25) -> Lobe:
     """A cusp with its mesial and distal ridges, an outer ridge, and a triangular ridge towards `towards_deg`."""
     outer_deg = 90.0 if y > 0 else -90.0
     ridges = ((180.0, 0.5), (0.0, 0.5), (outer_deg, 0.6), (towards_deg, 0.5))
-    return Lobe(x=x, y=y, height=height, ridges=ridges, slope=slope, radius_mm=0.5, groove_mm=groove_mm)
+    return Lobe(x=x, y=y, height=height, ridges=ridges, slope=slope, radius_mm=0.7, groove_mm=groove_mm)
 
 
 def _marginal_ridge(x: float, y: float, height: float, length: float = 2.6) -> Lobe:
     """A marginal ridge: an elongated low dome near the mesial or distal border."""
-    return Lobe(x=x, y=y, height=height, slope=0.9, radius_mm=0.6, stretch=(1.0, length), groove_mm=0.12)
+    return Lobe(x=x, y=y, height=height, slope=1.0, radius_mm=0.6, stretch=(1.0, length))
 
 
 _UPPER_MOLAR = dict(
@@ -76,14 +76,14 @@ _UPPER_MOLAR = dict(
     distal=(0.40, 0.72, 0.80, 0.90, 0.98, 1.0, 0.96, 0.84, 0.65),
     buccal=(0.34, 0.43, 0.46, 0.50, 0.49, 0.47, 0.42, 0.33, 0.20),
     lingual=(0.36, 0.44, 0.46, 0.485, 0.50, 0.49, 0.44, 0.34, 0.20),
-    squareness=2.9,
+    squareness=2.7,
 )
 _LOWER_MOLAR = dict(
     mesial=(0.55, 0.78, 0.83, 0.90, 0.96, 1.0, 0.98, 0.88, 0.70),
     distal=(0.45, 0.74, 0.82, 0.91, 0.98, 1.0, 0.96, 0.84, 0.65),
     buccal=(0.33, 0.42, 0.46, 0.50, 0.49, 0.46, 0.40, 0.30, 0.16),
     lingual=(0.33, 0.42, 0.44, 0.475, 0.50, 0.49, 0.45, 0.36, 0.22),
-    squareness=3.0,
+    squareness=2.75,
 )
 
 UPPER_CENTRAL = Crown(
@@ -93,7 +93,7 @@ UPPER_CENTRAL = Crown(
     buccal=(0.22, 0.38, 0.44, 0.50, 0.48, 0.40, 0.28, 0.14, -0.02),
     lingual=(0.22, 0.38, 0.44, 0.50, 0.37, 0.19, 0.07, 0.02, 0.04),
     squareness=2.7, taper=0.25, rim_mm=0.5,
-    edge=Edge(mesial_fall_mm=0.35, distal_fall_mm=0.9, mesial_power=6.0, distal_power=4.0, fossa_mm=0.45),
+    edge=Edge(mesial_fall_mm=0.5, distal_fall_mm=1.2, mesial_power=5.0, distal_power=3.5, fossa_mm=0.8),
 )  # fmt: skip
 UPPER_LATERAL = Crown(
     width_mm=6.5, depth_mm=6.0, height_mm=9.0,
@@ -102,7 +102,7 @@ UPPER_LATERAL = Crown(
     buccal=(0.22, 0.38, 0.44, 0.50, 0.48, 0.40, 0.29, 0.15, -0.02),
     lingual=(0.22, 0.38, 0.44, 0.50, 0.37, 0.19, 0.07, 0.03, 0.04),
     squareness=2.5, taper=0.25, rim_mm=0.5,
-    edge=Edge(mesial_fall_mm=0.6, distal_fall_mm=1.3, mesial_power=4.0, distal_power=3.0, fossa_mm=0.5),
+    edge=Edge(mesial_fall_mm=0.6, distal_fall_mm=1.3, mesial_power=4.0, distal_power=3.0, fossa_mm=0.8),
 )  # fmt: skip
 UPPER_CANINE = Crown(
     width_mm=7.5, depth_mm=8.0, height_mm=10.0,
@@ -121,8 +121,8 @@ UPPER_FIRST_PREMOLAR = Crown(
     buccal=(0.30, 0.41, 0.45, 0.49, 0.50, 0.46, 0.39, 0.29, 0.14),
     lingual=(0.30, 0.41, 0.45, 0.48, 0.50, 0.49, 0.43, 0.32, 0.16),
     squareness=2.3, taper=0.08,
-    lobes=(_cusp(0.05, 0.52, 1.0, -90.0), _cusp(-0.10, -0.50, 0.88, 90.0),
-           _marginal_ridge(-0.80, 0.0, 0.72), _marginal_ridge(0.80, 0.0, 0.72)),
+    cusps=(_cusp(0.05, 0.52, 1.0, -90.0), _cusp(-0.10, -0.50, 0.88, 90.0)),
+    marginal_ridges=(_marginal_ridge(-0.80, 0.0, 0.72), _marginal_ridge(0.80, 0.0, 0.72)),
 )  # fmt: skip
 UPPER_SECOND_PREMOLAR = Crown(
     width_mm=7.0, depth_mm=9.0, height_mm=8.5,
@@ -131,19 +131,21 @@ UPPER_SECOND_PREMOLAR = Crown(
     buccal=(0.30, 0.41, 0.45, 0.49, 0.50, 0.47, 0.41, 0.31, 0.15),
     lingual=(0.30, 0.41, 0.45, 0.48, 0.50, 0.49, 0.44, 0.33, 0.16),
     squareness=2.3, taper=0.03,
-    lobes=(_cusp(0.0, 0.52, 0.98, -90.0), _cusp(-0.08, -0.50, 0.93, 90.0),
-           _marginal_ridge(-0.80, 0.0, 0.75), _marginal_ridge(0.80, 0.0, 0.75)),
+    cusps=(_cusp(0.0, 0.52, 0.98, -90.0), _cusp(-0.08, -0.50, 0.93, 90.0)),
+    marginal_ridges=(_marginal_ridge(-0.80, 0.0, 0.75), _marginal_ridge(0.80, 0.0, 0.75)),
 )  # fmt: skip
 UPPER_FIRST_MOLAR = Crown(
     width_mm=10.0, depth_mm=11.0, height_mm=7.5, **_UPPER_MOLAR, taper=-0.03, skew=-0.08,
-    lobes=(_cusp(-0.48, 0.56, 0.97, -70.0), _cusp(0.42, 0.56, 0.93, -125.0), _cusp(-0.36, -0.48, 1.0, 60.0),
-           _cusp(0.52, -0.58, 0.86, 110.0), _marginal_ridge(-0.84, 0.05, 0.74), _marginal_ridge(0.84, -0.05, 0.70)),
+    cusps=(_cusp(-0.48, 0.56, 0.97, -70.0), _cusp(0.42, 0.56, 0.93, -125.0), _cusp(-0.36, -0.48, 1.0, 60.0),
+           _cusp(0.52, -0.58, 0.86, 110.0)),
+    marginal_ridges=(_marginal_ridge(-0.84, 0.05, 0.74), _marginal_ridge(0.84, -0.05, 0.70)),
     grooves=(AxialGroove(side="buccal", x=-0.02, depth_mm=0.45), AxialGroove(side="lingual", x=0.12, depth_mm=0.45)),
 )  # fmt: skip
 UPPER_SECOND_MOLAR = Crown(
     width_mm=9.0, depth_mm=11.0, height_mm=7.0, **_UPPER_MOLAR, taper=0.03, skew=-0.11,
-    lobes=(_cusp(-0.46, 0.55, 0.98, -70.0), _cusp(0.42, 0.52, 0.90, -125.0), _cusp(-0.30, -0.48, 1.0, 60.0),
-           _cusp(0.55, -0.58, 0.78, 110.0), _marginal_ridge(-0.84, 0.05, 0.74), _marginal_ridge(0.84, -0.05, 0.68)),
+    cusps=(_cusp(-0.46, 0.55, 0.98, -70.0), _cusp(0.42, 0.52, 0.90, -125.0), _cusp(-0.30, -0.48, 1.0, 60.0),
+           _cusp(0.55, -0.58, 0.78, 110.0)),
+    marginal_ridges=(_marginal_ridge(-0.84, 0.05, 0.74), _marginal_ridge(0.84, -0.05, 0.68)),
     grooves=(AxialGroove(side="buccal", x=-0.02, depth_mm=0.4), AxialGroove(side="lingual", x=0.2, depth_mm=0.4)),
 )  # fmt: skip
 
@@ -182,8 +184,8 @@ LOWER_FIRST_PREMOLAR = Crown(
     buccal=(0.30, 0.42, 0.47, 0.50, 0.48, 0.40, 0.29, 0.15, -0.02),
     lingual=(0.30, 0.42, 0.43, 0.44, 0.48, 0.50, 0.45, 0.30, 0.15),
     squareness=2.2, taper=0.18,
-    lobes=(_cusp(-0.02, 0.30, 1.0, -90.0, slope=0.85), _cusp(-0.05, -0.72, 0.66, 90.0, groove_mm=0.25),
-           _marginal_ridge(-0.78, -0.15, 0.68), _marginal_ridge(0.78, -0.15, 0.70)),
+    cusps=(_cusp(-0.02, 0.28, 1.0, -90.0, slope=1.3), _cusp(-0.05, -0.66, 0.72, 90.0)),
+    marginal_ridges=(_marginal_ridge(-0.78, -0.15, 0.68), _marginal_ridge(0.78, -0.15, 0.70)),
 )  # fmt: skip
 LOWER_SECOND_PREMOLAR = Crown(
     width_mm=7.0, depth_mm=8.0, height_mm=8.0,
@@ -192,21 +194,22 @@ LOWER_SECOND_PREMOLAR = Crown(
     buccal=(0.30, 0.42, 0.46, 0.50, 0.48, 0.42, 0.34, 0.22, 0.06),
     lingual=(0.30, 0.42, 0.43, 0.46, 0.49, 0.50, 0.46, 0.34, 0.18),
     squareness=2.4, taper=0.02,
-    lobes=(_cusp(0.0, 0.42, 1.0, -90.0), _cusp(-0.32, -0.58, 0.86, 80.0), _cusp(0.42, -0.58, 0.80, 110.0),
-           _marginal_ridge(-0.80, 0.0, 0.74), _marginal_ridge(0.80, 0.0, 0.72)),
+    cusps=(_cusp(0.0, 0.42, 1.0, -90.0), _cusp(-0.32, -0.58, 0.86, 80.0), _cusp(0.42, -0.58, 0.80, 110.0)),
+    marginal_ridges=(_marginal_ridge(-0.80, 0.0, 0.74), _marginal_ridge(0.80, 0.0, 0.72)),
 )  # fmt: skip
 LOWER_FIRST_MOLAR = Crown(
     width_mm=11.0, depth_mm=10.5, height_mm=7.5, **_LOWER_MOLAR, taper=0.05,
-    lobes=(_cusp(-0.54, 0.50, 0.96, -70.0), _cusp(0.10, 0.54, 0.94, -95.0), _cusp(0.66, 0.28, 0.86, -150.0),
-           _cusp(-0.50, -0.56, 1.0, 70.0), _cusp(0.34, -0.58, 0.98, 105.0),
-           _marginal_ridge(-0.86, -0.02, 0.76), _marginal_ridge(0.88, -0.15, 0.74)),
+    cusps=(_cusp(-0.54, 0.50, 0.96, -70.0), _cusp(0.10, 0.54, 0.94, -95.0), _cusp(0.66, 0.28, 0.86, -150.0),
+           _cusp(-0.50, -0.56, 1.0, 70.0), _cusp(0.34, -0.58, 0.98, 105.0)),
+    marginal_ridges=(_marginal_ridge(-0.86, -0.02, 0.76), _marginal_ridge(0.88, -0.15, 0.74)),
     grooves=(AxialGroove(side="buccal", x=-0.22, depth_mm=0.5), AxialGroove(side="buccal", x=0.48, depth_mm=0.35),
              AxialGroove(side="lingual", x=-0.08, depth_mm=0.35, end=0.5)),
 )  # fmt: skip
 LOWER_SECOND_MOLAR = Crown(
     width_mm=10.5, depth_mm=10.0, height_mm=7.0, **_LOWER_MOLAR, taper=0.05,
-    lobes=(_cusp(-0.48, 0.52, 0.97, -75.0), _cusp(0.44, 0.52, 0.94, -105.0), _cusp(-0.46, -0.56, 1.0, 75.0),
-           _cusp(0.42, -0.56, 0.97, 105.0), _marginal_ridge(-0.86, 0.0, 0.76), _marginal_ridge(0.86, 0.0, 0.74)),
+    cusps=(_cusp(-0.48, 0.52, 0.97, -75.0), _cusp(0.44, 0.52, 0.94, -105.0), _cusp(-0.46, -0.56, 1.0, 75.0),
+           _cusp(0.42, -0.56, 0.97, 105.0)),
+    marginal_ridges=(_marginal_ridge(-0.86, 0.0, 0.76), _marginal_ridge(0.86, 0.0, 0.74)),
     grooves=(AxialGroove(side="buccal", x=-0.02, depth_mm=0.5),
              AxialGroove(side="lingual", x=-0.02, depth_mm=0.35, end=0.5)),
 )  # fmt: skip

@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from cuspid.anatomy.crowns import Points, Values, crown_distance, smooth_max, smooth_min
+from cuspid.anatomy.crowns import Crown, Points, Values, crown_distance, silhouettes, smooth_max, smooth_min
 from cuspid.anatomy.dentition import ARCH_FORMS, QUADRANTS, ArchForm, Tooth
 from cuspid.jaw import GUM, Arch, Jaw
 from cuspid.mesh import Mesh
@@ -38,7 +38,9 @@ CONTACT_OVERLAP_MM = 0.12
 """Neighbours overlap by this much: contact points are worn to small areas."""
 PIVOT = 0.7
 """Height about which a tooth is inclined, as a fraction of its crown: that of the contact points."""
-ROOT = 0.45
+CREASE_MM = 0.2
+"""Rounding of the creases between neighbours and along the margin of the gum."""
+ROOT = 0.7
 """Length of the root that is modelled, as a fraction of the crown height; it ends inside the gum."""
 
 
@@ -71,6 +73,11 @@ class PlacedTooth:
     origin: Float[np.ndarray, "3"]
     """Centre of the cervix in the jaw, mm."""
 
+    @property
+    def is_last(self) -> bool:
+        """Whether no tooth stands behind it."""
+        return self.fdi % 10 == 7
+
     def to_tooth(self, points: Points) -> Points:
         """Points (n, 3) of the jaw in the frame of the tooth."""
         return (points - self.origin) @ self.axes
@@ -84,7 +91,7 @@ def build_phantom(options: PhantomOptions = PhantomOptions()) -> Jaw:
     """The phantom jaw for the given options; the same options give the same jaw."""
     rng = np.random.default_rng(options.seed)
     teeth = place_teeth(options, rng)
-    model = _Model(teeth=teeth, gum=_Gum.around(teeth, options.arch))
+    model = _Model(teeth=teeth, gum=_Gum.around(teeth, rng))
     vertices, faces = _mesh(model.distance, *model.bounds, options.edge_mm)
     labels = model.labels(vertices[faces].mean(axis=1))
     return Jaw(mesh=Mesh(vertices, faces), face_labels=_one_patch_each(faces, labels), arch=options.arch)
@@ -108,13 +115,14 @@ def _individual(teeth: tuple[Tooth, ...], variation: float, rng: np.random.Gener
 
 def _vary(tooth: Tooth, z: Float[np.ndarray, "8"]) -> Tooth:
     crown = tooth.crown
-    lobes = tuple(replace(lobe, height=lobe.height + 0.01 * z[6 + k % 2]) for k, lobe in enumerate(crown.lobes))
+    cusps = tuple(replace(cusp, height=cusp.height + 0.01 * z[6 + k % 2]) for k, cusp in enumerate(crown.cusps))
     varied = replace(
         crown,
         width_mm=crown.width_mm * (1 + 0.015 * z[0]),
         depth_mm=crown.depth_mm * (1 + 0.015 * z[1]),
         height_mm=crown.height_mm * (1 + 0.02 * z[2]),
-        lobes=lobes,
+        cusps=cusps,
+        phase=3.0 * z[0],
     )
     return replace(
         tooth,
@@ -198,8 +206,8 @@ def _top(tooth: Tooth) -> Float[np.ndarray, "3"]:
     crown = tooth.crown
     if crown.edge:
         return np.array([0.0, (crown.buccal[-2] - crown.lingual[-2]) / 2 * crown.depth_mm, crown.height_mm])
-    lobe = max(crown.lobes, key=lambda lobe: lobe.height)
-    return np.array([lobe.x * crown.half_width_mm, lobe.y * crown.half_depth_mm, lobe.height * crown.height_mm])
+    cusp = max(crown.cusps, key=lambda cusp: cusp.height)
+    return np.array([cusp.x * crown.half_width_mm, cusp.y * crown.half_depth_mm, cusp.height * crown.height_mm])
 
 
 def _level(teeth: tuple[PlacedTooth, ...], options: PhantomOptions) -> tuple[PlacedTooth, ...]:
@@ -218,6 +226,9 @@ def _level(teeth: tuple[PlacedTooth, ...], options: PhantomOptions) -> tuple[Pla
 
 # The gum
 
+WAVES = 10
+"""Number of waves that make the gum uneven."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Gum:
@@ -233,9 +244,11 @@ class _Gum:
     """Half-width of the ridge at its crest, mm."""
     base: float
     """Height of the flat base, mm."""
+    waves: Float[np.ndarray, "w 4"]
+    """Unevenness: wave vector (rad/mm) and phase of each wave."""
 
     @staticmethod
-    def around(teeth: tuple[PlacedTooth, ...], arch: Arch) -> "_Gum":
+    def around(teeth: tuple[PlacedTooth, ...], rng: np.random.Generator) -> "_Gum":
         """The ridge that holds the teeth."""
         cervices = np.array([placed.origin for placed in teeth])
         first, last = (_beyond(cervices[k], cervices[j]) for k, j in ((0, 1), (-1, -2)))
@@ -250,8 +263,9 @@ class _Gum:
             path=samples[:, :2],
             tangents=slopes / np.linalg.norm(slopes, axis=1, keepdims=True),
             crest=samples[:, 2] - 0.6,
-            half_width=samples[:, 3] + 0.4,
-            base=float(cervices[:, 2].min() - 6.5),
+            half_width=samples[:, 3],
+            waves=np.column_stack([rng.normal(0.0, 0.45, (WAVES, 3)), rng.uniform(0.0, 2 * np.pi, WAVES)]),
+            base=float(cervices[:, 2].min() - 8.0),
         )
 
     @cached_property
@@ -264,8 +278,13 @@ class _Gum:
         offset = points[:, :2] - self.path[nearest]
         across = np.hypot(offset[:, 0], offset[:, 1])
         depth = self.crest[nearest] - points[:, 2]
-        side = across - self.half_width[nearest] - 0.18 * np.maximum(depth, 0.0)
+        side = across - self.half_width[nearest] - 0.12 * np.maximum(depth, 0.0) - self.undulation(points)
         return smooth_max(smooth_max(side, -depth, 3.0), self.base - points[:, 2], 0.6)
+
+    def undulation(self, points: Points) -> Values:
+        """Unevenness of the gum in mm, shape (n,)."""
+        waves = np.sin(points @ self.waves[:, :3].T + self.waves[:, 3])
+        return 0.25 / np.sqrt(WAVES) * waves.sum(axis=1)
 
 
 def _beyond(end: Float[np.ndarray, "3"], before: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
@@ -274,13 +293,36 @@ def _beyond(end: Float[np.ndarray, "3"], before: Float[np.ndarray, "3"]) -> Floa
     return end + 0.5 * step * [1.0, 1.0, 0.0]
 
 
-def _collar(placed: PlacedTooth, local: Points, crown: Values) -> Values:
-    """Signed distance, shape (n,), to the gum round one tooth, from that to its crown: thin, with a scalloped margin."""
-    height = placed.tooth.crown.height_mm
-    u = np.minimum(np.abs(local[:, 0]) / placed.tooth.crown.half_width_mm, 1.15)
-    below = height * (0.08 + 0.36 * u**2.5) - local[:, 2]
-    thickness = 0.45 + 0.6 * u * u + 0.18 * np.clip(below, 0.0, 4.0)
-    return smooth_max(crown - thickness, -0.9 * below, 0.6)
+def _collar(placed: PlacedTooth, local: Points, distance: Values) -> Values:
+    """Signed distance, shape (n,), to the gum round one tooth, from that to the tooth.
+
+    A thin sleeve about the root, and a slab that leans inwards: it shows as a papilla where the tooth recedes.
+    """
+    crown = placed.tooth.crown
+    level = np.maximum(local[:, 2] / crown.height_mm, -0.1)
+    u = np.minimum(np.abs(local[:, 0]) / crown.half_width_mm, 1.2)
+    _, _, buccal, lingual = silhouettes(crown, level)
+    lean = 0.45 - 0.5 * u * u - 3.0 * level
+    across = smooth_max(local[:, 1] - buccal - lean, lingual - lean - local[:, 1], 0.5)
+    behind = (0.4 if placed.is_last else 1.0) * crown.half_width_mm
+    along = np.maximum(-crown.half_width_mm - local[:, 0], local[:, 0] - behind) - 0.3
+    slab = smooth_max(across, along, 1.5)
+    sleeve = smooth_min(slab, distance - 0.45, 0.8)
+    return smooth_max(_above_root_end(crown, local, sleeve), 0.9 * (local[:, 2] - _margin(placed, local)), 0.6)
+
+
+def _above_root_end(crown: Crown, local: Points, distance: Values) -> Values:
+    """A signed distance, shape (n,), cut off at the end of the modelled root."""
+    return smooth_max(distance, -local[:, 2] - ROOT * crown.height_mm, 2.0)
+
+
+def _margin(placed: PlacedTooth, local: Points) -> Values:
+    """Height in mm, shape (n,), of the gum's margin, scalloped: low in the middle of a tooth, high at its neighbours."""
+    crown = placed.tooth.crown
+    u = local[:, 0] / crown.half_width_mm
+    papilla = 0.48 if crown.edge else 0.38
+    rise = np.where(u > 0, 0.1 if placed.is_last else papilla, papilla)
+    return crown.height_mm * (0.03 + rise * np.minimum(np.abs(u), 1.05) ** 2.5)
 
 
 # The solid
@@ -311,18 +353,17 @@ class _Model:
             local = placed.to_tooth(points)
             near = np.flatnonzero(_within_reach(placed, local))
             local = local[near]
-            crown = crown_distance(placed.tooth.crown, local)
-            root_end = -local[:, 2] - ROOT * placed.tooth.crown.height_mm
-            crown = smooth_max(crown, root_end, 2.0)
+            shape = placed.tooth.crown
+            crown = _above_root_end(shape, local, crown_distance(shape, local))
             gum[near] = smooth_min(gum[near], _collar(placed, local, crown), 1.6)
             nearest[near] = np.where(crown < tooth[near], placed.fdi, nearest[near])
-            tooth[near] = smooth_min(tooth[near], crown, 0.06)
+            tooth[near] = smooth_min(tooth[near], crown, CREASE_MM)
         return tooth, gum, nearest
 
     def distance(self, points: Points) -> Values:
         """Approximate signed distance, shape (n,), to the solid."""
         tooth, gum, _ = self.parts(points)
-        return smooth_min(tooth, gum, 0.08)
+        return smooth_min(tooth, gum, CREASE_MM)
 
     def labels(self, points: Points) -> Int[np.ndarray, "n"]:
         """FDI number, or 0 for gum, of points on the surface."""
@@ -388,21 +429,20 @@ def _largest_part(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
     """The connected part with the most vertices: the outer surface, without enclosed voids."""
-    _, part = connected_components(_edges(faces, len(vertices)), directed=False)
+    _, part = connected_components(_graph(_edges(faces), len(vertices)), directed=False)
     keep = part == np.bincount(part).argmax()
     renumbered = np.cumsum(keep) - 1
     return vertices[keep], renumbered[faces[keep[faces[:, 0]]]]
 
 
-def _edges(faces: Int[np.ndarray, "f 3"], count: int) -> coo_array:
-    """Adjacency of the vertices, (count, count); each edge of a closed mesh appears once in either direction."""
-    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    return coo_array((np.ones(len(start)), (start, end)), shape=(count, count))
+def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
+    """Edges (e, 2) of the faces; each edge of a closed mesh appears once in either direction."""
+    return np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
 
 
 def _relax(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v 3"]:
     """Vertices moved half-way to the mean of their neighbours, which evens out the faces."""
-    adjacency = _edges(faces, len(vertices)).tocsr()
+    adjacency = _graph(_edges(faces), len(vertices)).tocsr()
     degree = adjacency.sum(axis=1)
     return 0.5 * vertices + 0.5 * (adjacency @ vertices) / degree[:, None]
 
@@ -423,4 +463,31 @@ def _onto_surface(field: Field, vertices: Float[np.ndarray, "v 3"], edge_mm: flo
 
 def _one_patch_each(faces: Int[np.ndarray, "f 3"], labels: Int[np.ndarray, "f"]) -> Int[np.ndarray, "f"]:
     """Labels (f,) of which each is one connected patch: specks take the label that surrounds them."""
+    pairs = _neighbours(faces)
+    for _ in range(3):
+        same = pairs[labels[pairs[:, 0]] == labels[pairs[:, 1]]]
+        _, patch = connected_components(_graph(same, len(faces)), directed=False)
+        size = np.bincount(patch)
+        largest = np.zeros(labels.max() + 1, dtype=np.int64)
+        np.maximum.at(largest, labels, size[patch])
+        speck = size[patch] < largest[labels]
+        if not speck.any():
+            break
+        border = pairs[speck[pairs[:, 0]] & ~speck[pairs[:, 1]]]
+        source = np.full(len(size), -1)
+        source[patch[border[:, 0]]] = labels[border[:, 1]]
+        labels = np.where(speck & (source[patch] >= 0), source[patch], labels)
     return labels
+
+
+def _neighbours(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "p 2"]:
+    """Pairs (p, 2) of faces that share an edge, in both orders, for a closed mesh."""
+    edges = np.sort(_edges(faces), axis=1)
+    order = np.lexsort((edges[:, 1], edges[:, 0]))
+    pairs = (order // 3).reshape(-1, 2)
+    return np.concatenate([pairs, pairs[:, ::-1]])
+
+
+def _graph(pairs: Int[np.ndarray, "p 2"], count: int) -> coo_array:
+    """Adjacency matrix (count, count) of the given pairs."""
+    return coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
