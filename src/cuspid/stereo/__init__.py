@@ -1,0 +1,5 @@
+"""Depth within one exposure: needs the rig, not the motion."""
+
+from cuspid.stereo.estimator import DepthEstimator, StereoOptions
+
+__all__ = ["DepthEstimator", "StereoOptions"]

@@ -1,0 +1,186 @@
+"""Take away from a fused mesh what is no surface of the jaw, and tell what is left open.
+
+Faces are *connected* across edges that exactly two of them share.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from cuspid.mesh import Mesh
+
+
+@dataclass(frozen=True, kw_only=True)
+class CleaningOptions:
+    """Cleaning of a fused mesh."""
+
+    least_piece_mm2: float = 2.0
+    """Connected pieces of a smaller area are removed."""
+    least_piece_share: float = 0.005
+    """Connected pieces of a smaller share of the whole area are removed."""
+    ghost_depth_mm: float = 0.5
+    """A face that looks at the back of another one within this distance is removed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hole:
+    """A closed boundary of the mesh other than the longest one of its piece."""
+
+    perimeter_mm: float
+    """Length of the boundary."""
+    area_mm2: float
+    """Area of the fan from the boundary's centroid."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CleaningReport:
+    """What was removed and what is left open."""
+
+    removed_pieces: int
+    """Floating pieces."""
+    removed_piece_faces: int
+    """Faces of floating pieces."""
+    removed_ghost_faces: int
+    """Faces behind the surface."""
+    removed_non_manifold_faces: int
+    """Faces that shared an edge with two others or more."""
+    split_vertices: int
+    """Vertices that were doubled where two fans of faces met in a point."""
+    holes: tuple[Hole, ...]
+    """Open places inside the surface, largest first."""
+    outer_boundary_mm: float
+    """Length of the outer boundaries, one for each piece."""
+
+
+def clean(mesh: Mesh, options: CleaningOptions | None = None) -> tuple[Mesh, CleaningReport]:
+    """A manifold mesh without floating pieces and ghosts, and a report. An empty mesh stays empty."""
+    options = options or CleaningOptions()
+    ghosts = ghost_faces(mesh, options.ghost_depth_mm)
+    cleaned = mesh.submesh(~ghosts)
+    crowded = non_manifold_faces(cleaned)
+    cleaned, split = with_split_fans(cleaned.submesh(~crowded))
+    floating, pieces = floating_faces(cleaned, options)
+    cleaned = cleaned.submesh(~floating)
+    outer, holes = boundaries(cleaned)
+    report = CleaningReport(
+        removed_pieces=pieces,
+        removed_piece_faces=int(floating.sum()),
+        removed_ghost_faces=int(ghosts.sum()),
+        removed_non_manifold_faces=int(crowded.sum()),
+        split_vertices=split,
+        holes=holes,
+        outer_boundary_mm=outer,
+    )
+    return cleaned, report
+
+
+def ghost_faces(mesh: Mesh, depth_mm: float) -> Bool[np.ndarray, "f"]:
+    """Faces whose outward normal soon meets the back of another face: they lie below the surface."""
+    if len(mesh.faces) == 0:
+        return np.zeros(0, dtype=bool)
+    start = mesh.face_centres + 1e-3 * mesh.face_normals
+    hits = mesh.cast(start, mesh.face_normals)
+    same_way = np.einsum("nd,nd->n", mesh.face_normals, mesh.face_normals[hits.faces]) > 0
+    return (hits.faces >= 0) & (hits.distances < depth_mm) & same_way
+
+
+def _edges(mesh: Mesh) -> tuple[Int[np.ndarray, "e"], Int[np.ndarray, "e 2"]]:
+    """For each side of each face (side-major): the number of its undirected edge, and its two vertices in order."""
+    sides = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+    low, high = sides.min(axis=1), sides.max(axis=1)
+    _, edge = np.unique(low * len(mesh.vertices) + high, return_inverse=True)
+    return edge, sides
+
+
+def non_manifold_faces(mesh: Mesh) -> Bool[np.ndarray, "f"]:
+    """Faces with an edge that three or more faces share, or that two share in the same direction, or without area."""
+    edge, sides = _edges(mesh)
+    forward = sides[:, 0] < sides[:, 1]
+    count = np.bincount(edge, minlength=1)
+    along = np.bincount(edge, forward, minlength=1)
+    bad = (count > 2) | ((count == 2) & (along != 1))
+    return bad[edge].reshape(3, -1).any(axis=0) | (mesh.face_areas == 0)
+
+
+def face_pieces(mesh: Mesh) -> Int[np.ndarray, "f"]:
+    """Number of the connected piece that each face belongs to."""
+    edge, _ = _edges(mesh)
+    face = np.tile(np.arange(len(mesh.faces)), 3)
+    order = np.argsort(edge, kind="stable")
+    pair = np.flatnonzero(edge[order][1:] == edge[order][:-1])
+    one, other = face[order][pair], face[order][pair + 1]
+    graph = coo_array((np.ones(len(one)), (one, other)), shape=(len(mesh.faces),) * 2)
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+
+
+def floating_faces(mesh: Mesh, options: CleaningOptions) -> tuple[Bool[np.ndarray, "f"], int]:
+    """Faces of pieces that are too small, and the number of such pieces."""
+    if len(mesh.faces) == 0:
+        return np.zeros(0, dtype=bool), 0
+    piece = face_pieces(mesh)
+    area = np.bincount(piece, mesh.face_areas)
+    small = area < max(options.least_piece_mm2, options.least_piece_share * area.sum())
+    return small[piece], int(small.sum())
+
+
+def with_split_fans(mesh: Mesh) -> tuple[Mesh, int]:
+    """The mesh with a vertex of its own for each fan of faces around a point, and how many vertices were added."""
+    corners = mesh.faces.size
+    if corners == 0:
+        return mesh, 0
+    # Corners (face-major) of one fan are joined where two faces share an edge.
+    edge, _ = _edges(mesh)
+    count = len(mesh.faces)
+    order = np.argsort(edge, kind="stable")
+    pair = np.flatnonzero(edge[order][1:] == edge[order][:-1])
+    one, other = order[pair], order[pair + 1]
+    start = [side % count * 3 + side // count for side in (one, other)]
+    end = [side % count * 3 + (side // count + 1) % 3 for side in (one, other)]
+    # The two faces run along the edge in opposite directions.
+    rows, columns = np.concatenate([start[0], end[0]]), np.concatenate([end[1], start[1]])
+    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(corners, corners))
+    _, fan = connected_components(graph, directed=False)
+    _, first = np.unique(fan, return_index=True)
+    source = mesh.faces.ravel()[first]
+    colors = None if mesh.colors is None else mesh.colors[source]
+    used = len(np.unique(mesh.faces))
+    return Mesh(mesh.vertices[source], fan.reshape(-1, 3), colors), len(source) - used
+
+
+def boundaries(mesh: Mesh) -> tuple[float, tuple[Hole, ...]]:
+    """Length of the outer boundaries (the longest of each piece, mm), and the other ones as holes, largest first."""
+    edge, sides = _edges(mesh)
+    alone = np.bincount(edge, minlength=1)[edge] == 1
+    open_sides = sides[alone]
+    if len(open_sides) == 0:
+        return 0.0, ()
+    face = np.tile(np.arange(len(mesh.faces)), 3)[alone]
+    graph = coo_array((np.ones(len(open_sides)), tuple(open_sides.T)), shape=(len(mesh.vertices),) * 2)
+    loop = connected_components(graph, directed=False)[1][open_sides[:, 0]]
+    _, loop = np.unique(loop, return_inverse=True)
+    perimeter, area = _loop_measures(mesh.vertices[open_sides], loop)
+    piece_of_loop = np.zeros(len(perimeter), dtype=np.int64)
+    piece_of_loop[loop] = face_pieces(mesh)[face]
+    by_length = np.argsort(-perimeter, kind="stable")
+    _, outermost = np.unique(piece_of_loop[by_length], return_index=True)
+    outer = np.zeros(len(perimeter), dtype=bool)
+    outer[by_length[outermost]] = True
+    holes = [Hole(perimeter_mm=float(perimeter[k]), area_mm2=float(area[k])) for k in by_length if not outer[k]]
+    return float(perimeter[outer].sum()), tuple(holes)
+
+
+def _loop_measures(
+    segments: Float[np.ndarray, "s 2 3"], loop: Int[np.ndarray, "s"]
+) -> tuple[Float[np.ndarray, "l"], Float[np.ndarray, "l"]]:
+    """Perimeter and area of the fan from the centroid, for each boundary loop."""
+    count = np.bincount(loop)
+    centroid = np.stack([np.bincount(loop, segments[:, 0, axis]) for axis in range(3)], axis=1) / count[:, None]
+    to_start, to_end = segments[:, 0] - centroid[loop], segments[:, 1] - centroid[loop]
+    perimeter = np.bincount(loop, np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1))
+    area = np.bincount(loop, 0.5 * np.linalg.norm(np.cross(to_start, to_end), axis=1))
+    return perimeter, area

@@ -1,0 +1,142 @@
+"""Surface nets: the zero level of a sparse volume as a mesh (Gibson 1998; "naive" form).
+
+Each cell of eight voxels that the surface crosses gets one vertex, the mean of the crossings of its edges; each grid
+edge that the surface crosses gets the quad of the four cells around it. Cells with an unobserved voxel are left out,
+so that no surface is invented.
+"""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+from cuspid.mesh import Mesh
+from cuspid.surface.volume import BLOCK, SparseVolume, unpack
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _place(neighbours, slot, i, j, k):
+    """Slot (-1: none) and index of a voxel given relative to a block, up to one block away."""
+    bi, bj, bk = i >> 3, j >> 3, k >> 3
+    other = neighbours[slot, (bi + 1) * 9 + (bj + 1) * 3 + bk + 1]
+    return other, ((i & 7) * 8 + (j & 7)) * 8 + (k & 7)
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _corners(distance, weight, neighbours, slot, i, j, k, least_weight, values):
+    """Distances at the eight corners of a cell; False where one is unobserved or the surface does not cross."""
+    inside = 0
+    for corner in range(8):
+        other, index = _place(neighbours, slot, i + (corner >> 2), j + ((corner >> 1) & 1), k + (corner & 1))
+        if other < 0 or weight[other, index] < least_weight:
+            return False
+        values[corner] = distance[other, index]
+        inside += values[corner] < 0
+    return 0 < inside < 8
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _cell_vertex(values, vertex):
+    """Mean of the crossings of the twelve edges of a cell, in units of the cell."""
+    vertex[:] = 0
+    count = 0
+    for corner in range(8):
+        for axis in range(3):
+            bit = 4 >> axis
+            if corner & bit:
+                continue
+            a, b = values[corner], values[corner | bit]
+            if (a < 0) != (b < 0):
+                vertex[0] += corner >> 2
+                vertex[1] += (corner >> 1) & 1
+                vertex[2] += corner & 1
+                vertex[axis] += a / (a - b)
+                count += 1
+    for axis in range(3):
+        vertex[axis] /= count
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _vertices(distance, weight, neighbours, origins, least_weight, index_of_cell):
+    """A vertex for each cell that the surface crosses (grid units); writes their indices into ``index_of_cell``."""
+    found = [np.zeros(3) for _ in range(0)]
+    values, vertex = np.zeros(8), np.zeros(3)
+    for slot in range(origins.shape[0]):
+        for i in range(8):
+            for j in range(8):
+                for k in range(8):
+                    if _corners(distance, weight, neighbours, slot, i, j, k, least_weight, values):
+                        _cell_vertex(values, vertex)
+                        index_of_cell[slot, (i * 8 + j) * 8 + k] = len(found)
+                        found.append(origins[slot] + np.array([i, j, k]) + vertex)
+    result = np.zeros((len(found), 3))
+    for n in range(len(found)):
+        result[n] = found[n]
+    return result
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _quad_around(index_of_cell, neighbours, slot, i, j, k, axis, quad):
+    """Vertices of the four cells around the grid edge that leaves a voxel along an axis; False where one is missing."""
+    for n in range(4):
+        # Around the axis, counter-clockwise seen from its tip: (-,-), (0,-), (0,0), (-,0) of the next two axes.
+        first, second = -(n == 0 or n == 3), -(n == 0 or n == 1)
+        shift_i = 0 if axis == 0 else (first if axis == 2 else second)
+        shift_j = first if axis == 0 else (0 if axis == 1 else second)
+        shift_k = second if axis == 0 else (first if axis == 1 else 0)
+        other, index = _place(neighbours, slot, i + shift_i, j + shift_j, k + shift_k)
+        if other < 0 or index_of_cell[other, index] < 0:
+            return False
+        quad[n] = index_of_cell[other, index]
+    return True
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _faces(distance, weight, neighbours, index_of_cell, blocks, least_weight, faces):
+    """Two triangles for each grid edge that the surface crosses; returns their number (``faces`` may be empty)."""
+    count = 0
+    quad = np.zeros(4, np.int64)
+    for slot in range(blocks):
+        for voxel in range(512):
+            if weight[slot, voxel] < least_weight:
+                continue
+            i, j, k = voxel >> 6, (voxel >> 3) & 7, voxel & 7
+            here = distance[slot, voxel] < 0
+            for axis in range(3):
+                other, index = _place(neighbours, slot, i + (axis == 0), j + (axis == 1), k + (axis == 2))
+                if other < 0 or weight[other, index] < least_weight or (distance[other, index] < 0) == here:
+                    continue
+                if not _quad_around(index_of_cell, neighbours, slot, i, j, k, axis, quad):
+                    continue
+                if faces.shape[0] > 0:
+                    a, c = quad[0], quad[2]
+                    b, d = (quad[1], quad[3]) if here else (quad[3], quad[1])
+                    faces[count, 0], faces[count, 1], faces[count, 2] = a, b, c
+                    faces[count + 1, 0], faces[count + 1, 1], faces[count + 1, 2] = a, c, d
+                count += 2
+    return count
+
+
+def extract(volume: SparseVolume, least_weight: float) -> Mesh:
+    """The zero level where all voxels around it weigh at least ``least_weight``."""
+    keys = volume.keys
+    distance, weight = volume.distance[: len(keys)], volume.weight[: len(keys)]
+    if len(keys) == 0:
+        return Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    neighbours = volume.neighbours()
+    index_of_cell = np.full(distance.shape, -1, dtype=np.int32)
+    origins = unpack(keys).astype(np.float64) * BLOCK
+    vertices = _vertices(distance, weight, neighbours, origins, least_weight, index_of_cell)
+    count = _faces(distance, weight, neighbours, index_of_cell, len(keys), least_weight, np.zeros((0, 3), np.int64))
+    faces = np.zeros((count, 3), dtype=np.int64)
+    if count:
+        _faces(distance, weight, neighbours, index_of_cell, len(keys), least_weight, faces)
+    return Mesh(vertices * volume.voxel_mm, faces)

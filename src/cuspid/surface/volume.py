@@ -1,0 +1,136 @@
+"""A sparse grid of signed distances: blocks of 8 x 8 x 8 voxels, allocated only around measured points.
+
+Frames: ``world`` (mm), ``grid`` (world divided by the voxel size; voxel (i, j, k) lies at the integer point), ``block``
+(grid divided by 8). Distances are positive outside, on the side of the cameras. A block is found by its packed integer
+key in a sorted array; ``neighbours`` holds the slot of each of the 27 blocks around a block.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float, Int
+from numba import njit
+
+from cuspid.geometry import Rigid3
+from cuspid.surface.evidence import Evidence, observe
+
+BLOCK = 8
+"""Voxels along the side of a block."""
+
+_OFFSET = 1 << 20
+"""Added to block coordinates so that packed keys are positive: room for a million blocks either way."""
+
+
+def pack(blocks: Int[np.ndarray, "*n 3"]) -> Int[np.ndarray, "*n"]:
+    """One integer per block coordinate triple."""
+    shifted = blocks.astype(np.int64) + _OFFSET
+    return (shifted[..., 0] << 42) | (shifted[..., 1] << 21) | shifted[..., 2]
+
+
+def unpack(keys: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n 3"]:
+    """Inverse of :func:`pack`."""
+    mask = (1 << 21) - 1
+    return np.stack([keys >> 42, (keys >> 21) & mask, keys & mask], axis=-1) - _OFFSET
+
+
+@dataclass
+class SparseVolume:
+    """Signed distances and weights, growing as depth maps come in. Not frozen: it is an accumulator."""
+
+    voxel_mm: float
+    """Spacing of the voxels."""
+    truncation_mm: float
+    """Distances are cut at this, and voxels farther behind a surface learn nothing of it."""
+
+    def __post_init__(self) -> None:
+        self._slot_of_key: dict[int, int] = {}
+        self.distance = np.zeros((0, BLOCK**3), dtype=np.float32)
+        self.weight = np.zeros((0, BLOCK**3), dtype=np.float32)
+
+    @property
+    def keys(self) -> Int[np.ndarray, "b"]:
+        """Packed coordinates of the blocks in order of their slots."""
+        return np.fromiter(self._slot_of_key, dtype=np.int64, count=len(self._slot_of_key))
+
+    def integrate(self, evidence: Evidence, cam_from_world: Rigid3, points: Float[np.ndarray, "n 3"]) -> None:
+        """Blend in one depth map, in the blocks around its points (world, mm)."""
+        keys = self._keys_around(points)
+        slots = self._allocate(keys)
+        _integrate(
+            self.distance,
+            self.weight,
+            slots,
+            unpack(keys).astype(np.float64) * BLOCK,
+            self.voxel_mm,
+            cam_from_world.rotation,
+            cam_from_world.translation,
+            evidence.arrays,
+            self.truncation_mm,
+        )
+
+    def _keys_around(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "b"]:
+        """Blocks within the truncation distance of points, sorted."""
+        side = self.voxel_mm * BLOCK
+        coarse = np.unique(pack(np.floor(points * (4 / side)).astype(np.int64)))
+        centres = (unpack(coarse) + 0.5) * (side / 4)
+        reach = self.truncation_mm + side / 8
+        corners = np.array(list(np.ndindex(2, 2, 2))) * 2 - 1
+        near = [np.floor((centres + reach * corner) / side).astype(np.int64) for corner in corners]
+        return np.unique(pack(np.concatenate(near)))
+
+    def _allocate(self, keys: Int[np.ndarray, "b"]) -> Int[np.ndarray, "b"]:
+        """Slots of blocks, made where they are new."""
+        table = self._slot_of_key
+        slots = np.array([table.setdefault(key, len(table)) for key in keys.tolist()], dtype=np.int64)
+        if len(table) > len(self.distance):
+            room = max(len(table), int(1.5 * len(self.distance)) + 1024)
+            self.distance = _grown(self.distance, room)
+            self.weight = _grown(self.weight, room)
+        return slots
+
+    def neighbours(self) -> Int[np.ndarray, "b 27"]:
+        """Slot of each block at offsets (-1..1)^3 around each block, -1 where there is none."""
+        keys = self.keys
+        order = np.argsort(keys)
+        ranked = keys[order]
+        offsets = np.array(list(np.ndindex(3, 3, 3))) - 1
+        wanted = pack(unpack(keys)[:, None] + offsets)
+        place = np.searchsorted(ranked, wanted).clip(0, len(keys) - 1)
+        return np.where(ranked[place] == wanted, order[place], -1)
+
+
+def _grown(array: Float[np.ndarray, "b v"], room: int) -> Float[np.ndarray, "r v"]:
+    grown = np.zeros((room, array.shape[1]), dtype=array.dtype)
+    grown[: len(array)] = array
+    return grown
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _integrate(distance, weight, slots, origins, voxel, rotation, translation, evidence, truncation):
+    """Running weighted mean of the signed distance in each voxel of the blocks."""
+    seen = np.zeros(6)
+    for n in range(slots.size):
+        values, weights = distance[slots[n]], weight[slots[n]]
+        for i in range(8):
+            for j in range(8):
+                for k in range(8):
+                    x = (origins[n, 0] + i) * voxel
+                    y = (origins[n, 1] + j) * voxel
+                    z = (origins[n, 2] + k) * voxel
+                    depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
+                    if depth <= 0:
+                        continue
+                    right = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]
+                    down = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]
+                    if not observe(evidence, right, down, depth, seen) or seen[0] < -truncation:
+                        continue
+                    voxel_index = (i * 8 + j) * 8 + k
+                    new = seen[1]
+                    total = weights[voxel_index] + new
+                    step = (min(seen[0], truncation) - values[voxel_index]) * new / total
+                    values[voxel_index] += step
+                    weights[voxel_index] = total
