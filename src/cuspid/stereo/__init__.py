@@ -1,5 +1,5 @@
 """Depth within one exposure: needs the rig, not the motion."""
 
-from cuspid.stereo.estimator import DepthEstimator, StereoOptions
+from cuspid.stereo.matching import DepthEstimator, StereoOptions
 
 __all__ = ["DepthEstimator", "StereoOptions"]

@@ -1,110 +1,207 @@
-"""A first depth for each pixel: semi-global matching of rectified pairs at half resolution, checked both ways.
+"""Depth maps of one exposure, group by group: match, refine, check.
 
-A *pair matcher* is any function from two rectified images and a range of disparities to the disparity of the first
-image's pixels; :func:`semi_global` is one. Matching by something else than grey values stands beside it.
+Frames: ``grid`` is the pinhole of a depth map, a coarser version of the camera's ideal pinhole.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
-from cuspid.rig import Rig
-from cuspid.stereo.rectification import RectifiedPair
-
-PairMatcher = Callable[
-    [UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"], tuple[float, float]], Float[np.ndarray, "h w"]
-]
-"""Rectified first and second image, lowest and highest disparity in px (positive: content lies farther left in the
-second image) to the disparity at each pixel of the first, NaN where unknown. float32."""
+from cuspid.camera import Camera
+from cuspid.errors import InputError
+from cuspid.reconstruction import DepthMap
+from cuspid.rig import Handpiece
+from cuspid.stereo.confidence import ConfidenceOptions, Measured, agreement, confidence, without_speckle
+from cuspid.stereo.rectification import IdealView, RectifiedPair, rectify
+from cuspid.stereo.refinement import SCORE, VARIANCE, GroupGeometry, Q, RefinementOptions, refine
+from cuspid.stereo.seeds import PairMatcher, seed_pairs, seed_points, semi_global
 
 
 @dataclass(frozen=True, kw_only=True)
-class SemiGlobalOptions:
-    """Semi-global matching (OpenCV's StereoSGBM)."""
+class StereoOptions:
+    """Depth within one exposure."""
 
-    block_px: int = 5
-    """Side of the matched block."""
-    small_jump_penalty: int = 8
-    """Penalty for a disparity change of 1 px between neighbours, per pixel of the block."""
-    large_jump_penalty: int = 32
-    """Penalty for a larger change, per pixel of the block."""
-    uniqueness_percent: int = 5
-    """By how much the best cost must beat the second best."""
-    left_right_tolerance_px: float = 1.0
-    """Largest difference between the disparities found in the two directions."""
+    spacing_px: int = 2
+    """Depth is measured at every so many pixels."""
+    seed_scale: float = 0.5
+    """Resolution of the first matching relative to the images."""
+    refinement: RefinementOptions = field(default_factory=RefinementOptions)
+    """Multi-camera refinement."""
+    confidence: ConfidenceOptions = field(default_factory=ConfidenceOptions)
+    """Checks and weights."""
 
 
-def semi_global(
-    first: UInt8[np.ndarray, "h w"],
-    second: UInt8[np.ndarray, "h w"],
-    disparities: tuple[float, float],
-    options: SemiGlobalOptions = SemiGlobalOptions(),
-) -> Float[np.ndarray, "h w"]:
-    """A :class:`PairMatcher`: semi-global matching in both directions, kept where they agree."""
-    forward = _semi_global_one_way(first, second, disparities, options)
-    backward = _semi_global_one_way(second[:, ::-1], first[:, ::-1], disparities, options)[:, ::-1]
-    columns = np.arange(first.shape[1])
-    target = np.rint(columns - np.nan_to_num(forward)).astype(int).clip(0, first.shape[1] - 1)
-    difference = np.abs(np.take_along_axis(backward, target, axis=1) - forward)
-    return np.where(difference <= options.left_right_tolerance_px, forward, np.nan).astype(np.float32)
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Cameras that see the same surface, prepared once."""
+
+    views: tuple[IdealView, ...]
+    """The cameras without distortion."""
+    pairs: tuple[RectifiedPair, ...]
+    """Pairs that give the first depths."""
+    geometry: tuple[GroupGeometry, ...]
+    """For each camera as the reference."""
+    grids: tuple[Camera, ...]
+    """For each camera the pinhole of its depth map."""
 
 
-def _semi_global_one_way(
-    first: UInt8[np.ndarray, "h w"],
-    second: UInt8[np.ndarray, "h w"],
-    disparities: tuple[float, float],
-    options: SemiGlobalOptions,
-) -> Float[np.ndarray, "h w"]:
-    lowest = int(np.floor(disparities[0]))
-    count = 16 * int(np.ceil((disparities[1] - lowest + 1) / 16))
-    matcher = cv2.StereoSGBM.create(
-        minDisparity=lowest,
-        numDisparities=count,
-        blockSize=options.block_px,
-        P1=options.small_jump_penalty * options.block_px**2,
-        P2=options.large_jump_penalty * options.block_px**2,
-        uniquenessRatio=options.uniqueness_percent,
-        mode=cv2.StereoSGBM_MODE_SGBM_3WAY,
+def coarser(camera: Camera, spacing_px: int) -> Camera:
+    """The pinhole whose pixel centres are every ``spacing_px``-th pixel centre, from ``spacing_px // 2`` on."""
+    first = spacing_px // 2 + 0.5
+    return replace(
+        camera,
+        width=len(range(spacing_px // 2, camera.width, spacing_px)),
+        height=len(range(spacing_px // 2, camera.height, spacing_px)),
+        focal_px=camera.focal_px / spacing_px,
+        principal_point_px=(camera.principal_point_px - first) / spacing_px + 0.5,
     )
-    # OpenCV gives no answer in the leftmost columns, as wide as the largest disparity: widen the images by these.
-    pad = lowest + count
-    wide = [cv2.copyMakeBorder(image, 0, 0, pad, 0, cv2.BORDER_CONSTANT) for image in (first, second)]
-    disparity = matcher.compute(*wide)[:, pad:].astype(np.float32) / 16
-    known = (disparity >= lowest) & (np.arange(first.shape[1]) - disparity >= 0)
-    return np.where(known, disparity, np.nan).astype(np.float32)
 
 
-def seed_pairs(rig: Rig, group: Sequence[str], pairs: Sequence[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
-    """For each camera of a group the partner with the widest baseline among the stereo pairs; no pair twice."""
-    chosen: dict[frozenset[str], tuple[str, str]] = {}
-    for name in group:
-        partners = [pair for pair in pairs if name in pair]
-        if partners:
-            widest = max(partners, key=lambda pair: _baseline_mm(rig, pair))
-            chosen.setdefault(frozenset(widest), widest)
-    return tuple(chosen.values())
+def group_geometry(views: Sequence[IdealView], reference: int) -> GroupGeometry:
+    """How pixels of a reference view and their inverse depth map into the other views."""
+    others = [index for index in range(len(views)) if index != reference]
+    inverse_matrix = np.linalg.inv(views[reference].camera.opencv_matrix)
+    rig_from_reference = views[reference].cam_from_rig.inverse()
+    infinite, parallax = [], []
+    for index in others:
+        other_from_reference = views[index].cam_from_rig @ rig_from_reference
+        matrix = views[index].camera.opencv_matrix
+        infinite.append(matrix @ other_from_reference.rotation @ inverse_matrix)
+        parallax.append(matrix @ other_from_reference.translation)
+    scale = max(float(np.linalg.norm(shift)) for shift in parallax)
+    return GroupGeometry(np.array(infinite), np.array(parallax) / scale, scale, np.array(others))
 
 
-def _baseline_mm(rig: Rig, pair: tuple[str, str]) -> float:
-    return float(np.linalg.norm(rig[pair[0]].centre_in_rig - rig[pair[1]].centre_in_rig))
+def seed_layer(points_in_rig: Float[np.ndarray, "n 3"], view: IdealView, grid: Camera) -> Float[np.ndarray, "h w"]:
+    """Depth of the nearest point in each pixel of the grid, NaN where there is none."""
+    in_cam = view.cam_from_rig.apply(points_in_rig)
+    pixels = grid.project(in_cam)
+    seen = grid.contains(pixels, 1e-6)
+    in_cam, pixels = in_cam[seen], pixels[seen]
+    order = np.argsort(-in_cam[:, 2], kind="stable")
+    column, row = pixels[order].astype(int).T
+    layer = np.full((grid.height, grid.width), np.nan)
+    layer[row, column] = in_cam[order, 2]
+    return layer
 
 
-def seed_points(
-    pair: RectifiedPair,
-    images: Mapping[str, UInt8[np.ndarray, "h w"]],
-    matcher: PairMatcher,
-    depth_range_mm: tuple[float, float],
-) -> Float[np.ndarray, "n 3"]:
-    """Points in the rig frame, mm, that a pair matcher finds within the depth range."""
-    near, far = depth_range_mm
-    first, second = pair.resample(images[pair.names[0]], images[pair.names[1]])
-    disparity = matcher(first, second, (pair.disparity(far), pair.disparity(near)))
-    rows, columns = np.nonzero(np.isfinite(disparity))
-    depth = pair.disparity(1.0) / disparity[rows, columns].astype(np.float64)
-    rays = pair.camera.rays(np.stack([columns, rows], axis=-1) + 0.5)
-    return pair.first_from_rig.inverse().apply(rays * depth[:, None])
+def stack_images(
+    images: Sequence[UInt8[np.ndarray, "_ _"]],
+) -> tuple[Float[np.ndarray, "c h w"], Int[np.ndarray, "c 2"]]:
+    """Grey images as one float32 array, padded to the largest, and their true sizes."""
+    sizes = np.array([image.shape for image in images])
+    stack = np.zeros((len(images), *sizes.max(axis=0)), dtype=np.float32)
+    for slot, image in zip(stack, images, strict=True):
+        slot[: image.shape[0], : image.shape[1]] = image
+    return stack, sizes
+
+
+class DepthEstimator:
+    """Measures depth in exposures of one handpiece. Holds only what the handpiece fixes; safe to share by threads."""
+
+    def __init__(
+        self, handpiece: Handpiece, options: StereoOptions | None = None, matcher: PairMatcher = semi_global
+    ) -> None:
+        """Prepare the groups. Raises InputError where no two cameras see the same surface."""
+        self.handpiece = handpiece
+        self.options = options or StereoOptions()
+        self.matcher = matcher
+        groups = handpiece.rig.groups(handpiece.working_distance_mm)
+        self.groups = tuple(self._prepare(group) for group in groups if len(group) > 1)
+        if not self.groups:
+            raise InputError(
+                f"handpiece {handpiece.name}: no two cameras see the same surface at "
+                f"{handpiece.working_distance_mm} mm; check the calibration and the working distance"
+            )
+
+    def _prepare(self, names: tuple[str, ...]) -> Group:
+        rig = self.handpiece.rig
+        views = tuple(IdealView.of(name, rig[name]) for name in names)
+        stereo_pairs = rig.stereo_pairs(self.handpiece.working_distance_mm)
+        pairs = seed_pairs(rig, names, stereo_pairs)
+        return Group(
+            views=views,
+            pairs=tuple(rectify(pair, rig[pair[0]], rig[pair[1]], self.options.seed_scale) for pair in pairs),
+            geometry=tuple(group_geometry(views, index) for index in range(len(views))),
+            grids=tuple(coarser(view.camera, self.options.spacing_px) for view in views),
+        )
+
+    def measure(self, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], frame: str) -> tuple[DepthMap, ...]:
+        """Depth maps of one exposure, one for each camera that has company, from RGB or grey images by camera name."""
+        return tuple(depth_map for group in self.groups for depth_map in self._measure_group(group, images, frame))
+
+    def _measure_group(
+        self, group: Group, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], frame: str
+    ) -> list[DepthMap]:
+        gray = {view.name: _gray(images[view.name]) for view in group.views}
+        depth_range = self.handpiece.depth_range_mm
+        seeds = [seed_points(pair, gray, self.matcher, depth_range) for pair in group.pairs]
+        stack, sizes = stack_images([view.resample(gray[view.name]) for view in group.views])
+        measured = [self._measure_reference(group, index, seeds, stack, sizes) for index in range(len(group.views))]
+        return [
+            self._depth_map(measured, index, view, images[view.name], frame) for index, view in enumerate(group.views)
+        ]
+
+    def _measure_reference(
+        self,
+        group: Group,
+        index: int,
+        seeds: Sequence[Float[np.ndarray, "_ 3"]],
+        stack: Float[np.ndarray, "c h w"],
+        sizes: Int[np.ndarray, "c 2"],
+    ) -> Measured:
+        view, grid, geometry = group.views[index], group.grids[index], group.geometry[index]
+        layers = np.stack([seed_layer(points, view, grid) for points in seeds])
+        planes = refine(
+            stack,
+            sizes,
+            index,
+            geometry,
+            layers,
+            self.handpiece.depth_range_mm,
+            self.options.spacing_px,
+            self.options.refinement,
+        )
+        found = planes[..., SCORE] >= self.options.refinement.accept_zncc
+        depth = geometry.scale / np.where(found, planes[..., Q], np.nan)
+        sigma = np.sqrt(planes[..., VARIANCE]) * depth**2 / geometry.scale
+        return Measured(grid, view.cam_from_rig, depth, sigma)
+
+    def _depth_map(
+        self,
+        measured: Sequence[Measured],
+        index: int,
+        view: IdealView,
+        image: UInt8[np.ndarray, "h w *c"],
+        frame: str,
+    ) -> DepthMap:
+        one, options = measured[index], self.options.confidence
+        keep = (agreement(measured, index, options) > 0) & (one.sigma_mm <= options.largest_sigma_mm)
+        keep = without_speckle(np.where(keep, one.depth_mm, np.nan), options)
+        return DepthMap(
+            frame=frame,
+            camera_name=view.name,
+            camera=one.camera,
+            cam_from_rig=one.cam_from_rig,
+            depth_mm=np.where(keep, one.depth_mm, np.nan).astype(np.float32),
+            confidence=confidence(one.sigma_mm, keep, options),
+            color=_color_grid(view.resample(image), self.options.spacing_px),
+        )
+
+
+def _gray(image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w"]:
+    if image.ndim == 2:
+        return image
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+def _color_grid(image: UInt8[np.ndarray, "h w *c"], spacing_px: int) -> UInt8[np.ndarray, "r s 3"]:
+    """RGB at the pixels of the grid."""
+    start = spacing_px // 2
+    picked = image[start::spacing_px, start::spacing_px]
+    return np.repeat(picked[..., None], 3, axis=2) if picked.ndim == 2 else np.ascontiguousarray(picked)

@@ -1,0 +1,110 @@
+"""A first depth for each pixel: semi-global matching of rectified pairs at half resolution, checked both ways.
+
+A *pair matcher* is any function from two rectified images and a range of disparities to the disparity of the first
+image's pixels; :func:`semi_global` is one. Matching by something else than grey values stands beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from cuspid.rig import Rig
+from cuspid.stereo.rectification import RectifiedPair
+
+PairMatcher = Callable[
+    [UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"], tuple[float, float]], Float[np.ndarray, "h w"]
+]
+"""Rectified first and second image, lowest and highest disparity in px (positive: content lies farther left in the
+second image) to the disparity at each pixel of the first, NaN where unknown. float32."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SemiGlobalOptions:
+    """Semi-global matching (OpenCV's StereoSGBM)."""
+
+    block_px: int = 5
+    """Side of the matched block."""
+    small_jump_penalty: int = 8
+    """Penalty for a disparity change of 1 px between neighbours, per pixel of the block."""
+    large_jump_penalty: int = 32
+    """Penalty for a larger change, per pixel of the block."""
+    uniqueness_percent: int = 5
+    """By how much the best cost must beat the second best."""
+    left_right_tolerance_px: float = 1.0
+    """Largest difference between the disparities found in the two directions."""
+
+
+def semi_global(
+    first: UInt8[np.ndarray, "h w"],
+    second: UInt8[np.ndarray, "h w"],
+    disparities: tuple[float, float],
+    options: SemiGlobalOptions = SemiGlobalOptions(),
+) -> Float[np.ndarray, "h w"]:
+    """A :class:`PairMatcher`: semi-global matching in both directions, kept where they agree."""
+    forward = _semi_global_one_way(first, second, disparities, options)
+    backward = _semi_global_one_way(second[:, ::-1], first[:, ::-1], disparities, options)[:, ::-1]
+    columns = np.arange(first.shape[1])
+    target = np.rint(columns - np.nan_to_num(forward)).astype(int).clip(0, first.shape[1] - 1)
+    difference = np.abs(np.take_along_axis(backward, target, axis=1) - forward)
+    return np.where(difference <= options.left_right_tolerance_px, forward, np.nan).astype(np.float32)
+
+
+def _semi_global_one_way(
+    first: UInt8[np.ndarray, "h w"],
+    second: UInt8[np.ndarray, "h w"],
+    disparities: tuple[float, float],
+    options: SemiGlobalOptions,
+) -> Float[np.ndarray, "h w"]:
+    lowest = int(np.floor(disparities[0]))
+    count = 16 * int(np.ceil((disparities[1] - lowest + 1) / 16))
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=lowest,
+        numDisparities=count,
+        blockSize=options.block_px,
+        P1=options.small_jump_penalty * options.block_px**2,
+        P2=options.large_jump_penalty * options.block_px**2,
+        uniquenessRatio=options.uniqueness_percent,
+        mode=cv2.StereoSGBM_MODE_SGBM_3WAY,
+    )
+    # OpenCV gives no answer in the leftmost columns, as wide as the largest disparity: widen the images by these.
+    pad = lowest + count
+    wide = [cv2.copyMakeBorder(image, 0, 0, pad, 0, cv2.BORDER_CONSTANT) for image in (first, second)]
+    disparity = matcher.compute(*wide)[:, pad:].astype(np.float32) / 16
+    known = (disparity >= lowest) & (np.arange(first.shape[1]) - disparity >= 0)
+    return np.where(known, disparity, np.nan).astype(np.float32)
+
+
+def seed_pairs(rig: Rig, group: Sequence[str], pairs: Sequence[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
+    """For each camera of a group the partner with the widest baseline among the stereo pairs; no pair twice."""
+    chosen: dict[frozenset[str], tuple[str, str]] = {}
+    for name in group:
+        partners = [pair for pair in pairs if name in pair]
+        if partners:
+            widest = max(partners, key=lambda pair: _baseline_mm(rig, pair))
+            chosen.setdefault(frozenset(widest), widest)
+    return tuple(chosen.values())
+
+
+def _baseline_mm(rig: Rig, pair: tuple[str, str]) -> float:
+    return float(np.linalg.norm(rig[pair[0]].centre_in_rig - rig[pair[1]].centre_in_rig))
+
+
+def seed_points(
+    pair: RectifiedPair,
+    images: Mapping[str, UInt8[np.ndarray, "h w"]],
+    matcher: PairMatcher,
+    depth_range_mm: tuple[float, float],
+) -> Float[np.ndarray, "n 3"]:
+    """Points in the rig frame, mm, that a pair matcher finds within the depth range."""
+    near, far = depth_range_mm
+    first, second = pair.resample(images[pair.names[0]], images[pair.names[1]])
+    disparity = matcher(first, second, (pair.disparity(far), pair.disparity(near)))
+    rows, columns = np.nonzero(np.isfinite(disparity))
+    depth = pair.disparity(1.0) / disparity[rows, columns].astype(np.float64)
+    rays = pair.camera.rays(np.stack([columns, rows], axis=-1) + 0.5)
+    return pair.first_from_rig.inverse().apply(rays * depth[:, None])
