@@ -1,1 +1,6 @@
 """Where the handpiece was: features, lean pairs, odometry, one bundle adjustment. The only import of pycolmap."""
+
+from cuspid.motion.adjustment import AdjustmentOptions, adjust
+from cuspid.motion.location import MotionOptions, locate
+
+__all__ = ["AdjustmentOptions", "MotionOptions", "adjust", "locate"]

@@ -1,0 +1,261 @@
+"""From a capture to metric poses and a sparse model, stage by stage."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path as FilePath
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from cuspid.capture import Capture
+from cuspid.errors import ReconstructionError
+from cuspid.geometry import Rigid3
+from cuspid.motion.adjustment import AdjustmentOptions, adjust
+from cuspid.motion.features import FeatureOptions, Progress, detect_all
+from cuspid.motion.odometry import (
+    Cloud,
+    OdometryOptions,
+    Path,
+    Views,
+    chain,
+    find_edges,
+    rays_in_rig,
+    triangulate_frame,
+)
+from cuspid.motion.pairs import MatchingOptions, frame_pairs, make_view, match_guided
+from cuspid.motion.tracks import intersect_rays, join
+from cuspid.reconstruction import Reconstruction, Tracks
+from cuspid.rig import Handpiece, Rig
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionOptions:
+    """How the handpiece's way is found from features."""
+
+    features: FeatureOptions = field(default_factory=FeatureOptions)
+    """Keypoints."""
+    within: MatchingOptions = field(default_factory=MatchingOptions)
+    """Matching of the cameras of a group within a frame."""
+    odometry: OdometryOptions = field(default_factory=OdometryOptions)
+    """First poses."""
+    between: MatchingOptions = field(default_factory=lambda: MatchingOptions(tolerance_px=3.0))
+    """Matching of a camera with itself at other frames once the poses are known about."""
+    reach: int = 3
+    """A camera is matched with itself at +1 to +reach frames."""
+    depth_slack_mm: float = 0.1
+    """Uncertainty of the depth of a point triangulated within a frame, when it is looked for in another."""
+    minimum_located: float = 0.5
+    """Least share (0 to 1) of the frames that must be located for a result."""
+    adjustment: AdjustmentOptions = field(default_factory=AdjustmentOptions)
+    """The final refinement."""
+    seed: int = 0
+    """Of the random samples of the pose estimation."""
+
+
+@contextmanager
+def _timed(log: dict[str, float], stage: str) -> Iterator[None]:
+    """Add the seconds that a stage takes to the log."""
+    start = time.perf_counter()
+    yield
+    log[f"{stage}_s"] = time.perf_counter() - start
+
+
+def _in_threads(work: Callable[[int], _T], count: int, stage: str, progress: Progress | None) -> list[_T]:
+    """``work(0)`` to ``work(count - 1)`` in threads, results in order."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        results = []
+        for result in pool.map(work, range(count)):
+            results.append(result)
+            if progress is not None:
+                progress(stage, len(results), count)
+    return results
+
+
+def _views(capture: Capture, options: MotionOptions, progress: Progress | None, cache: FilePath | None) -> list[Views]:
+    """Keypoints of every frame by camera."""
+    features = detect_all(capture, options.features, progress=progress, cache=cache)
+    cameras = capture.handpiece.rig.cameras
+    return [
+        {name: make_view(features[frame.name, name], mounted.camera) for name, mounted in cameras.items()}
+        for frame in capture.frames
+    ]
+
+
+def _depth_bounds(
+    cloud: Cloud, handpiece: Handpiece, camera: str, slack_mm: float
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Least and greatest depth of each keypoint: about that of its point, else the depth of field."""
+    depth = cloud.depths(handpiece.rig, camera)
+    near, far = handpiece.depth_range_mm
+    known = np.isfinite(depth)
+    return np.where(known, depth - slack_mm, near), np.where(known, depth + slack_mm, far)
+
+
+@dataclass(frozen=True, eq=False)
+class _Numbering:
+    """Numbers every keypoint of the located frames: frame after frame, camera after camera."""
+
+    starts: Mapping[tuple[int, str], int]
+    """Number of the first keypoint of an image."""
+    frame: Int[np.ndarray, "n"]
+    """Index of the located frame of each keypoint."""
+    camera: Int[np.ndarray, "n"]
+    """Index of the camera of each keypoint."""
+
+    @staticmethod
+    def of(frames: Sequence[Views]) -> _Numbering:
+        """Number the keypoints of frames."""
+        sizes = {(f, name): len(view.features) for f, views in enumerate(frames) for name, view in views.items()}
+        counts = list(sizes.values())
+        starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        cameras = {name: index for index, name in enumerate(frames[0])}
+        return _Numbering(
+            dict(zip(sizes, starts.tolist(), strict=False)),
+            np.repeat([frame for frame, _ in sizes], counts),
+            np.repeat([cameras[name] for _, name in sizes], counts),
+        )
+
+
+def _match_frames(
+    first: int,
+    second: int,
+    frames: Sequence[Views],
+    clouds: Sequence[Cloud],
+    poses: Sequence[Rigid3],
+    handpiece: Handpiece,
+    options: MotionOptions,
+    starts: Mapping[tuple[int, str], int],
+) -> Int[np.ndarray, "k 2"]:
+    """Matches, as numbers of keypoints, of each camera with itself at another frame."""
+    second_from_first = poses[second] @ poses[first].inverse()
+    matches = [np.zeros((0, 2), dtype=np.int64)]
+    for camera, mounted in handpiece.rig.cameras.items():
+        motion = mounted.cam_from_rig @ second_from_first @ mounted.cam_from_rig.inverse()
+        here, there = (_depth_bounds(clouds[f], handpiece, camera, options.depth_slack_mm) for f in (first, second))
+        found = match_guided(frames[first][camera], frames[second][camera], motion, here, there, options.between)
+        matches.append(found + [starts[first, camera], starts[second, camera]])
+    return np.concatenate(matches)
+
+
+def _within_frames(clouds: Sequence[Cloud], starts: Mapping[tuple[int, str], int]) -> list[Int[np.ndarray, "k 2"]]:
+    """Matches within the frames, as numbers of keypoints."""
+    return [
+        found + [starts[f, first], starts[f, second]]
+        for f, cloud in enumerate(clouds)
+        for first, second, found in cloud.matches
+    ]
+
+
+def _triangulated(
+    frames: Sequence[Views], poses: Sequence[Rigid3], rig: Rig, track: Int[np.ndarray, "n"], numbering: _Numbering
+) -> Tracks:
+    """Tracks with a point each where their rays meet."""
+    centres, directions = [], []
+    for views, pose in zip(frames, poses, strict=True):
+        world_from_rig = pose.inverse()
+        in_rig = rays_in_rig(rig, views)
+        centres.append(world_from_rig.apply(in_rig[0]))
+        directions.append(world_from_rig.rotate(in_rig[1]))
+    seen = np.flatnonzero(track >= 0)
+    count = int(track.max(initial=-1)) + 1
+    points = intersect_rays(np.concatenate(centres)[seen], np.concatenate(directions)[seen], track[seen], count)
+    finite = np.isfinite(points).all(axis=1)
+    seen = seen[finite[track[seen]]]
+    every = [view.features for views in frames for view in views.values()]
+    colors = np.zeros((count, 3), dtype=np.uint8)
+    colors[track[seen]] = np.concatenate([f.colors for f in every])[seen]
+    return Tracks(
+        points=np.nan_to_num(points),
+        colors=colors,
+        point_index=track[seen],
+        frame_index=numbering.frame[seen],
+        camera_index=numbering.camera[seen],
+        pixels=np.concatenate([f.pixels for f in every])[seen],
+    )
+
+
+def _link(
+    frames: Sequence[Views],
+    clouds: Sequence[Cloud],
+    poses: Sequence[Rigid3],
+    handpiece: Handpiece,
+    options: MotionOptions,
+    progress: Progress | None,
+) -> Tracks:
+    """Tracks over the located frames: the matches within frames and, guided by the poses, between them."""
+    numbering = _Numbering.of(frames)
+    pairs = frame_pairs(len(frames), options.reach)
+
+    def work(index: int) -> Int[np.ndarray, "k 2"]:
+        return _match_frames(*pairs[index], frames, clouds, poses, handpiece, options, numbering.starts)
+
+    between = _in_threads(work, len(pairs), "matching", progress)
+    image = numbering.frame * len(handpiece.rig.names) + numbering.camera
+    matches = np.concatenate([*_within_frames(clouds, numbering.starts), *between])
+    return _triangulated(frames, poses, handpiece.rig, join(matches, image), numbering)
+
+
+def _require_enough(path: Path, clouds: Sequence[Cloud], options: MotionOptions) -> None:
+    """Raise ReconstructionError where too few frames are located."""
+    placed, total = len(path.rig_from_world), len(clouds)
+    if placed >= options.minimum_located * total and (placed > 1 or total == 1):
+        return
+    shown = "; ".join(f"{d.what}: {d.reason}" for d in path.dropped[:3])
+    more = f"; and {len(path.dropped) - 3} more" if len(path.dropped) > 3 else ""
+    typical = int(np.median([len(cloud.points) for cloud in clouds]))
+    raise ReconstructionError(
+        f"motion: only {placed} of {total} frames could be placed, with {typical} points in a typical frame ({shown}"
+        f"{more}); give the surface more texture (powder), take frames closer together, or check the handpiece file"
+    )
+
+
+def locate(
+    capture: Capture,
+    options: MotionOptions | None = None,
+    *,
+    progress: Progress | None = None,
+    cache: FilePath | None = None,
+) -> Reconstruction:
+    """Metric poses of the frames and a sparse model; finished images are kept in ``cache`` for a later run.
+
+    Raises InputError for images that cannot be used and ReconstructionError where too few frames can be placed.
+    """
+    options, handpiece = options or MotionOptions(), capture.handpiece
+    log: dict[str, float] = {}
+    with _timed(log, "features"):
+        frames = _views(capture, options, progress, cache)
+    with _timed(log, "triangulation"):
+        pairs = handpiece.rig.stereo_pairs(handpiece.working_distance_mm)
+        clouds = _in_threads(
+            lambda f: triangulate_frame(handpiece, pairs, frames[f], options.within),
+            len(frames),
+            "triangulation",
+            progress,
+        )
+    with _timed(log, "odometry"):
+        edges = find_edges(handpiece.rig, frames, clouds, options.odometry, options.seed)
+        path = chain(edges, [frame.name for frame in capture.frames], options.odometry)
+    _require_enough(path, clouds, options)
+    located = list(path.rig_from_world)
+    with _timed(log, "matching"):
+        poses = list(path.rig_from_world.values())
+        tracks = _link([frames[f] for f in located], [clouds[f] for f in located], poses, handpiece, options, progress)
+    start = Reconstruction(
+        rig=handpiece.rig,
+        rig_from_world={capture.frames[f].name: pose for f, pose in path.rig_from_world.items()},
+        tracks=tracks,
+        dropped=path.dropped,
+        log=log,
+    )
+    with _timed(log, "adjustment"):
+        adjusted = adjust(start, options.adjustment)
+    return replace(adjusted, log={**adjusted.log, **log})

@@ -1,0 +1,258 @@
+"""The way of the handpiece, frame by frame: points triangulated within one frame are found again in the next.
+
+The points of a frame stand in its rig frame, in millimetres, for the rig fixes the scale; the pose of another frame
+relative to it follows from where all cameras see them there (generalised absolute pose). Frames that the neighbour at
++1 does not tie to the others are tried at +2, +3, ...; what stays apart is listed with its reason.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+
+from cuspid.geometry import Rigid3
+from cuspid.motion.colmap import colmap_camera, colmap_rigid, rigid_from_colmap
+from cuspid.motion.features import Features
+from cuspid.motion.pairs import MatchingOptions, View, match_guided, match_unguided
+from cuspid.motion.tracks import intersect_rays, join
+from cuspid.reconstruction import Dropped
+from cuspid.rig import Handpiece, Rig
+
+Views = Mapping[str, View]
+"""Keypoints of one frame by camera."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OdometryOptions:
+    """How a frame is placed relative to its neighbours."""
+
+    reach: int = 3
+    """Frames are tied to those at +1, where that fails to those at +2, and so on up to this."""
+    minimum_matches: int = 15
+    """Fewest consistent matches that place a frame."""
+    minimum_share: float = 0.15
+    """Least share (0 to 1) of the matches to a neighbour that must be consistent."""
+    error_px: float = 4.0
+    """Largest reprojection error of a consistent match, px."""
+    most_matches: int = 1500
+    """Matches beyond this number are thinned out evenly before the pose is estimated."""
+    unguided: MatchingOptions = field(default_factory=lambda: MatchingOptions(ratio=0.8))
+    """Matching where nothing is known of the motion."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Cloud:
+    """Points triangulated within one frame."""
+
+    points: Float[np.ndarray, "p 3"]
+    """In the rig frame, mm."""
+    point_of: Mapping[str, Int[np.ndarray, "?n"]]
+    """By camera: the point of each keypoint, -1 for none."""
+    matches: tuple[tuple[str, str, Int[np.ndarray, "?k 2"]], ...]
+    """(camera, camera, pairs of keypoints) that the points were made from."""
+
+    def depths(self, rig: Rig, camera: str) -> Float[np.ndarray, "n"]:
+        """Depth of each keypoint in its camera, mm; NaN where it has no point."""
+        in_rig = np.vstack([self.points, np.full((1, 3), np.nan)])[self.point_of[camera]]
+        return np.asarray(rig[camera].cam_from_rig.apply(in_rig)[:, 2])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Edge:
+    """Relative pose of two frames."""
+
+    target_from_source: Rigid3 | None
+    """Pose of the later frame relative to the earlier one, None where it could not be found."""
+    matches: int
+    """Number of consistent matches."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Path:
+    """The largest set of frames that are tied to each other."""
+
+    rig_from_world: Mapping[int, Rigid3]
+    """Pose by index of the frame; the world is the rig frame of the first one."""
+    dropped: tuple[Dropped, ...]
+    """The other frames."""
+
+
+def _full_range(
+    view: View, depth_range_mm: tuple[float, float]
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """The depth of field as bounds of every keypoint."""
+    near, far = depth_range_mm
+    return np.full(len(view.features), near), np.full(len(view.features), far)
+
+
+def _consistent(
+    rig: Rig,
+    views: Views,
+    points: Float[np.ndarray, "p 3"],
+    track: Mapping[str, Int[np.ndarray, "?n"]],
+    limit_px: float,
+) -> np.ndarray:
+    """True for the points that lie before each of their cameras and within ``limit_px`` of each of their keypoints."""
+    good = np.all(np.isfinite(points), axis=1)
+    for camera, view in views.items():
+        seen = np.flatnonzero(track[camera] >= 0)
+        in_cam = rig[camera].cam_from_rig.apply(points[track[camera][seen]])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            error = np.linalg.norm(in_cam[:, :2] / in_cam[:, 2:] - view.ideal[seen], axis=1) * view.focal_px
+            bad = ~((in_cam[:, 2] > 0) & (error <= limit_px))
+        good[track[camera][seen[bad]]] = False
+    return good
+
+
+def rays_in_rig(rig: Rig, views: Views) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Centre and direction, in the rig frame, of every keypoint of a frame, camera after camera."""
+    centres, directions = [], []
+    for camera, view in views.items():
+        rig_from_cam = rig[camera].cam_from_rig.inverse()
+        ray = np.column_stack([view.ideal, np.ones(len(view.ideal))])
+        directions.append(rig_from_cam.rotate(ray))
+        centres.append(np.broadcast_to(rig_from_cam.translation, ray.shape))
+    return np.concatenate(centres), np.concatenate(directions)
+
+
+def triangulate_frame(
+    handpiece: Handpiece, pairs: Sequence[tuple[str, str]], views: Views, options: MatchingOptions
+) -> Cloud:
+    """Match the camera pairs of one frame along their epipolar lines and triangulate."""
+    rig, bounds = handpiece.rig, handpiece.depth_range_mm
+    matches = []
+    for first, second in pairs:
+        a, b = views[first], views[second]
+        second_from_first = rig[second].cam_from_rig @ rig[first].cam_from_rig.inverse()
+        found = match_guided(a, b, second_from_first, _full_range(a, bounds), _full_range(b, bounds), options)
+        matches.append((first, second, found))
+    sizes = [len(view.features) for view in views.values()]
+    starts = dict(zip(views, np.concatenate([[0], np.cumsum(sizes)]), strict=False))
+    offset = [found + [starts[first], starts[second]] for first, second, found in matches]
+    track = join(np.concatenate([np.zeros((0, 2), np.int64), *offset]), np.repeat(np.arange(len(sizes)), sizes))
+    centres, directions = rays_in_rig(rig, views)
+    seen = track >= 0
+    points = intersect_rays(centres[seen], directions[seen], track[seen], int(track.max(initial=-1)) + 1)
+    by_camera = dict(zip(views, np.split(track, np.cumsum(sizes)[:-1]), strict=True))
+    good = _consistent(rig, views, points, by_camera, options.tolerance_px)
+    renumbered = np.append(np.where(good, np.cumsum(good) - 1, -1), -1)
+    return Cloud(
+        points=points[good],
+        point_of={camera: renumbered[which] for camera, which in by_camera.items()},
+        matches=tuple(matches),
+    )
+
+
+def _subset(features: Features, indices: Int[np.ndarray, "k"]) -> Features:
+    """Some of the keypoints."""
+    return Features(
+        pixels=features.pixels[indices],
+        descriptors=features.descriptors[indices],
+        colors=features.colors[indices],
+    )
+
+
+def _sightings(
+    cloud: Cloud, source: Views, target: Views, options: OdometryOptions
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 2"], Int[np.ndarray, "k"]]:
+    """Points of a cloud, where the cameras of another frame see them (px), and the index of that camera."""
+    points, pixels, cameras = [np.zeros((0, 3))], [np.zeros((0, 2))], [np.zeros(0, np.int64)]
+    for index, camera in enumerate(target):
+        known = np.flatnonzero(cloud.point_of[camera] >= 0)
+        found = match_unguided(_subset(source[camera].features, known), target[camera].features, options.unguided)
+        points.append(cloud.points[cloud.point_of[camera][known[found[:, 0]]]])
+        pixels.append(target[camera].features.pixels[found[:, 1]])
+        cameras.append(np.full(len(found), index))
+    return np.concatenate(points), np.concatenate(pixels), np.concatenate(cameras)
+
+
+def relative_pose(rig: Rig, cloud: Cloud, source: Views, target: Views, options: OdometryOptions, seed: int) -> Edge:
+    """Pose of the target frame relative to the frame of the cloud."""
+    points, pixels, cameras = _sightings(cloud, source, target, options)
+    if len(points) < options.minimum_matches:
+        return Edge(target_from_source=None, matches=len(points))
+    chosen = np.unique(np.linspace(0, len(points) - 1, options.most_matches).astype(np.int64))
+    ransac = pycolmap.RANSACOptions(
+        max_error=options.error_px, random_seed=seed, num_threads=1, min_num_trials=50, max_num_trials=3000
+    )
+    found = pycolmap.estimate_and_refine_generalized_absolute_pose(
+        pixels[chosen],
+        points[chosen],
+        cameras[chosen].tolist(),
+        [colmap_rigid(mounted.cam_from_rig) for mounted in rig.cameras.values()],
+        [colmap_camera(mounted.camera) for mounted in rig.cameras.values()],
+        ransac,
+    )
+    inliers = 0 if found is None else int(np.sum(found["inlier_mask"]))
+    if found is None or inliers < max(options.minimum_matches, options.minimum_share * len(chosen)):
+        return Edge(target_from_source=None, matches=inliers)
+    return Edge(target_from_source=rigid_from_colmap(found["rig_from_world"]), matches=inliers)
+
+
+def _parts(edges: Mapping[tuple[int, int], Edge], count: int) -> Int[np.ndarray, "f"]:
+    """For each frame the number of the connected part it belongs to."""
+    tied = np.array([pair for pair, edge in edges.items() if edge.target_from_source is not None]).reshape(-1, 2)
+    graph = coo_array((np.ones(len(tied)), (tied[:, 0], tied[:, 1])), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1])
+
+
+def find_edges(
+    rig: Rig, frames: Sequence[Views], clouds: Sequence[Cloud], options: OdometryOptions, seed: int
+) -> dict[tuple[int, int], Edge]:
+    """Relative poses at +1 and, between parts that are still apart, at +2 and farther."""
+    edges: dict[tuple[int, int], Edge] = {}
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for step in range(1, options.reach + 1):
+            part = _parts(edges, len(frames))
+            open_pairs = [(i, i + step) for i in range(len(frames) - step) if part[i] != part[i + step]]
+            jobs = [
+                pool.submit(relative_pose, rig, clouds[i], frames[i], frames[j], options, seed + i)
+                for i, j in open_pairs
+            ]
+            edges.update(zip(open_pairs, (job.result() for job in jobs), strict=True))
+    return edges
+
+
+def _reason(
+    frame: int, part: Int[np.ndarray, "f"], edges: Mapping[tuple[int, int], Edge], options: OdometryOptions
+) -> str:
+    """Why a frame is not in the largest part."""
+    fellows = int(np.sum(part == part[frame]))
+    if fellows > 1:
+        return f"with {fellows - 1} others in a part of the scan that nothing ties to the rest"
+    most = max((edge.matches for pair, edge in edges.items() if frame in pair), default=0)
+    if most >= options.minimum_matches:
+        return f"only {most} of its matches to its neighbours agree; too few of all"
+    return f"only {most} matches to its neighbours; {options.minimum_matches} are needed"
+
+
+def chain(edges: Mapping[tuple[int, int], Edge], names: Sequence[str], options: OdometryOptions) -> Path:
+    """Poses of the largest part by following the edges from its first frame."""
+    part = _parts(edges, len(names))
+    largest = int(np.argmax(np.bincount(part)))
+    located = np.flatnonzero(part == largest)
+    tied = {pair: edge.target_from_source for pair, edge in edges.items() if edge.target_from_source is not None}
+    rows = np.array([*tied, *((j, i) for i, j in tied)]).reshape(-1, 2)
+    graph = coo_array((np.ones(len(rows)), (rows[:, 0], rows[:, 1])), shape=(len(names), len(names)))
+    order, before = breadth_first_order(graph.tocsr(), int(located[0]))
+    poses = {int(located[0]): Rigid3.identity()}
+    for j in order[1:].tolist():
+        i = int(before[j])
+        forward = tied.get((i, j)) or tied[j, i].inverse()
+        poses[j] = forward @ poses[i]
+    return Path(
+        rig_from_world={int(frame): poses[int(frame)] for frame in located},
+        dropped=tuple(
+            Dropped(what=f"frame {name}", reason=_reason(index, part, edges, options))
+            for index, name in enumerate(names)
+            if part[index] != largest
+        ),
+    )
