@@ -1,0 +1,1 @@
+"""What scans the jaw: designs of handpieces, and what their cameras can see."""

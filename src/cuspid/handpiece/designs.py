@@ -1,0 +1,138 @@
+"""The handpieces of the thesis: the essential four cameras (3.5.1) and the twelve (3.5.2).
+
+Rig frame: origin at the nominal point of the occlusal surface under the probe, +X along the arch in the direction of
+travel, +Y across the arch towards the cheek (buccal), +Z out of the gum. A group is four cameras with parallel axes in
+one plane: two across the arch and two along the curve of Spee, with the LEDs at the corners between them.
+
+    image up        o occlusal: +X to the right of the image, buccal up
+     1              b buccal:   -X to the right, occlusal up
+   3   4            l lingual:  +X to the right, occlusal up
+     2
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from jaxtyping import Float
+
+from cuspid.camera import Camera
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
+from cuspid.rig import Exposure, Handpiece, Light, MountedCamera, Rig
+
+DEPTH_RANGE_MM = (2.5, 9.0)
+"""What a lens of such size keeps usefully sharp. Its blur disc is f A |1/Z - 1/Z0| wide and grows with the aperture A,
+while diffraction shrinks; at f = 416 px the two meet at A = 0.07 mm. Focused at Z0 = 3.9 mm, the disc is then 4 px wide
+at both ends of this range and narrower between. Nearer than 2.5 mm the housing would touch the teeth."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DesignOptions:
+    """What the designs of the thesis have in common."""
+
+    width_px: int = 500
+    """Image width in px."""
+    height_px: int = 500
+    """Image height in px."""
+    field_of_view_deg: float = 62.0
+    """Full horizontal angle of view."""
+    working_distance_mm: float = 5.0
+    """From the cameras to the surface that they look at."""
+    baseline_across_mm: float = 2.5
+    """Between the two cameras across the arch (up and down the tooth for the side groups)."""
+    baseline_along_mm: float = 1.5
+    """Between the two cameras along the curve of Spee."""
+    side_tilt_deg: float = 60.0
+    """Angle between the occlusal axis and the axes of the buccal and lingual groups (twelve cameras only)."""
+    side_offset_mm: float = 4.5
+    """From the middle of the crown to where the side groups' axes meet its side (twelve cameras only)."""
+    side_depth_mm: float = 2.0
+    """From the occlusal surface down to where the side groups' axes meet the side (twelve cameras only)."""
+
+    def __post_init__(self) -> None:
+        near, far = DEPTH_RANGE_MM
+        if not near < self.working_distance_mm < far:
+            raise InputError(f"design: working distance {self.working_distance_mm} mm must lie in {near}-{far} mm")
+        if not (self.baseline_across_mm > 0 and self.baseline_along_mm > 0):
+            raise InputError("design: the baselines must be positive")
+        if not 0 < self.field_of_view_deg < 180:
+            raise InputError(f"design: field of view {self.field_of_view_deg} deg must lie between 0 and 180")
+
+
+def essential_four(options: DesignOptions = DesignOptions()) -> Handpiece:
+    """Four cameras that look down on the occlusal or incisal surface (thesis 3.5.1)."""
+    return _handpiece("essential-four", {"o": _occlusal_view(options)}, options)
+
+
+def twelve_cameras(options: DesignOptions = DesignOptions()) -> Handpiece:
+    """Three groups of four in a U-shaped holder: occlusal, buccal and lingual (thesis 3.5.2)."""
+    views = {"o": _occlusal_view(options), "b": _side_view(options, +1), "l": _side_view(options, -1)}
+    return _handpiece("twelve-cameras", views, options)
+
+
+DESIGNS: Mapping[str, Callable[[DesignOptions], Handpiece]] = MappingProxyType(
+    {"four": essential_four, "twelve": twelve_cameras}
+)
+"""Designs by the name that the command line takes."""
+
+
+def _handpiece(name: str, views: Mapping[str, Rigid3], options: DesignOptions) -> Handpiece:
+    cameras: dict[str, MountedCamera] = {}
+    lights: dict[str, Light] = {}
+    for prefix, group_from_rig in views.items():
+        cameras |= _group_cameras(prefix, group_from_rig, options)
+        lights |= _group_lights(prefix, group_from_rig, options)
+    return Handpiece(
+        rig=Rig(cameras),
+        lights=lights,
+        exposures=(Exposure(name="all", lights=tuple(lights)),),
+        working_distance_mm=options.working_distance_mm,
+        depth_range_mm=DEPTH_RANGE_MM,
+        name=name,
+    )
+
+
+def _occlusal_view(options: DesignOptions) -> Rigid3:
+    return _looking_at(np.zeros(3), np.array([0, 0, -1.0]), np.array([1.0, 0, 0]), options.working_distance_mm)
+
+
+def _side_view(options: DesignOptions, side: int) -> Rigid3:
+    """``group_from_rig`` of the buccal (side +1) or lingual (-1) group; image up is occlusal."""
+    tilt = np.deg2rad(options.side_tilt_deg)
+    target = np.array([0, side * options.side_offset_mm, -options.side_depth_mm])
+    axis = np.array([0, -side * np.sin(tilt), -np.cos(tilt)])
+    return _looking_at(target, axis, np.array([-side, 0, 0]), options.working_distance_mm)
+
+
+def _looking_at(
+    target: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"], right: Float[np.ndarray, "3"], distance_mm: float
+) -> Rigid3:
+    """``view_from_rig`` of a view along ``axis`` onto a point, with ``right`` to the right of the image."""
+    rotation = np.stack([right, np.cross(axis, right), axis])
+    return Rigid3(rotation, -rotation @ (target - distance_mm * axis))
+
+
+def _group_cameras(prefix: str, group_from_rig: Rigid3, options: DesignOptions) -> dict[str, MountedCamera]:
+    camera = Camera.from_field_of_view(options.width_px, options.height_px, options.field_of_view_deg)
+    across, along = options.baseline_across_mm / 2, options.baseline_along_mm / 2
+    places = [(0, -across), (0, across), (-along, 0), (along, 0)]
+    return {
+        f"{prefix}{k + 1}": MountedCamera(camera, Rigid3(np.eye(3), np.array([-x, -y, 0.0])) @ group_from_rig)
+        for k, (x, y) in enumerate(places)
+    }
+
+
+def _group_lights(prefix: str, group_from_rig: Rigid3, options: DesignOptions) -> dict[str, Light]:
+    """Four LEDs in the plane of the cameras, at the corners between them, shining along the axes."""
+    across, along = options.baseline_across_mm / 2, options.baseline_along_mm
+    rig_from_group = group_from_rig.inverse()
+    axis = rig_from_group.rotate(np.array([0, 0, 1.0]))
+    corners = [(x, y, 0.0) for y in (-across, across) for x in (-along, along)]
+    return {
+        f"{prefix}{k + 1}": Light(position_mm=rig_from_group.apply(np.array(corner)), direction=axis)
+        for k, corner in enumerate(corners)
+    }

@@ -1,0 +1,1 @@
+"""Images of a jaw as the handpiece would take them."""

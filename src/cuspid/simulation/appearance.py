@@ -1,0 +1,203 @@
+"""What teeth and gums look like: two materials and a solid (3-D) procedural texture in jaw coordinates.
+
+The albedo at a point is mixed from two colours by a sum of octaves of gradient noise (Perlin 2002), so that it depends
+on the point of the jaw alone, never on the camera. Colours are linear RGB.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from numba import njit
+from scipy.spatial.transform import Rotation
+
+from cuspid.jaw import GUM, Jaw
+
+Colour = tuple[float, float, float]
+Preset = Literal["artificial", "powder", "enamel"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Material:
+    """Diffuse colour with a texture, under a glossy coat."""
+
+    dark: Colour
+    """Linear RGB albedo where the texture is at its lowest."""
+    light: Colour
+    """Linear RGB albedo where the texture is at its highest."""
+    wavelengths_mm: tuple[float, ...]
+    """Wavelength of each octave of the noise; all octaves weigh the same."""
+    hardness: float = 1.0
+    """How quickly the texture goes from dark to light: the slope of the logistic curve over the noise's sd."""
+    reflectance: float = 0.0
+    """Fresnel reflectance of the coat at normal incidence; 0 is matte, water 0.02, enamel 0.05."""
+    roughness: float = 0.3
+    """GGX roughness (alpha) of the coat; small is a sharp highlight."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Appearance:
+    """Materials of a jaw."""
+
+    enamel: Material
+    """Teeth; everything, where the jaw has no labels."""
+    gum: Material
+    """Gingiva."""
+
+
+_FINE = (0.06, 0.12, 0.24, 0.48, 0.96)
+"""From 5 px of a camera at 12 um per px, so that 3 px are left of it in the farthest views, to 1 mm."""
+
+_ARTIFICIAL = Material(dark=(0.02, 0.02, 0.02), light=(0.85, 0.82, 0.78), wavelengths_mm=_FINE, hardness=1.6)
+_POWDER = Material(dark=(0.62, 0.62, 0.60), light=(0.90, 0.90, 0.88), wavelengths_mm=(0.06, 0.12, 0.24))
+
+APPEARANCES: Mapping[str, Appearance] = MappingProxyType(
+    {
+        "artificial": Appearance(enamel=_ARTIFICIAL, gum=_ARTIFICIAL),
+        "powder": Appearance(enamel=_POWDER, gum=_POWDER),
+        "enamel": Appearance(
+            enamel=Material(
+                dark=(0.60, 0.47, 0.28),
+                light=(0.78, 0.70, 0.54),
+                wavelengths_mm=(2.5, 5.0),
+                reflectance=0.05,
+                roughness=0.09,
+            ),
+            gum=Material(
+                dark=(0.42, 0.10, 0.09),
+                light=(0.66, 0.28, 0.24),
+                wavelengths_mm=(0.7, 1.4, 2.8),
+                reflectance=0.035,
+                roughness=0.12,
+            ),
+        ),
+    }
+)
+"""Presets: ``artificial`` is a strong matte texture on everything (the thesis' condition), ``powder`` a weak matte
+speckle as of scanning spray, ``enamel`` plain, glossy and wet."""
+
+
+class Palette(NamedTuple):
+    """An appearance as arrays for the compiled shading; the first axis is the material (0 enamel, 1 gum)."""
+
+    dark: np.ndarray
+    light: np.ndarray
+    hardness: np.ndarray
+    reflectance: np.ndarray
+    roughness: np.ndarray
+    octaves: np.ndarray
+    """Number of octaves of each material."""
+    noise_from_jaw: np.ndarray
+    """(material, octave, 3, 4): turn, scale and shift of each octave, so that their lattices never line up."""
+
+
+def face_materials(jaw: Jaw) -> Int[np.ndarray, "f"]:
+    """Index of the material of each face: 0 enamel, 1 gum. uint8."""
+    if jaw.face_labels is None:
+        return np.zeros(len(jaw.mesh.faces), dtype=np.uint8)
+    return (jaw.face_labels == GUM).astype(np.uint8)
+
+
+def palette(appearance: Appearance, seed: int) -> Palette:
+    """The arrays that the shading needs. ``seed`` chooses the texture."""
+    materials = (appearance.enamel, appearance.gum)
+    rng = np.random.default_rng(seed)
+    most = max(len(material.wavelengths_mm) for material in materials)
+    noise_from_jaw = np.zeros((2, most, 3, 4))
+    for index, material in enumerate(materials):
+        for octave, wavelength in enumerate(material.wavelengths_mm):
+            noise_from_jaw[index, octave, :, :3] = Rotation.random(rng=rng).as_matrix() / wavelength
+            noise_from_jaw[index, octave, :, 3] = rng.uniform(0, 1000, 3)
+    return Palette(
+        dark=np.array([material.dark for material in materials]),
+        light=np.array([material.light for material in materials]),
+        hardness=np.array([material.hardness for material in materials]),
+        reflectance=np.array([material.reflectance for material in materials]),
+        roughness=np.array([material.roughness for material in materials]),
+        octaves=np.array([len(material.wavelengths_mm) for material in materials]),
+        noise_from_jaw=noise_from_jaw,
+    )
+
+
+GRADIENT_NOISE_SD = 0.27
+"""Standard deviation of :func:`gradient_noise` over space."""
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _corner(ix, iy, iz, x, y, z):  # type: ignore[no-untyped-def]
+    """Dot product of the offset with one of twelve gradients, chosen by a hash of the lattice point."""
+    h = (
+        (np.uint32(ix) * np.uint32(0x8DA6B343))
+        ^ (np.uint32(iy) * np.uint32(0xD8163841))
+        ^ (np.uint32(iz) * np.uint32(0xCB1AB31F))
+    )
+    h = (h ^ (h >> np.uint32(15))) * np.uint32(0x2C1B3C6D)
+    h = (h ^ (h >> np.uint32(13))) & np.uint32(15)
+    u = x if h < 8 else y
+    v = y if h < 4 else (x if h == 12 or h == 14 else z)
+    return (u if h & 1 == 0 else -u) + (v if h & 2 == 0 else -v)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def gradient_noise(x, y, z):  # type: ignore[no-untyped-def]
+    """Perlin's improved noise, about -1 to 1, zero mean, one feature a unit."""
+    fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
+    ix, iy, iz = np.int64(fx), np.int64(fy), np.int64(fz)
+    x, y, z = x - fx, y - fy, z - fz
+    u = x * x * x * (x * (x * 6 - 15) + 10)
+    v = y * y * y * (y * (y * 6 - 15) + 10)
+    w = z * z * z * (z * (z * 6 - 15) + 10)
+    a = _corner(ix, iy, iz, x, y, z)
+    a += u * (_corner(ix + 1, iy, iz, x - 1, y, z) - a)
+    b = _corner(ix, iy + 1, iz, x, y - 1, z)
+    b += u * (_corner(ix + 1, iy + 1, iz, x - 1, y - 1, z) - b)
+    c = _corner(ix, iy, iz + 1, x, y, z - 1)
+    c += u * (_corner(ix + 1, iy, iz + 1, x - 1, y, z - 1) - c)
+    d = _corner(ix, iy + 1, iz + 1, x, y - 1, z - 1)
+    d += u * (_corner(ix + 1, iy + 1, iz + 1, x - 1, y - 1, z - 1) - d)
+    a += v * (b - a)
+    c += v * (d - c)
+    return a + w * (c - a)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def albedo_at(point, material, palette):  # type: ignore[no-untyped-def]
+    """Linear RGB albedo of a material at one point of the jaw, as a tuple."""
+    x, y, z = point
+    octaves = palette.octaves[material]
+    total = 0.0
+    for k in range(octaves):
+        m = palette.noise_from_jaw[material, k]
+        total += gradient_noise(
+            m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
+            m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3],
+            m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3],
+        )
+    unit = total / (GRADIENT_NOISE_SD * np.sqrt(octaves))
+    share = 1 / (1 + np.exp(-palette.hardness[material] * unit))
+    dark, light = palette.dark[material], palette.light[material]
+    return (
+        dark[0] + share * (light[0] - dark[0]),
+        dark[1] + share * (light[1] - dark[1]),
+        dark[2] + share * (light[2] - dark[2]),
+    )
+
+
+@njit(cache=True, nogil=True)
+def _albedo(points, materials, palette, out):  # type: ignore[no-untyped-def]
+    for i in range(len(points)):
+        out[i] = albedo_at((points[i, 0], points[i, 1], points[i, 2]), materials[i], palette)
+
+
+def albedo(
+    points: Float[np.ndarray, "n 3"], materials: Int[np.ndarray, "n"], palette: Palette
+) -> Float[np.ndarray, "n 3"]:
+    """Linear RGB albedo at points of the jaw (mm in the occlusal frame), given the material of each."""
+    out = np.empty_like(points)
+    _albedo(points, materials, palette, out)
+    return out

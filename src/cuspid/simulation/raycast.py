@@ -1,0 +1,386 @@
+"""The default renderer: Embree rays, compiled shading.
+
+For each of the rays through a pixel: the albedo of the solid texture at the hit, lit by the lights that are on, each a
+point with a lobe and 1/d^2 falloff, through a GGX coat with Schlick's Fresnel term (Walter et al. 2007). Shadows are
+traced once a pixel. Interreflection is a constant share of the light that reaches a point. Radiance is linear RGB in
+units in which a white diffuse surface facing a light of power 1 at 1 mm has radiance 1. The world is the jaw's frame.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import cached_property
+from multiprocessing import get_context
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from numba import njit
+
+from cuspid.camera import Camera
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
+from cuspid.jaw import Jaw
+from cuspid.mesh import Mesh, RayHits
+from cuspid.rig import Handpiece
+from cuspid.simulation.appearance import Appearance, Palette, albedo_at, face_materials, palette
+from cuspid.simulation.sensor import expose
+
+AMBIENT = 0.08
+"""Share of the light reaching a point that arrives from all around after reflection in the mouth, unshadowed."""
+
+NOTICEABLE = 0.005
+"""A light that gives less than this share of the light at a point is left out there, and no shadow ray is traced."""
+
+BRIGHT_PERCENTILE, BRIGHT_LEVEL = 98.0, 0.75
+"""The exposure puts this percentile of the metered pixels at this share of full scale (linear)."""
+
+METERED_POSES = 5
+"""The exposure is metered at this many poses, spread over the capture."""
+
+Sink = Callable[[str, str, UInt8[np.ndarray, "h w 3"]], None]
+"""Takes frame, camera and image; called in the process that rendered it."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scene:
+    """What is in front of the cameras, and the cameras."""
+
+    jaw: Jaw
+    """The jaw, in whose frame the poses are given."""
+    handpiece: Handpiece
+    """Cameras, lights, sensor."""
+    appearance: Appearance
+    """Materials."""
+    supersampling: int = 2
+    """Rays through a pixel along each side."""
+    seed: int = 0
+    """Chooses the texture and the sensor noise."""
+
+    @cached_property
+    def surface(self) -> Surface:
+        """The jaw as arrays for the compiled shading."""
+        mesh = self.jaw.mesh
+        return Surface(mesh.faces, mesh.face_normals, mesh.vertex_normals, face_materials(self.jaw))
+
+    @cached_property
+    def palette(self) -> Palette:
+        """The materials as arrays for the compiled shading."""
+        return palette(self.appearance, self.seed)
+
+
+class Surface(NamedTuple):
+    """A mesh as arrays for the compiled shading."""
+
+    faces: np.ndarray
+    face_normals: np.ndarray
+    vertex_normals: np.ndarray
+    materials: np.ndarray
+
+
+class Lamps(NamedTuple):
+    """Lights in the world frame as arrays for the compiled shading."""
+
+    positions: np.ndarray
+    axes: np.ndarray
+    intensities: np.ndarray
+    exponents: np.ndarray
+
+
+def lamps(handpiece: Handpiece, exposure: str, rig_from_world: Rigid3) -> Lamps:
+    """The lights that an exposure names, in the world frame."""
+    names = {each.name: each.lights for each in handpiece.exposures}
+    if exposure not in names:
+        raise InputError(f"handpiece: no exposure named {exposure!r}; it has {', '.join(names) or 'none'}")
+    on = [handpiece.lights[name] for name in names[exposure]]
+    world_from_rig = rig_from_world.inverse()
+    return Lamps(
+        world_from_rig.apply(np.array([light.position_mm for light in on]).reshape(-1, 3)),
+        world_from_rig.rotate(np.array([light.direction for light in on]).reshape(-1, 3)),
+        np.array([light.power * light.colour for light in on]).reshape(-1, 3),
+        np.array([light.lobe_exponent for light in on]),
+    )
+
+
+def pixel_rays(camera: Camera, supersampling: int) -> Float[np.ndarray, "n 3"]:
+    """Directions (Z = 1, camera frame) on a regular grid within each pixel; the rays of one pixel follow each other."""
+    offsets = (np.arange(supersampling) + 0.5) / supersampling - 0.5
+    within = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(1, 1, -1, 2)
+    return camera.rays((camera.pixel_centres()[:, :, None] + within).reshape(-1, 2))
+
+
+def render_depth(mesh: Mesh, camera: Camera, cam_from_world: Rigid3) -> Float[np.ndarray, "h w"]:
+    """True depth (Z in the camera, mm) at each pixel centre, NaN where nothing is hit."""
+    world_from_cam = cam_from_world.inverse()
+    rays = pixel_rays(camera, 1)
+    hits = mesh.cast(np.tile(world_from_cam.translation, (len(rays), 1)), world_from_cam.rotate(rays))
+    depth = np.where(hits.faces >= 0, hits.distances, np.nan)
+    return depth.reshape(camera.height, camera.width)
+
+
+def radiance(scene: Scene, camera: Camera, cam_from_world: Rigid3, lights: Lamps) -> Float[np.ndarray, "h w 3"]:
+    """Linear light at each pixel, averaged over the pixel's area; 0 where nothing is hit."""
+    world_from_cam = cam_from_world.inverse()
+    directions = _turned(pixel_rays(camera, scene.supersampling), world_from_cam.rotation)
+    origin = world_from_cam.translation
+    hits = scene.jaw.mesh.cast(np.broadcast_to(origin, directions.shape), directions)
+    samples = scene.supersampling**2
+    lit, ambient = _lighting(scene, origin, directions[::samples], _every(hits, samples), lights)
+    out = np.zeros((camera.height * camera.width, 3), dtype=np.float32)
+    rays = _Rays(origin, directions, hits.faces, hits.distances, hits.barycentric)
+    _shade(rays, scene.surface, scene.palette, lights, lit, ambient, out)
+    return out.reshape(camera.height, camera.width, 3)
+
+
+class _Rays(NamedTuple):
+    """Rays from one point and their hits, as arrays for the compiled shading."""
+
+    origin: np.ndarray
+    directions: np.ndarray
+    faces: np.ndarray
+    distances: np.ndarray
+    barycentric: np.ndarray
+
+
+@njit(cache=True, nogil=True)
+def _turned(directions, rotation):  # type: ignore[no-untyped-def]
+    """``Rigid3.rotate`` without BLAS, whose threads would fight with the other processes."""
+    out = np.empty_like(directions)
+    for i in range(len(directions)):
+        for r in range(3):
+            out[i, r] = (
+                rotation[r, 0] * directions[i, 0]
+                + rotation[r, 1] * directions[i, 1]
+                + rotation[r, 2] * directions[i, 2]
+            )
+    return out
+
+
+def _every(hits: RayHits, step: int) -> RayHits:
+    return RayHits(hits.faces[::step], hits.distances[::step], hits.barycentric[::step])
+
+
+def _lighting(
+    scene: Scene, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"], hits: RayHits, lights: Lamps
+) -> tuple[Bool[np.ndarray, "n l"], Float[np.ndarray, "n 3"]]:
+    """Which lights reach each hit (False also where a light is too weak to matter), and the ambient light there."""
+    rays = _Rays(origin, directions, hits.faces, hits.distances, hits.barycentric)
+    points, ambient = np.zeros((2, len(directions), 3))
+    lit = np.zeros((len(directions), len(lights.positions)), dtype=np.bool_)
+    _light_matters(rays, scene.surface, lights, points, lit, ambient)
+    for index, position in enumerate(lights.positions):
+        ask = np.flatnonzero(lit[:, index])
+        lit[ask, index] = ~scene.jaw.mesh.occluded(points[ask], np.broadcast_to(position, (len(ask), 3)))
+    return lit, ambient
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _point(rays, i):  # type: ignore[no-untyped-def]
+    t = rays.distances[i]
+    return (
+        rays.origin[0] + t * rays.directions[i, 0],
+        rays.origin[1] + t * rays.directions[i, 1],
+        rays.origin[2] + t * rays.directions[i, 2],
+    )
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _dot(a, b):  # type: ignore[no-untyped-def]
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _normal(rays, i, surface):  # type: ignore[no-untyped-def]
+    """Interpolated unit normal at a hit, on the side that the ray came from."""
+    face = rays.faces[i]
+    u, v, w = rays.barycentric[i, 0], rays.barycentric[i, 1], rays.barycentric[i, 2]
+    a = surface.vertex_normals[surface.faces[face, 0]]
+    b = surface.vertex_normals[surface.faces[face, 1]]
+    c = surface.vertex_normals[surface.faces[face, 2]]
+    x, y, z = (u * a[0] + v * b[0] + w * c[0], u * a[1] + v * b[1] + w * c[1], u * a[2] + v * b[2] + w * c[2])
+    scale = 1 / np.sqrt(x * x + y * y + z * z + 1e-30)
+    if _dot(surface.face_normals[face], rays.directions[i]) > 0:
+        scale = -scale
+    return x * scale, y * scale, z * scale
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _incoming(point, index, lights):  # type: ignore[no-untyped-def]
+    """Unit vector towards a light, and its lobe over the squared distance at a point."""
+    x = lights.positions[index, 0] - point[0]
+    y = lights.positions[index, 1] - point[1]
+    z = lights.positions[index, 2] - point[2]
+    squared = x * x + y * y + z * z
+    inverse = 1 / np.sqrt(squared)
+    towards = (x * inverse, y * inverse, z * inverse)
+    cosine = -_dot(towards, lights.axes[index])
+    if cosine <= 0:
+        return towards, 0.0
+    exponent = lights.exponents[index]
+    return towards, (cosine if exponent == 1 else cosine**exponent) / squared
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _light_matters(rays, surface, lights, points, matters, ambient):  # type: ignore[no-untyped-def]
+    """Fill in for each ray: the point hit, the lights that give a noticeable part of its light, the ambient light."""
+    strength = np.zeros(len(lights.positions))
+    for i in range(len(rays.faces)):
+        if rays.faces[i] < 0:
+            continue
+        point = _point(rays, i)
+        points[i] = point
+        normal = _normal(rays, i, surface)
+        for k in range(len(strength)):
+            towards, falloff = _incoming(point, k, lights)
+            strength[k] = max(0.0, _dot(normal, towards)) * falloff
+            for c in range(3):
+                ambient[i, c] += AMBIENT * falloff * lights.intensities[k, c]
+        threshold = NOTICEABLE * strength.sum()
+        for k in range(len(strength)):
+            matters[i, k] = strength[k] > threshold
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _coat(nl, nv, nh, vh, reflectance, roughness):  # type: ignore[no-untyped-def]
+    """pi times the GGX reflectance times the cosine towards the light, and the Fresnel share."""
+    alpha2 = roughness * roughness
+    bell = nh * nh * (alpha2 - 1) + 1
+    masking = nl * np.sqrt(nv * nv * (1 - alpha2) + alpha2) + nv * np.sqrt(nl * nl * (1 - alpha2) + alpha2)
+    grazing = 1 - vh
+    fresnel = reflectance + (1 - reflectance) * grazing * grazing * grazing * grazing * grazing
+    return fresnel * alpha2 / (bell * bell) * 0.5 * nl / masking, fresnel
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _reflected(normal, view, towards, reflectance, roughness):  # type: ignore[no-untyped-def]
+    """Diffuse (to be multiplied by the albedo) and glossy answer to a light of strength 1; ``view`` points away."""
+    nl = _dot(normal, towards)
+    if nl <= 0:
+        return 0.0, 0.0
+    if reflectance == 0:
+        return nl, 0.0
+    half = (towards[0] - view[0], towards[1] - view[1], towards[2] - view[2])
+    inverse = 1 / np.sqrt(_dot(half, half))
+    nv = max(1e-3, -_dot(normal, view))
+    glossy, fresnel = _coat(nl, nv, _dot(normal, half) * inverse, _dot(towards, half) * inverse, reflectance, roughness)
+    return nl * (1 - fresnel), glossy
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _shade(rays, surface, palette, lights, lit, ambient, out):  # type: ignore[no-untyped-def]
+    samples = len(rays.faces) // len(out)
+    for i in range(len(rays.faces)):
+        if rays.faces[i] < 0:
+            continue
+        pixel = i // samples
+        m = surface.materials[rays.faces[i]]
+        point, normal = _point(rays, i), _normal(rays, i, surface)
+        albedo = albedo_at(point, m, palette)
+        direction = rays.directions[i]
+        inverse = 1 / np.sqrt(_dot(direction, direction))
+        view = (direction[0] * inverse, direction[1] * inverse, direction[2] * inverse)
+        for c in range(3):
+            out[pixel, c] += albedo[c] * ambient[pixel, c] / samples
+        for k in range(len(lights.positions)):
+            if lit[pixel, k]:
+                towards, falloff = _incoming(point, k, lights)
+                diffuse, glossy = _reflected(normal, view, towards, palette.reflectance[m], palette.roughness[m])
+                for c in range(3):
+                    out[pixel, c] += falloff * lights.intensities[k, c] * (albedo[c] * diffuse + glossy) / samples
+
+
+def auto_gain(scene: Scene, poses: Iterable[Rigid3], exposure: str = "all", stride: int = 10) -> float:
+    """The one gain of a capture, metered over all cameras at some poses, on images ``stride`` times coarser."""
+    levels = []
+    for rig_from_world in poses:
+        lights = lamps(scene.handpiece, exposure, rig_from_world)
+        for mounted in scene.handpiece.rig.cameras.values():
+            coarse = radiance(scene, _coarser(mounted.camera, stride), mounted.cam_from_rig @ rig_from_world, lights)
+            levels.append(coarse.mean(axis=-1).ravel())
+    seen = np.concatenate(levels)
+    seen = seen[seen > 0]
+    if not len(seen):
+        raise InputError("simulation: no camera sees the jaw; check the scan path and the handpiece")
+    return float(BRIGHT_LEVEL / np.percentile(seen, BRIGHT_PERCENTILE))
+
+
+def _coarser(camera: Camera, stride: int) -> Camera:
+    return Camera(
+        width=-(-camera.width // stride),
+        height=-(-camera.height // stride),
+        focal_px=camera.focal_px / stride,
+        principal_point_px=camera.principal_point_px / stride,
+        distortion=camera.distortion,
+    )
+
+
+def render_image(
+    scene: Scene, frame: str, camera_name: str, rig_from_world: Rigid3, gain: float, exposure: str = "all"
+) -> UInt8[np.ndarray, "h w 3"]:
+    """One image. Depends on its arguments alone, so that a resumed capture equals an uninterrupted one."""
+    mounted = scene.handpiece.rig[camera_name]
+    light = radiance(
+        scene, mounted.camera, mounted.cam_from_rig @ rig_from_world, lamps(scene.handpiece, exposure, rig_from_world)
+    )
+    rng = np.random.default_rng([scene.seed, zlib.crc32(frame.encode()), zlib.crc32(camera_name.encode())])
+    return expose(light, gain, scene.handpiece.sensor, rng)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Worker:
+    scene: Scene
+    poses: Mapping[str, Rigid3]
+    gain: float
+    sink: Sink
+    exposure: str
+
+    def __call__(self, task: tuple[str, str]) -> tuple[str, str]:
+        frame, camera = task
+        self.sink(frame, camera, render_image(self.scene, frame, camera, self.poses[frame], self.gain, self.exposure))
+        return task
+
+
+_worker: _Worker
+
+
+def _adopt(worker: _Worker) -> None:
+    global _worker
+    _worker = worker
+
+
+def _work(task: tuple[str, str]) -> tuple[str, str]:
+    return _worker(task)
+
+
+def render_capture(
+    scene: Scene,
+    poses: Mapping[str, Rigid3],
+    sink: Sink,
+    *,
+    skip: Callable[[str, str], bool] = lambda frame, camera: False,
+    processes: int = 1,
+    exposure: str = "all",
+) -> Iterator[tuple[str, str]]:
+    """Render every camera at every pose but those that ``skip`` names, and yield (frame, camera) as each is done.
+
+    Embree holds the interpreter lock, so the work is spread over processes. They are forked, and only trace rays in the
+    scene that the parent built (a forked child could not build one) and run kernels that the parent compiled.
+    """
+    tasks = [(frame, camera) for frame in poses for camera in scene.handpiece.rig.names if not skip(frame, camera)]
+    if not tasks:
+        return
+    gain = auto_gain(scene, _spread(list(poses.values()), METERED_POSES), exposure)
+    worker = _Worker(scene=scene, poses=poses, gain=gain, sink=sink, exposure=exposure)
+    if processes == 1:
+        yield from map(worker, tasks)
+        return
+    with ProcessPoolExecutor(processes, get_context("fork"), _adopt, (worker,)) as pool:
+        for done in as_completed([pool.submit(_work, task) for task in tasks]):
+            yield done.result()
+
+
+def _spread(poses: list[Rigid3], count: int) -> list[Rigid3]:
+    return [poses[index] for index in np.unique(np.linspace(0, len(poses) - 1, count).astype(int))]
