@@ -1,0 +1,267 @@
+"""Trueness of a scan, as errata.md lists it, in both directions. Positive is outside the reference.
+
+Accuracy: signed distances from points even by area on the scan to the reference. Completeness: from points even by area
+on the reference to the scan. What counts:
+
+- Of the reference, the faces of the ``scannable`` mask, which the pipeline sets where at least two cameras could see.
+  Without a mask all of it, less what ``min_openness`` and ``crop_mm`` take away.
+- Of the scan, every point, except
+  (a) a point whose closest reference face does not count and that lies within ``margin_mm`` of it: the scan has surface
+      where nothing could be measured, but where surface is. A point farther off is an error and counts;
+  (b) a point past an open border of the reference, that is, whose closest point lies on the border and that is farther
+      sideways than up or down. With a mask the reference is all there was to see, so that such a point is an error
+      again and counts if it is farther off than ``margin_mm``; without a mask the scan may simply show more.
+
+A point is always measured to the closest surface, whether that counts or not. ``Trueness.notes`` says how much was left
+out by each rule.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from cuspid.errors import InputError
+from cuspid.evaluation.distance import Feet, Surface
+from cuspid.evaluation.registration import Alignment, RegistrationOptions, best_scale, register
+from cuspid.evaluation.teeth import CANINES, MOLARS, distance_error_um, drift_um, find_teeth
+from cuspid.geometry import Rigid3
+from cuspid.jaw import GUM, Jaw
+from cuspid.mesh import Mesh
+from cuspid.trueness import DeviationStatistics, Trueness
+
+_WITHIN_UM = (50, 100, 200)
+_LEAST_TOOTH_PCT = 30.0
+"""Share of a tooth's surface that must lie within 200 um of the scan for its place to be judged."""
+_OPENNESS_RAYS = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationOptions:
+    """How a scan is compared with its reference."""
+
+    align: bool = True
+    """Align the scan rigidly first, from any pose; off if it lies in the frame of the reference."""
+    registration: RegistrationOptions = field(default_factory=RegistrationOptions)
+    """How it is aligned."""
+    samples: int = 200_000
+    """Points on each of the two surfaces, even by area."""
+    margin_mm: float = 0.5
+    """A point of the scan over surface that does not count is left out only within this distance."""
+    crop_mm: float | None = None
+    """Reference surface farther than this from the scan is regarded as not scanned; by default all counts."""
+    min_openness: float = 0.0
+    """Without a mask: share of the directions above the occlusal plane that must be free for a face to count. 0.05
+    leaves out the hidden insides and the base of a model; 0 counts everything."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Rules:
+    """What counts; see the top of the module."""
+
+    faces: Bool[np.ndarray, "f"]
+    """Faces of the reference that count."""
+    margin_mm: float
+    """Limit of rule (a)."""
+    border_margin_mm: float
+    """Limit of rule (b)."""
+    note: str
+    """How the faces were chosen."""
+
+    def unscannable(self, feet: Feet) -> Bool[np.ndarray, "n"]:
+        """Points that rule (a) leaves out."""
+        return ~self.faces[feet.faces] & (np.abs(feet.signed_mm) <= self.margin_mm)
+
+    def past_border(self, feet: Feet) -> Bool[np.ndarray, "n"]:
+        """Points that rule (b) leaves out."""
+        return feet.past_border & (np.abs(feet.signed_mm) <= self.border_margin_mm)
+
+    def counts(self, feet: Feet) -> Bool[np.ndarray, "n"]:
+        """Points that count."""
+        return ~(self.unscannable(feet) | self.past_border(feet))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Samples:
+    """Points that count, from one of the two surfaces."""
+
+    points: Float[np.ndarray, "n 3"]
+    """In the frame of the reference, mm."""
+    signed_mm: Float[np.ndarray, "n"]
+    """Distances to the other surface, positive where the scan lies outside the reference."""
+    labels: Int[np.ndarray, "n"]
+    """FDI numbers of the reference faces to which they belong, 0 for gum or unknown."""
+    left_out: str
+    """What does not count, for people."""
+
+
+def evaluate(
+    scan: Mesh,
+    reference: Jaw,
+    options: EvaluationOptions,
+    *,
+    scannable: Bool[np.ndarray, "f"] | None = None,
+    rng: np.random.Generator,
+) -> Trueness:
+    """Compare a scan in any pose with a reference of which the faces in ``scannable`` count (None: see the module).
+
+    Raises InputError where the two do not belong together or nothing is left to compare.
+    """
+    surface = Surface(reference.mesh)
+    rules = _rules(reference.mesh, scannable, options)
+    alignment = _align(scan, surface, options, rng)
+    aligned = scan.transformed(alignment.reference_from_scan)
+    labels = reference.face_labels if reference.face_labels is not None else np.full(len(reference.mesh.faces), GUM)
+    from_scan = _samples_of_scan(aligned, surface, labels, rules, options, rng)
+    from_reference, counted_pct = _samples_of_reference(aligned, reference.mesh, labels, rules, options, rng)
+    completeness_by_tooth = {
+        fdi: _within_pct(from_reference.signed_mm[from_reference.labels == fdi])
+        for fdi in reference.teeth
+        if np.any(from_reference.labels == fdi)
+    }
+    centroids = {
+        fdi: _centroid(reference.mesh, (labels == fdi) & rules.faces)
+        for fdi, within in completeness_by_tooth.items()
+        if within["200"] >= _LEAST_TOOTH_PCT
+    }
+    teeth = find_teeth(from_scan.points, from_scan.labels, centroids, surface, options.registration)
+    vertex_feet = surface.feet(aligned.vertices)
+    return Trueness(
+        accuracy=statistics(from_scan.signed_mm),
+        completeness=statistics(from_reference.signed_mm),
+        completeness_pct=_within_pct(from_reference.signed_mm),
+        scannable_pct=counted_pct,
+        per_tooth={fdi: statistics(from_scan.signed_mm[from_scan.labels == fdi]) for fdi in teeth},
+        per_tooth_completeness_pct=completeness_by_tooth,
+        scale_error_ppm=1e6 * (alignment.scale - 1),
+        inter_molar_error_um=distance_error_um(teeth, MOLARS),
+        inter_canine_error_um=distance_error_um(teeth, CANINES),
+        drift_um=drift_um(teeth, surface),
+        reference_from_scan=alignment.reference_from_scan,
+        deviation_um=np.where(rules.counts(vertex_feet), 1000 * vertex_feet.signed_mm, np.nan),
+        notes=(*alignment.notes, rules.note, from_scan.left_out, from_reference.left_out),
+    )
+
+
+def statistics(signed_mm: Float[np.ndarray, "n"]) -> DeviationStatistics:
+    """Statistics of signed distances (mm) that are even by area. Raises InputError where there are none."""
+    if len(signed_mm) == 0:
+        raise InputError("evaluation: no surface is left to compare; check the scannable mask and --crop-mm")
+    signed_um = 1000 * signed_mm
+    absolute_um = np.abs(signed_um)
+    p10, p90 = np.percentile(signed_um, [10, 90])
+    return DeviationStatistics(
+        count=len(signed_um),
+        mean_abs_um=float(absolute_um.mean()),
+        signed_mean_um=float(signed_um.mean()),
+        std_um=float(signed_um.std()),
+        rms_um=float(np.sqrt(np.mean(signed_um**2))),
+        half_p90_p10_um=float((p90 - p10) / 2),
+        p95_um=float(np.percentile(absolute_um, 95)),
+        max_um=float(absolute_um.max()),
+    )
+
+
+def openness(mesh: Mesh) -> Float[np.ndarray, "f"]:
+    """Share of the directions above the occlusal plane (XY) from which the centre of each face can be seen."""
+    steps = np.arange(_OPENNESS_RAYS) + 0.5
+    z, azimuth = steps / _OPENNESS_RAYS, steps * np.pi * (3 - np.sqrt(5))
+    directions = np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], axis=1)
+    origins = mesh.face_centres + 2e-3 * mesh.face_normals
+    free = np.zeros(len(mesh.faces))
+    for direction in directions:
+        facing = np.flatnonzero(mesh.face_normals @ direction > 0)
+        hits = mesh.cast(origins[facing], np.broadcast_to(direction, (len(facing), 3)))
+        free[facing[hits.faces < 0]] += 1
+    return free / _OPENNESS_RAYS
+
+
+def _rules(reference: Mesh, scannable: Bool[np.ndarray, "f"] | None, options: EvaluationOptions) -> _Rules:
+    if scannable is not None and len(scannable) != len(reference.faces):
+        raise InputError(
+            f"evaluation: the scannable mask has {len(scannable)} faces, the reference {len(reference.faces)}; "
+            "give the reference that it was made for"
+        )
+    if scannable is not None:
+        faces, border_margin, note = scannable, options.margin_mm, "the faces that at least two cameras could see"
+    elif options.min_openness > 0:
+        faces, border_margin = openness(reference) >= options.min_openness, np.inf
+        note = f"the faces seen from {options.min_openness:.0%} of the directions above the occlusal plane"
+    else:
+        faces, border_margin = np.ones(len(reference.faces), dtype=bool), np.inf
+        note = "all of it, hidden insides and base included (--min-openness and --crop-mm leave them out)"
+    return _Rules(
+        faces=faces,
+        margin_mm=options.margin_mm,
+        border_margin_mm=border_margin,
+        note=f"of the reference counts: {note}",
+    )
+
+
+def _align(scan: Mesh, surface: Surface, options: EvaluationOptions, rng: np.random.Generator) -> Alignment:
+    if options.align:
+        return register(scan, surface, options.registration, rng=rng)
+    points, _ = scan.sample(options.registration.samples, rng)
+    scale = best_scale(points, surface, Rigid3.identity(), options.registration)
+    notes = ("alignment: none, the scan was taken to lie in the frame of the reference",)
+    return Alignment(reference_from_scan=Rigid3.identity(), scale=scale, rms_um=0.0, overlap=1.0, notes=notes)
+
+
+def _samples_of_scan(
+    aligned: Mesh,
+    surface: Surface,
+    labels: Int[np.ndarray, "f"],
+    rules: _Rules,
+    options: EvaluationOptions,
+    rng: np.random.Generator,
+) -> _Samples:
+    points, _ = aligned.sample(options.samples, rng)
+    feet = surface.feet(points)
+    counts = rules.counts(feet)
+    over, past = 100 * rules.unscannable(feet).mean(), 100 * rules.past_border(feet).mean()
+    limit = "" if np.isinf(rules.border_margin_mm) else f" by at most {rules.border_margin_mm:g} mm"
+    return _Samples(
+        points=points[counts],
+        signed_mm=feet.signed_mm[counts],
+        labels=labels[feet.faces[counts]],
+        left_out=f"of the scan does not count: {over:.1f} % within {rules.margin_mm:g} mm of reference surface that "
+        f"does not count, {past:.1f} % past an open border of the reference{limit}",
+    )
+
+
+def _samples_of_reference(
+    aligned: Mesh,
+    reference: Mesh,
+    labels: Int[np.ndarray, "f"],
+    rules: _Rules,
+    options: EvaluationOptions,
+    rng: np.random.Generator,
+) -> tuple[_Samples, float]:
+    """The samples, and the share of the reference that they stand for, in per cent."""
+    indices = np.flatnonzero(rules.faces)
+    area_pct = 100 * reference.face_areas[indices].sum() / reference.face_areas.sum()
+    if not area_pct > 0:
+        raise InputError("evaluation: no face of the reference counts; check the scannable mask and --min-openness")
+    points, picks = Mesh(reference.vertices, reference.faces[indices]).sample(options.samples, rng)
+    faces = indices[picks]
+    distances, _, positions = aligned.closest(points)
+    signs = np.where(np.sum((positions - points) * reference.face_normals[faces], axis=1) < 0, -1.0, 1.0)
+    near = distances <= (np.inf if options.crop_mm is None else options.crop_mm)
+    cropped = "nothing is cropped" if options.crop_mm is None else f"what is over {options.crop_mm:g} mm from the scan"
+    samples = _Samples(
+        points=points[near],
+        signed_mm=(signs * distances)[near],
+        labels=labels[faces[near]],
+        left_out=f"of the reference does not count as scanned: {cropped}",
+    )
+    return samples, float(area_pct * near.mean())
+
+
+def _within_pct(signed_mm: Float[np.ndarray, "n"]) -> dict[str, float]:
+    return {str(um): float(100 * np.mean(np.abs(signed_mm) <= um / 1000)) for um in _WITHIN_UM}
+
+
+def _centroid(mesh: Mesh, faces: Bool[np.ndarray, "f"]) -> Float[np.ndarray, "3"]:
+    return np.asarray(np.average(mesh.face_centres[faces], axis=0, weights=mesh.face_areas[faces]))

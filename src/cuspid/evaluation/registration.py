@@ -1,0 +1,183 @@
+"""Rigid registration of a scan onto a reference, from any pose, of a part of the arch as well as of all of it.
+
+A search over all poses (:mod:`cuspid.evaluation.search`), then Gauss-Newton on exact closest-point distances with
+Tukey's weights, to convergence. Never with scale: the best similarity's scale is reported apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from cuspid.errors import InputError
+from cuspid.evaluation.distance import Feet, Surface
+from cuspid.evaluation.search import SearchOptions, find_poses
+from cuspid.geometry import Rigid3
+from cuspid.mesh import Mesh
+
+_WIDEST_MM = 2.0
+"""Upper bound of the distance at which a sample loses its weight."""
+_LEAST_OVERLAP = 0.2
+_FEW = 4000
+"""Samples that suffice to tell good poses from bad ones."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegistrationOptions:
+    """How a scan is aligned with its reference."""
+
+    search: SearchOptions = field(default_factory=SearchOptions)
+    """How densely poses are tried."""
+    samples: int = 60_000
+    """Points of the scan, even by area, on which the alignment rests."""
+    outlier_mm: float = 0.3
+    """Samples farther off than this (or than six robust standard deviations, if that is more) have no weight."""
+    tolerance_um: float = 0.01
+    """The alignment has converged when no sample moves more than this in a step."""
+    iterations: int = 100
+    """Upper bound of the steps."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Alignment:
+    """Result of a registration."""
+
+    reference_from_scan: Rigid3
+    """The rigid motion that was found."""
+    scale: float
+    """Size of the scan over that of the reference, by the best similarity. Not applied anywhere."""
+    rms_um: float
+    """Weighted RMS distance of the samples that took part."""
+    overlap: float
+    """Share of the samples that took part."""
+    notes: tuple[str, ...] = ()
+    """Why the alignment is doubtful; empty where it is not."""
+
+
+def register(scan: Mesh, surface: Surface, options: RegistrationOptions, *, rng: np.random.Generator) -> Alignment:
+    """Align a scan in any pose with a reference surface.
+
+    Raises InputError where no pose brings a fifth of the scan near the reference.
+    """
+    few = scan.sample(_FEW, rng)[0]
+    starts = _starts(scan, surface.mesh, options.search, rng)
+    poses = [refine(few, surface, start, replace(options, tolerance_um=1.0, iterations=25)) for start in starts]
+    scores = np.array([_truncated_mean_mm(few, surface, pose) for pose in poses])
+    best = int(np.argmin(scores))
+    alignment = fit(scan.sample(options.samples, rng)[0], surface, poses[best], options)
+    if alignment.overlap < _LEAST_OVERLAP:
+        raise InputError(
+            f"registration: at best {alignment.overlap:.0%} of the scan comes near the reference; "
+            "check that both show the same teeth, in the same unit"
+        )
+    return replace(alignment, notes=(*_doubts(alignment), *_rivals(poses, scores, few)))
+
+
+def fit(points: Float[np.ndarray, "n 3"], surface: Surface, start: Rigid3, options: RegistrationOptions) -> Alignment:
+    """Align points of a scan with a surface from a pose nearby."""
+    pose = refine(points, surface, start, options)
+    feet = surface.feet(pose.apply(points))
+    weights = _weights(feet, options.outlier_mm)
+    return Alignment(
+        reference_from_scan=pose,
+        scale=best_scale(points, surface, pose, options),
+        rms_um=float(1000 * np.sqrt(np.sum(weights * feet.signed_mm**2) / max(weights.sum(), 1e-300))),
+        overlap=float(np.mean(weights > 0)),
+    )
+
+
+def refine(points: Float[np.ndarray, "n 3"], surface: Surface, start: Rigid3, options: RegistrationOptions) -> Rigid3:
+    """``reference_from_scan`` with the least weighted sum of squared distances, from a pose nearby."""
+    pose = start
+    for _ in range(options.iterations):
+        moved = pose.apply(points)
+        feet = surface.feet(moved)
+        centre = moved.mean(axis=0)
+        step = _gauss_newton(moved - centre, feet, _weights(feet, options.outlier_mm))
+        motion = _about(centre, step)
+        pose = motion @ pose
+        if np.abs(motion.apply(moved) - moved).max() < options.tolerance_um / 1000:
+            break
+    return pose
+
+
+def best_scale(
+    points: Float[np.ndarray, "n 3"], surface: Surface, reference_from_scan: Rigid3, options: RegistrationOptions
+) -> float:
+    """Scale of the scan that the best similarity near an alignment would take away."""
+    moved, shrinking = reference_from_scan.apply(points), 1.0
+    for _ in range(options.iterations):
+        feet = surface.feet(moved)
+        centre = moved.mean(axis=0)
+        step = _gauss_newton(moved - centre, feet, _weights(feet, options.outlier_mm), with_scale=True)
+        before = moved
+        moved = _about(centre, step[:6]).apply(centre + (1 + step[6]) * (moved - centre))
+        shrinking *= 1 + step[6]
+        if np.abs(moved - before).max() < options.tolerance_um / 1000:
+            break
+    return float(1 / shrinking)
+
+
+def _about(centre: Float[np.ndarray, "3"], step: Float[np.ndarray, "6"]) -> Rigid3:
+    """The motion that turns about a centre and shifts."""
+    turn = Rigid3.from_rotation_vector(step[:3], np.zeros(3))
+    return Rigid3(turn.rotation, centre - turn.rotate(centre) + step[3:])
+
+
+def _gauss_newton(
+    centred: Float[np.ndarray, "n 3"], feet: Feet, weights: Float[np.ndarray, "n"], *, with_scale: bool = False
+) -> Float[np.ndarray, "p"]:
+    """(turn in rad, shift in mm, and the relative growth if asked for) that lessens the distances most."""
+    columns = [np.cross(centred, feet.directions), feet.directions]
+    if with_scale:
+        columns.append(np.sum(centred * feet.directions, axis=1, keepdims=True))
+    jacobian = np.concatenate(columns, axis=1)
+    hessian = jacobian.T @ (weights[:, None] * jacobian)
+    # What the surface leaves free (a plane slides, a sphere turns) stays where it is.
+    step = np.linalg.lstsq(hessian, -jacobian.T @ (weights * feet.signed_mm), rcond=1e-9)[0]
+    return np.asarray(step)
+
+
+def _weights(feet: Feet, outlier_mm: float) -> Float[np.ndarray, "n"]:
+    """Tukey's biweight, wide enough to leave normal errors their full weight; none at the border of the reference."""
+    distances = np.abs(feet.signed_mm)
+    inside = ~feet.on_border
+    if not inside.any():
+        return np.zeros_like(distances)
+    sigma = 1.4826 * np.median(distances[inside])
+    cutoff = np.clip(6 * sigma, outlier_mm, max(_WIDEST_MM, outlier_mm))
+    return np.asarray(np.where(inside & (distances < cutoff), (1 - (distances / cutoff) ** 2) ** 2, 0.0))
+
+
+def _starts(scan: Mesh, reference: Mesh, options: SearchOptions, rng: np.random.Generator) -> list[Rigid3]:
+    """The smaller surface is sought on the larger one."""
+    if scan.face_areas.sum() <= 1.5 * reference.face_areas.sum():
+        return find_poses(scan, reference, options, rng=rng)
+    return [pose.inverse() for pose in find_poses(reference, scan, options, rng=rng)]
+
+
+def _truncated_mean_mm(points: Float[np.ndarray, "n 3"], surface: Surface, pose: Rigid3) -> float:
+    feet = surface.feet(pose.apply(points))
+    return float(np.where(feet.on_border, 0.5, np.minimum(np.abs(feet.signed_mm), 0.5)).mean())
+
+
+def _doubts(alignment: Alignment) -> tuple[str, ...]:
+    notes = []
+    if alignment.overlap < 0.6:
+        notes.append(f"alignment: doubtful, only {alignment.overlap:.0%} of the scan comes near the reference")
+    if alignment.rms_um > 150:
+        notes.append(f"alignment: doubtful, the surfaces differ by {alignment.rms_um:.0f} um RMS where they meet")
+    return tuple(notes)
+
+
+def _rivals(poses: list[Rigid3], scores: Float[np.ndarray, "k"], probes: Float[np.ndarray, "n 3"]) -> tuple[str, ...]:
+    """A note where a quite different pose fits almost as well."""
+    order = np.argsort(scores, kind="stable")
+    best = poses[order[0]]
+    for k in order[1:]:
+        apart_mm = float(np.linalg.norm(poses[k].apply(probes) - best.apply(probes), axis=1).mean())
+        if apart_mm > 0.5 and scores[k] < 1.25 * scores[order[0]] + 1e-3:
+            return (f"alignment: doubtful, another pose {apart_mm:.1f} mm away fits almost as well",)
+    return ()

@@ -1,0 +1,84 @@
+"""How well the teeth of a scan stand to each other.
+
+The scanned surface of each tooth is laid on its reference by a rigid motion of its own, ``reference_from_scan`` of that
+tooth alone. What these motions do to the centroids of the teeth gives the errors of the distances across the arch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from cuspid.evaluation.distance import Surface
+from cuspid.evaluation.registration import RegistrationOptions, refine
+from cuspid.geometry import Rigid3
+
+_ARCH_ORDER = (*range(48, 40, -1), *range(31, 39), *range(18, 10, -1), *range(21, 29))
+"""FDI numbers along the lower and the upper arch."""
+MOLARS = ((46, 36), (16, 26), (47, 37), (17, 27))
+"""Pairs whose distance is the inter-molar one, the first that was scanned."""
+CANINES = ((43, 33), (13, 23))
+_LEAST_SAMPLES = 300
+_MOST_SAMPLES = 10_000
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScannedTooth:
+    """The surface of one tooth in the scan."""
+
+    points: Float[np.ndarray, "n 3"]
+    """Samples of the aligned scan on this tooth, mm."""
+    reference_from_scan: Rigid3
+    """What lays them best on the reference; the identity where the tooth stands right."""
+    centroid: Float[np.ndarray, "3"]
+    """Centroid of the tooth in the reference, mm."""
+
+    @property
+    def scanned_centroid(self) -> Float[np.ndarray, "3"]:
+        """Where the aligned scan has it."""
+        return self.reference_from_scan.inverse().apply(self.centroid)
+
+
+def find_teeth(
+    points: Float[np.ndarray, "n 3"],
+    labels: Int[np.ndarray, "n"],
+    centroids: Mapping[int, Float[np.ndarray, "3"]],
+    surface: Surface,
+    options: RegistrationOptions,
+) -> dict[int, ScannedTooth]:
+    """Teeth with enough samples in an aligned scan, in the order along the arch.
+
+    ``labels`` are the FDI numbers of the samples; ``centroids`` those of the teeth that may be judged.
+    """
+    teeth = {}
+    for fdi in (tooth for tooth in _ARCH_ORDER if tooth in centroids):
+        on_tooth = points[labels == fdi]
+        if len(on_tooth) >= _LEAST_SAMPLES:
+            few = on_tooth[:: max(1, len(on_tooth) // _MOST_SAMPLES)]
+            motion = refine(few, surface, Rigid3.identity(), options)
+            teeth[fdi] = ScannedTooth(points=on_tooth, reference_from_scan=motion, centroid=centroids[fdi])
+    return teeth
+
+
+def distance_error_um(teeth: Mapping[int, ScannedTooth], pairs: tuple[tuple[int, int], ...]) -> float | None:
+    """Error of the distance between the centroids of the first pair that was scanned; positive: too wide."""
+    for right, left in pairs:
+        if right in teeth and left in teeth:
+            a, b = teeth[right], teeth[left]
+            scanned = np.linalg.norm(a.scanned_centroid - b.scanned_centroid)
+            return float(1000 * (scanned - np.linalg.norm(a.centroid - b.centroid)))
+    return None
+
+
+def drift_um(teeth: Mapping[int, ScannedTooth], surface: Surface) -> dict[int, float]:
+    """Mean absolute distance of each tooth when the scan is aligned on the first tooth alone."""
+    if not teeth:
+        return {}
+    anchor = next(iter(teeth.values())).reference_from_scan
+    return {
+        fdi: float(1000 * np.abs(surface.feet(anchor.apply(tooth.points)).signed_mm).mean())
+        for fdi, tooth in teeth.items()
+    }
