@@ -56,8 +56,8 @@ class AdjustmentOptions:
     """Number of times that the minimum is sought, with outliers dropped in between."""
     iterations: int = 30
     """Most steps in a round."""
-    tolerance: float = 1e-7
-    """A round ends when a step lowers the cost by less than this share."""
+    tolerance_sigmas: float = 0.02
+    """A round ends when a step moves the unknowns by less than this share of their standard deviations."""
     minimum_angle_deg: float = 1.0
     """Points whose rays meet at less than this angle are dropped."""
 
@@ -571,14 +571,14 @@ def _minimise(
         step = _solve_damped(system, damping)
         candidate = state if step is None else _moved(state, observations, weighting, prior, damping, step)
         lower = np.inf if step is None else _cost(candidate, observations, weighting)
-        if lower < cost:
-            gain, state, cost, damping = 1 - lower / cost, candidate, lower, max(damping / 10, 1e-9)
-            if gain < options.tolerance:
-                break
-        elif damping > 1e6 or lower <= cost * (1 + 1e-12):
+        if lower <= cost:
+            state, cost, damping = candidate, lower, max(damping / 10, 1e-9)
+        elif damping > 1e6:
             break
         else:
             damping *= 10
+        if step is not None and -step @ system.gradient <= len(step) * options.tolerance_sigmas**2:
+            break
     return state
 
 

@@ -30,7 +30,7 @@ from cuspid.motion.odometry import (
     triangulate_frame,
 )
 from cuspid.motion.pairs import MatchingOptions, frame_pairs, make_view, match_guided
-from cuspid.motion.tracks import intersect_rays, join
+from cuspid.motion.tracks import intersect_rays, join, thin
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import Handpiece, Rig
 
@@ -53,6 +53,8 @@ class MotionOptions:
     """A camera is matched with itself at +1 to +reach frames."""
     depth_slack_mm: float = 0.1
     """Uncertainty of the depth of a point triangulated within a frame, when it is looked for in another."""
+    cell_px: float = 35.0
+    """Every cell of this size of an image keeps its longest track for the adjustment; 0 keeps all tracks."""
     minimum_located: float = 0.5
     """Least share (0 to 1) of the frames that must be located for a result."""
     adjustment: AdjustmentOptions = field(default_factory=AdjustmentOptions)
@@ -201,7 +203,12 @@ def _link(
     between = _in_threads(work, len(pairs), "matching", progress)
     image = numbering.frame * len(handpiece.rig.names) + numbering.camera
     matches = np.concatenate([*_within_frames(clouds, numbering.starts), *between])
-    return _triangulated(frames, poses, handpiece.rig, join(matches, image), numbering)
+    track = join(matches, image)
+    if options.cell_px > 0:
+        seen = np.flatnonzero(track >= 0)
+        pixels = np.concatenate([view.features.pixels for views in frames for view in views.values()])
+        track[seen[~thin(track[seen], image[seen], pixels[seen], options.cell_px)]] = -1
+    return _triangulated(frames, poses, handpiece.rig, track, numbering)
 
 
 def _require_enough(path: Path, clouds: Sequence[Cloud], options: MotionOptions) -> None:

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from cuspid.geometry import Rigid3
 from cuspid.motion.colmap import colmap_camera, colmap_rigid, rigid_from_colmap
-from cuspid.motion.features import Features
+from cuspid.motion.features import Features, spread
 from cuspid.motion.pairs import MatchingOptions, View, match_guided, match_unguided
 from cuspid.motion.tracks import intersect_rays, join
 from cuspid.reconstruction import Dropped
@@ -28,6 +28,8 @@ from cuspid.rig import Handpiece, Rig
 
 Views = Mapping[str, View]
 """Keypoints of one frame by camera."""
+
+_CELL_PX = 40
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +44,8 @@ class OdometryOptions:
     """Least share (0 to 1) of the matches to a neighbour that must be consistent."""
     error_px: float = 4.0
     """Largest reprojection error of a consistent match, px."""
-    most_matches: int = 1500
-    """Matches beyond this number are thinned out evenly before the pose is estimated."""
+    most_per_camera: int = 200
+    """Points of a frame that are looked for in a camera of another; those that most cameras saw come first."""
     unguided: MatchingOptions = field(default_factory=lambda: MatchingOptions(ratio=0.8))
     """Matching where nothing is known of the motion."""
 
@@ -160,13 +162,21 @@ def _subset(features: Features, indices: Int[np.ndarray, "k"]) -> Features:
     )
 
 
+def _best_known(cloud: Cloud, view: View, camera: str, count: int) -> Int[np.ndarray, "k"]:
+    """Keypoints that have a point, well spread, those whose points most cameras saw first."""
+    known = np.flatnonzero(cloud.point_of[camera] >= 0)
+    sightings = np.bincount(np.concatenate([p[p >= 0] for p in cloud.point_of.values()]), minlength=1)
+    strength = sightings[cloud.point_of[camera][known]].astype(np.float64)
+    return known[spread(view.features.pixels[known], strength, count, _CELL_PX)]
+
+
 def _sightings(
     cloud: Cloud, source: Views, target: Views, options: OdometryOptions
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 2"], Int[np.ndarray, "k"]]:
     """Points of a cloud, where the cameras of another frame see them (px), and the index of that camera."""
     points, pixels, cameras = [np.zeros((0, 3))], [np.zeros((0, 2))], [np.zeros(0, np.int64)]
     for index, camera in enumerate(target):
-        known = np.flatnonzero(cloud.point_of[camera] >= 0)
+        known = _best_known(cloud, source[camera], camera, options.most_per_camera)
         found = match_unguided(_subset(source[camera].features, known), target[camera].features, options.unguided)
         points.append(cloud.points[cloud.point_of[camera][known[found[:, 0]]]])
         pixels.append(target[camera].features.pixels[found[:, 1]])
@@ -179,20 +189,19 @@ def relative_pose(rig: Rig, cloud: Cloud, source: Views, target: Views, options:
     points, pixels, cameras = _sightings(cloud, source, target, options)
     if len(points) < options.minimum_matches:
         return Edge(target_from_source=None, matches=len(points))
-    chosen = np.unique(np.linspace(0, len(points) - 1, options.most_matches).astype(np.int64))
     ransac = pycolmap.RANSACOptions(
         max_error=options.error_px, random_seed=seed, num_threads=1, min_num_trials=50, max_num_trials=3000
     )
     found = pycolmap.estimate_and_refine_generalized_absolute_pose(
-        pixels[chosen],
-        points[chosen],
-        cameras[chosen].tolist(),
+        pixels,
+        points,
+        cameras.tolist(),
         [colmap_rigid(mounted.cam_from_rig) for mounted in rig.cameras.values()],
         [colmap_camera(mounted.camera) for mounted in rig.cameras.values()],
         ransac,
     )
     inliers = 0 if found is None else int(np.sum(found["inlier_mask"]))
-    if found is None or inliers < max(options.minimum_matches, options.minimum_share * len(chosen)):
+    if found is None or inliers < max(options.minimum_matches, options.minimum_share * len(points)):
         return Edge(target_from_source=None, matches=inliers)
     return Edge(target_from_source=rigid_from_colmap(found["rig_from_world"]), matches=inliers)
 

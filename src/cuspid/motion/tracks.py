@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import no_type_check
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numba import njit
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -38,3 +41,34 @@ def intersect_rays(
     points = np.full((count, 3), np.nan)
     points[solvable] = np.linalg.solve(matrices[solvable], vectors[solvable][..., None])[..., 0]
     return points
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _claim(order, start, cell_of):
+    """Tracks, taken in order, that come first to some cell."""
+    claimed = np.zeros(cell_of.max() + 1, np.bool_)
+    keep = np.zeros(len(start) - 1, np.bool_)
+    for track in order:
+        for o in range(start[track], start[track + 1]):
+            if not claimed[cell_of[o]]:
+                keep[track] = claimed[cell_of[o]] = True
+    return keep
+
+
+def thin(
+    track: Int[np.ndarray, "o"], image: Int[np.ndarray, "o"], pixels: Float[np.ndarray, "o 2"], cell_px: float
+) -> Bool[np.ndarray, "o"]:
+    """Observations of the longest tracks that together leave no cell of an image empty.
+
+    Neighbouring keypoints share their errors: more of them cost time and add little.
+    """
+    if not len(track):
+        return np.zeros(0, dtype=bool)
+    place = np.maximum(pixels // cell_px, 0).astype(np.int64)
+    columns, rows = place.max(axis=0) + 1
+    order = np.argsort(track, kind="stable")
+    counts = np.bincount(track)
+    cell_of = (image * rows + place[:, 1]) * columns + place[:, 0]
+    longest_first = np.argsort(-counts, kind="stable")
+    return np.asarray(_claim(longest_first, np.concatenate([[0], np.cumsum(counts)]), cell_of[order]))[track]
