@@ -34,13 +34,13 @@ FAST = {"cache": True, "nogil": True, "fastmath": {"contract", "reassoc", "arcp"
 class RefinementOptions:
     """Multi-camera refinement of depth."""
 
-    radius_px: int = 4
-    """Half the side of the window (4: 9 x 9 px)."""
-    window_sigma_px: float = 2.5
+    radius_px: int = 3
+    """Half the side of the window (3: 7 x 7 px)."""
+    window_sigma_px: float = 2.0
     """Width of the Gaussian weight over the window."""
     iterations: int = 10
     """Most Gauss-Newton steps."""
-    converged_px: float = 0.005
+    converged_px: float = 0.02
     """A step below this many px of disparity ends the iterations."""
     camera_zncc: float = 0.5
     """A camera below this correlation is taken to be occluded."""
