@@ -663,6 +663,18 @@ def _as_tracks(state: _State, observations: _Observations, colors: Any) -> Track
     )
 
 
+def residuals_px(reconstruction: Reconstruction) -> Float[np.ndarray, "o 2"]:
+    """Projected minus observed pixel for each observation of the tracks; NaN behind the camera."""
+    tracks = reconstruction.tracks
+    if tracks is None:
+        return np.zeros((0, 2))
+    observations, points = _sorted_by_point(tracks, np.ones(len(tracks.point_index), dtype=bool))
+    state = _initial_state(reconstruction, tracks.points[points], _Prior.of(reconstruction.rig))
+    residuals = np.empty_like(observations.pixels)
+    residuals[np.argsort(tracks.point_index, kind="stable")] = _residual_vectors(state, observations)
+    return residuals
+
+
 # --- the adjustment ----------------------------------------------------------------------------------------------
 
 

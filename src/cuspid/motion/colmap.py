@@ -1,17 +1,51 @@
-"""COLMAP's types and files."""
+"""COLMAP's types, its sparse models on disk, and its own mapper for comparison.
+
+COLMAP's rig frame is that of the rig's reference camera, here always the first one; see :meth:`cuspid.rig.Rig.rebased`.
+Images are named ``<camera>/<frame><suffix>``. COLMAP's mapper runs in several threads and is not
+repeatable bit for bit.
+"""
 
 from __future__ import annotations
 
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import combinations, pairwise
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pycolmap
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
 from cuspid.camera import Camera
+from cuspid.capture import Capture
+from cuspid.errors import InputError, OutputError, ReconstructionError
 from cuspid.geometry import Rigid3
+from cuspid.motion.adjustment import residuals_px
+from cuspid.reconstruction import Dropped, Reconstruction, Tracks
+from cuspid.rig import Rig
+
+MODEL_FILES = ("cameras", "images", "points3D")
+"""Files of a sparse model, ``.bin`` or ``.txt``; newer ones also have ``rigs`` and ``frames``."""
+
+SCALE_SPREAD = 0.02
+"""Largest relative spread of the scale between the frames of a model that is still taken for this handpiece."""
 
 
-def colmap_camera(camera: Camera) -> pycolmap.Camera:
+def colmap_camera(camera: Camera, camera_id: int = 0) -> pycolmap.Camera:
     """COLMAP's OPENCV camera; it has the same parameters and pixel origin."""
-    return pycolmap.Camera(model="OPENCV", width=camera.width, height=camera.height, params=camera.parameters.tolist())
+    return pycolmap.Camera(
+        camera_id=camera_id,
+        model="OPENCV",
+        width=camera.width,
+        height=camera.height,
+        params=camera.parameters.tolist(),
+    )
 
 
 def colmap_rigid(transform: Rigid3) -> pycolmap.Rigid3d:
@@ -22,3 +56,335 @@ def colmap_rigid(transform: Rigid3) -> pycolmap.Rigid3d:
 def rigid_from_colmap(transform: pycolmap.Rigid3d) -> Rigid3:
     """COLMAP's transform as a value."""
     return Rigid3.from_matrix(np.asarray(transform.matrix()))
+
+
+# --- writing -----------------------------------------------------------------------------------------------------
+
+
+def _sensor(index: int) -> pycolmap.sensor_t:
+    """The camera of that index in the rig."""
+    return pycolmap.sensor_t(pycolmap.SensorType.CAMERA, index + 1)
+
+
+def _colmap_rig(rig: Rig) -> pycolmap.Rig:
+    """The rig in the frame of its first camera."""
+    made = pycolmap.Rig(rig_id=1)
+    made.add_ref_sensor(_sensor(0))
+    for index, mounted in enumerate(list(rig.rebased()[0].cameras.values())[1:], start=1):
+        made.add_sensor(_sensor(index), colmap_rigid(mounted.cam_from_rig))
+    return made
+
+
+def _add_images(model: pycolmap.Reconstruction, found: Reconstruction, suffix: str) -> Int[np.ndarray, "o"]:
+    """Add frames and images with their keypoints; returns the number of each observation within its image."""
+    cameras, tracks = found.rig.names, found.tracks
+    reference_from_rig = found.rig.rebased()[1]
+    image_of = np.zeros(0, np.int64)
+    if tracks is not None:
+        image_of = tracks.frame_index * len(cameras) + tracks.camera_index
+    within = np.zeros(len(image_of), dtype=np.int64)
+    by_image = np.split(
+        np.argsort(image_of, kind="stable"),
+        np.searchsorted(np.sort(image_of), np.arange(1, len(found.frames) * len(cameras))),
+    )
+    for f, (name, rig_from_world) in enumerate(found.rig_from_world.items()):
+        frame = pycolmap.Frame(frame_id=f + 1, rig_id=1)
+        identifiers = [f * len(cameras) + c + 1 for c in range(len(cameras))]
+        for c, identifier in enumerate(identifiers):
+            frame.add_data_id(pycolmap.data_t(_sensor(c), identifier))
+        frame.rig_from_world = colmap_rigid(reference_from_rig @ rig_from_world)
+        model.add_frame(frame)
+        for c, identifier in enumerate(identifiers):
+            seen = by_image[identifier - 1]
+            within[seen] = np.arange(len(seen))
+            pixels = np.zeros((0, 2)) if tracks is None else tracks.pixels[seen]
+            image = pycolmap.Image(f"{cameras[c]}/{name}{suffix}", pixels, c + 1, identifier)
+            image.frame_id = f + 1
+            model.add_image(image)
+        model.register_frame(f + 1)
+    return within
+
+
+def _add_points(model: pycolmap.Reconstruction, tracks: Tracks, cameras: int, within: Int[np.ndarray, "o"]) -> None:
+    """Add the points with their tracks."""
+    order = np.argsort(tracks.point_index, kind="stable")
+    image = (tracks.frame_index * cameras + tracks.camera_index + 1)[order].tolist()
+    number = within[order].tolist()
+    ends = np.searchsorted(tracks.point_index[order], np.arange(len(tracks.points) + 1)).tolist()
+    for point, (first, last) in enumerate(pairwise(ends)):
+        if last - first >= 2:
+            elements = [pycolmap.TrackElement(image[o], number[o]) for o in range(first, last)]
+            model.add_point3D(tracks.points[point], pycolmap.Track(elements), tracks.colors[point])
+
+
+def to_colmap(found: Reconstruction, suffix: str = ".png") -> pycolmap.Reconstruction:
+    """The reconstruction as COLMAP's, with one rig; observations that it knows become the images' keypoints."""
+    model = pycolmap.Reconstruction()
+    for index, mounted in enumerate(found.rig.cameras.values()):
+        model.add_camera(colmap_camera(mounted.camera, index + 1))
+    model.add_rig(_colmap_rig(found.rig))
+    within = _add_images(model, found, suffix)
+    if found.tracks is not None:
+        _add_points(model, found.tracks, len(found.rig.names), within)
+    model.update_point_3d_errors()
+    return model
+
+
+def write_model(folder: Path, found: Reconstruction, capture: Capture) -> None:
+    """Write COLMAP's sparse model (binary) to a folder, whole or not at all. Raises OutputError."""
+    model = to_colmap(found, capture.suffix)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".part-") as part:
+            model.write(part)
+            written = pycolmap.Reconstruction(part)
+            if (written.num_points3D(), written.num_reg_images()) != (model.num_points3D(), model.num_reg_images()):
+                raise OSError("the disk is full")
+            for file in sorted(Path(part).iterdir()):
+                file.replace(folder / file.name)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise OutputError(f"{folder}: the sparse model cannot be written ({error}); free some space") from error
+
+
+# --- reading -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _PosedImages:
+    """Images of a model that belong to a capture."""
+
+    cam_from_world: Mapping[tuple[str, str], Rigid3]
+    """By (frame, camera), in the model's unit of length."""
+    image_ids: Mapping[int, tuple[str, str]]
+    """(frame, camera) of COLMAP's identifiers."""
+
+
+def _model_folder(folder: Path) -> Path:
+    """The folder itself or its subfolder ``0``, whichever holds a model. Raises InputError."""
+    for candidate in (folder, folder / "0", folder / "sparse", folder / "sparse" / "0"):
+        for suffix in (".bin", ".txt"):
+            if all((candidate / f"{name}{suffix}").is_file() for name in MODEL_FILES):
+                return candidate
+    raise InputError(f"{folder}: no COLMAP model; a folder with cameras, images and points3D (.bin or .txt) is needed")
+
+
+def _read(folder: Path) -> pycolmap.Reconstruction:
+    """A model from disk. Raises InputError."""
+    folder = _model_folder(folder)
+    try:
+        return pycolmap.Reconstruction(folder)
+    except (RuntimeError, ValueError, IndexError, MemoryError, KeyError, OverflowError) as error:
+        raise InputError(f"{folder}: the COLMAP model cannot be read; export it again from COLMAP") from error
+
+
+def _match_names(model: pycolmap.Reconstruction, capture: Capture, source: str) -> _PosedImages:
+    """Registered images by frame and camera. Raises InputError where the names are not those of the capture."""
+    frames, cameras = {frame.name for frame in capture.frames}, set(capture.handpiece.rig.names)
+    poses, identifiers, strange = {}, {}, []
+    for identifier in sorted(model.reg_image_ids()):
+        image = model.images[identifier]
+        path = Path(image.name)
+        frame, camera = path.stem, path.parent.name
+        if frame in frames and camera in cameras:
+            poses[frame, camera] = rigid_from_colmap(image.cam_from_world())
+            identifiers[identifier] = frame, camera
+        else:
+            strange.append(image.name)
+    if not poses:
+        example = f"{capture.handpiece.rig.names[0]}/{capture.frames[0].name}{capture.suffix}"
+        found = f"named like {strange[0]}" if strange else "none placed"
+        raise InputError(f"{source}: its images ({found}) are not those of the capture, which are named like {example}")
+    return _PosedImages(poses, identifiers)
+
+
+def _centres(rig: Rig, poses: Mapping[str, Rigid3]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Camera centres of one frame in the model's world and in the rig."""
+    return (
+        np.array([pose.inverse().translation for pose in poses.values()]),
+        np.array([rig[camera].centre_in_rig for camera in poses]),
+    )
+
+
+def _baselines(rig: Rig, poses: Mapping[str, Rigid3]) -> Float[np.ndarray, "n 2"]:
+    """Distances of each two cameras of one frame in the model and in the rig (mm)."""
+    in_model, in_rig = _centres(rig, poses)
+    pairs = np.array(list(combinations(range(len(in_model)), 2))).reshape(-1, 2)
+    return np.stack([np.linalg.norm(c[pairs[:, 0]] - c[pairs[:, 1]], axis=1) for c in (in_model, in_rig)], axis=1)
+
+
+def _scale(rig: Rig, frames: Mapping[str, Mapping[str, Rigid3]], source: str) -> tuple[float, float]:
+    """Millimetres per unit of the model and its relative spread over the frames. Raises InputError."""
+    sums = np.array([_baselines(rig, poses).sum(axis=0) for poses in frames.values()])
+    sums = sums[(sums > 0).all(axis=1)]
+    if not len(sums):
+        raise InputError(f"{source}: no frame has two placed cameras, so its scale is unknown; use a model of the rig")
+    scales = sums[:, 1] / sums[:, 0]
+    middle = float(np.median(scales))
+    return middle, float(np.median(np.abs(scales - middle)) / middle)
+
+
+def _rig_pose(rig: Rig, poses: Mapping[str, Rigid3], scale: float) -> Rigid3:
+    """rig_from_world (mm) that agrees best with the cameras of a frame: mean rotation, mean centre."""
+    turns = [rig[camera].cam_from_rig.rotation.T @ pose.rotation for camera, pose in poses.items()]
+    rotation = Rotation.from_matrix(np.stack(turns)).mean().as_matrix()
+    in_model, in_rig = _centres(rig, poses)
+    return Rigid3(rotation, in_rig.mean(axis=0) - rotation @ (scale * in_model.mean(axis=0)))
+
+
+def _tracks(
+    model: pycolmap.Reconstruction,
+    images: _PosedImages,
+    frames: Sequence[str],
+    cameras: Sequence[str],
+    world_from_model: Rigid3,
+    scale: float,
+) -> Tracks:
+    """Points and observations in the new world, mm."""
+    points: list[Any] = []
+    colors, rows, pixels = [], [], []
+    for _, point in sorted(model.points3D.items()):
+        for element in point.track.elements:
+            frame, camera = images.image_ids.get(element.image_id, ("", ""))
+            if frame:
+                rows.append((len(points), frames.index(frame), cameras.index(camera)))
+                pixels.append(model.images[element.image_id].points2D[element.point2D_idx].xy)
+        points.append(point.xyz)
+        colors.append(point.color)
+    index = np.array(rows, dtype=np.int64).reshape(-1, 3)
+    return Tracks(
+        points=world_from_model.apply(scale * np.array(points, dtype=np.float64).reshape(-1, 3)),
+        colors=np.array(colors, dtype=np.uint8).reshape(-1, 3),
+        point_index=index[:, 0],
+        frame_index=index[:, 1],
+        camera_index=index[:, 2],
+        pixels=np.array(pixels, dtype=np.float64).reshape(-1, 2),
+    )
+
+
+def from_colmap(model: pycolmap.Reconstruction, capture: Capture, source: str) -> Reconstruction:
+    """Metric poses of a capture from a COLMAP model made with or without the rig; the rig's baselines set the scale.
+
+    The log holds ``mm_per_model_unit`` and ``scale_spread``, by which a caller judges whether the model fits the
+    handpiece. Raises InputError where the image names do not match or the scale cannot be found.
+    """
+    rig, images = capture.handpiece.rig, _match_names(model, capture, source)
+    by_frame: dict[str, dict[str, Rigid3]] = {}
+    for frame in capture.frames:
+        poses = {c: images.cam_from_world[frame.name, c] for c in rig.names if (frame.name, c) in images.cam_from_world}
+        if poses:
+            by_frame[frame.name] = poses
+    scale, spread = _scale(rig, by_frame, source)
+    rig_from_model = {frame: _rig_pose(rig, poses, scale) for frame, poses in by_frame.items()}
+    world_from_model = next(iter(rig_from_model.values()))
+    model_from_world = world_from_model.inverse()
+    tracks = _tracks(model, images, list(by_frame), rig.names, world_from_model, scale)
+    found = Reconstruction(
+        rig=rig,
+        rig_from_world={frame: pose @ model_from_world for frame, pose in rig_from_model.items()},
+        tracks=tracks if len(tracks.points) else None,
+        dropped=tuple(
+            Dropped(what=f"frame {frame.name}", reason=f"not in {source}")
+            for frame in capture.frames
+            if frame.name not in by_frame
+        ),
+        log={"mm_per_model_unit": scale, "scale_spread": spread},
+    )
+    return found if found.tracks is None else replace(found, reprojection_rms_px=_rms(residuals_px(found)))
+
+
+def _rms(residuals: Float[np.ndarray, "o 2"]) -> float:
+    """RMS length of the residuals; those behind a camera do not count."""
+    return float(np.sqrt(np.nanmean(np.sum(residuals**2, axis=1))))
+
+
+def read_model(folder: Path, capture: Capture) -> Reconstruction:
+    """Poses of a capture from a folder with a COLMAP model (``--from-poses``), metric by the handpiece's rig.
+
+    Raises InputError where the folder holds no model, its image names are not those of the capture, or its cameras do
+    not keep the distances that they have in the handpiece.
+    """
+    found = from_colmap(_read(folder), capture, str(folder))
+    if found.log["scale_spread"] > SCALE_SPREAD:
+        raise InputError(
+            f"{folder}: the distances between its cameras vary by {100 * found.log['scale_spread']:.1f} % of those in "
+            "the handpiece; give the handpiece file that took these images, or make the model with its rig_config.json"
+        )
+    return found
+
+
+# --- COLMAP's own mapper -----------------------------------------------------------------------------------------
+
+
+def _rig_config(rig: Rig) -> pycolmap.RigConfig:
+    """The rig as COLMAP's rig_config.json has it."""
+    cameras = []
+    for index, (name, mounted) in enumerate(rig.rebased()[0].cameras.items()):
+        entry = pycolmap.RigConfigCamera(
+            ref_sensor=index == 0, image_prefix=f"{name}/", camera=colmap_camera(mounted.camera)
+        )
+        if index:
+            entry.cam_from_rig = colmap_rigid(mounted.cam_from_rig)
+        cameras.append(entry)
+    return pycolmap.RigConfig(cameras=cameras)
+
+
+def _mapper_options(with_rig: bool, seed: int) -> pycolmap.IncrementalPipelineOptions:
+    """COLMAP's defaults; the given calibration is held where the rig is used."""
+    options = pycolmap.IncrementalPipelineOptions(random_seed=seed)
+    if with_rig:
+        options.ba_refine_focal_length = False
+        options.ba_refine_extra_params = False
+        options.ba_refine_sensor_from_rig = False
+        options.mapper.abs_pose_refine_focal_length = False
+        options.mapper.abs_pose_refine_extra_params = False
+    return options
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """COLMAP without its log lines."""
+    before, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, 2
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before
+
+
+def _map(
+    capture: Capture, folder: Path, with_rig: bool, seed: int
+) -> tuple[list[pycolmap.Reconstruction], list[float]]:
+    """COLMAP's models of the capture and the seconds of extraction, matching and mapping."""
+    images, database = capture.folder / "images", folder / "database.db"
+    names = [f"{c}/{f.name}{capture.suffix}" for c in capture.handpiece.rig.names for f in capture.frames]
+    moments = [time.perf_counter()]
+    pycolmap.extract_features(database, images, names, camera_mode=pycolmap.CameraMode.PER_FOLDER)
+    moments.append(time.perf_counter())
+    if with_rig:
+        with pycolmap.Database.open(database) as opened:
+            pycolmap.apply_rig_config([_rig_config(capture.handpiece.rig)], opened)
+    pycolmap.match_sequential(database)
+    moments.append(time.perf_counter())
+    models = pycolmap.incremental_mapping(database, images, folder / "sparse", _mapper_options(with_rig, seed))
+    moments.append(time.perf_counter())
+    return list(models.values()), np.diff(moments).tolist()
+
+
+def locate_with_colmap(capture: Capture, folder: Path, *, with_rig: bool, seed: int = 0) -> Reconstruction:
+    """COLMAP as a user would run it: default features, sequential matching, incremental mapper; for comparison.
+
+    Without the rig the largest of its models is returned, scaled by the rig's baselines. The log tells how many models
+    there were, the images placed, and the seconds of each step. Raises ReconstructionError where there is no model.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    (folder / "sparse").mkdir(parents=True)
+    with _quiet():
+        models, seconds = _map(capture, folder, with_rig, seed)
+    if not models:
+        raise ReconstructionError(
+            f"COLMAP placed none of {len(capture.frames)} frames; give the surface more texture or use --motion rig"
+        )
+    largest = max(models, key=lambda model: int(model.num_reg_images()))
+    found = from_colmap(largest, capture, "COLMAP's largest model")
+    log = dict(zip(("extraction_s", "matching_s", "mapping_s"), seconds, strict=True))
+    counts = {"models": len(models), "images_placed": largest.num_reg_images()}
+    return replace(found, log={**found.log, **log, **counts})
