@@ -1,0 +1,1 @@
+"""What is scanned: the mouth, the jaw and its teeth."""

@@ -21,7 +21,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
-Arch = Literal["lower", "upper"]
 Values = Float[np.ndarray, "n"]
 Points = Float[np.ndarray, "n 3"]
 
@@ -144,6 +143,15 @@ class Crown:
         return self.depth_mm / 2
 
 
+@lru_cache(maxsize=4096)
+def top_of(crown: Crown, x: float, y: float) -> float:
+    """Height of the surface above a point of the cervical plane, mm."""
+    z = np.linspace(0.0, 1.1 * crown.height_mm, 500)
+    distance = crown_distance(crown, np.column_stack([np.full(500, x), np.full(500, y), z]))
+    last = np.flatnonzero(distance < 0).max(initial=0)
+    return float(np.interp(0.0, distance[last : last + 2], z[last : last + 2]))
+
+
 def smooth_max(a: Values, b: Values, radius: float) -> Values:
     """The larger of two values (n,), rounded where they differ by less than `radius`."""
     blend = np.maximum(radius - np.abs(a - b), 0.0) / radius
@@ -166,8 +174,9 @@ def crown_distance(crown: Crown, points: Points) -> Values:
     """Approximate signed distance in mm, shape (n,), of points (n, 3) in the frame of the tooth; negative inside."""
     level = points[:, 2] / crown.height_mm
     side, lingual_side = _side_distance(crown, points, level)
-    top = _edge_height(crown, points, level) if crown.edge else _occlusal_height(crown, points)
-    return smooth_max(side + _side_relief(crown, points, level, lingual_side), 0.8 * (points[:, 2] - top), crown.rim_mm)
+    relief = _side_relief(crown, points, level, lingual_side)
+    top = _edge_height(crown, crown.edge, points) if crown.edge else _occlusal_height(crown, points)
+    return smooth_max(side + relief, 0.8 * (points[:, 2] - top), crown.rim_mm)
 
 
 def silhouettes(crown: Crown, level: Values) -> tuple[Values, Values, Values, Values]:
@@ -191,13 +200,22 @@ def _side_distance(crown: Crown, points: Points, level: Values) -> tuple[Values,
     mesial, distal, buccal, lingual = silhouettes(crown, level)
     b = (buccal - lingual) / 2
     v = (points[:, 1] - (buccal + lingual) / 2) / b
-    a = (distal - mesial) / 2 * (1 + crown.taper * np.clip(v, -1.2, 1.2))
+    a = (distal - mesial) / 2 * (1 + crown.taper * np.clip(v, -1.2, 1.2)) / _fullness(crown)
     u = (points[:, 0] - (distal + mesial) / 2 - crown.skew * points[:, 1]) / a
     n = crown.squareness
     pu, pv = np.abs(u) ** (n - 1), np.abs(v) ** (n - 1)
     q = (pu * np.abs(u) + pv * np.abs(v) + 1e-12) ** (1 / n)
     gradient = q ** (1 - n) * np.hypot(pu / a, pv / b)
     return (q - 1) / np.maximum(gradient, 1e-6), -v
+
+
+@lru_cache(maxsize=256)
+def _fullness(crown: Crown) -> float:
+    """How much wider taper and skew would make the section, as a ratio."""
+    v = np.linspace(-1.0, 1.0, 401)
+    reach = (1 + crown.taper * v) * (1 - np.abs(v) ** crown.squareness) ** (1 / crown.squareness)
+    shift = crown.skew * v * crown.half_depth_mm / crown.half_width_mm
+    return float((reach + shift).max() + (reach - shift).max()) / 2
 
 
 def _side_relief(crown: Crown, points: Points, level: Values, lingual_side: Values) -> Values:
@@ -219,13 +237,12 @@ def _lingual_fossa(crown: Crown, edge: Edge, points: Points, level: Values) -> V
     return window * (edge.fossa_mm - edge.lingual_ridge_mm * np.exp(-((u / 0.2) ** 2)))
 
 
-def _edge_height(crown: Crown, points: Points, level: Values) -> Values:
+def _edge_height(crown: Crown, edge: Edge, points: Points) -> Values:
     """Height in mm, shape (n,), of the incisal edge above each point."""
-    assert crown.edge is not None
     u = points[:, 0] / crown.half_width_mm
     soft = np.sqrt(u * u + 0.01) - 0.1
-    mesial = crown.edge.mesial_fall_mm * soft**crown.edge.mesial_power
-    distal = crown.edge.distal_fall_mm * soft**crown.edge.distal_power
+    mesial = edge.mesial_fall_mm * soft**edge.mesial_power
+    distal = edge.distal_fall_mm * soft**edge.distal_power
     return crown.height_mm - np.where(u < 0, mesial, distal)
 
 

@@ -5,11 +5,10 @@ occlusion* (Am. J. Orthod. 1972) in sign and order of magnitude; silhouettes, cu
 after Wheeler's plates of each tooth.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from cuspid.anatomy.crowns import AxialGroove, Crown, Edge, Lobe
-from cuspid.jaw import Arch
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,21 +70,6 @@ def _marginal_ridge(x: float, y: float, height: float, length: float = 2.6) -> L
     return Lobe(x=x, y=y, height=height, slope=1.0, radius_mm=0.6, stretch=(1.0, length))
 
 
-_UPPER_MOLAR = dict(
-    mesial=(0.45, 0.75, 0.82, 0.88, 0.95, 1.0, 0.98, 0.88, 0.70),
-    distal=(0.40, 0.72, 0.80, 0.90, 0.98, 1.0, 0.96, 0.84, 0.65),
-    buccal=(0.34, 0.43, 0.46, 0.50, 0.49, 0.47, 0.42, 0.33, 0.20),
-    lingual=(0.36, 0.44, 0.46, 0.485, 0.50, 0.49, 0.44, 0.34, 0.20),
-    squareness=2.7,
-)
-_LOWER_MOLAR = dict(
-    mesial=(0.55, 0.78, 0.83, 0.90, 0.96, 1.0, 0.98, 0.88, 0.70),
-    distal=(0.45, 0.74, 0.82, 0.91, 0.98, 1.0, 0.96, 0.84, 0.65),
-    buccal=(0.33, 0.42, 0.46, 0.50, 0.49, 0.46, 0.40, 0.30, 0.16),
-    lingual=(0.33, 0.42, 0.44, 0.475, 0.50, 0.49, 0.45, 0.36, 0.22),
-    squareness=2.75,
-)
-
 UPPER_CENTRAL = Crown(
     width_mm=8.5, depth_mm=7.0, height_mm=10.5,
     mesial=(0.35, 0.68, 0.80, 0.86, 0.92, 0.97, 1.0, 0.97, 0.92),
@@ -94,6 +78,8 @@ UPPER_CENTRAL = Crown(
     lingual=(0.22, 0.38, 0.44, 0.50, 0.37, 0.19, 0.07, 0.02, 0.04),
     squareness=2.7, taper=0.25, rim_mm=0.5,
     edge=Edge(mesial_fall_mm=0.5, distal_fall_mm=1.2, mesial_power=5.0, distal_power=3.5, fossa_mm=0.8),
+    grooves=(AxialGroove(side="buccal", x=-0.28, depth_mm=0.08, width_mm=1.0, end=0.3),
+             AxialGroove(side="buccal", x=0.32, depth_mm=0.08, width_mm=1.0, end=0.3)),
 )  # fmt: skip
 UPPER_LATERAL = Crown(
     width_mm=6.5, depth_mm=6.0, height_mm=9.0,
@@ -103,6 +89,8 @@ UPPER_LATERAL = Crown(
     lingual=(0.22, 0.38, 0.44, 0.50, 0.37, 0.19, 0.07, 0.03, 0.04),
     squareness=2.5, taper=0.25, rim_mm=0.5,
     edge=Edge(mesial_fall_mm=0.6, distal_fall_mm=1.3, mesial_power=4.0, distal_power=3.0, fossa_mm=0.8),
+    grooves=(AxialGroove(side="buccal", x=-0.28, depth_mm=0.06, width_mm=0.8, end=0.3),
+             AxialGroove(side="buccal", x=0.32, depth_mm=0.06, width_mm=0.8, end=0.3)),
 )  # fmt: skip
 UPPER_CANINE = Crown(
     width_mm=7.5, depth_mm=8.0, height_mm=10.0,
@@ -113,6 +101,8 @@ UPPER_CANINE = Crown(
     squareness=2.1, taper=0.25, rim_mm=0.7,
     edge=Edge(mesial_fall_mm=2.0, distal_fall_mm=2.8, mesial_power=1.2, distal_power=1.2, fossa_mm=0.4,
               lingual_ridge_mm=0.45),
+    grooves=(AxialGroove(side="buccal", x=-0.4, depth_mm=0.12, width_mm=1.0, end=0.2),
+             AxialGroove(side="buccal", x=0.4, depth_mm=0.14, width_mm=1.0, end=0.2)),
 )  # fmt: skip
 UPPER_FIRST_PREMOLAR = Crown(
     width_mm=7.0, depth_mm=9.0, height_mm=8.5,
@@ -135,16 +125,21 @@ UPPER_SECOND_PREMOLAR = Crown(
     marginal_ridges=(_marginal_ridge(-0.80, 0.0, 0.75), _marginal_ridge(0.80, 0.0, 0.75)),
 )  # fmt: skip
 UPPER_FIRST_MOLAR = Crown(
-    width_mm=10.0, depth_mm=11.0, height_mm=7.5, **_UPPER_MOLAR, taper=-0.03, skew=-0.08,
+    width_mm=10.0, depth_mm=11.0, height_mm=7.5,
+    mesial=(0.45, 0.75, 0.82, 0.88, 0.95, 1.0, 0.98, 0.88, 0.70),
+    distal=(0.40, 0.72, 0.80, 0.90, 0.98, 1.0, 0.96, 0.84, 0.65),
+    buccal=(0.34, 0.43, 0.46, 0.50, 0.49, 0.47, 0.42, 0.33, 0.20),
+    lingual=(0.36, 0.44, 0.46, 0.485, 0.50, 0.49, 0.44, 0.34, 0.20),
+    squareness=2.7, taper=-0.03, skew=-0.08,
     cusps=(_cusp(-0.48, 0.56, 0.97, -70.0), _cusp(0.42, 0.56, 0.93, -125.0), _cusp(-0.36, -0.48, 1.0, 60.0),
            _cusp(0.52, -0.58, 0.86, 110.0)),
     marginal_ridges=(_marginal_ridge(-0.84, 0.05, 0.74), _marginal_ridge(0.84, -0.05, 0.70)),
     grooves=(AxialGroove(side="buccal", x=-0.02, depth_mm=0.45), AxialGroove(side="lingual", x=0.12, depth_mm=0.45)),
 )  # fmt: skip
-UPPER_SECOND_MOLAR = Crown(
-    width_mm=9.0, depth_mm=11.0, height_mm=7.0, **_UPPER_MOLAR, taper=0.03, skew=-0.11,
+UPPER_SECOND_MOLAR = replace(
+    UPPER_FIRST_MOLAR, width_mm=9.0, depth_mm=11.0, height_mm=7.0, taper=0.03, skew=-0.11,
     cusps=(_cusp(-0.46, 0.55, 0.98, -70.0), _cusp(0.42, 0.52, 0.90, -125.0), _cusp(-0.30, -0.48, 1.0, 60.0),
-           _cusp(0.55, -0.58, 0.78, 110.0)),
+           _cusp(0.55, -0.60, 0.84, 110.0)),
     marginal_ridges=(_marginal_ridge(-0.84, 0.05, 0.74), _marginal_ridge(0.84, -0.05, 0.68)),
     grooves=(AxialGroove(side="buccal", x=-0.02, depth_mm=0.4), AxialGroove(side="lingual", x=0.2, depth_mm=0.4)),
 )  # fmt: skip
@@ -176,6 +171,8 @@ LOWER_CANINE = Crown(
     squareness=2.1, taper=0.25, rim_mm=0.7,
     edge=Edge(mesial_fall_mm=1.5, distal_fall_mm=2.6, mesial_power=1.2, distal_power=1.2, fossa_mm=0.3,
               lingual_ridge_mm=0.3),
+    grooves=(AxialGroove(side="buccal", x=-0.4, depth_mm=0.1, width_mm=1.0, end=0.2),
+             AxialGroove(side="buccal", x=0.4, depth_mm=0.12, width_mm=1.0, end=0.2)),
 )  # fmt: skip
 LOWER_FIRST_PREMOLAR = Crown(
     width_mm=7.0, depth_mm=7.5, height_mm=8.5,
@@ -184,7 +181,7 @@ LOWER_FIRST_PREMOLAR = Crown(
     buccal=(0.30, 0.42, 0.47, 0.50, 0.48, 0.40, 0.29, 0.15, -0.02),
     lingual=(0.30, 0.42, 0.43, 0.44, 0.48, 0.50, 0.45, 0.30, 0.15),
     squareness=2.2, taper=0.18,
-    cusps=(_cusp(-0.02, 0.28, 1.0, -90.0, slope=1.3), _cusp(-0.05, -0.66, 0.72, 90.0)),
+    cusps=(_cusp(-0.02, 0.28, 1.0, -90.0, slope=1.6), _cusp(-0.05, -0.68, 0.72, 90.0)),
     marginal_ridges=(_marginal_ridge(-0.78, -0.15, 0.68), _marginal_ridge(0.78, -0.15, 0.70)),
 )  # fmt: skip
 LOWER_SECOND_PREMOLAR = Crown(
@@ -194,19 +191,24 @@ LOWER_SECOND_PREMOLAR = Crown(
     buccal=(0.30, 0.42, 0.46, 0.50, 0.48, 0.42, 0.34, 0.22, 0.06),
     lingual=(0.30, 0.42, 0.43, 0.46, 0.49, 0.50, 0.46, 0.34, 0.18),
     squareness=2.4, taper=0.02,
-    cusps=(_cusp(0.0, 0.42, 1.0, -90.0), _cusp(-0.32, -0.58, 0.86, 80.0), _cusp(0.42, -0.58, 0.80, 110.0)),
+    cusps=(_cusp(0.0, 0.42, 1.0, -90.0), _cusp(-0.36, -0.58, 0.86, 80.0), _cusp(0.50, -0.56, 0.83, 115.0)),
     marginal_ridges=(_marginal_ridge(-0.80, 0.0, 0.74), _marginal_ridge(0.80, 0.0, 0.72)),
 )  # fmt: skip
 LOWER_FIRST_MOLAR = Crown(
-    width_mm=11.0, depth_mm=10.5, height_mm=7.5, **_LOWER_MOLAR, taper=0.05,
+    width_mm=11.0, depth_mm=10.5, height_mm=7.5,
+    mesial=(0.55, 0.78, 0.83, 0.90, 0.96, 1.0, 0.98, 0.88, 0.70),
+    distal=(0.45, 0.74, 0.82, 0.91, 0.98, 1.0, 0.96, 0.84, 0.65),
+    buccal=(0.33, 0.42, 0.46, 0.50, 0.49, 0.46, 0.40, 0.30, 0.16),
+    lingual=(0.33, 0.42, 0.44, 0.475, 0.50, 0.49, 0.45, 0.36, 0.22),
+    squareness=2.75, taper=0.05,
     cusps=(_cusp(-0.54, 0.50, 0.96, -70.0), _cusp(0.10, 0.54, 0.94, -95.0), _cusp(0.66, 0.28, 0.86, -150.0),
            _cusp(-0.50, -0.56, 1.0, 70.0), _cusp(0.34, -0.58, 0.98, 105.0)),
     marginal_ridges=(_marginal_ridge(-0.86, -0.02, 0.76), _marginal_ridge(0.88, -0.15, 0.74)),
     grooves=(AxialGroove(side="buccal", x=-0.22, depth_mm=0.5), AxialGroove(side="buccal", x=0.48, depth_mm=0.35),
              AxialGroove(side="lingual", x=-0.08, depth_mm=0.35, end=0.5)),
 )  # fmt: skip
-LOWER_SECOND_MOLAR = Crown(
-    width_mm=10.5, depth_mm=10.0, height_mm=7.0, **_LOWER_MOLAR, taper=0.05,
+LOWER_SECOND_MOLAR = replace(
+    LOWER_FIRST_MOLAR, width_mm=10.5, depth_mm=10.0, height_mm=7.0,
     cusps=(_cusp(-0.48, 0.52, 0.97, -75.0), _cusp(0.44, 0.52, 0.94, -105.0), _cusp(-0.46, -0.56, 1.0, 75.0),
            _cusp(0.42, -0.56, 0.97, 105.0)),
     marginal_ridges=(_marginal_ridge(-0.86, 0.0, 0.76), _marginal_ridge(0.86, 0.0, 0.74)),

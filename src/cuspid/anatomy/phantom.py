@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from cuspid.anatomy.crowns import Crown, Points, Values, crown_distance, silhouettes, smooth_max, smooth_min
+from cuspid.anatomy.crowns import Crown, Points, Values, crown_distance, silhouettes, smooth_max, smooth_min, top_of
 from cuspid.anatomy.dentition import ARCH_FORMS, QUADRANTS, ArchForm, Tooth
 from cuspid.jaw import GUM, Arch, Jaw
 from cuspid.mesh import Mesh
@@ -80,7 +80,7 @@ class PlacedTooth:
 
     def to_tooth(self, points: Points) -> Points:
         """Points (n, 3) of the jaw in the frame of the tooth."""
-        return (points - self.origin) @ self.axes
+        return np.einsum("ni,ij->nj", points - self.origin, self.axes)
 
     def to_jaw(self, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
         """A point (3,) of the tooth in the jaw."""
@@ -93,6 +93,7 @@ def build_phantom(options: PhantomOptions = PhantomOptions()) -> Jaw:
     teeth = place_teeth(options, rng)
     model = _Model(teeth=teeth, gum=_Gum.around(teeth, rng))
     vertices, faces = _mesh(model.distance, *model.bounds, options.edge_mm)
+    vertices = _onto_margin(model, vertices, faces, options.edge_mm)
     labels = model.labels(vertices[faces].mean(axis=1))
     return Jaw(mesh=Mesh(vertices, faces), face_labels=_one_patch_each(faces, labels), arch=options.arch)
 
@@ -102,34 +103,40 @@ def build_phantom(options: PhantomOptions = PhantomOptions()) -> Jaw:
 
 def place_teeth(options: PhantomOptions, rng: np.random.Generator) -> tuple[PlacedTooth, ...]:
     """The fourteen teeth from the last molar at X < 0 round to the one at X > 0."""
-    quadrants = {side: _individual(QUADRANTS[options.arch], options.variation, rng) for side in (-1, 1)}
+    quadrants = _individuals(QUADRANTS[options.arch], options.variation, rng)
     headings = _solve_headings(quadrants, ARCH_FORMS[options.arch], options)
     left, right = (_place_quadrant(quadrants[side], side, headings, options) for side in (-1, 1))
     return _level((*reversed(left), *right), options)
 
 
-def _individual(teeth: tuple[Tooth, ...], variation: float, rng: np.random.Generator) -> tuple[Tooth, ...]:
-    """The teeth of one quadrant with random size, rotation, inclination and height."""
-    return tuple(_vary(tooth, variation * rng.standard_normal(8)) for tooth in teeth)
+def _individuals(teeth: tuple[Tooth, ...], variation: float, rng: np.random.Generator) -> dict[int, tuple[Tooth, ...]]:
+    """The varied teeth of both quadrants, by the sign of X; counterparts are alike but not the same."""
+    common = rng.standard_normal((len(teeth), 8))
+    deviates = {side: 0.8 * common + 0.6 * rng.standard_normal(common.shape) for side in (-1, 1)}
+    return {
+        side: tuple(_vary(tooth, variation * row) for tooth, row in zip(teeth, rows, strict=True))
+        for side, rows in deviates.items()
+    }
 
 
 def _vary(tooth: Tooth, z: Float[np.ndarray, "8"]) -> Tooth:
+    """A tooth changed in size, shape and stand by standard normal deviates (8,)."""
     crown = tooth.crown
-    cusps = tuple(replace(cusp, height=cusp.height + 0.01 * z[6 + k % 2]) for k, cusp in enumerate(crown.cusps))
+    cusps = tuple(replace(cusp, height=cusp.height + 0.012 * z[6 + k % 2]) for k, cusp in enumerate(crown.cusps))
     varied = replace(
         crown,
-        width_mm=crown.width_mm * (1 + 0.015 * z[0]),
-        depth_mm=crown.depth_mm * (1 + 0.015 * z[1]),
-        height_mm=crown.height_mm * (1 + 0.02 * z[2]),
+        width_mm=crown.width_mm * (1 + 0.02 * z[0]),
+        depth_mm=crown.depth_mm * (1 + 0.02 * z[1]),
+        height_mm=crown.height_mm * (1 + 0.03 * z[2]),
         cusps=cusps,
-        phase=3.0 * z[0],
+        phase=3.0 * float(z.sum()),
     )
     return replace(
         tooth,
         crown=varied,
-        rotation_deg=tooth.rotation_deg + 2.0 * z[3],
+        rotation_deg=tooth.rotation_deg + 2.5 * z[3],
         inclination_deg=tooth.inclination_deg + 1.5 * z[4],
-        rise_mm=tooth.rise_mm + 0.1 * z[5],
+        rise_mm=tooth.rise_mm + 0.12 * z[5],
     )
 
 
@@ -142,7 +149,7 @@ def _fdi(arch: Arch, side: int, position: int) -> int:
 def _solve_headings(
     quadrants: dict[int, tuple[Tooth, ...]], form: ArchForm, options: PhantomOptions
 ) -> Float[np.ndarray, "7"]:
-    """Headings (7,) in radians of the teeth of a quadrant, nearest to the natural ones, that give the arch its widths."""
+    """Headings (7,) in radians of a quadrant's teeth: nearest to the natural ones, giving the arch its widths."""
     targets = np.array([form.inter_canine_mm, form.inter_first_molar_mm, form.inter_second_molar_mm])
     natural = np.radians(form.headings_deg)
 
@@ -163,9 +170,9 @@ def _landmark(tooth: Tooth) -> Float[np.ndarray, "3"]:
     """Cusp tip of a canine, or the mesiobuccal groove of a molar at the rim, in the frame of the tooth, mm."""
     crown = tooth.crown
     if crown.edge:
-        return np.array([0.0, (crown.buccal[-2] - crown.lingual[-2]) / 2 * crown.depth_mm, crown.height_mm])
-    first = crown.grooves[0].x * crown.half_width_mm
-    return np.array([first, 0.62 * crown.half_depth_mm, 0.85 * crown.height_mm])
+        return _tips(tooth)[0]
+    x, y = crown.grooves[0].x * crown.half_width_mm, 0.62 * crown.half_depth_mm
+    return np.array([x, y, top_of(crown, x, y)])
 
 
 def _place_quadrant(
@@ -189,7 +196,7 @@ def _place(tooth: Tooth, fdi: int, side: int, centre: Float[np.ndarray, "2"], he
     origin = pivot - axes @ np.array([0.0, 0.0, PIVOT * tooth.crown.height_mm])
     mirror = np.array([side, 1.0, 1.0])
     placed = PlacedTooth(fdi=fdi, tooth=tooth, axes=mirror[:, None] * axes, origin=mirror * origin)
-    return replace(placed, origin=placed.origin - [0.0, 0.0, placed.to_jaw(_top(tooth))[2]])
+    return replace(placed, origin=placed.origin - [0.0, 0.0, _top(placed)[2]])
 
 
 def _stand(tooth: Tooth) -> Float[np.ndarray, "3 3"]:
@@ -201,18 +208,23 @@ def _stand(tooth: Tooth) -> Float[np.ndarray, "3 3"]:
     return about_z @ about_x @ about_y
 
 
-def _top(tooth: Tooth) -> Float[np.ndarray, "3"]:
-    """The highest cusp tip or the middle of the incisal edge in the frame of the tooth, mm."""
+def _tips(tooth: Tooth) -> Float[np.ndarray, "c 3"]:
+    """The cusp tips, or the middle of the incisal edge, in the frame of the tooth, mm."""
     crown = tooth.crown
-    if crown.edge:
-        return np.array([0.0, (crown.buccal[-2] - crown.lingual[-2]) / 2 * crown.depth_mm, crown.height_mm])
-    cusp = max(crown.cusps, key=lambda cusp: cusp.height)
-    return np.array([cusp.x * crown.half_width_mm, cusp.y * crown.half_depth_mm, cusp.height * crown.height_mm])
+    middle = (0.0, (crown.buccal[-2] - crown.lingual[-2]) / 2 * crown.depth_mm)
+    cusps = [(cusp.x * crown.half_width_mm, cusp.y * crown.half_depth_mm) for cusp in crown.cusps]
+    return np.array([(x, y, top_of(crown, x, y)) for x, y in cusps or [middle]])
+
+
+def _top(placed: PlacedTooth) -> Float[np.ndarray, "3"]:
+    """The highest tip in the jaw, mm."""
+    tips = np.array([placed.to_jaw(tip) for tip in _tips(placed.tooth)])
+    return tips[tips[:, 2].argmax()]
 
 
 def _level(teeth: tuple[PlacedTooth, ...], options: PhantomOptions) -> tuple[PlacedTooth, ...]:
     """The teeth on the curve of Spee, in the occlusal frame: centred, their tops level on average."""
-    tops = np.array([placed.to_jaw(_top(placed.tooth)) for placed in teeth])
+    tops = np.array([_top(placed) for placed in teeth])
     u = (tops[:, 1] - tops[:, 1].min()) / np.ptp(tops[:, 1])
     spee = (1 if options.arch == "upper" else -1) * options.spee_mm * 4 * u * (1 - u)
     rise = spee + [placed.tooth.rise_mm for placed in teeth]
@@ -283,7 +295,7 @@ class _Gum:
 
     def undulation(self, points: Points) -> Values:
         """Unevenness of the gum in mm, shape (n,)."""
-        waves = np.sin(points @ self.waves[:, :3].T + self.waves[:, 3])
+        waves = np.sin(np.einsum("ni,wi->nw", points, self.waves[:, :3]) + self.waves[:, 3])
         return 0.25 / np.sqrt(WAVES) * waves.sum(axis=1)
 
 
@@ -302,13 +314,14 @@ def _collar(placed: PlacedTooth, local: Points, distance: Values) -> Values:
     level = np.maximum(local[:, 2] / crown.height_mm, -0.1)
     u = np.minimum(np.abs(local[:, 0]) / crown.half_width_mm, 1.2)
     _, _, buccal, lingual = silhouettes(crown, level)
-    lean = 0.45 - 0.5 * u * u - 3.0 * level
+    lean = 0.45 - 0.8 * u * u - 3.0 * level
     across = smooth_max(local[:, 1] - buccal - lean, lingual - lean - local[:, 1], 0.5)
     behind = (0.4 if placed.is_last else 1.0) * crown.half_width_mm
     along = np.maximum(-crown.half_width_mm - local[:, 0], local[:, 0] - behind) - 0.3
     slab = smooth_max(across, along, 1.5)
-    sleeve = smooth_min(slab, distance - 0.45, 0.8)
-    return smooth_max(_above_root_end(crown, local, sleeve), 0.9 * (local[:, 2] - _margin(placed, local)), 0.6)
+    above = 0.9 * (local[:, 2] - _margin(placed, local))
+    sleeve = smooth_max(distance - 0.45, above, 0.6)
+    return _above_root_end(crown, local, smooth_min(sleeve, smooth_max(slab, above - 0.3, 1.6), 0.8))
 
 
 def _above_root_end(crown: Crown, local: Points, distance: Values) -> Values:
@@ -317,10 +330,10 @@ def _above_root_end(crown: Crown, local: Points, distance: Values) -> Values:
 
 
 def _margin(placed: PlacedTooth, local: Points) -> Values:
-    """Height in mm, shape (n,), of the gum's margin, scalloped: low in the middle of a tooth, high at its neighbours."""
+    """Height in mm, shape (n,), of the scalloped margin: low in the middle of a tooth, high towards its neighbours."""
     crown = placed.tooth.crown
     u = local[:, 0] / crown.half_width_mm
-    papilla = 0.48 if crown.edge else 0.38
+    papilla = 0.5 if crown.edge else 0.41
     rise = np.where(u > 0, 0.1 if placed.is_last else papilla, papilla)
     return crown.height_mm * (0.03 + rise * np.minimum(np.abs(u), 1.05) ** 2.5)
 
@@ -350,9 +363,8 @@ class _Model:
         gum = np.minimum(self.gum.ridge_distance(points), FAR_MM)
         nearest = np.zeros(len(points), dtype=np.int64)
         for placed in self.teeth:
-            local = placed.to_tooth(points)
-            near = np.flatnonzero(_within_reach(placed, local))
-            local = local[near]
+            near = _within_reach(placed, points)
+            local = placed.to_tooth(points[near])
             shape = placed.tooth.crown
             crown = _above_root_end(shape, local, crown_distance(shape, local))
             gum[near] = smooth_min(gum[near], _collar(placed, local, crown), 1.6)
@@ -365,24 +377,31 @@ class _Model:
         tooth, gum, _ = self.parts(points)
         return smooth_min(tooth, gum, CREASE_MM)
 
+    def lead_of_gum(self, points: Points) -> Values:
+        """How much nearer the gum is than the teeth, mm, shape (n,); zero at the margin."""
+        tooth, gum, _ = self.parts(points)
+        return tooth - gum
+
     def labels(self, points: Points) -> Int[np.ndarray, "n"]:
         """FDI number, or 0 for gum, of points on the surface."""
         tooth, gum, nearest = self.parts(points)
         return np.where(tooth <= gum, nearest, GUM)
 
 
-def _within_reach(placed: PlacedTooth, local: Points) -> np.ndarray:
-    """Mask (n,) of the points nearer to a tooth than about `FAR_MM`."""
+def _within_reach(placed: PlacedTooth, points: Points) -> Int[np.ndarray, "m"]:
+    """Indices (m,) of the points nearer to a tooth than about `FAR_MM`."""
     crown = placed.tooth.crown
-    low = np.array([-crown.half_width_mm, -crown.half_depth_mm, -ROOT * crown.height_mm])
-    high = np.array([crown.half_width_mm, crown.half_depth_mm, crown.height_mm])
-    return np.all((local > low - FAR_MM) & (local < high + FAR_MM), axis=1)
+    reach = np.hypot(crown.half_width_mm, crown.half_depth_mm) + FAR_MM
+    from_axis = points[:, :2] - placed.to_jaw(np.array([0.0, 0.0, crown.height_mm / 2]))[:2]
+    return np.flatnonzero((from_axis**2).sum(axis=1) < reach**2)
 
 
 # The surface
 
 BLOCK = 4
 """Grid cells along the edge of a block that is sampled or skipped as a whole."""
+STENCIL_MM = 0.02
+"""Size of the stencil of a gradient."""
 CHUNK = 60_000
 """Points evaluated at once: enough for numpy, few enough for the cache."""
 
@@ -449,16 +468,67 @@ def _relax(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) ->
 
 def _onto_surface(field: Field, vertices: Float[np.ndarray, "v 3"], edge_mm: float) -> Float[np.ndarray, "v 3"]:
     """Vertices moved along the gradient onto the zero surface, by at most half an edge."""
-    corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * 0.02
-    values = np.stack([_in_chunks(field, vertices + corner) for corner in corners], axis=1)
-    gradient = values @ corners / (4 * 0.02**2)
-    step = values.mean(axis=1) / np.maximum((gradient**2).sum(axis=1), 0.05)
-    move = -step[:, None] * gradient
+    values, gradient = _value_and_gradient(field, vertices)
+    return _newton(vertices, values, gradient, 0.5 * edge_mm)
+
+
+def _value_and_gradient(field: Field, points: Points) -> tuple[Values, Points]:
+    """A field, shape (n,), and its gradient, (n, 3), from its values at the corners of a small tetrahedron."""
+    corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * STENCIL_MM
+    values = np.stack([_in_chunks(field, points + corner) for corner in corners], axis=1)
+    return values.mean(axis=1), np.einsum("nc,ck->nk", values, corners) / (4 * STENCIL_MM**2)
+
+
+def _newton(points: Points, values: Values, gradient: Points, limit_mm: float) -> Points:
+    """Points (n, 3) after a step along the gradient towards the zero of a field, no longer than the limit."""
+    move = -(values / np.maximum((gradient**2).sum(axis=1), 0.4))[:, None] * gradient
     length = np.linalg.norm(move, axis=1, keepdims=True)
-    return vertices + move * np.minimum(1.0, 0.5 * edge_mm / np.maximum(length, 1e-12))
+    return points + move * np.minimum(1.0, limit_mm / np.maximum(length, 1e-12))
 
 
 # The labels
+
+
+def _onto_margin(
+    model: _Model, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], edge_mm: float
+) -> Float[np.ndarray, "v 3"]:
+    """Vertices beside the margin of the gum moved onto it, so that edges run along it."""
+    lead = _in_chunks(model.lead_of_gum, vertices)
+    ends = _edges(faces)
+    ends = ends[lead[ends[:, 0]] * lead[ends[:, 1]] < 0]
+    nearer = np.abs(lead[ends[:, 0]]) < np.abs(lead[ends[:, 1]])
+    beside = np.unique(np.where(nearer, ends[:, 0], ends[:, 1]))
+    moved = vertices.copy()
+    moved[beside] = _along_surface(model, vertices[beside], 0.4 * edge_mm)
+    return _without_folds(vertices, moved, faces)
+
+
+def _without_folds(
+    vertices: Float[np.ndarray, "v 3"], moved: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> Float[np.ndarray, "v 3"]:
+    """The moved vertices, but for those that would turn one of their faces over or flatten it."""
+    before = _face_cross(vertices, faces)
+    for _ in range(3):
+        after = _face_cross(moved, faces)
+        folded = (before * after).sum(axis=1) < 0.2 * (before**2).sum(axis=1)
+        moved = moved.copy()
+        moved[faces[folded]] = vertices[faces[folded]]
+    return moved
+
+
+def _face_cross(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
+    """Cross products (f, 3) of two edges of each face, mm^2."""
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    return np.cross(b - a, c - a)
+
+
+def _along_surface(model: _Model, points: Points, limit_mm: float) -> Points:
+    """Points (n, 3) of the surface moved within it towards the margin of the gum."""
+    values, slope = _value_and_gradient(model.lead_of_gum, points)
+    _, normal = _value_and_gradient(model.distance, points)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
+    tangential = slope - (slope * normal).sum(axis=1, keepdims=True) * normal
+    return _onto_surface(model.distance, _newton(points, values, tangential, limit_mm), limit_mm)
 
 
 def _one_patch_each(faces: Int[np.ndarray, "f 3"], labels: Int[np.ndarray, "f"]) -> Int[np.ndarray, "f"]:
