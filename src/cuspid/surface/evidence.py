@@ -1,9 +1,8 @@
 """What one depth map says about a point in space: its distance to the surface that was seen, and how sure that is.
 
 Around a pixel the surface is a plane. With normalised coordinates (x, y) inverse depth is affine there,
-1/Z = a x + b y + c, so that the plane is n.X = 1 with n = (a, b, c), and a point X = (x, y, 1) z lies at the signed
-distance (1 - z/Z) / |n| from it, positive on the side of the camera. Inverse depth between pixels is bilinear, which is
-exact for planes; where the depth jumps there is no answer.
+1/Z = a x + b y + c, so that the plane is n.X = 1 with n = (a, b, c), and a point X of the camera frame lies at the
+signed distance (1 - n.X) / |n| from it, positive on the side of the camera. The pixel nearest to a point answers.
 """
 
 from __future__ import annotations
@@ -20,35 +19,37 @@ from cuspid.reconstruction import DepthMap
 DISTANCE, WEIGHT, NORMAL_X, NORMAL_Y, NORMAL_Z, PIXEL = range(6)
 """What :func:`observe` writes: signed distance (mm), weight, unit normal in the camera, flat index of the pixel."""
 
+EXTRAPOLATED = 0.1
+"""Weight of a pixel without depth beside pixels with depth, relative to theirs."""
+
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
     """A depth map prepared for questions."""
 
-    inverse_depth: Float[np.ndarray, "h w"]
-    """1/Z in 1/mm, NaN where unknown. float32."""
-    weight: Float[np.ndarray, "h w"]
-    """Confidence times the cosine between ray and normal. float32."""
     plane: Float[np.ndarray, "h w 3"]
-    """n of the plane through each pixel, in the camera frame, 1/mm. float32."""
-    intrinsics: Float[np.ndarray, "5"]
-    """fx, fy, cx, cy with the first pixel centre at 0, and the largest jump of depth between neighbours in mm."""
+    """n of the plane at each pixel, in the camera frame, 1/mm. float32."""
+    weight: Float[np.ndarray, "h w"]
+    """Confidence times the cosine between ray and normal, 0 where nothing is known. float32."""
+    intrinsics: Float[np.ndarray, "4"]
+    """fx, fy, cx, cy with the first pixel centre at 0."""
 
     @property
     def arrays(self) -> tuple[Any, ...]:
         """For numba."""
-        return self.inverse_depth, self.weight, self.plane, self.intrinsics
+        return self.plane, self.weight, self.intrinsics
 
     @staticmethod
     def of(depth_map: DepthMap, largest_jump_mm: float) -> Evidence:
-        """Prepare a depth map."""
+        """Prepare a depth map; neighbours that differ by more than the jump do not belong to one surface."""
         known = np.isfinite(depth_map.depth_mm) & (depth_map.confidence > 0)
         inverse = np.where(known, 1 / depth_map.depth_mm, np.nan).astype(np.float32)
-        (fx, fy), (cx, cy) = depth_map.camera.focal_px, depth_map.camera.principal_point_px - 0.5
-        intrinsics = np.array([fx, fy, cx, cy, largest_jump_mm])
-        plane, cosine = _planes(inverse, intrinsics)
+        focal, centre = depth_map.camera.focal_px, depth_map.camera.principal_point_px - 0.5
+        intrinsics = np.concatenate([focal, centre])
+        plane, cosine = _planes(inverse, intrinsics, largest_jump_mm)
         weight = np.where(known, depth_map.confidence * cosine, 0).astype(np.float32)
-        return Evidence(inverse, weight, plane, intrinsics)
+        plane, weight = _grown(plane, weight)
+        return Evidence(plane, weight, intrinsics)
 
 
 @njit(cache=True, nogil=True)
@@ -69,10 +70,10 @@ def _slope(inverse, row, column, d_row, d_column, jump):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _planes(inverse, intrinsics):
+def _planes(inverse, intrinsics, jump):
     """Plane through each pixel, and the cosine between its normal and the ray; 0 where no plane can be told."""
     height, width = inverse.shape
-    fx, fy, cx, cy, jump = intrinsics
+    fx, fy, cx, cy = intrinsics
     plane = np.zeros((height, width, 3), np.float32)
     cosine = np.zeros((height, width), np.float32)
     for row in range(height):
@@ -89,33 +90,45 @@ def _planes(inverse, intrinsics):
     return plane, cosine
 
 
+@njit(cache=True, nogil=True)
+@no_type_check
+def _grown(plane, weight):
+    """Carry the planes one pixel on, for the outermost half windows and voxels would be lost at every border."""
+    height, width = weight.shape
+    wide_plane, wide_weight = plane.copy(), weight.copy()
+    for row in range(height):
+        for column in range(width):
+            if weight[row, column] > 0:
+                continue
+            best = np.float32(0)
+            for r in range(max(row - 1, 0), min(row + 2, height)):
+                for c in range(max(column - 1, 0), min(column + 2, width)):
+                    if weight[r, c] > best:
+                        best = weight[r, c]
+                        wide_plane[row, column] = plane[r, c]
+            wide_weight[row, column] = EXTRAPOLATED * best
+    return wide_plane, wide_weight
+
+
 @njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def observe(evidence, right, down, depth, seen):
     """Ask about a point of the camera frame in front of the camera; False where the map has no answer."""
-    inverse, weight, plane, intrinsics = evidence
-    u = intrinsics[0] * right / depth + intrinsics[2]
-    v = intrinsics[1] * down / depth + intrinsics[3]
-    if not (u >= 0 and v >= 0 and u < inverse.shape[1] - 1 and v < inverse.shape[0] - 1):
+    plane, weight, intrinsics = evidence
+    u = intrinsics[0] * right / depth + intrinsics[2] + 0.5
+    v = intrinsics[1] * down / depth + intrinsics[3] + 0.5
+    if not (u >= 0 and v >= 0 and u < weight.shape[1] and v < weight.shape[0]):
         return False
     column, row = int(u), int(v)
-    a, b = inverse[row, column], inverse[row, column + 1]
-    c, d = inverse[row + 1, column], inverse[row + 1, column + 1]
-    low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
-    if not (high - low <= intrinsics[4] * low * high) or np.isnan(a + b + c + d):
+    if not weight[row, column] > 0:
         return False
-    fx, fy = u - column, v - row
-    near_column, near_row = column + (fx > 0.5), row + (fy > 0.5)
-    n = plane[near_row, near_column]
-    length = np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
-    if length == 0:
-        return False
-    top, bottom = a + fx * (b - a), c + fx * (d - c)
-    seen[0] = (1 - depth * (top + fy * (bottom - top))) / length
-    seen[1] = weight[near_row, near_column]
-    seen[2], seen[3], seen[4] = -n[0] / length, -n[1] / length, -n[2] / length
-    seen[5] = near_row * inverse.shape[1] + near_column
-    return seen[1] > 0
+    a, b, c = plane[row, column, 0], plane[row, column, 1], plane[row, column, 2]
+    inverse_length = 1 / np.sqrt(a * a + b * b + c * c)
+    seen[0] = (1 - a * right - b * down - c * depth) * inverse_length
+    seen[1] = weight[row, column]
+    seen[2], seen[3], seen[4] = -a * inverse_length, -b * inverse_length, -c * inverse_length
+    seen[5] = row * weight.shape[1] + column
+    return True
 
 
 def colors_of(depth_map: DepthMap) -> UInt8[np.ndarray, "p 3"]:

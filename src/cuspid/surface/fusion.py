@@ -8,7 +8,7 @@ too few maps confirm from its outer side is not kept: that takes away ghosts and
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import no_type_check
 
@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numba import njit
 
-from cuspid.errors import ReconstructionError
+from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.reconstruction import DepthMap
 from cuspid.surface.evidence import Evidence, colors_of, observe
 from cuspid.surface.meshing import extract
-from cuspid.surface.volume import SparseVolume
+from cuspid.surface.volume import SparseVolume, in_threads
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,34 +43,64 @@ class FusionOptions:
     """Number of depth maps that must confirm a vertex."""
 
 
-def fuse(
-    depth_maps: Sequence[DepthMap], rig_from_world: Mapping[str, Rigid3], options: FusionOptions | None = None
-) -> Mesh:
-    """One coloured mesh in the world frame from the depth maps whose frame was located.
+Progress = Callable[[str, int, int], None]
+"""Told the stage, how much of it is done and how much there is."""
 
-    ``depth_maps`` is gone through twice and may read its items lazily. Raises ReconstructionError where there is none.
+
+def _silent(stage: str, done: int, total: int) -> None:
+    """A :data:`Progress` that says nothing."""
+
+
+def fuse(
+    depth_maps: Iterable[DepthMap],
+    rig_from_world: Mapping[str, Rigid3],
+    options: FusionOptions | None = None,
+    *,
+    progress: Progress = _silent,
+) -> Mesh:
+    """One coloured mesh in the world frame from the depth maps whose frame was located; no faces if they hold nothing.
+
+    ``depth_maps`` is gone through twice and may read its items lazily, but a generator, which is spent after the first
+    time, will not do. The same maps in the same order give the same mesh.
     """
     options = options or FusionOptions()
     volume = SparseVolume(options.voxel_mm, options.truncation_voxels * options.voxel_mm)
+    half = len(rig_from_world)
+    for depth_map, cam_from_world, done in _located(depth_maps, rig_from_world):
+        points = rig_from_world[depth_map.frame].inverse().apply(depth_map.points_in_rig()[0])
+        volume.integrate(Evidence.of(depth_map, options.largest_jump_mm), cam_from_world, points)
+        progress("fusion", done, 2 * half)
+    votes = Votes.on(extract(volume, options.least_weight))
+    del volume
+    for depth_map, cam_from_world, done in _located(depth_maps, rig_from_world):
+        votes.collect(Evidence.of(depth_map, options.largest_jump_mm), depth_map, cam_from_world, options.agreement_mm)
+        progress("fusion", half + done, 2 * half)
+    return votes.outcome(options.least_maps)
+
+
+def _located(
+    depth_maps: Iterable[DepthMap], rig_from_world: Mapping[str, Rigid3]
+) -> Iterator[tuple[DepthMap, Rigid3, int]]:
+    """Depth maps of located frames, where their camera was, and how many frames were begun."""
+    begun: set[str] = set()
     for depth_map in depth_maps:
         if depth_map.frame in rig_from_world:
-            cam_from_world = depth_map.cam_from_rig @ rig_from_world[depth_map.frame]
-            points, _ = depth_map.points_in_rig()
-            world_points = rig_from_world[depth_map.frame].inverse().apply(points)
-            volume.integrate(Evidence.of(depth_map, options.largest_jump_mm), cam_from_world, world_points)
-    rough = extract(volume, options.least_weight)
-    del volume
-    if len(rough.faces) == 0:
-        raise ReconstructionError(
-            "surface: the located frames hold no depth; more texture, more overlap or a better calibration is needed"
-        )
-    return _projected(rough, depth_maps, rig_from_world, options)
+            begun.add(depth_map.frame)
+            yield depth_map, depth_map.cam_from_rig @ rig_from_world[depth_map.frame], len(begun)
+
+
+CHUNK = 256
+"""Vertices that are tested together for being in the view of a depth map."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Votes:
-    """What the depth maps say about each vertex; filled map by map."""
+class Votes:
+    """What the depth maps say about each vertex of a rough mesh; filled map by map."""
 
+    rough: Mesh
+    """The zero level of the volume."""
+    balls: Float[np.ndarray, "c 4"]
+    """Centre and radius (mm) of a ball around each chunk of consecutive vertices, which lie close together."""
     moment: Float[np.ndarray, "v 2"]
     """Sum of weights, and of weights times distance along the vertex normal (mm)."""
     color: Float[np.ndarray, "v 3"]
@@ -78,70 +108,80 @@ class _Votes:
     maps: Int[np.ndarray, "v"]
     """Number of depth maps that confirm the vertex."""
 
+    @staticmethod
+    def on(rough: Mesh) -> Votes:
+        """No votes yet."""
+        count = len(rough.vertices)
+        chunks = [rough.vertices[start : start + CHUNK] for start in range(0, count, CHUNK)]
+        balls = np.zeros((len(chunks), 4))
+        for ball, chunk in zip(balls, chunks, strict=True):
+            ball[:3] = (chunk.min(axis=0) + chunk.max(axis=0)) / 2
+            ball[3] = np.linalg.norm(chunk - ball[:3], axis=1).max()
+        return Votes(rough, balls, np.zeros((count, 2)), np.zeros((count, 3)), np.zeros(count, dtype=np.int64))
 
-def _projected(
-    rough: Mesh, depth_maps: Sequence[DepthMap], rig_from_world: Mapping[str, Rigid3], options: FusionOptions
-) -> Mesh:
-    """The mesh with its vertices on the mean of the depth maps, coloured, without what too few maps confirm."""
-    count = len(rough.vertices)
-    votes = _Votes(np.zeros((count, 2)), np.zeros((count, 3)), np.zeros(count, dtype=np.int64))
-    for depth_map in depth_maps:
-        if depth_map.frame in rig_from_world:
-            cam_from_world = depth_map.cam_from_rig @ rig_from_world[depth_map.frame]
-            _collect(rough, Evidence.of(depth_map, options.largest_jump_mm), depth_map, cam_from_world, options, votes)
-    return _moved(rough, votes, options.least_maps)
+    def collect(self, evidence: Evidence, depth_map: DepthMap, cam_from_world: Rigid3, agreement_mm: float) -> None:
+        """Let one depth map vote on the vertices that it sees."""
+        chunks = self._in_view(depth_map.camera, cam_from_world)
+        colors = colors_of(depth_map)
+        in_threads(
+            lambda part: _vote(
+                chunks[part],
+                self.rough.vertices,
+                self.rough.vertex_normals,
+                cam_from_world.rotation,
+                cam_from_world.translation,
+                evidence.arrays,
+                colors,
+                agreement_mm,
+                self.moment,
+                self.color,
+                self.maps,
+            ),
+            len(chunks),
+        )
 
+    def _in_view(self, camera: Camera, cam_from_world: Rigid3) -> Int[np.ndarray, "k"]:
+        """Chunks whose ball meets the pyramid of view (a few more, never less)."""
+        centres, radii = cam_from_world.apply(self.balls[:, :3]), self.balls[:, 3]
+        corners = camera.rays(
+            np.array([[0.0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]])
+        )
+        inward = np.cross(corners, np.roll(corners, -1, axis=0))
+        inward /= np.linalg.norm(inward, axis=1, keepdims=True)
+        return np.flatnonzero((centres @ inward.T > -radii[:, None]).all(axis=1))
 
-def _collect(
-    rough: Mesh,
-    evidence: Evidence,
-    depth_map: DepthMap,
-    cam_from_world: Rigid3,
-    options: FusionOptions,
-    votes: _Votes,
-) -> None:
-    _vote(
-        rough.vertices,
-        rough.vertex_normals,
-        cam_from_world.rotation,
-        cam_from_world.translation,
-        evidence.arrays,
-        colors_of(depth_map),
-        options.agreement_mm,
-        votes.moment,
-        votes.color,
-        votes.maps,
-    )
-
-
-def _moved(rough: Mesh, votes: _Votes, least_maps: int) -> Mesh:
-    total = np.maximum(votes.moment[:, :1], 1e-12)
-    vertices = rough.vertices + rough.vertex_normals * votes.moment[:, 1:] / total
-    colors: UInt8[np.ndarray, "v 3"] = np.rint(votes.color / total).clip(0, 255).astype(np.uint8)
-    confirmed = votes.maps >= least_maps
-    return Mesh(vertices, rough.faces, colors).submesh(confirmed[rough.faces].all(axis=1))
+    def outcome(self, least_maps: int) -> Mesh:
+        """The mesh with its vertices on the mean of the depth maps, coloured, without what too few maps confirm."""
+        total = np.maximum(self.moment[:, :1], 1e-12)
+        vertices = self.rough.vertices + self.rough.vertex_normals * self.moment[:, 1:] / total
+        colors: UInt8[np.ndarray, "v 3"] = np.rint(self.color / total).clip(0, 255).astype(np.uint8)
+        confirmed = self.maps >= least_maps
+        return Mesh(vertices, self.rough.faces, colors).submesh(confirmed[self.rough.faces].all(axis=1))
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _vote(vertices, normals, rotation, translation, evidence, colors, agreement, moment, color, maps):
+def _vote(chunks, vertices, normals, rotation, translation, evidence, colors, agreement, moment, color, maps):
     """Each vertex that a depth map sees from its outer side and near its surface gets the map's vote."""
-    seen = np.zeros(6)
-    for n in range(vertices.shape[0]):
-        x = rotation @ vertices[n] + translation
-        if x[2] <= 0 or not observe(evidence, x[0], x[1], x[2], seen):
-            continue
-        distance = seen[0]
-        normal = rotation @ normals[n]
-        facing = normal[0] * seen[2] + normal[1] * seen[3] + normal[2] * seen[4]
-        if abs(distance) >= agreement or facing < 0.3:
-            continue
-        closeness = 1 - (distance / agreement) ** 2
-        weight = seen[1] * closeness * closeness
-        moment[n, 0] += weight
-        # The surface lies a distance below the point: move against the normal where the point is outside.
-        moment[n, 1] -= weight * distance / facing
-        pixel = int(seen[5])
-        for channel in range(3):
-            color[n, channel] += weight * colors[pixel, channel]
-        maps[n] += 1
+    seen, x, normal = np.zeros(6), np.zeros(3), np.zeros(3)
+    for chunk in chunks:
+        for n in range(chunk * CHUNK, min((chunk + 1) * CHUNK, vertices.shape[0])):
+            for k in range(3):
+                x[k], normal[k] = translation[k], 0
+                for m in range(3):
+                    x[k] += rotation[k, m] * vertices[n, m]
+                    normal[k] += rotation[k, m] * normals[n, m]
+            if x[2] <= 0 or not observe(evidence, x[0], x[1], x[2], seen):
+                continue
+            distance = seen[0]
+            facing = normal[0] * seen[2] + normal[1] * seen[3] + normal[2] * seen[4]
+            if abs(distance) >= agreement or facing < 0.3:
+                continue
+            closeness = 1 - (distance / agreement) ** 2
+            weight = seen[1] * closeness * closeness
+            moment[n, 0] += weight
+            # A vertex outside of the surface moves against its normal.
+            moment[n, 1] -= weight * distance / facing
+            for channel in range(3):
+                color[n, channel] += weight * colors[int(seen[5]), channel]
+            maps[n] += 1

@@ -7,7 +7,11 @@ key in a sorted array; ``neighbours`` holds the slot of each of the 27 blocks ar
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import no_type_check
 
 import numpy as np
@@ -36,6 +40,14 @@ def unpack(keys: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n 3"]:
     return np.stack([keys >> 42, (keys >> 21) & mask, keys & mask], axis=-1) - _OFFSET
 
 
+def in_threads(work: Callable[[slice], None], count: int) -> None:
+    """Call ``work``, which must leave the interpreter's lock alone, on a slice of ``count`` items for each processor."""
+    threads = os.cpu_count() or 1
+    bounds = np.linspace(0, count, threads + 1).astype(int)
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(work, (slice(start, stop) for start, stop in pairwise(bounds.tolist()))))
+
+
 @dataclass
 class SparseVolume:
     """Signed distances and weights, growing as depth maps come in. Not frozen: it is an accumulator."""
@@ -59,16 +71,20 @@ class SparseVolume:
         """Blend in one depth map, in the blocks around its points (world, mm)."""
         keys = self._keys_around(points)
         slots = self._allocate(keys)
-        _integrate(
-            self.distance,
-            self.weight,
-            slots,
-            unpack(keys).astype(np.float64) * BLOCK,
-            self.voxel_mm,
-            cam_from_world.rotation,
-            cam_from_world.translation,
-            evidence.arrays,
-            self.truncation_mm,
+        origins = unpack(keys).astype(np.float64) * BLOCK
+        in_threads(
+            lambda part: _integrate(
+                self.distance,
+                self.weight,
+                slots[part],
+                origins[part],
+                self.voxel_mm,
+                cam_from_world.rotation,
+                cam_from_world.translation,
+                evidence.arrays,
+                self.truncation_mm,
+            ),
+            len(slots),
         )
 
     def _keys_around(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "b"]:
