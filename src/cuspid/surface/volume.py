@@ -41,7 +41,7 @@ def unpack(keys: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n 3"]:
 
 
 def in_threads(work: Callable[[slice], None], count: int) -> None:
-    """Call ``work``, which must leave the interpreter's lock alone, on a slice of ``count`` items for each processor."""
+    """Call ``work``, which must release the GIL, on a slice of ``count`` items for each processor."""
     threads = os.cpu_count() or 1
     bounds = np.linspace(0, count, threads + 1).astype(int)
     with ThreadPoolExecutor(threads) as pool:
