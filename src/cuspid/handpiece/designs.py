@@ -105,7 +105,7 @@ def _side_view(options: DesignOptions, side: int) -> Rigid3:
     tilt = np.deg2rad(options.side_tilt_deg)
     target = np.array([0, side * options.side_offset_mm, -options.side_depth_mm])
     axis = np.array([0, -side * np.sin(tilt), -np.cos(tilt)])
-    return _looking_at(target, axis, np.array([-side, 0, 0]), options.working_distance_mm)
+    return _looking_at(target, axis, np.array([-side, 0.0, 0.0]), options.working_distance_mm)
 
 
 def _looking_at(

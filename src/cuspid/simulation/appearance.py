@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -129,7 +129,8 @@ GRADIENT_NOISE_SD = 0.27
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _corner(ix, iy, iz, x, y, z):  # type: ignore[no-untyped-def]
+@no_type_check
+def _corner(ix, iy, iz, x, y, z):
     """Dot product of the offset with one of twelve gradients, chosen by a hash of the lattice point."""
     h = (
         (np.uint32(ix) * np.uint32(0x8DA6B343))
@@ -144,7 +145,8 @@ def _corner(ix, iy, iz, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def gradient_noise(x, y, z):  # type: ignore[no-untyped-def]
+@no_type_check
+def gradient_noise(x, y, z):
     """Perlin's improved noise, about -1 to 1, zero mean, one feature a unit."""
     fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
     ix, iy, iz = np.int64(fx), np.int64(fy), np.int64(fz)
@@ -166,7 +168,8 @@ def gradient_noise(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def albedo_at(point, material, palette):  # type: ignore[no-untyped-def]
+@no_type_check
+def albedo_at(point, material, palette):
     """Linear RGB albedo of a material at one point of the jaw, as a tuple."""
     x, y, z = point
     octaves = palette.octaves[material]
@@ -189,7 +192,8 @@ def albedo_at(point, material, palette):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _albedo(points, materials, palette, out):  # type: ignore[no-untyped-def]
+@no_type_check
+def _albedo(points, materials, palette, out):
     for i in range(len(points)):
         out[i] = albedo_at((points[i, 0], points[i, 1], points[i, 2]), materials[i], palette)
 

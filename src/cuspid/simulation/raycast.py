@@ -3,7 +3,8 @@
 For each of the rays through a pixel: the albedo of the solid texture at the hit, lit by the lights that are on, each a
 point with a lobe and 1/d^2 falloff, through a GGX coat with Schlick's Fresnel term (Walter et al. 2007). Shadows are
 traced once a pixel. Interreflection is a constant share of the light that reaches a point. Radiance is linear RGB in
-units in which a white diffuse surface facing a light of power 1 at 1 mm has radiance 1. The world is the jaw's frame.
+units in which a white diffuse surface facing a light of power 1 at 1 mm has radiance 1 plus that share. The world is
+the frame of the jaw.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import cached_property
 from multiprocessing import get_context
-from typing import NamedTuple
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -146,7 +147,8 @@ class _Rays(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _turned(directions, rotation):  # type: ignore[no-untyped-def]
+@no_type_check
+def _turned(directions, rotation):
     """``Rigid3.rotate`` without BLAS, whose threads would fight with the other processes."""
     out = np.empty_like(directions)
     for i in range(len(directions)):
@@ -178,7 +180,8 @@ def _lighting(
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _point(rays, i):  # type: ignore[no-untyped-def]
+@no_type_check
+def _point(rays, i):
     t = rays.distances[i]
     return (
         rays.origin[0] + t * rays.directions[i, 0],
@@ -188,12 +191,14 @@ def _point(rays, i):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _dot(a, b):  # type: ignore[no-untyped-def]
+@no_type_check
+def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _normal(rays, i, surface):  # type: ignore[no-untyped-def]
+@no_type_check
+def _normal(rays, i, surface):
     """Interpolated unit normal at a hit, on the side that the ray came from."""
     face = rays.faces[i]
     u, v, w = rays.barycentric[i, 0], rays.barycentric[i, 1], rays.barycentric[i, 2]
@@ -208,7 +213,8 @@ def _normal(rays, i, surface):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _incoming(point, index, lights):  # type: ignore[no-untyped-def]
+@no_type_check
+def _incoming(point, index, lights):
     """Unit vector towards a light, and its lobe over the squared distance at a point."""
     x = lights.positions[index, 0] - point[0]
     y = lights.positions[index, 1] - point[1]
@@ -224,7 +230,8 @@ def _incoming(point, index, lights):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _light_matters(rays, surface, lights, points, matters, ambient):  # type: ignore[no-untyped-def]
+@no_type_check
+def _light_matters(rays, surface, lights, points, matters, ambient):
     """Fill in for each ray: the point hit, the lights that give a noticeable part of its light, the ambient light."""
     strength = np.zeros(len(lights.positions))
     for i in range(len(rays.faces)):
@@ -244,7 +251,8 @@ def _light_matters(rays, surface, lights, points, matters, ambient):  # type: ig
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _coat(nl, nv, nh, vh, reflectance, roughness):  # type: ignore[no-untyped-def]
+@no_type_check
+def _coat(nl, nv, nh, vh, reflectance, roughness):
     """pi times the GGX reflectance times the cosine towards the light, and the Fresnel share."""
     alpha2 = roughness * roughness
     bell = nh * nh * (alpha2 - 1) + 1
@@ -255,7 +263,8 @@ def _coat(nl, nv, nh, vh, reflectance, roughness):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _reflected(normal, view, towards, reflectance, roughness):  # type: ignore[no-untyped-def]
+@no_type_check
+def _reflected(normal, view, towards, reflectance, roughness):
     """Diffuse (to be multiplied by the albedo) and glossy answer to a light of strength 1; ``view`` points away."""
     nl = _dot(normal, towards)
     if nl <= 0:
@@ -270,7 +279,8 @@ def _reflected(normal, view, towards, reflectance, roughness):  # type: ignore[n
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _shade(rays, surface, palette, lights, lit, ambient, out):  # type: ignore[no-untyped-def]
+@no_type_check
+def _shade(rays, surface, palette, lights, lit, ambient, out):
     samples = len(rays.faces) // len(out)
     for i in range(len(rays.faces)):
         if rays.faces[i] < 0:

@@ -25,6 +25,9 @@ from cuspid.rig import Handpiece
 TOOTH_FRAMES, ARCH_FRAMES = 10, 100
 """Positions of the handpiece in the thesis: 120 images of a tooth and 1200 of an arch with twelve cameras."""
 
+TOOTH_PATH_MM = 9.0
+"""Length of the path over a tooth: ten positions 1 mm apart, which overlap by some 80 %."""
+
 _GRID_MM = 0.25
 """Spacing of the height map in which the arch is found."""
 _CROWN_TOP_MM = 4.0
@@ -49,9 +52,9 @@ class ScanPathOptions:
     """FDI number of the one tooth to scan; None for the whole arch."""
     frames: int | None = None
     """Positions of the handpiece; None for 10 over a tooth and 100 over an arch, or more where the overlap needs it."""
-    margin_mm: float | None = None
-    """How far the path goes on beyond the ends of the tooth or arch; None for -1.5 on a tooth (the images see 3 mm
-    farther than the path goes) and 0 on an arch."""
+    length_mm: float | None = None
+    """Length of the path over the middle of the tooth or arch; None for 9 mm over a tooth (the images see 3 mm farther
+    on both sides) and from the first crown to the last over an arch."""
     jitter_mm: float = 0.15
     """Standard deviation of the hand's drift along each axis."""
     jitter_deg: float = 1.5
@@ -146,13 +149,14 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
 
 
 def _stretch(jaw: Jaw, curve: ArchCurve, options: ScanPathOptions) -> tuple[float, float]:
+    """Start and end of the path, in mm along the curve."""
     if options.tooth is None:
-        first, last, margin = 0.0, float(curve.lengths_mm[-1]), 0.0
+        first, last, length = 0.0, float(curve.lengths_mm[-1]), float(curve.lengths_mm[-1])
     else:
         first, last = curve.span_of(jaw.mesh.face_centres[jaw.tooth_faces(options.tooth)])
-        margin = -1.5
-    margin = margin if options.margin_mm is None else options.margin_mm
-    return first - margin, last + margin
+        length = TOOTH_PATH_MM
+    middle, half = (first + last) / 2, (options.length_mm or length) / 2
+    return middle - half, middle + half
 
 
 def _even_path(
@@ -161,7 +165,7 @@ def _even_path(
     """The path on which the hand goes slower where the images change faster, so that the overlap is about even."""
     path = _sampled(mesh, handpiece, curve, hand, lengths_mm)
     for _ in range(2):
-        worst = np.nan_to_num(1 - np.nanmin(path.overlap, axis=1), nan=0.0)
+        worst = 1 - np.min(path.overlap, axis=1, initial=1.0, where=np.isfinite(path.overlap))
         change = np.concatenate([[0], np.cumsum(np.maximum(worst, 0.25 * worst.max()))])
         lengths_mm = np.interp(np.linspace(0, change[-1], len(lengths_mm)), change, lengths_mm)
         path = _sampled(mesh, handpiece, curve, hand, lengths_mm)

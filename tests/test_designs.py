@@ -1,0 +1,115 @@
+"""The designs have the baselines, angles and distances of the thesis."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cuspid.errors import InputError
+from cuspid.handpiece.designs import DESIGNS, DesignOptions, essential_four, twelve_cameras
+from cuspid.rig import Handpiece
+
+OPTIONS = st.builds(
+    DesignOptions,
+    field_of_view_deg=st.floats(40, 90),
+    working_distance_mm=st.floats(3, 8),
+    baseline_across_mm=st.floats(0.5, 4),
+    baseline_along_mm=st.floats(0.5, 4),
+    side_tilt_deg=st.floats(45, 80),
+)
+
+
+def baseline(handpiece: Handpiece, first: str, second: str) -> np.ndarray:
+    return handpiece.rig[second].centre_in_rig - handpiece.rig[first].centre_in_rig
+
+
+@given(OPTIONS)
+def test_occlusal_group_has_its_baselines_across_and_along_the_arch(options: DesignOptions) -> None:
+    for handpiece in (essential_four(options), twelve_cameras(options)):
+        np.testing.assert_allclose(baseline(handpiece, "o2", "o1"), [0, options.baseline_across_mm, 0], atol=1e-12)
+        np.testing.assert_allclose(baseline(handpiece, "o3", "o4"), [options.baseline_along_mm, 0, 0], atol=1e-12)
+        np.testing.assert_allclose(handpiece.rig["o1"].centre_in_rig[2], options.working_distance_mm, atol=1e-12)
+
+
+@given(OPTIONS)
+def test_side_groups_have_the_same_baselines_and_mirror_each_other(options: DesignOptions) -> None:
+    handpiece = twelve_cameras(options)
+    for group in "bl":
+        across, along = baseline(handpiece, f"{group}1", f"{group}2"), baseline(handpiece, f"{group}3", f"{group}4")
+        assert np.linalg.norm(across) == pytest.approx(options.baseline_across_mm)
+        np.testing.assert_allclose(np.abs(along), [options.baseline_along_mm, 0, 0], atol=1e-12)
+        assert across[2] < 0, "camera 1 is the one farther from the gum"
+    for camera in ("1", "2"):
+        mirrored = handpiece.rig[f"l{camera}"].centre_in_rig * [1, -1, 1]
+        np.testing.assert_allclose(handpiece.rig[f"b{camera}"].centre_in_rig, mirrored, atol=1e-12)
+
+
+@given(OPTIONS)
+def test_axes_of_a_group_are_parallel_and_images_upright(options: DesignOptions) -> None:
+    handpiece = twelve_cameras(options)
+    for group in "obl":
+        rotations = [handpiece.rig[f"{group}{k}"].cam_from_rig.rotation for k in range(1, 5)]
+        assert np.ptp(rotations, axis=0).max() < 1e-12
+    for side, sign in (("b", -1), ("l", 1)):
+        right, down, axis = handpiece.rig[f"{side}1"].cam_from_rig.rotation
+        np.testing.assert_allclose(right, [sign, 0, 0], atol=1e-12)
+        assert down[2] < 0
+        assert np.rad2deg(np.arccos(-axis[2])) == pytest.approx(options.side_tilt_deg)
+        assert np.sign(axis[1]) == sign
+
+
+def test_defaults_are_those_of_the_thesis() -> None:
+    handpiece = twelve_cameras()
+    assert len(handpiece.rig.names) == 12
+    assert len(essential_four().rig.names) == 4
+    for mounted in handpiece.rig.cameras.values():
+        assert (mounted.camera.width, mounted.camera.height) == (500, 500)
+        edge = mounted.camera.rays(np.array([[0.0, 250], [500, 250]]))
+        assert np.rad2deg(2 * np.arctan(edge[1, 0])) == pytest.approx(62)
+        assert edge[0, 0] == pytest.approx(-edge[1, 0])
+    assert np.linalg.norm(baseline(handpiece, "o1", "o2")) == pytest.approx(2.5)
+    assert np.linalg.norm(baseline(handpiece, "b3", "b4")) == pytest.approx(1.5)
+
+
+def test_twelve_cameras_pair_within_their_three_groups_only() -> None:
+    rig = twelve_cameras().rig
+    assert [set(group) for group in rig.groups(5.0)] == [{f"{g}{k}" for k in range(1, 5)} for g in "obl"]
+    assert len(rig.stereo_pairs(5.0)) == 3 * 6
+
+
+def test_side_groups_aim_at_the_crown_from_the_working_distance() -> None:
+    options = DesignOptions(side_offset_mm=4.0, side_depth_mm=3.0)
+    handpiece = twelve_cameras(options)
+    for group, side in (("b", 1), ("l", -1)):
+        middle = np.mean([handpiece.rig[f"{group}{k}"].centre_in_rig for k in range(1, 5)], axis=0)
+        aim = middle + options.working_distance_mm * handpiece.rig[f"{group}1"].axis_in_rig
+        np.testing.assert_allclose(aim, [0, side * 4.0, -3.0], atol=1e-12)
+
+
+def test_lights_lie_between_the_cameras_of_their_group_and_are_on_in_the_one_exposure() -> None:
+    handpiece = twelve_cameras()
+    assert [exposure.name for exposure in handpiece.exposures] == ["all"]
+    assert set(handpiece.exposures[0].lights) == set(handpiece.lights)
+    for name, light in handpiece.lights.items():
+        camera = handpiece.rig[f"{name[0]}1"]
+        np.testing.assert_allclose(light.direction, camera.axis_in_rig, atol=1e-12)
+        assert (light.position_mm - camera.centre_in_rig) @ camera.axis_in_rig == pytest.approx(0, abs=1e-12)
+        gaps = [np.linalg.norm(light.position_mm - each.centre_in_rig) for each in handpiece.rig.cameras.values()]
+        assert 0.5 < min(gaps) < 2
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_every_named_design_can_be_built(name: str) -> None:
+    handpiece = DESIGNS[name](DesignOptions(width_px=320, height_px=240))
+    assert {(each.camera.width, each.camera.height) for each in handpiece.rig.cameras.values()} == {(320, 240)}
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"working_distance_mm": 1.0}, {"baseline_across_mm": 0.0}, {"field_of_view_deg": 180.0}],
+)
+def test_impossible_designs_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(InputError, match="design"):
+        DesignOptions(**wrong)
