@@ -1,8 +1,9 @@
 """The fourteen teeth of a jaw, one quadrant from the midline backwards: shapes and how they stand in the arch.
 
-Widths, depths and heights are Wheeler's (see `crowns`). Inclinations follow L. F. Andrews, *The six keys to normal
-occlusion* (Am. J. Orthod. 1972) in sign and order of magnitude; silhouettes, cusp positions and grooves are drawn
-after Wheeler's plates of each tooth.
+Widths, depths and heights are Wheeler's (see `crowns`), but for the lower incisors, which are 0.3 and 0.4 mm wider:
+in his sizes they would stand in a straight line between canines as far apart as those of `ARCH_FORMS`. Inclinations
+follow L. F. Andrews, *The six keys to normal occlusion* (Am. J. Orthod. 1972) in sign and order of magnitude;
+silhouettes, cusp positions and grooves are drawn after Wheeler's plates of each tooth.
 """
 
 from dataclasses import dataclass, replace
@@ -145,18 +146,18 @@ UPPER_SECOND_MOLAR = replace(
 )  # fmt: skip
 
 LOWER_CENTRAL = Crown(
-    width_mm=5.0, depth_mm=6.0, height_mm=9.0,
-    mesial=(0.32, 0.58, 0.70, 0.78, 0.86, 0.93, 0.98, 1.0, 1.0),
-    distal=(0.32, 0.58, 0.70, 0.78, 0.86, 0.93, 0.98, 0.99, 0.97),
+    width_mm=5.3, depth_mm=6.0, height_mm=9.0,
+    mesial=(0.32, 0.58, 0.70, 0.78, 0.86, 0.94, 0.99, 1.0, 0.99),
+    distal=(0.32, 0.58, 0.70, 0.78, 0.86, 0.94, 0.99, 1.0, 0.97),
     buccal=(0.24, 0.40, 0.45, 0.49, 0.45, 0.36, 0.25, 0.12, -0.03),
     lingual=(0.24, 0.40, 0.46, 0.50, 0.40, 0.24, 0.11, 0.03, 0.0),
     squareness=2.4, taper=0.25, rim_mm=0.45,
     edge=Edge(mesial_fall_mm=0.2, distal_fall_mm=0.3, mesial_power=6.0, distal_power=5.0, fossa_mm=0.2),
 )  # fmt: skip
 LOWER_LATERAL = Crown(
-    width_mm=5.5, depth_mm=6.5, height_mm=9.5,
-    mesial=(0.32, 0.58, 0.70, 0.78, 0.86, 0.93, 0.98, 1.0, 1.0),
-    distal=(0.32, 0.58, 0.70, 0.79, 0.88, 0.95, 1.0, 0.97, 0.90),
+    width_mm=5.9, depth_mm=6.5, height_mm=9.5,
+    mesial=(0.32, 0.58, 0.70, 0.78, 0.86, 0.94, 0.99, 1.0, 0.99),
+    distal=(0.32, 0.58, 0.70, 0.79, 0.88, 0.96, 1.0, 0.97, 0.90),
     buccal=(0.24, 0.40, 0.45, 0.49, 0.45, 0.36, 0.25, 0.12, -0.03),
     lingual=(0.24, 0.40, 0.46, 0.50, 0.40, 0.24, 0.11, 0.03, 0.0),
     squareness=2.4, taper=0.25, rim_mm=0.45,

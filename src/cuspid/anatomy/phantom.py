@@ -6,12 +6,10 @@ gum, +Y anterior, mm. Seen along -Z with +Y up, +X points right; that is the pat
 tooth with X < 0 is left-handed, for it is the mirror image of its counterpart.
 
 The teeth of a quadrant are a chain of segments, each as long as its tooth is wide, that touch at the contact points.
-Their headings are those nearest to a natural arch that give it its transverse widths. The
-solid is the union of implicit functions (crowns, and a gum made of a ridge and a collar round each tooth), sampled
-in a narrow band, cut by marching cubes and drawn onto the exact surface.
+Their headings are those nearest to a natural arch that give it its transverse widths. The solid is the union of
+implicit functions: the crowns, and a gum made of a ridge and a collar round each tooth.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,18 +17,24 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
-from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
-from skimage.measure import marching_cubes
 
 from cuspid.anatomy.crowns import Crown, Points, Values, crown_distance, silhouettes, smooth_max, smooth_min, top_of
 from cuspid.anatomy.dentition import ARCH_FORMS, QUADRANTS, ArchForm, Tooth
+from cuspid.anatomy.isosurface import (
+    edges_of,
+    evaluate,
+    graph_of,
+    mesh_of,
+    neighbours_of,
+    newton_step,
+    onto_surface,
+    value_and_gradient,
+    without_folds,
+)
 from cuspid.jaw import GUM, Arch, Jaw
 from cuspid.mesh import Mesh
-
-Field = Callable[[Points], Values]
-"""Signed distance in mm, shape (n,), of points (n, 3); negative inside."""
 
 FAR_MM = 3.0
 """Distance that stands for all larger ones."""
@@ -92,7 +96,7 @@ def build_phantom(options: PhantomOptions = PhantomOptions()) -> Jaw:
     rng = np.random.default_rng(options.seed)
     teeth = place_teeth(options, rng)
     model = _Model(teeth=teeth, gum=_Gum.around(teeth, rng))
-    vertices, faces = _mesh(model.distance, *model.bounds, options.edge_mm)
+    vertices, faces = mesh_of(model.distance, *model.bounds, options.edge_mm)
     vertices = _onto_margin(model, vertices, faces, options.edge_mm)
     labels = model.labels(vertices[faces].mean(axis=1))
     return Jaw(mesh=Mesh(vertices, faces), face_labels=_one_patch_each(faces, labels), arch=options.arch)
@@ -248,8 +252,6 @@ class _Gum:
 
     path: Float[np.ndarray, "s 2"]
     """Points of the centre line in XY, mm."""
-    tangents: Float[np.ndarray, "s 2"]
-    """Unit tangents of the centre line."""
     crest: Float[np.ndarray, "s"]
     """Height of the crest of the ridge, mm."""
     half_width: Float[np.ndarray, "s"]
@@ -268,12 +270,9 @@ class _Gum:
         widths = np.array([placed.tooth.crown.half_depth_mm for placed in teeth])
         table = np.column_stack([knots, np.pad(widths, 1, mode="edge")])
         run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots[:, :2], axis=0), axis=1))])
-        spline = CubicSpline(run, table)
-        s = np.linspace(0.0, run[-1], 1200)
-        samples, slopes = spline(s), spline(s, 1)[:, :2]
+        samples = CubicSpline(run, table)(np.linspace(0.0, run[-1], 1200))
         return _Gum(
             path=samples[:, :2],
-            tangents=slopes / np.linalg.norm(slopes, axis=1, keepdims=True),
             crest=samples[:, 2] - 0.6,
             half_width=samples[:, 3],
             waves=np.column_stack([rng.normal(0.0, 0.45, (WAVES, 3)), rng.uniform(0.0, 2 * np.pi, WAVES)]),
@@ -396,96 +395,6 @@ def _within_reach(placed: PlacedTooth, points: Points) -> Int[np.ndarray, "m"]:
     return np.flatnonzero((from_axis**2).sum(axis=1) < reach**2)
 
 
-# The surface
-
-BLOCK = 4
-"""Grid cells along the edge of a block that is sampled or skipped as a whole."""
-STENCIL_MM = 0.02
-"""Size of the stencil of a gradient."""
-CHUNK = 60_000
-"""Points evaluated at once: enough for numpy, few enough for the cache."""
-
-
-def _mesh(
-    field: Field, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], edge_mm: float
-) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """The zero surface of a field as one closed mesh with well-shaped faces."""
-    volume = _sample_band(field, low, high, edge_mm)
-    vertices, faces, _, _ = marching_cubes(volume, 0.0, gradient_direction="descent")
-    vertices, faces = _largest_part(low + edge_mm * vertices.astype(float), faces.astype(np.int64))
-    for _ in range(2):
-        vertices = _onto_surface(field, _relax(vertices, faces), edge_mm)
-    return vertices, faces
-
-
-def _sample_band(field: Field, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], edge_mm: float) -> np.ndarray:
-    """The field on a grid, exact near its zero surface and of the right sign elsewhere."""
-    blocks = np.ceil((high - low) / (BLOCK * edge_mm)).astype(int)
-    index = np.stack(np.meshgrid(*map(np.arange, blocks), indexing="ij"), axis=-1).reshape(-1, 3)
-    size = BLOCK * edge_mm
-    centre = _in_chunks(field, low + (index + 0.5) * size - edge_mm / 2)
-    volume = np.broadcast_to(centre[:, None], (len(index), BLOCK**3)).astype(np.float32)
-    active = np.flatnonzero(np.abs(centre) < 1.25 * size)
-    inner = np.stack(np.meshgrid(*[np.arange(BLOCK)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    cells = (index[active, None] * BLOCK + inner).reshape(-1, 3)
-    values = _in_chunks(field, low + cells * edge_mm)
-    volume[active] = _off_zero(values, 0.02 * edge_mm).reshape(-1, BLOCK**3)
-    return volume.reshape(*blocks, BLOCK, BLOCK, BLOCK).transpose(0, 3, 1, 4, 2, 5).reshape(blocks * BLOCK)
-
-
-def _in_chunks(field: Field, points: Points) -> Values:
-    """The field at many points, shape (n,)."""
-    parts = np.array_split(points, max(1, len(points) // CHUNK))
-    return np.concatenate([field(part) for part in parts])
-
-
-def _off_zero(values: Values, least: float) -> Values:
-    """Values (n,) kept away from zero, so that no vertex coincides with a grid point."""
-    return np.where(values < 0, np.minimum(values, -least), np.maximum(values, least))
-
-
-def _largest_part(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
-) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
-    """The connected part with the most vertices: the outer surface, without enclosed voids."""
-    _, part = connected_components(_graph(_edges(faces), len(vertices)), directed=False)
-    keep = part == np.bincount(part).argmax()
-    renumbered = np.cumsum(keep) - 1
-    return vertices[keep], renumbered[faces[keep[faces[:, 0]]]]
-
-
-def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
-    """Edges (e, 2) of the faces; each edge of a closed mesh appears once in either direction."""
-    return np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
-
-
-def _relax(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v 3"]:
-    """Vertices moved half-way to the mean of their neighbours, which evens out the faces."""
-    adjacency = _graph(_edges(faces), len(vertices)).tocsr()
-    degree = adjacency.sum(axis=1)
-    return 0.5 * vertices + 0.5 * (adjacency @ vertices) / degree[:, None]
-
-
-def _onto_surface(field: Field, vertices: Float[np.ndarray, "v 3"], edge_mm: float) -> Float[np.ndarray, "v 3"]:
-    """Vertices moved along the gradient onto the zero surface, by at most half an edge."""
-    values, gradient = _value_and_gradient(field, vertices)
-    return _newton(vertices, values, gradient, 0.5 * edge_mm)
-
-
-def _value_and_gradient(field: Field, points: Points) -> tuple[Values, Points]:
-    """A field, shape (n,), and its gradient, (n, 3), from its values at the corners of a small tetrahedron."""
-    corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * STENCIL_MM
-    values = np.stack([_in_chunks(field, points + corner) for corner in corners], axis=1)
-    return values.mean(axis=1), np.einsum("nc,ck->nk", values, corners) / (4 * STENCIL_MM**2)
-
-
-def _newton(points: Points, values: Values, gradient: Points, limit_mm: float) -> Points:
-    """Points (n, 3) after a step along the gradient towards the zero of a field, no longer than the limit."""
-    move = -(values / np.maximum((gradient**2).sum(axis=1), 0.4))[:, None] * gradient
-    length = np.linalg.norm(move, axis=1, keepdims=True)
-    return points + move * np.minimum(1.0, limit_mm / np.maximum(length, 1e-12))
-
-
 # The labels
 
 
@@ -493,50 +402,31 @@ def _onto_margin(
     model: _Model, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], edge_mm: float
 ) -> Float[np.ndarray, "v 3"]:
     """Vertices beside the margin of the gum moved onto it, so that edges run along it."""
-    lead = _in_chunks(model.lead_of_gum, vertices)
-    ends = _edges(faces)
+    lead = evaluate(model.lead_of_gum, vertices)
+    ends = edges_of(faces)
     ends = ends[lead[ends[:, 0]] * lead[ends[:, 1]] < 0]
     nearer = np.abs(lead[ends[:, 0]]) < np.abs(lead[ends[:, 1]])
     beside = np.unique(np.where(nearer, ends[:, 0], ends[:, 1]))
     moved = vertices.copy()
     moved[beside] = _along_surface(model, vertices[beside], 0.4 * edge_mm)
-    return _without_folds(vertices, moved, faces)
-
-
-def _without_folds(
-    vertices: Float[np.ndarray, "v 3"], moved: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
-) -> Float[np.ndarray, "v 3"]:
-    """The moved vertices, but for those that would turn one of their faces over or flatten it."""
-    before = _face_cross(vertices, faces)
-    for _ in range(3):
-        after = _face_cross(moved, faces)
-        folded = (before * after).sum(axis=1) < 0.2 * (before**2).sum(axis=1)
-        moved = moved.copy()
-        moved[faces[folded]] = vertices[faces[folded]]
-    return moved
-
-
-def _face_cross(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
-    """Cross products (f, 3) of two edges of each face, mm^2."""
-    a, b, c = vertices[faces].transpose(1, 0, 2)
-    return np.cross(b - a, c - a)
+    return without_folds(vertices, moved, faces)
 
 
 def _along_surface(model: _Model, points: Points, limit_mm: float) -> Points:
     """Points (n, 3) of the surface moved within it towards the margin of the gum."""
-    values, slope = _value_and_gradient(model.lead_of_gum, points)
-    _, normal = _value_and_gradient(model.distance, points)
+    values, slope = value_and_gradient(model.lead_of_gum, points)
+    _, normal = value_and_gradient(model.distance, points)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
     tangential = slope - (slope * normal).sum(axis=1, keepdims=True) * normal
-    return _onto_surface(model.distance, _newton(points, values, tangential, limit_mm), limit_mm)
+    return onto_surface(model.distance, newton_step(points, values, tangential, limit_mm), limit_mm)
 
 
 def _one_patch_each(faces: Int[np.ndarray, "f 3"], labels: Int[np.ndarray, "f"]) -> Int[np.ndarray, "f"]:
     """Labels (f,) of which each is one connected patch: specks take the label that surrounds them."""
-    pairs = _neighbours(faces)
+    pairs = neighbours_of(faces)
     for _ in range(3):
         same = pairs[labels[pairs[:, 0]] == labels[pairs[:, 1]]]
-        _, patch = connected_components(_graph(same, len(faces)), directed=False)
+        _, patch = connected_components(graph_of(same, len(faces)), directed=False)
         size = np.bincount(patch)
         largest = np.zeros(labels.max() + 1, dtype=np.int64)
         np.maximum.at(largest, labels, size[patch])
@@ -548,16 +438,3 @@ def _one_patch_each(faces: Int[np.ndarray, "f 3"], labels: Int[np.ndarray, "f"])
         source[patch[border[:, 0]]] = labels[border[:, 1]]
         labels = np.where(speck & (source[patch] >= 0), source[patch], labels)
     return labels
-
-
-def _neighbours(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "p 2"]:
-    """Pairs (p, 2) of faces that share an edge, in both orders, for a closed mesh."""
-    edges = np.sort(_edges(faces), axis=1)
-    order = np.lexsort((edges[:, 1], edges[:, 0]))
-    pairs = (order // 3).reshape(-1, 2)
-    return np.concatenate([pairs, pairs[:, ::-1]])
-
-
-def _graph(pairs: Int[np.ndarray, "p 2"], count: int) -> coo_array:
-    """Adjacency matrix (count, count) of the given pairs."""
-    return coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
