@@ -1,6 +1,6 @@
 """The handpieces of the thesis: the essential four cameras (3.5.1) and the twelve (3.5.2).
 
-Rig frame: origin at the nominal point of the occlusal surface under the probe, +X along the arch in the direction of
+Rig frame: origin at the height of the cusp tips under the probe, +X along the arch in the direction of
 travel, +Y across the arch towards the cheek (buccal), +Z out of the gum. A group is four cameras with parallel axes in
 one plane: two across the arch and two along the curve of Spee, with the LEDs at the corners between them.
 
@@ -50,8 +50,8 @@ class DesignOptions:
     """Angle between the occlusal axis and the axes of the buccal and lingual groups (twelve cameras only)."""
     side_offset_mm: float = 4.5
     """From the middle of the crown to where the side groups' axes meet its side (twelve cameras only)."""
-    side_depth_mm: float = 2.0
-    """From the occlusal surface down to where the side groups' axes meet the side (twelve cameras only)."""
+    side_depth_mm: float = 2.5
+    """From the cusp tips down to where the side groups' axes meet the side (twelve cameras only)."""
 
     def __post_init__(self) -> None:
         near, far = DEPTH_RANGE_MM

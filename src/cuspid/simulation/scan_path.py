@@ -69,7 +69,7 @@ class ScanPathOptions:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ArchCurve:
-    """A line through the middle of the crowns at the height of their occlusal surface, finely sampled."""
+    """A line through the middle of the crowns at the height of their cusp tips, finely sampled."""
 
     points: Float[np.ndarray, "n 3"]
     """Positions in the occlusal frame, mm; clockwise seen from +Z."""
@@ -273,12 +273,12 @@ def _circle_centre(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2"]:
 def _middles(
     along: Float[np.ndarray, "n"], sideways: Float[np.ndarray, "n"], height: Float[np.ndarray, "n"]
 ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m 2"]]:
-    """For each millimetre along the arch: where it is, the middle between the crowns' sides and their height."""
+    """For each millimetre along the arch: where it is, the middle between the crowns' sides and the height of their tips."""
     bins = np.floor(along - along.min()).astype(int)
     cuts = np.zeros((bins.max() + 1, 3))
     for index in np.unique(bins):
         inside = bins == index
-        cuts[index] = *np.percentile(sideways[inside], [3, 97]), np.percentile(height[inside], 70)
+        cuts[index] = *np.percentile(sideways[inside], [3, 97]), np.percentile(height[inside], 95)
     counted = np.unique(bins)
     at = along.min() + counted + 0.5
     return at, np.column_stack([cuts[counted, :2].mean(axis=1), cuts[counted, 2]])
