@@ -11,8 +11,10 @@ import hashlib
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import cv2
 import numpy as np
@@ -123,7 +125,7 @@ def _load(path: Path, key: str) -> Features | None:
             if str(kept["key"]) != key:
                 return None
             return Features(pixels=kept["pixels"], descriptors=kept["descriptors"], colors=kept["colors"])
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, BadZipFile):
         return None
 
 
@@ -142,7 +144,8 @@ def _keep(path: Path, key: str, features: Features) -> None:
             )
         part.replace(path)
     except OSError as error:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):
+            part.unlink()
         raise OutputError(f"{path}: cannot be written ({error.strerror}); free some space") from error
 
 

@@ -18,7 +18,7 @@ from cuspid.capture import Capture
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.motion.adjustment import AdjustmentOptions, adjust
-from cuspid.motion.features import FeatureOptions, Progress, detect_all
+from cuspid.motion.features import FeatureOptions, Features, Progress, detect_all
 from cuspid.motion.odometry import (
     Cloud,
     OdometryOptions,
@@ -80,16 +80,6 @@ def _in_threads(work: Callable[[int], _T], count: int, stage: str, progress: Pro
             if progress is not None:
                 progress(stage, len(results), count)
     return results
-
-
-def _views(capture: Capture, options: MotionOptions, progress: Progress | None, cache: FilePath | None) -> list[Views]:
-    """Keypoints of every frame by camera."""
-    features = detect_all(capture, options.features, progress=progress, cache=cache)
-    cameras = capture.handpiece.rig.cameras
-    return [
-        {name: make_view(features[frame.name, name], mounted.camera) for name, mounted in cameras.items()}
-        for frame in capture.frames
-    ]
 
 
 def _depth_bounds(
@@ -225,6 +215,42 @@ def _require_enough(path: Path, clouds: Sequence[Cloud], options: MotionOptions)
     )
 
 
+def locate_features(
+    handpiece: Handpiece,
+    features: Mapping[tuple[str, str], Features],
+    names: Sequence[str],
+    options: MotionOptions,
+    *,
+    progress: Progress | None = None,
+) -> Reconstruction:
+    """As :func:`locate`, from the keypoints by (frame, camera) of the frames ``names`` in the order of capture."""
+    rig, log = handpiece.rig, dict[str, float]()
+    frames = [{c: make_view(features[name, c], mounted.camera) for c, mounted in rig.cameras.items()} for name in names]
+    with _timed(log, "triangulation"):
+        pairs = rig.stereo_pairs(handpiece.working_distance_mm)
+        clouds = _in_threads(
+            lambda f: triangulate_frame(handpiece, pairs, frames[f], options.within),
+            len(frames),
+            "triangulation",
+            progress,
+        )
+    with _timed(log, "odometry"):
+        path = chain(find_edges(rig, frames, clouds, options.odometry, options.seed), names, options.odometry)
+    _require_enough(path, clouds, options)
+    with _timed(log, "matching"):
+        frames, clouds = [frames[f] for f in path.rig_from_world], [clouds[f] for f in path.rig_from_world]
+        tracks = _link(frames, clouds, list(path.rig_from_world.values()), handpiece, options, progress)
+    start = Reconstruction(
+        rig=rig,
+        rig_from_world={names[f]: pose for f, pose in path.rig_from_world.items()},
+        tracks=tracks,
+        dropped=path.dropped,
+    )
+    with _timed(log, "adjustment"):
+        adjusted = adjust(start, options.adjustment)
+    return replace(adjusted, log={**log, **adjusted.log})
+
+
 def locate(
     capture: Capture,
     options: MotionOptions | None = None,
@@ -236,33 +262,9 @@ def locate(
 
     Raises InputError for images that cannot be used and ReconstructionError where too few frames can be placed.
     """
-    options, handpiece = options or MotionOptions(), capture.handpiece
-    log: dict[str, float] = {}
+    options, log = options or MotionOptions(), dict[str, float]()
     with _timed(log, "features"):
-        frames = _views(capture, options, progress, cache)
-    with _timed(log, "triangulation"):
-        pairs = handpiece.rig.stereo_pairs(handpiece.working_distance_mm)
-        clouds = _in_threads(
-            lambda f: triangulate_frame(handpiece, pairs, frames[f], options.within),
-            len(frames),
-            "triangulation",
-            progress,
-        )
-    with _timed(log, "odometry"):
-        edges = find_edges(handpiece.rig, frames, clouds, options.odometry, options.seed)
-        path = chain(edges, [frame.name for frame in capture.frames], options.odometry)
-    _require_enough(path, clouds, options)
-    located = list(path.rig_from_world)
-    with _timed(log, "matching"):
-        poses = list(path.rig_from_world.values())
-        tracks = _link([frames[f] for f in located], [clouds[f] for f in located], poses, handpiece, options, progress)
-    start = Reconstruction(
-        rig=handpiece.rig,
-        rig_from_world={capture.frames[f].name: pose for f, pose in path.rig_from_world.items()},
-        tracks=tracks,
-        dropped=path.dropped,
-        log=log,
-    )
-    with _timed(log, "adjustment"):
-        adjusted = adjust(start, options.adjustment)
-    return replace(adjusted, log={**adjusted.log, **log})
+        features = detect_all(capture, options.features, progress=progress, cache=cache)
+    names = [frame.name for frame in capture.frames]
+    found = locate_features(capture.handpiece, features, names, options, progress=progress)
+    return replace(found, log={**log, **found.log})

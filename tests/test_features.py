@@ -1,0 +1,179 @@
+"""Keypoints: accuracy under a known motion, spread, cache."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cuspid.camera import Camera
+from cuspid.capture import Capture, Frame
+from cuspid.errors import InputError, OutputError
+from cuspid.geometry import Rigid3
+from cuspid.motion.features import DESCRIPTOR_NORM, FeatureOptions, detect, detect_all, spread
+from cuspid.motion.pairs import match_unguided
+from cuspid.rig import Handpiece, MountedCamera, Rig
+
+SIZE = 240
+
+
+def texture(seed: int = 0) -> np.ndarray:
+    """Speckle of several sizes, twice as large as an image."""
+    rng = np.random.default_rng(seed)
+    layers = [cv2.GaussianBlur(rng.normal(size=(900, 900)), (0, 0), s) * s for s in (2.0, 5.0, 12.0)]
+    return cv2.normalize(sum(layers), None, 30, 225, cv2.NORM_MINMAX).astype(np.float32)
+
+
+def photograph(texture_px_from_px: np.ndarray, seed: int = 0, noise: float = 1.5) -> np.ndarray:
+    """An RGB image; the matrix takes COLMAP's pixels to texture coordinates, whose first centre is (0.5, 0.5) too."""
+    shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+    matrix = np.linalg.inv(shift) @ texture_px_from_px @ shift
+    gray = cv2.warpPerspective(
+        texture(), matrix, (SIZE, SIZE), flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REFLECT
+    )
+    noisy = gray + np.random.default_rng(seed).normal(0, noise, gray.shape)
+    return np.repeat(np.clip(np.rint(noisy), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+TURN = np.deg2rad(4)
+FIRST = np.array([[1.5, 0, 200], [0, 1.5, 200], [0, 0, 1]])
+SECOND = np.array(
+    [[1.4 * np.cos(TURN), -1.5 * np.sin(TURN), 230.3], [1.4 * np.sin(TURN), 1.5 * np.cos(TURN), 190.7], [0, 1e-5, 1]]
+)
+
+
+def move(matrix: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Apply a homography."""
+    moved = np.column_stack([pixels, np.ones(len(pixels))]) @ matrix.T
+    return moved[:, :2] / moved[:, 2:]
+
+
+def test_keypoints_are_accurate_and_unbiased() -> None:
+    """Between two noisy views of a texture: sub-pixel, and without the half pixel of a wrong origin."""
+    a, b = detect(photograph(FIRST, 1)), detect(photograph(SECOND, 2))
+    pairs = match_unguided(a, b)
+    errors = b.pixels[pairs[:, 1]] - move(np.linalg.inv(SECOND) @ FIRST, a.pixels[pairs[:, 0]])
+    good = np.linalg.norm(errors, axis=1) < 2
+    assert good.mean() > 0.95
+    assert good.sum() > 150
+    assert 0.03 < np.sqrt(np.mean(errors[good] ** 2)) < 0.3
+    assert np.abs(errors[good].mean(axis=0)).max() < 0.05
+
+
+def test_a_blob_lies_where_it_was_drawn() -> None:
+    """The pixel origin: a Gaussian blob centred on the corner between pixels (60, 80) has COLMAP's (60, 80)."""
+    x, y = np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5)
+    gray = 60 + 150 * np.exp(-((x - 60) ** 2 + (y - 80) ** 2) / (2 * 4.0**2))
+    image = np.repeat(np.rint(gray).astype(np.uint8)[..., None], 3, axis=2)
+    nearest = detect(image).pixels - [60, 80]
+    assert np.linalg.norm(nearest, axis=1).min() < 0.05
+
+
+def test_descriptors_have_their_length_and_colors_their_place() -> None:
+    """RootSIFT of length 512; the colour is the image's."""
+    image = photograph(FIRST)
+    found = detect(image)
+    lengths = np.linalg.norm(found.descriptors.astype(float), axis=1)
+    assert np.all(np.abs(lengths / DESCRIPTOR_NORM - 1) < 0.03)
+    row, column = found.pixels[7].astype(int)[::-1]
+    np.testing.assert_array_equal(found.colors[7], image[row, column])
+
+
+def test_count_and_uniqueness() -> None:
+    """No more than asked for, and no place twice."""
+    found = detect(photograph(FIRST), FeatureOptions(count=100))
+    assert len(found) == 100
+    assert len(np.unique(found.pixels.round(3), axis=0)) == 100
+
+
+def test_turned_images_match_with_orientations_only() -> None:
+    """Upright descriptors are for a handpiece that keeps its roll; the option is there for one that does not."""
+    image = photograph(FIRST)
+    turned = np.ascontiguousarray(np.rot90(image))
+    upright = match_unguided(detect(image), detect(turned))
+    free = FeatureOptions(upright=False)
+    turning = match_unguided(detect(image, free), detect(turned, free))
+    assert len(turning) > 100
+    assert len(upright) < 0.1 * len(turning)
+
+
+@pytest.mark.parametrize("gray", [0, 128, 255])
+def test_a_plain_image_has_no_keypoints(gray: int) -> None:
+    """And is no error."""
+    assert len(detect(np.full((SIZE, SIZE, 3), gray, np.uint8))) == 0
+
+
+@given(count=st.integers(1, 60), seed=st.integers(0, 100))
+def test_spread_takes_the_strongest_of_each_cell_first(count: int, seed: int) -> None:
+    """A keypoint that is left out has no stronger rank in its cell than any that was taken."""
+    rng = np.random.default_rng(seed)
+    pixels, strengths = rng.uniform(0, 100, (80, 2)), rng.random(80)
+    chosen = spread(pixels, strengths, count, 25)
+    assert len(chosen) == len(np.unique(chosen)) == min(count, 80)
+    cells = (pixels // 25).astype(int) @ [1, 10]
+    rank = np.array([np.sum((cells == cells[k]) & (strengths > strengths[k])) for k in range(80)])
+    left = np.setdiff1d(np.arange(80), chosen)
+    assert len(left) == 0 or rank[chosen].max() <= rank[left].min()
+
+
+# --- captures ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Capture:
+    """Two cameras and two frames on disk."""
+    camera = Camera.from_field_of_view(SIZE, SIZE, 62.0)
+    rig = Rig({name: MountedCamera(camera, Rigid3.identity()) for name in ("a", "b")})
+    made = Capture(
+        folder=tmp_path, handpiece=Handpiece(rig=rig), frames=tuple(Frame(name=f"{k:05d}") for k in range(2))
+    )
+    for camera_name in rig.names:
+        for k, frame in enumerate(made.frames):
+            path = made.image_path(frame, camera_name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path), photograph(FIRST + [[0, 0, 9 * k], [0, 0, 0], [0, 0, 0]]))
+    return made
+
+
+def test_all_images_are_read_once(capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A second run takes every image from the cache and finds the same; a changed option or image does not."""
+    seen: list[tuple[str, int, int]] = []
+    cache = tmp_path / "cache"
+    first = detect_all(capture, cache=cache, progress=lambda *step: seen.append(step))
+    assert seen == [("features", k, 4) for k in (1, 2, 3, 4)]
+    assert set(first) == {(f"{k:05d}", c) for k in (0, 1) for c in "ab"}
+    reads: list[object] = []
+    original = Capture.image
+    monkeypatch.setattr(Capture, "image", lambda self, *which: reads.append(which) or original(self, *which))
+    again = detect_all(capture, cache=cache)
+    assert not reads
+    np.testing.assert_array_equal(again["00001", "b"].descriptors, first["00001", "b"].descriptors)
+    np.testing.assert_array_equal(again["00001", "b"].pixels, first["00001", "b"].pixels)
+    cv2.imwrite(str(capture.image_path("00001", "b")), photograph(SECOND))
+    detect_all(capture, cache=cache)
+    assert reads == [("00001", "b")]
+    assert len(detect_all(capture, FeatureOptions(count=10), cache=cache)["00000", "a"]) == 10
+
+
+def test_a_broken_cache_file_is_made_again(capture: Capture, tmp_path: Path) -> None:
+    """A run that was killed while writing leaves nothing that a later one trusts."""
+    cache = tmp_path / "cache"
+    first = detect_all(capture, cache=cache)
+    file = cache / "features" / "a" / "00000.npz"
+    file.write_bytes(file.read_bytes()[:500])
+    np.testing.assert_array_equal(detect_all(capture, cache=cache)["00000", "a"].pixels, first["00000", "a"].pixels)
+
+
+def test_bad_images_and_caches_are_told(capture: Capture, tmp_path: Path) -> None:
+    """Missing image: InputError with its name; a cache that cannot be written: OutputError."""
+    blocked = tmp_path / "blocked"
+    blocked.write_text("a file, not a folder")
+    with pytest.raises(OutputError, match="blocked"):
+        detect_all(capture, cache=blocked)
+    capture.image_path("00001", "a").unlink()
+    with pytest.raises(InputError, match=r"a/00001\.png"):
+        detect_all(capture, cache=tmp_path / "cache")
