@@ -15,14 +15,11 @@ taken to be occluded and left out. Pixels are OpenCV's here: the first centre is
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
-
-CAMERAS_MAX = 16
-"""Most cameras in a group."""
 
 Q, Q_U, Q_V, SCORE, VARIANCE, SUPPORT = range(6)
 """Channels of a refined field: the plane, mean ZNCC of the cameras used, variance of q, how many cameras."""
@@ -40,7 +37,7 @@ class RefinementOptions:
     """Width of the Gaussian weight over the window."""
     iterations: int = 10
     """Most Gauss-Newton steps."""
-    converged_px: float = 0.02
+    converged_px: float = 0.06
     """A step below this many px of disparity ends the iterations."""
     camera_zncc: float = 0.5
     """A camera below this correlation is taken to be occluded."""
@@ -68,18 +65,63 @@ class GroupGeometry:
     """Index of each other camera in the stack of images."""
 
 
-def patch_weights(options: RefinementOptions) -> Float[np.ndarray, "k"]:
-    """Gaussian weights over the window, row by row, of sum 1."""
+class _View(NamedTuple):
+    """What the kernels see of a reference camera and its group."""
+
+    images: np.ndarray
+    sizes: np.ndarray
+    reference: int
+    infinite: np.ndarray
+    parallax: np.ndarray
+    others: np.ndarray
+    window: np.ndarray
+    radius: int
+    spacing: int
+    q_low: float
+    q_high: float
+
+
+class _Limits(NamedTuple):
+    """The numbers of :class:`RefinementOptions`."""
+
+    iterations: int
+    converged: float
+    camera_zncc: np.float32
+    lag: np.float32
+    accept: float
+    least_contrast: float
+    effective: float
+
+
+class _Buffers(NamedTuple):
+    """Memory that the kernels use again for each pixel."""
+
+    template: np.ndarray
+    values: np.ndarray
+    slopes: np.ndarray
+    warp: np.ndarray
+    places: np.ndarray
+    systems: np.ndarray
+    znccs: np.ndarray
+    total: np.ndarray
+    step: np.ndarray
+    result: np.ndarray
+    candidates: np.ndarray
+
+
+def patch_window(options: RefinementOptions) -> Float[np.ndarray, "3 k"]:
+    """Offsets du and dv over the window, row by row, and Gaussian weights of sum 1."""
     offsets = np.arange(-options.radius_px, options.radius_px + 1)
-    profile = np.exp(-0.5 * (offsets / options.window_sigma_px) ** 2)
-    weights = np.outer(profile, profile).ravel()
-    return (weights / weights.sum()).astype(np.float32)
+    du, dv = np.meshgrid(offsets, offsets)
+    weights = np.exp(-0.5 * (du**2 + dv**2) / options.window_sigma_px**2)
+    return np.stack([du.ravel(), dv.ravel(), (weights / weights.sum()).ravel()]).astype(np.float32)
 
 
 @njit(**FAST)
 @no_type_check
-def _load_template(image, u, v, radius, weights, template):
+def _load_template(view, u, v, template):
     """Normalised patch around a pixel of the reference image; returns its standard deviation."""
+    image, weights, radius = view.images[view.reference], view.window[2], view.radius
     count = 0
     mean = np.float32(0)
     for dv in range(-radius, radius + 1):
@@ -100,47 +142,58 @@ def _load_template(image, u, v, radius, weights, template):
 
 @njit(**FAST)
 @no_type_check
-def _warp_is_inside(x, along_u, along_v, radius, width, height):
+def _is_inside(warp, radius, width, height):
     """True where the four corners of the window fall into the image, a pixel off its border."""
-    for sv in (-radius, radius):
-        for su in (-radius, radius):
-            z = x[2] + su * along_u[2] + sv * along_v[2]
+    for dv in (-radius, radius):
+        for du in (-radius, radius):
+            z = warp[0, 2] + du * warp[1, 2] + dv * warp[2, 2]
             if not z > 1e-6:
                 return False
-            px = (x[0] + su * along_u[0] + sv * along_v[0]) / z
-            py = (x[1] + su * along_u[1] + sv * along_v[1]) / z
-            if not (px >= 1 and py >= 1 and px < width - 2 and py < height - 2):
+            x = (warp[0, 0] + du * warp[1, 0] + dv * warp[2, 0]) / z
+            y = (warp[0, 1] + du * warp[1, 1] + dv * warp[2, 1]) / z
+            if not (x >= 1 and y >= 1 and x < width - 2 and y < height - 2):
                 return False
     return True
 
 
 @njit(**FAST)
 @no_type_check
-def _warp(image, x, along_u, along_v, parallax, radius, values, slopes):
-    """Intensities of the window seen in another image, and their derivative by q."""
-    count = 0
-    for dv in range(-radius, radius + 1):
-        for du in range(-radius, radius + 1):
-            inverse = 1 / (x[2] + du * along_u[2] + dv * along_v[2])
-            px = (x[0] + du * along_u[0] + dv * along_v[0]) * inverse
-            py = (x[1] + du * along_u[1] + dv * along_v[1]) * inverse
-            column, row = int(px), int(py)
-            fx, fy = np.float32(px - column), np.float32(py - row)
-            a, b = image[row, column], image[row, column + 1]
-            c, d = image[row + 1, column], image[row + 1, column + 1]
-            top, bottom = a + fx * (b - a), c + fx * (d - c)
-            values[count] = top + fy * (bottom - top)
-            slope_x = (b - a) + fy * ((d - c) - (b - a))
-            shift_x = (parallax[0] - px * parallax[2]) * inverse
-            shift_y = (parallax[1] - py * parallax[2]) * inverse
-            slopes[count] = slope_x * np.float32(shift_x) + (bottom - top) * np.float32(shift_y)
-            count += 1
+def _locate(window, warp, parallax, places):
+    """Where the window's pixels lie in another image (x, y), and how these move with q. A loop that vectorises."""
+    x0, y0, z0 = np.float32(warp[0, 0]), np.float32(warp[0, 1]), np.float32(warp[0, 2])
+    xu, yu, zu = np.float32(warp[1, 0]), np.float32(warp[1, 1]), np.float32(warp[1, 2])
+    xv, yv, zv = np.float32(warp[2, 0]), np.float32(warp[2, 1]), np.float32(warp[2, 2])
+    bx, by, bz = np.float32(parallax[0]), np.float32(parallax[1]), np.float32(parallax[2])
+    for k in range(window.shape[1]):
+        du, dv = window[0, k], window[1, k]
+        inverse = np.float32(1) / (z0 + du * zu + dv * zv)
+        x, y = (x0 + du * xu + dv * xv) * inverse, (y0 + du * yu + dv * yv) * inverse
+        places[0, k], places[1, k] = x, y
+        places[2, k], places[3, k] = (bx - x * bz) * inverse, (by - y * bz) * inverse
 
 
 @njit(**FAST)
 @no_type_check
-def _normal_equations(template, weights, values, slopes, radius, system):
-    """ZNCC of a warped patch with the template; its normal equations (6 + 3 numbers) go to ``system``."""
+def _sample(image, places, values, slopes):
+    """Intensities of the window seen in another image (bilinear), and their derivative by q."""
+    one = np.uint32(1)
+    for k in range(values.size):
+        x, y = places[0, k], places[1, k]
+        # Unsigned: numba would look for negative indices otherwise.
+        column, row = np.uint32(x), np.uint32(y)
+        fx, fy = x - np.float32(column), y - np.float32(row)
+        a, b = image[row, column], image[row, column + one]
+        c, d = image[row + one, column], image[row + one, column + one]
+        top, bottom = a + fx * (b - a), c + fx * (d - c)
+        slope_x, slope_y = (b - a) + fy * ((d - c) - (b - a)), bottom - top
+        values[k] = top + fy * slope_y
+        slopes[k] = slope_x * places[2, k] + slope_y * places[3, k]
+
+
+@njit(**FAST)
+@no_type_check
+def _normalize(template, weights, values, slopes):
+    """Bring a warped patch to mean 0 and norm 1, its slopes with it; returns its ZNCC with the template."""
     count = weights.size
     mean = np.float32(0)
     for k in range(count):
@@ -153,18 +206,22 @@ def _normal_equations(template, weights, values, slopes, radius, system):
     if not variance > 1e-6:
         return np.float32(-1)
     inverse = 1 / np.sqrt(variance)
-    zncc = product * inverse
-    side = 2 * radius + 1
+    for k in range(count):
+        values[k] *= inverse
+        slopes[k] *= inverse
+    return product * inverse
+
+
+@njit(**FAST)
+@no_type_check
+def _normal_equations(template, window, values, slopes, zncc, system):
+    """Normal equations of a normalised patch: H (upper triangle, row by row), then the gradient."""
     m0 = mu = mv = i0 = iu = iv = e0 = eu = ev = np.float32(0)
     h00 = h0u = h0v = huu = huv = hvv = np.float32(0)
-    for k in range(count):
-        du, dv = np.float32(k % side - radius), np.float32(k // side - radius)
-        slope = slopes[k] * inverse
-        seen = values[k] * inverse
-        ws = weights[k] * slope
-        we = ws * (seen - template[k])
-        wi = ws * seen
-        wss = ws * slope
+    for k in range(window.shape[1]):
+        du, dv = window[0, k], window[1, k]
+        ws = window[2, k] * slopes[k]
+        we, wi, wss = ws * (values[k] - template[k]), ws * values[k], ws * slopes[k]
         m0 += ws
         mu += ws * du
         mv += ws * dv
@@ -181,43 +238,40 @@ def _normal_equations(template, weights, values, slopes, radius, system):
         huv += wss * du * dv
         hvv += wss * dv * dv
     # The derivative of a normalised patch has no component along 1 nor along the patch itself.
-    system[0] = h00 - m0 * m0 - i0 * i0
-    system[1] = h0u - m0 * mu - i0 * iu
-    system[2] = h0v - m0 * mv - i0 * iv
-    system[3] = huu - mu * mu - iu * iu
-    system[4] = huv - mu * mv - iu * iv
-    system[5] = hvv - mv * mv - iv * iv
+    system[0], system[1], system[2] = h00 - m0 * m0 - i0 * i0, h0u - m0 * mu - i0 * iu, h0v - m0 * mv - i0 * iv
+    system[3], system[4], system[5] = huu - mu * mu - iu * iu, huv - mu * mv - iu * iv, hvv - mv * mv - iv * iv
     lack = 1 - zncc
-    system[6] = e0 - i0 * lack
-    system[7] = eu - iu * lack
-    system[8] = ev - iv * lack
-    return zncc
+    system[6], system[7], system[8] = e0 - i0 * lack, eu - iu * lack, ev - iv * lack
 
 
 @njit(**FAST)
 @no_type_check
-def _compare(images, sizes, infinite, parallax, others, u, v, plane, radius, weights, scratch, systems, znccs):
+def _compare(view, u, v, plane, buffers):
     """ZNCC and normal equations of each other camera at a plane; -1 where the window is not inside the image."""
-    template, values, slopes, x, along_u, along_v = scratch
-    for j in range(others.size):
-        a, b = infinite[j], parallax[j]
+    warp = buffers.warp
+    for j in range(view.others.size):
+        other, a, b = view.others[j], view.infinite[j], view.parallax[j]
         for k in range(3):
-            x[k] = a[k, 0] * u + a[k, 1] * v + a[k, 2] + plane[0] * b[k]
-            along_u[k] = a[k, 0] + plane[1] * b[k]
-            along_v[k] = a[k, 1] + plane[2] * b[k]
-        znccs[j] = -1
-        if _warp_is_inside(x, along_u, along_v, radius, sizes[others[j], 1], sizes[others[j], 0]):
-            _warp(images[others[j]], x, along_u, along_v, b, radius, values, slopes)
-            znccs[j] = _normal_equations(template, weights, values, slopes, radius, systems[j])
+            warp[0, k] = a[k, 0] * u + a[k, 1] * v + a[k, 2] + plane[0] * b[k]
+            warp[1, k] = a[k, 0] + plane[1] * b[k]
+            warp[2, k] = a[k, 1] + plane[2] * b[k]
+        buffers.znccs[j] = -1
+        if _is_inside(warp, view.radius, view.sizes[other, 1], view.sizes[other, 0]):
+            template, values, slopes = buffers.template, buffers.values, buffers.slopes
+            _locate(view.window, warp, b, buffers.places)
+            _sample(view.images[other], buffers.places, values, slopes)
+            zncc = _normalize(template, view.window[2], values, slopes)
+            buffers.znccs[j] = zncc
+            if zncc > 0:
+                _normal_equations(template, view.window, values, slopes, zncc, buffers.systems[j])
 
 
 @njit(**FAST)
 @no_type_check
-def _combine(systems, znccs, camera_zncc, lag, total):
+def _combine(buffers, camera_zncc, lag):
     """Sum the equations of the cameras that see the patch; returns how many, and their mean ZNCC."""
-    best = np.float32(-1)
-    for j in range(znccs.size):
-        best = max(best, znccs[j])
+    znccs, total = buffers.znccs, buffers.total
+    best = znccs.max()
     total[:] = 0
     used, score = 0, np.float32(0)
     for j in range(znccs.size):
@@ -225,15 +279,16 @@ def _combine(systems, znccs, camera_zncc, lag, total):
             used += 1
             score += znccs[j]
             for k in range(9):
-                total[k] += systems[j, k]
+                total[k] += buffers.systems[j, k]
     return used, (score / used if used > 0 else best)
 
 
 @njit(**FAST)
 @no_type_check
-def _solve(total, ridge, step):
+def _solve(total, step):
     """Gauss-Newton step from the summed equations; returns the variance factor (H^-1)_00, negative if singular."""
-    h00, h01, h02, h11, h12, h22 = total[0], total[1], total[2], total[3] + ridge, total[4], total[5] + ridge
+    # A slight damping of the slants, which a window of poor texture leaves open.
+    h00, h01, h02, h11, h12, h22 = total[0], total[1], total[2], total[3] + 1e-3, total[4], total[5] + 1e-3
     c00, c01, c02 = h11 * h22 - h12 * h12, h02 * h12 - h01 * h22, h01 * h12 - h02 * h11
     c11, c12, c22 = h00 * h22 - h02 * h02, h01 * h02 - h00 * h12, h00 * h11 - h01 * h01
     determinant = h00 * c00 + h01 * c01 + h02 * c02
@@ -248,46 +303,39 @@ def _solve(total, ridge, step):
 
 @njit(**FAST)
 @no_type_check
-def _refine_plane(view, u, v, plane, settings, buffers, result):
-    """Gauss-Newton from a plane, changed in place; ``result`` gets SCORE, VARIANCE, SUPPORT. False where it fails."""
-    radius, iterations, converged, camera_zncc, lag = settings[:5]
-    images, sizes, infinite, parallax, others, weights, effective = view
-    scratch, systems, znccs, total, step = buffers
-    for iteration in range(iterations):
-        _compare(images, sizes, infinite, parallax, others, u, v, plane, radius, weights, scratch, systems, znccs)
+def _refine_plane(view, limits, buffers, u, v, plane):
+    """Gauss-Newton from a plane, changed in place; ``buffers.result`` gets SCORE, VARIANCE, SUPPORT. False: failed."""
+    result, step = buffers.result, buffers.step
+    for iteration in range(limits.iterations):
+        _compare(view, u, v, plane, buffers)
         # The start may be a pixel off: let cameras in that do not agree well yet.
-        floor = camera_zncc if iteration >= 2 else np.float32(0.4) * camera_zncc
-        used, score = _combine(systems, znccs, floor, lag, total)
+        floor = limits.camera_zncc if iteration >= 2 else np.float32(0.4) * limits.camera_zncc
+        used, score = _combine(buffers, floor, limits.lag)
         if used == 0:
             return False
-        factor = _solve(total, 1e-3, step)
+        factor = _solve(buffers.total, step)
         if factor < 0:
             return False
-        result[0], result[1], result[2] = score, 2 * (1 - score) * factor / effective, used
+        result[0], result[1], result[2] = score, 2 * (1 - score) * factor / limits.effective, used
         length = abs(step[0])
         shrink = 1.0 if length <= 1 else 1 / length
         for k in range(3):
             plane[k] += shrink * step[k]
-        if length < converged:
+        if length < limits.converged:
             break
     return True
 
 
 @njit(**FAST)
 @no_type_check
-def _best_start(view, u, v, candidates, count, settings, buffers):
+def _best_start(view, limits, buffers, u, v, count):
     """Index of the candidate plane with the best mean ZNCC."""
     if count == 1:
         return 0
-    radius, _, _, camera_zncc, lag = settings[:5]
-    images, sizes, infinite, parallax, others, weights, _ = view
-    scratch, systems, znccs, total, _ = buffers
     best, best_score = 0, np.float32(-2)
     for c in range(count):
-        _compare(
-            images, sizes, infinite, parallax, others, u, v, candidates[c], radius, weights, scratch, systems, znccs
-        )
-        _, score = _combine(systems, znccs, np.float32(0.4) * camera_zncc, lag, total)
+        _compare(view, u, v, buffers.candidates[c], buffers)
+        _, score = _combine(buffers, np.float32(0.4) * limits.camera_zncc, limits.lag)
         if score > best_score:
             best, best_score = c, score
     return best
@@ -321,58 +369,37 @@ def _gather_candidates(field, seeds, row, column, direction, spacing, accept, ca
 
 @njit(**FAST)
 @no_type_check
-def _sweep(view, reference, seeds, field, direction, spacing, settings, buffers):
-    """Visit the pixels that have no accepted plane yet, in raster order or against it."""
-    radius, _, _, _, _, accept, least_contrast, q_low, q_high = settings
-    rows, columns = field.shape[:2]
-    height, width = view[1][reference]
-    image, weights, template = view[0][reference], view[5], buffers[0][0]
-    candidates = np.zeros((seeds.shape[0] + 4, 3))
-    result = np.zeros(3)
-    for i in range(rows):
-        row = i if direction > 0 else rows - 1 - i
-        v = spacing // 2 + row * spacing
-        for k in range(columns):
-            column = k if direction > 0 else columns - 1 - k
-            u = spacing // 2 + column * spacing
-            if field[row, column, SCORE] >= accept or not (
-                radius <= u < width - radius and radius <= v < height - radius
-            ):
-                continue
-            count = _gather_candidates(field, seeds, row, column, direction, spacing, accept, candidates)
-            if count == 0 or _load_template(image, u, v, radius, weights, template) < least_contrast:
-                continue
-            plane = candidates[_best_start(view, u, v, candidates, count, settings, buffers)]
-            if not _refine_plane(view, u, v, plane, settings, buffers, result):
-                continue
-            if result[0] > field[row, column, SCORE] and q_low <= plane[0] <= q_high:
-                field[row, column, :3] = plane
-                field[row, column, 3:] = result
+def _visit(view, limits, buffers, seeds, field, row, column, direction):
+    """Refine a pixel from the best of its candidates; writes the field where that is better than what it holds."""
+    u, v = view.spacing // 2 + column * view.spacing, view.spacing // 2 + row * view.spacing
+    height, width = view.sizes[view.reference]
+    if not (view.radius <= u < width - view.radius and view.radius <= v < height - view.radius):
+        return
+    count = _gather_candidates(field, seeds, row, column, direction, view.spacing, limits.accept, buffers.candidates)
+    if count == 0 or _load_template(view, u, v, buffers.template) < limits.least_contrast:
+        return
+    plane = buffers.candidates[_best_start(view, limits, buffers, u, v, count)]
+    if not _refine_plane(view, limits, buffers, u, v, plane):
+        return
+    if buffers.result[0] > field[row, column, SCORE] and view.q_low <= plane[0] <= view.q_high:
+        field[row, column, :3] = plane
+        field[row, column, 3:] = buffers.result
 
 
 @njit(**FAST)
 @no_type_check
-def _refine_field(view, reference, seeds, spacing, sweeps, settings):
-    """The refined field (rows, columns, 6) of a reference camera from layers of seeds (q; 0 where there is none)."""
-    size, others = view[5].size, view[4].size
-    buffers = (
-        (
-            np.zeros(size, np.float32),
-            np.zeros(size, np.float32),
-            np.zeros(size, np.float32),
-            np.zeros(3),
-            np.zeros(3),
-            np.zeros(3),
-        ),
-        np.zeros((others, 9), np.float32),
-        np.zeros(others, np.float32),
-        np.zeros(9),
-        np.zeros(3),
-    )
-    field = np.zeros((seeds.shape[1], seeds.shape[2], 6))
-    for _ in range(sweeps):
-        _sweep(view, reference, seeds, field, 1, spacing, settings, buffers)
-        _sweep(view, reference, seeds, field, -1, spacing, settings, buffers)
+def _refine_field(view, limits, buffers, seeds, sweeps):
+    """Visit the pixels that have no accepted plane yet, in raster order and against it, ``sweeps`` times."""
+    rows, columns = seeds.shape[1:]
+    field = np.zeros((rows, columns, 6))
+    for sweep in range(2 * sweeps):
+        direction = 1 - 2 * (sweep % 2)
+        for i in range(rows):
+            row = i if direction > 0 else rows - 1 - i
+            for k in range(columns):
+                column = k if direction > 0 else columns - 1 - k
+                if not field[row, column, SCORE] >= limits.accept:
+                    _visit(view, limits, buffers, seeds, field, row, column, direction)
     return field
 
 
@@ -391,28 +418,46 @@ def refine(
     ``images`` are grey values 0 to 255 in float32, padded to one size; ``sizes`` are their true heights and widths.
     ``seeds_mm`` are layers of first depths on the grid, NaN where there is none.
     """
-    weights = patch_weights(options)
-    with np.errstate(invalid="ignore"):
-        seeds = np.nan_to_num(geometry.scale / seeds_mm).astype(np.float64)
+    window = patch_window(options)
     near, far = depth_range_mm
-    view = (
-        images,
-        sizes,
-        geometry.infinite,
-        geometry.parallax,
-        geometry.others,
-        weights,
-        float(1 / np.sum(weights.astype(np.float64) ** 2)),
+    view = _View(
+        images=images,
+        sizes=sizes,
+        reference=reference,
+        infinite=geometry.infinite,
+        parallax=geometry.parallax,
+        others=geometry.others,
+        window=window,
+        radius=options.radius_px,
+        spacing=spacing_px,
+        q_low=geometry.scale / far,
+        q_high=geometry.scale / near,
     )
-    settings = (
-        options.radius_px,
-        options.iterations,
-        options.converged_px,
-        np.float32(options.camera_zncc),
-        np.float32(options.camera_zncc_lag),
-        options.accept_zncc,
-        options.least_contrast_dn,
-        geometry.scale / far,
-        geometry.scale / near,
+    limits = _Limits(
+        iterations=options.iterations,
+        converged=options.converged_px,
+        camera_zncc=np.float32(options.camera_zncc),
+        lag=np.float32(options.camera_zncc_lag),
+        accept=options.accept_zncc,
+        least_contrast=options.least_contrast_dn,
+        effective=float(1 / np.sum(window[2].astype(np.float64) ** 2)),
     )
-    return np.asarray(_refine_field(view, reference, seeds, spacing_px, options.sweeps, settings))
+    buffers = _new_buffers(window.shape[1], len(geometry.others), len(seeds_mm))
+    seeds = np.nan_to_num(geometry.scale / seeds_mm).astype(np.float64)
+    return np.asarray(_refine_field(view, limits, buffers, seeds, options.sweeps))
+
+
+def _new_buffers(samples: int, others: int, layers: int) -> _Buffers:
+    return _Buffers(
+        template=np.zeros(samples, np.float32),
+        values=np.zeros(samples, np.float32),
+        slopes=np.zeros(samples, np.float32),
+        warp=np.zeros((3, 3)),
+        places=np.zeros((4, samples), np.float32),
+        systems=np.zeros((others, 9), np.float32),
+        znccs=np.zeros(others, np.float32),
+        total=np.zeros(9),
+        step=np.zeros(3),
+        result=np.zeros(3),
+        candidates=np.zeros((4 + layers, 3)),
+    )
