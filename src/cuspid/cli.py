@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from cuspid import pipeline, storage
 from cuspid.anatomy.phantom import PhantomOptions, build_phantom
@@ -24,7 +24,7 @@ from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.jaw import Arch, Jaw
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.reconstruction import Reconstruction
-from cuspid.reporting.figures import draw_deviation, draw_mesh
+from cuspid.reporting.figures import deviation_colors, save_deviation_picture, save_picture
 from cuspid.rig import Handpiece
 from cuspid.trueness import Trueness
 
@@ -91,7 +91,7 @@ def run(
     out: Path,
     source: Annotated[Source, Flat] = Source(),
     probe: Annotated[Probe, Flat] = Probe(),
-    simulation: Annotated[SimulationOptions, Flat] = SimulationOptions(),
+    simulation: Annotated[SimulationOptions, Flat, OmitArgPrefixes] = SimulationOptions(),
     reconstruction: Annotated[ReconstructionOptions, Flat] = ReconstructionOptions(),
     evaluation: EvaluationOptions = EvaluationOptions(),
 ) -> None:
@@ -120,7 +120,7 @@ def phantom(*, out: Path, options: Annotated[PhantomOptions, Flat] = PhantomOpti
         storage.write_jaw(out, made)
     else:
         storage.write_mesh(out, made.mesh)
-    draw_mesh(out.with_suffix(".png"), made)
+    save_picture(out.with_suffix(".png"), made.mesh, title=f"{options.arch} phantom, seed {options.seed}")
     console.print(f"{out}: {len(made.mesh.faces):,} faces, teeth {', '.join(map(str, made.teeth))}")
 
 
@@ -148,7 +148,7 @@ def simulate(
     out: Path,
     source: Annotated[Source, Flat] = Source(),
     probe: Annotated[Probe, Flat] = Probe(),
-    simulation: Annotated[SimulationOptions, Flat] = SimulationOptions(),
+    simulation: Annotated[SimulationOptions, Flat, OmitArgPrefixes] = SimulationOptions(),
 ) -> None:
     """Render what the handpiece sees: OUT/capture (images, calibration) and OUT/truth (what only the simulator knows).
 
@@ -222,7 +222,8 @@ def _evaluate(mesh: Path, reference: Path, out: Path, source: Source, options: E
     hashes |= {"mesh": storage.hash_file(mesh)}
     storage.claim_folder(out, "evaluate", {"evaluation": options}, hashes, replace=True)
     trueness = pipeline.evaluate(scan, known, options, scannable=scannable)
-    draw_deviation(out, scan, trueness)
+    storage.write_mesh(out / "deviation.ply", replace(scan, colors=deviation_colors(trueness.deviation_um)))
+    save_deviation_picture(out / "deviation.png", scan, trueness)
     storage.write_trueness(out / "trueness.json", trueness)
     _print_trueness(trueness)
 

@@ -31,8 +31,8 @@ from cuspid.handpiece.visibility import VisibilityOptions, scannable_faces
 from cuspid.jaw import Arch, Jaw
 from cuspid.mesh import Mesh
 from cuspid.motion.colmap import locate_with_colmap, read_model, write_model
-from cuspid.motion.odometry import MotionOptions
-from cuspid.motion.odometry import locate as locate_with_rig
+from cuspid.motion.location import MotionOptions
+from cuspid.motion.location import locate as locate_with_rig
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece
 from cuspid.simulation.appearance import APPEARANCES, Preset
@@ -172,7 +172,7 @@ class ReconstructionOptions:
 
 @dataclass(frozen=True)
 class StoredDepthMaps:
-    """Depth maps on disk, read when they are iterated, as often as need be."""
+    """Depth maps on disk, read while they are iterated, as often as need be."""
 
     files: Sequence[Path]
     """One file a frame."""

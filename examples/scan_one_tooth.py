@@ -1,0 +1,29 @@
+"""Scan the top of one tooth of the built-in phantom with four cameras, reconstruct it, and print how true the mesh is.
+
+python examples/scan_one_tooth.py FOLDER
+"""
+
+import sys
+from pathlib import Path
+
+from cuspid import pipeline
+from cuspid.anatomy.phantom import PhantomOptions, build_phantom
+from cuspid.evaluation.deviation import EvaluationOptions
+from cuspid.handpiece.designs import DESIGNS, DesignOptions
+from cuspid.handpiece.visibility import VisibilityOptions
+from cuspid.simulation.scan_path import ScanPathOptions
+
+folder = Path(sys.argv[1])
+
+jaw = build_phantom(PhantomOptions(arch="lower"))
+handpiece = DESIGNS["four"](DesignOptions())
+path = ScanPathOptions(tooth=46)
+capture, truth = pipeline.simulate(jaw, handpiece, folder, pipeline.SimulationOptions(path=path))
+
+reconstruction, mesh = pipeline.reconstruct(capture, folder, pipeline.ReconstructionOptions())
+print(f"located {len(reconstruction.frames)} of {len(capture.frames)} frames; the mesh has {len(mesh.faces):,} faces")
+
+seen = pipeline.scannable(truth, VisibilityOptions())
+trueness = pipeline.evaluate(mesh, truth.jaw, EvaluationOptions(), scannable=seen)
+print(f"mean absolute deviation {trueness.accuracy.mean_abs_um:.1f} um, P95 {trueness.accuracy.p95_um:.1f} um")
+print(f"{trueness.completeness_pct['50']:.1f} % of what two cameras could see lies within 50 um of the mesh")

@@ -1,0 +1,33 @@
+"""The examples run, and say what they promise."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def run(name: str, *arguments: object) -> str:
+    command = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_own_handpiece(tmp_path):
+    printed = run("own_handpiece.py", tmp_path)
+    assert "(('left', 'right'),)" in printed
+    assert {path.name for path in tmp_path.iterdir()} == {"handpiece.json", "rig_config.json"}
+
+
+def test_scan_one_tooth(tmp_path):
+    """The whole flow, from the phantom to the trueness, through the Python interface."""
+    printed = run("scan_one_tooth.py", tmp_path)
+    assert "located 10 of 10 frames" in printed
+    mean, p95 = map(float, re.search(r"deviation ([\d.]+) um, P95 ([\d.]+) um", printed).groups())
+    assert 0.1 < mean < 8
+    assert mean < p95 < 25
+    assert 90 < float(re.search(r"([\d.]+) % of what", printed).group(1)) <= 100
+    assert (tmp_path / "mesh.ply").exists()
+    assert (tmp_path / "motion" / "sparse").is_dir()
