@@ -1,0 +1,304 @@
+"""The occlusal frame, scale and tooth numbers of a jaw that a user brings, from its shape alone.
+
+The outside of a scan tells where the crowns point: an open surface by the mean of its normals, a closed model by its
+side that is not smooth. Seen from there the tips of the crowns give the occlusal plane, the symmetry of the crowns the
+midline, and their spread across it which end is anterior.
+
+Frames: ``occlusal`` as in :mod:`cuspid.jaw`: origin in the middle of the crowns at the mean height of their tips.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+from scipy.ndimage import maximum_filter
+from scipy.spatial import ConvexHull, cKDTree
+
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
+from cuspid.jaw import GUM, Arch
+from cuspid.mesh import Mesh
+from cuspid.storage import MM_PER_UNIT, Unit
+
+_GRID_MM = 0.5
+"""Spacing of the height map."""
+_NEAR_MM = 8.0
+"""About the width of a tooth: a tip is the highest point within a square of this side."""
+_CROWN_MM = 3.0
+"""A point belongs to the top of a crown if it lies less than this below the tip near it."""
+_SPEE_MM = 5.0
+"""Tips lie within this below the plane on which the jaw would rest."""
+_ARCH_HALF_WIDTH_MM, _ARCH_DEPTH_MM = 25.0, 42.0
+"""Of the mean arch, at the middle of the second molars."""
+_ARCH_MISFIT_MM = 2.0
+"""A whole arch lies closer than this to the mean arch, as crowns are up to 11 mm wide."""
+_JAW_MM = (40.0, 90.0)
+"""Usual width of a jaw."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OcclusalFrame:
+    """Where the occlusal frame lies in a mesh."""
+
+    occlusal_from_mesh: Rigid3
+    """Takes the mesh into its occlusal frame."""
+    notes: tuple[str, ...]
+    """Why this is unsure; empty where it is not."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Relief:
+    """A mesh seen from +Z of some frame, on a grid."""
+
+    points: Float[np.ndarray, "h w 3"]
+    """First surface under each place of the grid, mm; NaN where there is none or only its back is seen."""
+    normals: Float[np.ndarray, "h w 3"]
+    """Normal there."""
+
+    @property
+    def heights(self) -> Float[np.ndarray, "h w"]:
+        """Z of the points, minus infinity where unknown."""
+        return np.where(np.isnan(self.points[..., 2]), -np.inf, self.points[..., 2])
+
+    def crowns(self) -> Bool[np.ndarray, "h w"]:
+        """The tops of the crowns."""
+        summits = maximum_filter(self.heights, round(_NEAR_MM / _GRID_MM))
+        return np.asarray((self.heights > summits - _CROWN_MM) & (np.abs(summits - self._plane()) < _SPEE_MM))
+
+    def tips(self) -> Bool[np.ndarray, "h w"]:
+        """The highest points of their surroundings."""
+        return np.asarray(self.crowns() & (self.heights == maximum_filter(self.heights, round(_NEAR_MM / _GRID_MM))))
+
+    def _plane(self) -> float:
+        """About the height of the tips; flaps of gum may rise higher."""
+        known = self.heights[np.isfinite(self.heights)]
+        return float(np.percentile(known, 95))
+
+
+def find_occlusal_frame(mesh: Mesh) -> OcclusalFrame:
+    """The occlusal frame of a jaw in any orientation, in mm; says so where it is unsure."""
+    upright, notes_up = _upright(mesh)
+    level = _level(mesh, upright)
+    relief = _relief(mesh, level)
+    crowns = relief.points[relief.crowns()]
+    anterior, notes_front = _anterior(crowns[:, :2])
+    tips = relief.points[relief.tips()]
+    centre = np.array([*crowns[:, :2].mean(axis=0), tips[:, 2].mean()])
+    turn = np.array([[anterior[1], -anterior[0], 0], [anterior[0], anterior[1], 0], [0, 0, 1.0]])
+    return OcclusalFrame(occlusal_from_mesh=Rigid3(turn, -turn @ centre) @ level, notes=(*notes_up, *notes_front))
+
+
+def _frame(up: Float[np.ndarray, "3"], centre: Float[np.ndarray, "3"]) -> Rigid3:
+    """A frame at ``centre`` with +Z along ``up``."""
+    first = np.cross(np.eye(3)[np.argmin(np.abs(up))], up)
+    first /= np.linalg.norm(first)
+    axes = np.stack([first, np.cross(up, first), up])
+    return Rigid3(axes, -axes @ centre)
+
+
+def _upright(mesh: Mesh) -> tuple[Rigid3, tuple[str, ...]]:
+    """A frame whose +Z leaves the crowns, within some ten degrees."""
+    weights = mesh.face_areas / mesh.face_areas.sum()
+    centre = weights @ mesh.face_centres
+    spread = (mesh.face_centres - centre).T @ (weights[:, None] * (mesh.face_centres - centre))
+    across = np.linalg.eigh(spread)[1][:, 0]
+    mean_normal = weights @ mesh.face_normals
+    openness = float(np.linalg.norm(mean_normal))
+    if openness > 0.15:
+        outwards = mean_normal / openness
+        along = float(across @ outwards)
+        up = np.sign(along) * across if abs(along) > 0.8 else outwards
+        return _frame(up, centre), ()
+    sides = [_frame(sign * across, centre) for sign in (1.0, -1.0)]
+    rough = [_roughness(_relief(mesh, side)) for side in sides]
+    best = int(np.argmax(rough))
+    sure = rough[best] > 1.3 * rough[1 - best]
+    notes = () if sure else ("occlusal frame: unsure which side the crowns are on, both are rough; check the picture",)
+    return sides[best], notes
+
+
+def _relief(mesh: Mesh, frame: Rigid3) -> _Relief:
+    """The mesh seen from +Z of ``frame``."""
+    seen = frame.apply(mesh.vertices)
+    lower, upper = seen.min(axis=0), seen.max(axis=0)
+    x, y = (np.arange(lower[axis], upper[axis] + _GRID_MM, _GRID_MM) for axis in range(2))
+    eyes = np.stack(np.broadcast_arrays(x[None], y[:, None], upper[2] + 1.0), axis=-1)
+    rays = frame.inverse()
+    hits = mesh.cast(rays.apply(eyes).reshape(-1, 3), np.broadcast_to(-frame.rotation[2], (eyes.size // 3, 3)))
+    normals = np.where(hits.faces[:, None] >= 0, frame.rotate(mesh.face_normals[hits.faces]), np.nan)
+    unseen = ~(normals[:, 2] > 0)
+    points = eyes.reshape(-1, 3) - np.where(unseen, np.nan, hits.distances)[:, None] * np.array([0, 0, 1.0])
+    points[unseen], normals[unseen] = np.nan, np.nan
+    return _Relief(points=points.reshape(eyes.shape), normals=normals.reshape(eyes.shape))
+
+
+def _roughness(relief: _Relief) -> float:
+    """Mean change of the normal from one place of the grid to the next, radians; 0 on a flat base."""
+    a, b = relief.normals[:, :-1].reshape(-1, 3), relief.normals[:, 1:].reshape(-1, 3)
+    cosines = np.sum(a * b, axis=1)
+    known = np.isfinite(cosines)
+    return float(np.arccos(np.clip(cosines[known], -1, 1)).mean()) if known.any() else 0.0
+
+
+def _level(mesh: Mesh, upright: Rigid3) -> Rigid3:
+    """Turn a frame so that the tips of the crowns lie in the plane XY on average."""
+    frame = _resting(_relief(mesh, upright), upright)
+    for _ in range(4):
+        relief = _relief(mesh, frame)
+        tips = relief.points[relief.tips()]
+        if len(tips) < 3:
+            return frame
+        design = np.column_stack([tips[:, :2], np.ones(len(tips))])
+        a, b, _ = np.linalg.lstsq(design, tips[:, 2], rcond=1e-6)[0]
+        frame = _tilted(np.array([-a, -b, 1.0]), frame)
+    return frame
+
+
+def _resting(relief: _Relief, frame: Rigid3) -> Rigid3:
+    """Turn a frame so that +Z is normal to the plane on which the jaw would rest, crowns down."""
+    points = relief.points[np.isfinite(relief.points[..., 2])]
+    hull = ConvexHull(points)
+    up = hull.equations[:, 2] > 0.5
+    centre = points.mean(axis=0)
+    normals, offsets = hull.equations[up, :3], hull.equations[up, 3]
+    if len(normals) == 0:
+        return frame
+    # The facet over the centre of mass is the one at which the line upwards leaves the hull first.
+    exits = -(offsets + normals @ centre) / normals[:, 2]
+    return _tilted(normals[int(np.argmin(exits))], frame)
+
+
+def _tilted(up: Float[np.ndarray, "3"], frame: Rigid3) -> Rigid3:
+    """``frame`` turned the short way so that the direction ``up`` in it becomes +Z."""
+    up = up / np.linalg.norm(up)
+    axis = np.cross(up, [0, 0, 1.0])
+    sine = np.linalg.norm(axis)
+    if sine < 1e-12:
+        return frame
+    return Rigid3.from_rotation_vector(axis / sine * np.arctan2(sine, up[2]), np.zeros(3)) @ frame
+
+
+def _anterior(crowns: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "2"], tuple[str, ...]]:
+    """Unit vector towards anterior, from the places of the crowns seen from above: how an arch fits them best."""
+    places = crowns[:: max(1, len(crowns) // 1000)]
+    fits = [_fit_arch(places, angle) for angle in np.deg2rad(np.arange(0, 360, 15.0))]
+    misfits = np.array([misfit for misfit, _ in fits])
+    directions = np.array([direction for _, direction in fits])
+    best = int(np.argmin(misfits))
+    rivals = misfits[directions @ directions[best] < np.cos(np.deg2rad(60))]
+    sure = misfits[best] < _ARCH_MISFIT_MM and (len(rivals) == 0 or misfits[best] < 0.85 * rivals.min())
+    note = "occlusal frame: unsure which way is anterior, this does not look like a whole arch; check the picture"
+    return _midline(places, directions[best]), () if sure else (note,)
+
+
+def _midline(places: Float[np.ndarray, "n 2"], front: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+    """The direction near ``front`` of the axis in which the crowns are most nearly their own mirror image."""
+    tree, centre, start = cKDTree(places), places.mean(axis=0), float(np.arctan2(front[1], front[0]))
+
+    def asymmetry(angle: float, offset_mm: float) -> float:
+        axis = np.array([np.cos(angle), np.sin(angle)])
+        across = np.array([-axis[1], axis[0]])
+        mirrored = places - 2 * ((places - centre) @ across - offset_mm)[:, None] * across
+        return float(np.minimum(tree.query(mirrored)[0], 3.0).mean())
+
+    tries = [(start + np.deg2rad(turn), offset) for turn in range(-26, 27, 2) for offset in np.arange(-4.0, 5.0)]
+    best, _ = min(tries, key=lambda attempt: asymmetry(*attempt))
+    return np.array([np.cos(best), np.sin(best)])
+
+
+def _fit_arch(places: Float[np.ndarray, "n 2"], angle: float) -> tuple[float, Float[np.ndarray, "2"]]:
+    """Lay the mean arch on the crowns from a start ``angle``: misfit in mm (0 to 4), and where its front points."""
+    x = np.linspace(-1, 1, 61)
+    arch = np.stack([_ARCH_HALF_WIDTH_MM * x, -_ARCH_DEPTH_MM * np.abs(x) ** 2.3], axis=1)
+    arch -= arch.mean(axis=0)
+    c, s = np.cos(angle), np.sin(angle)
+    laid = arch @ np.array([[c, s], [-s, c]]) + places.mean(axis=0)
+    tree = cKDTree(places)
+    for _ in range(20):
+        _, from_places = cKDTree(laid).query(places)
+        far, to_places = tree.query(laid)
+        near = far < 6.0
+        source = np.concatenate([arch[from_places], arch[near]])
+        target = np.concatenate([places, places[to_places[near]]])
+        weights = np.concatenate([np.full(len(places), 1 / len(places)), np.full(near.sum(), 1 / len(arch))])
+        laid = _similarity(source, target, weights, arch)
+    there, _ = cKDTree(laid).query(places)
+    back, _ = tree.query(laid)
+    front = laid[30] - laid[[0, -1]].mean(axis=0)
+    misfit = np.minimum(there, 4.0).mean() + np.minimum(back, 4.0).mean()
+    return float(misfit / 2), front / np.linalg.norm(front)
+
+
+def _similarity(
+    source: Float[np.ndarray, "n 2"],
+    target: Float[np.ndarray, "n 2"],
+    weights: Float[np.ndarray, "n"],
+    points: Float[np.ndarray, "m 2"],
+) -> Float[np.ndarray, "m 2"]:
+    """``points`` moved by the similarity, of moderate scale, that lays ``source`` best on ``target``."""
+    weights = weights / weights.sum()
+    from_centre, to_centre = weights @ source, weights @ target
+    a, b = (source - from_centre) @ [1, 1j], (target - to_centre) @ [1, 1j]
+    factor = np.sum(weights * a.conj() * b) / np.sum(weights * np.abs(a) ** 2)
+    factor *= np.clip(np.abs(factor), 0.75, 1.3) / max(np.abs(factor), 1e-9)
+    moved = factor * ((points - from_centre) @ [1, 1j])
+    return np.stack([moved.real, moved.imag], axis=1) + to_centre
+
+
+def check_scale(mesh: Mesh, unit: Unit = "mm") -> tuple[str, ...]:
+    """Notes on the width of a jaw that was read in ``unit`` and is now in mm.
+
+    Raises InputError where it cannot be in that unit, naming the unit that it seems to be in.
+    """
+    centred = mesh.vertices - mesh.vertices.mean(axis=0)
+    axes = np.linalg.eigh(centred.T @ centred)[1]
+    width_mm = float(np.ptp(centred @ axes[:, 1:], axis=0).max())
+    lower, upper = _JAW_MM
+    measured = f"the mesh is {width_mm:.3g} mm wide (--unit {unit}); a jaw is {lower:g}-{upper:g} mm wide"
+    if lower / 4 < width_mm < 1.5 * upper:
+        return () if lower < width_mm < upper else (f"scale: {measured}",)
+    raw = width_mm / MM_PER_UNIT[unit]
+    likely = [other for other, factor in MM_PER_UNIT.items() if lower <= raw * factor <= upper]
+    advice = f"give --unit {likely[0]}" if likely else "rescale it, or give the --unit that it is in"
+    raise InputError(f"{measured}; {advice}")
+
+
+def labels_from_colors(
+    face_colors: UInt8[np.ndarray, "f 3"], mesh: Mesh, arch: Arch | None
+) -> Int[np.ndarray, "f"] | None:
+    """FDI number for each face of a mesh in the occlusal frame whose teeth have a colour each and whose gum is white.
+
+    The teeth are numbered from the midline backwards on each side as if none were missing. None where the arch is not
+    known, the colours are not those of teeth (too few, too many, scattered), or a gap shows that a tooth is missing.
+    """
+    if arch is None:
+        return None
+    colors, region = np.unique(face_colors, axis=0, return_inverse=True)
+    teeth = np.flatnonzero(~np.all(colors == 255, axis=1))
+    if not 10 <= len(teeth) <= 16:
+        return None
+    areas = np.bincount(region, mesh.face_areas, minlength=len(colors))
+    summed = [np.bincount(region, mesh.face_areas * mesh.face_centres[:, k], minlength=len(colors)) for k in range(3)]
+    centroids = (np.stack(summed, axis=1) / areas[:, None])[:, :2]
+    numbers = _number_teeth(centroids[teeth], arch)
+    if numbers is None:
+        return None
+    table = np.full(len(colors), GUM)
+    table[teeth] = numbers
+    return np.asarray(table[region])
+
+
+def _number_teeth(centroids: Float[np.ndarray, "n 2"], arch: Arch) -> Int[np.ndarray, "n"] | None:
+    """FDI numbers by place along the arch, or None where they are not those of a row without gaps."""
+    numbers = np.zeros(len(centroids), dtype=np.int64)
+    around = np.arctan2(centroids[:, 0], centroids[:, 1] - centroids[:, 1].min() + 1.0)
+    for side, quadrant in ((1, 4), (-1, 3)) if arch == "lower" else ((1, 2), (-1, 1)):
+        members = np.flatnonzero(side * centroids[:, 0] > 0)
+        ordered = members[np.argsort(np.abs(around[members]))]
+        steps = np.linalg.norm(np.diff(centroids[ordered], axis=0), axis=1)
+        if not 5 <= len(ordered) <= 8 or np.any(steps > 14) or np.any(steps < 2):
+            return None
+        numbers[ordered] = 10 * quadrant + 1 + np.arange(len(ordered))
+    return numbers
