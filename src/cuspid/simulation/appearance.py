@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Literal, NamedTuple, no_type_check
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, UInt8
 from numba import njit
 from scipy.spatial.transform import Rotation
 
@@ -96,8 +96,8 @@ class Palette(NamedTuple):
     """(material, octave, 3, 4): turn, scale and shift of each octave, so that their lattices never line up."""
 
 
-def face_materials(jaw: Jaw) -> Int[np.ndarray, "f"]:
-    """Index of the material of each face: 0 enamel, 1 gum. uint8."""
+def face_materials(jaw: Jaw) -> UInt8[np.ndarray, "f"]:
+    """Index of the material of each face: 0 enamel, 1 gum."""
     if jaw.face_labels is None:
         return np.zeros(len(jaw.mesh.faces), dtype=np.uint8)
     return (jaw.face_labels == GUM).astype(np.uint8)
@@ -199,7 +199,7 @@ def _albedo(points, materials, palette, out):
 
 
 def albedo(
-    points: Float[np.ndarray, "n 3"], materials: Int[np.ndarray, "n"], palette: Palette
+    points: Float[np.ndarray, "n 3"], materials: UInt8[np.ndarray, "n"], palette: Palette
 ) -> Float[np.ndarray, "n 3"]:
     """Linear RGB albedo at points of the jaw (mm in the occlusal frame), given the material of each."""
     out = np.empty_like(points)

@@ -273,7 +273,7 @@ def _circle_centre(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2"]:
 def _middles(
     along: Float[np.ndarray, "n"], sideways: Float[np.ndarray, "n"], height: Float[np.ndarray, "n"]
 ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m 2"]]:
-    """For each millimetre along the arch: where it is, the middle between the crowns' sides and the height of their tips."""
+    """For each millimetre along the arch: where it is, the middle between the crowns' sides, their height."""
     bins = np.floor(along - along.min()).astype(int)
     cuts = np.zeros((bins.max() + 1, 3))
     for index in np.unique(bins):
