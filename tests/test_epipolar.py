@@ -47,9 +47,7 @@ def test_triangulation_returns_the_point(first_from_world, rotation, translation
     assume(np.linalg.norm(translation) > 0.2)
     second_from_world = near(rotation, translation) @ first_from_world
     world = first_from_world.inverse().apply(POINTS)
-    projections = np.stack(
-        [projection_matrix(CAMERA, first_from_world), projection_matrix(CAMERA, second_from_world)]
-    )
+    projections = np.stack([projection_matrix(CAMERA, first_from_world), projection_matrix(CAMERA, second_from_world)])
     pixels = np.stack([CAMERA.project(frame.apply(world)) for frame in (first_from_world, second_from_world)])
     np.testing.assert_allclose(triangulate(projections, pixels), world, atol=1e-5)
 

@@ -64,12 +64,12 @@ def load_jaw(path: Path, *, unit: storage.Unit = "mm", arch: Arch | None = None)
     Raises InputError where the file is no mesh, or its width is not that of a jaw in the given unit.
     """
     mesh, labels, colors = storage.read_labelled_mesh(path, unit)
-    check_scale(mesh, unit)
+    notes = check_scale(mesh, unit)
     occlusal = find_occlusal_frame(mesh)
     moved = mesh.transformed(occlusal.occlusal_from_mesh)
     if labels is None and colors is not None:
-        labels = labels_from_colors(moved, colors, arch)
-    return Jaw(mesh=moved, face_labels=labels, arch=arch), occlusal.notes
+        labels = labels_from_colors(colors, moved, arch)
+    return Jaw(mesh=moved, face_labels=labels, arch=arch), (*notes, *occlusal.notes)
 
 
 def load_reference(
