@@ -663,6 +663,20 @@ def _as_tracks(state: _State, observations: _Observations, colors: Any) -> Track
     )
 
 
+def calibration_sigma_px(rig: Rig, distance_mm: float) -> float:
+    """How far (px, one standard deviation, worst camera) the rig's covariance moves points at a distance; 0 if held."""
+    prior, sigma = _Prior.of(rig), 0.0
+    if not prior.is_free:
+        return sigma
+    for index, mounted in enumerate(rig.cameras.values()):
+        corners = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]]) * [mounted.camera.width, mounted.camera.height]
+        in_rig = mounted.cam_from_rig.inverse().apply(distance_mm * mounted.camera.rays(corners))
+        moved = [prior.camera_at(index, unit) for unit in np.eye(_CALIBRATION)]
+        shifts = np.stack([m.camera.project(m.cam_from_rig.apply(in_rig)) - corners for m in moved])
+        sigma = max(sigma, float(np.sqrt(np.sum(shifts**2, axis=(0, 2)).max())))
+    return sigma
+
+
 def residuals_px(reconstruction: Reconstruction) -> Float[np.ndarray, "o 2"]:
     """Projected minus observed pixel for each observation of the tracks; NaN behind the camera."""
     tracks = reconstruction.tracks

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from cuspid.capture import Capture
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
-from cuspid.motion.adjustment import AdjustmentOptions, adjust
+from cuspid.motion.adjustment import AdjustmentOptions, adjust, calibration_sigma_px
 from cuspid.motion.features import FeatureOptions, Features, Progress, detect_all
 from cuspid.motion.odometry import (
     Cloud,
@@ -215,6 +215,17 @@ def _require_enough(path: Path, clouds: Sequence[Cloud], options: MotionOptions)
     )
 
 
+def _loosened(options: MotionOptions, slack_px: float) -> MotionOptions:
+    """Options with tolerances that allow for an uncertain calibration."""
+    within, odometry, between = options.within, options.odometry, options.between
+    return replace(
+        options,
+        within=replace(within, tolerance_px=within.tolerance_px + slack_px),
+        odometry=replace(odometry, error_px=odometry.error_px + slack_px),
+        between=replace(between, tolerance_px=between.tolerance_px + slack_px),
+    )
+
+
 def locate_features(
     handpiece: Handpiece,
     features: Mapping[tuple[str, str], Features],
@@ -225,6 +236,7 @@ def locate_features(
 ) -> Reconstruction:
     """As :func:`locate`, from the keypoints by (frame, camera) of the frames ``names`` in the order of capture."""
     rig, log = handpiece.rig, dict[str, float]()
+    options = _loosened(options, 2 * calibration_sigma_px(rig, handpiece.working_distance_mm))
     frames = [{c: make_view(features[name, c], mounted.camera) for c, mounted in rig.cameras.items()} for name in names]
     with _timed(log, "triangulation"):
         pairs = rig.stereo_pairs(handpiece.working_distance_mm)

@@ -56,9 +56,9 @@ class Cloud:
 
     points: Float[np.ndarray, "p 3"]
     """In the rig frame, mm."""
-    point_of: Mapping[str, Int[np.ndarray, "?n"]]
+    point_of: Mapping[str, Int[np.ndarray, "_"]]
     """By camera: the point of each keypoint, -1 for none."""
-    matches: tuple[tuple[str, str, Int[np.ndarray, "?k 2"]], ...]
+    matches: tuple[tuple[str, str, Int[np.ndarray, "_ 2"]], ...]
     """(camera, camera, pairs of keypoints) that the points were made from."""
 
     def depths(self, rig: Rig, camera: str) -> Float[np.ndarray, "n"]:
@@ -99,7 +99,7 @@ def _consistent(
     rig: Rig,
     views: Views,
     points: Float[np.ndarray, "p 3"],
-    track: Mapping[str, Int[np.ndarray, "?n"]],
+    track: Mapping[str, Int[np.ndarray, "_"]],
     limit_px: float,
 ) -> np.ndarray:
     """True for the points that lie before each of their cameras and within ``limit_px`` of each of their keypoints."""

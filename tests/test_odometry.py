@@ -1,0 +1,285 @@
+"""From keypoints, and from images, to metric poses; and what happens where that cannot be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cuspid.camera import Camera
+from cuspid.capture import Capture, Frame
+from cuspid.errors import ReconstructionError
+from cuspid.geometry import Rigid3
+from cuspid.motion import MotionOptions, locate
+from cuspid.motion.features import DESCRIPTOR_NORM, Features
+from cuspid.motion.location import locate_features
+from cuspid.motion.odometry import Edge, OdometryOptions, chain, triangulate_frame
+from cuspid.motion.pairs import MatchingOptions, make_view
+from cuspid.reconstruction import Reconstruction
+from cuspid.rig import Handpiece, MountedCamera, Rig
+
+SIGMA_PX = 0.2
+Keypoints = dict[tuple[str, str], Features]
+
+
+def make_handpiece() -> Handpiece:
+    """Three cameras side by side and one that looks from the side, not paired with them."""
+    camera = Camera.from_field_of_view(400, 400, 62.0)
+    camera = camera.with_parameters(camera.parameters + [0, 0, 2, -1, -0.08, 0.02, 1e-3, 0])
+    places = {"a": [0.0, 0, 0], "b": [1.4, 0, 0], "c": [0.5, 1.2, 0]}
+    cameras = {name: MountedCamera(camera, Rigid3(np.eye(3), -np.array(x))) for name, x in places.items()}
+    aside = Rigid3.from_rotation_vector(np.array([0, 0.9, 0]), np.array([0, 0, 5.0])) @ Rigid3(
+        np.eye(3), np.array([0, 0, -5.0])
+    )
+    return Handpiece(rig=Rig({**cameras, "side": MountedCamera(camera, aside)}))
+
+
+def make_path(count: int) -> dict[str, Rigid3]:
+    """A turning walk; the first pose is the identity."""
+    return {
+        f"{k:05d}": Rigid3.from_rotation_vector(np.array([0.01 * k, -0.02 * k, 0.04 * k]), np.array([-0.7 * k, 0, 0]))
+        for k in range(count)
+    }
+
+
+def words(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Random descriptors, as floats."""
+    raw = rng.gamma(0.4, size=(count, 128))
+    return DESCRIPTOR_NORM * np.sqrt(raw / raw.sum(axis=1, keepdims=True))
+
+
+def see(handpiece: Handpiece, path: dict[str, Rigid3], *, seed: int = 0, points: int = 900) -> Keypoints:
+    """Keypoints of a wavy surface: noisy places and descriptors, in random order."""
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform([-4, -4], [9, 5], (points, 2))
+    surface = np.column_stack([xy, 5 + 0.5 * np.sin(1.3 * xy[:, 0]) * np.cos(xy[:, 1])])
+    dictionary, seen = words(rng, points), {}
+    for frame, pose in path.items():
+        for name, mounted in handpiece.rig.cameras.items():
+            pixels = mounted.camera.project((mounted.cam_from_rig @ pose).apply(surface))
+            inside = rng.permutation(np.flatnonzero(mounted.camera.contains(pixels)))
+            noisy = dictionary[inside] + rng.normal(0, 4, (len(inside), 128))
+            seen[frame, name] = Features(
+                pixels=pixels[inside] + rng.normal(0, SIGMA_PX, (len(inside), 2)),
+                descriptors=np.clip(np.rint(noisy), 0, 255).astype(np.uint8),
+                colors=np.full((len(inside), 3), 200, np.uint8),
+            )
+    return seen
+
+
+def blanked(seen: Keypoints, frame: str, keep: int = 0) -> Keypoints:
+    """The same with few keypoints left in one frame."""
+    return {
+        key: Features(pixels=f.pixels[:keep], descriptors=f.descriptors[:keep], colors=f.colors[:keep])
+        if key[0] == frame
+        else f
+        for key, f in seen.items()
+    }
+
+
+def errors(found: Reconstruction, path: dict[str, Rigid3]) -> np.ndarray:
+    """(frames, 6) small motions on the left of the true poses, with the world in the first located frame."""
+    world = path[found.frames[0]].inverse()
+    motions = [found.rig_from_world[name] @ (path[name] @ world).inverse() for name in found.frames]
+    return np.array([[*motion.rotation_vector, *motion.translation] for motion in motions])
+
+
+def test_closed_loop_is_metric_and_as_good_as_it_says() -> None:
+    """Poses to micrometres, without any scale given; errors fit the covariance."""
+    handpiece, path = make_handpiece(), make_path(6)
+    squares = []
+    for seed in range(3):
+        found = locate_features(handpiece, see(handpiece, path, seed=seed), list(path), MotionOptions())
+        assert found.frames == tuple(path)
+        assert not found.dropped
+        off = errors(found, path)
+        assert not off[0].any()
+        assert 0 < np.abs(off[:, 3:]).max() < 0.01
+        covariance = found.pose_covariance[1:]
+        squares.append(np.einsum("fi,fi->f", off[1:], np.linalg.solve(covariance, off[1:, :, None])[..., 0]))
+        assert found.log["observation_sigma_px"] == pytest.approx(SIGMA_PX, rel=0.1)
+    assert 2.5 < np.mean(squares) < 12
+
+
+def test_tracks_lie_on_the_surface() -> None:
+    """The sparse model is in millimetres too, and the observations name images in which it is seen."""
+    handpiece, path = make_handpiece(), make_path(4)
+    tracks = locate_features(handpiece, see(handpiece, path), list(path), MotionOptions()).tracks
+    x, y, z = tracks.points.T
+    off = z - (5 + 0.5 * np.sin(1.3 * x) * np.cos(y))
+    assert 0 < np.median(np.abs(off)) < 0.01
+    assert set(np.unique(tracks.frame_index)) == set(range(4))
+    assert set(np.unique(tracks.camera_index)) == set(range(4))
+    assert np.all(tracks.colors[np.unique(tracks.point_index)] == 200)
+
+
+def test_result_is_repeatable() -> None:
+    """Bit for bit, whatever the threads do."""
+    handpiece, path = make_handpiece(), make_path(4)
+    seen = see(handpiece, path)
+    one, other = (locate_features(handpiece, seen, list(path), MotionOptions()) for _ in range(2))
+    for name, pose in one.rig_from_world.items():
+        np.testing.assert_array_equal(pose.matrix, other.rig_from_world[name].matrix)
+
+
+def test_a_blurred_frame_is_dropped_and_bridged() -> None:
+    """Its neighbours are tied to each other at +2; the message says how many matches it had."""
+    handpiece, path = make_handpiece(), make_path(6)
+    found = locate_features(handpiece, blanked(see(handpiece, path), "00003", keep=4), list(path), MotionOptions())
+    assert found.frames == tuple(name for name in path if name != "00003")
+    assert [d.what for d in found.dropped] == ["frame 00003"]
+    assert "matches to its neighbours; 15 are needed" in found.dropped[0].reason
+    assert np.abs(errors(found, path)[:, 3:]).max() < 0.01
+
+
+def test_of_a_broken_scan_the_largest_part_is_kept() -> None:
+    """After frame 3 the handpiece jumps to a place that it had not seen."""
+    handpiece, path = make_handpiece(), make_path(7)
+    seen = see(handpiece, path)
+    elsewhere = see(handpiece, path, seed=1)
+    mixed = {key: elsewhere[key] if key[0] > "00003" else f for key, f in seen.items()}
+    found = locate_features(handpiece, mixed, list(path), MotionOptions())
+    assert found.frames == tuple(path)[:4]
+    assert [d.what for d in found.dropped] == [f"frame {name}" for name in tuple(path)[4:]]
+    assert "2 others" in found.dropped[0].reason
+
+
+@pytest.mark.parametrize("points", [0, 12])
+def test_too_little_texture_is_told_in_one_line(points: int) -> None:
+    """No crash and no poses: how many frames, which not, why, and what to change."""
+    handpiece, path = make_handpiece(), make_path(6)
+    with pytest.raises(ReconstructionError) as raised:
+        locate_features(handpiece, see(handpiece, path, points=points), list(path), MotionOptions())
+    message = str(raised.value)
+    assert "\n" not in message
+    assert "of 6 frames could be placed" in message
+    assert "frame 0000" in message
+    assert "texture" in message
+
+
+def test_a_single_frame_is_located_at_the_origin() -> None:
+    """One exposure is metric by itself."""
+    handpiece, path = make_handpiece(), make_path(1)
+    found = locate_features(handpiece, see(handpiece, path), list(path), MotionOptions())
+    np.testing.assert_array_equal(found.rig_from_world["00000"].matrix, np.eye(4))
+    assert len(found.tracks.points) > 20
+
+
+def test_wrong_matches_do_not_harm() -> None:
+    """A third of the descriptors is that of another point."""
+    handpiece, path = make_handpiece(), make_path(5)
+    rng, seen = np.random.default_rng(0), see(handpiece, path)
+    for key, f in seen.items():
+        order = np.arange(len(f))
+        some = rng.permutation(len(f))[: len(f) // 3]
+        order[some] = np.roll(some, 1)
+        seen[key] = replace(f, descriptors=f.descriptors[order])
+    found = locate_features(handpiece, seen, list(path), MotionOptions())
+    assert found.frames == tuple(path)
+    assert np.abs(errors(found, path)[:, 3:]).max() < 0.02
+
+
+def test_an_uncertain_calibration_is_refined() -> None:
+    """Given with its covariance, the extrinsic calibration comes back nearer to the truth."""
+    truth, path = make_handpiece(), make_path(6)
+    sigma, rng = np.array([2e-3] * 3 + [0.01] * 3), np.random.default_rng(2)
+    given = {}
+    for name, mounted in truth.rig.cameras.items():
+        motion = rng.normal(0, sigma)
+        moved = Rigid3.from_rotation_vector(motion[:3], motion[3:]) @ mounted.cam_from_rig
+        given[name] = replace(mounted, cam_from_rig=moved, covariance=np.diag(sigma**2))
+    nominal = replace(truth, rig=Rig(given))
+    found = locate_features(nominal, see(truth, path), list(path), MotionOptions())
+
+    def relative(rig: Rig) -> np.ndarray:
+        b_from_a = rig["b"].cam_from_rig @ rig["a"].cam_from_rig.inverse()
+        true = truth.rig["b"].cam_from_rig @ truth.rig["a"].cam_from_rig.inverse()
+        return (b_from_a @ true.inverse()).rotation_vector
+
+    assert np.linalg.norm(relative(found.rig)) < 0.3 * np.linalg.norm(relative(nominal.rig))
+    assert found.log["observation_sigma_px"] == pytest.approx(SIGMA_PX, rel=0.15)
+
+
+def test_a_frame_is_triangulated_in_the_rig_frame() -> None:
+    """Points of one exposure are where they are, seen by two or more cameras of the group only."""
+    handpiece, path = make_handpiece(), make_path(1)
+    seen = see(handpiece, path)
+    views = {c: make_view(seen["00000", c], m.camera) for c, m in handpiece.rig.cameras.items()}
+    cloud = triangulate_frame(handpiece, handpiece.rig.stereo_pairs(5.0), views, MatchingOptions())
+    x, y, z = cloud.points.T
+    assert len(z) > 100
+    assert np.median(np.abs(z - (5 + 0.5 * np.sin(1.3 * x) * np.cos(y)))) < 0.02
+    assert np.all(cloud.point_of["side"] == -1)
+    depths = cloud.depths(handpiece.rig, "a")
+    assert np.nanmin(depths) > 4
+    assert np.array_equal(np.isfinite(depths), cloud.point_of["a"] >= 0)
+
+
+def test_chain_follows_edges_in_both_directions() -> None:
+    """Poses come from the edges whatever frame they start at; the first located frame is the world."""
+    step = Rigid3.from_rotation_vector(np.array([0, 0, 0.1]), np.array([1.0, 0, 0]))
+    none = Edge(target_from_source=None, matches=3)
+    edges = {
+        (0, 1): none,
+        (1, 2): Edge(target_from_source=step, matches=90),
+        (0, 2): none,
+        (1, 3): Edge(target_from_source=step @ step, matches=80),
+        (2, 3): none,
+    }
+    path = chain(edges, ["p", "q", "r", "s"], OdometryOptions())
+    assert list(path.rig_from_world) == [1, 2, 3]
+    np.testing.assert_array_equal(path.rig_from_world[1].matrix, np.eye(4))
+    np.testing.assert_allclose(
+        (path.rig_from_world[3] @ path.rig_from_world[2].inverse()).matrix, step.matrix, atol=1e-12
+    )
+    assert path.dropped[0].what == "frame p"
+    assert path.dropped[0].reason == "only 3 matches to its neighbours; 15 are needed"
+
+
+# --- images ------------------------------------------------------------------------------------------------------
+
+
+def photograph(camera: Camera, cam_from_world: Rigid3, texture: np.ndarray, px_per_mm: float) -> np.ndarray:
+    """The plane z = 5 of the world with a texture centred at its origin, through an ideal camera, four rays a pixel."""
+    grid = (np.stack(np.meshgrid(np.arange(2 * camera.width), np.arange(2 * camera.height)), -1) + 0.5) / 2
+    world_from_cam = cam_from_world.inverse()
+    rays, centre = world_from_cam.rotate(camera.rays(grid)), world_from_cam.translation
+    on_plane = centre + rays * ((5 - centre[2]) / rays[..., 2:])
+    place = (on_plane[..., :2] * px_per_mm + np.array(texture.shape[::-1]) / 2 - 0.5).astype(np.float32)
+    fine = cv2.remap(texture, place[..., 0], place[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    return cv2.resize(fine, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+
+
+def make_capture(folder: Path, rig: Rig, path: dict[str, Rigid3]) -> Capture:
+    """Images of a speckled plane on disk."""
+    rng = np.random.default_rng(0)
+    layers = [cv2.GaussianBlur(rng.normal(size=(1600, 1600)), (0, 0), s) * s for s in (2.0, 5.0, 12.0)]
+    texture = cv2.normalize(sum(layers), None, 30, 225, cv2.NORM_MINMAX).astype(np.float32)
+    capture = Capture(folder=folder, handpiece=Handpiece(rig=rig), frames=tuple(Frame(name=name) for name in path))
+    for frame, pose in path.items():
+        for name, mounted in rig.cameras.items():
+            gray = photograph(mounted.camera, mounted.cam_from_rig @ pose, texture, 80.0)
+            noisy = np.clip(np.rint(gray + rng.normal(0, 1.5, gray.shape)), 0, 255).astype(np.uint8)
+            file = capture.image_path(frame, name)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(file), cv2.merge([noisy] * 3))
+    return capture
+
+
+def test_images_are_located(tmp_path: Path) -> None:
+    """Speckled plane, three cameras with distortion, three frames: poses to a few micrometres; stages are reported."""
+    rig = Rig({name: m for name, m in make_handpiece().rig.cameras.items() if name != "side"})
+    path = {
+        f"{k:05d}": Rigid3.from_rotation_vector(np.array([0.03 * k, -0.02 * k, 0.03 * k]), np.array([-0.6 * k, 0, 0]))
+        for k in range(3)
+    }
+    stages: list[str] = []
+    found = locate(make_capture(tmp_path, rig, path), progress=lambda stage, done, total: stages.append(stage))
+    assert found.frames == tuple(path)
+    assert 0 < np.abs(errors(found, path)[:, 3:]).max() < 0.01
+    assert 0 < found.reprojection_rms_px < 0.5
+    assert list(dict.fromkeys(stages)) == ["features", "triangulation", "matching"]
+    assert {"features_s", "odometry_s", "adjustment_s", "observations"} <= set(found.log)
