@@ -23,7 +23,7 @@ class ConfidenceOptions:
     """A depth with a larger standard deviation is dropped."""
     best_sigma_mm: float = 0.002
     """Standard deviation that has confidence 1; the confidence falls with its inverse square."""
-    speckle_px: int = 60
+    speckle_px: int = 30
     """Connected pieces of fewer depth pixels are dropped."""
     speckle_jump_mm: float = 0.06
     """Neighbours that differ by more than this are not connected."""

@@ -26,7 +26,7 @@ from cuspid.stereo.seeds import PairMatcher, seed_pairs, seed_points, semi_globa
 class StereoOptions:
     """Depth within one exposure."""
 
-    spacing_px: int = 2
+    spacing_px: int = 3
     """Depth is measured at every so many pixels."""
     seed_scale: float = 0.5
     """Resolution of the first matching relative to the images."""

@@ -1,0 +1,116 @@
+"""Cleaning removes what was added to a good surface, and nothing else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from cuspid.mesh import Mesh
+from cuspid.surface.cleaning import CleaningOptions, boundaries, clean, face_pieces, non_manifold_faces
+from synthetic_scene import height_field
+
+SHEET = height_field(lambda x, y: 5 + 0.2 * np.sin(x), half_width_mm=2.0, count=41)
+
+
+def joined(*meshes: Mesh) -> Mesh:
+    offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
+    return Mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]),
+    )
+
+
+def shifted(mesh: Mesh, shift: tuple[float, float, float]) -> Mesh:
+    return Mesh(mesh.vertices + shift, mesh.faces)
+
+
+def sphere(radius: float) -> Mesh:
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    return Mesh(np.asarray(ball.vertices), np.asarray(ball.faces))
+
+
+def test_a_good_surface_is_left_alone() -> None:
+    cleaned, report = clean(SHEET)
+    assert len(cleaned.faces) == len(SHEET.faces)
+    assert cleaned.face_areas.sum() == pytest.approx(SHEET.face_areas.sum())
+    assert report.removed_pieces == report.removed_ghost_faces == report.removed_non_manifold_faces == 0
+    assert report.split_vertices == 0
+    assert report.holes == ()
+    assert report.outer_boundary_mm == pytest.approx(16.0, rel=0.05)
+
+
+def test_floating_pieces_go() -> None:
+    crumb = shifted(sphere(0.2), (0, 0, -3))
+    cleaned, report = clean(joined(SHEET, crumb))
+    assert report.removed_pieces == 1
+    assert report.removed_piece_faces == len(crumb.faces)
+    assert len(cleaned.faces) == len(SHEET.faces)
+
+
+def test_a_wall_behind_the_surface_goes() -> None:
+    # The outside looks at -Z: what lies at a larger z is below the surface.
+    ghost = shifted(SHEET, (0, 0, 0.2))
+    cleaned, report = clean(joined(SHEET, ghost))
+    assert report.removed_ghost_faces > 0.9 * len(ghost.faces)
+    assert len(SHEET.faces) <= len(cleaned.faces) < 1.02 * len(SHEET.faces)
+    # The other side of a thin body is no ghost.
+    back = Mesh(ghost.vertices, ghost.faces[:, ::-1])
+    assert clean(joined(SHEET, back))[1].removed_ghost_faces == 0
+
+
+def test_holes_are_measured() -> None:
+    centre = np.linalg.norm(SHEET.face_centres[:, :2] - [0.5, 0.3], axis=1)
+    corner = np.linalg.norm(SHEET.face_centres[:, :2] + [1.0, 1.0], axis=1)
+    _, report = clean(SHEET.submesh((centre > 0.4) & (corner > 0.2)))
+    large, small = report.holes
+    assert large.area_mm2 == pytest.approx(np.pi * 0.16, rel=0.25)
+    assert large.perimeter_mm == pytest.approx(2 * np.pi * 0.4, rel=0.35)
+    assert 0 < small.area_mm2 < large.area_mm2
+
+
+def test_a_closed_surface_has_no_boundary() -> None:
+    assert boundaries(sphere(2.0)) == (0.0, ())
+
+
+def test_fins_are_cut_off() -> None:
+    fin = Mesh(np.vstack([SHEET.vertices, [[0, 0, 3.0]]]), np.vstack([SHEET.faces, [[820, 821, 1681]]]))
+    assert non_manifold_faces(fin).sum() >= 1
+    cleaned, report = clean(fin)
+    assert report.removed_non_manifold_faces >= 1
+    check = trimesh.Trimesh(cleaned.vertices, cleaned.faces, process=False)
+    assert len(trimesh.grouping.group_rows(check.edges_sorted, require_count=3)) == 0
+    assert len(cleaned.faces) > len(SHEET.faces) - 5
+
+
+def test_surfaces_that_touch_in_a_point_are_parted() -> None:
+    other = shifted(SHEET, (4.0, 4.0, 5.0))
+    touching = joined(SHEET, other)
+    last, first = len(SHEET.vertices) - 1, len(SHEET.vertices)
+    faces = np.where(touching.faces == first, last, touching.faces)
+    cleaned, report = clean(Mesh(touching.vertices, faces))
+    assert report.split_vertices == 1
+    assert len(cleaned.faces) == 2 * len(SHEET.faces)
+    assert len(cleaned.vertices) == 2 * len(SHEET.vertices)
+
+
+def test_pieces_are_counted_by_shared_edges() -> None:
+    assert face_pieces(joined(SHEET, shifted(SHEET, (0, 0, 2)), sphere(1.0))).max() == 2
+
+
+def test_colours_stay_with_their_vertices() -> None:
+    colors = np.tile((SHEET.vertices[:, :1] * 50 + 120).astype(np.uint8), 3)
+    half = joined(shifted(sphere(0.1), (0, 0, -3)), SHEET)
+    black = np.zeros((len(half.vertices) - len(colors), 3), dtype=np.uint8)
+    painted = Mesh(half.vertices, half.faces, np.vstack([black, colors]))
+    cleaned, _ = clean(painted)
+    assert cleaned.colors is not None
+    assert np.array_equal(cleaned.colors[:, 0], (cleaned.vertices[:, 0] * 50 + 120).astype(np.uint8))
+
+
+def test_nothing_stays_nothing() -> None:
+    empty = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    cleaned, report = clean(empty)
+    assert len(cleaned.faces) == 0
+    assert report.holes == ()
+    assert len(clean(sphere(0.1), CleaningOptions())[0].faces) == 0

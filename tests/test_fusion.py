@@ -1,0 +1,189 @@
+"""Fusion of depth maps against the surface that they were cast from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cuspid.geometry import Rigid3
+from cuspid.mesh import Mesh
+from cuspid.reconstruction import DepthMap
+from cuspid.surface.evidence import Evidence, observe
+from cuspid.surface.fusion import FusionOptions, Votes, fuse
+from cuspid.surface.volume import SparseVolume, pack, unpack
+from synthetic_scene import diamond, height_field, true_depth_map
+
+HILLS = height_field(lambda x, y: 5 + 0.3 * np.sin(2 * x) * np.cos(1.7 * y))
+RIDGE = height_field(lambda x, y: 5 + 0.8 * np.abs(x), count=401)
+POSES = {
+    f"{k:05d}": Rigid3.from_rotation_vector(
+        np.array([0.02 * k, 0.03 * k, 0.1 * k]), np.array([0.3 * k - 0.3, 0.2, 0.0])
+    )
+    for k in range(3)
+}
+
+
+def depth_maps(mesh: Mesh, poses=POSES, names=("west", "north")) -> list[DepthMap]:
+    rig = diamond(120).rig
+    return [true_depth_map(mesh, rig[name], pose, frame, name) for frame, pose in poses.items() for name in names]
+
+
+@cache
+def fused_hills() -> Mesh:
+    return fuse(depth_maps(HILLS), POSES)
+
+
+def signed_um(mesh: Mesh, reference: Mesh) -> np.ndarray:
+    _, face, place = reference.closest(mesh.vertices)
+    return 1000 * np.einsum("nd,nd->n", mesh.vertices - place, reference.face_normals[face])
+
+
+def test_true_depth_fuses_to_the_surface_without_bias() -> None:
+    deviation = signed_um(fused_hills(), HILLS)
+    assert len(deviation) > 5000
+    assert 0 < np.mean(np.abs(deviation)) < 1.5
+    assert np.percentile(np.abs(deviation), 95) < 4
+    assert abs(deviation.mean()) < 0.5
+
+
+def test_every_seen_place_is_covered() -> None:
+    points = np.concatenate(
+        [POSES[m.frame].inverse().apply(m.points_in_rig()[0]) for m in depth_maps(HILLS, names=("west",))]
+    )
+    distance, _, _ = fused_hills().closest(points)
+    assert (distance < 0.05).mean() > 0.98
+
+
+def test_faces_look_at_the_cameras() -> None:
+    mesh = fused_hills()
+    _, face, _ = HILLS.closest(mesh.face_centres)
+    facing = np.einsum("nd,nd->n", mesh.face_normals, HILLS.face_normals[face])
+    assert (facing > 0.8).mean() > 0.99
+
+
+def test_noise_averages_out() -> None:
+    rng = np.random.default_rng(0)
+    noisy = [
+        replace(m, depth_mm=(m.depth_mm + rng.normal(size=m.depth_mm.shape) * 0.01).astype(np.float32))
+        for m in depth_maps(HILLS)
+    ]
+    deviation = signed_um(fuse(noisy, POSES), HILLS)
+    assert 1 < np.mean(np.abs(deviation)) < 6
+    assert abs(deviation.mean()) < 1
+
+
+def test_confident_maps_outweigh_others() -> None:
+    poses = {"a": POSES["00000"], "b": POSES["00000"]}
+    good, bad = depth_maps(HILLS, poses, names=("west",))
+    shifted = replace(
+        bad, depth_mm=(bad.depth_mm - 0.02).astype(np.float32), confidence=(0.1 * bad.confidence).astype(np.float32)
+    )
+    assert 1 < np.median(signed_um(fuse([good, shifted], poses), HILLS)) < 4
+
+
+def test_a_sharp_ridge_keeps_its_edge() -> None:
+    mesh = fuse(depth_maps(RIDGE), POSES)
+    near = np.abs(mesh.vertices[:, 0]) < 0.1
+    assert near.sum() > 100
+    assert 0 < np.mean(np.abs(signed_um(mesh, RIDGE)[near])) < 8
+
+
+def test_what_one_map_alone_saw_is_left_out() -> None:
+    alone = fuse(depth_maps(HILLS, {"00000": POSES["00000"]}, names=("west",)), POSES)
+    assert len(alone.faces) == 0
+    trusting = FusionOptions(least_maps=1)
+    assert len(fuse(depth_maps(HILLS, {"00000": POSES["00000"]}, names=("west",)), POSES, trusting).faces) > 1000
+
+
+def test_maps_of_frames_that_were_not_located_are_left_out() -> None:
+    located = {name: POSES[name] for name in list(POSES)[:2]}
+    with_stray = fuse(depth_maps(HILLS), located)
+    without = fuse(depth_maps(HILLS, located), located)
+    assert np.array_equal(with_stray.vertices, without.vertices)
+
+
+def test_no_depth_gives_no_faces() -> None:
+    empty = [
+        replace(m, depth_mm=np.full_like(m.depth_mm, np.nan), confidence=np.zeros_like(m.confidence))
+        for m in depth_maps(HILLS)
+    ]
+    assert len(fuse(empty, POSES).faces) == 0
+    assert len(fuse([], POSES).faces) == 0
+
+
+def test_colour_comes_from_the_maps() -> None:
+    painted = [replace(m, color=np.full_like(m.color, (10, 200, 90))) for m in depth_maps(HILLS)]
+    mesh = fuse(painted, POSES)
+    assert mesh.colors is not None
+    assert np.all(np.abs(mesh.colors.astype(int) - (10, 200, 90)) <= 1)
+
+
+def test_fusion_is_deterministic_and_tells_progress() -> None:
+    told: list[tuple[str, int, int]] = []
+    again = fuse(depth_maps(HILLS), POSES, progress=lambda *step: told.append(step))
+    assert np.array_equal(again.vertices, fused_hills().vertices)
+    assert np.array_equal(again.faces, fused_hills().faces)
+    assert told[0] == ("fusion", 1, 6)
+    assert told[-1] == ("fusion", 6, 6)
+
+
+def test_the_frame_of_the_world_does_not_matter() -> None:
+    moved_from_world = Rigid3.from_rotation_vector(np.array([0.4, -0.7, 0.2]), np.array([30.0, -20.0, 5.0]))
+    moved = {name: pose @ moved_from_world.inverse() for name, pose in POSES.items()}
+    mesh = fuse(depth_maps(HILLS), moved).transformed(moved_from_world.inverse())
+    deviation = signed_um(mesh, HILLS)
+    assert 0 < np.mean(np.abs(deviation)) < 1.5
+
+
+def test_evidence_is_the_distance_to_a_tilted_plane() -> None:
+    tilted = height_field(lambda x, y: 5 + 0.3 * x - 0.2 * y, count=2)
+    depth_map = depth_maps(tilted, {"00000": Rigid3.identity()}, names=("west",))[0]
+    evidence, seen = Evidence.of(depth_map, 0.15), np.zeros(6)
+    normal = np.array([0.3, -0.2, -1.0]) / np.linalg.norm([0.3, -0.2, -1.0])
+    point = np.array([0.4, 0.3, 5 + 0.12 - 0.06]) + 0.07 * normal
+    in_cam = depth_map.cam_from_rig.apply(point)
+    assert observe(evidence.arrays, *in_cam, seen)
+    assert seen[0] == pytest.approx(0.07, abs=1e-4)
+    assert np.allclose(seen[2:5], normal, atol=1e-3)
+
+
+def test_depth_jumps_bend_no_plane() -> None:
+    step = height_field(lambda x, y: np.where(x < 0, 4.6, 5.4), count=400)
+    depth_map = depth_maps(step, {"00000": Rigid3.identity()}, names=("north",))[0]
+    evidence = Evidence.of(depth_map, 0.15)
+    known = evidence.weight > 0
+    cosine = np.abs(evidence.plane[known][:, 2]) / np.linalg.norm(evidence.plane[known], axis=1)
+    assert (cosine > 0.99).mean() > 0.98
+
+
+@given(st.lists(st.tuples(*[st.integers(-(2**19), 2**19)] * 3), min_size=1, max_size=20))
+def test_block_keys_are_unique_and_invert(blocks: list[tuple[int, int, int]]) -> None:
+    array = np.array(blocks)
+    assert np.array_equal(unpack(pack(array)), array)
+
+
+def test_neighbours_of_blocks() -> None:
+    volume = SparseVolume(0.05, 0.15)
+    volume._allocate(pack(np.array([[0, 0, 0], [1, 0, 0], [0, -1, 0], [5, 5, 5]])))
+    around = volume.neighbours()
+    assert around[0, 13] == 0
+    assert around[0, 22] == 1
+    assert around[0, 10] == 2
+    assert around[1, 4] == 0
+    assert (around[3] >= 0).sum() == 1
+
+
+def test_no_vertex_in_view_is_culled() -> None:
+    mesh = fused_hills()
+    votes = Votes.on(mesh)
+    depth_map = depth_maps(HILLS)[0]
+    cam_from_world = depth_map.cam_from_rig @ POSES[depth_map.frame]
+    in_view = depth_map.camera.contains(depth_map.camera.project(cam_from_world.apply(mesh.vertices)))
+    chosen = np.isin(np.arange(len(mesh.vertices)) // 256, votes._in_view(depth_map.camera, cam_from_world))
+    assert in_view.any()
+    assert chosen[in_view].all()

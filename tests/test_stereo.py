@@ -1,0 +1,266 @@
+"""Stereo against depth that is known by ray casting."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cuspid.camera import Camera
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
+from cuspid.reconstruction import DepthMap
+from cuspid.rig import Handpiece, MountedCamera, Rig
+from cuspid.stereo.confidence import ConfidenceOptions, Measured, agreement, confidence, without_speckle
+from cuspid.stereo.matching import DepthEstimator, StereoOptions, coarser, group_geometry
+from cuspid.stereo.rectification import IdealView, rectify
+from cuspid.stereo.seeds import seed_pairs, semi_global
+from synthetic_scene import cast_depth, diamond, height_field, render
+
+HILLS = height_field(lambda x, y: 5 + 0.25 * np.sin(1.8 * x) * np.cos(1.5 * y))
+STEP = height_field(lambda x, y: np.where(x < 0, 4.6, 5.4), count=400)
+LENS = (-0.12, 0.03, 0.001, -0.002)
+
+
+def photograph(handpiece: Handpiece, mesh=HILLS, seed: int = 0, **options) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return {
+        name: render(mesh, mounted, Rigid3.identity(), rng, **options)
+        for name, mounted in handpiece.rig.cameras.items()
+    }
+
+
+def errors_um(depth_map: DepthMap, mesh=HILLS) -> np.ndarray:
+    truth = cast_depth(mesh, depth_map.camera, depth_map.cam_from_rig)
+    difference = 1000 * (depth_map.depth_mm - truth)
+    return difference[np.isfinite(difference)]
+
+
+@cache
+def hills_images() -> dict[str, np.ndarray]:
+    return photograph(diamond())
+
+
+@cache
+def measured_hills() -> tuple[DepthMap, ...]:
+    return DepthEstimator(diamond(), StereoOptions(spacing_px=2)).measure(hills_images(), "00000")
+
+
+def test_depth_is_right_in_every_camera() -> None:
+    # One pixel of disparity in the widest pair is 75 um here.
+    for depth_map in measured_hills():
+        error = errors_um(depth_map)
+        assert error.size > 0.55 * depth_map.depth_mm.size
+        assert 0.1 < np.median(np.abs(error)) < 6
+        assert np.percentile(np.abs(error), 95) < 30
+        assert abs(np.median(error)) < 1.5
+
+
+def test_depth_map_is_well_formed() -> None:
+    for depth_map in measured_hills():
+        known = np.isfinite(depth_map.depth_mm)
+        assert depth_map.depth_mm.dtype == depth_map.confidence.dtype == np.float32
+        assert np.array_equal(known, depth_map.confidence > 0)
+        assert depth_map.confidence.max() <= 1
+        assert depth_map.color is not None
+        assert depth_map.color.shape == (*known.shape, 3)
+        assert not np.any(depth_map.camera.distortion)
+
+
+def test_confidence_orders_the_errors() -> None:
+    depth_map = measured_hills()[0]
+    truth = cast_depth(HILLS, depth_map.camera, depth_map.cam_from_rig)
+    known = np.isfinite(depth_map.depth_mm)
+    error, weight = np.abs(depth_map.depth_mm - truth)[known], depth_map.confidence[known]
+    sure, unsure = error[weight >= np.median(weight)], error[weight < np.quantile(weight, 0.1)]
+    assert np.median(unsure) > 1.3 * np.median(sure)
+
+
+def test_four_cameras_beat_two() -> None:
+    handpiece = diamond()
+    pair = replace(handpiece, rig=Rig({name: handpiece.rig[name] for name in ("west", "east")}))
+    two = DepthEstimator(pair, StereoOptions(spacing_px=2)).measure(hills_images(), "00000")
+    four = {depth_map.camera_name: depth_map for depth_map in measured_hills()}
+    assert len(two) == 2
+    for depth_map in two:
+        both = np.isfinite(depth_map.depth_mm) & np.isfinite(four[depth_map.camera_name].depth_mm)
+        truth = cast_depth(HILLS, depth_map.camera, depth_map.cam_from_rig)
+        with_two = np.abs(depth_map.depth_mm - truth)[both]
+        with_four = np.abs(four[depth_map.camera_name].depth_mm - truth)[both]
+        assert 0 < with_four.mean() < with_two.mean() < 0.02
+
+
+def test_distorted_and_turned_cameras_measure_as_well() -> None:
+    handpiece = diamond(distortion=LENS, turn_rad=0.05)
+    for depth_map in DepthEstimator(handpiece).measure(photograph(handpiece), "00000"):
+        error = errors_um(depth_map)
+        assert error.size > 0.4 * depth_map.depth_mm.size
+        assert 0.1 < np.median(np.abs(error)) < 8
+        assert abs(np.median(error)) < 2
+
+
+def test_no_texture_gives_no_depth() -> None:
+    handpiece = diamond()
+    for depth_map in DepthEstimator(handpiece).measure(photograph(handpiece, contrast=0.0), "00000"):
+        assert np.isfinite(depth_map.depth_mm).mean() < 0.002
+
+
+def test_unrelated_images_give_no_depth() -> None:
+    handpiece = diamond()
+    rng = np.random.default_rng(1)
+    images = {name: rng.integers(0, 255, (160, 160), dtype=np.uint8) for name in handpiece.rig.names}
+    for depth_map in DepthEstimator(handpiece).measure(images, "00000"):
+        assert np.isfinite(depth_map.depth_mm).mean() < 0.002
+
+
+def test_gain_and_offset_of_a_camera_do_not_matter() -> None:
+    handpiece = diamond()
+    images = hills_images()
+    dimmed = images | {"east": (images["east"] * 0.6 + 20).astype(np.uint8)}
+    depth_map = DepthEstimator(handpiece).measure(dimmed, "00000")[0]
+    assert depth_map.camera_name == "west"
+    assert np.median(np.abs(errors_um(depth_map))) < 7
+
+
+def test_depth_outside_of_the_range_is_not_kept() -> None:
+    handpiece = replace(diamond(), depth_range_mm=(4.95, 7.0))
+    for depth_map in DepthEstimator(handpiece).measure(hills_images(), "00000"):
+        known = depth_map.depth_mm[np.isfinite(depth_map.depth_mm)]
+        assert known.size > 0
+        assert known.min() >= 4.949
+
+
+def test_a_step_is_not_bridged() -> None:
+    handpiece = diamond()
+    for depth_map in DepthEstimator(handpiece).measure(photograph(handpiece, STEP), "00000"):
+        known = depth_map.depth_mm[np.isfinite(depth_map.depth_mm)]
+        between = (known > 4.7) & (known < 5.3)
+        assert known.size > 0.4 * depth_map.depth_mm.size
+        assert between.mean() < 0.01
+
+
+def test_the_same_images_give_the_same_depth() -> None:
+    again = DepthEstimator(diamond(), StereoOptions(spacing_px=2)).measure(hills_images(), "00000")
+    for one, other in zip(measured_hills(), again, strict=True):
+        assert np.array_equal(one.depth_mm, other.depth_mm, equal_nan=True)
+
+
+def test_cameras_that_share_no_view_are_refused() -> None:
+    camera = Camera.from_field_of_view(100, 100, 62.0)
+    back = Rigid3.from_rotation_vector(np.array([0, np.pi, 0]), np.zeros(3))
+    rig = Rig({"a": MountedCamera(camera, Rigid3.identity()), "b": MountedCamera(camera, back)})
+    with pytest.raises(InputError, match="no two cameras see the same surface"):
+        DepthEstimator(Handpiece(rig=rig))
+
+
+def test_cameras_behind_each_other_are_refused() -> None:
+    camera = Camera.from_field_of_view(100, 100, 62.0)
+    behind = MountedCamera(camera, Rigid3(np.eye(3), np.array([0, 0, 1.0])))
+    with pytest.raises(InputError, match="behind each other"):
+        rectify(("a", "b"), MountedCamera(camera, Rigid3.identity()), behind, 0.5)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10**6), turn=st.floats(0, 0.1))
+def test_rectified_pairs_share_rows_and_disparity_is_depth(seed: int, turn: float) -> None:
+    rig = diamond(turn_rad=turn).rig
+    rng = np.random.default_rng(seed)
+    first, second = rng.choice(rig.names, 2, replace=False)
+    pair = rectify((str(first), str(second)), rig[str(first)], rig[str(second)], 0.5)
+    points = rng.uniform([-1, -1, 4], [1, 1, 6], (20, 3))
+    in_first, in_second = pair.first_from_rig.apply(points), pair.second_from_rig.apply(points)
+    left, right = pair.camera.project(in_first), pair.camera.project(in_second)
+    assert np.allclose(left[:, 1], right[:, 1], atol=1e-9)
+    assert np.allclose(left[:, 0] - right[:, 0], [pair.disparity(z) for z in in_first[:, 2]], atol=1e-9)
+
+
+def test_resampling_honours_the_pixel_origin() -> None:
+    mounted = diamond(distortion=LENS).rig["west"]
+    view = IdealView.of("west", mounted)
+    assert view.maps is not None
+    row, column = 40, 100
+    ray = view.camera.rays(np.array([column + 0.5, row + 0.5]))
+    expected = mounted.camera.project(ray) - 0.5
+    assert np.allclose([view.maps[0][row, column], view.maps[1][row, column]], expected, atol=1e-4)
+
+
+@given(spacing=st.integers(1, 7), size=st.integers(20, 60))
+def test_coarser_pinhole_keeps_the_rays(spacing: int, size: int) -> None:
+    camera = Camera.from_field_of_view(size, size + 3, 62.0)
+    grid = coarser(camera, spacing)
+    fine = camera.pixel_centres()[spacing // 2 :: spacing, spacing // 2 :: spacing]
+    assert np.allclose(camera.rays(fine), grid.rays(grid.pixel_centres()), atol=1e-12)
+
+
+def test_group_geometry_projects_as_the_cameras_do() -> None:
+    rig = diamond(turn_rad=0.05).rig
+    views = [IdealView.of(name, mounted) for name, mounted in rig.cameras.items()]
+    geometry = group_geometry(views, 1)
+    point = np.array([0.3, -0.2, 5.1])
+    in_reference = views[1].cam_from_rig.apply(point)
+    pixel = views[1].camera.project(in_reference) - 0.5
+    for a, b, other in zip(geometry.infinite, geometry.parallax, geometry.others, strict=True):
+        homogeneous = a @ [*pixel, 1.0] + geometry.scale / in_reference[2] * b
+        expected = views[other].camera.project(views[other].cam_from_rig.apply(point)) - 0.5
+        assert np.allclose(homogeneous[:2] / homogeneous[2], expected, atol=1e-9)
+
+
+def test_semi_global_matching_finds_a_known_shift() -> None:
+    rng = np.random.default_rng(2)
+    scene = rng.integers(0, 255, (60, 140), dtype=np.uint8)
+    disparity = semi_global(scene[:, :100].copy(), scene[:, 12:112].copy(), (4.0, 20.0))
+    known = np.isfinite(disparity)
+    assert known[5:-5, 25:-5].mean() > 0.95
+    assert np.median(np.abs(disparity[known] - 12)) < 0.1
+    # What lies left of the second image cannot be matched.
+    assert not np.any(known[:, :11])
+
+
+def test_each_camera_gets_its_widest_partner() -> None:
+    handpiece = diamond()
+    group = handpiece.rig.groups(5.0)[0]
+    assert set(seed_pairs(handpiece.rig, group, handpiece.rig.stereo_pairs(5.0))) == {
+        ("west", "east"),
+        ("north", "south"),
+    }
+
+
+def flat(centre: tuple[float, float], depth: float) -> Measured:
+    camera = Camera.from_field_of_view(20, 20, 62.0)
+    full = np.full((20, 20), depth)
+    return Measured(camera, Rigid3(np.eye(3), -np.array([*centre, 0.0])), full, np.full((20, 20), 0.001))
+
+
+def test_cameras_that_agree_vote_for_a_depth_and_others_against() -> None:
+    measured = [flat((0, 0), 5.0), flat((0.5, 0), 5.01), flat((0, 0.5), 5.5), flat((0.5, 0.5), 4.5)]
+    votes = agreement(measured, 0, ConfidenceOptions(agreement_mm=0.03))[10, 10]
+    # The second agrees, the third looks through the point, the fourth sees something in front and knows nothing of it.
+    assert votes == 0
+    assert agreement(measured[:2], 0, ConfidenceOptions(agreement_mm=0.03))[10, 10] == 1
+    assert agreement(measured[::3], 0, ConfidenceOptions(agreement_mm=0.03))[10, 10] == 0
+
+
+def test_speckle_goes_and_surface_stays() -> None:
+    depth = np.full((40, 40), np.nan)
+    depth[:, :20] = 5.0
+    depth[5:8, 30:33] = 5.0
+    depth[20:23, 5:8] = 6.0
+    keep = without_speckle(depth, ConfidenceOptions(speckle_px=20))
+    assert keep[:, :5].all()
+    assert not keep[:, 20:].any()
+    assert not keep[20:23, 5:8].any()
+
+
+@given(sigma=st.floats(1e-5, 0.1))
+def test_confidence_is_inverse_variance_up_to_one(sigma: float) -> None:
+    options = ConfidenceOptions()
+    sigmas, keep = np.array([[sigma, 2 * sigma]]), np.array([[True, True]])
+    weight = confidence(sigmas, keep, options)
+    assert 0 < weight[0, 1] <= weight[0, 0] <= 1
+    if sigma > options.best_sigma_mm:
+        assert weight[0, 0] == pytest.approx(4 * weight[0, 1], rel=1e-5)
+    assert not confidence(sigmas, ~keep, options).any()
