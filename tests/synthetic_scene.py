@@ -79,7 +79,7 @@ def render(
     contrast: float = 1.0,
     noise_dn: float = 1.5,
     cell_mm: float = 0.12,
-    supersampling: int = 3,
+    supersampling: int = 2,
 ) -> np.ndarray:
     """RGB image of the mesh with a solid texture, box-filtered, with Gaussian noise; black where nothing is seen."""
     camera = mounted.camera
