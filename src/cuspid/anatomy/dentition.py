@@ -1,7 +1,7 @@
 """The fourteen teeth of a jaw, one quadrant from the midline backwards: shapes and how they stand in the arch.
 
-Widths, depths and heights are Wheeler's (see `crowns`), but for the lower incisors, which are 0.3 and 0.4 mm wider:
-in his sizes they would stand in a straight line between canines as far apart as those of `ARCH_FORMS`. Inclinations
+Widths, depths and heights are Wheeler's (see `crowns`), but for incisors and upper canines, 0.2 to 0.5 mm wider: in his
+sizes they would stand in a straight line between canines as far apart as those of `ARCH_FORMS`. Inclinations
 follow L. F. Andrews, *The six keys to normal occlusion* (Am. J. Orthod. 1972) in sign and order of magnitude;
 silhouettes, cusp positions and grooves are drawn after Wheeler's plates of each tooth.
 """
@@ -72,7 +72,7 @@ def _marginal_ridge(x: float, y: float, height: float, length: float = 2.6) -> L
 
 
 UPPER_CENTRAL = Crown(
-    width_mm=8.5, depth_mm=7.0, height_mm=10.5,
+    width_mm=8.8, depth_mm=7.0, height_mm=10.5,
     mesial=(0.35, 0.68, 0.80, 0.86, 0.92, 0.97, 1.0, 0.97, 0.92),
     distal=(0.35, 0.68, 0.80, 0.88, 0.95, 0.99, 1.0, 0.93, 0.80),
     buccal=(0.22, 0.38, 0.44, 0.50, 0.48, 0.40, 0.28, 0.14, -0.02),
@@ -83,7 +83,7 @@ UPPER_CENTRAL = Crown(
              AxialGroove(side="buccal", x=0.32, depth_mm=0.08, width_mm=1.0, end=0.3)),
 )  # fmt: skip
 UPPER_LATERAL = Crown(
-    width_mm=6.5, depth_mm=6.0, height_mm=9.0,
+    width_mm=6.9, depth_mm=6.0, height_mm=9.0,
     mesial=(0.35, 0.66, 0.77, 0.84, 0.91, 0.97, 1.0, 0.93, 0.80),
     distal=(0.35, 0.66, 0.77, 0.86, 0.94, 1.0, 0.97, 0.84, 0.65),
     buccal=(0.22, 0.38, 0.44, 0.50, 0.48, 0.40, 0.29, 0.15, -0.02),
@@ -94,11 +94,11 @@ UPPER_LATERAL = Crown(
              AxialGroove(side="buccal", x=0.32, depth_mm=0.06, width_mm=0.8, end=0.3)),
 )  # fmt: skip
 UPPER_CANINE = Crown(
-    width_mm=7.5, depth_mm=8.0, height_mm=10.0,
+    width_mm=7.7, depth_mm=8.0, height_mm=10.0,
     mesial=(0.35, 0.63, 0.73, 0.81, 0.89, 0.97, 0.98, 0.80, 0.50),
     distal=(0.35, 0.63, 0.73, 0.84, 0.95, 1.0, 0.94, 0.70, 0.40),
-    buccal=(0.26, 0.40, 0.44, 0.49, 0.50, 0.43, 0.31, 0.14, -0.04),
-    lingual=(0.26, 0.40, 0.44, 0.50, 0.41, 0.26, 0.13, 0.02, -0.06),
+    buccal=(0.26, 0.40, 0.44, 0.49, 0.50, 0.45, 0.35, 0.20, 0.04),
+    lingual=(0.26, 0.40, 0.44, 0.50, 0.41, 0.25, 0.09, -0.04, -0.10),
     squareness=2.1, taper=0.25, rim_mm=0.7,
     edge=Edge(mesial_fall_mm=2.0, distal_fall_mm=2.8, mesial_power=1.2, distal_power=1.2, fossa_mm=0.4,
               lingual_ridge_mm=0.45),
@@ -146,7 +146,7 @@ UPPER_SECOND_MOLAR = replace(
 )  # fmt: skip
 
 LOWER_CENTRAL = Crown(
-    width_mm=5.3, depth_mm=6.0, height_mm=9.0,
+    width_mm=5.4, depth_mm=6.0, height_mm=9.0,
     mesial=(0.32, 0.58, 0.70, 0.78, 0.86, 0.94, 0.99, 1.0, 0.99),
     distal=(0.32, 0.58, 0.70, 0.78, 0.86, 0.94, 0.99, 1.0, 0.97),
     buccal=(0.24, 0.40, 0.45, 0.49, 0.45, 0.36, 0.25, 0.12, -0.03),
@@ -155,7 +155,7 @@ LOWER_CENTRAL = Crown(
     edge=Edge(mesial_fall_mm=0.2, distal_fall_mm=0.3, mesial_power=6.0, distal_power=5.0, fossa_mm=0.2),
 )  # fmt: skip
 LOWER_LATERAL = Crown(
-    width_mm=5.9, depth_mm=6.5, height_mm=9.5,
+    width_mm=6.0, depth_mm=6.5, height_mm=9.5,
     mesial=(0.32, 0.58, 0.70, 0.78, 0.86, 0.94, 0.99, 1.0, 0.99),
     distal=(0.32, 0.58, 0.70, 0.79, 0.88, 0.96, 1.0, 0.97, 0.90),
     buccal=(0.24, 0.40, 0.45, 0.49, 0.45, 0.36, 0.25, 0.12, -0.03),
@@ -204,7 +204,7 @@ LOWER_FIRST_MOLAR = Crown(
     squareness=2.75, taper=0.05,
     cusps=(_cusp(-0.54, 0.50, 0.96, -70.0), _cusp(0.10, 0.54, 0.94, -95.0), _cusp(0.66, 0.28, 0.86, -150.0),
            _cusp(-0.50, -0.56, 1.0, 70.0), _cusp(0.34, -0.58, 0.98, 105.0)),
-    marginal_ridges=(_marginal_ridge(-0.86, -0.02, 0.76), _marginal_ridge(0.88, -0.15, 0.74)),
+    marginal_ridges=(_marginal_ridge(-0.86, -0.02, 0.76), _marginal_ridge(0.88, -0.15, 0.70)),
     grooves=(AxialGroove(side="buccal", x=-0.22, depth_mm=0.5), AxialGroove(side="buccal", x=0.48, depth_mm=0.35),
              AxialGroove(side="lingual", x=-0.08, depth_mm=0.35, end=0.5)),
 )  # fmt: skip

@@ -10,8 +10,10 @@ Their headings are those nearest to a natural arch that give it its transverse w
 implicit functions: the crowns, and a gum made of a ridge and a collar round each tooth.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -38,10 +40,12 @@ from cuspid.mesh import Mesh
 
 FAR_MM = 3.0
 """Distance that stands for all larger ones."""
-CONTACT_OVERLAP_MM = 0.12
-"""Neighbours overlap by this much: contact points are worn to small areas."""
+CONTACT_OVERLAP_MM = 0.02
+"""Neighbours overlap by this much, beside the rounding of creases: contact points are worn to small areas."""
+CONTACT_ROUNDS = 4
+"""How often the teeth are moved together until they touch."""
 PIVOT = 0.7
-"""Height about which a tooth is inclined, as a fraction of its crown: that of the contact points."""
+"""Height of the contacts, about which a tooth is inclined, as a fraction of its crown."""
 CREASE_MM = 0.2
 """Rounding of the creases between neighbours and along the margin of the gum."""
 ROOT = 0.7
@@ -108,8 +112,37 @@ def build_phantom(options: PhantomOptions = PhantomOptions()) -> Jaw:
 def place_teeth(options: PhantomOptions, rng: np.random.Generator) -> tuple[PlacedTooth, ...]:
     """The fourteen teeth from the last molar at X < 0 round to the one at X > 0."""
     quadrants = _individuals(QUADRANTS[options.arch], options.variation, rng)
-    headings = _solve_headings(quadrants, ARCH_FORMS[options.arch], options)
-    left, right = (_place_quadrant(quadrants[side], side, headings, options) for side in (-1, 1))
+    closing = {side: np.zeros(7) for side in (-1, 1)}
+    teeth = _arrange(quadrants, closing, options)
+    for _ in range(CONTACT_ROUNDS):
+        excess = np.array([clearance(one, other) for one, other in pairwise(teeth)]) + CONTACT_OVERLAP_MM
+        excess[6] /= 2  # either central incisor moves half of the way to the midline
+        closing = {-1: closing[-1] + excess[6::-1], 1: closing[1] + excess[6:]}
+        teeth = _arrange(quadrants, closing, options)
+    return teeth
+
+
+def clearance(one: PlacedTooth, other: PlacedTooth) -> float:
+    """Width of the gap between two neighbours at its narrowest, mm; negative where they overlap."""
+    front, back = sorted((one, other), key=lambda placed: placed.fdi % 10)
+    crown = back.tooth.crown
+    box = np.array([crown.half_width_mm, crown.half_depth_mm, crown.height_mm])
+    low, high = box * [-1.25, -0.8, 0.35], box * [-0.75, 0.8, 1.0]
+    grid = np.stack(np.meshgrid(*np.linspace(low, high, 13).T, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = np.einsum("ni,ji->nj", grid, back.axes) + back.origin
+    outside = np.maximum(crown_distance(crown, grid), crown_distance(front.tooth.crown, front.to_tooth(points)))
+    return 2 * float(outside.min())
+
+
+def _arrange(
+    quadrants: dict[int, tuple[Tooth, ...]], closing: dict[int, Float[np.ndarray, "7"]], options: PhantomOptions
+) -> tuple[PlacedTooth, ...]:
+    """The teeth in the occlusal frame, each drawn towards its mesial neighbour by `closing` (7,), mm."""
+
+    def placed(headings: Float[np.ndarray, "7"]) -> list[tuple[PlacedTooth, ...]]:
+        return [_place_quadrant(quadrants[side], options.arch, side, headings, closing[side]) for side in (-1, 1)]
+
+    left, right = placed(_solve_headings(placed, ARCH_FORMS[options.arch]))
     return _level((*reversed(left), *right), options)
 
 
@@ -151,18 +184,18 @@ def _fdi(arch: Arch, side: int, position: int) -> int:
 
 
 def _solve_headings(
-    quadrants: dict[int, tuple[Tooth, ...]], form: ArchForm, options: PhantomOptions
+    placed: Callable[[Float[np.ndarray, "7"]], list[tuple[PlacedTooth, ...]]], form: ArchForm
 ) -> Float[np.ndarray, "7"]:
     """Headings (7,) in radians of a quadrant's teeth: nearest to the natural ones, giving the arch its widths."""
     targets = np.array([form.inter_canine_mm, form.inter_first_molar_mm, form.inter_second_molar_mm])
     natural = np.radians(form.headings_deg)
 
     def misfit(change: Float[np.ndarray, "7"]) -> Float[np.ndarray, "10"]:
-        sides = [_place_quadrant(quadrants[side], side, natural + change, options) for side in (-1, 1)]
-        widths = _landmark_x(sides[1]) - _landmark_x(sides[0])
+        left, right = placed(natural + change)
+        widths = _landmark_x(right) - _landmark_x(left)
         return np.concatenate([100.0 * (widths - targets), np.diff(change, prepend=0.0)])
 
-    return natural + least_squares(misfit, np.zeros(7)).x
+    return natural + least_squares(misfit, np.zeros(7), xtol=1e-5, ftol=1e-6).x
 
 
 def _landmark_x(quadrant: tuple[PlacedTooth, ...]) -> Float[np.ndarray, "3"]:
@@ -180,27 +213,36 @@ def _landmark(tooth: Tooth) -> Float[np.ndarray, "3"]:
 
 
 def _place_quadrant(
-    teeth: tuple[Tooth, ...], side: int, headings: Float[np.ndarray, "7"], options: PhantomOptions
+    teeth: tuple[Tooth, ...],
+    arch: Arch,
+    side: int,
+    headings: Float[np.ndarray, "7"],
+    closing: Float[np.ndarray, "7"],
 ) -> tuple[PlacedTooth, ...]:
     """Teeth set one after the other from the midline backwards, each along its heading; X has the sign of `side`."""
-    steps = np.array([tooth.crown.width_mm - CONTACT_OVERLAP_MM for tooth in teeth])[:, None]
-    directions = steps * np.column_stack([np.cos(headings), -np.sin(headings)])
-    centres = np.cumsum(directions, axis=0) - directions / 2
-    return tuple(
-        _place(tooth, _fdi(options.arch, side, k + 1), side, centres[k], headings[k]) for k, tooth in enumerate(teeth)
-    )
+    widths = np.array([tooth.crown.width_mm for tooth in teeth])[:, None]
+    directions = np.column_stack([np.cos(headings), -np.sin(headings)])
+    ends = np.cumsum((widths - closing[:, None]) * directions, axis=0)
+    centres = ends - widths / 2 * directions
+    return tuple(_place(tooth, _fdi(arch, side, k + 1), side, centres[k], headings[k]) for k, tooth in enumerate(teeth))
 
 
 def _place(tooth: Tooth, fdi: int, side: int, centre: Float[np.ndarray, "2"], heading: float) -> PlacedTooth:
-    """A tooth with its pivot above `centre` (2,), its mesiodistal axis along `heading`, its top at Z = 0."""
+    """A tooth with the middle of its contacts above `centre` (2,), turned along `heading`, its top at Z = 0."""
     distal = np.array([np.cos(heading), -np.sin(heading), 0.0])
     buccal = np.array([np.sin(heading), np.cos(heading), 0.0])
     axes = np.column_stack([distal, buccal, [0.0, 0.0, 1.0]]) @ _stand(tooth)
     pivot = np.array([*centre, 0.0]) + tooth.offset_mm * buccal
-    origin = pivot - axes @ np.array([0.0, 0.0, PIVOT * tooth.crown.height_mm])
+    origin = pivot - axes @ _contact_centre(tooth.crown)
     mirror = np.array([side, 1.0, 1.0])
     placed = PlacedTooth(fdi=fdi, tooth=tooth, axes=mirror[:, None] * axes, origin=mirror * origin)
     return replace(placed, origin=placed.origin - [0.0, 0.0, _top(placed)[2]])
+
+
+def _contact_centre(crown: Crown) -> Float[np.ndarray, "3"]:
+    """The point midway between the contacts of a tooth, in its frame, mm."""
+    _, _, buccal, lingual = silhouettes(crown, np.array([PIVOT]))
+    return np.array([0.0, (buccal[0] + lingual[0]) / 2, PIVOT * crown.height_mm])
 
 
 def _stand(tooth: Tooth) -> Float[np.ndarray, "3 3"]:
