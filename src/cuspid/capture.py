@@ -8,23 +8,38 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import UInt8
+from PIL import Image, UnidentifiedImageError
 
 from cuspid.errors import InputError
 from cuspid.rig import Handpiece
 
+PNG_END = b"IEND\xaeB`\x82"
+"""The last bytes of a whole PNG file."""
+
 
 def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     """An 8-bit RGB image. Raises InputError where the file is missing or cannot be decoded whole."""
-    try:
-        encoded = np.fromfile(path, dtype=np.uint8)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); put the image back or drop its frame") from error
-    if path.suffix.lower() == ".png" and b"IEND" not in encoded[-16:].tobytes():
-        raise InputError(f"{path}: truncated PNG; copy the image again")
-    image = cv2.imdecode(encoded, cv2.IMREAD_COLOR_RGB) if encoded.size else None
+    image_size(path)
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
     if image is None:
         raise InputError(f"{path}: not an image that can be decoded; copy the image again")
     return np.asarray(image, dtype=np.uint8)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height in px, from the header. Raises InputError where the file is missing, no image, or cut short."""
+    try:
+        with path.open("rb") as stream:
+            size = Image.open(stream).size
+            stream.seek(max(0, path.stat().st_size - len(PNG_END)))
+            end = stream.read()
+    except UnidentifiedImageError as error:
+        raise InputError(f"{path}: not an image, or truncated; copy the image again") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); put the image back") from error
+    if path.suffix.lower() == ".png" and end != PNG_END:
+        raise InputError(f"{path}: truncated PNG; copy the image again")
+    return size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,15 +72,18 @@ class Capture:
 
     def image(self, frame: Frame | str, camera: str) -> UInt8[np.ndarray, "h w 3"]:
         """RGB image. Raises InputError where the file is missing, broken, or of another size than the camera's."""
-        path = self.image_path(frame, camera)
-        image = read_image(path)
-        model = self.handpiece.rig[camera].camera
-        if image.shape[:2] != (model.height, model.width):
+        self.check_image(frame, camera)
+        return read_image(self.image_path(frame, camera))
+
+    def check_image(self, frame: Frame | str, camera: str) -> None:
+        """Raise what :meth:`image` would, as far as a glance at the file tells."""
+        path, model = self.image_path(frame, camera), self.handpiece.rig[camera].camera
+        width, height = image_size(path)
+        if (width, height) != (model.width, model.height):
             raise InputError(
-                f"{path}: {image.shape[1]} x {image.shape[0]} px, but camera {camera} has "
-                f"{model.width} x {model.height} px; give the handpiece file that belongs to these images"
+                f"{path}: {width} x {height} px, but camera {camera} has {model.width} x {model.height} px; "
+                "give the handpiece file that belongs to these images"
             )
-        return image
 
     def gray(self, frame: Frame | str, camera: str) -> UInt8[np.ndarray, "h w"]:
         """The image in grey (Rec. 601), as :meth:`image`."""

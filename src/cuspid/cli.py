@@ -199,18 +199,15 @@ def evaluate(
 def _simulate(mesh: Path | None, out: Path, source: Source, probe: Probe, options: SimulationOptions) -> None:
     jaw, jaw_hash = _load_source(mesh, source)
     device, device_hash = _load_probe(probe)
-    storage.claim_folder(
-        out, "simulate", {"source": source, "probe": probe, "simulation": options}, jaw_hash | device_hash
-    )
-    with _progress() as progress:
+    settings = {"source": source, "probe": probe, "simulation": options}
+    with storage.claimed_folder(out, "simulate", settings, jaw_hash | device_hash), _progress() as progress:
         pipeline.simulate(jaw, device, out, options, progress=progress)
 
 
 def _reconstruct(capture: Capture, out: Path, options: ReconstructionOptions, model: Path | None) -> None:
-    storage.claim_folder(
-        out, "reconstruct", {"reconstruction": options, "from_poses": model}, storage.hash_capture(capture)
-    )
-    with _progress() as progress:
+    settings = {"reconstruction": options, "from_poses": model}
+    inputs = storage.hash_capture(capture)
+    with storage.claimed_folder(out, "reconstruct", settings, inputs), _progress() as progress:
         reconstruction, mesh = pipeline.reconstruct(capture, out, options, colmap_model=model, progress=progress)
     _print_located(reconstruction, capture)
     console.print(f"{out / 'mesh.ply'}: {len(mesh.faces):,} faces")
@@ -220,11 +217,11 @@ def _evaluate(mesh: Path, reference: Path, out: Path, source: Source, options: E
     scan = storage.read_mesh(mesh, source.unit)
     known, scannable, hashes = pipeline.load_reference(reference, unit=source.unit, arch=source.arch)
     hashes |= {"mesh": storage.hash_file(mesh)}
-    storage.claim_folder(out, "evaluate", {"evaluation": options}, hashes, replace=True)
-    trueness = pipeline.evaluate(scan, known, options, scannable=scannable)
-    storage.write_mesh(out / "deviation.ply", replace(scan, colors=deviation_colors(trueness.deviation_um)))
-    save_deviation_picture(out / "deviation.png", scan, trueness)
-    storage.write_trueness(out / "trueness.json", trueness)
+    with storage.claimed_folder(out, "evaluate", {"evaluation": options}, hashes, replace=True):
+        trueness = pipeline.evaluate(scan, known, options, scannable=scannable)
+        storage.write_mesh(out / "deviation.ply", replace(scan, colors=deviation_colors(trueness.deviation_um)))
+        save_deviation_picture(out / "deviation.png", scan, trueness)
+        storage.write_trueness(out / "trueness.json", trueness)
     _print_trueness(trueness)
 
 

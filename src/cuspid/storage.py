@@ -172,6 +172,22 @@ def claim_folder(
         write_json(manifest_path, {**manifest, stage: entry})
 
 
+@contextmanager
+def claimed_folder(
+    folder: Path, stage: str, settings: Mapping[str, object], inputs: Mapping[str, str], *, replace: bool = False
+) -> Iterator[None]:
+    """:func:`claim_folder` for the work in the block; leaves no trace where the work is refused before it wrote."""
+    existed = folder.exists()
+    claim_folder(folder, stage, settings, inputs, replace=replace)
+    try:
+        yield
+    except CuspidError:
+        if not existed and [path.name for path in folder.iterdir()] == ["run.json"]:
+            (folder / "run.json").unlink()
+            folder.rmdir()
+        raise
+
+
 def _first_difference(old: Any, new: Any, name: str = "") -> str:
     if isinstance(old, dict) and isinstance(new, dict):
         for key in {**old, **new}:
@@ -486,7 +502,8 @@ def read_capture(folder: Path, handpiece: Path | None = None) -> Capture:
     """A capture folder: ``images/<camera>/<frame>.*`` and a handpiece file (default ``handpiece.json`` in it).
 
     Without ``capture.json`` the frames are those of the image folders. Raises InputError where a camera's folder is
-    missing, a folder belongs to no camera of the handpiece, or the frames differ between cameras.
+    missing, a folder belongs to no camera of the handpiece, the frames differ between cameras, or
+    an image is truncated or of another size than its camera's.
     """
     if not (folder / "images").is_dir():
         raise InputError(f"{folder}: no folder 'images' in it; give the folder that holds images/<camera>/<frame>.png")
@@ -503,7 +520,8 @@ def read_capture(folder: Path, handpiece: Path | None = None) -> Capture:
     suffix, stems = _image_stems(folder / "images", known.rig.names)
     manifest = folder / "capture.json"
     if not manifest.exists():
-        return Capture(folder=folder, handpiece=known, frames=tuple(Frame(name=stem) for stem in stems), suffix=suffix)
+        frames = tuple(Frame(name=stem) for stem in stems)
+        return _checked(Capture(folder=folder, handpiece=known, frames=frames, suffix=suffix))
     value = read_json(manifest)
     with reading(manifest):
         frames = tuple(Frame(**frame) for frame in value["frames"])
@@ -514,7 +532,14 @@ def read_capture(folder: Path, handpiece: Path | None = None) -> Capture:
             f"{folder}: {len(absent)} of {len(frames)} frames have no images (first: {absent[0]}); "
             "finish the capture with the command that began it"
         )
-    return Capture(folder=folder, handpiece=known, frames=frames, suffix=suffix)
+    return _checked(Capture(folder=folder, handpiece=known, frames=frames, suffix=suffix))
+
+
+def _checked(capture: Capture) -> Capture:
+    for name in capture.handpiece.rig.names:
+        for frame in capture.frames:
+            capture.check_image(frame, name)
+    return capture
 
 
 def _image_stems(images: Path, cameras: Sequence[str]) -> tuple[str, list[str]]:
