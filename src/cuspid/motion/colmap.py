@@ -10,7 +10,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
@@ -168,13 +168,75 @@ def _model_folder(folder: Path) -> Path:
     raise InputError(f"{folder}: no COLMAP model; a folder with cameras, images and points3D (.bin or .txt) is needed")
 
 
+def _integer(data: bytes, at: int, size: int) -> int:
+    """A little-endian integer."""
+    return int.from_bytes(data[at : at + size], "little")
+
+
+def _after_camera(data: bytes, at: int) -> int:
+    """End of a camera of ``cameras.bin``: identifier, model, size, parameters."""
+    model = pycolmap.CameraModelId(_integer(data, at + 4, 4))
+    return at + 24 + 8 * len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params)
+
+
+def _after_rig(data: bytes, at: int) -> int:
+    """End of a rig of ``rigs.bin``: identifier, reference sensor, other sensors with or without a pose."""
+    sensors = _integer(data, at + 4, 4)
+    at += 16 if sensors else 8
+    for _ in range(1, sensors):
+        at += 65 if data[at + 8] else 9
+    return at
+
+
+def _after_frame(data: bytes, at: int) -> int:
+    """End of a frame of ``frames.bin``: identifiers, pose, images."""
+    return at + 68 + 16 * _integer(data, at + 64, 4)
+
+
+def _after_image(data: bytes, at: int) -> int:
+    """End of an image of ``images.bin``: identifiers, pose, name, keypoints."""
+    name_end = data.index(b"\0", at + 64)
+    return name_end + 9 + 24 * _integer(data, name_end + 1, 8)
+
+
+def _after_point(data: bytes, at: int) -> int:
+    """End of a point of ``points3D.bin``: identifier, place, colour, error, track."""
+    return at + 51 + 8 * _integer(data, at + 43, 8)
+
+
+_AFTER = {
+    "cameras": _after_camera,
+    "rigs": _after_rig,
+    "frames": _after_frame,
+    "images": _after_image,
+    "points3D": _after_point,
+}
+
+
+def _is_whole(data: bytes, after: Callable[[bytes, int], int]) -> bool:
+    """Whether a binary file ends where its last entry does."""
+    at = 8
+    try:
+        for _ in range(_integer(data, 0, 8)):
+            at = after(data, at)
+            if at > len(data):
+                return False
+    except (ValueError, IndexError, TypeError):
+        return False
+    return at == len(data)
+
+
 def _read(folder: Path) -> pycolmap.Reconstruction:
-    """A model from disk. Raises InputError."""
+    """A model from disk. Raises InputError, also for truncated files, on which COLMAP's own reader may hang."""
     folder = _model_folder(folder)
+    for name, after in _AFTER.items():
+        file = folder / f"{name}.bin"
+        if file.is_file() and not _is_whole(file.read_bytes(), after):
+            raise InputError(f"{file}: truncated or damaged; copy the COLMAP model again")
     try:
         return pycolmap.Reconstruction(folder)
     except (RuntimeError, ValueError, IndexError, MemoryError, KeyError, OverflowError) as error:
-        raise InputError(f"{folder}: the COLMAP model cannot be read; export it again from COLMAP") from error
+        raise InputError(f"{folder}: the COLMAP model cannot be read; copy or export it again") from error
 
 
 def _match_names(model: pycolmap.Reconstruction, capture: Capture, source: str) -> _PosedImages:
@@ -208,7 +270,7 @@ def _centres(rig: Rig, poses: Mapping[str, Rigid3]) -> tuple[Float[np.ndarray, "
 def _baselines(rig: Rig, poses: Mapping[str, Rigid3]) -> Float[np.ndarray, "n 2"]:
     """Distances of each two cameras of one frame in the model and in the rig (mm)."""
     in_model, in_rig = _centres(rig, poses)
-    pairs = np.array(list(combinations(range(len(in_model)), 2))).reshape(-1, 2)
+    pairs = np.array(list(combinations(range(len(in_model)), 2)), dtype=np.int64).reshape(-1, 2)
     return np.stack([np.linalg.norm(c[pairs[:, 0]] - c[pairs[:, 1]], axis=1) for c in (in_model, in_rig)], axis=1)
 
 

@@ -1,0 +1,283 @@
+"""COLMAP's sparse models: there and back, models of others, and its own mapper."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from cuspid.camera import Camera
+from cuspid.capture import Capture, Frame
+from cuspid.errors import InputError, ReconstructionError
+from cuspid.geometry import Rigid3
+from cuspid.motion.adjustment import residuals_px
+from cuspid.motion.colmap import locate_with_colmap, read_model, write_model
+from cuspid.reconstruction import Reconstruction, Tracks
+from cuspid.rig import Handpiece, MountedCamera, Rig
+
+
+def make_rig() -> Rig:
+    """Three cameras; the rig frame is not that of any of them."""
+    camera = Camera.from_field_of_view(400, 400, 62.0)
+    camera = camera.with_parameters(camera.parameters + [0, 1, 2, -1, -0.08, 0.02, 1e-3, 0])
+    places = {"a": [0.3, 0.2, -0.1], "b": [1.4, 0, 0], "c": [0.5, 1.2, 0]}
+    turn = Rigid3.from_rotation_vector(np.array([0.1, -0.05, 0.2]), np.zeros(3))
+    return Rig({n: MountedCamera(camera, turn @ Rigid3(np.eye(3), -np.array(x))) for n, x in places.items()})
+
+
+def make_found(frames: int = 4) -> Reconstruction:
+    """A reconstruction with noisy observations."""
+    rig, rng = make_rig(), np.random.default_rng(0)
+    path = {
+        f"{k:05d}": Rigid3.from_rotation_vector(np.array([0.03, -0.02, 0.05]) * k, np.array([-0.6, 0.1, 0]) * k)
+        for k in range(frames)
+    }
+    points = np.column_stack([rng.uniform(-2, 3, (120, 2)), rng.uniform(4.5, 5.5, 120)])
+    rows = []
+    for f, pose in enumerate(path.values()):
+        for c, mounted in enumerate(rig.cameras.values()):
+            pixels = mounted.camera.project((mounted.cam_from_rig @ pose).apply(points))
+            pixels = pixels + rng.normal(0, 0.2, pixels.shape)
+            rows += [(p, f, c, *pixels[p]) for p in np.flatnonzero(mounted.camera.contains(pixels))]
+    table = np.array(rng.permutation(rows))
+    table = table[np.bincount(table[:, 0].astype(int), minlength=120)[table[:, 0].astype(int)] >= 2]
+    index = table[:, :3].astype(np.int64)
+    tracks = Tracks(
+        points=points,
+        colors=rng.integers(0, 256, (120, 3)).astype(np.uint8),
+        point_index=index[:, 0],
+        frame_index=index[:, 1],
+        camera_index=index[:, 2],
+        pixels=table[:, 3:],
+    )
+    return Reconstruction(rig=rig, rig_from_world=path, tracks=tracks)
+
+
+def make_capture(folder: Path, found: Reconstruction) -> Capture:
+    """The capture that the reconstruction is of; its images are not needed."""
+    frames = tuple(Frame(name=name) for name in found.frames)
+    return Capture(folder=folder, handpiece=Handpiece(rig=found.rig), frames=frames)
+
+
+def assert_same_poses(one: Reconstruction, other: Reconstruction, atol: float = 1e-9) -> None:
+    """Same frames at the same places."""
+    assert one.frames == other.frames
+    for name, pose in one.rig_from_world.items():
+        np.testing.assert_allclose(other.rig_from_world[name].matrix, pose.matrix, atol=atol)
+
+
+def observations(found: Reconstruction) -> set[tuple[float, ...]]:
+    """Observations with their point's place, in no order."""
+    t = found.tracks
+    table = np.column_stack([t.points[t.point_index], t.colors[t.point_index], t.frame_index, t.camera_index, t.pixels])
+    return {tuple(row) for row in table.round(6)}
+
+
+# --- there and back ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_a_model_comes_back_as_it_went(tmp_path: Path, text: bool) -> None:
+    """Poses, points, colours and observations, in binary and in text; the log tells that the scale is one."""
+    found = make_found()
+    capture = make_capture(tmp_path, found)
+    write_model(tmp_path / "sparse" / "0", found, capture)
+    folder = tmp_path / "sparse"
+    if text:
+        folder = tmp_path / "text"
+        folder.mkdir()
+        pycolmap.Reconstruction(tmp_path / "sparse" / "0").write_text(folder)
+    back = read_model(folder, capture)
+    assert_same_poses(found, back)
+    assert observations(back) == observations(found)
+    assert back.log["mm_per_model_unit"] == pytest.approx(1, abs=1e-9)
+    assert not back.dropped
+    errors = np.linalg.norm(residuals_px(found), axis=1)
+    assert back.reprojection_rms_px == pytest.approx(np.sqrt(np.mean(errors**2)), rel=1e-6)
+
+
+def test_colmap_agrees_with_our_projection(tmp_path: Path) -> None:
+    """COLMAP's own mean reprojection error of the model is that of our residuals; nothing is left beside the model."""
+    found = make_found()
+    write_model(tmp_path / "sparse", found, make_capture(tmp_path, found))
+    assert sorted(file.name for file in (tmp_path / "sparse").iterdir()) == [
+        f"{name}.bin" for name in ("cameras", "frames", "images", "points3D", "rigs")
+    ]
+    model = pycolmap.Reconstruction(tmp_path / "sparse")
+    model.update_point_3d_errors()
+    errors = np.linalg.norm(residuals_px(found), axis=1)
+    tracked = np.bincount(found.tracks.point_index, minlength=120)
+    per_point = np.bincount(found.tracks.point_index, errors, minlength=120)[tracked > 0] / tracked[tracked > 0]
+    assert model.num_frames() == 4
+    assert model.num_images() == 12
+    np.testing.assert_allclose(
+        sorted(p.error for p in model.points3D.values()), np.sort(per_point), rtol=1e-6, atol=1e-9
+    )
+
+
+def test_poses_without_tracks_make_a_model_too(tmp_path: Path) -> None:
+    """Images without keypoints."""
+    found = replace(make_found(), tracks=None)
+    capture = make_capture(tmp_path, found)
+    write_model(tmp_path / "sparse", found, capture)
+    assert_same_poses(found, read_model(tmp_path / "sparse", capture))
+
+
+# --- models of others --------------------------------------------------------------------------------------------
+
+
+def without_rig(found: Reconstruction, *, units_per_mm: float = 1.0, noise_mm: float = 0.0) -> pycolmap.Reconstruction:
+    """Each image posed by itself, in another unit and world, as COLMAP gives it without the rig."""
+    rng, model = np.random.default_rng(1), pycolmap.Reconstruction()
+    old_from_new = Rigid3.from_rotation_vector(np.array([0.3, 1.0, -0.4]), np.array([5.0, 2, 1]))
+    for c, mounted in enumerate(found.rig.cameras.values()):
+        camera = pycolmap.Camera(
+            camera_id=c + 1, model="OPENCV", width=400, height=400, params=mounted.camera.parameters
+        )
+        model.add_camera_with_trivial_rig(camera)
+    for f, (name, pose) in enumerate(found.rig_from_world.items()):
+        for c, (camera_name, mounted) in enumerate(found.rig.cameras.items()):
+            cam = mounted.cam_from_rig @ pose @ old_from_new
+            cam = Rigid3(cam.rotation, units_per_mm * (cam.translation + rng.normal(0, noise_mm, 3)))
+            image = pycolmap.Image(f"{camera_name}/{name}.png", np.zeros((0, 2)), c + 1, 3 * f + c + 1)
+            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(cam.matrix[:3]))
+    return model
+
+
+def write(model: pycolmap.Reconstruction, folder: Path) -> Path:
+    """A model on disk."""
+    folder.mkdir()
+    model.write(folder)
+    return folder
+
+
+@pytest.mark.parametrize("units_per_mm", [1.0, 0.001, 7.3])
+def test_the_rig_sets_the_scale(tmp_path: Path, units_per_mm: float) -> None:
+    """A model in any unit and world comes back in millimetres, in the rig frame of the first frame."""
+    found = make_found()
+    folder = write(without_rig(found, units_per_mm=units_per_mm), tmp_path / "m")
+    back = read_model(folder, make_capture(tmp_path, found))
+    assert_same_poses(found, back, atol=1e-6)
+    assert back.log["mm_per_model_unit"] == pytest.approx(1 / units_per_mm, rel=1e-6)
+
+
+def test_cameras_of_a_frame_are_averaged(tmp_path: Path) -> None:
+    """Small errors of single images shrink; the spread of the scale is told."""
+    found = make_found()
+    folder = write(without_rig(found, noise_mm=0.005), tmp_path / "m")
+    back = read_model(folder, make_capture(tmp_path, found))
+    offsets = [
+        np.linalg.norm(back.rig_from_world[n].inverse().translation - p.inverse().translation)
+        for n, p in found.rig_from_world.items()
+    ]
+    assert 0 < max(offsets) < 0.03
+    assert 0 < back.log["scale_spread"] < 0.02
+
+
+def test_another_handpiece_is_refused(tmp_path: Path) -> None:
+    """The cameras of the model do not keep the distances of the rig."""
+    found = make_found()
+    folder = write(without_rig(found, noise_mm=0.5), tmp_path / "m")
+    with pytest.raises(InputError, match="handpiece"):
+        read_model(folder, make_capture(tmp_path, found))
+
+
+def test_scale_needs_two_cameras(tmp_path: Path) -> None:
+    """One image a frame has no baseline."""
+    found = make_found()
+    model = without_rig(found)
+    for frame in list(model.frames.values()):
+        if frame.frame_id % 3 != 1:
+            model.deregister_frame(frame.frame_id)
+    with pytest.raises(InputError, match="two placed cameras"):
+        read_model(write(model, tmp_path / "m"), make_capture(tmp_path, found))
+
+
+def test_frames_that_the_model_lacks_are_listed(tmp_path: Path) -> None:
+    """The others are read; the world is the first of them."""
+    found = make_found()
+    capture = make_capture(tmp_path, found)
+    some = replace(found, rig_from_world=dict(list(found.rig_from_world.items())[1:]), tracks=None)
+    write_model(tmp_path / "sparse", some, capture)
+    back = read_model(tmp_path / "sparse", capture)
+    assert back.frames == found.frames[1:]
+    assert [d.what for d in back.dropped] == ["frame 00000"]
+    np.testing.assert_allclose(back.rig_from_world["00001"].matrix, np.eye(4), atol=1e-9)
+
+
+def test_names_of_another_capture_are_refused(tmp_path: Path) -> None:
+    """And both ways of naming are shown."""
+    found = make_found()
+    write_model(tmp_path / "sparse", found, make_capture(tmp_path, found))
+    other = make_capture(tmp_path, replace(found, rig_from_world={"x1": Rigid3.identity()}, tracks=None))
+    with pytest.raises(InputError, match=r"a/00000\.png.*a/x1\.png"):
+        read_model(tmp_path / "sparse", other)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 0.99])
+def test_truncated_files_are_told(tmp_path: Path, name: str, share: float) -> None:
+    """Never a crash and never a hang."""
+    found = make_found()
+    capture = make_capture(tmp_path, found)
+    write_model(tmp_path / "sparse", found, capture)
+    file = tmp_path / "sparse" / f"{name}.bin"
+    file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+    with pytest.raises(InputError, match="again"):
+        read_model(tmp_path / "sparse", capture)
+
+
+def test_a_folder_without_a_model_is_told(tmp_path: Path) -> None:
+    """With what it should hold."""
+    with pytest.raises(InputError, match="points3D"):
+        read_model(tmp_path, make_capture(tmp_path, make_found()))
+
+
+# --- COLMAP's mapper ---------------------------------------------------------------------------------------------
+
+
+def photograph(camera: Camera, cam_from_world: Rigid3, texture: np.ndarray) -> np.ndarray:
+    """The plane z = 5 with a texture of 80 px/mm."""
+    rays = cam_from_world.inverse().rotate(camera.rays(camera.pixel_centres()))
+    centre = cam_from_world.inverse().translation
+    on_plane = centre + rays * ((5 - centre[2]) / rays[..., 2:])
+    place = (on_plane[..., :2] * 80 + 800).astype(np.float32)
+    gray = cv2.remap(texture, place[..., 0], place[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    return np.clip(np.rint(gray), 0, 255).astype(np.uint8)
+
+
+def take_images(folder: Path, found: Reconstruction, texture: np.ndarray) -> Capture:
+    """Images on disk."""
+    capture = make_capture(folder, found)
+    for frame, pose in found.rig_from_world.items():
+        for name, mounted in found.rig.cameras.items():
+            file = capture.image_path(frame, name)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(file), photograph(mounted.camera, mounted.cam_from_rig @ pose, texture))
+    return capture
+
+
+def test_colmap_maps_with_the_rig(tmp_path: Path) -> None:
+    """One metric model, poses to some micrometres, and the seconds that it took."""
+    found, rng = make_found(frames=4), np.random.default_rng(0)
+    layers = [cv2.GaussianBlur(rng.normal(size=(1600, 1600)), (0, 0), s) * s for s in (3.0, 6.0, 12.0)]
+    texture = cv2.normalize(sum(layers), None, 30, 225, cv2.NORM_MINMAX).astype(np.float32)
+    capture = take_images(tmp_path, found, texture)
+    mapped = locate_with_colmap(capture, tmp_path / "colmap", with_rig=True)
+    assert_same_poses(replace(found, tracks=None), mapped, atol=0.02)
+    assert mapped.log["models"] == 1
+    assert mapped.log["images_placed"] == 12
+    assert mapped.log["mm_per_model_unit"] == pytest.approx(1, abs=1e-6)
+    assert 0 < mapped.reprojection_rms_px < 1
+    assert mapped.log["mapping_s"] > 0
+
+
+def test_colmap_without_texture_is_told(tmp_path: Path) -> None:
+    """No model, no crash."""
+    capture = take_images(tmp_path, make_found(frames=2), np.full((1600, 1600), 90, np.float32))
+    with pytest.raises(ReconstructionError, match="texture"):
+        locate_with_colmap(capture, tmp_path / "colmap", with_rig=False)
