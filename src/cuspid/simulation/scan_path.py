@@ -135,17 +135,21 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
     stretch = _stretch(jaw, curve, options)
     hand = _hand_motion(stretch, options, rng)
     frames = options.frames or (ARCH_FRAMES if options.tooth is None else TOOTH_FRAMES)
-    path = _even_path(jaw.mesh, handpiece, curve, hand, np.linspace(*stretch, frames))
-    while path.minimum_overlap <= options.minimum_overlap and options.frames is None and frames < 5 * ARCH_FRAMES:
-        frames = int(np.ceil(frames * 1.05))
+    most = frames if options.frames else 3 * frames
+    while True:
         path = _even_path(jaw.mesh, handpiece, curve, hand, np.linspace(*stretch, frames))
-    if path.minimum_overlap <= options.minimum_overlap:
-        raise InputError(
-            f"scan path: with {frames} frames consecutive images overlap by only {path.minimum_overlap:.0%}, less than "
-            f"{options.minimum_overlap:.0%}; ask for more frames (none given: as many as it takes)"
-        )
-    _check_clearance(jaw.mesh, handpiece, path.rig_from_world, options.clearance_mm)
-    return path
+        _check_clearance(jaw.mesh, handpiece, path.rig_from_world, options.clearance_mm)
+        if path.minimum_overlap > options.minimum_overlap:
+            return path
+        # The surface that an image loses is about in proportion to the step.
+        growth = (1 - path.minimum_overlap) / (1 - options.minimum_overlap)
+        needed = max(frames + 1, int(np.ceil(1 + (frames - 1) * growth)))
+        if needed > most:
+            raise InputError(
+                f"scan path: with {frames} frames consecutive images overlap by only {path.minimum_overlap:.0%}, less "
+                f"than {options.minimum_overlap:.0%}; about {needed} frames would be needed"
+            )
+        frames = needed
 
 
 def _stretch(jaw: Jaw, curve: ArchCurve, options: ScanPathOptions) -> tuple[float, float]:

@@ -1,0 +1,193 @@
+"""The path follows the arch, overlaps as measured, stays clear of the jaw, and trembles as asked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
+from cuspid.handpiece.designs import DesignOptions, essential_four, twelve_cameras
+from cuspid.jaw import Jaw
+from cuspid.mesh import Mesh
+from cuspid.rig import Handpiece, Rig
+from cuspid.simulation.scan_path import (
+    ArchCurve,
+    ScanPath,
+    ScanPathOptions,
+    _hand_motion,
+    arch_curve,
+    image_overlap,
+    plan_scan_path,
+)
+
+STILL = ScanPathOptions(tooth=46, jitter_mm=0.0, jitter_deg=0.0)
+
+
+def plan(jaw: Jaw, options: ScanPathOptions, handpiece: Handpiece | None = None, seed: int = 0) -> ScanPath:
+    return plan_scan_path(jaw, handpiece or twelve_cameras(), options, np.random.default_rng(seed))
+
+
+@pytest.fixture(scope="module")
+def curve(coarse_phantom: Jaw) -> ArchCurve:
+    return arch_curve(coarse_phantom)
+
+
+@pytest.fixture(scope="module")
+def molar_path(coarse_phantom: Jaw) -> ScanPath:
+    return plan(coarse_phantom, ScanPathOptions(tooth=46))
+
+
+# --- the arch -----------------------------------------------------------------------------------------------------
+
+
+def test_the_arch_runs_over_the_middle_of_every_tooth_from_one_end_to_the_other(
+    coarse_phantom: Jaw, curve: ArchCurve
+) -> None:
+    order = [tooth for quadrant in ((37, 36, 35, 34, 33, 32, 31), (41, 42, 43, 44, 45, 46, 47)) for tooth in quadrant]
+    places = []
+    for tooth in order:
+        points = coarse_phantom.mesh.face_centres[coarse_phantom.tooth_faces(tooth)]
+        top = points[points[:, 2] > points[:, 2].max() - 3.0]
+        gaps = np.linalg.norm(curve.points[:, :2] - top[:, :2].mean(axis=0), axis=1)
+        assert gaps.min() < 1.3, tooth
+        assert abs(curve.points[gaps.argmin(), 2] - points[:, 2].max()) < 1.5, tooth
+        places.append(curve.lengths_mm[gaps.argmin()])
+    assert np.all(np.diff(places) > 3)
+    assert places[0] == pytest.approx(5.5, abs=2.5)
+    assert curve.lengths_mm[-1] - places[-1] == pytest.approx(5.5, abs=2.5)
+
+
+def test_the_arch_is_found_without_labels(coarse_phantom: Jaw, curve: ArchCurve) -> None:
+    blind = arch_curve(replace(coarse_phantom, face_labels=None))
+    gaps = np.linalg.norm(blind.points[:, None, :2] - curve.points[None, ::5, :2], axis=2).min(axis=1)
+    assert np.percentile(gaps, 95) < 1.0
+    assert blind.lengths_mm[-1] == pytest.approx(curve.lengths_mm[-1], abs=4.0)
+
+
+def test_the_arch_moves_with_the_jaw(coarse_phantom: Jaw, curve: ArchCurve) -> None:
+    moved = coarse_phantom.mesh.transformed(Rigid3(np.eye(3), np.array([7.0, -3.0, 2.0])))
+    there = arch_curve(replace(coarse_phantom, mesh=moved))
+    assert there.lengths_mm[-1] == pytest.approx(curve.lengths_mm[-1], abs=0.5)
+    gaps = np.linalg.norm(there.points[:, None] - (curve.points[None, ::3] + [7.0, -3.0, 2.0]), axis=2).min(axis=1)
+    assert np.percentile(gaps, 95) < 0.4
+
+
+def test_the_handpiece_is_upright_and_its_y_axis_points_to_the_cheek(curve: ArchCurve) -> None:
+    for length in np.linspace(-2, curve.lengths_mm[-1] + 2, 9):
+        world_from_rig = curve.rig_from_world(float(length)).inverse()
+        along, cheek, up = world_from_rig.rotation.T
+        assert np.linalg.det(world_from_rig.rotation) == pytest.approx(1)
+        assert up[2] > 0.95
+        assert cheek[2] == pytest.approx(0, abs=1e-12)
+        outward = world_from_rig.translation[:2] - curve.points[:, :2].mean(axis=0)
+        assert cheek[:2] @ outward > 0
+        ahead = curve.rig_from_world(float(length) + 0.5).inverse().translation - world_from_rig.translation
+        assert along @ ahead == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_mesh_without_crowns_is_refused() -> None:
+    corners = np.array([[0, 0, 0], [3.0, 0, 0], [0, 3.0, 0]])
+    with pytest.raises(InputError, match="no crowns found"):
+        arch_curve(Jaw(mesh=Mesh(corners, np.array([[0, 2, 1]])), face_labels=np.array([0])))
+
+
+# --- the path -----------------------------------------------------------------------------------------------------
+
+
+def test_a_tooth_is_scanned_with_the_images_of_the_thesis(molar_path: ScanPath) -> None:
+    assert list(molar_path.rig_from_world) == [f"{k:05d}" for k in range(10)]
+    assert 0.75 < molar_path.minimum_overlap <= molar_path.mean_overlap < 0.99
+
+
+def test_cameras_look_at_the_tooth_from_about_the_working_distance(coarse_phantom: Jaw, molar_path: ScanPath) -> None:
+    rig = twelve_cameras().rig
+    pose = molar_path.rig_from_world["00005"]
+    tooth = coarse_phantom.tooth_faces(46)
+    for group in "obl":
+        mounted = rig[f"{group}3"]
+        world_from_cam = (mounted.cam_from_rig @ pose).inverse()
+        hits = coarse_phantom.mesh.cast(world_from_cam.translation[None], world_from_cam.rotation[:, 2][None])
+        assert tooth[hits.faces[0]], group
+        assert 3.5 < hits.distances[0] < 7.5, group
+
+
+def test_overlap_of_a_plane_is_the_closed_form() -> None:
+    corners = np.array([[-50, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]], dtype=float)
+    plane = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    poses = [Rigid3(np.eye(3), np.array([-x, 0, 0])) for x in (0.0, 1.0, 3.0)]
+    overlap = image_overlap(plane, essential_four(), poses, grid=60)
+    expected = 1 - np.array([1.0, 2.0]) / (2 * 5 * np.tan(np.deg2rad(31)))
+    np.testing.assert_allclose(overlap, np.tile(expected[:, None], 4), atol=1 / 60)
+
+
+def test_overlap_leaves_out_what_something_hides() -> None:
+    """A wall on the plane hides half of what lies behind it from the next position."""
+    corners = np.array([[-50, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]], dtype=float)
+    wall = np.array([[1.0, -50, 0], [1.0, 50, 0], [1.0, 50, 2.0], [1.0, -50, 2.0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    both = Mesh(np.concatenate([corners, wall]), np.concatenate([faces, faces + 4]))
+    poses = [Rigid3(np.eye(3), np.array([-x, 0, 0])) for x in (1.0, 0.0)]
+    flat, walled = (image_overlap(mesh, essential_four(), poses, 40)[0, 0] for mesh in (Mesh(corners, faces), both))
+    hidden_mm = 2.0 / 3.0
+    assert flat - walled == pytest.approx(hidden_mm / (2 * 5 * np.tan(np.deg2rad(31))), abs=0.04)
+
+
+def test_too_few_frames_are_refused_and_more_are_taken_where_none_is_asked(coarse_phantom: Jaw) -> None:
+    few = Handpiece(rig=Rig({"o1": twelve_cameras().rig["o1"]}))
+    with pytest.raises(
+        InputError, match=r"with 4 frames consecutive images overlap by only \d\d%, less than 75%; about"
+    ):
+        plan(coarse_phantom, ScanPathOptions(tooth=46, frames=4), few)
+    dense = plan(coarse_phantom, ScanPathOptions(tooth=46, minimum_overlap=0.92), few)
+    assert len(dense.rig_from_world) > 10
+    assert dense.minimum_overlap > 0.92
+
+
+def test_unknown_teeth_are_refused(coarse_phantom: Jaw) -> None:
+    with pytest.raises(InputError, match="no tooth 11"):
+        plan(coarse_phantom, ScanPathOptions(tooth=11))
+    with pytest.raises(InputError, match="no labels"):
+        plan(replace(coarse_phantom, face_labels=None), ScanPathOptions(tooth=46))
+
+
+def test_a_handpiece_that_would_touch_the_jaw_is_refused(coarse_phantom: Jaw) -> None:
+    narrow = twelve_cameras(DesignOptions(side_offset_mm=1.0, side_depth_mm=6.0))
+    with pytest.raises(InputError, match=r"frame \d+ (camera|light) \w+ of the handpiece comes nearer"):
+        plan(coarse_phantom, STILL, narrow)
+
+
+# --- the hand -----------------------------------------------------------------------------------------------------
+
+
+def test_without_jitter_the_handpiece_rides_on_the_curve(coarse_phantom: Jaw, curve: ArchCurve) -> None:
+    path = plan(coarse_phantom, STILL)
+    places = np.array([pose.inverse().translation for pose in path.rig_from_world.values()])
+    gaps = np.linalg.norm(places[:, None] - curve.points[None], axis=2).min(axis=1)
+    assert gaps.max() < 0.06
+    assert np.linalg.norm(places[-1] - places[0]) == pytest.approx(9.0, abs=0.2)
+
+
+def test_jitter_has_the_asked_deviation_and_is_smooth() -> None:
+    options = ScanPathOptions(jitter_mm=0.2, jitter_deg=1.0, jitter_length_mm=5.0)
+    hand = _hand_motion((0.0, 5000.0), options, np.random.default_rng(0))
+    np.testing.assert_allclose(hand.drift[:, 3:].std(axis=0), 0.2, rtol=0.1)
+    np.testing.assert_allclose(np.rad2deg(hand.drift[:, :3].std(axis=0)), 1.0, rtol=0.1)
+    step = 1.0
+    places = np.array([hand.at(length).translation for length in np.arange(0, 3000, step)])
+    change = np.diff(places, axis=0).std()
+    assert 0.02 < change < 0.2 * np.sqrt(2) * 0.4, "white noise would change by sqrt(2) of its deviation"
+
+
+def test_the_hand_moves_the_same_whatever_the_number_of_frames(coarse_phantom: Jaw) -> None:
+    few = Handpiece(rig=Rig({"o1": twelve_cameras().rig["o1"]}))
+    first, second, other = (
+        plan(coarse_phantom, ScanPathOptions(tooth=46, frames=frames), few, seed)
+        for frames, seed in ((10, 1), (19, 1), (10, 2))
+    )
+    for name in ("00000", "00009"):
+        later = {"00000": "00000", "00009": "00018"}[name]
+        np.testing.assert_allclose(first.rig_from_world[name].matrix, second.rig_from_world[later].matrix, atol=1e-9)
+        assert np.abs(first.rig_from_world[name].matrix - other.rig_from_world[name].matrix).max() > 0.01
