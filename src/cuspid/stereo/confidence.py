@@ -19,11 +19,11 @@ class ConfidenceOptions:
 
     agreement_mm: float = 0.03
     """Depths of two cameras agree within this, or within three standard deviations where that is more."""
-    largest_sigma_mm: float = 0.03
+    largest_sigma_mm: float = 0.01
     """A depth with a larger standard deviation is dropped."""
     best_sigma_mm: float = 0.002
     """Standard deviation that has confidence 1; the confidence falls with its inverse square."""
-    speckle_px: int = 30
+    speckle_px: int = 100
     """Connected pieces of fewer depth pixels are dropped."""
     speckle_jump_mm: float = 0.06
     """Neighbours that differ by more than this are not connected."""
