@@ -20,7 +20,7 @@ from cuspid.mesh import Mesh
 _WIDEST_MM = 2.0
 """Upper bound of the distance at which a sample loses its weight."""
 _LEAST_OVERLAP = 0.2
-_FEW = 4000
+_FEW = 2000
 """Samples that suffice to tell good poses from bad ones."""
 
 
@@ -49,30 +49,39 @@ class Alignment:
     scale: float
     """Size of the scan over that of the reference, by the best similarity. Not applied anywhere."""
     rms_um: float
-    """Weighted RMS distance of the samples that took part."""
+    """Weighted RMS distance where they meet."""
     overlap: float
-    """Share of the samples that took part."""
+    """Share of the smaller surface that lies within ``outlier_mm`` of the larger one."""
     notes: tuple[str, ...] = ()
     """Why the alignment is doubtful; empty where it is not."""
 
 
 def register(scan: Mesh, surface: Surface, options: RegistrationOptions, *, rng: np.random.Generator) -> Alignment:
-    """Align a scan in any pose with a reference surface.
+    """Align a scan in any pose with a reference surface; the smaller of the two is laid on the larger one.
 
-    Raises InputError where no pose brings a fifth of the scan near the reference.
+    Raises InputError where no pose brings a fifth of the smaller surface near the larger one.
     """
-    few = scan.sample(_FEW, rng)[0]
-    starts = _starts(scan, surface.mesh, options.search, rng)
-    poses = [refine(few, surface, start, replace(options, tolerance_um=1.0, iterations=25)) for start in starts]
-    scores = np.array([_truncated_mean_mm(few, surface, pose) for pose in poses])
-    best = int(np.argmin(scores))
-    alignment = fit(scan.sample(options.samples, rng)[0], surface, poses[best], options)
-    if alignment.overlap < _LEAST_OVERLAP:
+    if scan.face_areas.sum() > 1.5 * surface.mesh.face_areas.sum():
+        swapped = _lay(surface.mesh, Surface(scan), options, rng)
+        return replace(swapped, reference_from_scan=swapped.reference_from_scan.inverse(), scale=1 / swapped.scale)
+    return _lay(scan, surface, options, rng)
+
+
+def _lay(scan: Mesh, surface: Surface, options: RegistrationOptions, rng: np.random.Generator) -> Alignment:
+    few, _ = scan.sample(_FEW, rng)
+    brief = replace(options, tolerance_um=1.0, iterations=25)
+    starts = find_poses(scan, surface.mesh, options.search, rng=rng)
+    poses = [refine(few, surface, start, brief) for start in starts]
+    misfits = np.array([_truncated_mean_mm(few, surface, pose) for pose in poses])
+    best = poses[int(np.argmin(misfits))]
+    overlap = _overlap(surface.feet(best.apply(few)), options.outlier_mm)
+    if overlap < _LEAST_OVERLAP:
         raise InputError(
-            f"registration: at best {alignment.overlap:.0%} of the scan comes near the reference; "
+            f"registration: at best {overlap:.0%} of the scan comes near the reference; "
             "check that both show the same teeth, in the same unit"
         )
-    return replace(alignment, notes=(*_doubts(alignment), *_rivals(poses, scores, few)))
+    alignment = fit(scan.sample(options.samples, rng)[0], surface, best, options)
+    return replace(alignment, notes=(*_doubts(alignment), *_rivals(poses, misfits, few)))
 
 
 def fit(points: Float[np.ndarray, "n 3"], surface: Surface, start: Rigid3, options: RegistrationOptions) -> Alignment:
@@ -84,7 +93,7 @@ def fit(points: Float[np.ndarray, "n 3"], surface: Surface, start: Rigid3, optio
         reference_from_scan=pose,
         scale=best_scale(points, surface, pose, options),
         rms_um=float(1000 * np.sqrt(np.sum(weights * feet.signed_mm**2) / max(weights.sum(), 1e-300))),
-        overlap=float(np.mean(weights > 0)),
+        overlap=_overlap(feet, options.outlier_mm),
     )
 
 
@@ -151,11 +160,8 @@ def _weights(feet: Feet, outlier_mm: float) -> Float[np.ndarray, "n"]:
     return np.asarray(np.where(inside & (distances < cutoff), (1 - (distances / cutoff) ** 2) ** 2, 0.0))
 
 
-def _starts(scan: Mesh, reference: Mesh, options: SearchOptions, rng: np.random.Generator) -> list[Rigid3]:
-    """The smaller surface is sought on the larger one."""
-    if scan.face_areas.sum() <= 1.5 * reference.face_areas.sum():
-        return find_poses(scan, reference, options, rng=rng)
-    return [pose.inverse() for pose in find_poses(reference, scan, options, rng=rng)]
+def _overlap(feet: Feet, near_mm: float) -> float:
+    return float(np.mean(~feet.on_border & (np.abs(feet.signed_mm) < near_mm)))
 
 
 def _truncated_mean_mm(points: Float[np.ndarray, "n 3"], surface: Surface, pose: Rigid3) -> float:

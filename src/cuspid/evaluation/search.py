@@ -12,10 +12,12 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -39,7 +41,7 @@ class SearchOptions:
     """Points of the fixed surface on which each anchor is laid."""
     turn_step_deg: float = 10.0
     """Step of the turn about the normal."""
-    candidates: int = 1000
+    candidates: int = 600
     """Poses that are refined."""
     finalists: int = 8
     """Distinct poses that are returned, at most."""
@@ -105,10 +107,10 @@ def _unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
 def _table(cloud: _Cloud, margin_mm: float) -> _Table:
     lower, upper = cloud.points.min(axis=0) - margin_mm, cloud.points.max(axis=0) + margin_mm
     pitch = max(margin_mm / 6, float((np.prod(upper - lower) / _MAX_VOXELS) ** (1 / 3)))
-    axes = [np.arange(start, stop + pitch, pitch) for start, stop in zip(lower, upper, strict=True)]
-    centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    _, nearest = cKDTree(cloud.points).query(centres, workers=-1)
-    return _Table(cloud=cloud, nearest=nearest.astype(np.int32), origin=lower, pitch_mm=pitch)
+    owner = np.full(np.ceil((upper - lower) / pitch).astype(int) + 1, -1, dtype=np.int32)
+    owner[tuple(np.rint((cloud.points - lower) / pitch).astype(int).T)] = np.arange(len(cloud.points))
+    voxels = distance_transform_edt(owner < 0, return_distances=False, return_indices=True)
+    return _Table(cloud=cloud, nearest=owner[tuple(voxels)], origin=lower, pitch_mm=pitch)
 
 
 def _frames(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
@@ -154,7 +156,8 @@ def _try_all(cloud: _Cloud, table: _Table, cap_mm: float, options: SearchOptions
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _score_turns(turned, targets, frames, fixed, nearest, origin, pitch, cap):  # type: ignore[no-untyped-def]
+@no_type_check
+def _score_turns(turned, targets, frames, fixed, nearest, origin, pitch, cap):
     """Mean truncated distance (share of the cap) for each target and turn; 1 for a pose that soon looks hopeless."""
     scores = np.ones((len(targets), len(turned)), dtype=np.float32)
     for t in range(len(targets)):
@@ -170,7 +173,8 @@ def _score_turns(turned, targets, frames, fixed, nearest, origin, pitch, cap):  
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _distance(turned, k, i, targets, frames, t, fixed, nearest, origin, pitch, cap):  # type: ignore[no-untyped-def]
+@no_type_check
+def _distance(turned, k, i, targets, frames, t, fixed, nearest, origin, pitch, cap):
     """Truncated distance of one point, as a share of the cap; 1 where the normals disagree."""
     x, y, z = turned[k, i, 0], turned[k, i, 1], turned[k, i, 2]
     p0 = frames[t, 0, 0] * x + frames[t, 0, 1] * y + frames[t, 0, 2] * z + targets[t, 0]

@@ -1,0 +1,127 @@
+from functools import cache
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from scipy.spatial.transform import Rotation
+
+from cuspid.errors import InputError
+from cuspid.evaluation.distance import Surface
+from cuspid.evaluation.registration import RegistrationOptions, fit, refine, register
+from cuspid.evaluation.search import SearchOptions
+from cuspid.geometry import Rigid3
+from cuspid.jaw import Jaw
+from cuspid.mesh import Mesh
+from horseshoe import horseshoe
+from strategies import rigid3s
+
+FAST = RegistrationOptions(search=SearchOptions(targets=2500, candidates=300), samples=20_000)
+
+
+@cache
+def jaw() -> Jaw:
+    return horseshoe()
+
+
+@cache
+def surface() -> Surface:
+    return Surface(jaw().mesh)
+
+
+def any_pose(seed: int) -> Rigid3:
+    rng = np.random.default_rng(seed)
+    return Rigid3(Rotation.random(rng=rng).as_matrix(), 200 * rng.normal(size=3))
+
+
+def error_um(found: Rigid3, true: Rigid3, points: np.ndarray) -> float:
+    return 1000 * float(np.linalg.norm(found.apply(points) - true.apply(points), axis=1).max())
+
+
+def around_tooth(fdi: int, radius_mm: float) -> Mesh:
+    mesh = jaw().mesh
+    centre = mesh.face_centres[jaw().tooth_faces(fdi)].mean(axis=0)
+    return mesh.submesh(np.linalg.norm(mesh.face_centres - centre, axis=1) < radius_mm)
+
+
+def noisy(mesh: Mesh, sd_mm: float) -> Mesh:
+    noise = np.random.default_rng(5).normal(scale=sd_mm, size=len(mesh.vertices))
+    return Mesh(mesh.vertices + noise[:, None] * mesh.vertex_normals, mesh.faces)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_an_identical_surface_is_laid_exactly_from_any_pose(seed: int):
+    scan_from_reference = any_pose(seed)
+    scan = jaw().mesh.transformed(scan_from_reference)
+    found = register(scan, surface(), FAST, rng=np.random.default_rng(0))
+    assert error_um(found.reference_from_scan, scan_from_reference.inverse(), scan.vertices) < 0.1
+    assert found.overlap == 1
+    assert found.notes == ()
+    assert abs(found.scale - 1) < 1e-7
+
+
+@pytest.mark.parametrize(("fdi", "seed"), [(46, 3), (31, 4), (35, 5)])
+def test_a_noisy_tooth_finds_its_place_in_the_arch(fdi: int, seed: int):
+    scan_from_reference = any_pose(seed)
+    scan = noisy(around_tooth(fdi, 8.0), 0.01).transformed(scan_from_reference)
+    found = register(scan, surface(), FAST, rng=np.random.default_rng(0))
+    assert 0.01 < error_um(found.reference_from_scan, scan_from_reference.inverse(), scan.vertices) < 5
+    assert 4 < found.rms_um < 10
+    assert found.notes == ()
+
+
+def test_a_scan_larger_than_its_reference_is_laid_too():
+    scan_from_reference = any_pose(6)
+    scan = jaw().mesh.transformed(scan_from_reference)
+    found = register(scan, Surface(around_tooth(44, 10.0)), FAST, rng=np.random.default_rng(0))
+    assert error_um(found.reference_from_scan, scan_from_reference.inverse(), scan.vertices) < 1
+
+
+@settings(max_examples=10, deadline=None)
+@given(rigid3s())
+def test_refinement_undoes_a_small_motion(motion: Rigid3):
+    small = Rigid3.from_rotation_vector(motion.rotation_vector / 60, motion.translation / 200)
+    points = small.apply(jaw().mesh.sample(2000, np.random.default_rng(0))[0])
+    found = refine(points, surface(), Rigid3.identity(), RegistrationOptions())
+    assert error_um(found, small.inverse(), points) < 0.1
+
+
+@pytest.mark.parametrize("scale", [0.998, 1.001])
+def test_scale_is_measured_but_never_applied(scale: float):
+    mesh = jaw().mesh
+    points = Mesh(scale * mesh.vertices, mesh.faces).sample(20_000, np.random.default_rng(0))[0]
+    found = fit(points, surface(), Rigid3.identity(), RegistrationOptions())
+    assert 1e6 * (found.scale - scale) == pytest.approx(0, abs=1)
+    rotation = found.reference_from_scan.rotation
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert found.rms_um > 5
+
+
+def test_floating_pieces_do_not_move_the_alignment():
+    blob = trimesh.creation.icosphere(3, 3.0)
+    mesh = jaw().mesh
+    scan = Mesh(
+        np.concatenate([mesh.vertices, blob.vertices + [0, 0, 15.0]]),
+        np.concatenate([mesh.faces, blob.faces + len(mesh.vertices)]),
+    )
+    points = scan.sample(20_000, np.random.default_rng(0))[0]
+    start = Rigid3.from_rotation_vector(np.array([0.0, 0.02, 0.01]), np.array([0.2, -0.2, 0.1]))
+    found = fit(points, surface(), start, RegistrationOptions())
+    assert error_um(found.reference_from_scan, Rigid3.identity(), points) < 0.1
+    assert 0.9 < found.overlap < 0.995
+
+
+def test_two_poses_that_fit_alike_are_told_and_chosen_from_alike():
+    box = trimesh.creation.box((10.0, 6.0, 4.0)).subdivide_to_size(0.5)
+    mesh = Mesh(np.asarray(box.vertices), np.asarray(box.faces))
+    scan = mesh.transformed(any_pose(1))
+    found, again = (register(scan, Surface(mesh), FAST, rng=np.random.default_rng(0)) for _ in range(2))
+    np.testing.assert_array_equal(found.reference_from_scan.matrix, again.reference_from_scan.matrix)
+    assert any("another pose" in note for note in found.notes)
+    assert found.rms_um < 0.01
+
+
+def test_surfaces_that_do_not_belong_together_are_refused():
+    ball = trimesh.creation.icosphere(4, 25.0)
+    with pytest.raises(InputError, match="same teeth, in the same unit"):
+        register(Mesh(np.asarray(ball.vertices), np.asarray(ball.faces)), surface(), FAST, rng=np.random.default_rng(0))
