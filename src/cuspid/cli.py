@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -248,7 +248,7 @@ def _print_trueness(trueness: Trueness) -> None:
         console.print(f"note: {note}")
 
 
-COMMANDS = {
+COMMANDS: Mapping[str, Callable[..., Any]] = {
     "run": run,
     "phantom": phantom,
     "handpiece": handpiece,
@@ -262,7 +262,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run a verb; a known error is one line on stderr and exit status 1."""
     try:
         tyro.extras.subcommand_cli_from_dict(
-            COMMANDS,
+            dict(COMMANDS),
             prog="cuspid",
             description="Passive intra-oral 3D scanning: simulate, reconstruct, and prove the accuracy.",
             args=arguments,
