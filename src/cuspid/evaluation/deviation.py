@@ -8,9 +8,9 @@ on the reference to the scan. What counts:
 - Of the scan, every point, except
   (a) a point whose closest reference face does not count and that lies within ``margin_mm`` of it: the scan has surface
       where nothing could be measured, but where surface is. A point farther off is an error and counts;
-  (b) a point past an open border of the reference, that is, whose closest point lies on the border and that is farther
-      sideways than up or down. With a mask the reference is all there was to see, so that such a point is an error
-      again and counts if it is farther off than ``margin_mm``; without a mask the scan may simply show more.
+  (b) without a mask, a point whose closest point lies on an open border of the reference: the scan may simply show
+      more. With a mask the reference is all there was to see, and a point is left out only if it lies past the border,
+      farther sideways than up or down, and within ``margin_mm``, as where a scan frays at its rim.
 
 A point is always measured to the closest surface, whether that counts or not. ``Trueness.notes`` says how much was left
 out by each rule.
@@ -64,9 +64,9 @@ class _Rules:
     faces: Bool[np.ndarray, "f"]
     """Faces of the reference that count."""
     margin_mm: float
-    """Limit of rule (a)."""
-    border_margin_mm: float
-    """Limit of rule (b)."""
+    """Limit of both rules."""
+    reference_is_all: bool
+    """The scan cannot rightly show anything else: the strict form of rule (b)."""
     note: str
     """How the faces were chosen."""
 
@@ -76,7 +76,9 @@ class _Rules:
 
     def past_border(self, feet: Feet) -> Bool[np.ndarray, "n"]:
         """Points that rule (b) leaves out."""
-        return feet.past_border & (np.abs(feet.signed_mm) <= self.border_margin_mm)
+        if not self.reference_is_all:
+            return feet.on_border
+        return feet.past_border & (np.abs(feet.signed_mm) <= self.margin_mm)
 
     def counts(self, feet: Feet) -> Bool[np.ndarray, "n"]:
         """Points that count."""
@@ -185,17 +187,17 @@ def _rules(reference: Mesh, scannable: Bool[np.ndarray, "f"] | None, options: Ev
             "give the reference that it was made for"
         )
     if scannable is not None:
-        faces, border_margin, note = scannable, options.margin_mm, "the faces that at least two cameras could see"
+        faces, note = scannable, "the faces that at least two cameras could see"
     elif options.min_openness > 0:
-        faces, border_margin = openness(reference) >= options.min_openness, np.inf
+        faces = openness(reference) >= options.min_openness
         note = f"the faces seen from {options.min_openness:.0%} of the directions above the occlusal plane"
     else:
-        faces, border_margin = np.ones(len(reference.faces), dtype=bool), np.inf
+        faces = np.ones(len(reference.faces), dtype=bool)
         note = "all of it, hidden insides and base included (--min-openness and --crop-mm leave them out)"
     return _Rules(
         faces=faces,
         margin_mm=options.margin_mm,
-        border_margin_mm=border_margin,
+        reference_is_all=scannable is not None,
         note=f"of the reference counts: {note}",
     )
 
@@ -221,7 +223,7 @@ def _samples_of_scan(
     feet = surface.feet(points)
     counts = rules.counts(feet)
     over, past = 100 * rules.unscannable(feet).mean(), 100 * rules.past_border(feet).mean()
-    limit = "" if np.isinf(rules.border_margin_mm) else f" by at most {rules.border_margin_mm:g} mm"
+    limit = f" by at most {rules.margin_mm:g} mm" if rules.reference_is_all else ""
     return _Samples(
         points=points[counts],
         signed_mm=feet.signed_mm[counts],

@@ -141,10 +141,10 @@ def _crevices(depth_mm: Float[np.ndarray, "h w"], step_mm: float) -> Float[np.nd
     return np.asarray(np.where(known, np.clip(0.3 * deeper, 0, 0.35), 0))
 
 
-def save_picture(path: Path, mesh: Mesh, *, title: str = "") -> None:
+def save_picture(path: Path, mesh: Mesh, *, title: str = "", width_px: int = 1000) -> None:
     """PNG of a mesh in its own colours: occlusal, and two oblique views."""
     figure = _figure(6.6)
-    _draw_views(figure, mesh, 0.04, width_px=1000)
+    _draw_views(figure, mesh, 0.04, width_px=width_px)
     _draw_title(figure, title)
     _save(figure, path)
 
@@ -180,7 +180,7 @@ def _draw_title(figure: Figure, title: str) -> None:
 
 def _draw_views(figure: Figure, mesh: Mesh, bottom: float, *, width_px: int) -> None:
     """The occlusal view large, and one from each side of the arch at its right."""
-    middle, top = 0.5 * (bottom + 0.93), 0.93
+    middle, top = 0.5 * (bottom + 0.91), 0.91
     azimuth, names = _outward(mesh)
     _draw_view(figure, (0.02, bottom, 0.55, top - bottom), render(mesh, OCCLUSAL, width_px=width_px), "occlusal")
     for name, turn, low in ((names[0], 0.0, middle), (names[1], 180.0, bottom)):

@@ -1,0 +1,116 @@
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from cuspid.errors import InputError, OutputError
+from cuspid.evaluation.deviation import EvaluationOptions, evaluate
+from cuspid.evaluation.registration import RegistrationOptions
+from cuspid.geometry import Rigid3
+from cuspid.mesh import Mesh
+from cuspid.reporting.figures import (
+    NOT_COUNTED,
+    OCCLUSAL,
+    FigureOptions,
+    deviation_colors,
+    look,
+    render,
+    save_deviation_picture,
+    save_picture,
+)
+from horseshoe import horseshoe
+
+
+def ball(radius_mm: float, centre: tuple[float, float, float], color: tuple[int, int, int]) -> Mesh:
+    shape = trimesh.creation.icosphere(4, radius_mm)
+    colors = np.tile(np.array(color, dtype=np.uint8), (len(shape.vertices), 1))
+    return Mesh(np.asarray(shape.vertices) + centre, np.asarray(shape.faces), colors)
+
+
+def together(*meshes: Mesh) -> Mesh:
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    return Mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]),
+        np.concatenate([mesh.colors for mesh in meshes if mesh.colors is not None]),
+    )
+
+
+def place_of(image: np.ndarray, channel: int) -> np.ndarray:
+    """Mean (column, row) of the pixels in which a channel prevails."""
+    others = [other for other in range(3) if other != channel]
+    rows, columns = np.nonzero(image[..., channel].astype(int) > image[..., others].max(axis=2).astype(int) + 40)
+    return np.array([columns.mean(), rows.mean()])
+
+
+def test_colours_are_green_within_tolerance_red_outside_blue_inside_grey_unknown():
+    colors = deviation_colors(np.array([-500.0, -100, -60, -20, 0, 20, 60, 100, 500, np.nan])).astype(int)
+    red, green, blue = colors.T
+    assert (green[3:6] > red[3:6]).all()
+    assert (green[3:6] > blue[3:6]).all()
+    assert (blue[:3] > red[:3] + 50).all()
+    assert (red[6:9] > blue[6:9] + 50).all()
+    np.testing.assert_array_equal(colors[0], colors[1])
+    np.testing.assert_array_equal(colors[7], colors[8])
+    np.testing.assert_array_equal(colors[9], NOT_COUNTED)
+    wide = FigureOptions(range_um=500.0, tolerance_um=90.0)
+    np.testing.assert_array_equal(deviation_colors(np.array([80.0]), wide), deviation_colors(np.array([0.0])))
+
+
+@pytest.mark.parametrize("tolerance_um", [0.0, 100.0])
+def test_a_tolerance_outside_the_range_is_refused(tolerance_um: float):
+    with pytest.raises(InputError, match="tolerance"):
+        FigureOptions(tolerance_um=tolerance_um)
+
+
+def test_views_are_rotations_and_look_where_they_say():
+    for axes in (OCCLUSAL, look(90.0, 30.0), look(-20.0, 10.0)):
+        np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(axes) == pytest.approx(1)
+    np.testing.assert_allclose(OCCLUSAL, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(look(90.0, 0.0)[2], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(look(0.0, 0.0)[1], [0, 0, 1], atol=1e-12)
+
+
+def test_a_picture_is_to_scale_and_the_right_way_round():
+    red, green = ball(3.0, (-10, 0, 0), (200, 30, 30)), ball(3.0, (0, 8, 0), (30, 200, 30))
+    view = render(together(red, green), width_px=300)
+    covered = np.sum(view.image.min(axis=2) < 240) * view.mm_per_px**2
+    assert covered == pytest.approx(2 * np.pi * 9, rel=0.02)
+    apart = (place_of(view.image, 1) - place_of(view.image, 0)) * view.mm_per_px
+    np.testing.assert_allclose(apart, [10, -8], atol=0.3)
+
+
+def test_what_is_nearer_hides_what_is_farther():
+    scene = together(ball(3.0, (0, 0, 0), (200, 30, 30)), ball(2.0, (0, 0, 10), (30, 200, 30)))
+    centre = np.array(render(scene, width_px=200).image.shape[:2]) // 2
+    assert np.argmax(render(scene, width_px=200).image[tuple(centre)]) == 1
+    assert np.argmax(render(scene, look(-90.0, -90.0), width_px=200).image[tuple(centre)]) == 0
+
+
+def test_pictures_are_written_whole(tmp_path: Path):
+    jaw = horseshoe(120, 40)
+    moved = Rigid3.from_rotation_vector(np.array([0.0, 0.001, 0.0]), np.array([0.0, 0.0, 0.02]))
+    scan = jaw.mesh.transformed(moved)
+    options = EvaluationOptions(align=False, samples=5000, registration=RegistrationOptions(samples=2000))
+    trueness = evaluate(scan, jaw, options, rng=np.random.default_rng(0))
+    small = FigureOptions(width_px=300)
+    save_deviation_picture(tmp_path / "deviation.png", scan, trueness, small, title="A jaw")
+    save_picture(tmp_path / "jaw.png", jaw.mesh, width_px=300)
+    for name in ("deviation.png", "jaw.png"):
+        image = cv2.imread(str(tmp_path / name))
+        assert image is not None
+        assert image.shape[1] == 1560
+        assert 0.1 < np.mean(image.min(axis=2) < 250) < 0.8
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["deviation.png", "jaw.png"]
+    nothing = replace(trueness, deviation_um=np.full(len(scan.vertices), np.nan))
+    save_deviation_picture(tmp_path / "nothing.png", scan, nothing, small)
+
+
+def test_a_picture_that_cannot_be_written_is_one_line(tmp_path: Path):
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="cannot be written"):
+        save_picture(tmp_path / "file" / "jaw.png", horseshoe(60, 20).mesh, width_px=100)

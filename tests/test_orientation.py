@@ -1,0 +1,101 @@
+from functools import cache
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, labels_from_colors
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
+from cuspid.jaw import GUM, Jaw
+from cuspid.mesh import Mesh
+from cuspid.storage import Unit
+from horseshoe import horseshoe, without_base
+
+
+@cache
+def jaw() -> Jaw:
+    return horseshoe()
+
+
+def any_pose(seed: int) -> Rigid3:
+    rng = np.random.default_rng(seed)
+    return Rigid3(Rotation.random(rng=rng).as_matrix(), 300 * rng.normal(size=3))
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("closed", [True, False])
+def test_the_frame_is_found_from_any_orientation(seed: int, closed: bool):
+    mesh = jaw().mesh if closed else without_base(jaw().mesh)
+    found = find_occlusal_frame(mesh.transformed(any_pose(seed)))
+    to_truth = found.occlusal_from_mesh @ any_pose(seed)
+    assert to_truth.angle_deg < 6
+    assert found.notes == ()
+    crowns = to_truth.apply(jaw().mesh.vertices)
+    assert abs(crowns[:, 0].max() + crowns[:, 0].min()) < 4
+    assert 0 < crowns[:, 2].max() < 2.5
+
+
+def test_where_there_is_no_arch_the_frame_is_unsure():
+    ball = trimesh.creation.icosphere(4, 25.0)
+    notes = find_occlusal_frame(Mesh(np.asarray(ball.vertices), np.asarray(ball.faces))).notes
+    assert any("unsure" in note for note in notes)
+    quadrant = jaw().mesh.submesh(jaw().mesh.face_centres[:, 0] > 8)
+    assert any("anterior" in note for note in find_occlusal_frame(quadrant).notes)
+
+
+def in_unit(mm_per_unit_read: float) -> Mesh:
+    mesh = jaw().mesh.transformed(any_pose(0))
+    return Mesh(mesh.vertices * mm_per_unit_read, mesh.faces)
+
+
+def test_a_jaw_in_millimetres_passes():
+    assert check_scale(in_unit(1.0)) == ()
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "m"), (1 / 25.4, "in"), (0.1, "cm"), (1000.0, "um")])
+def test_another_unit_is_recognised(factor: float, unit: str):
+    with pytest.raises(InputError, match=rf"\d mm wide .--unit mm.; a jaw is 40-90 mm wide; give --unit {unit}$"):
+        check_scale(in_unit(factor))
+
+
+def test_a_wrong_unit_leads_back_to_the_right_one():
+    unit: Unit = "m"
+    with pytest.raises(InputError, match=r"--unit mm$"):
+        check_scale(in_unit(1000.0), unit)
+
+
+def test_an_unlikely_width_is_told_and_an_impossible_one_refused():
+    (note,) = check_scale(in_unit(0.5))
+    assert "a jaw is 40-90 mm wide" in note
+    with pytest.raises(InputError, match="rescale it"):
+        check_scale(in_unit(3.0))
+
+
+def painted(labels: np.ndarray) -> np.ndarray:
+    """White gum and a colour for each tooth."""
+    palette = np.random.default_rng(0).integers(0, 250, (50, 3)).astype(np.uint8)
+    palette[GUM] = 255
+    return palette[labels]
+
+
+def test_colours_of_teeth_become_their_numbers():
+    labels, mesh = jaw().face_labels, jaw().mesh
+    assert labels is not None
+    np.testing.assert_array_equal(labels_from_colors(painted(labels), mesh, "lower"), labels)
+    upper = labels_from_colors(painted(labels), mesh, "upper")
+    assert upper is not None
+    np.testing.assert_array_equal(upper[labels == 41], 21)
+    np.testing.assert_array_equal(upper[labels == 37], 17)
+
+
+def test_colours_that_do_not_number_the_teeth_give_no_labels():
+    labels, mesh = jaw().face_labels, jaw().mesh
+    assert labels is not None
+    assert labels_from_colors(painted(labels), mesh, None) is None
+    assert labels_from_colors(np.full((len(mesh.faces), 3), 255, dtype=np.uint8), mesh, "lower") is None
+    noise = np.random.default_rng(0).integers(0, 255, (len(mesh.faces), 3)).astype(np.uint8)
+    assert labels_from_colors(noise, mesh, "lower") is None
+    gap = np.where(np.isin(labels, (45, 44)), GUM, labels)
+    assert labels_from_colors(painted(gap), mesh, "lower") is None
