@@ -53,8 +53,9 @@ def test_a_mesh_in_another_unit_is_told_its_unit(tmp_path, capsys, unit):
     assert not (tmp_path / "scan").exists()
 
 
-def test_a_tooth_that_is_not_there(tmp_path, capsys):
-    message = refused(capsys, "simulate", "--tooth", 16, "--out", tmp_path / "scan")
+def test_a_tooth_that_is_not_there(tmp_path, capsys, coarse_phantom):
+    storage.write_jaw(tmp_path / "jaw.ply", coarse_phantom)
+    message = refused(capsys, "simulate", tmp_path / "jaw.ply", "--tooth", 16, "--out", tmp_path / "scan")
     assert "no tooth 16" in message
     assert not (tmp_path / "scan").exists()
 

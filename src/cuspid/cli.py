@@ -70,19 +70,19 @@ def _progress() -> Iterator[pipeline.Progress]:
         yield report
 
 
-def _load_source(mesh: Path | None, source: Source) -> tuple[Jaw, dict[str, str]]:
+def _load_source(mesh: Path | None, source: Source) -> Jaw:
     if mesh is None:
-        return build_phantom(PhantomOptions(arch=source.arch or "lower", seed=source.jaw_seed)), {}
+        return build_phantom(PhantomOptions(arch=source.arch or "lower", seed=source.jaw_seed))
     jaw, notes = pipeline.load_jaw(mesh, unit=source.unit, arch=source.arch)
     for note in notes:
         console.print(f"note: {note}")
-    return jaw, {"jaw": storage.hash_file(mesh)}
+    return jaw
 
 
-def _load_probe(probe: Probe) -> tuple[Handpiece, dict[str, str]]:
+def _load_probe(probe: Probe) -> Handpiece:
     if probe.handpiece is None:
-        return DESIGNS[probe.design](DesignOptions()), {}
-    return storage.read_handpiece(probe.handpiece), {"handpiece": storage.hash_file(probe.handpiece)}
+        return DESIGNS[probe.design](DesignOptions())
+    return storage.read_handpiece(probe.handpiece)
 
 
 def run(
@@ -197,11 +197,13 @@ def evaluate(
 
 
 def _simulate(mesh: Path | None, out: Path, source: Source, probe: Probe, options: SimulationOptions) -> None:
-    jaw, jaw_hash = _load_source(mesh, source)
-    device, device_hash = _load_probe(probe)
     settings = {"source": source, "probe": probe, "simulation": options}
-    with storage.claimed_folder(out, "simulate", settings, jaw_hash | device_hash), _progress() as progress:
-        pipeline.simulate(jaw, device, out, options, progress=progress)
+    given = {"jaw": mesh, "handpiece": probe.handpiece}
+    hashes = {name: storage.hash_file(path) for name, path in given.items() if path is not None}
+    with storage.claimed_folder(out, "simulate", settings, hashes):
+        jaw, device = _load_source(mesh, source), _load_probe(probe)
+        with _progress() as progress:
+            pipeline.simulate(jaw, device, out, options, progress=progress)
 
 
 def _reconstruct(capture: Capture, out: Path, options: ReconstructionOptions, model: Path | None) -> None:

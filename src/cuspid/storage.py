@@ -127,6 +127,8 @@ def reading(path: Path) -> Iterator[None]:
 
 def hash_file(path: Path) -> str:
     """SHA-256 of a file's contents."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
     try:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
