@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from cuspid.camera import Camera
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
-from cuspid.motion import adjustment
+from cuspid.motion import adjustment, normal_equations
 from cuspid.motion.adjustment import AdjustmentOptions, adjust, covariance_factor, left_jacobian
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
@@ -154,7 +154,9 @@ def drawn_from_priors(rig: Rig, rng: np.random.Generator) -> Rig:
 def linearised(state, frame, camera, point):
     """Pixel and Jacobian of one observation."""
     pixel, jacobian = np.zeros(2), np.zeros((2, 23))
-    assert adjustment._linearise(state, point, frame, camera, True, adjustment._scratch(), pixel, jacobian)
+    assert normal_equations.linearise(
+        state, point, frame, camera, True, normal_equations.make_scratch(), pixel, jacobian
+    )
     return pixel, jacobian
 
 
@@ -170,10 +172,10 @@ def test_jacobian_agrees_with_finite_differences(seed: int) -> None:
     whitened = 10 * rng.normal(size=(len(rig.names), 14))
     start = adjustment._with_calibration(adjustment._initial_state(scene, point[None], prior), prior, whitened)
     camera = int(rng.integers(4))
-    nothing = adjustment._Observations(
+    nothing = normal_equations.Observations(
         np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(2, np.int64)
     )
-    weighting = adjustment._Weighting(1.0, 2.0, True)
+    weighting = normal_equations.Weighting(1.0, 2.0, True)
 
     def pixel_after(step: np.ndarray) -> np.ndarray:
         unknowns = np.zeros(6 + whitened.size)

@@ -15,28 +15,31 @@ number of parts in a fixed order, so the result does not depend on the number of
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, no_type_check
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
 from cuspid.epipolar import skew
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
+from cuspid.motion.normal_equations import (
+    CALIBRATION,
+    POSE,
+    Observations,
+    State,
+    System,
+    Weighting,
+    normal_equations,
+    residual_vectors,
+    substitute,
+)
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
 
-_POSE = 6
-_CALIBRATION = 14
-_COLUMNS = 3 + _POSE + _CALIBRATION
-_PARTS = 4
-_NEAREST_MM = 1e-3
 _LEAST_SIGMA_PX = 1e-6
 
 
@@ -60,352 +63,6 @@ class AdjustmentOptions:
     """A round ends when a step moves the unknowns by less than this share of their standard deviations."""
     minimum_angle_deg: float = 1.0
     """Points whose rays meet at less than this angle are dropped."""
-
-
-class _State(NamedTuple):
-    """Values of all unknowns."""
-
-    frame_rotation: np.ndarray
-    frame_translation: np.ndarray
-    camera_rotation: np.ndarray
-    camera_translation: np.ndarray
-    intrinsics: np.ndarray
-    points: np.ndarray
-    whitened: np.ndarray
-    """(cameras, 14): z of each camera, zero at the prior."""
-    basis: np.ndarray
-    """(cameras, 14, 14): derivative of (motion on the left of cam_from_rig, parameters) with respect to z."""
-
-
-class _Observations(NamedTuple):
-    """Observations sorted by point."""
-
-    pixels: np.ndarray
-    frame: np.ndarray
-    camera: np.ndarray
-    start: np.ndarray
-    """(points + 1): the observations of point p are start[p] to start[p + 1]."""
-
-
-class _Weighting(NamedTuple):
-    """What a residual counts for, and which unknowns there are."""
-
-    sigma_px: float
-    huber_sigmas: float
-    calibrated: bool
-
-
-class _System(NamedTuple):
-    """Reduced normal equations: ``matrix @ step = -gradient``, before damping of ``diagonal``."""
-
-    matrix: np.ndarray
-    gradient: np.ndarray
-    diagonal: np.ndarray
-
-
-# --- one observation ---------------------------------------------------------------------------------------------
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _camera_jacobian(k, x, y, z, pixel, by_point, by_parameters):
-    """Projection of a point in the camera frame, and its derivatives (2x3 and 2x8)."""
-    fx, fy, k1, k2, p1, p2 = k[0], k[1], k[4], k[5], k[6], k[7]
-    u, v = x / z, y / z
-    r2 = u * u + v * v
-    radial, slope = 1 + k1 * r2 + k2 * r2 * r2, k1 + 2 * k2 * r2
-    xd = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
-    yd = v * radial + 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
-    pixel[0], pixel[1] = fx * xd + k[2], fy * yd + k[3]
-    cross = 2 * u * v * slope + 2 * p1 * u + 2 * p2 * v
-    xu = radial + 2 * u * u * slope + 2 * p1 * v + 6 * p2 * u
-    yv = radial + 2 * v * v * slope + 2 * p2 * u + 6 * p1 * v
-    by_point[0, 0], by_point[0, 1] = fx * xu / z, fx * cross / z
-    by_point[1, 0], by_point[1, 1] = fy * cross / z, fy * yv / z
-    by_point[0, 2] = -(by_point[0, 0] * u + by_point[0, 1] * v)
-    by_point[1, 2] = -(by_point[1, 0] * u + by_point[1, 1] * v)
-    by_parameters[:] = 0
-    by_parameters[0, 0], by_parameters[1, 1] = xd, yd
-    by_parameters[0, 2], by_parameters[1, 3] = 1, 1
-    by_parameters[0, 4], by_parameters[1, 4] = fx * u * r2, fy * v * r2
-    by_parameters[0, 5], by_parameters[1, 5] = fx * u * r2 * r2, fy * v * r2 * r2
-    by_parameters[0, 6], by_parameters[1, 6] = fx * 2 * u * v, fy * (r2 + 2 * v * v)
-    by_parameters[0, 7], by_parameters[1, 7] = fx * (r2 + 2 * u * u), fy * 2 * u * v
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _move(rotation, translation, x, out):
-    """out = rotation @ x + translation."""
-    for i in range(3):
-        out[i] = rotation[i, 0] * x[0] + rotation[i, 1] * x[1] + rotation[i, 2] * x[2] + translation[i]
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _times(a, b, out):
-    """out (2xn) = a (2x3) @ b (3xn)."""
-    for i in range(2):
-        for j in range(b.shape[1]):
-            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _times_motion(a, x, out):
-    """out (2x6): a (2x3) times the derivative [-[x]_x, I] of x under a small motion on its left."""
-    for i in range(2):
-        out[i, 0] = a[i, 2] * x[1] - a[i, 1] * x[2]
-        out[i, 1] = a[i, 0] * x[2] - a[i, 2] * x[0]
-        out[i, 2] = a[i, 1] * x[0] - a[i, 0] * x[1]
-        out[i, 3], out[i, 4], out[i, 5] = a[i, 0], a[i, 1], a[i, 2]
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _linearise(state, point, frame, camera, calibrated, scratch, pixel, jacobian):
-    """Projected pixel and its derivatives (2x23) by point, pose and whitened calibration. False behind the camera."""
-    x_in_rig, x_in_cam, by_cam, by_rig, raw = scratch
-    _move(state.frame_rotation[frame], state.frame_translation[frame], state.points[point], x_in_rig)
-    _move(state.camera_rotation[camera], state.camera_translation[camera], x_in_rig, x_in_cam)
-    if x_in_cam[2] < _NEAREST_MM:
-        return False
-    x, y, z = x_in_cam
-    _camera_jacobian(state.intrinsics[camera], x, y, z, pixel, by_cam, raw[:, _POSE:])
-    _times(by_cam, state.camera_rotation[camera], by_rig)
-    _times(by_rig, state.frame_rotation[frame], jacobian[:, :3])
-    _times_motion(by_rig, x_in_rig, jacobian[:, 3 : 3 + _POSE])
-    if calibrated:
-        _times_motion(by_cam, x_in_cam, raw[:, :_POSE])
-        for i in range(2):
-            for j in range(_CALIBRATION):
-                total = 0.0
-                for k in range(_CALIBRATION):
-                    total += raw[i, k] * state.basis[camera, k, j]
-                jacobian[i, 3 + _POSE + j] = total
-    return True
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _scratch():
-    """Working memory of :func:`_linearise`."""
-    return np.zeros(3), np.zeros(3), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, _CALIBRATION))
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _residuals(state, observations, out):
-    """Projected minus observed pixel for each observation; NaN behind the camera."""
-    x_in_rig, x_in_cam, by_cam, _, raw = _scratch()
-    for point in range(observations.start.shape[0] - 1):
-        for o in range(observations.start[point], observations.start[point + 1]):
-            frame, camera = observations.frame[o], observations.camera[o]
-            _move(state.frame_rotation[frame], state.frame_translation[frame], state.points[point], x_in_rig)
-            _move(state.camera_rotation[camera], state.camera_translation[camera], x_in_rig, x_in_cam)
-            out[o] = np.nan
-            if x_in_cam[2] >= _NEAREST_MM:
-                x, y, z = x_in_cam
-                _camera_jacobian(state.intrinsics[camera], x, y, z, out[o], by_cam, raw[:, _POSE:])
-                out[o] -= observations.pixels[o]
-
-
-# --- normal equations --------------------------------------------------------------------------------------------
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _weigh(state, observations, weighting, point, o, scratch, residual, jacobian):
-    """Residual and Jacobian of an observation, scaled by the root of its weight. False behind the camera."""
-    frame, camera = observations.frame[o], observations.camera[o]
-    if not _linearise(state, point, frame, camera, weighting.calibrated, scratch, residual, jacobian):
-        return False
-    residual -= observations.pixels[o]
-    scale = 1 / weighting.sigma_px
-    length = np.hypot(residual[0], residual[1]) * scale
-    if length > weighting.huber_sigmas:
-        scale *= np.sqrt(weighting.huber_sigmas / length)
-    residual *= scale
-    jacobian *= scale
-    return True
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _slot(offsets, count, offset, coupling):
-    """Where a block of unknowns stands among the blocks of the present point; a new one starts at zero."""
-    for slot in range(count):
-        if offsets[slot] == offset:
-            return slot, count
-    offsets[count] = offset
-    coupling[count] = 0
-    return count, count + 1
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _add_block(matrix, row, column, left, right):
-    """matrix[row:, column:] += left^T right for 2xn factors."""
-    for i in range(left.shape[1]):
-        for j in range(right.shape[1]):
-            matrix[row + i, column + j] += left[0, i] * right[0, j] + left[1, i] * right[1, j]
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _add_gradient(system, offset, by_block, residual):
-    """Add J^T r and the diagonal of J^T J of one block of unknowns."""
-    for i in range(by_block.shape[1]):
-        system.gradient[offset + i] += by_block[0, i] * residual[0] + by_block[1, i] * residual[1]
-        system.diagonal[offset + i] += by_block[0, i] ** 2 + by_block[1, i] ** 2
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _add_observation(system, blocks, jacobian, residual, pose_at, camera_at):
-    """Add an observation to the direct part of the system and to the coupling of its blocks with the point."""
-    offsets, widths, coupling, count = blocks
-    by_point = jacobian[:, :3]
-    by_pose, by_calibration = jacobian[:, 3 : 3 + _POSE], jacobian[:, 3 + _POSE :]
-    if pose_at >= 0:
-        _add_block(system.matrix, pose_at, pose_at, by_pose, by_pose)
-        _add_gradient(system, pose_at, by_pose, residual)
-        slot, count = _slot(offsets, count, pose_at, coupling)
-        widths[slot] = _POSE
-        _add_block(coupling[slot], 0, 0, by_pose, by_point)
-    if camera_at >= 0:
-        _add_block(system.matrix, camera_at, camera_at, by_calibration, by_calibration)
-        _add_gradient(system, camera_at, by_calibration, residual)
-        slot, count = _slot(offsets, count, camera_at, coupling)
-        widths[slot] = _CALIBRATION
-        _add_block(coupling[slot], 0, 0, by_calibration, by_point)
-        if pose_at >= 0:
-            _add_block(system.matrix, camera_at, pose_at, by_calibration, by_pose)
-    return count
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _eliminate(system, offsets, widths, coupling, count, inverse, point_gradient):
-    """Subtract what the blocks share through the present point: W V^-1 W^T and W V^-1 g. Lower triangle only."""
-    for a in range(count):
-        for i in range(widths[a]):
-            row = offsets[a] + i
-            w0, w1, w2 = coupling[a, i, 0], coupling[a, i, 1], coupling[a, i, 2]
-            y0 = w0 * inverse[0, 0] + w1 * inverse[1, 0] + w2 * inverse[2, 0]
-            y1 = w0 * inverse[0, 1] + w1 * inverse[1, 1] + w2 * inverse[2, 1]
-            y2 = w0 * inverse[0, 2] + w1 * inverse[1, 2] + w2 * inverse[2, 2]
-            system.gradient[row] -= y0 * point_gradient[0] + y1 * point_gradient[1] + y2 * point_gradient[2]
-            for b in range(count):
-                if offsets[b] > offsets[a]:
-                    continue
-                for j in range(widths[b]):
-                    system.matrix[row, offsets[b] + j] -= (
-                        y0 * coupling[b, j, 0] + y1 * coupling[b, j, 1] + y2 * coupling[b, j, 2]
-                    )
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _point_inverse(hessian, damping, inverse):
-    """Inverse of a point's 3x3 block with damping; zero where the point is not determined."""
-    a, b, c = hessian[0, 0] * (1 + damping), hessian[0, 1], hessian[0, 2]
-    d, e, f = hessian[1, 1] * (1 + damping), hessian[1, 2], hessian[2, 2] * (1 + damping)
-    determinant = a * (d * f - e * e) - b * (b * f - e * c) + c * (b * e - d * c)
-    inverse[:] = 0
-    if determinant <= 1e-12 * a * d * f:
-        return
-    inverse[0, 0], inverse[1, 1] = (d * f - e * e) / determinant, (a * f - c * c) / determinant
-    inverse[2, 2] = (a * d - b * b) / determinant
-    inverse[0, 1] = inverse[1, 0] = (c * e - b * f) / determinant
-    inverse[0, 2] = inverse[2, 0] = (b * e - c * d) / determinant
-    inverse[1, 2] = inverse[2, 1] = (b * c - a * e) / determinant
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _offsets_of(observations, weighting, o, frames):
-    """Where the pose and the calibration of an observation stand in the system; -1 where they are held."""
-    frame, camera = observations.frame[o], observations.camera[o]
-    calibration_at = _POSE * (frames - 1) + _CALIBRATION * camera
-    return _POSE * (frame - 1) if frame > 0 else -1, calibration_at if weighting.calibrated else -1
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _accumulate(state, observations, weighting, damping, first, last, system):
-    """Add the points ``first`` to ``last`` to the reduced normal equations."""
-    frames, longest = state.frame_rotation.shape[0], np.diff(observations.start).max()
-    scratch, residual, jacobian = _scratch(), np.zeros(2), np.zeros((2, _COLUMNS))
-    offsets, widths = np.zeros(2 * longest, np.int64), np.zeros(2 * longest, np.int64)
-    coupling = np.zeros((2 * longest, _CALIBRATION, 3))
-    hessian, gradient, inverse = np.zeros((3, 3)), np.zeros((3, 1)), np.zeros((3, 3))
-    for point in range(first, last):
-        hessian[:], gradient[:] = 0, 0
-        count = 0
-        for o in range(observations.start[point], observations.start[point + 1]):
-            if _weigh(state, observations, weighting, point, o, scratch, residual, jacobian):
-                pose_at, camera_at = _offsets_of(observations, weighting, o, frames)
-                _add_block(hessian, 0, 0, jacobian[:, :3], jacobian[:, :3])
-                _add_block(gradient, 0, 0, jacobian[:, :3], residual.reshape(2, 1))
-                blocks = (offsets, widths, coupling, count)
-                count = _add_observation(system, blocks, jacobian, residual, pose_at, camera_at)
-        _point_inverse(hessian, damping, inverse)
-        _eliminate(system, offsets, widths, coupling, count, inverse, gradient[:, 0])
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _substitute(state, observations, weighting, damping, step, first, last, moved):
-    """Back-substitution: the points ``first`` to ``last`` after the reduced unknowns have made their step."""
-    frames = state.frame_rotation.shape[0]
-    scratch, residual, jacobian = _scratch(), np.zeros(2), np.zeros((2, _COLUMNS))
-    hessian, gradient, inverse = np.zeros((3, 3)), np.zeros((3, 1)), np.zeros((3, 3))
-    for point in range(first, last):
-        hessian[:], gradient[:] = 0, 0
-        for o in range(observations.start[point], observations.start[point + 1]):
-            if not _weigh(state, observations, weighting, point, o, scratch, residual, jacobian):
-                continue
-            pose_at, camera_at = _offsets_of(observations, weighting, o, frames)
-            for i in range(2):
-                if pose_at >= 0:
-                    residual[i] += np.dot(jacobian[i, 3 : 3 + _POSE], step[pose_at : pose_at + _POSE])
-                if camera_at >= 0:
-                    residual[i] += np.dot(jacobian[i, 3 + _POSE :], step[camera_at : camera_at + _CALIBRATION])
-            _add_block(hessian, 0, 0, jacobian[:, :3], jacobian[:, :3])
-            _add_block(gradient, 0, 0, jacobian[:, :3], residual.reshape(2, 1))
-        _point_inverse(hessian, damping, inverse)
-        for i in range(3):
-            moved[point, i] = state.points[point, i] - (
-                inverse[i, 0] * gradient[0, 0] + inverse[i, 1] * gradient[1, 0] + inverse[i, 2] * gradient[2, 0]
-            )
-
-
-def _in_parts(work: Callable[[int, int], Any], count: int) -> list[Any]:
-    """``work(first, last)`` on each of a fixed number of ranges, in threads; results in the order of the ranges."""
-    edges = np.linspace(0, count, _PARTS + 1).astype(int).tolist()
-    with ThreadPoolExecutor(_PARTS) as pool:
-        return list(pool.map(work, edges[:-1], edges[1:]))
-
-
-def _normal_equations(state: _State, observations: _Observations, weighting: _Weighting, damping: float) -> _System:
-    """Reduced normal equations of all observations and of the prior of the calibration."""
-    size = _POSE * (len(state.frame_rotation) - 1)
-    total = size + (state.whitened.size if weighting.calibrated else 0)
-
-    def part(first: int, last: int) -> _System:
-        system = _System(np.zeros((total, total)), np.zeros(total), np.zeros(total))
-        _accumulate(state, observations, weighting, damping, first, last, system)
-        return system
-
-    parts = _in_parts(part, len(state.points))
-    matrix, gradient, diagonal = (sum(terms[1:], terms[0]) for terms in zip(*parts, strict=True))
-    if weighting.calibrated:
-        prior = np.arange(size, total)
-        matrix[prior, prior] += 1
-        diagonal[prior] += 1
-        gradient[prior] += state.whitened.ravel()
-    return _System(matrix, gradient, diagonal)
 
 
 # --- states ------------------------------------------------------------------------------------------------------
@@ -467,13 +124,13 @@ class _Prior:
         motion = self.extrinsic_factor[index] @ whitened[:6]
         turn = left_jacobian(motion[:3])
         on_the_left = np.block([[turn, np.zeros((3, 3))], [skew(motion[3:]) @ turn, np.eye(3)]])
-        basis = np.zeros((_CALIBRATION, _CALIBRATION))
+        basis = np.zeros((CALIBRATION, CALIBRATION))
         basis[:6, :6] = on_the_left @ self.extrinsic_factor[index]
         basis[6:, 6:] = self.parameter_factor[index]
         return basis
 
 
-def _with_calibration(state: _State, prior: _Prior, whitened: Float[np.ndarray, "c 14"]) -> _State:
+def _with_calibration(state: State, prior: _Prior, whitened: Float[np.ndarray, "c 14"]) -> State:
     """The state with another calibration."""
     cameras = [prior.camera_at(index, z) for index, z in enumerate(whitened)]
     return state._replace(
@@ -485,12 +142,12 @@ def _with_calibration(state: _State, prior: _Prior, whitened: Float[np.ndarray, 
     )
 
 
-def _initial_state(reconstruction: Reconstruction, points: Float[np.ndarray, "p 3"], prior: _Prior) -> _State:
+def _initial_state(reconstruction: Reconstruction, points: Float[np.ndarray, "p 3"], prior: _Prior) -> State:
     """The reconstruction as arrays."""
     poses = reconstruction.rig_from_world.values()
     cameras = len(reconstruction.rig.names)
     empty = np.zeros(0)
-    state = _State(
+    state = State(
         frame_rotation=np.stack([pose.rotation for pose in poses]),
         frame_translation=np.stack([pose.translation for pose in poses]),
         camera_rotation=empty,
@@ -500,26 +157,20 @@ def _initial_state(reconstruction: Reconstruction, points: Float[np.ndarray, "p 
         whitened=empty,
         basis=empty,
     )
-    return _with_calibration(state, prior, np.zeros((cameras, _CALIBRATION)))
+    return _with_calibration(state, prior, np.zeros((cameras, CALIBRATION)))
 
 
 def _moved(
-    state: _State, observations: _Observations, weighting: _Weighting, prior: _Prior, damping: float, step: Any
-) -> _State:
+    state: State, observations: Observations, weighting: Weighting, prior: _Prior, damping: float, step: Any
+) -> State:
     """The state after a step of the reduced unknowns and the back-substitution of the points."""
-    points = np.empty_like(state.points)
-
-    def part(first: int, last: int) -> None:
-        _substitute(state, observations, weighting, damping, step, first, last, points)
-
-    _in_parts(part, len(points))
-    size = _POSE * (len(state.frame_rotation) - 1)
-    motions = np.vstack([np.zeros((1, _POSE)), step[:size].reshape(-1, _POSE)])
+    size = POSE * (len(state.frame_rotation) - 1)
+    motions = np.vstack([np.zeros((1, POSE)), step[:size].reshape(-1, POSE)])
     turns = Rotation.from_rotvec(motions[:, :3]).as_matrix()
     moved = state._replace(
         frame_rotation=turns @ state.frame_rotation,
         frame_translation=np.einsum("fij,fj->fi", turns, state.frame_translation) + motions[:, 3:],
-        points=points,
+        points=substitute(state, observations, weighting, damping, step),
     )
     if not weighting.calibrated:
         return moved
@@ -529,16 +180,9 @@ def _moved(
 # --- minimisation ------------------------------------------------------------------------------------------------
 
 
-def _residual_vectors(state: _State, observations: _Observations) -> Float[np.ndarray, "o 2"]:
-    """Projected minus observed pixels; NaN behind the camera."""
-    residuals = np.empty_like(observations.pixels)
-    _residuals(state, observations, residuals)
-    return residuals
-
-
-def _cost(state: _State, observations: _Observations, weighting: _Weighting) -> float:
+def _cost(state: State, observations: Observations, weighting: Weighting) -> float:
     """Huber loss of the residuals plus the prior; infinite if a point went behind a camera."""
-    lengths = np.linalg.norm(_residual_vectors(state, observations), axis=1) / weighting.sigma_px
+    lengths = np.linalg.norm(residual_vectors(state, observations), axis=1) / weighting.sigma_px
     if not np.all(np.isfinite(lengths)):
         return np.inf
     knee = weighting.huber_sigmas
@@ -546,7 +190,7 @@ def _cost(state: _State, observations: _Observations, weighting: _Weighting) -> 
     return float(np.sum(loss) + np.sum(state.whitened**2))
 
 
-def _solve_damped(system: _System, damping: float) -> Float[np.ndarray, "n"] | None:
+def _solve_damped(system: System, damping: float) -> Float[np.ndarray, "n"] | None:
     """The damped step, or None where the system is not positive definite."""
     matrix = system.matrix.copy()
     on_diagonal = np.arange(len(matrix))
@@ -558,16 +202,16 @@ def _solve_damped(system: _System, damping: float) -> Float[np.ndarray, "n"] | N
 
 
 def _minimise(
-    state: _State,
-    observations: _Observations,
-    weighting: _Weighting,
+    state: State,
+    observations: Observations,
+    weighting: Weighting,
     prior: _Prior,
     options: AdjustmentOptions,
-) -> _State:
+) -> State:
     """Levenberg-Marquardt from ``state`` to the minimum of the cost."""
     damping, cost = 1e-4, _cost(state, observations, weighting)
     for _ in range(options.iterations):
-        system = _normal_equations(state, observations, weighting, damping)
+        system = normal_equations(state, observations, weighting, damping)
         step = _solve_damped(system, damping)
         candidate = state if step is None else _moved(state, observations, weighting, prior, damping, step)
         lower = np.inf if step is None else _cost(candidate, observations, weighting)
@@ -582,13 +226,13 @@ def _minimise(
     return state
 
 
-def _sigma_px(state: _State, observations: _Observations, weighting: _Weighting, unknowns: int) -> float:
+def _sigma_px(state: State, observations: Observations, weighting: Weighting, unknowns: int) -> float:
     """Standard deviation (px) that an observation counts for in the estimate.
 
     For a robust loss the covariance of the estimate is a / b^2 (J^T J)^-1, with a the variance of the influence
     psi(r) = w(r) r and b its mean slope (Huber, Robust Statistics, 1981, section 7.6); so sigma^2 = a / b^2.
     """
-    lengths = np.linalg.norm(_residual_vectors(state, observations), axis=1) / weighting.sigma_px
+    lengths = np.linalg.norm(residual_vectors(state, observations), axis=1) / weighting.sigma_px
     beyond = lengths > weighting.huber_sigmas
     influence = np.minimum(lengths, weighting.huber_sigmas)
     variance = np.sum(influence**2) / max(2 * len(lengths) - unknowns, 1)
@@ -599,7 +243,7 @@ def _sigma_px(state: _State, observations: _Observations, weighting: _Weighting,
 # --- observations ------------------------------------------------------------------------------------------------
 
 
-def _largest_angles_deg(state: _State, observations: _Observations) -> Float[np.ndarray, "p"]:
+def _largest_angles_deg(state: State, observations: Observations) -> Float[np.ndarray, "p"]:
     """For each point the angle between the first ray and the one farthest from it."""
     counts = np.diff(observations.start)
     point = np.repeat(np.arange(len(counts)), counts)
@@ -613,26 +257,24 @@ def _largest_angles_deg(state: _State, observations: _Observations) -> Float[np.
     return np.rad2deg(2 * np.arcsin(np.clip(np.maximum.reduceat(chord, observations.start[:-1]) / 2, 0, 1)))
 
 
-def _good(
-    state: _State, observations: _Observations, limit_px: float, minimum_angle_deg: float
-) -> Bool[np.ndarray, "o"]:
+def _good(state: State, observations: Observations, limit_px: float, minimum_angle_deg: float) -> Bool[np.ndarray, "o"]:
     """Observations to keep: before the camera, near the projection, of points with two of them and enough angle."""
     counts = np.diff(observations.start)
     point = np.repeat(np.arange(len(counts)), counts)
-    lengths = np.linalg.norm(_residual_vectors(state, observations), axis=1)
+    lengths = np.linalg.norm(residual_vectors(state, observations), axis=1)
     near = np.isfinite(lengths) & (lengths <= limit_px)
     seen = np.bincount(point, weights=near, minlength=len(counts)) >= 2
     wide = _largest_angles_deg(state, observations) >= minimum_angle_deg
     return near & (seen & wide)[point]
 
 
-def _sorted_by_point(tracks: Tracks, keep: Bool[np.ndarray, "o"]) -> tuple[_Observations, Int[np.ndarray, "p"]]:
+def _sorted_by_point(tracks: Tracks, keep: Bool[np.ndarray, "o"]) -> tuple[Observations, Int[np.ndarray, "p"]]:
     """The kept observations sorted by point, and the indices of the points that still have any."""
     order = np.flatnonzero(keep)
     order = order[np.argsort(tracks.point_index[order], kind="stable")]
     points, counts = np.unique(tracks.point_index[order], return_counts=True)
     return (
-        _Observations(
+        Observations(
             pixels=np.ascontiguousarray(tracks.pixels[order]),
             frame=np.ascontiguousarray(tracks.frame_index[order]),
             camera=np.ascontiguousarray(tracks.camera_index[order]),
@@ -643,14 +285,14 @@ def _sorted_by_point(tracks: Tracks, keep: Bool[np.ndarray, "o"]) -> tuple[_Obse
 
 
 def _select(
-    state: _State, observations: _Observations, colors: Any, keep: Bool[np.ndarray, "o"]
-) -> tuple[_State, _Observations, Any]:
+    state: State, observations: Observations, colors: Any, keep: Bool[np.ndarray, "o"]
+) -> tuple[State, Observations, Any]:
     """State, observations and colours without what is not kept."""
     kept, points = _sorted_by_point(_as_tracks(state, observations, colors), keep)
     return state._replace(points=state.points[points]), kept, colors[points]
 
 
-def _as_tracks(state: _State, observations: _Observations, colors: Any) -> Tracks:
+def _as_tracks(state: State, observations: Observations, colors: Any) -> Tracks:
     """Points and observations as a value for others."""
     counts = np.diff(observations.start)
     return Tracks(
@@ -671,7 +313,7 @@ def calibration_sigma_px(rig: Rig, distance_mm: float) -> float:
     for index, mounted in enumerate(rig.cameras.values()):
         corners = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]]) * [mounted.camera.width, mounted.camera.height]
         in_rig = mounted.cam_from_rig.inverse().apply(distance_mm * mounted.camera.rays(corners))
-        moved = [prior.camera_at(index, unit) for unit in np.eye(_CALIBRATION)]
+        moved = [prior.camera_at(index, unit) for unit in np.eye(CALIBRATION)]
         shifts = np.stack([m.camera.project(m.cam_from_rig.apply(in_rig)) - corners for m in moved])
         sigma = max(sigma, float(np.sqrt(np.sum(shifts**2, axis=(0, 2)).max())))
     return sigma
@@ -685,7 +327,7 @@ def residuals_px(reconstruction: Reconstruction) -> Float[np.ndarray, "o 2"]:
     observations, points = _sorted_by_point(tracks, np.ones(len(tracks.point_index), dtype=bool))
     state = _initial_state(reconstruction, tracks.points[points], _Prior.of(reconstruction.rig))
     residuals = np.empty_like(observations.pixels)
-    residuals[np.argsort(tracks.point_index, kind="stable")] = _residual_vectors(state, observations)
+    residuals[np.argsort(tracks.point_index, kind="stable")] = residual_vectors(state, observations)
     return residuals
 
 
@@ -693,24 +335,24 @@ def residuals_px(reconstruction: Reconstruction) -> Float[np.ndarray, "o 2"]:
 
 
 def _posterior(
-    state: _State, observations: _Observations, weighting: _Weighting
+    state: State, observations: Observations, weighting: Weighting
 ) -> tuple[Float[np.ndarray, "f 6 6"], Float[np.ndarray, "c 14 14"] | None]:
     """Covariance of each pose and of each camera's calibration (motion on the left, parameters)."""
-    system = _normal_equations(state, observations, weighting._replace(huber_sigmas=np.inf), 0.0)
+    system = normal_equations(state, observations, weighting._replace(huber_sigmas=np.inf), 0.0)
     inverse = cho_solve(cho_factor(system.matrix, lower=True), np.eye(len(system.matrix)))
-    poses = np.zeros((len(state.frame_rotation), _POSE, _POSE))
+    poses = np.zeros((len(state.frame_rotation), POSE, POSE))
     for frame in range(1, len(poses)):
-        at = slice(_POSE * (frame - 1), _POSE * frame)
+        at = slice(POSE * (frame - 1), POSE * frame)
         poses[frame] = inverse[at, at]
     if not weighting.calibrated:
         return poses, None
-    start = _POSE * (len(poses) - 1)
-    starts = range(start, len(inverse), _CALIBRATION)
-    whitened = np.stack([inverse[at : at + _CALIBRATION, at : at + _CALIBRATION] for at in starts])
+    start = POSE * (len(poses) - 1)
+    starts = range(start, len(inverse), CALIBRATION)
+    whitened = np.stack([inverse[at : at + CALIBRATION, at : at + CALIBRATION] for at in starts])
     return poses, state.basis @ whitened @ np.swapaxes(state.basis, 1, 2)
 
 
-def _adjusted_rig(state: _State, prior: _Prior, covariance: Float[np.ndarray, "c 14 14"] | None) -> Rig:
+def _adjusted_rig(state: State, prior: _Prior, covariance: Float[np.ndarray, "c 14 14"] | None) -> Rig:
     """The rig with the refined calibration and what is still uncertain of it; what was held stays as given."""
     if covariance is None:
         return prior.rig
@@ -729,8 +371,9 @@ def _adjusted_rig(state: _State, prior: _Prior, covariance: Float[np.ndarray, "c
 def adjust(reconstruction: Reconstruction, options: AdjustmentOptions | None = None) -> Reconstruction:
     """Refine poses, points and free calibration together; the tracks come back without outliers.
 
-    The covariance of the poses is relative to the first frame, that of the calibration replaces its prior. Raises
-    ReconstructionError where the observations do not determine every pose.
+    The covariance of the poses is relative to the first frame, that of the calibration replaces its prior. It takes the
+    errors of keypoints for independent; those of one surface point in neighbouring images are not, so that real poses
+    are some times as uncertain. Raises ReconstructionError where the observations do not determine every pose.
     """
     options = options or AdjustmentOptions()
     tracks = reconstruction.tracks
@@ -745,9 +388,9 @@ def adjust(reconstruction: Reconstruction, options: AdjustmentOptions | None = N
         if not keep.any():
             raise ReconstructionError("adjustment: no point is consistent; check the handpiece's calibration")
         state, observations, colors = _select(state, observations, colors, keep)
-        weighting = _Weighting(sigma_px, options.huber_sigmas, prior.is_free)
+        weighting = Weighting(sigma_px, options.huber_sigmas, prior.is_free)
         state = _minimise(state, observations, weighting, prior, options)
-        unknowns = state.points.size + _POSE * (len(state.frame_rotation) - 1)
+        unknowns = state.points.size + POSE * (len(state.frame_rotation) - 1)
         sigma_px = _sigma_px(state, observations, weighting, unknowns)
         limit_px = options.outlier_sigmas * sigma_px
     return _result(reconstruction, state, observations, colors, prior, sigma_px)
@@ -755,21 +398,21 @@ def adjust(reconstruction: Reconstruction, options: AdjustmentOptions | None = N
 
 def _result(
     reconstruction: Reconstruction,
-    state: _State,
-    observations: _Observations,
+    state: State,
+    observations: Observations,
     colors: Any,
     prior: _Prior,
     sigma_px: float,
 ) -> Reconstruction:
     """The adjusted reconstruction with its covariances."""
     try:
-        poses, calibration = _posterior(state, observations, _Weighting(sigma_px, np.inf, prior.is_free))
+        poses, calibration = _posterior(state, observations, Weighting(sigma_px, np.inf, prior.is_free))
     except LinAlgError as error:
         raise ReconstructionError(
             "adjustment: the tracks do not tie every frame to the others; more overlap is needed"
         ) from error
     motions = zip(state.frame_rotation, state.frame_translation, strict=True)
-    residuals = _residual_vectors(state, observations)
+    residuals = residual_vectors(state, observations)
     return replace(
         reconstruction,
         rig=_adjusted_rig(state, prior, calibration),

@@ -1,0 +1,389 @@
+"""Derivatives of the observations, and the normal equations with the points eliminated (Schur complement).
+
+Notation as in :mod:`cuspid.motion.adjustment`. With V the 3x3 block of a point, W its coupling with the other unknowns
+and H their direct part, the reduced system is H - W V^-1 W^T.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, no_type_check
+
+import numpy as np
+from jaxtyping import Float
+from numba import njit
+
+POSE = 6
+"""Unknowns of a frame."""
+CALIBRATION = 14
+"""Unknowns of a camera: 6 of its place in the rig, 8 of its lens."""
+_COLUMNS = 3 + POSE + CALIBRATION
+_PARTS = 4
+_NEAREST_MM = 1e-3
+
+
+class State(NamedTuple):
+    """Values of all unknowns."""
+
+    frame_rotation: np.ndarray
+    frame_translation: np.ndarray
+    camera_rotation: np.ndarray
+    camera_translation: np.ndarray
+    intrinsics: np.ndarray
+    points: np.ndarray
+    whitened: np.ndarray
+    """(cameras, 14): z of each camera, zero at the prior."""
+    basis: np.ndarray
+    """(cameras, 14, 14): derivative of (motion on the left of cam_from_rig, parameters) with respect to z."""
+
+
+class Observations(NamedTuple):
+    """Observations sorted by point."""
+
+    pixels: np.ndarray
+    frame: np.ndarray
+    camera: np.ndarray
+    start: np.ndarray
+    """(points + 1): the observations of point p are start[p] to start[p + 1]."""
+
+
+class Weighting(NamedTuple):
+    """What a residual counts for, and which unknowns there are."""
+
+    sigma_px: float
+    huber_sigmas: float
+    calibrated: bool
+
+
+class System(NamedTuple):
+    """Reduced normal equations: ``matrix @ step = -gradient``, before damping of ``diagonal``."""
+
+    matrix: np.ndarray
+    gradient: np.ndarray
+    diagonal: np.ndarray
+
+
+# --- one observation ---------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _camera_jacobian(k, x, y, z, pixel, by_point, by_parameters):
+    """Projection of a point in the camera frame, and its derivatives (2x3 and 2x8)."""
+    fx, fy, k1, k2, p1, p2 = k[0], k[1], k[4], k[5], k[6], k[7]
+    u, v = x / z, y / z
+    r2 = u * u + v * v
+    radial, slope = 1 + k1 * r2 + k2 * r2 * r2, k1 + 2 * k2 * r2
+    xd = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
+    yd = v * radial + 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
+    pixel[0], pixel[1] = fx * xd + k[2], fy * yd + k[3]
+    cross = 2 * u * v * slope + 2 * p1 * u + 2 * p2 * v
+    xu = radial + 2 * u * u * slope + 2 * p1 * v + 6 * p2 * u
+    yv = radial + 2 * v * v * slope + 2 * p2 * u + 6 * p1 * v
+    by_point[0, 0], by_point[0, 1] = fx * xu / z, fx * cross / z
+    by_point[1, 0], by_point[1, 1] = fy * cross / z, fy * yv / z
+    by_point[0, 2] = -(by_point[0, 0] * u + by_point[0, 1] * v)
+    by_point[1, 2] = -(by_point[1, 0] * u + by_point[1, 1] * v)
+    by_parameters[:] = 0
+    by_parameters[0, 0], by_parameters[1, 1] = xd, yd
+    by_parameters[0, 2], by_parameters[1, 3] = 1, 1
+    by_parameters[0, 4], by_parameters[1, 4] = fx * u * r2, fy * v * r2
+    by_parameters[0, 5], by_parameters[1, 5] = fx * u * r2 * r2, fy * v * r2 * r2
+    by_parameters[0, 6], by_parameters[1, 6] = fx * 2 * u * v, fy * (r2 + 2 * v * v)
+    by_parameters[0, 7], by_parameters[1, 7] = fx * (r2 + 2 * u * u), fy * 2 * u * v
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _move(rotation, translation, x, out):
+    """out = rotation @ x + translation."""
+    for i in range(3):
+        out[i] = rotation[i, 0] * x[0] + rotation[i, 1] * x[1] + rotation[i, 2] * x[2] + translation[i]
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _times(a, b, out):
+    """out (2xn) = a (2x3) @ b (3xn)."""
+    for i in range(2):
+        for j in range(b.shape[1]):
+            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _times_motion(a, x, out):
+    """out (2x6): a (2x3) times the derivative [-[x]_x, I] of x under a small motion on its left."""
+    for i in range(2):
+        out[i, 0] = a[i, 2] * x[1] - a[i, 1] * x[2]
+        out[i, 1] = a[i, 0] * x[2] - a[i, 2] * x[0]
+        out[i, 2] = a[i, 1] * x[0] - a[i, 0] * x[1]
+        out[i, 3], out[i, 4], out[i, 5] = a[i, 0], a[i, 1], a[i, 2]
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def linearise(state, point, frame, camera, calibrated, scratch, pixel, jacobian):
+    """Projected pixel and its derivatives (2x23) by point, pose and whitened calibration. False behind the camera."""
+    x_in_rig, x_in_cam, by_cam, by_rig, raw = scratch
+    _move(state.frame_rotation[frame], state.frame_translation[frame], state.points[point], x_in_rig)
+    _move(state.camera_rotation[camera], state.camera_translation[camera], x_in_rig, x_in_cam)
+    if x_in_cam[2] < _NEAREST_MM:
+        return False
+    x, y, z = x_in_cam
+    _camera_jacobian(state.intrinsics[camera], x, y, z, pixel, by_cam, raw[:, POSE:])
+    _times(by_cam, state.camera_rotation[camera], by_rig)
+    _times(by_rig, state.frame_rotation[frame], jacobian[:, :3])
+    _times_motion(by_rig, x_in_rig, jacobian[:, 3 : 3 + POSE])
+    if calibrated:
+        _times_motion(by_cam, x_in_cam, raw[:, :POSE])
+        for i in range(2):
+            for j in range(CALIBRATION):
+                total = 0.0
+                for k in range(CALIBRATION):
+                    total += raw[i, k] * state.basis[camera, k, j]
+                jacobian[i, 3 + POSE + j] = total
+    return True
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def make_scratch():
+    """Working memory of :func:`linearise`."""
+    return np.zeros(3), np.zeros(3), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, CALIBRATION))
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _residuals(state, observations, out):
+    """Projected minus observed pixel for each observation; NaN behind the camera."""
+    x_in_rig, x_in_cam, by_cam, _, raw = make_scratch()
+    for point in range(observations.start.shape[0] - 1):
+        for o in range(observations.start[point], observations.start[point + 1]):
+            frame, camera = observations.frame[o], observations.camera[o]
+            _move(state.frame_rotation[frame], state.frame_translation[frame], state.points[point], x_in_rig)
+            _move(state.camera_rotation[camera], state.camera_translation[camera], x_in_rig, x_in_cam)
+            out[o] = np.nan
+            if x_in_cam[2] >= _NEAREST_MM:
+                x, y, z = x_in_cam
+                _camera_jacobian(state.intrinsics[camera], x, y, z, out[o], by_cam, raw[:, POSE:])
+                out[o] -= observations.pixels[o]
+
+
+# --- normal equations --------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _weigh(state, observations, weighting, point, o, scratch, residual, jacobian):
+    """Residual and Jacobian of an observation, scaled by the root of its weight. False behind the camera."""
+    frame, camera = observations.frame[o], observations.camera[o]
+    if not linearise(state, point, frame, camera, weighting.calibrated, scratch, residual, jacobian):
+        return False
+    residual -= observations.pixels[o]
+    scale = 1 / weighting.sigma_px
+    length = np.hypot(residual[0], residual[1]) * scale
+    if length > weighting.huber_sigmas:
+        scale *= np.sqrt(weighting.huber_sigmas / length)
+    residual *= scale
+    jacobian *= scale
+    return True
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _slot(offsets, count, offset, coupling):
+    """Where a block of unknowns stands among the blocks of the present point; a new one starts at zero."""
+    for slot in range(count):
+        if offsets[slot] == offset:
+            return slot, count
+    offsets[count] = offset
+    coupling[count] = 0
+    return count, count + 1
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _add_block(matrix, row, column, left, right):
+    """matrix[row:, column:] += left^T right for 2xn factors."""
+    for i in range(left.shape[1]):
+        for j in range(right.shape[1]):
+            matrix[row + i, column + j] += left[0, i] * right[0, j] + left[1, i] * right[1, j]
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _add_gradient(system, offset, by_block, residual):
+    """Add J^T r and the diagonal of J^T J of one block of unknowns."""
+    for i in range(by_block.shape[1]):
+        system.gradient[offset + i] += by_block[0, i] * residual[0] + by_block[1, i] * residual[1]
+        system.diagonal[offset + i] += by_block[0, i] ** 2 + by_block[1, i] ** 2
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _add_observation(system, blocks, jacobian, residual, pose_at, camera_at):
+    """Add an observation to the direct part of the system and to the coupling of its blocks with the point."""
+    offsets, widths, coupling, count = blocks
+    by_point = jacobian[:, :3]
+    by_pose, by_calibration = jacobian[:, 3 : 3 + POSE], jacobian[:, 3 + POSE :]
+    if pose_at >= 0:
+        _add_block(system.matrix, pose_at, pose_at, by_pose, by_pose)
+        _add_gradient(system, pose_at, by_pose, residual)
+        slot, count = _slot(offsets, count, pose_at, coupling)
+        widths[slot] = POSE
+        _add_block(coupling[slot], 0, 0, by_pose, by_point)
+    if camera_at >= 0:
+        _add_block(system.matrix, camera_at, camera_at, by_calibration, by_calibration)
+        _add_gradient(system, camera_at, by_calibration, residual)
+        slot, count = _slot(offsets, count, camera_at, coupling)
+        widths[slot] = CALIBRATION
+        _add_block(coupling[slot], 0, 0, by_calibration, by_point)
+        if pose_at >= 0:
+            _add_block(system.matrix, camera_at, pose_at, by_calibration, by_pose)
+    return count
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _eliminate(system, offsets, widths, coupling, count, inverse, point_gradient):
+    """Subtract what the blocks share through the present point: W V^-1 W^T and W V^-1 g. Lower triangle only."""
+    for a in range(count):
+        for i in range(widths[a]):
+            row = offsets[a] + i
+            w0, w1, w2 = coupling[a, i, 0], coupling[a, i, 1], coupling[a, i, 2]
+            y0 = w0 * inverse[0, 0] + w1 * inverse[1, 0] + w2 * inverse[2, 0]
+            y1 = w0 * inverse[0, 1] + w1 * inverse[1, 1] + w2 * inverse[2, 1]
+            y2 = w0 * inverse[0, 2] + w1 * inverse[1, 2] + w2 * inverse[2, 2]
+            system.gradient[row] -= y0 * point_gradient[0] + y1 * point_gradient[1] + y2 * point_gradient[2]
+            for b in range(count):
+                if offsets[b] > offsets[a]:
+                    continue
+                for j in range(widths[b]):
+                    system.matrix[row, offsets[b] + j] -= (
+                        y0 * coupling[b, j, 0] + y1 * coupling[b, j, 1] + y2 * coupling[b, j, 2]
+                    )
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _point_inverse(hessian, damping, inverse):
+    """Inverse of a point's 3x3 block with damping; zero where the point is not determined."""
+    a, b, c = hessian[0, 0] * (1 + damping), hessian[0, 1], hessian[0, 2]
+    d, e, f = hessian[1, 1] * (1 + damping), hessian[1, 2], hessian[2, 2] * (1 + damping)
+    determinant = a * (d * f - e * e) - b * (b * f - e * c) + c * (b * e - d * c)
+    inverse[:] = 0
+    if determinant <= 1e-12 * a * d * f:
+        return
+    inverse[0, 0], inverse[1, 1] = (d * f - e * e) / determinant, (a * f - c * c) / determinant
+    inverse[2, 2] = (a * d - b * b) / determinant
+    inverse[0, 1] = inverse[1, 0] = (c * e - b * f) / determinant
+    inverse[0, 2] = inverse[2, 0] = (b * e - c * d) / determinant
+    inverse[1, 2] = inverse[2, 1] = (b * c - a * e) / determinant
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _offsets_of(observations, weighting, o, frames):
+    """Where the pose and the calibration of an observation stand in the system; -1 where they are held."""
+    frame, camera = observations.frame[o], observations.camera[o]
+    calibration_at = POSE * (frames - 1) + CALIBRATION * camera
+    return POSE * (frame - 1) if frame > 0 else -1, calibration_at if weighting.calibrated else -1
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _accumulate(state, observations, weighting, damping, first, last, system):
+    """Add the points ``first`` to ``last`` to the reduced normal equations."""
+    frames, longest = state.frame_rotation.shape[0], np.diff(observations.start).max()
+    scratch, residual, jacobian = make_scratch(), np.zeros(2), np.zeros((2, _COLUMNS))
+    offsets, widths = np.zeros(2 * longest, np.int64), np.zeros(2 * longest, np.int64)
+    coupling = np.zeros((2 * longest, CALIBRATION, 3))
+    hessian, gradient, inverse = np.zeros((3, 3)), np.zeros((3, 1)), np.zeros((3, 3))
+    for point in range(first, last):
+        hessian[:], gradient[:] = 0, 0
+        count = 0
+        for o in range(observations.start[point], observations.start[point + 1]):
+            if _weigh(state, observations, weighting, point, o, scratch, residual, jacobian):
+                pose_at, camera_at = _offsets_of(observations, weighting, o, frames)
+                _add_block(hessian, 0, 0, jacobian[:, :3], jacobian[:, :3])
+                _add_block(gradient, 0, 0, jacobian[:, :3], residual.reshape(2, 1))
+                blocks = (offsets, widths, coupling, count)
+                count = _add_observation(system, blocks, jacobian, residual, pose_at, camera_at)
+        _point_inverse(hessian, damping, inverse)
+        _eliminate(system, offsets, widths, coupling, count, inverse, gradient[:, 0])
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _substitute(state, observations, weighting, damping, step, first, last, moved):
+    """Back-substitution: the points ``first`` to ``last`` after the reduced unknowns have made their step."""
+    frames = state.frame_rotation.shape[0]
+    scratch, residual, jacobian = make_scratch(), np.zeros(2), np.zeros((2, _COLUMNS))
+    hessian, gradient, inverse = np.zeros((3, 3)), np.zeros((3, 1)), np.zeros((3, 3))
+    for point in range(first, last):
+        hessian[:], gradient[:] = 0, 0
+        for o in range(observations.start[point], observations.start[point + 1]):
+            if not _weigh(state, observations, weighting, point, o, scratch, residual, jacobian):
+                continue
+            pose_at, camera_at = _offsets_of(observations, weighting, o, frames)
+            for i in range(2):
+                if pose_at >= 0:
+                    residual[i] += np.dot(jacobian[i, 3 : 3 + POSE], step[pose_at : pose_at + POSE])
+                if camera_at >= 0:
+                    residual[i] += np.dot(jacobian[i, 3 + POSE :], step[camera_at : camera_at + CALIBRATION])
+            _add_block(hessian, 0, 0, jacobian[:, :3], jacobian[:, :3])
+            _add_block(gradient, 0, 0, jacobian[:, :3], residual.reshape(2, 1))
+        _point_inverse(hessian, damping, inverse)
+        for i in range(3):
+            moved[point, i] = state.points[point, i] - (
+                inverse[i, 0] * gradient[0, 0] + inverse[i, 1] * gradient[1, 0] + inverse[i, 2] * gradient[2, 0]
+            )
+
+
+def _in_parts(work: Callable[[int, int], Any], count: int) -> list[Any]:
+    """``work(first, last)`` on each of a fixed number of ranges, in threads; results in the order of the ranges."""
+    edges = np.linspace(0, count, _PARTS + 1).astype(int).tolist()
+    with ThreadPoolExecutor(_PARTS) as pool:
+        return list(pool.map(work, edges[:-1], edges[1:]))
+
+
+def normal_equations(state: State, observations: Observations, weighting: Weighting, damping: float) -> System:
+    """Reduced normal equations of all observations and of the prior of the calibration."""
+    size = POSE * (len(state.frame_rotation) - 1)
+    total = size + (state.whitened.size if weighting.calibrated else 0)
+
+    def part(first: int, last: int) -> System:
+        system = System(np.zeros((total, total)), np.zeros(total), np.zeros(total))
+        _accumulate(state, observations, weighting, damping, first, last, system)
+        return system
+
+    parts = _in_parts(part, len(state.points))
+    matrix, gradient, diagonal = (sum(terms[1:], terms[0]) for terms in zip(*parts, strict=True))
+    if weighting.calibrated:
+        prior = np.arange(size, total)
+        matrix[prior, prior] += 1
+        diagonal[prior] += 1
+        gradient[prior] += state.whitened.ravel()
+    return System(matrix, gradient, diagonal)
+
+
+def substitute(
+    state: State, observations: Observations, weighting: Weighting, damping: float, step: Float[np.ndarray, "n"]
+) -> Float[np.ndarray, "p 3"]:
+    """The points after the reduced unknowns have made their step."""
+    points = np.empty_like(state.points)
+
+    def part(first: int, last: int) -> None:
+        _substitute(state, observations, weighting, damping, step, first, last, points)
+
+    _in_parts(part, len(points))
+    return points
+
+
+def residual_vectors(state: State, observations: Observations) -> Float[np.ndarray, "o 2"]:
+    """Projected minus observed pixels; NaN behind the camera."""
+    residuals = np.empty_like(observations.pixels)
+    _residuals(state, observations, residuals)
+    return residuals
