@@ -47,7 +47,7 @@ class RefinementOptions:
     """Mean correlation from which a plane is kept and handed to neighbours."""
     least_contrast_dn: float = 2.0
     """Standard deviation of a window, in digital numbers, below which it carries no texture."""
-    sweeps: int = 2
+    sweeps: int = 1
     """How often planes are handed on to neighbours without one, in each direction."""
 
 

@@ -35,7 +35,7 @@ class FusionOptions:
     """Distance from a surface, in voxels, up to which it is blended."""
     largest_jump_mm: float = 0.15
     """Neighbouring depths that differ by more do not belong to one surface."""
-    least_weight: float = 0.05
+    least_weight: float = 0.01
     """Weight (sum of confidences) from which a voxel counts as observed."""
     agreement_mm: float = 0.08
     """A depth map confirms a vertex within this distance; nearer ones count more."""

@@ -63,22 +63,23 @@ def _cell_vertex(values, vertex):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _vertices(distance, weight, neighbours, origins, least_weight, index_of_cell):
-    """A vertex for each cell that the surface crosses (grid units); writes their indices into ``index_of_cell``."""
-    found = [np.zeros(3) for _ in range(0)]
+def _vertices(distance, weight, neighbours, origins, least_weight, index_of_cell, vertices):
+    """A vertex (grid units) for each cell that the surface crosses; returns how many (``vertices`` may be empty)."""
+    count = 0
     values, vertex = np.zeros(8), np.zeros(3)
     for slot in range(origins.shape[0]):
-        for i in range(8):
-            for j in range(8):
-                for k in range(8):
-                    if _corners(distance, weight, neighbours, slot, i, j, k, least_weight, values):
-                        _cell_vertex(values, vertex)
-                        index_of_cell[slot, (i * 8 + j) * 8 + k] = len(found)
-                        found.append(origins[slot] + np.array([i, j, k]) + vertex)
-    result = np.zeros((len(found), 3))
-    for n in range(len(found)):
-        result[n] = found[n]
-    return result
+        for voxel in range(512):
+            i, j, k = voxel >> 6, (voxel >> 3) & 7, voxel & 7
+            if not _corners(distance, weight, neighbours, slot, i, j, k, least_weight, values):
+                continue
+            if vertices.shape[0] > 0:
+                _cell_vertex(values, vertex)
+                index_of_cell[slot, voxel] = count
+                vertices[count, 0] = origins[slot, 0] + i + vertex[0]
+                vertices[count, 1] = origins[slot, 1] + j + vertex[1]
+                vertices[count, 2] = origins[slot, 2] + k + vertex[2]
+            count += 1
+    return count
 
 
 @njit(cache=True, nogil=True)
@@ -100,11 +101,11 @@ def _quad_around(index_of_cell, neighbours, slot, i, j, k, axis, quad):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _faces(distance, weight, neighbours, index_of_cell, blocks, least_weight, faces):
+def _faces(distance, weight, neighbours, index_of_cell, least_weight, faces):
     """Two triangles for each grid edge that the surface crosses; returns their number (``faces`` may be empty)."""
     count = 0
     quad = np.zeros(4, np.int64)
-    for slot in range(blocks):
+    for slot in range(index_of_cell.shape[0]):
         for voxel in range(512):
             if weight[slot, voxel] < least_weight:
                 continue
@@ -134,9 +135,11 @@ def extract(volume: SparseVolume, least_weight: float) -> Mesh:
     neighbours = volume.neighbours()
     index_of_cell = np.full(distance.shape, -1, dtype=np.int32)
     origins = unpack(keys).astype(np.float64) * BLOCK
-    vertices = _vertices(distance, weight, neighbours, origins, least_weight, index_of_cell)
-    count = _faces(distance, weight, neighbours, index_of_cell, len(keys), least_weight, np.zeros((0, 3), np.int64))
-    faces = np.zeros((count, 3), dtype=np.int64)
-    if count:
-        _faces(distance, weight, neighbours, index_of_cell, len(keys), least_weight, faces)
+    grid = (distance, weight, neighbours)
+    vertices = np.zeros((_vertices(*grid, origins, least_weight, index_of_cell, np.zeros((0, 3))), 3))
+    if len(vertices):
+        _vertices(*grid, origins, least_weight, index_of_cell, vertices)
+    faces = np.zeros((_faces(*grid, index_of_cell, least_weight, np.zeros((0, 3), np.int64)), 3), dtype=np.int64)
+    if len(faces):
+        _faces(*grid, index_of_cell, least_weight, faces)
     return Mesh(vertices * volume.voxel_mm, faces)

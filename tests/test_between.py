@@ -1,0 +1,52 @@
+"""Depth between two exposures: right where the motion is right, and modest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from cuspid.geometry import Rigid3
+from cuspid.rig import Handpiece, Rig
+from cuspid.stereo.between import BetweenOptions, measure_between, moving_pair
+from synthetic_scene import cast_depth, diamond, height_field, render
+
+HILLS = height_field(lambda x, y: 5 + 0.25 * np.sin(1.8 * x) * np.cos(1.5 * y))
+STEP = Rigid3.from_rotation_vector(np.array([0.01, -0.02, 0.03]), np.array([-1.1, 0.15, 0.05]))
+
+
+def lone_camera() -> Handpiece:
+    handpiece = diamond()
+    return replace(handpiece, rig=Rig({"west": handpiece.rig["west"]}))
+
+
+def test_one_moving_camera_measures_depth() -> None:
+    handpiece, rng = lone_camera(), np.random.default_rng(0)
+    mounted = handpiece.rig["west"]
+    images = [{"west": render(HILLS, mounted, pose, rng)} for pose in (Rigid3.identity(), STEP)]
+    options = BetweenOptions(confidence_share=0.1)
+    found = measure_between(handpiece, images[0], images[1], STEP, "00000", options)
+    assert [depth_map.camera_name for depth_map in found] == ["west", "west+"]
+    for depth_map in found:
+        # Both are given in the rig frame of the first exposure, which is the world here.
+        error = 1000 * (depth_map.depth_mm - cast_depth(HILLS, depth_map.camera, depth_map.cam_from_rig))
+        error = error[np.isfinite(error)]
+        assert depth_map.frame == "00000"
+        assert error.size > 0.4 * depth_map.depth_mm.size
+        assert 0.5 < np.median(np.abs(error)) < 20
+        assert abs(np.median(error)) < 5
+        assert 0.05 < depth_map.confidence.max() <= 0.1
+
+
+def test_a_camera_that_hardly_moved_is_left_out() -> None:
+    still = Rigid3(np.eye(3), np.array([-0.1, 0, 0]))
+    assert moving_pair(lone_camera(), "west", still, BetweenOptions()) is None
+    assert moving_pair(lone_camera(), "west", STEP, BetweenOptions()) is not None
+
+
+def test_a_camera_that_moved_along_its_axis_or_turned_away_is_left_out() -> None:
+    closer = Rigid3(np.eye(3), np.array([-0.5, 0, 1.5]))
+    turned = Rigid3.from_rotation_vector(np.array([0, 0.6, 0]), np.array([-1.1, 0, 0]))
+    away = Rigid3(np.eye(3), np.array([-5.0, 0, 0]))
+    for motion in (closer, turned, away):
+        assert moving_pair(lone_camera(), "west", motion, BetweenOptions()) is None
