@@ -38,6 +38,8 @@ class Material:
     """Fresnel reflectance of the coat at normal incidence; 0 is matte, water 0.02, enamel 0.05."""
     roughness: float = 0.3
     """GGX roughness (alpha) of the coat; small is a sharp highlight."""
+    scattering_mm: Colour = (0.0, 0.0, 0.0)
+    """How far red, green and blue light travels under the surface; only Blender renders it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +69,7 @@ APPEARANCES: Mapping[str, Appearance] = MappingProxyType(
                 wavelengths_mm=(2.5, 5.0),
                 reflectance=0.05,
                 roughness=0.09,
+                scattering_mm=(0.5, 0.4, 0.3),
             ),
             gum=Material(
                 dark=(0.42, 0.10, 0.09),
@@ -74,6 +77,7 @@ APPEARANCES: Mapping[str, Appearance] = MappingProxyType(
                 wavelengths_mm=(0.7, 1.4, 2.8),
                 reflectance=0.035,
                 roughness=0.12,
+                scattering_mm=(0.8, 0.25, 0.15),
             ),
         ),
     }

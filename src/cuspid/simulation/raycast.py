@@ -2,9 +2,9 @@
 
 For each of the rays through a pixel: the albedo of the solid texture at the hit, lit by the lights that are on, each a
 point with a lobe and 1/d^2 falloff, through a GGX coat with Schlick's Fresnel term (Walter et al. 2007). Shadows are
-traced once a pixel. Interreflection is a constant share of the light that reaches a point. Radiance is linear RGB in
-units in which a white diffuse surface facing a light of power 1 at 1 mm has radiance 1 plus that share. The world is
-the frame of the jaw.
+traced once for each surface in a pixel. Interreflection is a constant share of the light that reaches a point. Radiance
+is linear RGB in units in which a white diffuse surface facing a light of power 1 at 1 mm has radiance 1 plus that
+share. The world is the frame of the jaw.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from multiprocessing import get_context
 from typing import NamedTuple, no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from numba import njit
 
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh, RayHits
-from cuspid.rig import Handpiece
+from cuspid.mesh import Mesh
+from cuspid.rig import Handpiece, Light
 from cuspid.simulation.appearance import Appearance, Palette, albedo_at, face_materials, palette
 from cuspid.simulation.sensor import expose
 
@@ -35,6 +35,9 @@ AMBIENT = 0.08
 
 NOTICEABLE = 0.005
 """A light that gives less than this share of the light at a point is left out there, and no shadow ray is traced."""
+
+SAME_SURFACE = 0.03
+"""Rays through a pixel whose lengths differ by less than this share see one surface (12 um at 5 mm, up to 85 deg)."""
 
 BRIGHT_PERCENTILE, BRIGHT_LEVEL = 98.0, 0.75
 """The exposure puts this percentile of the metered pixels at this share of full scale (linear)."""
@@ -91,12 +94,17 @@ class Lamps(NamedTuple):
     exponents: np.ndarray
 
 
-def lamps(handpiece: Handpiece, exposure: str, rig_from_world: Rigid3) -> Lamps:
-    """The lights that an exposure names, in the world frame."""
+def lights_on(handpiece: Handpiece, exposure: str) -> list[Light]:
+    """The lights that an exposure names."""
     names = {each.name: each.lights for each in handpiece.exposures}
     if exposure not in names:
         raise InputError(f"handpiece: no exposure named {exposure!r}; it has {', '.join(names) or 'none'}")
-    on = [handpiece.lights[name] for name in names[exposure]]
+    return [handpiece.lights[name] for name in names[exposure]]
+
+
+def lamps(handpiece: Handpiece, exposure: str, rig_from_world: Rigid3) -> Lamps:
+    """The lights that an exposure names, in the world frame."""
+    on = lights_on(handpiece, exposure)
     world_from_rig = rig_from_world.inverse()
     return Lamps(
         world_from_rig.apply(np.array([light.position_mm for light in on]).reshape(-1, 3)),
@@ -128,12 +136,27 @@ def radiance(scene: Scene, camera: Camera, cam_from_world: Rigid3, lights: Lamps
     directions = _turned(pixel_rays(camera, scene.supersampling), world_from_cam.rotation)
     origin = world_from_cam.translation
     hits = scene.jaw.mesh.cast(np.broadcast_to(origin, directions.shape), directions)
-    samples = scene.supersampling**2
-    lit, ambient = _lighting(scene, origin, directions[::samples], _every(hits, samples), lights)
-    out = np.zeros((camera.height * camera.width, 3), dtype=np.float32)
     rays = _Rays(origin, directions, hits.faces, hits.distances, hits.barycentric)
-    _shade(rays, scene.surface, scene.palette, lights, lit, ambient, out)
+    chosen, row = _shadow_rows(hits.distances, scene.supersampling**2)
+    lit, ambient = _lighting(scene, rays.take(chosen), lights)
+    out = np.zeros((camera.height * camera.width, 3), dtype=np.float32)
+    _shade(rays, scene.surface, scene.palette, lights, lit, ambient, row, out)
     return out.reshape(camera.height, camera.width, 3)
+
+
+def _shadow_rows(distances: Float[np.ndarray, "n"], samples: int) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "n"]]:
+    """The rays for which shadows are traced, and for each ray the row of its answer among them.
+
+    One ray answers for a pixel, but where a pixel sees more than one surface each ray asks for itself: the shadow of an
+    edge on what lies behind must not darken the edge.
+    """
+    pixels = distances.reshape(-1, samples)
+    mixed = pixels.max(axis=1) > (1 + SAME_SURFACE) * pixels.min(axis=1)
+    counts = np.where(mixed, samples, 1)
+    row = (np.cumsum(counts) - counts)[:, None] + np.where(mixed[:, None], np.arange(samples), 0)
+    chosen = np.zeros(counts.sum(), dtype=np.int64)
+    chosen[row.ravel()] = np.arange(len(distances))
+    return chosen, row.ravel()
 
 
 class _Rays(NamedTuple):
@@ -144,6 +167,11 @@ class _Rays(NamedTuple):
     faces: np.ndarray
     distances: np.ndarray
     barycentric: np.ndarray
+
+    def take(self, chosen: Int[np.ndarray, "m"]) -> _Rays:
+        """Some of the rays."""
+        arrays = (self.directions, self.faces, self.distances, self.barycentric)
+        return _Rays(self.origin, *(array[chosen] for array in arrays))
 
 
 @njit(cache=True, nogil=True)
@@ -161,17 +189,10 @@ def _turned(directions, rotation):
     return out
 
 
-def _every(hits: RayHits, step: int) -> RayHits:
-    return RayHits(hits.faces[::step], hits.distances[::step], hits.barycentric[::step])
-
-
-def _lighting(
-    scene: Scene, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"], hits: RayHits, lights: Lamps
-) -> tuple[Bool[np.ndarray, "n l"], Float[np.ndarray, "n 3"]]:
+def _lighting(scene: Scene, rays: _Rays, lights: Lamps) -> tuple[Bool[np.ndarray, "n l"], Float[np.ndarray, "n 3"]]:
     """Which lights reach each hit (False also where a light is too weak to matter), and the ambient light there."""
-    rays = _Rays(origin, directions, hits.faces, hits.distances, hits.barycentric)
-    points, ambient = np.zeros((2, len(directions), 3))
-    lit = np.zeros((len(directions), len(lights.positions)), dtype=np.bool_)
+    points, ambient = np.zeros((2, len(rays.faces), 3))
+    lit = np.zeros((len(rays.faces), len(lights.positions)), dtype=np.bool_)
     _light_matters(rays, scene.surface, lights, points, lit, ambient)
     for index, position in enumerate(lights.positions):
         ask = np.flatnonzero(lit[:, index])
@@ -280,7 +301,7 @@ def _reflected(normal, view, towards, reflectance, roughness):
 
 @njit(cache=True, nogil=True, fastmath=True)
 @no_type_check
-def _shade(rays, surface, palette, lights, lit, ambient, out):
+def _shade(rays, surface, palette, lights, lit, ambient, row, out):
     samples = len(rays.faces) // len(out)
     for i in range(len(rays.faces)):
         if rays.faces[i] < 0:
@@ -293,9 +314,9 @@ def _shade(rays, surface, palette, lights, lit, ambient, out):
         inverse = 1 / np.sqrt(_dot(direction, direction))
         view = (direction[0] * inverse, direction[1] * inverse, direction[2] * inverse)
         for c in range(3):
-            out[pixel, c] += albedo[c] * ambient[pixel, c] / samples
+            out[pixel, c] += albedo[c] * ambient[row[i], c] / samples
         for k in range(len(lights.positions)):
-            if lit[pixel, k]:
+            if lit[row[i], k]:
                 towards, falloff = _incoming(point, k, lights)
                 diffuse, glossy = _reflected(normal, view, towards, palette.reflectance[m], palette.roughness[m])
                 for c in range(3):
@@ -317,6 +338,13 @@ def auto_gain(scene: Scene, poses: Iterable[Rigid3], exposure: str = "all", stri
     return float(BRIGHT_LEVEL / np.percentile(seen, BRIGHT_PERCENTILE))
 
 
+def metered_gain(scene: Scene, poses: Mapping[str, Rigid3], exposure: str) -> float:
+    """The one gain of a capture, metered at a few poses spread over it."""
+    all_poses = list(poses.values())
+    spread = np.unique(np.linspace(0, len(all_poses) - 1, METERED_POSES).astype(int))
+    return auto_gain(scene, [all_poses[index] for index in spread], exposure)
+
+
 def _coarser(camera: Camera, stride: int) -> Camera:
     return Camera(
         width=-(-camera.width // stride),
@@ -335,8 +363,12 @@ def render_image(
     light = radiance(
         scene, mounted.camera, mounted.cam_from_rig @ rig_from_world, lamps(scene.handpiece, exposure, rig_from_world)
     )
-    rng = np.random.default_rng([scene.seed, zlib.crc32(frame.encode()), zlib.crc32(camera_name.encode())])
-    return expose(light, gain, scene.handpiece.sensor, rng)
+    return expose(light, gain, scene.handpiece.sensor, image_rng(scene, frame, camera_name))
+
+
+def image_rng(scene: Scene, frame: str, camera_name: str) -> np.random.Generator:
+    """The sensor noise of one image, whatever was rendered before."""
+    return np.random.default_rng([scene.seed, zlib.crc32(frame.encode()), zlib.crc32(camera_name.encode())])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -382,7 +414,7 @@ def render_capture(
     tasks = [(frame, camera) for frame in poses for camera in scene.handpiece.rig.names if not skip(frame, camera)]
     if not tasks:
         return
-    gain = auto_gain(scene, _spread(list(poses.values()), METERED_POSES), exposure)
+    gain = metered_gain(scene, poses, exposure)
     worker = _Worker(scene=scene, poses=poses, gain=gain, sink=sink, exposure=exposure)
     if processes == 1:
         yield from map(worker, tasks)
@@ -390,7 +422,3 @@ def render_capture(
     with ProcessPoolExecutor(processes, get_context("fork"), _adopt, (worker,)) as pool:
         for done in as_completed([pool.submit(_work, task) for task in tasks]):
             yield done.result()
-
-
-def _spread(poses: list[Rigid3], count: int) -> list[Rigid3]:
-    return [poses[index] for index in np.unique(np.linspace(0, len(poses) - 1, count).astype(int))]

@@ -1,0 +1,164 @@
+"""The second renderer: Blender Cycles with light that scatters under the surface, run as a program of its own.
+
+It takes the same scene as :mod:`cuspid.simulation.raycast` and gives images through the same sensor. Its texture has
+the same statistics but another pattern, for Blender draws its own noise; interreflection is traced. bpy wants its own
+environment (another licence and an old numpy), so nothing of it is imported here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import tempfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cuspid.errors import InputError, MissingDependencyError
+from cuspid.geometry import Rigid3
+from cuspid.rig import Light, MountedCamera
+from cuspid.simulation.appearance import face_materials
+from cuspid.simulation.raycast import Scene, Sink, image_rng, lights_on, metered_gain
+from cuspid.simulation.sensor import expose
+
+PYTHON_VARIABLE = "CUSPID_BLENDER_PYTHON"
+"""Environment variable with the path of the Python that has bpy."""
+SAMPLES = 64
+"""Paths traced through each pixel."""
+LED_DIAMETER_MM = 0.2
+"""Diameter of the discs that the lights are."""
+
+_SCRIPT = Path(__file__).with_name("blender_script.py")
+_HOW_TO = (
+    "make an environment with Python 3.11 (python3.11 -m venv bpy-env; bpy-env/bin/pip install 'bpy==4.5.*' 'numpy<2') "
+    f"and set {PYTHON_VARIABLE}=bpy-env/bin/python"
+)
+
+
+def render_with_blender(
+    scene: Scene,
+    poses: Mapping[str, Rigid3],
+    sink: Sink,
+    *,
+    skip: Callable[[str, str], bool] = lambda frame, camera: False,
+    processes: int = 1,
+    exposure: str = "all",
+) -> Iterator[tuple[str, str]]:
+    """As :func:`cuspid.simulation.raycast.render_capture`, by Blender on ``processes`` threads.
+
+    Raises MissingDependencyError where Blender is not there, InputError where a camera has lens distortion or a light
+    another lobe than Lambert's, which Blender does not offer.
+    """
+    python = blender_python()
+    tasks = [(frame, camera) for frame in poses for camera in scene.handpiece.rig.names if not skip(frame, camera)]
+    if not tasks:
+        return
+    gain = metered_gain(scene, poses, exposure)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        _write_scene(folder, scene, poses, tasks, exposure, processes)
+        for frame, camera in _run(python, folder):
+            image = folder / f"{frame}-{camera}.npy"
+            rng = image_rng(scene, frame, camera)
+            sink(frame, camera, expose(np.load(image), gain, scene.handpiece.sensor, rng))
+            image.unlink()
+            yield frame, camera
+
+
+def blender_python() -> Path:
+    """The Python that has bpy. Raises MissingDependencyError, saying how to get it."""
+    given = os.environ.get(PYTHON_VARIABLE)
+    if not given:
+        raise MissingDependencyError(f"Blender is not set up: {_HOW_TO}")
+    try:
+        found = subprocess.run([given, "-c", "import bpy"], capture_output=True, text=True, check=False)
+    except OSError as error:
+        raise MissingDependencyError(f"{PYTHON_VARIABLE}={given} does not run ({error.strerror}): {_HOW_TO}") from error
+    if found.returncode:
+        reason = (found.stderr.strip().splitlines() or ["no message"])[-1]
+        raise MissingDependencyError(f"{PYTHON_VARIABLE}={given} cannot import bpy ({reason}): {_HOW_TO}")
+    return Path(given)
+
+
+def _run(python: Path, folder: Path) -> Iterator[tuple[str, str]]:
+    """Run the script and yield frame and camera of each image as it is there."""
+    with (
+        (folder / "errors.txt").open("w+") as errors,
+        subprocess.Popen([python, _SCRIPT, folder], stdout=subprocess.PIPE, stderr=errors, text=True) as process,
+    ):
+        try:
+            for line in process.stdout or ():
+                if line.startswith("rendered "):
+                    _, frame, camera = line.split()
+                    yield frame, camera
+        except BaseException:
+            process.terminate()
+            raise
+        if process.wait():
+            errors.seek(0)
+            reason = (errors.read().strip().splitlines() or ["no message"])[-1]
+            raise MissingDependencyError(f"Blender stopped ({reason}); it was tested with bpy 4.5")
+
+
+def _write_scene(
+    folder: Path,
+    scene: Scene,
+    poses: Mapping[str, Rigid3],
+    tasks: Sequence[tuple[str, str]],
+    exposure: str,
+    threads: int,
+) -> None:
+    mesh = scene.jaw.mesh
+    np.savez(folder / "mesh.npz", vertices=mesh.vertices, faces=mesh.faces, materials=face_materials(scene.jaw))
+    lights = lights_on(scene.handpiece, exposure)
+    description = {
+        "samples": SAMPLES,
+        "threads": threads,
+        "materials": [dataclasses.asdict(each) for each in (scene.appearance.enamel, scene.appearance.gum)],
+        "images": [
+            {
+                "frame": frame,
+                "name": name,
+                "seed": zlib.crc32(f"{scene.seed}/{frame}/{name}".encode()) & 0x7FFFFFFF,
+                "camera": _camera(name, scene.handpiece.rig[name], poses[frame]),
+                "lights": [_light(light, poses[frame]) for light in lights],
+            }
+            for frame, name in tasks
+        ],
+    }
+    (folder / "scene.json").write_text(json.dumps(description))
+
+
+def _camera(name: str, mounted: MountedCamera, rig_from_world: Rigid3) -> dict[str, Any]:
+    camera = mounted.camera
+    if np.any(camera.distortion):
+        raise InputError(f"camera {name}: Blender has no such lens distortion; use the renderer embree")
+    return {
+        "width": camera.width,
+        "height": camera.height,
+        "focal_px": camera.focal_px.tolist(),
+        "principal_point_px": camera.principal_point_px.tolist(),
+        "world_from_cam": (mounted.cam_from_rig @ rig_from_world).inverse().matrix.tolist(),
+    }
+
+
+def _light(light: Light, rig_from_world: Rigid3) -> dict[str, Any]:
+    if light.lobe_exponent != 1:
+        raise InputError(f"light: Blender's discs shine with lobe exponent 1, not {light.lobe_exponent}; use embree")
+    world_from_rig = rig_from_world.inverse()
+    # Blender's area lights shine along -Z; about that axis any turn will do.
+    axis = -world_from_rig.rotate(light.direction)
+    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    across /= np.linalg.norm(across)
+    rotation = np.stack([across, np.cross(axis, across), axis], axis=1)
+    return {
+        "world_from_light": Rigid3(rotation, world_from_rig.apply(light.position_mm)).matrix.tolist(),
+        "power": light.power,
+        "colour": light.colour.tolist(),
+        "diameter_mm": LED_DIAMETER_MM,
+    }
