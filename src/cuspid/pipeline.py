@@ -36,6 +36,7 @@ from cuspid.motion.location import locate as locate_with_rig
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece
 from cuspid.simulation.appearance import APPEARANCES, Preset
+from cuspid.simulation.blender import render_with_blender
 from cuspid.simulation.raycast import Scene, render_capture
 from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path
 from cuspid.stereo.matching import DepthEstimator, StereoOptions
@@ -133,7 +134,8 @@ def _render(capture: Capture, truth: GroundTruth, options: SimulationOptions) ->
         supersampling=options.supersampling,
         seed=options.seed,
     )
-    rendered = render_capture(
+    render = render_with_blender if options.renderer == "blender" else render_capture
+    rendered = render(
         scene,
         truth.rig_from_world,
         lambda frame, camera, image: storage.write_image(capture.image_path(frame, camera), image),
