@@ -19,7 +19,7 @@ from cuspid.mesh import Mesh
 
 _WIDEST_MM = 2.0
 """Upper bound of the distance at which a sample loses its weight."""
-_LEAST_OVERLAP = 0.2
+_LEAST_OVERLAP = 0.25
 _FEW = 2000
 """Samples that suffice to tell good poses from bad ones."""
 
@@ -59,7 +59,7 @@ class Alignment:
 def register(scan: Mesh, surface: Surface, options: RegistrationOptions, *, rng: np.random.Generator) -> Alignment:
     """Align a scan in any pose with a reference surface; the smaller of the two is laid on the larger one.
 
-    Raises InputError where no pose brings a fifth of the smaller surface near the larger one.
+    Raises InputError where no pose brings a quarter of the smaller surface near the larger one.
     """
     if scan.face_areas.sum() > 1.5 * surface.mesh.face_areas.sum():
         swapped = _lay(surface.mesh, Surface(scan), options, rng)

@@ -25,6 +25,8 @@ PLASTER = np.array([222, 214, 200], dtype=np.uint8)
 """Colour of a mesh that has none."""
 NOT_COUNTED = np.array([168, 168, 168], dtype=np.uint8)
 """Colour of a vertex without a deviation."""
+_BACK = 0.78
+"""Grey of a surface seen from behind."""
 _INK = "#333333"
 
 
@@ -122,10 +124,13 @@ def _lit(mesh: Mesh, hits: RayHits, axes: Float[np.ndarray, "3 3"]) -> Float32[n
     weights = hits.barycentric[hit]
     normals = np.einsum("nk,nkd->nd", weights, mesh.vertex_normals[corners]) @ axes.T
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    back = mesh.face_normals[hits.faces[hit]] @ axes[2] < 0
+    normals[back] *= -1
     key = np.clip(normals @ (np.array([-0.45, 0.60, 0.66])), 0, 1)
     shade = 0.46 + 0.38 * key + 0.22 * np.clip(normals[:, 2], 0, 1)
     colors = np.broadcast_to(PLASTER, mesh.vertices.shape) if mesh.colors is None else mesh.colors
     albedo = np.einsum("nk,nkd->nd", weights, colors[corners] / 255)
+    albedo[back] = _BACK
     return (albedo * shade[:, None]).astype(np.float32)
 
 
@@ -234,7 +239,11 @@ def _draw_histogram(figure: Figure, mesh: Mesh, deviation_um: Float[np.ndarray, 
     bar.ax.tick_params(labelsize=11, color=_INK, labelcolor=_INK)
     bar.ax.xaxis.set_major_formatter(lambda um, _: f"{um:+g}" if um else "0")
     bar.outline.set_visible(False)
-    bar.set_label("deviation from the reference / µm   (positive: outside; grey: not counted)", fontsize=12, color=_INK)
+    bar.set_label(
+        "deviation from the reference / µm   (positive: outside; grey: not counted, or seen from behind)",
+        fontsize=12,
+        color=_INK,
+    )
 
 
 def _draw_figures(figure: Figure, trueness: Trueness) -> None:
