@@ -203,7 +203,7 @@ def relative_pose(rig: Rig, cloud: Cloud, source: Views, target: Views, options:
     inliers = 0 if found is None else int(np.sum(found["inlier_mask"]))
     if found is None or inliers < max(options.minimum_matches, options.minimum_share * len(points)):
         return Edge(target_from_source=None, matches=inliers)
-    return Edge(target_from_source=rigid_from_colmap(found["rig_from_world"]), matches=inliers)
+    return Edge(target_from_source=_rounded(rigid_from_colmap(found["rig_from_world"])), matches=inliers)
 
 
 def _parts(edges: Mapping[tuple[int, int], Edge], count: int) -> Int[np.ndarray, "f"]:
