@@ -156,6 +156,18 @@ def test_a_crop_takes_what_was_not_scanned_out_of_the_completeness():
     assert any("0.5 mm from the scan" in note for note in found.notes)
 
 
+def test_a_tooth_that_stands_far_off_is_still_reported():
+    mesh, labels = jaw().mesh, jaw().face_labels
+    assert labels is not None
+    moved = np.zeros(len(mesh.vertices))
+    moved[np.unique(mesh.faces[labels == 46])] = 0.6
+    found = trueness(displaced(mesh, moved[:, None] * mesh.vertex_normals))
+    assert found.per_tooth[46].mean_abs_um > 300
+    assert found.per_tooth[36].mean_abs_um < 1
+    assert 46 not in found.drift_um
+    assert found.inter_molar_error_um is not None  # of the second molars
+
+
 # Distances across the arch
 
 

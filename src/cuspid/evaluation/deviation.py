@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float, Int
 from cuspid.errors import InputError
 from cuspid.evaluation.distance import Feet, Surface
 from cuspid.evaluation.registration import Alignment, RegistrationOptions, best_scale, register
-from cuspid.evaluation.teeth import CANINES, MOLARS, distance_error_um, drift_um, find_teeth
+from cuspid.evaluation.teeth import CANINES, LEAST_SAMPLES, MOLARS, distance_error_um, drift_um, find_teeth
 from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
@@ -135,7 +135,11 @@ def evaluate(
         completeness=statistics(from_reference.signed_mm),
         completeness_pct=_within_pct(from_reference.signed_mm),
         scannable_pct=counted_pct,
-        per_tooth={fdi: statistics(from_scan.signed_mm[from_scan.labels == fdi]) for fdi in teeth},
+        per_tooth={
+            fdi: statistics(from_scan.signed_mm[from_scan.labels == fdi])
+            for fdi in completeness_by_tooth
+            if np.sum(from_scan.labels == fdi) >= LEAST_SAMPLES
+        },
         per_tooth_completeness_pct=completeness_by_tooth,
         scale_error_ppm=1e6 * (alignment.scale - 1),
         inter_molar_error_um=distance_error_um(teeth, MOLARS),

@@ -21,7 +21,8 @@ _ARCH_ORDER = (*range(48, 40, -1), *range(31, 39), *range(18, 10, -1), *range(21
 MOLARS = ((46, 36), (16, 26), (47, 37), (17, 27))
 """Pairs whose distance is the inter-molar one, the first that was scanned."""
 CANINES = ((43, 33), (13, 23))
-_LEAST_SAMPLES = 300
+LEAST_SAMPLES = 300
+"""Samples of a tooth below which nothing is said about it."""
 _MOST_SAMPLES = 10_000
 
 
@@ -56,7 +57,7 @@ def find_teeth(
     teeth = {}
     for fdi in (tooth for tooth in _ARCH_ORDER if tooth in centroids):
         on_tooth = points[labels == fdi]
-        if len(on_tooth) >= _LEAST_SAMPLES:
+        if len(on_tooth) >= LEAST_SAMPLES:
             few = on_tooth[:: max(1, len(on_tooth) // _MOST_SAMPLES)]
             motion = refine(few, surface, Rigid3.identity(), options)
             teeth[fdi] = ScannedTooth(points=on_tooth, reference_from_scan=motion, centroid=centroids[fdi])
