@@ -100,10 +100,11 @@ def at(image: np.ndarray, camera: Camera, point: tuple[float, float, float]) -> 
 
 
 @pytest.mark.parametrize("marker", [(0.0, 0.0, 4.0), (-1.5, 1.1, 5.0), (1.4, 1.2, 6.0), (2.0, -1.3, 5.5)])
-def test_a_marker_appears_where_the_camera_projects_it(marker: tuple[float, float, float]) -> None:
+@pytest.mark.parametrize("side", [-0.2, 0.2])
+def test_a_marker_appears_where_the_camera_projects_it(marker: tuple[float, float, float], side: float) -> None:
     jaw = jaw_of(quad(marker, 0.12), quad((0, 0, 9.0), 20.0), labels=[11, 0])
     # The lamp beside the camera throws the marker's shadow on the wall behind, just where the marker's edge is.
-    image = light_seen(jaw, probe(led(x=0.3), camera=SKEWED), supersampling=6)
+    image = light_seen(jaw, probe(led(x=side, y=side), camera=SKEWED), supersampling=6)
     weights = image / image.sum()
     centroid = np.sum(weights[..., None] * SKEWED.pixel_centres(), axis=(0, 1))
     np.testing.assert_allclose(centroid, SKEWED.project(np.array(marker)), atol=0.1)
