@@ -184,6 +184,11 @@ def _sightings(
     return np.concatenate(points), np.concatenate(pixels), np.concatenate(cameras)
 
 
+def _rounded(transform: Rigid3) -> Rigid3:
+    """Without the last bits, in which COLMAP's refinement differs from call to call."""
+    return Rigid3.from_rotation_vector(transform.rotation_vector.round(9), transform.translation.round(9))
+
+
 def relative_pose(rig: Rig, cloud: Cloud, source: Views, target: Views, options: OdometryOptions, seed: int) -> Edge:
     """Pose of the target frame relative to the frame of the cloud."""
     points, pixels, cameras = _sightings(cloud, source, target, options)
