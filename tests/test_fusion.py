@@ -93,6 +93,26 @@ def test_a_sharp_ridge_keeps_its_edge() -> None:
     assert 0 < np.mean(np.abs(signed_um(mesh, RIDGE)[near])) < 8
 
 
+def test_coarse_voxels_do_not_coarsen_the_vertices() -> None:
+    coarse = FusionOptions(voxel_mm=0.15)
+    ripples = height_field(lambda x, y: 5 + 0.05 * np.sin(9 * x) * np.sin(8 * y), count=400)
+    deviation = signed_um(fuse(depth_maps(ripples), POSES, coarse), ripples)
+    assert 0 < np.mean(np.abs(deviation)) < 1.5
+
+
+def test_both_sides_of_a_thin_wall_stay_apart() -> None:
+    front = height_field(lambda x, y: np.full_like(x, 5.0), count=41)
+    back = Mesh(front.vertices + [0, 0, 0.4], front.faces[:, ::-1])
+    behind = Rigid3.from_rotation_vector(np.array([0, np.pi, 0]), np.array([0.0, 0, 10.4]))
+    sides = {"front": (front, Rigid3.identity()), "back": (back, behind)}
+    maps = [m for frame, (mesh, pose) in sides.items() for m in depth_maps(mesh, {frame: pose})]
+    mesh = fuse(maps, {frame: pose for frame, (_, pose) in sides.items()})
+    depth = mesh.vertices[:, 2]
+    assert np.abs(depth[depth < 5.2] - 5.0).max() < 0.003
+    assert np.abs(depth[depth > 5.2] - 5.4).max() < 0.003
+    assert min((depth < 5.2).sum(), (depth > 5.2).sum()) > 3000
+
+
 def test_what_one_map_alone_saw_is_left_out() -> None:
     alone = fuse(depth_maps(HILLS, {"00000": POSES["00000"]}, names=("west",)), POSES)
     assert len(alone.faces) == 0
@@ -158,7 +178,7 @@ def test_depth_jumps_bend_no_plane() -> None:
     evidence = Evidence.of(depth_map, 0.15)
     known = evidence.weight > 0
     cosine = np.abs(evidence.plane[known][:, 2]) / np.linalg.norm(evidence.plane[known], axis=1)
-    assert (cosine > 0.99).mean() > 0.98
+    assert (cosine > 0.99).mean() > 0.999
 
 
 @given(st.lists(st.tuples(*[st.integers(-(2**19), 2**19)] * 3), min_size=1, max_size=20))
