@@ -75,6 +75,10 @@ class Capture:
         self.check_image(frame, camera)
         return read_image(self.image_path(frame, camera))
 
+    def images(self, frame: Frame | str) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
+        """The images of all cameras at a frame, as :meth:`image`."""
+        return {name: self.image(frame, name) for name in self.handpiece.rig.names}
+
     def check_image(self, frame: Frame | str, camera: str) -> None:
         """Raise what :meth:`image` would, as far as a glance at the file tells."""
         path, model = self.image_path(frame, camera), self.handpiece.rig[camera].camera

@@ -15,6 +15,8 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -39,6 +41,7 @@ from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.blender import render_with_blender
 from cuspid.simulation.raycast import Scene, render_capture
 from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path
+from cuspid.stereo.between import BetweenOptions, measure_between
 from cuspid.stereo.matching import DepthEstimator, StereoOptions
 from cuspid.surface.cleaning import CleaningOptions, clean
 from cuspid.surface.fusion import FusionOptions
@@ -162,6 +165,8 @@ class ReconstructionOptions:
     """How the frames are located: rig (ours), or COLMAP's own mapper without (colmap) and with the rig (colmap-rig)."""
     stereo: StereoOptions = field(default_factory=StereoOptions)
     """Depth within an exposure."""
+    between: BetweenOptions = field(default_factory=BetweenOptions)
+    """Depth between consecutive exposures, where one camera of a group alone saw the surface."""
     tracking: MotionOptions = field(default_factory=MotionOptions)
     """Features, odometry and adjustment of the method ``rig``."""
     fusion: FusionOptions = field(default_factory=FusionOptions)
@@ -187,16 +192,51 @@ def measure_depth(
 ) -> StoredDepthMaps:
     """Depth maps of every frame, exposure by exposure, kept in ``folder``."""
     estimator = DepthEstimator(capture.handpiece, options)
-    files = [folder / f"{frame.name}.npz" for frame in capture.frames]
 
-    def measure(frame: Frame, file: Path) -> None:
+    def measure(frame: Frame) -> tuple[DepthMap, ...]:
+        return estimator.measure(capture.images(frame), frame.name)
+
+    return _measure_all(capture.frames, measure, folder, partial(progress, "depth"))
+
+
+def measure_depth_between(
+    capture: Capture,
+    reconstruction: Reconstruction,
+    folder: Path,
+    options: BetweenOptions,
+    *,
+    progress: Progress = silent,
+) -> StoredDepthMaps:
+    """Depth maps of each camera together with itself at the next located frame, kept in ``folder``."""
+    located = [frame for frame in capture.frames if frame.name in reconstruction.rig_from_world]
+    following = {frame.name: after for frame, after in pairwise(located)}
+
+    def measure(frame: Frame) -> tuple[DepthMap, ...]:
+        after = following[frame.name]
+        poses = reconstruction.rig_from_world
+        after_from_rig = poses[after.name] @ poses[frame.name].inverse()
+        return measure_between(
+            capture.handpiece, capture.images(frame), capture.images(after), after_from_rig, frame.name, options
+        )
+
+    return _measure_all(located[:-1], measure, folder, partial(progress, "depth between"))
+
+
+def _measure_all(
+    frames: Sequence[Frame],
+    measure: Callable[[Frame], tuple[DepthMap, ...]],
+    folder: Path,
+    progress: Callable[[int, int], None],
+) -> StoredDepthMaps:
+    files = [folder / f"{frame.name}.npz" for frame in frames]
+
+    def keep(frame: Frame, file: Path) -> None:
         if not file.exists():
-            images = {name: capture.image(frame, name) for name in capture.handpiece.rig.names}
-            storage.write_depth_maps(file, estimator.measure(images, frame.name))
+            storage.write_depth_maps(file, measure(frame))
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for done, _ in enumerate(pool.map(measure, capture.frames, files), start=1):
-            progress("depth", done, len(files))
+        for done, _ in enumerate(pool.map(keep, frames, files), start=1):
+            progress(done, len(files))
     return StoredDepthMaps(files)
 
 
@@ -254,8 +294,13 @@ def reconstruct(
         reconstruction = read_model(colmap_model, capture)
         storage.write_reconstruction(folder / "motion", reconstruction, capture.handpiece)
     if _moved(capture.handpiece, reconstruction):
-        refined = dataclasses.replace(capture, handpiece=dataclasses.replace(capture.handpiece, rig=reconstruction.rig))
-        depths = measure_depth(refined, folder / "depth-refined", options.stereo, progress=progress)
+        capture = dataclasses.replace(capture, handpiece=dataclasses.replace(capture.handpiece, rig=reconstruction.rig))
+        depths = measure_depth(capture, folder / "depth-refined", options.stereo, progress=progress)
+    if options.between.enabled:
+        between = measure_depth_between(
+            capture, reconstruction, folder / "depth-between", options.between, progress=progress
+        )
+        depths = StoredDepthMaps([*depths.files, *between.files])
     return reconstruction, fuse(depths, reconstruction, folder, options, progress=progress)
 
 
