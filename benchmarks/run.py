@@ -60,9 +60,10 @@ def measure(name: str, seed: int, simulate: list[str], work: Path, motion: str =
     """Simulate once, then time images to mesh, then evaluate."""
     folder = work / name
     shared = [*simulate, "--seed", str(seed)]
-    simulated = run_timed("simulate", *shared, "--out", str(folder))
-    for stage in ("depth", "motion"):
+    run_timed("simulate", *shared, "--out", str(folder))
+    for stage in ("depth", "depth-between", "motion"):
         shutil.rmtree(folder / stage, ignore_errors=True)
+    (folder / "mesh.ply").unlink(missing_ok=True)
     reconstruct = ["reconstruct", str(folder / "capture"), "--out", str(folder), "--motion", motion]
     reconstructed = run_timed(*reconstruct)
     run_timed("evaluate", str(folder / "mesh.ply"), str(folder / "truth"), "--out", str(folder))
@@ -70,7 +71,6 @@ def measure(name: str, seed: int, simulate: list[str], work: Path, motion: str =
         "case": name,
         "seed": seed,
         "commands": [f"cuspid simulate {' '.join(shared)}", f"cuspid {' '.join(reconstruct)}"],
-        "simulate": simulated,
         "images_to_mesh": reconstructed,
         "reconstruction": json.loads((folder / "motion" / "reconstruction.json").read_text())["log"],
         "trueness": json.loads((folder / "trueness.json").read_text()),
