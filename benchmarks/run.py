@@ -70,7 +70,12 @@ def measure(name: str, seed: int, simulate: list[str], work: Path, motion: str =
     return {
         "case": name,
         "seed": seed,
-        "commands": [f"cuspid simulate {' '.join(shared)}", f"cuspid {' '.join(reconstruct)}"],
+        "commands": [
+            f"cuspid simulate {' '.join(Path(argument).name for argument in shared)} --out {name}",
+            f"cuspid reconstruct {name}/capture --out {name} --motion {motion}",
+        ],
+        "threads": os.cpu_count(),
+        "options": json.loads((folder / "run.json").read_text()),
         "images_to_mesh": reconstructed,
         "reconstruction": json.loads((folder / "motion" / "reconstruction.json").read_text())["log"],
         "trueness": json.loads((folder / "trueness.json").read_text()),
