@@ -1,9 +1,12 @@
 """The examples run, and say what they promise."""
 
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
+
+from cuspid import pipeline, storage
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -29,5 +32,16 @@ def test_scan_one_tooth(tmp_path):
     assert 0.1 < mean < 8
     assert mean < p95 < 25
     assert 90 < float(re.search(r"([\d.]+) % of what", printed).group(1)) <= 100
-    assert (tmp_path / "mesh.ply").exists()
     assert (tmp_path / "motion" / "sparse").is_dir()
+    assert goes_on_where_it_stopped(tmp_path)
+
+
+def goes_on_where_it_stopped(folder: Path) -> bool:
+    """Whether a run that lost its last stages, as a killed one does, makes the same mesh again."""
+    whole = (folder / "mesh.stl").read_bytes()
+    for lost in ("mesh.ply", "mesh.stl", "mesh.json", "depth/00003.npz", "motion/reconstruction.json"):
+        (folder / lost).unlink()
+    shutil.rmtree(folder / "depth-between")
+    kept = (folder / "depth" / "00004.npz").stat().st_mtime_ns
+    pipeline.reconstruct(storage.read_capture(folder / "capture"), folder, pipeline.ReconstructionOptions())
+    return (folder / "mesh.stl").read_bytes() == whole and (folder / "depth" / "00004.npz").stat().st_mtime_ns == kept

@@ -116,6 +116,14 @@ def test_handpiece_and_rig_config_return(tmp_path, camera, transform, other):
         assert (colmap[name].camera.width, colmap[name].camera.height) == (camera.width, camera.height)
 
 
+def test_a_rig_config_serves_as_a_handpiece(tmp_path):
+    original = handpiece("a", "b")
+    storage.write_rig_config(tmp_path / "rig_config.json", original.rig)
+    again = storage.read_handpiece(tmp_path / "rig_config.json")
+    assert again.rig.names == ("a", "b")
+    assert again.depth_range_mm[0] < again.working_distance_mm < again.depth_range_mm[1]
+
+
 def test_a_rig_config_of_colmap_without_sizes(tmp_path):
     entry = {
         "image_prefix": "cam1/",

@@ -53,7 +53,7 @@ class Probe:
     design: Literal["four", "twelve"] = "twelve"
     """Built-in design: the essential four cameras, or the twelve."""
     handpiece: Path | None = None
-    """A handpiece.json of your own, instead of a built-in design."""
+    """A handpiece.json, or COLMAP's rig_config.json, of your own, instead of a built-in design."""
 
 
 @contextmanager
@@ -203,7 +203,12 @@ def _simulate(mesh: Path | None, out: Path, source: Source, probe: Probe, option
     with storage.claimed_folder(out, "simulate", settings, hashes):
         jaw, device = _load_source(mesh, source), _load_probe(probe)
         with _progress() as progress:
-            pipeline.simulate(jaw, device, out, options, progress=progress)
+            capture, _ = pipeline.simulate(jaw, device, out, options, progress=progress)
+    overlap = storage.read_json(out / "truth" / "path.json")
+    console.print(
+        f"{len(capture.frames)} frames of {len(device.rig.names)} cameras; consecutive images overlap by "
+        f"{overlap['minimum_overlap']:.1%} at least, {overlap['mean_overlap']:.1%} on average"
+    )
 
 
 def _reconstruct(capture: Capture, out: Path, options: ReconstructionOptions, model: Path | None) -> None:

@@ -117,6 +117,7 @@ def simulate(
     path = plan_scan_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
     truth = GroundTruth(jaw=jaw, handpiece=handpiece, rig_from_world=path.rig_from_world)
     storage.write_truth(folder / "truth", truth)
+    storage.write_overlap(folder / "truth" / "path.json", path.minimum_overlap, path.mean_overlap)
     capture = Capture(
         folder=folder / "capture", handpiece=handpiece, frames=tuple(Frame(name=name) for name in path.rig_from_world)
     )

@@ -20,7 +20,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Int, UInt8
+from jaxtyping import Int, UInt8
 
 import cuspid
 from cuspid.camera import Camera
@@ -383,8 +383,13 @@ def _light_from_json(value: Mapping[str, Any]) -> Light:
 
 
 def read_handpiece(path: Path) -> Handpiece:
-    """Read ``handpiece.json``. Raises InputError that names a missing or unusable field."""
+    """Read ``handpiece.json``, or COLMAP's ``rig_config.json`` with the working distance of the built-in designs.
+
+    Raises InputError that names a missing or unusable field.
+    """
     value = read_json(path)
+    if isinstance(value, list):
+        return Handpiece(rig=read_rig_config(path), name=path.stem)
     with reading(path):
         cameras = {
             name: MountedCamera(
@@ -582,15 +587,9 @@ def read_truth(folder: Path) -> GroundTruth:
     )
 
 
-def write_scannable(path: Path, scannable: Bool[np.ndarray, "f"]) -> None:
-    """Keep which faces of the true jaw the cameras could have seen."""
-    with whole_file(path) as temporary:
-        np.save(temporary, scannable)
-
-
-def read_scannable(path: Path) -> Bool[np.ndarray, "f"]:
-    """Read what :func:`write_scannable` wrote."""
-    return np.asarray(np.load(path, allow_pickle=False), dtype=bool)
+def write_overlap(path: Path, minimum: float, mean: float) -> None:
+    """Write the share of the surface in an image that the same camera's next image also sees."""
+    write_json(path, {"minimum_overlap": minimum, "mean_overlap": mean})
 
 
 # --- Reconstructions -----------------------------------------------------------------------------------------------

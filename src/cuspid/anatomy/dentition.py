@@ -47,11 +47,15 @@ class ArchForm:
 ARCH_FORMS = MappingProxyType(
     {
         "lower": ArchForm(
-            inter_canine_mm=26.8, inter_first_molar_mm=51.2, inter_second_molar_mm=55.9,
+            inter_canine_mm=26.8,
+            inter_first_molar_mm=51.2,
+            inter_second_molar_mm=55.9,
             headings_deg=(5.0, 20.0, 45.0, 63.0, 70.0, 77.0, 81.0),
         ),
         "upper": ArchForm(
-            inter_canine_mm=34.5, inter_first_molar_mm=55.4, inter_second_molar_mm=59.1,
+            inter_canine_mm=34.5,
+            inter_first_molar_mm=55.4,
+            inter_second_molar_mm=59.1,
             headings_deg=(8.0, 26.0, 48.0, 65.0, 73.0, 79.0, 84.0),
         ),
     }
