@@ -53,7 +53,7 @@ def undistort(
 
 
 def project_orthographic(points: Float[np.ndarray, "*n 3"], scale_px_per_mm: float = 1.0) -> Float[np.ndarray, "*n 2"]:
-    """Scaled orthographic projection x = s X, y = s Y (errata to Eq 3.1)."""
+    """Scaled orthographic projection x = s X, y = s Y (Eq 3.1, which prints the perspective one)."""
     return scale_px_per_mm * points[..., :2]
 
 

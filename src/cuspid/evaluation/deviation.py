@@ -1,4 +1,4 @@
-"""Trueness of a scan, as errata.md lists it, in both directions. Positive is outside the reference.
+"""Trueness of a scan, as the field measures it, in both directions. Positive is outside the reference.
 
 Accuracy: signed distances from points even by area on the scan to the reference. Completeness: from points even by area
 on the reference to the scan. What counts:
