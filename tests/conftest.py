@@ -1,10 +1,15 @@
 """Values that are costly to make, once for each worker."""
 
 import pytest
+from hypothesis import settings
 
 from cuspid.anatomy.phantom import PhantomOptions, build_phantom
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
+
+# Machines differ in speed, and a test says nothing about it.
+settings.register_profile("cuspid", deadline=None)
+settings.load_profile("cuspid")
 
 
 @pytest.fixture(scope="session")
