@@ -159,6 +159,15 @@ def test_a_capture_returns(tmp_path):
     assert [frame.name for frame in storage.read_capture(tmp_path).frames] == ["00000", "00001"]
 
 
+def test_what_a_killed_run_left_unfinished_is_passed_over(tmp_path):
+    capture = make_capture(tmp_path / "capture")
+    (capture.folder / "images" / "b" / f"{storage.PART}x1y2.png").write_bytes(b"half an image")
+    assert storage.read_capture(capture.folder).frames == capture.frames
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / f"{storage.PART}x1y2.json").write_text("{")
+    storage.claim_folder(tmp_path / "out", "simulate", {}, {})
+
+
 def test_broken_captures_are_refused(tmp_path):
     capture = make_capture(tmp_path)
     path = capture.image_path("00001", "b")

@@ -44,6 +44,14 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 # --- Writing whole files -------------------------------------------------------------------------------------------
 
 
+PART = ".part-"
+"""How the names of unfinished files begin; a killed run leaves them behind, and nothing reads them."""
+
+
+def _finished(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if not path.name.startswith(PART)]
+
+
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """A temporary path beside ``path`` that takes its place when the block ends well.
@@ -53,7 +61,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     temporary: Path | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=".part-", suffix=path.suffix)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=PART, suffix=path.suffix)
         os.close(handle)
         temporary = Path(name)
         temporary.chmod(0o644)
@@ -163,7 +171,7 @@ def claim_folder(
     manifest_path = folder / "run.json"
     entry = _plain({"cuspid": cuspid.__version__, "settings": settings, "inputs_sha256": inputs})
     manifest = read_json(manifest_path) if manifest_path.exists() else {}
-    if not manifest and folder.exists() and any(folder.iterdir()):
+    if not manifest and folder.exists() and _finished(folder):
         raise OutputError(f"{folder}: holds files that are not from cuspid; give an empty or new folder as --out")
     if stage in manifest and manifest[stage] != entry and not replace:
         changed = _first_difference(manifest[stage], entry)
@@ -551,7 +559,7 @@ def _checked(capture: Capture) -> Capture:
 
 def _image_stems(images: Path, cameras: Sequence[str]) -> tuple[str, list[str]]:
     files = {
-        camera: [path for path in (images / camera).iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
+        camera: [path for path in _finished(images / camera) if path.suffix.lower() in IMAGE_SUFFIXES]
         for camera in cameras
     }
     stems = {camera: {path.stem for path in paths} for camera, paths in files.items()}
