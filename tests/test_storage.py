@@ -13,7 +13,7 @@ from builders import CAMERA, box_mesh, handpiece, make_capture
 from cuspid import storage
 from cuspid.errors import CuspidError, InputError, OutputError
 from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
+from cuspid.jaw import Jaw, Landmark, Sphere
 from cuspid.reconstruction import DepthMap, Dropped, Reconstruction
 from cuspid.rig import MountedCamera, Rig
 from strategies import cameras, rigid3s
@@ -31,16 +31,27 @@ def test_meshes_return_from_every_format_and_unit(tmp_path, suffix, unit):
     assert again.face_areas.sum() == pytest.approx(mesh.face_areas.sum(), rel=1e-5)
 
 
-def test_a_jaw_keeps_labels_colours_and_landmarks(tmp_path):
+def test_a_jaw_keeps_labels_colours_landmarks_lines_and_spheres(tmp_path):
     mesh = box_mesh()
     colored = dataclasses.replace(mesh, colors=np.arange(24, dtype=np.uint8).reshape(8, 3))
-    jaw = Jaw(mesh=colored, face_labels=np.arange(12) % 2 * 46, arch="lower", landmarks={"tip": np.array([1.0, 2, 3])})
+    jaw = Jaw(
+        mesh=colored,
+        face_labels=np.arange(12) % 2 * 46,
+        arch="lower",
+        landmarks={"46.tip": Landmark(np.array([1.0, 2, 3])), "midline": Landmark(np.array([4.0, 5, 6]), 0.2)},
+        lines={"46.margin": np.arange(9.0).reshape(3, 3)},
+        spheres={"1": Sphere(np.array([7.0, 8, 9]), 2.5)},
+    )
     storage.write_jaw(tmp_path / "jaw.ply", jaw)
     again = storage.read_jaw(tmp_path / "jaw.ply")
     np.testing.assert_allclose(again.mesh.face_centres, mesh.face_centres, atol=1e-5)
     np.testing.assert_array_equal(again.face_labels, jaw.face_labels)
     assert again.arch == "lower"
-    np.testing.assert_array_equal(again.landmarks["tip"], [1, 2, 3])
+    np.testing.assert_array_equal(again.landmarks["46.tip"].position, [1, 2, 3])
+    assert [point.estimated_sigma_mm for point in again.landmarks.values()] == [None, 0.2]
+    np.testing.assert_array_equal(again.lines["46.margin"], jaw.lines["46.margin"])
+    np.testing.assert_array_equal(again.spheres["1"].centre, [7, 8, 9])
+    assert again.spheres["1"].radius_mm == 2.5
     order = np.lexsort(again.mesh.vertices.T)
     np.testing.assert_array_equal(again.mesh.colors[order], colored.colors[np.lexsort(mesh.vertices.T)])
 

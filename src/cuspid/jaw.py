@@ -32,6 +32,33 @@ UNIVERSAL_FROM_FDI = {
 FDI_FROM_UNIVERSAL = {universal: fdi for fdi, universal in UNIVERSAL_FROM_FDI.items()}
 
 
+@dataclass(frozen=True, eq=False)
+class Landmark:
+    """A named anatomical point."""
+
+    position: Float[np.ndarray, "3"]
+    """In the occlusal frame, mm."""
+    estimated_sigma_mm: float | None = None
+    """Standard uncertainty (one axis) of a point that was estimated from the surface; None for one that is known or was
+    placed by hand."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "position", read_only(np.asarray(self.position, dtype=np.float64)))
+
+
+@dataclass(frozen=True, eq=False)
+class Sphere:
+    """A sphere of a metrology object."""
+
+    centre: Float[np.ndarray, "3"]
+    """In the occlusal frame, mm."""
+    radius_mm: float
+    """Nominal radius."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "centre", read_only(np.asarray(self.centre, dtype=np.float64)))
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Jaw:
     """What is scanned, or the reference that a scan is judged by."""
@@ -42,8 +69,13 @@ class Jaw:
     """FDI number for each face, 0 for gum; None where the file has none."""
     arch: Arch | None = None
     """Which jaw, where it is known."""
-    landmarks: Mapping[str, Float[np.ndarray, "3"]] = field(default_factory=dict)
-    """Named points in the occlusal frame, mm."""
+    landmarks: Mapping[str, Landmark] = field(default_factory=dict)
+    """By label, ``<FDI>.<point>`` or ``<point>`` (scheme: `cuspid.anatomy.landmarks`)."""
+    lines: Mapping[str, Float[np.ndarray, "_ 3"]] = field(default_factory=dict)
+    """Polylines on the surface, mm, by label: ``45.margin`` is the margin line of the preparation of tooth 45; a closed
+    one ends where it begins."""
+    spheres: Mapping[str, Sphere] = field(default_factory=dict)
+    """Spheres of a metrology object, by label."""
 
     def __post_init__(self) -> None:
         if self.face_labels is not None:

@@ -1,0 +1,49 @@
+"""The named landmarks of a jaw: five for each tooth and two at the midline, 72 for fourteen teeth, 62 for twelve.
+
+The thesis uses 72 points on a jaw of fourteen teeth; its figure of them is lost. This scheme has that number, the points
+that the arch dimensions a, b, c and f are defined by, and for each tooth points that span its crown. A label is
+``<FDI>.<point>``, for example ``46.buccal_groove``; the points at the midline have no number. Points are always paired by
+label, never by order.
+
+*Mesial* is towards the midline along the arch, *distal* away from it; *buccal* (front teeth: *labial*) towards cheek and
+lip, *lingual* towards the tongue or palate.
+"""
+
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
+from typing import Literal
+
+ToothKind = Literal["incisor", "canine", "premolar", "molar"]
+
+_KINDS: tuple[ToothKind, ...] = ("incisor", "incisor", "canine", "premolar", "premolar", "molar", "molar", "molar")
+
+TOOTH_LANDMARKS: Mapping[ToothKind, tuple[str, ...]] = MappingProxyType(
+    {
+        "incisor": ("mesial_angle", "incisal_edge", "distal_angle", "labial_cervix", "lingual_cervix"),
+        "canine": ("mesial_angle", "cusp_tip", "distal_angle", "labial_cervix", "lingual_cervix"),
+        "premolar": ("buccal_cusp", "lingual_cusp", "central_groove", "buccal_cervix", "lingual_cervix"),
+        "molar": ("mesiobuccal_cusp", "distobuccal_cusp", "mesiolingual_cusp", "buccal_groove", "central_groove"),
+    }
+)
+"""Points of a tooth of each kind.
+
+``*_angle``: corner of the incisal edge; on a canine, the shoulder where the edge meets the proximal side.
+``incisal_edge``: its middle. ``*_cusp``, ``cusp_tip``: highest point of the cusp; of several lingual cusps of a premolar,
+the mesial one. ``central_groove``: deepest point of the central groove or fossa. ``buccal_groove``: where the
+(mesio)buccal groove crosses the occlusal rim. ``*_cervix``: lowest (most apical) point of the gum's margin on that side.
+"""
+
+MIDLINE_LANDMARKS = ("papilla", "midline")
+"""``papilla``: centre of the incisive papilla (upper), tip of the lingual papilla between the central incisors (lower).
+``midline``: between the mesial angles of the central incisors."""
+
+
+def kind_of(fdi: int) -> ToothKind:
+    """Kind of a permanent tooth by its FDI number."""
+    return _KINDS[fdi % 10 - 1]
+
+
+def labels_of(teeth: Iterable[int]) -> tuple[str, ...]:
+    """Labels of all landmarks of a jaw with the given teeth (FDI), tooth by tooth in the given order, midline last."""
+    points = [f"{fdi}.{point}" for fdi in teeth for point in TOOTH_LANDMARKS[kind_of(fdi)]]
+    return (*points, *MIDLINE_LANDMARKS)

@@ -1,0 +1,88 @@
+"""Every folder and file format, read and write (see docs/formats.md).
+
+Files appear whole or not at all: they are written beside their place and renamed. A folder that a run writes into keeps
+``run.json`` with what it was made from, so that a run can go on where it stopped and never mixes with another one.
+"""
+
+from cuspid.storage.captures import (
+    IMAGE_SUFFIXES,
+    hash_capture,
+    read_capture,
+    read_truth,
+    write_capture,
+    write_image,
+    write_overlap,
+    write_truth,
+)
+from cuspid.storage.files import (
+    PART,
+    claim_folder,
+    claimed_folder,
+    hash_file,
+    read_json,
+    reading,
+    whole_file,
+    write_bytes,
+    write_json,
+)
+from cuspid.storage.handpieces import read_handpiece, read_rig_config, write_handpiece, write_rig_config
+from cuspid.storage.jaws import (
+    MESH_SUFFIXES,
+    MM_PER_UNIT,
+    Unit,
+    read_jaw,
+    read_labelled_mesh,
+    read_mesh,
+    write_jaw,
+    write_mesh,
+)
+from cuspid.storage.reconstructions import (
+    read_depth_maps,
+    read_poses,
+    read_reconstruction,
+    trueness_summary,
+    write_depth_maps,
+    write_poses,
+    write_reconstruction,
+    write_trueness,
+)
+
+__all__ = [
+    "IMAGE_SUFFIXES",
+    "MESH_SUFFIXES",
+    "MM_PER_UNIT",
+    "PART",
+    "Unit",
+    "claim_folder",
+    "claimed_folder",
+    "hash_capture",
+    "hash_file",
+    "read_capture",
+    "read_depth_maps",
+    "read_handpiece",
+    "read_jaw",
+    "read_json",
+    "read_labelled_mesh",
+    "read_mesh",
+    "read_poses",
+    "read_reconstruction",
+    "read_rig_config",
+    "read_truth",
+    "reading",
+    "trueness_summary",
+    "whole_file",
+    "write_bytes",
+    "write_capture",
+    "write_depth_maps",
+    "write_handpiece",
+    "write_image",
+    "write_jaw",
+    "write_json",
+    "write_mesh",
+    "write_overlap",
+    "write_poses",
+    "write_reconstruction",
+    "write_rig_config",
+    "write_trueness",
+    "write_truth",
+]

@@ -1,0 +1,164 @@
+"""Files that appear whole or not at all, and the record of what a folder was made from."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import cuspid
+from cuspid.errors import CuspidError, InputError, OutputError
+
+PART = ".part-"
+"""How the names of unfinished files begin; a killed run leaves them behind, and nothing reads them."""
+
+
+def finished(folder: Path) -> list[Path]:
+    """What is in a folder, without the unfinished files of a killed run."""
+    return [path for path in folder.iterdir() if not path.name.startswith(PART)]
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A temporary path beside ``path`` that takes its place when the block ends well.
+
+    Raises OutputError where the disk is full, read-only or the folder cannot be made.
+    """
+    temporary: Path | None = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=PART, suffix=path.suffix)
+        os.close(handle)
+        temporary = Path(name)
+        temporary.chmod(0o644)
+        yield temporary
+        temporary.replace(path)
+    except OSError as error:
+        raise OutputError(_describe(path, error)) from error
+    finally:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def _describe(path: Path, error: OSError) -> str:
+    if error.errno == errno.ENOSPC:
+        return f"{path}: the disk is full; free some space and run the same command again, it goes on where it stopped"
+    return f"{path}: cannot be written ({error.strerror or error}); choose another --out"
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all."""
+    with whole_file(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_json(path: Path, value: object) -> None:
+    """Write JSON whole or not at all; dataclasses, arrays and paths are converted."""
+    write_bytes(path, (json.dumps(to_plain(value), indent=2, allow_nan=False) + "\n").encode())
+
+
+def to_plain(value: Any) -> Any:
+    """A value as JSON knows it; numbers that are not finite become null."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: to_plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): to_plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | list | tuple):
+        return [to_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return to_plain(value.item())
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
+
+
+def read_json(path: Path) -> Any:
+    """Parse a JSON file. Raises InputError where it is missing or broken."""
+    try:
+        return json.loads(path.read_text())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise InputError(f"{path}: not valid JSON ({error})") from error
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn what a malformed value in a parsed file raises into one clear line."""
+    try:
+        yield
+    except CuspidError:
+        raise
+    except KeyError as error:
+        raise InputError(f"{path}: the field {error} is missing; see docs/formats.md") from error
+    except (ValueError, TypeError, AttributeError, IndexError, np.linalg.LinAlgError) as error:
+        raise InputError(f"{path}: a value cannot be used ({error}); see docs/formats.md") from error
+
+
+def hash_file(path: Path) -> str:
+    """SHA-256 of a file's contents."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def claim_folder(
+    folder: Path, stage: str, settings: Mapping[str, object], inputs: Mapping[str, str], *, replace: bool = False
+) -> None:
+    """Make ``folder`` the home of one run of a stage, or find that it is already.
+
+    ``run.json`` keeps for each stage the version, the settings and the hashes of the inputs. Raises OutputError where
+    the folder holds files that no run of cuspid wrote, or the same stage made from something else (unless it may be
+    replaced, since it is made anew as a whole).
+    """
+    manifest_path = folder / "run.json"
+    entry = to_plain({"cuspid": cuspid.__version__, "settings": settings, "inputs_sha256": inputs})
+    manifest = read_json(manifest_path) if manifest_path.exists() else {}
+    if not manifest and folder.exists() and finished(folder):
+        raise OutputError(f"{folder}: holds files that are not from cuspid; give an empty or new folder as --out")
+    if stage in manifest and manifest[stage] != entry and not replace:
+        changed = _first_difference(manifest[stage], entry)
+        raise OutputError(
+            f"{folder}: holds another run of '{stage}' ({changed} differs); give another --out or delete the folder"
+        )
+    if manifest.get(stage) != entry:
+        write_json(manifest_path, {**manifest, stage: entry})
+
+
+@contextmanager
+def claimed_folder(
+    folder: Path, stage: str, settings: Mapping[str, object], inputs: Mapping[str, str], *, replace: bool = False
+) -> Iterator[None]:
+    """:func:`claim_folder` for the work in the block; leaves no trace where the work is refused before it wrote."""
+    existed = folder.exists()
+    claim_folder(folder, stage, settings, inputs, replace=replace)
+    try:
+        yield
+    except CuspidError:
+        if not existed and [path.name for path in folder.iterdir()] == ["run.json"]:
+            (folder / "run.json").unlink()
+            folder.rmdir()
+        raise
+
+
+def _first_difference(old: Any, new: Any, name: str = "") -> str:
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in {**old, **new}:
+            if old.get(key) != new.get(key):
+                return _first_difference(old.get(key), new.get(key), f"{name}.{key}" if name else key)
+    return name or "it"

@@ -1,0 +1,196 @@
+"""Handpieces, and rigs as COLMAP writes them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cuspid.camera import Camera
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
+from cuspid.rig import Exposure, Handpiece, Light, MountedCamera, Rig, Sensor
+from cuspid.storage.files import read_json, reading, write_json
+
+
+def rigid_to_json(target_from_source: Rigid3) -> dict[str, Any]:
+    """A rigid motion as quaternion and translation in mm."""
+    return {
+        "rotation_wxyz": target_from_source.quaternion.tolist(),
+        "translation_mm": target_from_source.translation.tolist(),
+    }
+
+
+def rigid_from_json(value: Mapping[str, Any]) -> Rigid3:
+    """Inverse of :func:`rigid_to_json`."""
+    return Rigid3.from_quaternion(
+        np.array(value["rotation_wxyz"], dtype=np.float64),
+        np.array(value["translation_mm"], dtype=np.float64),
+    )
+
+
+def covariance_from_json(value: Any) -> np.ndarray | None:
+    """A covariance matrix, or None."""
+    return None if value is None else np.array(value, dtype=np.float64)
+
+
+def camera_to_json(camera: Camera) -> dict[str, Any]:
+    """Intrinsic calibration of a camera."""
+    return {
+        "width_px": camera.width,
+        "height_px": camera.height,
+        "focal_px": camera.focal_px,
+        "principal_point_px": camera.principal_point_px,
+        "distortion_k1_k2_p1_p2": camera.distortion,
+        "covariance_fx_fy_cx_cy_k1_k2_p1_p2": camera.covariance,
+    }
+
+
+def camera_from_json(value: Mapping[str, Any]) -> Camera:
+    """Inverse of :func:`camera_to_json`."""
+    return Camera(
+        width=int(value["width_px"]),
+        height=int(value["height_px"]),
+        focal_px=np.array(value["focal_px"], dtype=np.float64),
+        principal_point_px=np.array(value["principal_point_px"], dtype=np.float64),
+        distortion=np.array(value.get("distortion_k1_k2_p1_p2", np.zeros(4)), dtype=np.float64),
+        covariance=covariance_from_json(value.get("covariance_fx_fy_cx_cy_k1_k2_p1_p2")),
+    )
+
+
+def handpiece_to_json(handpiece: Handpiece) -> dict[str, Any]:
+    """All of a handpiece (docs/formats.md)."""
+    cameras = {
+        name: {
+            **camera_to_json(mounted.camera),
+            "cam_from_rig": rigid_to_json(mounted.cam_from_rig),
+            "covariance_rotation_rad_translation_mm": mounted.covariance,
+        }
+        for name, mounted in handpiece.rig.cameras.items()
+    }
+    return {
+        "name": handpiece.name,
+        "working_distance_mm": handpiece.working_distance_mm,
+        "depth_range_mm": handpiece.depth_range_mm,
+        "cameras": cameras,
+        "lights": handpiece.lights,
+        "exposures": handpiece.exposures,
+        "sensor": handpiece.sensor,
+    }
+
+
+def write_handpiece(path: Path, handpiece: Handpiece) -> None:
+    """Write ``handpiece.json``."""
+    write_json(path, handpiece_to_json(handpiece))
+
+
+def _light_from_json(value: Mapping[str, Any]) -> Light:
+    arrays = {key: np.array(value[key], dtype=np.float64) for key in ("position_mm", "direction", "colour")}
+    return Light(**{**value, **arrays})
+
+
+def read_handpiece(path: Path) -> Handpiece:
+    """Read ``handpiece.json``, or COLMAP's ``rig_config.json`` with the working distance of the built-in designs.
+
+    Raises InputError that names a missing or unusable field.
+    """
+    value = read_json(path)
+    if isinstance(value, list):
+        return Handpiece(rig=read_rig_config(path), name=path.stem)
+    with reading(path):
+        cameras = {
+            name: MountedCamera(
+                camera_from_json(camera),
+                rigid_from_json(camera["cam_from_rig"]),
+                covariance_from_json(camera.get("covariance_rotation_rad_translation_mm")),
+            )
+            for name, camera in value["cameras"].items()
+        }
+        near, far = value["depth_range_mm"]
+        return Handpiece(
+            rig=Rig(cameras),
+            lights={name: _light_from_json(light) for name, light in value.get("lights", {}).items()},
+            exposures=tuple(
+                Exposure(name=exposure["name"], lights=tuple(exposure["lights"]))
+                for exposure in value.get("exposures", [])
+            ),
+            sensor=Sensor(**value.get("sensor", {})),
+            working_distance_mm=float(value["working_distance_mm"]),
+            depth_range_mm=(float(near), float(far)),
+            name=str(value.get("name", path.stem)),
+        )
+
+
+def write_rig_config(path: Path, rig: Rig) -> None:
+    """Write COLMAP's ``rig_config.json``; the reference sensor is the first camera."""
+    rebased, _ = rig.rebased()
+    cameras: list[dict[str, Any]] = []
+    for index, (name, mounted) in enumerate(rebased.cameras.items()):
+        entry: dict[str, Any] = {
+            "image_prefix": f"{name}/",
+            "camera_model_name": "OPENCV",
+            "camera_params": mounted.camera.parameters,
+            "camera_size": [mounted.camera.width, mounted.camera.height],
+        }
+        if index == 0:
+            entry["ref_sensor"] = True
+        else:
+            entry["cam_from_rig_rotation"] = mounted.cam_from_rig.quaternion
+            entry["cam_from_rig_translation"] = mounted.cam_from_rig.translation
+        cameras.append(entry)
+    write_json(path, [{"cameras": cameras}])
+
+
+def read_rig_config(path: Path, image_size_px: tuple[int, int] | None = None) -> Rig:
+    """Read COLMAP's ``rig_config.json`` (one rig, calibrated cameras of a PINHOLE or OPENCV family).
+
+    The format has no image size: it is taken from cuspid's own extra field ``camera_size``, else from the argument,
+    else twice the principal point.
+    """
+    value = read_json(path)
+    with reading(path):
+        if len(value) != 1:
+            raise InputError(f"{path}: {len(value)} rigs; cuspid works with one")
+        cameras: dict[str, MountedCamera] = {}
+        for entry in value[0]["cameras"]:
+            name = str(entry["image_prefix"]).strip("/")
+            cam_from_rig = (
+                Rigid3.identity()
+                if entry.get("ref_sensor")
+                else Rigid3.from_quaternion(
+                    np.array(entry["cam_from_rig_rotation"], dtype=np.float64),
+                    np.array(entry["cam_from_rig_translation"], dtype=np.float64),
+                )
+            )
+            cameras[name] = MountedCamera(_camera_from_colmap(entry, image_size_px), cam_from_rig)
+        return Rig(cameras)
+
+
+_COLMAP_PARAMETERS: Mapping[str, Sequence[int]] = {
+    "SIMPLE_PINHOLE": (0, 0, 1, 2),
+    "PINHOLE": (0, 1, 2, 3),
+    "SIMPLE_RADIAL": (0, 0, 1, 2, 3),
+    "RADIAL": (0, 0, 1, 2, 3, 4),
+    "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
+}
+"""Where (fx, fy, cx, cy, k1, k2, p1, p2) stand among a COLMAP model's parameters."""
+
+
+def _camera_from_colmap(entry: Mapping[str, Any], image_size_px: tuple[int, int] | None) -> Camera:
+    model = entry["camera_model_name"]
+    if model not in _COLMAP_PARAMETERS:
+        raise InputError(f"camera model {model} is not known here; use one of {', '.join(_COLMAP_PARAMETERS)}")
+    given = np.array(entry["camera_params"], dtype=np.float64)
+    parameters = np.zeros(8)
+    chosen = given[list(_COLMAP_PARAMETERS[model])]
+    parameters[: len(chosen)] = chosen
+    width, height = entry.get("camera_size") or image_size_px or np.rint(2 * parameters[2:4]).astype(int)
+    return Camera(
+        width=int(width),
+        height=int(height),
+        focal_px=parameters[:2],
+        principal_point_px=parameters[2:4],
+        distortion=parameters[4:],
+    )

@@ -1,0 +1,135 @@
+"""Reconstructions, depth maps and trueness."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cuspid.geometry import Rigid3
+from cuspid.reconstruction import DepthMap, Dropped, Reconstruction
+from cuspid.rig import Handpiece
+from cuspid.storage.files import read_json, reading, to_plain, whole_file, write_json
+from cuspid.storage.handpieces import (
+    camera_from_json,
+    camera_to_json,
+    covariance_from_json,
+    read_handpiece,
+    rigid_from_json,
+    rigid_to_json,
+    write_handpiece,
+)
+from cuspid.trueness import Trueness
+
+
+def write_poses(path: Path, rig_from_world: Mapping[str, Rigid3]) -> None:
+    """Write ``rig_from_world`` for each frame."""
+    write_json(path, {name: rigid_to_json(pose) for name, pose in rig_from_world.items()})
+
+
+def read_poses(path: Path) -> dict[str, Rigid3]:
+    """Read what :func:`write_poses` wrote."""
+    value = read_json(path)
+    with reading(path):
+        return {name: rigid_from_json(pose) for name, pose in value.items()}
+
+
+def write_reconstruction(folder: Path, reconstruction: Reconstruction, handpiece: Handpiece) -> None:
+    """Write poses, refined handpiece and the list of what was dropped; last of all ``reconstruction.json``."""
+    write_poses(folder / "poses.json", reconstruction.rig_from_world)
+    write_handpiece(folder / "handpiece.json", dataclasses.replace(handpiece, rig=reconstruction.rig))
+    write_json(
+        folder / "reconstruction.json",
+        {
+            "frames_located": len(reconstruction.rig_from_world),
+            "frames_dropped": reconstruction.dropped,
+            "points": 0 if reconstruction.tracks is None else len(reconstruction.tracks.points),
+            "reprojection_rms_px": reconstruction.reprojection_rms_px,
+            "log": reconstruction.log,
+            "pose_covariance_rotation_rad_translation_mm": reconstruction.pose_covariance,
+        },
+    )
+
+
+def read_reconstruction(folder: Path) -> Reconstruction:
+    """Read what :func:`write_reconstruction` wrote; the sparse tracks stay in COLMAP's model beside it."""
+    path = folder / "reconstruction.json"
+    value = read_json(path)
+    with reading(path):
+        return Reconstruction(
+            rig=read_handpiece(folder / "handpiece.json").rig,
+            rig_from_world=read_poses(folder / "poses.json"),
+            dropped=tuple(Dropped(**entry) for entry in value["frames_dropped"]),
+            pose_covariance=covariance_from_json(value["pose_covariance_rotation_rad_translation_mm"]),
+            reprojection_rms_px=value["reprojection_rms_px"],
+            log=value["log"],
+        )
+
+
+def write_depth_maps(path: Path, depth_maps: Sequence[DepthMap]) -> None:
+    """Write the depth maps of one frame as one ``.npz``."""
+    arrays: dict[str, np.ndarray] = {}
+    for index, depth in enumerate(depth_maps):
+        arrays[f"{index}.depth_mm"] = depth.depth_mm
+        arrays[f"{index}.confidence"] = depth.confidence.astype(np.float16)
+        if depth.color is not None:
+            arrays[f"{index}.color"] = depth.color
+    header = [
+        {
+            "frame": depth.frame,
+            "camera_name": depth.camera_name,
+            "camera": camera_to_json(depth.camera),
+            "cam_from_rig": depth.cam_from_rig.matrix,
+        }
+        for depth in depth_maps
+    ]
+    arrays["header"] = np.frombuffer(json.dumps(to_plain(header)).encode(), dtype=np.uint8)
+    with whole_file(path) as temporary, temporary.open("wb") as stream:
+        np.savez(stream, allow_pickle=False, **arrays)
+
+
+def read_depth_maps(path: Path) -> tuple[DepthMap, ...]:
+    """Read what :func:`write_depth_maps` wrote."""
+    with np.load(path, allow_pickle=False) as arrays:
+        header = json.loads(arrays["header"].tobytes())
+        return tuple(
+            DepthMap(
+                frame=entry["frame"],
+                camera_name=entry["camera_name"],
+                camera=camera_from_json(entry["camera"]),
+                cam_from_rig=Rigid3.from_matrix(np.array(entry["cam_from_rig"])),
+                depth_mm=arrays[f"{index}.depth_mm"],
+                confidence=arrays[f"{index}.confidence"].astype(np.float32),
+                color=arrays[f"{index}.color"] if f"{index}.color" in arrays else None,
+            )
+            for index, entry in enumerate(header)
+        )
+
+
+def trueness_summary(trueness: Trueness) -> dict[str, Any]:
+    """``trueness.json``: the headline at the top level, everything else below it. Unknown numbers are null."""
+    accuracy = trueness.accuracy
+    details = {
+        field.name: getattr(trueness, field.name)
+        for field in dataclasses.fields(trueness)
+        if field.name not in {"deviation_um", "reference_from_scan"}
+    }
+    return {
+        "mean_abs_um": accuracy.mean_abs_um,
+        "signed_mean_um": accuracy.signed_mean_um,
+        "std_um": accuracy.std_um,
+        "rms_um": accuracy.rms_um,
+        "p95_um": accuracy.p95_um,
+        "max_um": accuracy.max_um,
+        **details,
+        "reference_from_scan": trueness.reference_from_scan.matrix,
+    }
+
+
+def write_trueness(path: Path, trueness: Trueness) -> None:
+    """Write ``trueness.json``."""
+    write_json(path, trueness_summary(trueness))
