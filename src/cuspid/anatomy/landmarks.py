@@ -1,12 +1,12 @@
 """The named landmarks of a jaw: five for each tooth and two at the midline, 72 for fourteen teeth, 62 for twelve.
 
-The thesis uses 72 points on a jaw of fourteen teeth; its figure of them is lost. This scheme has that number, the points
-that the arch dimensions a, b, c and f are defined by, and for each tooth points that span its crown. A label is
-``<FDI>.<point>``, for example ``46.buccal_groove``; the points at the midline have no number. Points are always paired by
-label, never by order.
+The thesis uses 72 points on a jaw of fourteen teeth; its figure of them is lost. This scheme has that number, the
+points that the arch dimensions a, b, c and f are defined by, and for each tooth points that span its crown. A label is
+``<FDI>.<point>``, for example ``46.buccal_groove``; the points at the midline have no number. Points are always paired
+by label, never by order.
 
-*Mesial* is towards the midline along the arch, *distal* away from it; *buccal* (front teeth: *labial*) towards cheek and
-lip, *lingual* towards the tongue or palate.
+*Mesial* is towards the midline along the arch, *distal* away from it; *buccal* (front teeth: *labial*) towards cheek
+and lip, *lingual* towards the tongue or palate.
 """
 
 from collections.abc import Iterable, Mapping
@@ -28,8 +28,8 @@ TOOTH_LANDMARKS: Mapping[ToothKind, tuple[str, ...]] = MappingProxyType(
 """Points of a tooth of each kind.
 
 ``*_angle``: corner of the incisal edge; on a canine, the shoulder where the edge meets the proximal side.
-``incisal_edge``: its middle. ``*_cusp``, ``cusp_tip``: highest point of the cusp; of several lingual cusps of a premolar,
-the mesial one. ``central_groove``: deepest point of the central groove or fossa. ``buccal_groove``: where the
+``incisal_edge``: its middle. ``*_cusp``, ``cusp_tip``: highest point of the cusp; of several lingual cusps of a
+premolar, the mesial one. ``central_groove``: deepest point of the central groove or fossa. ``buccal_groove``: where the
 (mesio)buccal groove crosses the occlusal rim. ``*_cervix``: lowest (most apical) point of the gum's margin on that side.
 """
 
