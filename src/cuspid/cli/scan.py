@@ -1,88 +1,23 @@
-"""The command line: a verb is load, one call, save."""
+"""Scan, reconstruct and evaluate."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated
 
-import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from cuspid import pipeline, storage
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
 from cuspid.capture import Capture
-from cuspid.errors import CuspidError, InputError
+from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress
 from cuspid.evaluation.deviation import EvaluationOptions
-from cuspid.handpiece.designs import DESIGNS, DesignOptions
-from cuspid.jaw import Arch, Jaw
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.reconstruction import Reconstruction
-from cuspid.reporting.figures import deviation_colors, save_deviation_picture, save_picture
-from cuspid.rig import Handpiece
+from cuspid.reporting.figures import deviation_colors, save_deviation_picture
 from cuspid.trueness import Trueness
-
-console = Console(stderr=True)
-
-Flat = arg(name="")
-"""The fields of a nested options value appear without a prefix."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Source:
-    """What is scanned."""
-
-    unit: storage.Unit = "mm"
-    """Length unit of the mesh file."""
-    arch: Arch | None = None
-    """Which jaw the file holds, where its teeth are to be numbered; of the phantom: lower unless said otherwise."""
-    jaw_seed: int = 0
-    """Individual of the built-in phantom."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Probe:
-    """What scans it."""
-
-    design: Literal["four", "twelve"] = "twelve"
-    """Built-in design: the essential four cameras, or the twelve."""
-    handpiece: Path | None = None
-    """A handpiece.json, or COLMAP's rig_config.json, of your own, instead of a built-in design."""
-
-
-@contextmanager
-def _progress() -> Iterator[pipeline.Progress]:
-    columns = (TextColumn("{task.description:>12}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console) as bars:
-        tasks: dict[str, TaskID] = {}
-
-        def report(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=total)
-            bars.update(tasks[stage], completed=done, total=total)
-
-        yield report
-
-
-def _load_source(mesh: Path | None, source: Source) -> Jaw:
-    if mesh is None:
-        return build_phantom(PhantomOptions(arch=source.arch or "lower", seed=source.jaw_seed))
-    jaw, notes = pipeline.load_jaw(mesh, unit=source.unit, arch=source.arch)
-    for note in notes:
-        console.print(f"note: {note}")
-    return jaw
-
-
-def _load_probe(probe: Probe) -> Handpiece:
-    if probe.handpiece is None:
-        return DESIGNS[probe.design](DesignOptions())
-    return storage.read_handpiece(probe.handpiece)
 
 
 def run(
@@ -105,41 +40,6 @@ def run(
     _simulate(jaw, out, source, probe, simulation)
     _reconstruct(storage.read_capture(out / "capture"), out, reconstruction, None)
     _evaluate(out / "mesh.ply", out / "truth", out, Source(), evaluation)
-
-
-def phantom(*, out: Path, options: Annotated[PhantomOptions, Flat] = PhantomOptions()) -> None:
-    """Make the built-in phantom jaw: a mesh with tooth labels, and a picture of it.
-
-    Args:
-        out: Mesh file to write (.ply keeps the labels; .stl, .obj).
-    """
-    made = build_phantom(options)
-    if out.suffix.lower() not in storage.MESH_SUFFIXES:
-        raise InputError(f"{out}: give a file name that ends in .ply, .stl or .obj")
-    if out.suffix.lower() == ".ply":
-        storage.write_jaw(out, made)
-    else:
-        storage.write_mesh(out, made.mesh)
-    save_picture(out.with_suffix(".png"), made.mesh, title=f"{options.arch} phantom, seed {options.seed}")
-    console.print(f"{out}: {len(made.mesh.faces):,} faces, teeth {', '.join(map(str, made.teeth))}")
-
-
-def handpiece(
-    *,
-    out: Path,
-    design: Literal["four", "twelve"] = "twelve",
-    options: Annotated[DesignOptions, Flat] = DesignOptions(),
-) -> None:
-    """Write a built-in handpiece as handpiece.json and COLMAP's rig_config.json, to use or to change.
-
-    Args:
-        out: Folder.
-        design: The essential four cameras, or the twelve.
-    """
-    made = DESIGNS[design](options)
-    storage.write_handpiece(out / "handpiece.json", made)
-    storage.write_rig_config(out / "rig_config.json", made.rig)
-    console.print(f"{out / 'handpiece.json'}: {len(made.rig.names)} cameras, {len(made.lights)} lights")
 
 
 def simulate(
@@ -201,8 +101,8 @@ def _simulate(mesh: Path | None, out: Path, source: Source, probe: Probe, option
     given = {"jaw": mesh, "handpiece": probe.handpiece}
     hashes = {name: storage.hash_file(path) for name, path in given.items() if path is not None}
     with storage.claimed_folder(out, "simulate", settings, hashes):
-        jaw, device = _load_source(mesh, source), _load_probe(probe)
-        with _progress() as progress:
+        jaw, device = load_source(mesh, source), load_probe(probe)
+        with show_progress() as progress:
             capture, _ = pipeline.simulate(jaw, device, out, options, progress=progress)
     overlap = storage.read_json(out / "truth" / "path.json")
     console.print(
@@ -214,7 +114,7 @@ def _simulate(mesh: Path | None, out: Path, source: Source, probe: Probe, option
 def _reconstruct(capture: Capture, out: Path, options: ReconstructionOptions, model: Path | None) -> None:
     settings = {"reconstruction": options, "from_poses": model}
     inputs = storage.hash_capture(capture)
-    with storage.claimed_folder(out, "reconstruct", settings, inputs), _progress() as progress:
+    with storage.claimed_folder(out, "reconstruct", settings, inputs), show_progress() as progress:
         reconstruction, mesh = pipeline.reconstruct(capture, out, options, colmap_model=model, progress=progress)
     _print_located(reconstruction, capture)
     console.print(f"{out / 'mesh.ply'}: {len(mesh.faces):,} faces")
@@ -253,30 +153,3 @@ def _print_trueness(trueness: Trueness) -> None:
     Console().print(table)
     for note in trueness.notes:
         console.print(f"note: {note}")
-
-
-COMMANDS: Mapping[str, Callable[..., Any]] = {
-    "run": run,
-    "phantom": phantom,
-    "handpiece": handpiece,
-    "simulate": simulate,
-    "reconstruct": reconstruct,
-    "evaluate": evaluate,
-}
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """Run a verb; a known error is one line on stderr and exit status 1."""
-    try:
-        tyro.extras.subcommand_cli_from_dict(
-            dict(COMMANDS),
-            prog="cuspid",
-            description="Passive intra-oral 3D scanning: simulate, reconstruct, and prove the accuracy.",
-            args=arguments,
-        )
-    except CuspidError as error:
-        console.print(f"cuspid: {error}", style="red", soft_wrap=True, markup=False, highlight=False)
-        sys.exit(1)
-    except KeyboardInterrupt:
-        console.print("cuspid: interrupted; the same command goes on where it stopped")
-        sys.exit(130)

@@ -1,0 +1,41 @@
+"""The command line: a verb is load, one call, save."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import tyro
+
+from cuspid.cli.handpieces import handpiece
+from cuspid.cli.jaws import phantom
+from cuspid.cli.scan import evaluate, reconstruct, run, simulate
+from cuspid.cli.shared import console
+from cuspid.errors import CuspidError
+
+COMMANDS: Mapping[str, Callable[..., Any]] = {
+    "run": run,
+    "phantom": phantom,
+    "handpiece": handpiece,
+    "simulate": simulate,
+    "reconstruct": reconstruct,
+    "evaluate": evaluate,
+}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run a verb; a known error is one line on stderr and exit status 1."""
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            dict(COMMANDS),
+            prog="cuspid",
+            description="Passive intra-oral 3D scanning: simulate, reconstruct, and prove the accuracy.",
+            args=arguments,
+        )
+    except CuspidError as error:
+        console.print(f"cuspid: {error}", style="red", soft_wrap=True, markup=False, highlight=False)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        console.print("cuspid: interrupted; the same command goes on where it stopped")
+        sys.exit(130)

@@ -1,0 +1,78 @@
+"""What the verbs have in common: what is scanned, with what, and how progress is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from tyro.conf import arg
+
+from cuspid import pipeline, storage
+from cuspid.anatomy.phantom import PhantomOptions, build_phantom
+from cuspid.handpiece.designs import DESIGNS, DesignOptions
+from cuspid.jaw import Arch, Jaw
+from cuspid.rig import Handpiece
+
+console = Console(stderr=True)
+
+Flat = arg(name="")
+"""The fields of a nested options value appear without a prefix."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """What is scanned."""
+
+    unit: storage.Unit = "mm"
+    """Length unit of the mesh file."""
+    arch: Arch | None = None
+    """Which jaw the file holds, where its teeth are to be numbered; of the phantom: lower unless said otherwise."""
+    jaw_seed: int = 0
+    """Individual of the built-in phantom."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Probe:
+    """What scans it."""
+
+    design: Literal["four", "twelve"] = "twelve"
+    """Built-in design: the essential four cameras, or the twelve."""
+    handpiece: Path | None = None
+    """A handpiece.json, or COLMAP's rig_config.json, of your own, instead of a built-in design."""
+
+
+@contextmanager
+def show_progress() -> Iterator[pipeline.Progress]:
+    """A bar for each stage of long work, with the time left."""
+    columns = (TextColumn("{task.description:>12}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def report(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total)
+            bars.update(tasks[stage], completed=done, total=total)
+
+        yield report
+
+
+def load_source(mesh: Path | None, source: Source) -> Jaw:
+    """The jaw of a file in the occlusal frame, or the phantom; prints what was found or is unsure."""
+    if mesh is None:
+        return build_phantom(PhantomOptions(arch=source.arch or "lower", seed=source.jaw_seed))
+    jaw, notes = pipeline.load_jaw(mesh, unit=source.unit, arch=source.arch)
+    for note in notes:
+        console.print(f"note: {note}")
+    return jaw
+
+
+def load_probe(probe: Probe) -> Handpiece:
+    """The handpiece of a file, or a built-in design."""
+    if probe.handpiece is None:
+        return DESIGNS[probe.design](DesignOptions())
+    return storage.read_handpiece(probe.handpiece)
