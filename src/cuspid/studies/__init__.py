@@ -1,0 +1,1 @@
+"""Experiments made of whole pipelines, on this machine or on a Dask cluster."""

@@ -1,0 +1,254 @@
+"""Run a grid of cases: each is a call of one function with its own parameters and returns a row of figures.
+
+Every finished case is a file ``cases/<name>.json`` at once, so that a killed study goes on where it stopped. A case
+that fails is recorded with its reason and does not stop the others. Locally each case is a process of its own, pinned
+to one core; with the address of a Dask scheduler the same calls go to its workers, which need the package and nothing
+else: what they return is written here.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import multiprocessing
+import os
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+from cuspid import storage
+from cuspid.errors import CuspidError, InputError, MissingDependencyError
+
+Value = float | int | str | bool | None
+"""What a cell of the table holds."""
+
+CLUSTER_TIMEOUT_S = 10
+"""How long a scheduler may take to answer."""
+WORKER_DEATHS = 2
+"""How often a case may lose its worker before it counts as failed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """One point of the grid."""
+
+    name: str
+    """Unique in the study, and fit for a file name."""
+    parameters: Mapping[str, Value]
+    """Arguments of the function; units in the names."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What became of a case."""
+
+    case: Case
+    """Which one."""
+    figures: Mapping[str, Value]
+    """What the function returned, units in the names; empty where it failed."""
+    failure: str | None = None
+    """Why it failed, one line."""
+
+
+Work = Callable[..., Mapping[str, Value]]
+"""A function of a module that workers can import: takes the parameters of a case by name, returns figures by name, and
+raises where the case fails."""
+
+Progress = Callable[[int, int], None]
+"""Told how many cases are done, and of how many."""
+
+
+def grid(**axes: Sequence[Value]) -> tuple[Case, ...]:
+    """All combinations of the values on the axes, the last axis fastest, named after their values."""
+    names = tuple(axes)
+    return tuple(
+        Case(
+            name="_".join(f"{name}-{value}" for name, value in zip(names, values, strict=True)),
+            parameters=dict(zip(names, values, strict=True)),
+        )
+        for values in itertools.product(*axes.values())
+    )
+
+
+def run_grid(
+    cases: Sequence[Case],
+    work: Work,
+    folder: Path,
+    *,
+    workers: int | None = None,
+    cluster: str | None = None,
+    retry_failed: bool = False,
+    progress: Progress = lambda done, total: None,
+) -> tuple[Outcome, ...]:
+    """Run the cases that have no result in ``folder`` yet and return all outcomes, in the order of the cases.
+
+    ``workers`` local processes (default: one for each core), or the workers of the Dask scheduler at ``cluster``.
+    Writes ``cases/<name>.json`` for each case and the table ``results.csv``. Raises InputError where two cases share a
+    name or the cluster cannot be reached, MissingDependencyError where Dask is not installed.
+    """
+    names = [case.name for case in cases]
+    if len(set(names)) < len(names):
+        raise InputError(f"study: two cases are called {next(name for name in names if names.count(name) > 1)}")
+    done = {case.name: found for case in cases if (found := _read(folder, case)) is not None}
+    if retry_failed:
+        done = {name: outcome for name, outcome in done.items() if outcome.failure is None}
+    left = [case for case in cases if case.name not in done]
+    progress(len(done), len(cases))
+    if left:
+        outcomes = _on_cluster(left, work, cluster) if cluster else _in_processes(left, work, workers or _cores())
+        for outcome in outcomes:
+            done[outcome.case.name] = outcome
+            _write(folder, outcome)
+            progress(len(done), len(cases))
+    ordered = tuple(done[case.name] for case in cases)
+    storage.write_bytes(folder / "results.csv", table(ordered).encode())
+    return ordered
+
+
+def table(outcomes: Sequence[Outcome]) -> str:
+    """The outcomes as CSV: parameters, figures, and the reason where a case failed."""
+    parameters = list(dict.fromkeys(name for outcome in outcomes for name in outcome.case.parameters))
+    figures = list(dict.fromkeys(name for outcome in outcomes for name in outcome.figures))
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, ["case", *parameters, *figures, "failure"], lineterminator="\n")
+    writer.writeheader()
+    for outcome in outcomes:
+        cells = {**outcome.case.parameters, **outcome.figures}
+        writer.writerow({"case": outcome.case.name, **cells, "failure": outcome.failure})
+    return stream.getvalue()
+
+
+def _path(folder: Path, case: Case) -> Path:
+    return folder / "cases" / f"{case.name}.json"
+
+
+def _write(folder: Path, outcome: Outcome) -> None:
+    entry = {"parameters": outcome.case.parameters, "figures": outcome.figures, "failure": outcome.failure}
+    storage.write_json(_path(folder, outcome.case), entry)
+
+
+def _read(folder: Path, case: Case) -> Outcome | None:
+    path = _path(folder, case)
+    if not path.exists():
+        return None
+    entry = storage.read_json(path)
+    with storage.reading(path):
+        if entry["parameters"] != dict(case.parameters):
+            raise InputError(f"{path}: made with other parameters; give another --out or delete the folder")
+        return Outcome(case=case, figures=entry["figures"], failure=entry["failure"])
+
+
+def _attempt(work: Work, case: Case) -> Outcome:
+    """The outcome of a case, whatever its function raises."""
+    try:
+        return Outcome(case=case, figures=dict(work(**case.parameters)))
+    except CuspidError as error:
+        return Outcome(case=case, figures={}, failure=str(error))
+    except Exception as error:  # one broken case must not end a study of many hours
+        return Outcome(case=case, figures={}, failure=_one_line(error))
+
+
+def _one_line(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}".splitlines()[0]
+
+
+# --- Local processes -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Running:
+    """A case in its process."""
+
+    case: Case
+    process: BaseProcess
+    answer: Connection
+    core: int
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+def _in_processes(cases: Sequence[Case], work: Work, workers: int) -> Iterator[Outcome]:
+    """Outcomes as they come, from at most so many processes at once."""
+    waiting = list(reversed(cases))
+    cores = sorted(os.sched_getaffinity(0))
+    free = [cores[k % len(cores)] for k in range(workers)]
+    running: dict[Connection, _Running] = {}
+    try:
+        while waiting or running:
+            while waiting and free:
+                started = _start(waiting.pop(), work, free.pop())
+                running[started.answer] = started
+            for answer in wait(list(running)):
+                finished = running.pop(answer)  # type: ignore[call-overload]
+                free.append(finished.core)
+                yield _collect(finished)
+    finally:
+        for left in running.values():
+            left.process.terminate()
+
+
+def _start(case: Case, work: Work, core: int) -> _Running:
+    context = multiprocessing.get_context("spawn")
+    receiving, sending = context.Pipe(duplex=False)
+    process = context.Process(target=_work_alone, args=(sending, work, case, core), daemon=False)
+    process.start()
+    sending.close()
+    return _Running(case, process, receiving, core)
+
+
+def _work_alone(sending: Connection, work: Work, case: Case, core: int) -> None:
+    os.sched_setaffinity(0, {core})
+    sending.send(_attempt(work, case))
+
+
+def _collect(finished: _Running) -> Outcome:
+    try:
+        outcome: Outcome = finished.answer.recv()
+    except EOFError:
+        finished.process.join()
+        status = finished.process.exitcode or 0
+        reason = f"killed by signal {-status}" if status < 0 else f"ended with status {status}"
+        outcome = Outcome(case=finished.case, figures={}, failure=f"its process was {reason} (out of memory?)")
+    finished.process.join()
+    finished.answer.close()
+    return outcome
+
+
+# --- Dask ----------------------------------------------------------------------------------------------------------
+
+
+def _on_cluster(cases: Sequence[Case], work: Work, address: str) -> Iterator[Outcome]:
+    """Outcomes as they come from the workers of a Dask scheduler."""
+    try:
+        import distributed
+    except ImportError as error:
+        raise MissingDependencyError("--cluster needs Dask: pip install 'cuspid[cluster]'") from error
+    try:
+        client = distributed.Client(address, timeout=CLUSTER_TIMEOUT_S, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise InputError(f"--cluster {address}: no Dask scheduler answers there ({type(error).__name__})") from error
+    with client, client.as_current():
+        if not client.scheduler_info(n_workers=-1)["workers"]:
+            raise InputError(
+                f"--cluster {address}: the scheduler has no workers; start some with: dask worker {address}"
+            )
+        futures = {
+            client.submit(
+                _attempt, work, case, pure=False, retries=WORKER_DEATHS, key=f"cuspid-{uuid.uuid4().hex}"
+            ): case
+            for case in cases
+        }
+        for future in distributed.as_completed(list(futures)):
+            if future.status == "finished":
+                yield future.result()
+            else:
+                lost = future.exception()
+                yield Outcome(
+                    case=futures[future], figures={}, failure=f"{type(lost).__name__}: {lost}".splitlines()[0]
+                )

@@ -1,0 +1,40 @@
+"""Functions that the tests of the grid run in other processes."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from cuspid.errors import ReconstructionError
+
+
+def square(x: int, delay_s: float = 0.0) -> dict[str, float]:
+    time.sleep(delay_s)
+    return {"square_mm2": float(x * x)}
+
+
+def refuses_two(x: int) -> dict[str, float]:
+    if x == 2:
+        raise ReconstructionError("no surface: the images need texture")
+    return {"half": 1 / (x - 3) if x != 4 else x / 2}
+
+
+def leaves_a_mark(x: int, folder: str) -> dict[str, float]:
+    with (Path(folder) / "calls").open("a") as stream:
+        stream.write(f"{x}\n")
+    return {"y": float(x)}
+
+
+def dies_on_three(x: int) -> dict[str, float]:
+    if x == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return {"y": float(x)}
+
+
+def is_killed_once(x: int, folder: str) -> dict[str, float]:
+    """Takes its worker along the first time that x is 2."""
+    first = Path(folder) / "first"
+    if x == 2 and not first.exists():
+        first.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return {"y": float(10 * x)}

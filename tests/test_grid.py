@@ -1,0 +1,116 @@
+"""A study goes on after whatever happens to it, and a cluster gives the same table as one process."""
+
+import csv
+import os
+
+import pytest
+
+import grid_cases
+from cuspid.errors import InputError
+from cuspid.studies.grid import Case, grid, run_grid, table
+
+
+def cases(values, **fixed):
+    return tuple(Case(name=f"x{value}", parameters={"x": value, **fixed}) for value in values)
+
+
+def test_a_grid_is_the_product_of_its_axes_and_keeps_their_order(tmp_path):
+    points = grid(baseline_mm=(1.0, 2.5), angle_deg=(0, 3, 6))
+    assert [tuple(point.parameters.values()) for point in points][:4] == [(1.0, 0), (1.0, 3), (1.0, 6), (2.5, 0)]
+    assert len({point.name for point in points}) == 6
+    assert points[0].name == "baseline_mm-1.0_angle_deg-0"
+
+
+def test_results_are_in_order_and_have_units_in_their_columns(tmp_path):
+    outcomes = run_grid(cases([3, 1, 2]), grid_cases.square, tmp_path, workers=2)
+    assert [outcome.figures["square_mm2"] for outcome in outcomes] == [9, 1, 4]
+    rows = list(csv.DictReader((tmp_path / "results.csv").open()))
+    assert [row["square_mm2"] for row in rows] == ["9.0", "1.0", "4.0"]
+    assert [row["x"] for row in rows] == ["3", "1", "2"]
+    assert all(row["failure"] == "" for row in rows)
+
+
+def test_a_failed_case_is_recorded_and_stops_nobody(tmp_path):
+    outcomes = run_grid(cases([1, 2, 3, 4]), grid_cases.refuses_two, tmp_path, workers=2)
+    assert [outcome.failure for outcome in outcomes][1] == "no surface: the images need texture"
+    assert "ZeroDivisionError" in outcomes[2].failure
+    assert outcomes[0].figures == {"half": -0.5}
+    assert outcomes[3].figures == {"half": 2.0}
+
+
+def test_a_case_that_kills_its_process_is_recorded(tmp_path):
+    outcomes = run_grid(cases([2, 3, 4]), grid_cases.dies_on_three, tmp_path, workers=1)
+    assert [outcome.figures.get("y") for outcome in outcomes] == [2.0, None, 4.0]
+    assert "signal 9" in outcomes[1].failure
+
+
+def test_what_is_finished_is_not_run_again(tmp_path):
+    few = run_grid(cases([1, 2], folder=str(tmp_path)), grid_cases.leaves_a_mark, tmp_path / "out", workers=1)
+    assert len(few) == 2
+    seen = []
+    run_grid(
+        cases([1, 2, 3], folder=str(tmp_path)),
+        grid_cases.leaves_a_mark,
+        tmp_path / "out",
+        workers=1,
+        progress=lambda done, total: seen.append((done, total)),
+    )
+    assert (tmp_path / "calls").read_text().split() == ["1", "2", "3"]
+    assert seen == [(2, 3), (3, 3)]
+
+
+def test_failed_cases_are_run_again_where_asked(tmp_path):
+    run_grid(cases([2], folder=str(tmp_path)), grid_cases.is_killed_once, tmp_path / "out", workers=1)
+    kept = run_grid(cases([2], folder=str(tmp_path)), grid_cases.is_killed_once, tmp_path / "out", workers=1)
+    assert kept[0].failure is not None
+    again = run_grid(
+        cases([2], folder=str(tmp_path)), grid_cases.is_killed_once, tmp_path / "out", workers=1, retry_failed=True
+    )
+    assert again[0].figures == {"y": 20.0}
+
+
+def test_other_parameters_under_the_same_name_are_refused(tmp_path):
+    run_grid([Case(name="a", parameters={"x": 1})], grid_cases.square, tmp_path, workers=1)
+    with pytest.raises(InputError, match="other parameters"):
+        run_grid([Case(name="a", parameters={"x": 2})], grid_cases.square, tmp_path, workers=1)
+    with pytest.raises(InputError, match="two cases are called a"):
+        run_grid([Case(name="a", parameters={"x": 2})] * 2, grid_cases.square, tmp_path, workers=1)
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    distributed = pytest.importorskip("distributed", reason="needs Dask: pip install 'cuspid[cluster]'")
+    os.environ["PYTHONPATH"] = os.path.dirname(grid_cases.__file__)  # noqa: PTH120
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
+    ) as made:
+        yield made.scheduler_address
+
+
+def test_a_cluster_that_loses_a_worker_gives_the_serial_table(tmp_path, cluster):
+    for name in ("serial", "cluster"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "serial" / "first").touch()
+    serial = run_grid(
+        [Case(name=f"x{k}", parameters={"x": k, "folder": str(tmp_path / "serial")}) for k in range(6)],
+        grid_cases.is_killed_once,
+        tmp_path / "a",
+        workers=1,
+    )
+    clustered = run_grid(
+        [Case(name=f"x{k}", parameters={"x": k, "folder": str(tmp_path / "cluster")}) for k in range(6)],
+        grid_cases.is_killed_once,
+        tmp_path / "b",
+        cluster=cluster,
+    )
+    assert (tmp_path / "cluster" / "first").exists(), "no worker was killed"
+    assert table(clustered).replace("/cluster", "/serial") == table(serial)
+    assert all(outcome.failure is None for outcome in clustered)
+
+
+def test_a_cluster_that_does_not_answer(tmp_path, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("cuspid.studies.grid.CLUSTER_TIMEOUT_S", 1)
+    with pytest.raises(InputError, match="no Dask scheduler answers"):
+        run_grid(cases([1]), grid_cases.square, tmp_path, cluster="tcp://127.0.0.1:9")
+    assert not (tmp_path / "cases").exists()
