@@ -62,10 +62,13 @@ def silent(stage: str, done: int, total: int) -> None:
 
 
 def load_jaw(path: Path, *, unit: storage.Unit = "mm", arch: Arch | None = None) -> tuple[Jaw, tuple[str, ...]]:
-    """A user's jaw mesh, brought into the occlusal frame, and notes on what was found or is unsure.
+    """A user's jaw mesh, brought into the occlusal frame, and notes on what was found or is unsure; a jaw that cuspid
+    wrote, as it is.
 
     Raises InputError where the file is no mesh, or its width is not that of a jaw in the given unit.
     """
+    if storage.is_jaw(path):
+        return storage.read_jaw(path), ()
     mesh, labels, colors = storage.read_labelled_mesh(path, unit)
     notes = check_scale(mesh, unit)
     occlusal = find_occlusal_frame(mesh)
@@ -81,6 +84,8 @@ def load_reference(
     """What a scan is compared with: a mesh file, or the ``truth`` folder of a simulation, which also knows which faces
     could be seen (None for a mesh file). Also the hashes of the files."""
     if not path.is_dir():
+        if storage.is_jaw(path):
+            return storage.read_jaw(path), None, {"reference": storage.hash_file(path)}
         mesh, labels, _ = storage.read_labelled_mesh(path, unit)
         return Jaw(mesh=mesh, face_labels=labels, arch=arch), None, {"reference": storage.hash_file(path)}
     truth = storage.read_truth(path)

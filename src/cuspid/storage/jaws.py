@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import trimesh
@@ -20,6 +20,9 @@ MM_PER_UNIT: Mapping[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25
 """Length units that a mesh file may be in."""
 
 MESH_SUFFIXES = (".stl", ".ply", ".obj")
+
+OCCLUSAL = "occlusal"
+"""Name of the frame of a jaw in its JSON file."""
 
 
 def read_mesh(path: Path, unit: Unit = "mm") -> Mesh:
@@ -117,6 +120,7 @@ def write_jaw(path: Path, jaw: Jaw) -> None:
     """Write a jaw as PLY with its labels, and what a mesh file cannot hold as JSON beside it."""
     write_mesh(path, jaw.mesh, jaw.face_labels)
     extra = {
+        "frame": OCCLUSAL,
         "arch": jaw.arch,
         "landmarks": {
             label: {"position_mm": point.position, "estimated_sigma_mm": point.estimated_sigma_mm}
@@ -130,12 +134,23 @@ def write_jaw(path: Path, jaw: Jaw) -> None:
     write_json(path.with_suffix(".json"), extra)
 
 
+def is_jaw(path: Path) -> bool:
+    """Whether :func:`write_jaw` wrote a mesh file, so that its frame is known and more than the mesh may be read."""
+    beside = path.with_suffix(".json")
+    if path.suffix.lower() not in MESH_SUFFIXES or not beside.is_file():
+        return False
+    extra = read_json(beside)
+    return isinstance(extra, dict) and extra.get("frame") == OCCLUSAL
+
+
 def read_jaw(path: Path) -> Jaw:
-    """A jaw that :func:`write_jaw` wrote, already in the occlusal frame and in mm."""
+    """A jaw that :func:`write_jaw` wrote, already in the occlusal frame and in mm.
+
+    Raises InputError where the JSON beside the mesh is missing or broken.
+    """
     mesh, labels, _ = read_labelled_mesh(path)
     beside = path.with_suffix(".json")
-    empty: dict[str, Any] = {"arch": None, "landmarks": {}, "lines_mm": {}, "spheres": {}}
-    extra = read_json(beside) if beside.exists() else empty
+    extra = read_json(beside)
     with reading(beside):
         arch: Arch | None = extra["arch"]
         return Jaw(
