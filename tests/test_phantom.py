@@ -12,7 +12,8 @@ from scipy.spatial import cKDTree
 
 from cuspid.anatomy.crowns import Points
 from cuspid.anatomy.dentition import ARCH_FORMS
-from cuspid.anatomy.phantom import PhantomOptions, PlacedTooth, build_phantom, place_teeth
+from cuspid.anatomy.landmarks import labels_of
+from cuspid.anatomy.phantom import PhantomOptions, PlacedTooth, build_phantom, phantom_landmarks, place_teeth
 from cuspid.jaw import GUM, Jaw
 
 COARSE_MM = 0.4
@@ -191,3 +192,35 @@ def test_cusps_are_as_many_as_the_tooth_has(jaw: Jaw, teeth: dict[int, PlacedToo
         expected = CUSPS[options.arch].get(fdi % 10)
         if expected:
             assert len(tips_of(jaw, tooth)) in expected, fdi
+
+
+def test_the_landmarks_are_those_of_the_scheme(jaw: Jaw, options: PhantomOptions) -> None:
+    assert len(jaw.landmarks) == 72
+    assert set(jaw.landmarks) == set(labels_of(jaw.teeth))
+    assert all(landmark.estimated_sigma_mm is None for landmark in jaw.landmarks.values())
+    again = phantom_landmarks(options)
+    assert all(np.array_equal(again[label].position, jaw.landmarks[label].position) for label in again)
+
+
+def test_the_landmarks_lie_on_the_surface(jaw: Jaw) -> None:
+    away = jaw.mesh.closest(np.array([landmark.position for landmark in jaw.landmarks.values()]))[0]
+    assert np.count_nonzero(away < 0.05) >= 70
+    assert away.max() < 0.5 * COARSE_MM
+
+
+def test_the_landmarks_lie_on_their_tooth(jaw: Jaw) -> None:
+    for label, landmark in jaw.landmarks.items():
+        if label[0].isdigit():
+            assert cKDTree(surface_of(jaw, int(label[:2]))).query(landmark.position)[0] < COARSE_MM, label
+
+
+def test_the_arch_widths_are_those_of_the_arch_form(jaw: Jaw, options: PhantomOptions) -> None:
+    form = ARCH_FORMS[options.arch]
+    negative, positive = quadrants(options)
+    for position, point, expected in (
+        (3, "cusp_tip", form.inter_canine_mm),
+        (6, "buccal_groove", form.inter_first_molar_mm),
+        (7, "buccal_groove", form.inter_second_molar_mm),
+    ):
+        ends = [jaw.landmarks[f"{quadrant + position}.{point}"].position for quadrant in (negative, positive)]
+        assert abs(np.linalg.norm(ends[1] - ends[0]) - expected) < 0.05

@@ -1,0 +1,153 @@
+"""The landmarks of a phantom, exact points of its implicit surface (scheme: `cuspid.anatomy.landmarks`).
+
+A *cervix* is the lowest point of the gum's margin on that side of a tooth, along its long axis. The papilla of a lower
+jaw is the highest point of the gum between the central incisors on the lingual side; that of an upper jaw lies behind
+the central incisors, `PAPILLA_BELOW_MM` apical of their palatal cervices.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+from cuspid.anatomy.arrangement import PlacedTooth
+from cuspid.anatomy.crown_points import Point, crown_points
+from cuspid.anatomy.crowns import Points, Values, crown_distance, silhouettes
+from cuspid.anatomy.gum import margin_height
+from cuspid.anatomy.isosurface import newton_step, value_and_gradient
+from cuspid.anatomy.landmarks import TOOTH_LANDMARKS, kind_of, labels_of
+from cuspid.anatomy.solid import CREASE_MM, Solid
+from cuspid.jaw import Arch, Landmark
+
+PAPILLA_BELOW_MM = 1.0
+"""Height of the palatal cervices of the upper central incisors above the centre of the incisive papilla."""
+REACH = 0.5
+"""Half the part of the margin that is searched for its lowest point, as a fraction of half the width of the tooth."""
+
+
+def landmarks_of(solid: Solid, arch: Arch) -> dict[str, Landmark]:
+    """All landmarks of the teeth and the midline, by label, in the occlusal frame."""
+    points = {f"{placed.fdi}.{name}": p for placed in solid.teeth for name, p in _crown_points(placed).items()}
+    points = dict(zip(points, _onto(solid, np.array(list(points.values()))), strict=True))
+    for placed in solid.teeth:
+        points |= {f"{placed.fdi}.{name}": point for name, point in _cervices(solid, placed).items()}
+    points |= _midline_points(solid, arch, points)
+    return {label: Landmark(points[label]) for label in labels_of(placed.fdi for placed in solid.teeth)}
+
+
+def _crown_points(placed: PlacedTooth) -> dict[str, Point]:
+    """The landmarks on a crown, in the jaw."""
+    points = crown_points(placed.tooth.crown, kind_of(placed.fdi))
+    return {name: placed.to_jaw(point) for name, point in points.items()}
+
+
+def _onto(solid: Solid, points: Points) -> Points:
+    """Points (n, 3) moved onto the surface: where neighbours touch, their crease is rounded."""
+    for _ in range(3):
+        points = newton_step(points, *value_and_gradient(solid.distance, points), 0.2)
+    return points
+
+
+# Points on the margin of the gum
+
+
+def _cervices(solid: Solid, placed: PlacedTooth) -> dict[str, Point]:
+    """The lowest point of the margin on either side, where the scheme has it."""
+    names = [name for name in TOOTH_LANDMARKS[kind_of(placed.fdi)] if name.endswith("_cervix")]
+    return {name: _cervix(solid, placed, -1 if name.startswith("lingual") else 1) for name in names}
+
+
+def _cervix(solid: Solid, placed: PlacedTooth, side: int) -> Point:
+    """The lowest point of the margin on the buccal (+1) or lingual (-1) side."""
+    middle, reach = 0.0, REACH * placed.tooth.crown.half_width_mm
+    local = np.zeros((0, 3))
+    for _ in range(2):
+        local = _margin_points(solid, placed, side, middle + reach * np.linspace(-1.0, 1.0, 11))
+        middle, reach = local[local[:, 2].argmin(), 0], 0.2 * reach
+    return placed.to_jaw(local[local[:, 2].argmin()])
+
+
+def _margin_points(solid: Solid, placed: PlacedTooth, side: int, x: Values) -> Points:
+    """The points (n, 3) of the margin at given x (n,) on one side, in the frame of the tooth."""
+    crown = placed.tooth.crown
+    local = np.column_stack([x, np.zeros_like(x), np.zeros_like(x)])
+    local[:, 2] = margin_height(placed, local)
+    local[:, 1] = silhouettes(crown, local[:, 2] / crown.height_mm)[2 if side > 0 else 3]
+
+    def parts(points: Points) -> Float[np.ndarray, "n 2"]:
+        tooth, gum, _ = solid.parts(points @ placed.axes.T + placed.origin)
+        return np.column_stack([tooth, gum]) - CREASE_MM / 4
+
+    return _root(parts, local, np.eye(3)[1:])
+
+
+def _root(
+    function: Callable[[Points], Float[np.ndarray, "n 2"]], points: Points, along: Float[np.ndarray, "2 3"]
+) -> Points:
+    """Points (n, 3) moved along two directions to where both values of a function vanish (Newton's method)."""
+    step_mm = 0.01
+    for _ in range(8):
+        values = function(points)
+        slopes = np.stack([(function(points + step_mm * d) - values) / step_mm for d in along], axis=2)
+        move = np.einsum("nij,nj->ni", np.linalg.pinv(slopes, rcond=0.1), -values)
+        points = points + np.clip(move, -0.5, 0.5) @ along
+    return points
+
+
+# Points at the midline
+
+
+def _midline_points(solid: Solid, arch: Arch, points: dict[str, Point]) -> dict[str, Point]:
+    """Papilla and midline, from the landmarks of the central incisors."""
+    left, right = (placed.fdi for placed in solid.teeth if placed.fdi % 10 == 1)
+    middle = (points[f"{left}.mesial_angle"] + points[f"{right}.mesial_angle"]) / 2
+    return {
+        "papilla": _incisive_papilla(solid, points) if arch == "upper" else _lingual_papilla(solid),
+        "midline": _first_inside(solid, middle + [0.0, 0.0, 2.0], np.array([0.0, 0.0, -1.0]), 12.0),
+    }
+
+
+def _incisive_papilla(solid: Solid, points: dict[str, Point]) -> Point:
+    """The point of the palatal gum behind the contact of the central incisors."""
+    between, lingual = _between_centrals(solid)
+    level = np.mean([points[f"{p.fdi}.lingual_cervix"][2] for p in solid.teeth if p.fdi % 10 == 1])
+    start = np.array([*between[:2], level - PAPILLA_BELOW_MM])
+    return _first_inside(solid, start + 12.0 * lingual, -lingual, 12.0)
+
+
+def _lingual_papilla(solid: Solid) -> Point:
+    """The highest point of the gum between the central incisors, on their lingual side."""
+    between, lingual = _between_centrals(solid)
+    along, up = np.meshgrid(np.linspace(0.0, 6.0, 61), np.linspace(-4.0, 9.0, 131), indexing="ij")
+    points = between * [1.0, 1.0, 0.0] + along.reshape(-1, 1) * lingual + up.reshape(-1, 1) * [0.0, 0.0, 1.0]
+    points[:, 2] += between[2]
+    tooth, gum, _ = solid.parts(points)
+    inside = (gum < tooth) & (gum < CREASE_MM / 4)
+    start = points[inside][points[inside, 2].argmax()][None]
+
+    def parts(points: Points) -> Float[np.ndarray, "n 2"]:
+        tooth, gum, _ = solid.parts(points)
+        return np.column_stack([tooth, gum]) - CREASE_MM / 4
+
+    return _root(parts, start, np.stack([lingual, [0.0, 0.0, 1.0]]))[0]
+
+
+def _between_centrals(solid: Solid) -> tuple[Point, Point]:
+    """The point between the central incisors where they are equally near, and the lingual direction there."""
+    one, other = (placed for placed in solid.teeth if placed.fdi % 10 == 1)
+    ends = [placed.to_jaw(np.array([0.0, 0.0, 0.4 * placed.tooth.crown.height_mm])) for placed in (one, other)]
+    line = np.linspace(ends[0], ends[1], 201)
+    lead = np.abs(
+        crown_distance(one.tooth.crown, one.to_tooth(line)) - crown_distance(other.tooth.crown, other.to_tooth(line))
+    )
+    across = ends[1] - ends[0]
+    lingual = np.array([across[1], -across[0], 0.0])
+    return line[lead.argmin()], lingual / np.linalg.norm(lingual)
+
+
+def _first_inside(solid: Solid, start: Point, direction: Point, length_mm: float) -> Point:
+    """Where a ray first meets the surface."""
+    reach = np.linspace(0.0, length_mm, int(40 * length_mm))
+    distance = solid.distance(start + reach[:, None] * direction)
+    first = int(np.flatnonzero(distance < 0)[0])
+    return start + np.interp(0.0, distance[[first, first - 1]], reach[[first, first - 1]]) * direction
