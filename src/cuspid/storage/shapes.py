@@ -1,0 +1,158 @@
+"""A statistical shape model of jaws, and how it is stored: the mean as a jaw, the modes as arrays beside it.
+
+Notation: a jaw of the model is ``mean + sum_k w_k sd_k mode_k`` with weights ``w`` in standard deviations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from io import BytesIO
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from jaxtyping import Float
+
+from cuspid.errors import InputError
+from cuspid.jaw import Jaw, Landmark
+from cuspid.mesh import Mesh
+from cuspid.storage.files import read_json, reading, write_bytes, write_json
+from cuspid.storage.jaws import read_jaw, write_jaw
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeanStep:
+    """One round of the iteration: the current mean laid on all samples, and their mean taken."""
+
+    change_um: float
+    """How far the vertices of the mean moved, root mean square."""
+    surface_change_um: float
+    """How far they moved along the normals of the mean: what changes its surface, root mean square."""
+    largest_change_um: float
+    """How far the vertex that moved most did."""
+    covered_pct: float
+    """Share of the vertices, over all samples, that lie on the sample's surface."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ShapeModel:
+    """The mean of a set of jaws and how they vary about it."""
+
+    mean: Jaw
+    """Mean jaw with the faces and labels of the first sample, and the mean of the common landmarks."""
+    modes: Float[np.ndarray, "k v 3"]
+    """Principal modes: displacement of each vertex of the mean, root mean square 1 over the surface."""
+    landmark_modes: Float[np.ndarray, "k l 3"]
+    """The same modes at the landmarks, in the order of ``mean.landmarks``."""
+    standard_deviations_mm: Float[np.ndarray, "k"]
+    """Standard deviation of each mode over the samples: root mean square displacement of the surface, mm."""
+    variance_shares: Float[np.ndarray, "k"]
+    """Share of each mode in the variance of all, also of those that were left out."""
+    scores: Float[np.ndarray, "n k"]
+    """Weights of each sample, in standard deviations."""
+    names: tuple[str, ...]
+    """The samples."""
+    scales: Float[np.ndarray, "n"]
+    """By which each sample was scaled; ones where the size was kept."""
+    scaled: bool
+    """Whether the samples were scaled to a common size."""
+    first: str
+    """The sample whose faces and labels the mean has."""
+    correspondence: str
+    """How corresponding points were found: ``surface`` or ``landmarks``."""
+    converged: bool
+    """Whether the mean stopped moving."""
+    log: tuple[MeanStep, ...]
+    """Each round of the iteration."""
+    notes: tuple[str, ...]
+    """What the user should know: teeth that some samples lack, landmarks that were left out."""
+
+    @property
+    def variance_mm2(self) -> Float[np.ndarray, "k"]:
+        """Variance of each mode, mm^2."""
+        return np.asarray(self.standard_deviations_mm**2)
+
+    def sample(self, weights: Sequence[float] | Float[np.ndarray, "w"]) -> Jaw:
+        """The jaw with the given weights of the first modes, in standard deviations; the other weights are zero.
+
+        Raises InputError for more weights than modes.
+        """
+        given = np.asarray(weights, dtype=np.float64)
+        if len(given) > len(self.modes):
+            raise InputError(f"shape model: {len(given)} weights for {len(self.modes)} modes; give fewer")
+        steps = given * self.standard_deviations_mm[: len(given)]
+        moved = self.mean.mesh.vertices + np.einsum("k,kvd->vd", steps, self.modes[: len(given)])
+        points = np.einsum("k,kld->ld", steps, self.landmark_modes[: len(given)])
+        landmarks = {
+            label: Landmark(point.position + shift)
+            for (label, point), shift in zip(self.mean.landmarks.items(), points, strict=True)
+        }
+        return replace(self.mean, mesh=replace(self.mean.mesh, vertices=moved), landmarks=landmarks)
+
+
+def write_shape_model(folder: Path, model: ShapeModel) -> None:
+    """Write ``mean.ply`` (with ``mean.json``), ``modes.npz`` and, last, ``shape.json``, which completes them."""
+    write_jaw(folder / "mean.ply", model.mean)
+    buffer = BytesIO()
+    # A mesh file does not keep the order of the vertices.
+    np.savez(
+        buffer,
+        vertices=model.mean.mesh.vertices,
+        faces=model.mean.mesh.faces,
+        modes=model.modes.astype(np.float32),
+        landmark_modes=model.landmark_modes,
+    )
+    write_bytes(folder / "modes.npz", buffer.getvalue())
+    summary = {
+        "samples": model.names,
+        "first": model.first,
+        "scaled": model.scaled,
+        "scales": model.scales,
+        "correspondence": model.correspondence,
+        "converged": model.converged,
+        "standard_deviations_mm": model.standard_deviations_mm,
+        "variance_mm2": model.variance_mm2,
+        "variance_shares": model.variance_shares,
+        "scores_sd": model.scores,
+        "log": model.log,
+        "notes": model.notes,
+    }
+    write_json(folder / "shape.json", summary)
+
+
+def read_shape_model(folder: Path) -> ShapeModel:
+    """A shape model that :func:`write_shape_model` wrote. Raises InputError where a part is missing or broken."""
+    summary_path = folder / "shape.json"
+    summary = read_json(summary_path)
+    mean = read_jaw(folder / "mean.ply")
+    mesh, modes, landmark_modes = _read_modes(folder / "modes.npz")
+    if len(mesh.faces) != len(mean.mesh.faces) or landmark_modes.shape[1] != len(mean.landmarks):
+        raise InputError(f"{folder / 'modes.npz'}: not the modes of mean.ply beside it; make the shape model again")
+    with reading(summary_path):
+        return ShapeModel(
+            mean=replace(mean, mesh=mesh),
+            modes=modes,
+            landmark_modes=landmark_modes,
+            standard_deviations_mm=np.array(summary["standard_deviations_mm"], dtype=np.float64),
+            variance_shares=np.array(summary["variance_shares"], dtype=np.float64),
+            scores=np.array(summary["scores_sd"], dtype=np.float64).reshape(len(summary["samples"]), -1),
+            names=tuple(summary["samples"]),
+            scales=np.array(summary["scales"], dtype=np.float64),
+            scaled=summary["scaled"],
+            first=summary["first"],
+            correspondence=summary["correspondence"],
+            converged=summary["converged"],
+            log=tuple(MeanStep(**step) for step in summary["log"]),
+            notes=tuple(summary["notes"]),
+        )
+
+
+def _read_modes(path: Path) -> tuple[Mesh, Float[np.ndarray, "k v 3"], Float[np.ndarray, "k l 3"]]:
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return Mesh(stored["vertices"], stored["faces"]), stored["modes"], stored["landmark_modes"]
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); make the shape model again") from error
+    except (KeyError, ValueError, BadZipFile) as error:
+        raise InputError(f"{path}: not the modes of a shape model ({error}); make the shape model again") from error
