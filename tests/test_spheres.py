@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from cuspid.anatomy.dentition import ARCH_FORMS
 from cuspid.anatomy.sphere_arch import SphereArchOptions, build_sphere_arch
@@ -21,6 +23,7 @@ from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import twelve_cameras
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
+from cuspid.reporting.sphere_figures import save_sphere_picture
 from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path
 
 COARSE = SphereArchOptions(edge_mm=0.45)
@@ -277,3 +280,19 @@ def test_a_sphere_is_fitted_exactly_whatever_its_cap(
     points = np.array(centre) + radius * np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
     found, size = fit_sphere(points, rng.uniform(0.5, 2, 200))
     np.testing.assert_allclose([*found, size], [*centre, radius], atol=1e-6)
+
+
+def test_the_picture_is_drawn_also_where_a_sphere_is_missing(coarse_arch: Jaw, worn_arch: Mesh, tmp_path: Path) -> None:
+    report = evaluate_spheres(worn_arch.submesh(coarse_arch.face_labels != 47), coarse_arch, Rigid3.identity())
+    assert set(report.named_um) == {"33-43", "36-46", "33-46", "43-36"}
+    save_sphere_picture(
+        tmp_path / "spheres.png",
+        coarse_arch,
+        {label: sphere.form_rms_um for label, sphere in report.spheres.items()},
+        np.array([each.nominal_mm for each in report.spacings]),
+        np.array([each.error_um for each in report.spacings]),
+        report.named_um,
+        report.scale_ppm,
+        title="worn",
+    )
+    assert np.asarray(Image.open(tmp_path / "spheres.png")).std() > 10

@@ -41,6 +41,8 @@ _DIRECTIONS = 400
 _COVERED_DEG = 8.0
 """A direction is covered where a point lies this near; neighbouring directions are 10 deg apart."""
 _SIGMA_OF_MAD = 1.4826
+_SIDES = (("3", "4"), ("1", "2"))
+"""FDI quadrants that face each other, lower and upper."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,6 +134,13 @@ class SphereReport:
     """Errors of the distances between a canine and the first molar of the other side, as "33-46"."""
     notes: tuple[str, ...]
     """How it was measured, for people."""
+
+    @property
+    def named_um(self) -> dict[str, float]:
+        """Errors of the distances across the arch that have a name, by "<label>-<label>"."""
+        pairs = {f"{one}{position}-{other}{position}" for one, other in _SIDES for position in (3, 6, 7)}
+        named = {f"{each.first}-{each.second}": each.error_um for each in self.spacings}
+        return {name: error for name, error in named.items() if name in pairs} | dict(self.cross_arch_um)
 
 
 def evaluate_spheres(
@@ -347,10 +356,6 @@ def _report(
         cross_arch_um={f"{a}-{b}": between[pair] for a, b in crossing if (pair := frozenset((a, b))) in between},
         notes=_notes(options),
     )
-
-
-_SIDES = (("3", "4"), ("1", "2"))
-"""FDI quadrants that face each other, lower and upper."""
 
 
 def _spacing(
