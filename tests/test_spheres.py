@@ -38,7 +38,7 @@ def arch() -> Jaw:
 @pytest.fixture(scope="module")
 def coarse_arch() -> Jaw:
     """With few faces; its vertices lie on the spheres all the same."""
-    return build_sphere_arch(COARSE)
+    return build_sphere_arch("lower", COARSE)
 
 
 # --- the object ---------------------------------------------------------------------------------------------------
@@ -75,7 +75,7 @@ def test_each_sphere_is_free_down_to_the_ridge_and_all_round(arch: Jaw) -> None:
 
 @pytest.mark.parametrize("which", ["lower", "upper"])
 def test_canines_and_molars_are_as_wide_apart_as_in_the_arch_form(which: str) -> None:
-    spheres = build_sphere_arch(SphereArchOptions(arch=which, edge_mm=0.9)).spheres
+    spheres = build_sphere_arch(which, SphereArchOptions(edge_mm=0.9)).spheres
     left, right = ("3", "4") if which == "lower" else ("1", "2")
     form = ARCH_FORMS[which]
     for position, width in (
@@ -116,7 +116,7 @@ def test_the_twelve_cameras_can_scan_it_like_a_jaw(coarse_arch: Jaw) -> None:
 )
 def test_impossible_options_are_refused_in_one_line(options: dict[str, float], word: str) -> None:
     with pytest.raises(InputError, match=word) as caught:
-        build_sphere_arch(SphereArchOptions(**options))
+        build_sphere_arch("lower", SphereArchOptions(**options))
     assert "\n" not in str(caught.value)
 
 

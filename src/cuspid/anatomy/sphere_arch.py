@@ -46,8 +46,6 @@ _LONGEST_EDGE = 1.26
 class SphereArchOptions:
     """Size of the sphere arch, and how finely it is meshed."""
 
-    arch: Arch = "lower"
-    """Which jaw it stands for."""
     radius_mm: float = 2.5
     """Radius of the spheres."""
     edge_mm: float = 0.11
@@ -77,29 +75,29 @@ class SphereArchOptions:
         return float(np.rad2deg(np.arccos(-self.rise_mm / self.radius_mm)))
 
 
-def build_sphere_arch(options: SphereArchOptions = SphereArchOptions()) -> Jaw:
+def build_sphere_arch(arch: Arch = "lower", options: SphereArchOptions = SphereArchOptions()) -> Jaw:
     """The watertight sphere arch: faces of the sphere at a tooth position carry its FDI number, the ridge 0.
 
     ``Jaw.spheres`` holds the centres and radii by FDI number. Raises InputError where the spheres would touch.
     """
-    spheres = place_spheres(options)
+    spheres = place_spheres(arch, options)
     ball = _ball(options)
     parts: dict[int, Manifold] = {GUM: _ridge(options, np.array([sphere.centre for sphere in spheres.values()]))}
     for label, sphere in spheres.items():
         parts[int(label)] = ball.translate(tuple(sphere.centre))
     mesh, labels = _union(parts)
-    return Jaw(mesh=mesh, face_labels=labels, arch=options.arch, spheres=spheres)
+    return Jaw(mesh=mesh, face_labels=labels, arch=arch, spheres=spheres)
 
 
 # --- where the spheres are ----------------------------------------------------------------------------------------
 
 
-def place_spheres(options: SphereArchOptions) -> dict[str, Sphere]:
+def place_spheres(arch: Arch, options: SphereArchOptions) -> dict[str, Sphere]:
     """The spheres by FDI number, from the second molar at X < 0 round to the one at X > 0; their tops level on average.
 
     Raises InputError where two would touch.
     """
-    side = _quadrant(ARCH_FORMS[options.arch], options.depth_mm)
+    side = _quadrant(ARCH_FORMS[arch], options.depth_mm)
     xy = np.concatenate([side[::-1] * [-1, 1], side])
     gap = np.linalg.norm(np.diff(xy, axis=0), axis=1).min() - 2 * options.radius_mm
     if gap < _LEAST_GAP_MM:
@@ -107,9 +105,9 @@ def place_spheres(options: SphereArchOptions) -> dict[str, Sphere]:
             f"sphere arch: spheres of {options.radius_mm:g} mm radius stand {gap:.2f} mm apart, less than "
             f"{_LEAST_GAP_MM:g} mm; choose a smaller radius_mm"
         )
-    quadrants = {"lower": (30, 40), "upper": (10, 20)}[options.arch]
+    quadrants = {"lower": (30, 40), "upper": (10, 20)}[arch]
     numbers = [quadrants[0] + k for k in range(_POSITIONS, 0, -1)] + [quadrants[1] + k + 1 for k in range(_POSITIONS)]
-    z = _spee(xy[:, 1], options) - options.radius_mm
+    z = (1 if arch == "upper" else -1) * _spee(xy[:, 1], options.spee_mm) - options.radius_mm
     centres = np.column_stack([xy - xy.mean(axis=0), z])
     return {str(fdi): Sphere(centre, options.radius_mm) for fdi, centre in zip(numbers, centres, strict=True)}
 
@@ -133,10 +131,10 @@ def _beta_form(width_mm: float, depth_mm: float) -> Float[np.ndarray, "n 2"]:
     return np.column_stack([x, y])
 
 
-def _spee(y: Float[np.ndarray, "n"], options: SphereArchOptions) -> Float[np.ndarray, "n"]:
+def _spee(y: Float[np.ndarray, "n"], depth_mm: float) -> Float[np.ndarray, "n"]:
     """Height of the curve of Spee, level on average."""
     u = (y - y.min()) / np.ptp(y)
-    z = (1 if options.arch == "upper" else -1) * options.spee_mm * 4 * u * (1 - u)
+    z = depth_mm * 4 * u * (1 - u)
     return np.asarray(z - z.mean())
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 from tyro.conf import OmitArgPrefixes, Positional, arg
@@ -14,9 +15,13 @@ from cuspid import pipeline, storage
 from cuspid.capture import Capture
 from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress
 from cuspid.evaluation.deviation import EvaluationOptions
+from cuspid.evaluation.spheres import SphereReport, evaluate_spheres
+from cuspid.jaw import Jaw
+from cuspid.mesh import Mesh
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.reconstruction import Reconstruction
 from cuspid.reporting.figures import deviation_colors, save_deviation_picture
+from cuspid.reporting.sphere_figures import save_sphere_picture
 from cuspid.trueness import Trueness
 
 
@@ -129,7 +134,53 @@ def _evaluate(mesh: Path, reference: Path, out: Path, source: Source, options: E
         storage.write_mesh(out / "deviation.ply", replace(scan, colors=deviation_colors(trueness.deviation_um)))
         save_deviation_picture(out / "deviation.png", scan, trueness)
         storage.write_trueness(out / "trueness.json", trueness)
+        spheres = _evaluate_spheres(scan, known, trueness, out) if known.spheres else None
     _print_trueness(trueness)
+    if spheres is not None:
+        _print_spheres(spheres)
+
+
+def _evaluate_spheres(scan: Mesh, reference: Jaw, trueness: Trueness, out: Path) -> SphereReport:
+    report = evaluate_spheres(scan, reference, trueness.reference_from_scan)
+    storage.write_json(out / "spheres.json", report)
+    save_sphere_picture(
+        out / "spheres.png",
+        reference,
+        {label: sphere.form_rms_um for label, sphere in report.spheres.items()},
+        np.array([spacing.nominal_mm for spacing in report.spacings]),
+        np.array([spacing.error_um for spacing in report.spacings]),
+        _named_spacings(report),
+        report.scale_ppm,
+        title="Spheres in the scan, without a best fit",
+    )
+    return report
+
+
+def _named_spacings(report: SphereReport) -> dict[str, float]:
+    """Spacing errors in um across the arch between canines, first molars, second molars, and canine and first molar."""
+    wanted = {("3", "3"), ("6", "6"), ("7", "7"), ("3", "6"), ("6", "3")}
+    return {
+        f"{spacing.first}-{spacing.second}": spacing.error_um
+        for spacing in report.spacings
+        if spacing.first[0] != spacing.second[0] and (spacing.first[1], spacing.second[1]) in wanted
+    }
+
+
+def _print_spheres(report: SphereReport) -> None:
+    table = Table(title="Spheres in µm, without a best fit", title_justify="left")
+    for column in ("sphere", "size error", "form error (range)", "form RMS", "cap covered, %"):
+        table.add_column(column, justify="left" if column == "sphere" else "right")
+    for label, sphere in report.spheres.items():
+        figures = (sphere.size_error_um, sphere.form_range_um, sphere.form_rms_um, sphere.coverage_pct)
+        table.add_row(label, *(f"{figure:.1f}" for figure in figures))
+    Console().print(table)
+    console.print(
+        f"spacing error of {len(report.spacings)} pairs: max {report.spacing_max_um:.1f} µm, RMS "
+        f"{report.spacing_rms_um:.1f} µm, scale {report.scale_ppm:+.0f} ppm; "
+        + ", ".join(f"{name} {error:+.1f}" for name, error in _named_spacings(report).items())
+    )
+    for label, reason in report.not_measured.items():
+        console.print(f"  not measured: {label}: {reason}")
 
 
 def _print_located(reconstruction: Reconstruction, capture: Capture) -> None:
