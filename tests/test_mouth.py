@@ -13,15 +13,17 @@ from scipy.optimize import brentq
 
 from cuspid.anatomy.mouth import (
     OPENINGS,
+    PRINTED_GAP_MM,
     RAMUS,
     Anatomy,
     Mouth,
     MouthOptions,
     Normal,
     draw_people,
+    fit_curve,
     fit_pct,
     opening_turn_rad,
-    room_mm,
+    sagittal_view,
     study_mouths,
     thesis_lines,
     tooth_ends_mm,
@@ -200,6 +202,9 @@ def test_the_draw_follows_its_options() -> None:
     assert np.mean(tall.mouth.depth_mm) == pytest.approx(RAMUS.mean, abs=0.3)
     bare = draw_people(opening, MouthOptions(overlap=False), np.random.default_rng(0))
     assert np.all(bare.mouth.overlap_mm == 0)
+    half = draw_people(opening, MouthOptions(held=0.5), np.random.default_rng(0))
+    assert np.mean(half.mouth.interincisal_mm) == pytest.approx(opening.mean / 2, abs=0.1)
+    assert np.mean(half.mouth.path_mm) == pytest.approx(Anatomy().path_mm.mean / 2, abs=0.1)
     tied = draw_people(opening, MouthOptions(correlation=0.5), np.random.default_rng(0)).mouth
     assert np.corrcoef(tied.interincisal_mm, tied.radius_mm)[0, 1] == pytest.approx(0.487, abs=0.02)
 
@@ -248,7 +253,12 @@ def test_nothing_fits_everybody_and_too_much_fits_nobody() -> None:
 
 @pytest.mark.parametrize(
     ("options", "word"),
-    [({"thickness_mm": -1.0}, "thickness_mm"), ({"people": 0}, "people"), ({"correlation": 2.0}, "correlation")],
+    [
+        ({"thickness_mm": -1.0}, "thickness_mm"),
+        ({"people": 0}, "people"),
+        ({"correlation": 2.0}, "correlation"),
+        ({"held": 1.2}, "held"),
+    ],
 )
 def test_impossible_options_are_refused_in_one_line(options: dict[str, float], word: str) -> None:
     with pytest.raises(InputError, match=word):
@@ -268,17 +278,39 @@ def test_the_lines_of_the_thesis_are_recomputed_from_its_own_inputs() -> None:
 # --- pictures -----------------------------------------------------------------------------------------------------
 
 
+def test_the_sagittal_view_is_the_typical_mouth() -> None:
+    options = MouthOptions()
+    view, (mouth, ends) = (
+        sagittal_view(OPENINGS["india-2012"]["men"], options),
+        typical_mouth(OPENINGS["india-2012"]["men"], options),
+    )
+    gaps = np.linalg.norm(view.closed_mm - view.opened_mm, axis=1)
+    assert gaps[0] == pytest.approx(51.3 + 2.9)
+    assert gaps[-1] == pytest.approx(float(mouth.gap_mm(ends[-1])))
+    for arc, tooth in zip(view.arcs_mm, (0, -1), strict=True):
+        np.testing.assert_allclose(arc[[0, -1]], [view.closed_mm[tooth], view.opened_mm[tooth]], atol=1e-9)
+
+
+def test_the_fit_curve_falls_from_everybody_to_few() -> None:
+    options = MouthOptions(people=500)
+    report, people = study_mouths(options)
+    needed, shares = fit_curve(people, options)
+    for sex, share in shares.items():
+        assert np.all(share[0] == 100)
+        assert np.all(np.diff(share, axis=0) <= 0)
+        assert share[-1, 6] < 10
+        assert share[np.searchsorted(needed, options.total_mm), 6] == pytest.approx(report.groups[sex].fit_pct[7])
+
+
 def test_pictures_are_drawn(tmp_path: Path) -> None:
     options = MouthOptions(people=500)
-    mouth, ends = typical_mouth(OPENINGS["india-2012"]["women"], options)
-    behind = np.concatenate([[0.0], ends])
-    ways = np.stack([mouth.places_mm(behind[[0, -1]], share) for share in np.linspace(0, 1, 20)])
-    closed, opened, condyle = mouth.places_mm(behind, 0.0), mouth.places_mm(behind), mouth.condyle_mm()
-    save_sagittal_picture(tmp_path / "s.png", closed, opened, condyle, (ways[:, 0], ways[:, 1]), 7.0, 5.0, title="a")
+    view = sagittal_view(OPENINGS["india-2012"]["women"], options)
+    save_sagittal_picture(
+        tmp_path / "s.png", view.closed_mm, view.opened_mm, view.condyle_mm, view.arcs_mm, 7.0, 5.0, title="a"
+    )
     _, people = study_mouths(options)
-    needed = np.linspace(0, 40, 41)
-    shares = {sex: fit_pct(room_mm(group, options), needed) for sex, group in people.items()}
+    needed, shares = fit_curve(people, options)
     save_fit_picture(tmp_path / "f.png", needed, shares, options.total_mm, title="b")
-    save_gap_picture(tmp_path / "g.png", {sex: group.gap_mm[:, 6] for sex, group in people.items()}, (12.0, 26.6))
+    save_gap_picture(tmp_path / "g.png", {sex: group.gap_mm[:, 6] for sex, group in people.items()}, PRINTED_GAP_MM)
     for name in "sfg":
         assert np.asarray(Image.open(tmp_path / f"{name}.png")).std() > 10

@@ -37,6 +37,12 @@ Sex = Literal["men", "women"]
 Study = Literal["india-2012", "china-2017", "rieder-1978"]
 TEETH = 7
 """Teeth of a quadrant, from the midline backwards."""
+PRINTED_GAP_MM = (12.0, 26.6)
+"""L as the thesis prints it (Eq. 2.4)."""
+_CURVE_STEP_MM = 0.25
+"""Spacing of the fit curve."""
+_WAY_POINTS = 60
+"""Points of the way of a tooth in the sagittal view."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -256,6 +262,8 @@ class MouthOptions:
     """Room to spare."""
     study: Study = "india-2012"
     """Whose mouth openings: a survey of 894 adults, of 452 young adults, or the thesis' (Rieder's intervals)."""
+    held: float = 1.0
+    """Part of the maximal opening that is held during a scan; the condyles slide in proportion."""
     overlap: bool = True
     """Add the vertical overlap of the incisors to the opening; without it the room is underestimated."""
     ramus: bool = False
@@ -273,6 +281,8 @@ class MouthOptions:
         for name in ("thickness_mm", "working_distance_mm", "clearance_mm"):
             if getattr(self, name) < 0:
                 raise InputError(f"mouth: {name} is {getattr(self, name):g}; it must not be negative")
+        if not 0 < self.held <= 1:
+            raise InputError(f"mouth: held is {self.held:g}; it must be above 0 and at most 1")
         if self.people < 1:
             raise InputError(f"mouth: people is {self.people}; draw at least one")
         if not -1 <= self.correlation <= 1:
@@ -324,6 +334,7 @@ def draw_people(
     )
     drawn = (kind.mean + kind.sd * row for kind, row in zip(kinds, deviates, strict=True))
     interincisal, arm, base, depth, path, slope, overlap, molar = drawn
+    interincisal, path = options.held * interincisal, options.held * path
     radius = np.sqrt(np.maximum(arm**2 - (base / 2) ** 2, 0))
     overlap = overlap if options.overlap else np.zeros_like(overlap)
     good = np.isfinite(opening_turn_rad(interincisal + overlap, radius, depth, path, slope))
@@ -344,11 +355,11 @@ def draw_people(
 def typical_mouth(opening: Normal, options: MouthOptions, anatomy: Anatomy = Anatomy()) -> tuple[Mouth, np.ndarray]:
     """The mouth with the mean of every distribution, and how far behind its incisal edges teeth 1 to 7 end (7,), mm."""
     mouth = Mouth(
-        interincisal_mm=opening.mean,
+        interincisal_mm=options.held * opening.mean,
         radius_mm=float(np.sqrt(anatomy.arm_mm.mean**2 - (anatomy.base_mm.mean / 2) ** 2)),
         depth_mm=(RAMUS if options.ramus else anatomy.depth_mm).mean,
         overlap_mm=anatomy.overlap_mm.mean if options.overlap else 0.0,
-        path_mm=anatomy.path_mm.mean,
+        path_mm=options.held * anatomy.path_mm.mean,
         slope_deg=anatomy.slope_deg.mean,
     )
     return mouth, tooth_ends_mm(anatomy.molar_depth_mm.mean)
@@ -373,7 +384,7 @@ class GroupFit:
     left_out: int
     """Draws that no mouth can have."""
     opening_mm: Mapping[str, float]
-    """Percentiles of the interincisal opening."""
+    """Percentiles of the interincisal opening that is held."""
     turn_deg: Mapping[str, float]
     """Percentiles of theta."""
     gap_mm: Mapping[int, Mapping[str, float]]
@@ -434,6 +445,43 @@ def room_mm(people: People, options: MouthOptions) -> Float[np.ndarray, "n 7"]:
     return people.vertical_gap_mm if options.vertical else people.gap_mm
 
 
+def fit_curve(
+    people: Mapping[Sex, People], options: MouthOptions
+) -> tuple[Float[np.ndarray, "t"], dict[Sex, Float[np.ndarray, "t 7"]]]:
+    """Needed room, from nothing up (mm), and for each group the share of people who have it at each tooth (%)."""
+    rooms = {sex: room_mm(group, options) for sex, group in people.items()}
+    most = max(float(np.percentile(room[:, 0], 90)) for room in rooms.values())
+    needed = np.arange(0.0, max(most, options.total_mm) + _CURVE_STEP_MM, _CURVE_STEP_MM)
+    return needed, {sex: fit_pct(room, needed) for sex, room in rooms.items()}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SagittalView:
+    """One mouth closed and open; places are x forwards and z upwards of the hinge axis, mm."""
+
+    closed_mm: Float[np.ndarray, "8 2"]
+    """Incisal edges and distal ends of teeth 1 to 7, in the closed mouth."""
+    opened_mm: Float[np.ndarray, "8 2"]
+    """The same of the lower jaw in the open mouth."""
+    condyle_mm: Float[np.ndarray, "2"]
+    """The condyle in the open mouth."""
+    arcs_mm: tuple[Float[np.ndarray, "a 2"], Float[np.ndarray, "a 2"]]
+    """Ways of the lower incisal edges and of the second molar's end, the condyles sliding as the jaw turns."""
+
+
+def sagittal_view(opening: Normal, options: MouthOptions) -> SagittalView:
+    """The typical mouth of a group, for a picture."""
+    mouth, ends = typical_mouth(opening, options)
+    behind = np.concatenate([[0.0], ends])
+    ways = np.stack([mouth.places_mm(behind[[0, -1]], share) for share in np.linspace(0, 1, _WAY_POINTS)])
+    return SagittalView(
+        closed_mm=mouth.places_mm(behind, 0.0),
+        opened_mm=mouth.places_mm(behind),
+        condyle_mm=mouth.condyle_mm(),
+        arcs_mm=(ways[:, 0], ways[:, 1]),
+    )
+
+
 def _group(people: People, options: MouthOptions) -> GroupFit:
     shares = fit_pct(room_mm(people, options), np.array([options.total_mm]))[0]
     return GroupFit(
@@ -467,7 +515,9 @@ def _assumptions(options: MouthOptions) -> tuple[str, ...]:
         f"a handpiece fits at a tooth if thickness, working distance and clearance are at most the {judged} at the "
         "tooth's distal end; the gap grows forwards, so that is the narrowest place along a handpiece that comes in "
         "from the front",
-        "teeth count as points of the occlusal planes; cheeks, tongue, lips and the curve of Spee are left out",
+        f"the mouth is open to {options.held:.0%} of its maximum; nobody holds all of it for long",
+        "healthy adults; teeth count as points of the occlusal planes; cheeks, tongue, lips and the curve of Spee are "
+        "left out",
         "all values are normal and independent of each other"
         + (f", but for opening and condyle-incisor distance ({options.correlation:+g})" if options.correlation else ""),
         "the corrected opening moves the incisors: interincisal distance plus vertical overlap"
