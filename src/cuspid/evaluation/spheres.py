@@ -32,6 +32,8 @@ from cuspid.mesh import Mesh
 
 _ROUNDS = 30
 """Choices of points after which a sphere that has not settled is given up."""
+_FREE_ROUNDS = 10
+"""Choices after which points that once belonged to a sphere stay with it, for a few at the rim may come and go."""
 _SETTLED_MM = 1e-5
 """A sphere has settled when a new choice of points moves it by less than this."""
 _LEAST_SIGMA_MM = 1e-4
@@ -259,8 +261,10 @@ def _measure(
     centre = scan_from_reference.apply(nominal.centre)
     near = np.linalg.norm(vertices - centre, axis=1) < nominal.radius_mm + 3 * options.band_mm
     points, weights = vertices[near], areas[near]
-    for _ in range(_ROUNDS):
-        chosen = _belongs(points, centre, nominal.radius_mm, occlusal, options)
+    chosen = np.zeros(len(points), dtype=bool)
+    for round_ in range(_ROUNDS):
+        chosen &= round_ >= _FREE_ROUNDS
+        chosen |= _belongs(points, centre, nominal.radius_mm, occlusal, options)
         if chosen.sum() < options.least_points:
             return f"only {chosen.sum()} points, {options.least_points} are needed"
         fit = _fit(points[chosen], weights[chosen], options.outlier_sigmas)

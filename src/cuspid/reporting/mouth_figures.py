@@ -165,13 +165,13 @@ def save_fit_picture(
             colour = (0.12 + 0.10 * tooth, 0.40 - 0.03 * tooth, 0.85 - 0.10 * tooth)
             axes.plot(needed_mm, shares[:, tooth], color=colour, linewidth=2.4 if tooth == 6 else 1.3, label=name)
         axes.axvline(total_mm, color=_FAINT, linewidth=1, linestyle="--")
-        axes.text(total_mm, 103, f"{total_mm:g} mm", fontsize=10, color=_INK, ha="center")
+        axes.text(total_mm, 60, f" {total_mm:g} mm", fontsize=10, color=_INK)
         _style(axes, "thickness + working distance + clearance / mm", "share of people / %")
         axes.set_ylim(0, 101)
         axes.set_xlim(needed_mm[0], needed_mm[-1])
         axes.set_title(group, loc="left", fontsize=13, color=_INK)
         if place == 0:
-            axes.legend(frameon=False, fontsize=10, loc="lower left")
+            axes.legend(frameon=True, framealpha=1, edgecolor="white", fontsize=10, loc="lower left")
     with whole_file(path) as temporary:
         figure.savefig(temporary)
 
