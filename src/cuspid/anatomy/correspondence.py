@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.interpolate import RBFInterpolator
 from scipy.sparse import csr_array, diags_array
 from scipy.spatial import cKDTree
+from scipy.stats import binom
 
 from cuspid.anatomy.procrustes import dimension
 from cuspid.jaw import GUM
@@ -26,7 +27,10 @@ _ON_BORDER = 0.7
 """A partner on the rim of a patch counts only if the way to it leaves the patch at least this steeply (sine)."""
 _PER_EDGE = 8
 """Points that stand for an edge of a border."""
-_LEAST_WEIGHT = 1e-6
+_LEAST_WEIGHT = 0.01
+"""Where fewer partners than this share are near, displacements fade away."""
+_TAIL = 4.5
+"""Terms of a smoothing beyond this many standard deviations are left out."""
 
 Border = tuple[int, int]
 """The two labels on the sides of an edge, the smaller one first."""
@@ -78,7 +82,7 @@ class Template:
     borders: Mapping[Border, Int[np.ndarray, "_"]]
     """Vertices between two labels."""
     averaging: csr_array
-    """Takes values at the vertices to the mean of each with its neighbours, (v, v)."""
+    """Takes values at the vertices to the mean of the neighbours of each, (v, v)."""
 
     @staticmethod
     def of(mesh: Mesh, labels: Int[np.ndarray, "f"]) -> Template:
@@ -104,11 +108,19 @@ class Template:
         self, values: Float[np.ndarray, "v 3"], weights: Float[np.ndarray, "v"], sigma_mm: float
     ) -> Float[np.ndarray, "v 3"]:
         """Weighted mean of the values round each vertex, by diffusion over the surface."""
-        carried = np.column_stack([values * weights[:, None], weights])
-        # One step is a walk of half an edge's variance in the surface: a quarter along each axis.
-        for _ in range(max(1, round(4 * (sigma_mm / self.edge_mm) ** 2))):
-            carried = self.averaging @ carried
-        return np.asarray(carried[:, :3] / np.maximum(carried[:, 3:], _LEAST_WEIGHT))
+        # A step of diffusion is A = (1 + W) / 2 with W the mean over the neighbours: a walk with a quarter of an edge's
+        # variance along each axis. In Chebyshev polynomials A^n = sum_k c_k T_k(W) with binomial c_k, which vanish long
+        # before k = n.
+        steps = max(1, round(4 * (sigma_mm / self.edge_mm) ** 2))
+        last = min(steps, int(_TAIL * np.sqrt(steps / 2)) + 1)
+        shares = 2 * binom.pmf(steps - np.arange(last + 1), 2 * steps, 0.5)
+        before = np.column_stack([values * weights[:, None], weights])
+        now = self.averaging @ before
+        total = shares[0] / 2 * before + shares[1] * now
+        for share in shares[2:]:
+            before, now = now, 2 * (self.averaging @ now) - before
+            total += share * now
+        return np.asarray(total[:, :3] / np.maximum(total[:, 3:], _LEAST_WEIGHT))
 
 
 def _averaging(faces: Int[np.ndarray, "f 3"], count: int) -> csr_array:
@@ -117,7 +129,7 @@ def _averaging(faces: Int[np.ndarray, "f 3"], count: int) -> csr_array:
     adjacency = csr_array((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count))
     adjacency.data[:] = 1.0
     degree = np.maximum(adjacency.sum(axis=1), 1.0)
-    return csr_array(0.5 * diags_array(1.0 / degree) @ adjacency + 0.5 * diags_array(np.ones(count)))
+    return csr_array(diags_array(1.0 / degree) @ adjacency)
 
 
 # The sample
