@@ -10,6 +10,7 @@ import tyro
 
 from cuspid.cli.handpieces import handpiece
 from cuspid.cli.jaws import phantom
+from cuspid.cli.mouth import mouth
 from cuspid.cli.scan import evaluate, reconstruct, run, simulate
 from cuspid.cli.shared import console
 from cuspid.errors import CuspidError
@@ -17,6 +18,7 @@ from cuspid.errors import CuspidError
 COMMANDS: Mapping[str, Callable[..., Any]] = {
     "run": run,
     "phantom": phantom,
+    "mouth": mouth,
     "handpiece": handpiece,
     "simulate": simulate,
     "reconstruct": reconstruct,

@@ -14,6 +14,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from cuspid import pipeline, storage
 from cuspid.capture import Capture
 from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress
+from cuspid.errors import InputError
 from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.evaluation.spheres import SphereReport, evaluate_spheres
 from cuspid.jaw import Jaw
@@ -134,14 +135,17 @@ def _evaluate(mesh: Path, reference: Path, out: Path, source: Source, options: E
         storage.write_mesh(out / "deviation.ply", replace(scan, colors=deviation_colors(trueness.deviation_um)))
         save_deviation_picture(out / "deviation.png", scan, trueness)
         storage.write_trueness(out / "trueness.json", trueness)
-        spheres = _evaluate_spheres(scan, known, trueness, out) if known.spheres else None
     _print_trueness(trueness)
-    if spheres is not None:
-        _print_spheres(spheres)
+    if known.spheres:
+        _evaluate_spheres(scan, known, trueness, out)
 
 
-def _evaluate_spheres(scan: Mesh, reference: Jaw, trueness: Trueness, out: Path) -> SphereReport:
-    report = evaluate_spheres(scan, reference, trueness.reference_from_scan)
+def _evaluate_spheres(scan: Mesh, reference: Jaw, trueness: Trueness, out: Path) -> None:
+    try:
+        report = evaluate_spheres(scan, reference, trueness.reference_from_scan)
+    except InputError as error:
+        console.print(f"note: {error}")
+        return
     storage.write_json(out / "spheres.json", report)
     save_sphere_picture(
         out / "spheres.png",
@@ -149,21 +153,11 @@ def _evaluate_spheres(scan: Mesh, reference: Jaw, trueness: Trueness, out: Path)
         {label: sphere.form_rms_um for label, sphere in report.spheres.items()},
         np.array([spacing.nominal_mm for spacing in report.spacings]),
         np.array([spacing.error_um for spacing in report.spacings]),
-        _named_spacings(report),
+        report.named_um,
         report.scale_ppm,
         title="Spheres in the scan, without a best fit",
     )
-    return report
-
-
-def _named_spacings(report: SphereReport) -> dict[str, float]:
-    """Spacing errors in um across the arch between canines, first molars, second molars, and canine and first molar."""
-    wanted = {("3", "3"), ("6", "6"), ("7", "7"), ("3", "6"), ("6", "3")}
-    return {
-        f"{spacing.first}-{spacing.second}": spacing.error_um
-        for spacing in report.spacings
-        if spacing.first[0] != spacing.second[0] and (spacing.first[1], spacing.second[1]) in wanted
-    }
+    _print_spheres(report)
 
 
 def _print_spheres(report: SphereReport) -> None:
@@ -177,7 +171,7 @@ def _print_spheres(report: SphereReport) -> None:
     console.print(
         f"spacing error of {len(report.spacings)} pairs: max {report.spacing_max_um:.1f} µm, RMS "
         f"{report.spacing_rms_um:.1f} µm, scale {report.scale_ppm:+.0f} ppm; "
-        + ", ".join(f"{name} {error:+.1f}" for name, error in _named_spacings(report).items())
+        + ", ".join(f"{name} {error:+.1f}" for name, error in report.named_um.items())
     )
     for label, reason in report.not_measured.items():
         console.print(f"  not measured: {label}: {reason}")
