@@ -9,9 +9,15 @@ by label, never by order.
 and lip, *lingual* towards the tongue or palate.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import replace
+from difflib import get_close_matches
 from types import MappingProxyType
 from typing import Literal
+
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
+from cuspid.jaw import UNIVERSAL_FROM_FDI, Landmark
 
 ToothKind = Literal["incisor", "canine", "premolar", "molar"]
 
@@ -30,7 +36,8 @@ TOOTH_LANDMARKS: Mapping[ToothKind, tuple[str, ...]] = MappingProxyType(
 ``*_angle``: corner of the incisal edge; on a canine, the shoulder where the edge meets the proximal side.
 ``incisal_edge``: its middle. ``*_cusp``, ``cusp_tip``: highest point of the cusp; of several lingual cusps of a
 premolar, the mesial one. ``central_groove``: deepest point of the central groove or fossa. ``buccal_groove``: where the
-(mesio)buccal groove crosses the occlusal rim. ``*_cervix``: lowest (most apical) point of the gum's margin on that side.
+(mesio)buccal groove crosses the occlusal rim. ``*_cervix``: lowest (most apical) point of the gum's margin on that
+side.
 """
 
 MIDLINE_LANDMARKS = ("papilla", "midline")
@@ -47,3 +54,42 @@ def labels_of(teeth: Iterable[int]) -> tuple[str, ...]:
     """Labels of all landmarks of a jaw with the given teeth (FDI), tooth by tooth in the given order, midline last."""
     points = [f"{fdi}.{point}" for fdi in teeth for point in TOOTH_LANDMARKS[kind_of(fdi)]]
     return (*points, *MIDLINE_LANDMARKS)
+
+
+def teeth_named(labels: Iterable[str]) -> tuple[int, ...]:
+    """FDI numbers that occur in labels, in ascending order."""
+    prefixes = {label.partition(".")[0] for label in labels}
+    return tuple(sorted(int(prefix) for prefix in prefixes if prefix.isdecimal()))
+
+
+def missing(landmarks: Collection[str], teeth: Iterable[int]) -> tuple[str, ...]:
+    """Labels of the scheme, for the given teeth, that are not among ``landmarks``."""
+    return tuple(label for label in labels_of(teeth) if label not in landmarks)
+
+
+def validate(landmarks: Iterable[str], teeth: Collection[int] = (), *, source: str = "landmarks") -> None:
+    """Raise InputError where a label is not of the scheme, or names a tooth that is not one of ``teeth``.
+
+    Without ``teeth`` any permanent tooth may be named. ``source`` (a file) begins the message.
+    """
+    scheme = labels_of(UNIVERSAL_FROM_FDI)
+    for label in landmarks:
+        if label not in scheme:
+            raise InputError(f"{source}: unknown landmark '{label}'; {_advice(label, scheme)}")
+        if teeth and not set(teeth_named([label])) <= set(teeth):
+            has = ", ".join(map(str, sorted(teeth)))
+            raise InputError(f"{source}: landmark '{label}' is of no tooth of this jaw; it has {has} (FDI)")
+
+
+def _advice(label: str, scheme: tuple[str, ...]) -> str:
+    near = get_close_matches(label, scheme, n=3, cutoff=0.7)
+    if near:
+        return f"did you mean {' or '.join(near)}?"
+    return "a label is <FDI>.<point>, as 46.buccal_groove (docs/landmarks.md lists them)"
+
+
+def in_frame(landmarks: Mapping[str, Landmark], target_from_source: Rigid3) -> dict[str, Landmark]:
+    """The same landmarks in another frame."""
+    return {
+        label: replace(point, position=target_from_source.apply(point.position)) for label, point in landmarks.items()
+    }

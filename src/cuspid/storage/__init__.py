@@ -37,6 +37,7 @@ from cuspid.storage.jaws import (
     write_jaw,
     write_mesh,
 )
+from cuspid.storage.landmarks import MARKUPS_SUFFIX, LandmarkFile, LandmarkFrame, read_landmarks, write_landmarks
 from cuspid.storage.reconstructions import (
     read_depth_maps,
     read_poses,
@@ -47,12 +48,16 @@ from cuspid.storage.reconstructions import (
     write_reconstruction,
     write_trueness,
 )
+from cuspid.storage.tables import write_table
 
 __all__ = [
     "IMAGE_SUFFIXES",
+    "MARKUPS_SUFFIX",
     "MESH_SUFFIXES",
     "MM_PER_UNIT",
     "PART",
+    "LandmarkFile",
+    "LandmarkFrame",
     "Unit",
     "claim_folder",
     "claimed_folder",
@@ -65,6 +70,7 @@ __all__ = [
     "read_jaw",
     "read_json",
     "read_labelled_mesh",
+    "read_landmarks",
     "read_mesh",
     "read_poses",
     "read_reconstruction",
@@ -80,11 +86,13 @@ __all__ = [
     "write_image",
     "write_jaw",
     "write_json",
+    "write_landmarks",
     "write_mesh",
     "write_overlap",
     "write_poses",
     "write_reconstruction",
     "write_rig_config",
+    "write_table",
     "write_trueness",
     "write_truth",
 ]
