@@ -91,6 +91,8 @@ def test_statistics_of_a_normal_distribution():
     assert found.std_um == pytest.approx(20, rel=0.01)
     assert found.rms_um == pytest.approx(np.hypot(5, 20), rel=0.01)
     assert found.half_p90_p10_um == pytest.approx(1.2816 * 20, rel=0.01)
+    assert found.std_abs_um == pytest.approx(np.sqrt(found.rms_um**2 - found.mean_abs_um**2), rel=1e-6)
+    assert 0 <= found.min_um < found.mean_abs_um < found.max_um
     assert found.mean_abs_um == pytest.approx(np.abs(1000 * signed_mm).mean())
     assert found.max_um == pytest.approx(1000 * np.abs(signed_mm).max())
     assert np.mean(np.abs(1000 * signed_mm) <= found.p95_um) == pytest.approx(0.95, abs=1e-4)

@@ -36,6 +36,8 @@ class DeviationStatistics:
     """Number of sample points."""
     mean_abs_um: float
     """Mean absolute deviation."""
+    std_abs_um: float
+    """Standard deviation of the absolute deviations, as in Table 3.2 of the thesis."""
     signed_mean_um: float
     """Mean; positive where the scan lies outside the reference."""
     std_um: float
@@ -46,6 +48,8 @@ class DeviationStatistics:
     """(P90 - P10) / 2 of the signed deviations."""
     p95_um: float
     """95th percentile of the absolute deviations."""
+    min_um: float
+    """Smallest absolute deviation."""
     max_um: float
     """Largest absolute deviation."""
 

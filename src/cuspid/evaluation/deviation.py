@@ -161,11 +161,13 @@ def statistics(signed_mm: Float[np.ndarray, "n"]) -> DeviationStatistics:
     return DeviationStatistics(
         count=len(signed_um),
         mean_abs_um=float(absolute_um.mean()),
+        std_abs_um=float(absolute_um.std()),
         signed_mean_um=float(signed_um.mean()),
         std_um=float(signed_um.std()),
         rms_um=float(np.sqrt(np.mean(signed_um**2))),
         half_p90_p10_um=float((p90 - p10) / 2),
         p95_um=float(np.percentile(absolute_um, 95)),
+        min_um=float(absolute_um.min()),
         max_um=float(absolute_um.max()),
     )
 
