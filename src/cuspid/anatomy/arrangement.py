@@ -1,35 +1,58 @@
-"""Where the teeth of a phantom stand: fourteen teeth in a row that touch and have the asked widths.
+"""Where the teeth of a phantom stand: in a row, touching, with the asked widths and length of the arch.
 
 Frames. *Jaw*: the occlusal frame of `cuspid.jaw`. Seen along -Z with +Y up, +X points right; that is the patient's
 right in a lower jaw (teeth 41-47) and the patient's left in an upper one (teeth 21-27). *Tooth*: see
 `cuspid.anatomy.crowns`; the frame of a tooth with X < 0 is left-handed, for it is the mirror image of its counterpart.
 
 The teeth of a quadrant are a chain of segments, each as long as its tooth is wide, that touch at the contact points.
-Their headings are those nearest to a natural arch that give it its transverse widths.
+Their headings are those nearest to a natural arch that give it its dimensions (`arch_form`). Rotated or displaced teeth
+touch elsewhere than at their widest, and the row closes up behind them: that is what a crowded front is made of.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import least_squares
 
-from cuspid.anatomy.crown_points import Point, crown_points
+from cuspid.anatomy.arch_form import Aim, Chain, Seen, Shape, dimensions, segments, solve_shape
+from cuspid.anatomy.crown_points import Point, crown_point
 from cuspid.anatomy.crowns import Crown, Points, crown_distance, silhouettes, top_of
-from cuspid.anatomy.dentition import ARCH_FORMS, QUADRANTS, ArchForm, Tooth
+from cuspid.anatomy.dentition import ARCH_FORMS, QUADRANTS, Tooth
 from cuspid.anatomy.landmarks import kind_of
+from cuspid.errors import InputError
 from cuspid.jaw import Arch
 
 CONTACT_OVERLAP_MM = 0.02
 """Neighbours overlap by this much, beside the rounding of creases: contact points are worn to small areas."""
 CONTACT_ROUNDS = 4
 """How often the teeth are moved together until they touch."""
-WIDTH_POINTS = {3: "cusp_tip", 6: "buccal_groove", 7: "buccal_groove"}
-"""Landmarks between which the transverse widths of the arch are measured, by the position of the tooth."""
+MORE_ROUNDS = 14
+"""How often more, where a crowded front or a rotated tooth has to find its place."""
+DIMENSION_POINTS: Mapping[int, str] = {3: "cusp_tip", 6: "buccal_groove", 7: "buccal_groove"}
+"""Landmarks between which the arch is measured, by the position of the tooth."""
 PIVOT = 0.7
 """Height of the contacts, about which a tooth is inclined, as a fraction of its crown."""
+CROWDED = {1: np.array([-5.0, 0.1]), 2: np.array([7.0, -1.0]), 3: np.array([-6.0, 0.3])}
+"""How a crowded front is displaced: for each position degrees of rotation (distal end towards labial) and mm towards
+labial, per mm that the lateral incisors stand lingually."""
+MOST_CROWDED_MM = 4.0
+"""How far a lateral incisor is displaced at most."""
+
+OPTION_OF = {3: "inter_canine_mm", 6: "inter_first_molar_mm", 7: "inter_second_molar_mm"}
+"""The option that asks for the distance between the teeth at a position."""
+TOLERANCE_MM = 0.05
+"""How far an asked dimension may be missed."""
+CROWDING_TOLERANCE_MM = 0.3
+"""How far asked crowding may be missed."""
+MOST_KINK_DEG = 50.0
+"""How much the direction of neighbouring teeth may depart from that of a natural arch."""
+KINK_MARGIN_DEG = 8.0
+"""How much individual teeth may add to a kink of the textbook's."""
+
+PapillaOf = Callable[[tuple["PlacedTooth", ...]], Point]
+"""Where the papilla lies behind given teeth."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +69,26 @@ class PhantomOptions:
     """Depth of the curve of Spee between the incisors and the second molar."""
     variation: float = 1.0
     """Strength of the individual variation: 0 = the textbook arch, 1 = natural."""
+    inter_canine_mm: float | None = None
+    """Distance a between the cusp tips of the canines; the mean of adults unless said otherwise."""
+    inter_first_molar_mm: float | None = None
+    """Distance b between the buccal grooves of the first molars; the mean unless said otherwise, or, where a premolar
+    is missing, what the row of teeth makes of it."""
+    inter_second_molar_mm: float | None = None
+    """Distance c between the buccal grooves of the second molars; as for b."""
+    arch_length_mm: float | None = None
+    """Distance f from the papilla to the middle between the buccal grooves of the second molars; what the teeth make of
+    the widths unless said otherwise."""
+    tooth_size: float | None = None
+    """Size of all teeth relative to the textbook's; 1, or what fits dimensions or crowding that are asked for."""
+    missing: tuple[int, ...] = ()
+    """Teeth (FDI) that are missing; their space is closed. 34 44: extracted premolars. 37 47: no second molars."""
+    crowding_mm: float = 0.0
+    """By how much the front is too short for its six teeth: they stand rotated and overlapping."""
+    rotate_deg: dict[int, float] = field(default_factory=dict)
+    """Tooth (FDI) and its rotation about the long axis, distal end towards buccal: 33 20 43 -15."""
+    displace_mm: dict[int, float] = field(default_factory=dict)
+    """Tooth (FDI) and its displacement towards buccal: 32 -1.5 42 -1."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -60,11 +103,13 @@ class PlacedTooth:
     """Columns: distal, buccal and occlusal direction in the jaw; a reflection for X < 0."""
     origin: Float[np.ndarray, "3"]
     """Centre of the cervix in the jaw, mm."""
+    is_last: bool = False
+    """Whether no tooth stands behind it."""
 
     @property
-    def is_last(self) -> bool:
-        """Whether no tooth stands behind it."""
-        return self.fdi % 10 == 7
+    def position(self) -> int:
+        """Place in the quadrant, 1 (central incisor) to 7 (second molar)."""
+        return self.fdi % 10
 
     def to_tooth(self, points: Points) -> Points:
         """Points (n, 3) of the jaw in the frame of the tooth."""
@@ -75,51 +120,306 @@ class PlacedTooth:
         return self.axes @ point + self.origin
 
 
-def place_teeth(options: PhantomOptions, rng: np.random.Generator) -> tuple[PlacedTooth, ...]:
-    """The fourteen teeth from the last molar at X < 0 round to the one at X > 0."""
-    quadrants = _individuals(QUADRANTS[options.arch], options.variation, rng)
-    closing = {side: np.zeros(7) for side in (-1, 1)}
-    teeth = _arrange(quadrants, closing, options)
-    for _ in range(CONTACT_ROUNDS):
-        excess = np.array([clearance(one, other) for one, other in pairwise(teeth)]) + CONTACT_OVERLAP_MM
-        excess[6] /= 2  # either central incisor moves half of the way to the midline
-        closing = {-1: closing[-1] + excess[6::-1], 1: closing[1] + excess[6:]}
-        teeth = _arrange(quadrants, closing, options)
+# The row of teeth
+
+Rows = dict[int, tuple[tuple[int, Tooth], ...]]
+"""Position and shape of each tooth of a quadrant from the midline backwards, by the sign of X."""
+
+
+def place_teeth(
+    options: PhantomOptions, individuals: dict[int, tuple[Tooth, ...]], papilla_of: PapillaOf
+) -> tuple[PlacedTooth, ...]:
+    """The teeth from the last one at X < 0 round to the last at X > 0.
+
+    Raises:
+        InputError: a tooth that is not there is named, or the asked dimensions cannot be met together.
+    """
+    rows = _rows(options, individuals)
+    aim = _aim(options, rows)
+    closing = {side: np.zeros(len(row)) for side, row in rows.items()}
+    shape, crowd, seen = Shape(size=options.tooth_size or 1.0), 0.0, Seen()
+    loose = {side: np.zeros(len(row)) for side, row in rows.items()}
+    teeth: tuple[PlacedTooth, ...] = ()
+    for turn in range(_rounds(options) + 1):
+        if turn:
+            closing = _closed_up(teeth, closing)
+            seen = _seen(teeth, aim, papilla_of)
+        if turn == CONTACT_ROUNDS:
+            loose = closing
+        if turn >= CONTACT_ROUNDS and turn % 2 == 0 and options.crowding_mm:
+            crowd = _more_crowded(crowd, _shortened(closing, loose), options.crowding_mm)
+        stood = _crowded(rows, crowd, options)
+        sized = _sized(stood, shape.size)
+        shape = solve_shape(_chains(sized, closing, options.arch), shape.size, aim, seen, shape)
+        teeth = _arrange(_sized(stood, shape.size), closing, shape, options)
+    _check(teeth, shape, aim, papilla_of)
+    short_mm = options.crowding_mm - _shortened(closing, loose)
+    if options.crowding_mm and abs(short_mm) > CROWDING_TOLERANCE_MM:
+        raise InputError(
+            f"crowding_mm: these teeth overlap by {options.crowding_mm - short_mm:.1f} mm at most, not by "
+            f"{options.crowding_mm:g}; ask for less"
+        )
     return teeth
+
+
+def _rounds(options: PhantomOptions) -> int:
+    """How often the teeth are moved together."""
+    unusual = options.crowding_mm or options.rotate_deg or options.displace_mm
+    return CONTACT_ROUNDS + (MORE_ROUNDS if unusual else 3 if options.arch_length_mm else 0)
+
+
+def _rows(options: PhantomOptions, individuals: dict[int, tuple[Tooth, ...]]) -> Rows:
+    """The teeth that are there, varied, rotated and displaced as asked."""
+    numbers = {fdi_of(options.arch, side, k + 1): (side, k) for side in (-1, 1) for k in range(7)}
+    for name, teeth in (
+        ("missing", options.missing),
+        ("rotate_deg", options.rotate_deg),
+        ("displace_mm", options.displace_mm),
+    ):
+        for fdi in teeth:
+            if fdi not in numbers or (name != "missing" and fdi in options.missing):
+                raise InputError(f"{name}: no tooth {fdi} in this {options.arch} jaw; give FDI numbers of teeth it has")
+            if name == "missing" and fdi % 10 in (1, 3):
+                raise InputError(f"missing: {fdi} marks the arch (midline, canine width); leave it in")
+    rows: Rows = {}
+    for side in (-1, 1):
+        kept = [(k + 1, tooth) for k, tooth in enumerate(individuals[side])]
+        named = [(position, tooth, fdi_of(options.arch, side, position)) for position, tooth in kept]
+        rows[side] = tuple(
+            (position, _turned(tooth, options.rotate_deg.get(fdi, 0.0), options.displace_mm.get(fdi, 0.0)))
+            for position, tooth, fdi in named
+            if fdi not in options.missing
+        )
+    return rows
+
+
+def _turned(tooth: Tooth, rotation_deg: float, displacement_mm: float) -> Tooth:
+    """A tooth rotated about its axis and displaced towards buccal."""
+    return replace(tooth, rotation_deg=tooth.rotation_deg + rotation_deg, offset_mm=tooth.offset_mm + displacement_mm)
+
+
+def _aim(options: PhantomOptions, rows: Rows) -> Aim:
+    """The dimensions that the arch shall have."""
+    form = ARCH_FORMS[options.arch]
+    asked = {3: options.inter_canine_mm, 6: options.inter_first_molar_mm, 7: options.inter_second_molar_mm}
+    usual = {3: form.inter_canine_mm, 6: form.inter_first_molar_mm, 7: form.inter_second_molar_mm}
+    there = {position for position in asked if all(position in dict(row) for row in rows.values())}
+    for position in asked:
+        if asked[position] is not None and position not in there:
+            raise InputError(f"{OPTION_OF[position]}: a tooth {position} is missing; leave the dimension out")
+    if options.arch_length_mm is not None and 7 not in there:
+        raise InputError("arch_length_mm: a second molar is missing; leave the dimension out")
+    shortened = any(set(range(1, 6)) - set(dict(row)) for row in rows.values())
+    widths = {
+        position: asked[position] or usual[position]
+        for position in sorted(there)
+        if asked[position] is not None or position == 3 or not shortened
+    }
+    given = [*asked.values(), options.arch_length_mm, options.crowding_mm or None]
+    free = options.tooth_size is None and any(value is not None for value in given)
+    return Aim(widths_mm=widths, length_mm=options.arch_length_mm, free_size=free)
+
+
+def _sized(rows: Rows, size: float) -> Rows:
+    """The teeth at another size."""
+
+    def scaled(tooth: Tooth) -> Tooth:
+        crown = tooth.crown
+        return replace(
+            tooth,
+            crown=replace(
+                crown,
+                width_mm=size * crown.width_mm,
+                depth_mm=size * crown.depth_mm,
+                height_mm=size * crown.height_mm,
+            ),
+        )
+
+    return {side: tuple((position, scaled(tooth)) for position, tooth in row) for side, row in rows.items()}
+
+
+def _chains(rows: Rows, closing: dict[int, Float[np.ndarray, "_"]], arch: Arch) -> tuple[Chain, Chain]:
+    """The row as segments of the plane."""
+
+    def chain(side: int) -> Chain:
+        positions = tuple(position for position, _ in rows[side])
+        return Chain(
+            side=side,
+            positions=positions,
+            natural=_natural_headings(positions, arch),
+            widths=np.array([tooth.crown.width_mm for _, tooth in rows[side]]),
+            closing=closing[side],
+            points=np.array([_from_contacts(position, tooth) for position, tooth in rows[side]]),
+        )
+
+    return chain(-1), chain(1)
+
+
+def _natural_headings(positions: tuple[int, ...], arch: Arch) -> Float[np.ndarray, "n"]:
+    """Headings in radians of the teeth at the given positions, closed up along the natural arch."""
+    widths = np.array([tooth.crown.width_mm for tooth in QUADRANTS[arch]])
+    kept = widths[np.array(positions) - 1]
+    along, natural = np.cumsum(widths) - widths / 2, np.radians(ARCH_FORMS[arch].headings_deg)
+    return np.interp(np.cumsum(kept) - kept / 2, along, natural)
+
+
+def _from_contacts(position: int, tooth: Tooth) -> Point:
+    """The landmark that the arch is measured at, or else the middle of the tooth, from the line of contacts."""
+    if position not in DIMENSION_POINTS:
+        return np.array([0.0, tooth.offset_mm, 0.0])
+    point = crown_point(tooth.crown, kind_of(position), DIMENSION_POINTS[position])
+    return _stand(tooth) @ (point - _contact_centre(tooth.crown)) + [0.0, tooth.offset_mm, 0.0]
+
+
+def _arrange(
+    rows: Rows, closing: dict[int, Float[np.ndarray, "_"]], shape: Shape, options: PhantomOptions
+) -> tuple[PlacedTooth, ...]:
+    """The teeth in the occlusal frame."""
+    quadrants = []
+    for chain in _chains(rows, closing, options.arch):
+        headings = shape.headings(chain)
+        centres, _, _ = segments(headings, chain.widths, chain.closing)
+        quadrants.append(
+            [
+                _place(tooth, fdi_of(options.arch, chain.side, position), chain.side, centres[k], float(headings[k]))
+                for k, (position, tooth) in enumerate(rows[chain.side])
+            ]
+        )
+        quadrants[-1][-1] = replace(quadrants[-1][-1], is_last=True)
+    return _level((*reversed(quadrants[0]), *quadrants[1]), options)
+
+
+def _seen(teeth: tuple[PlacedTooth, ...], aim: Aim, papilla_of: PapillaOf) -> Seen:
+    """Heights of the landmarks, and the place of the papilla, of teeth as they stand."""
+    heights = {
+        (1 if placed.origin[0] > 0 else -1, placed.position): float(dimension_point(placed)[2])
+        for placed in teeth
+        if placed.position in DIMENSION_POINTS
+    }
+    centrals = [placed for placed in teeth if placed.position == 1]
+    if aim.length_mm is None:
+        return Seen(heights=heights)
+    middle = np.mean([p.to_jaw(_contact_centre(p.tooth.crown)) for p in centrals], axis=0)
+    return Seen(heights=heights, papilla=papilla_of(teeth) - middle * [1.0, 1.0, 0.0])
+
+
+def dimension_point(placed: PlacedTooth) -> Point:
+    """The landmark of a canine or molar that the arch is measured at, in the jaw."""
+    name = DIMENSION_POINTS[placed.position]
+    return placed.to_jaw(crown_point(placed.tooth.crown, kind_of(placed.fdi), name))
+
+
+def arch_dimensions(teeth: tuple[PlacedTooth, ...], aim: Aim, papilla_of: PapillaOf) -> Float[np.ndarray, "d"]:
+    """The dimensions of placed teeth in the order of `Aim.values`, mm."""
+    points = {
+        position: [dimension_point(placed) for placed in teeth if placed.position == position]
+        for position in {*aim.widths_mm, *([] if aim.length_mm is None else [7])}
+    }
+    widths = [float(np.linalg.norm(points[position][1] - points[position][0])) for position in aim.widths_mm]
+    if aim.length_mm is None:
+        return np.array(widths)
+    return np.array([*widths, np.linalg.norm(np.mean(points[7], axis=0) - papilla_of(teeth))])
+
+
+def can_stand(options: PhantomOptions) -> bool:
+    """Whether a row of textbook teeth can have the asked dimensions: quick, before contacts are looked at."""
+    rows = _rows(options, dict.fromkeys((-1, 1), QUADRANTS[options.arch]))
+    aim = replace(_aim(options, rows), length_mm=None)
+    size = options.tooth_size or 1.0
+    chains = _chains(_sized(rows, size), {side: np.zeros(len(row)) for side, row in rows.items()}, options.arch)
+    shape = solve_shape(chains, size, aim, Seen(), Shape(size=size))
+    missed = np.abs(dimensions(chains, size, shape, aim, Seen()) - aim.values).max()
+    return bool(missed < TOLERANCE_MM and shape.kinks_deg.max() < MOST_KINK_DEG - KINK_MARGIN_DEG)
+
+
+def _check(teeth: tuple[PlacedTooth, ...], shape: Shape, aim: Aim, papilla_of: PapillaOf) -> None:
+    """Raise an error if the teeth miss the aim."""
+    got, asked = arch_dimensions(teeth, aim, papilla_of), aim.values
+    names = [*(OPTION_OF[position] for position in aim.widths_mm), "arch_length_mm"][: len(got)]
+    worst = int(np.abs(got - asked).argmax())
+    if abs(got[worst] - asked[worst]) > TOLERANCE_MM:
+        nearest = ", ".join(f"{name} {value:.1f}" for name, value in zip(names, got, strict=True))
+        raise InputError(
+            f"{names[worst]}: {asked[worst]:g} does not go with the other dimensions and teeth of size "
+            f"{shape.size:.2f}; the nearest arch has {nearest}"
+        )
+    if shape.kinks_deg.max() > MOST_KINK_DEG:
+        raise InputError(
+            f"{', '.join(names)}: {', '.join(f'{value:g}' for value in asked)} bend the row by "
+            f"{shape.kinks_deg.max():.0f} degrees at tooth {int(shape.kinks_deg.argmax()) + 1} from the midline; ask "
+            "for dimensions nearer to the mean, or for another tooth_size"
+        )
+
+
+# Contacts
+
+
+def _closed_up(
+    teeth: tuple[PlacedTooth, ...], closing: dict[int, Float[np.ndarray, "_"]]
+) -> dict[int, Float[np.ndarray, "_"]]:
+    """How far each tooth is to be drawn towards its mesial neighbour so that they touch, mm."""
+    excess = np.array([clearance(one, other) for one, other in pairwise(teeth)]) + CONTACT_OVERLAP_MM
+    middle = len(closing[-1]) - 1
+    excess[middle] /= 2  # either central incisor moves half of the way to the midline
+    return {-1: closing[-1] + excess[middle::-1], 1: closing[1] + excess[middle:]}
 
 
 def clearance(one: PlacedTooth, other: PlacedTooth) -> float:
     """Width of the gap between two neighbours at its narrowest, mm; negative where they overlap."""
-    front, back = sorted((one, other), key=lambda placed: placed.fdi % 10)
+    front, back = sorted((one, other), key=lambda placed: placed.position)
     crown = back.tooth.crown
-    box = np.array([crown.half_width_mm, crown.half_depth_mm, crown.height_mm])
-    low, high = box * [-1.25, -0.8, 0.35], box * [-0.75, 0.8, 1.0]
-    grid = np.stack(np.meshgrid(*np.linspace(low, high, 13).T, indexing="ij"), axis=-1).reshape(-1, 3)
-    points = np.einsum("ni,ji->nj", grid, back.axes) + back.origin
-    outside = np.maximum(crown_distance(crown, grid), crown_distance(front.tooth.crown, front.to_tooth(points)))
-    return 2 * float(outside.min())
+    across = front.to_jaw(_contact_centre(front.tooth.crown)) - back.to_jaw(_contact_centre(crown))
+    towards = across * [1.0, 1.0, 0.0] / np.hypot(*across[:2])
+    aside = np.array([-towards[1], towards[0], 0.0])
+    along = crown.width_mm / (crown.width_mm + front.tooth.crown.width_mm) * np.hypot(*across[:2])
+    reach, depth = 0.25 * crown.half_width_mm, 0.8 * crown.half_depth_mm
+    grid = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 13)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    middle = back.to_jaw(_contact_centre(crown)) + along * towards + across[2] / 2 * np.array([0.0, 0.0, 1.0])
+    points = middle + grid @ np.stack([reach * towards, depth * aside, [0.0, 0.0, 0.33 * crown.height_mm]])
+    one_side, other_side = (crown_distance(p.tooth.crown, p.to_tooth(points)) for p in (front, back))
+    return 2 * float(np.maximum(one_side, other_side).min())
 
 
-def _arrange(
-    quadrants: dict[int, tuple[Tooth, ...]], closing: dict[int, Float[np.ndarray, "7"]], options: PhantomOptions
-) -> tuple[PlacedTooth, ...]:
-    """The teeth in the occlusal frame, each drawn towards its mesial neighbour by `closing` (7,), mm."""
+# A crowded front
 
-    def placed(headings: Float[np.ndarray, "7"]) -> tuple[PlacedTooth, ...]:
-        left, right = (
-            _place_quadrant(quadrants[side], options.arch, side, headings, closing[side]) for side in (-1, 1)
+
+def _crowded(rows: Rows, lingual_mm: float, options: PhantomOptions) -> Rows:
+    """The front teeth displaced and rotated by the pattern `CROWDED`, unevenly, for lateral incisors that stand
+    lingually by the given mm."""
+    uneven = 1.0 + 0.3 * options.variation * np.random.default_rng([options.seed, 1]).uniform(-1.0, 1.0, (2, 3))
+    crowded: Rows = {}
+    for side in (-1, 1):
+        crowded[side] = tuple(
+            (position, _turned(tooth, *(lingual_mm * uneven[(side + 1) // 2, position - 1] * CROWDED[position])))
+            if position in CROWDED
+            else (position, tooth)
+            for position, tooth in rows[side]
         )
-        return _level((*reversed(left), *right), options)
-
-    return placed(_solve_headings(placed, ARCH_FORMS[options.arch]))
+    return crowded
 
 
-def _individuals(teeth: tuple[Tooth, ...], variation: float, rng: np.random.Generator) -> dict[int, tuple[Tooth, ...]]:
+def _shortened(closing: dict[int, Float[np.ndarray, "_"]], loose: dict[int, Float[np.ndarray, "_"]]) -> float:
+    """By how much the five contacts of the front have closed up, mm."""
+    return float(sum((closing[side] - loose[side])[:3].sum() for side in (-1, 1)))
+
+
+def _more_crowded(lingual_mm: float, got_mm: float, asked_mm: float) -> float:
+    """The next displacement: the shortening goes about with its square."""
+    if not lingual_mm:
+        return float(np.sqrt(asked_mm))
+    return float(np.clip(lingual_mm * np.clip(asked_mm / max(got_mm, 1e-3), 0.5, 2.0) ** 0.5, 0.0, MOST_CROWDED_MM))
+
+
+# One tooth
+
+
+def vary_teeth(options: PhantomOptions, rng: np.random.Generator) -> dict[int, tuple[Tooth, ...]]:
     """The varied teeth of both quadrants, by the sign of X; counterparts are alike but not the same."""
+    teeth = QUADRANTS[options.arch]
     common = rng.standard_normal((len(teeth), 8))
     deviates = {side: 0.8 * common + 0.6 * rng.standard_normal(common.shape) for side in (-1, 1)}
     return {
-        side: tuple(_vary(tooth, variation * row) for tooth, row in zip(teeth, rows, strict=True))
+        side: tuple(_vary(tooth, options.variation * row) for tooth, row in zip(teeth, rows, strict=True))
         for side, rows in deviates.items()
     }
 
@@ -145,48 +445,10 @@ def _vary(tooth: Tooth, z: Float[np.ndarray, "8"]) -> Tooth:
     )
 
 
-def _fdi(arch: Arch, side: int, position: int) -> int:
+def fdi_of(arch: Arch, side: int, position: int) -> int:
     """FDI number of the tooth at `position` (1 = central incisor) on the side of the sign of X."""
     quadrant = {("lower", 1): 40, ("lower", -1): 30, ("upper", 1): 20, ("upper", -1): 10}[arch, side]
     return quadrant + position
-
-
-def _solve_headings(
-    placed: Callable[[Float[np.ndarray, "7"]], tuple[PlacedTooth, ...]], form: ArchForm
-) -> Float[np.ndarray, "7"]:
-    """Headings (7,) in radians of a quadrant's teeth: nearest to the natural ones, giving the arch its widths."""
-    targets = np.array([form.inter_canine_mm, form.inter_first_molar_mm, form.inter_second_molar_mm])
-    natural = np.radians(form.headings_deg)
-
-    def misfit(change: Float[np.ndarray, "7"]) -> Float[np.ndarray, "10"]:
-        return np.concatenate([100.0 * (arch_widths(placed(natural + change)) - targets), np.diff(change, prepend=0.0)])
-
-    return natural + least_squares(misfit, np.zeros(7), xtol=1e-5, ftol=1e-6).x
-
-
-def arch_widths(teeth: tuple[PlacedTooth, ...]) -> Float[np.ndarray, "3"]:
-    """Distances (3,) in mm between the canines' tips, and between the buccal grooves of first and second molars."""
-    points: dict[int, list[Point]] = {position: [] for position in WIDTH_POINTS}
-    for placed in teeth:
-        if placed.fdi % 10 in WIDTH_POINTS:
-            point = crown_points(placed.tooth.crown, kind_of(placed.fdi))[WIDTH_POINTS[placed.fdi % 10]]
-            points[placed.fdi % 10].append(placed.to_jaw(point))
-    return np.array([np.linalg.norm(np.subtract(*points[position])) for position in WIDTH_POINTS])
-
-
-def _place_quadrant(
-    teeth: tuple[Tooth, ...],
-    arch: Arch,
-    side: int,
-    headings: Float[np.ndarray, "7"],
-    closing: Float[np.ndarray, "7"],
-) -> tuple[PlacedTooth, ...]:
-    """Teeth set one after the other from the midline backwards, each along its heading; X has the sign of `side`."""
-    widths = np.array([tooth.crown.width_mm for tooth in teeth])[:, None]
-    directions = np.column_stack([np.cos(headings), -np.sin(headings)])
-    ends = np.cumsum((widths - closing[:, None]) * directions, axis=0)
-    centres = ends - widths / 2 * directions
-    return tuple(_place(tooth, _fdi(arch, side, k + 1), side, centres[k], headings[k]) for k, tooth in enumerate(teeth))
 
 
 def _place(tooth: Tooth, fdi: int, side: int, centre: Float[np.ndarray, "2"], heading: float) -> PlacedTooth:

@@ -6,9 +6,7 @@ the occlusal surface to the side. The central groove is taken at its deepest: of
 central pit; of a premolar, whose pits lie to either side, half-way between mesial and distal.
 """
 
-from collections.abc import Mapping
 from functools import lru_cache
-from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float
@@ -23,53 +21,44 @@ RIM = 0.62
 ANGLE_DEG = {"incisor": 45.0, "canine": 60.0}
 """Direction in which the angle of an edge is the farthest point, from the long axis to the side: the edge of a canine
 slopes."""
+UP = np.array([0.0, 0.0, 1.0])
+"""The occlusal direction."""
 STEEPEST = 0.02
 """Residual distance in mm above which a vertical line does not meet the crown."""
 
 
-@lru_cache(maxsize=4096)
-def crown_points(crown: Crown, kind: ToothKind) -> Mapping[str, Point]:
+def crown_points(crown: Crown, kind: ToothKind) -> dict[str, Point]:
     """The landmarks on the crown by name, mm: those of `TOOTH_LANDMARKS` but for the cervices."""
-    if crown.edge:
-        return MappingProxyType(_edge_points(crown, kind))
-    wide = 0.15 if kind == "molar" else 0.0
-    points = {**_cusp_points(crown), "central_groove": _deepest(crown, wide)}
-    if kind == "molar":
-        points["buccal_groove"] = _buccal_groove(crown)
-    return MappingProxyType({name: points[name] for name in TOOTH_LANDMARKS[kind] if name in points})
+    names = [name for name in TOOTH_LANDMARKS[kind] if not name.endswith("_cervix")]
+    return {name: crown_point(crown, kind, name) for name in names}
 
 
-def _edge_points(crown: Crown, kind: ToothKind) -> dict[str, Point]:
-    """Corners and middle of an incisal edge."""
-    half, y = crown.half_width_mm, (crown.buccal[-2] - crown.lingual[-2]) / 2 * crown.depth_mm
-    lean = np.radians(ANGLE_DEG[kind])
-    corners = {
-        name: _farthest(crown, (0.8 * side * half, y), np.array([side * np.sin(lean), 0.0, np.cos(lean)]), (1.0, 1.0))
-        for name, side in (("mesial_angle", -1), ("distal_angle", 1))
-    }
-    up = np.array([0.0, 0.0, 1.0])
-    middle = ("cusp_tip", (0.5, 0.8)) if kind == "canine" else ("incisal_edge", (0.0, 0.8))
-    return {
-        "mesial_angle": corners["mesial_angle"],
-        middle[0]: _farthest(crown, (0.0, y), up, middle[1]),
-        "distal_angle": corners["distal_angle"],
-    }
+@lru_cache(maxsize=4096)
+def crown_point(crown: Crown, kind: ToothKind, name: str) -> Point:
+    """One landmark on the crown, mm."""
+    if name == "central_groove":
+        return _deepest(crown, 0.15 if kind == "molar" else 0.0)
+    if name == "buccal_groove":
+        return _buccal_groove(crown)
+    return _edge_point(crown, kind, name) if crown.edge else _tip(crown, name)
 
 
-def _cusp_points(crown: Crown) -> dict[str, Point]:
-    """Tips of the cusps that have a name on a premolar or a molar."""
-    up = np.array([0.0, 0.0, 1.0])
-    row = sorted(crown.cusps, key=lambda cusp: cusp.x)
-    tips = {
-        side: [
-            _farthest(crown, (cusp.x * crown.half_width_mm, cusp.y * crown.half_depth_mm), up, (0.6, 0.6))
-            for cusp in row
-            if cusp.y * sign > 0
-        ]
-        for side, sign in (("buccal", 1), ("lingual", -1))
-    }
-    points = {f"{side}_cusp": tips[side][0] for side in tips} | {f"mesio{side}_cusp": tips[side][0] for side in tips}
-    return points | ({"distobuccal_cusp": tips["buccal"][1]} if len(tips["buccal"]) > 1 else {})
+def _edge_point(crown: Crown, kind: ToothKind, name: str) -> Point:
+    """A corner of an incisal edge, or its middle or tip."""
+    y = (crown.buccal[-2] - crown.lingual[-2]) / 2 * crown.depth_mm
+    if name in ("cusp_tip", "incisal_edge"):
+        return _farthest(crown, (0.0, y), UP, (0.5 if name == "cusp_tip" else 0.0, 0.8))
+    side, lean = (-1 if name == "mesial_angle" else 1), np.radians(ANGLE_DEG[kind])
+    towards = np.array([side * np.sin(lean), 0.0, np.cos(lean)])
+    return _farthest(crown, (0.8 * side * crown.half_width_mm, y), towards, (1.0, 1.0))
+
+
+def _tip(crown: Crown, name: str) -> Point:
+    """The tip of a cusp by its name: the mesial or distal one of its side."""
+    side = 1 if "buccal" in name else -1
+    row = sorted((cusp for cusp in crown.cusps if side * cusp.y > 0), key=lambda cusp: cusp.x)
+    cusp = row[1 if name.startswith("disto") else 0]
+    return _farthest(crown, (cusp.x * crown.half_width_mm, cusp.y * crown.half_depth_mm), UP, (0.6, 0.6))
 
 
 def _buccal_groove(crown: Crown) -> Point:
@@ -91,12 +80,13 @@ def _farthest(crown: Crown, start: tuple[float, float], towards: Point, reach: t
     """The point of the occlusal surface farthest in a direction, within `reach` mm of a start (x, y)."""
     best, spread = np.array(start), np.array(reach)
     low, high = best - spread, best + spread
-    steps = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 5)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
-    for _ in range(7):
+    axes = [np.linspace(-1.0, 1.0, 5) if reach_mm else np.zeros(1) for reach_mm in reach]
+    steps = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    for _ in range(5):
         xy = np.clip(best + spread * steps, low, high)
         points = np.column_stack([xy, heights(crown, xy)])
         best = xy[(points @ towards).argmax()]
-        spread = 0.45 * spread
+        spread = 0.35 * spread
     return np.array([*best, heights(crown, best[None])[0]])
 
 
@@ -104,7 +94,7 @@ def heights(crown: Crown, xy: Float[np.ndarray, "n 2"]) -> Values:
     """Height in mm, shape (n,), of the surface above points of the cervical plane; minus infinity beside the crown."""
     z = np.full(len(xy), 1.1 * crown.height_mm)
     distance = z
-    for _ in range(9):
+    for _ in range(6):
         distance = crown_distance(crown, np.column_stack([xy, z]))
-        z = z - distance
+        z = z - distance / 0.8  # the slope of the occlusal part of the distance
     return np.where(np.abs(distance) < STEEPEST, z, -np.inf)

@@ -33,8 +33,8 @@ class Gum:
     """Unevenness: wave vector (rad/mm) and phase of each wave."""
 
     @staticmethod
-    def around(teeth: tuple[PlacedTooth, ...], rng: np.random.Generator) -> "Gum":
-        """The ridge that holds the teeth."""
+    def around(teeth: tuple[PlacedTooth, ...], waves: Float[np.ndarray, "w 4"]) -> "Gum":
+        """The ridge that holds the teeth, uneven by the given waves."""
         cervices = np.array([placed.origin for placed in teeth])
         first, last = (_beyond(cervices[k], cervices[j]) for k, j in ((0, 1), (-1, -2)))
         knots = np.vstack([first, cervices, last])
@@ -46,9 +46,14 @@ class Gum:
             path=samples[:, :2],
             crest=samples[:, 2] - 0.6,
             half_width=samples[:, 3],
-            waves=np.column_stack([rng.normal(0.0, 0.45, (WAVES, 3)), rng.uniform(0.0, 2 * np.pi, WAVES)]),
+            waves=waves,
             base=float(cervices[:, 2].min() - 8.0),
         )
+
+    @staticmethod
+    def random_waves(rng: np.random.Generator) -> Float[np.ndarray, "w 4"]:
+        """Unevenness of an individual."""
+        return np.column_stack([rng.normal(0.0, 0.45, (WAVES, 3)), rng.uniform(0.0, 2 * np.pi, WAVES)])
 
     @cached_property
     def _tree(self) -> cKDTree:

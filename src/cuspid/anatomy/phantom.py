@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from cuspid.anatomy.arrangement import PhantomOptions, PlacedTooth, place_teeth
+from cuspid.anatomy.arrangement import PhantomOptions, PlacedTooth, place_teeth, vary_teeth
 from cuspid.anatomy.crowns import Points
 from cuspid.anatomy.gum import Gum
 from cuspid.anatomy.isosurface import (
@@ -24,15 +24,19 @@ from cuspid.anatomy.isosurface import (
     without_folds,
 )
 from cuspid.anatomy.solid import Solid
-from cuspid.anatomy.surface_points import landmarks_of
+from cuspid.anatomy.surface_points import landmarks_of, papilla
 from cuspid.jaw import Jaw, Landmark
 from cuspid.mesh import Mesh
 
-__all__ = ["PhantomOptions", "PlacedTooth", "build_phantom", "phantom_landmarks", "place_teeth"]
+__all__ = ["PhantomOptions", "PlacedTooth", "build_phantom", "phantom_landmarks", "phantom_teeth"]
 
 
 def build_phantom(options: PhantomOptions = PhantomOptions()) -> Jaw:
-    """The phantom jaw for the given options, with its landmarks; the same options give the same jaw."""
+    """The phantom jaw for the given options, with its landmarks; the same options give the same jaw.
+
+    Raises:
+        InputError: a tooth that is not there is named, or the asked dimensions cannot be met together.
+    """
     solid = _solid(options)
     landmarks = landmarks_of(solid, options.arch)
     vertices, faces = mesh_of(solid.distance, *solid.bounds, options.edge_mm)
@@ -43,15 +47,29 @@ def build_phantom(options: PhantomOptions = PhantomOptions()) -> Jaw:
 
 
 def phantom_landmarks(options: PhantomOptions = PhantomOptions()) -> dict[str, Landmark]:
-    """The landmarks that `build_phantom` gives the jaw, without the costly mesh."""
+    """The landmarks that `build_phantom` gives the jaw, without the costly mesh.
+
+    Raises:
+        InputError: as `build_phantom`.
+    """
     return landmarks_of(_solid(options), options.arch)
+
+
+def phantom_teeth(options: PhantomOptions = PhantomOptions()) -> tuple[PlacedTooth, ...]:
+    """The teeth of the phantom and where they stand, from the last one at X < 0 to the last at X > 0."""
+    return _solid(options).teeth
 
 
 def _solid(options: PhantomOptions) -> Solid:
     """Teeth and gum."""
     rng = np.random.default_rng(options.seed)
-    teeth = place_teeth(options, rng)
-    return Solid(teeth=teeth, gum=Gum.around(teeth, rng))
+    individuals = vary_teeth(options, rng)
+    waves = Gum.random_waves(rng)
+
+    def around(teeth: tuple[PlacedTooth, ...]) -> Solid:
+        return Solid(teeth=teeth, gum=Gum.around(teeth, waves))
+
+    return around(place_teeth(options, individuals, lambda teeth: papilla(around(teeth), options.arch)))
 
 
 def _through(

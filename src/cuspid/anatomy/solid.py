@@ -39,6 +39,8 @@ class Solid:
         nearest = np.zeros(len(points), dtype=np.int64)
         for placed in self.teeth:
             near = _within_reach(placed, points)
+            if not len(near):
+                continue
             local = placed.to_tooth(points[near])
             shape = placed.tooth.crown
             crown = above_root_end(shape, local, crown_distance(shape, local))

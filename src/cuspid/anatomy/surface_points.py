@@ -2,7 +2,7 @@
 
 A *cervix* is the lowest point of the gum's margin on that side of a tooth, along its long axis. The papilla of a lower
 jaw is the highest point of the gum between the central incisors on the lingual side; that of an upper jaw lies behind
-the central incisors, `PAPILLA_BELOW_MM` apical of their palatal cervices.
+the central incisors, `PAPILLA_BELOW_MM` apical of their cervices.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from cuspid.anatomy.solid import CREASE_MM, Solid
 from cuspid.jaw import Arch, Landmark
 
 PAPILLA_BELOW_MM = 1.0
-"""Height of the palatal cervices of the upper central incisors above the centre of the incisive papilla."""
+"""Height of the cervices of the upper central incisors above the centre of the incisive papilla."""
 REACH = 0.5
 """Half the part of the margin that is searched for its lowest point, as a fraction of half the width of the tooth."""
 
@@ -29,9 +29,7 @@ def landmarks_of(solid: Solid, arch: Arch) -> dict[str, Landmark]:
     """All landmarks of the teeth and the midline, by label, in the occlusal frame."""
     points = {f"{placed.fdi}.{name}": p for placed in solid.teeth for name, p in _crown_points(placed).items()}
     points = dict(zip(points, _onto(solid, np.array(list(points.values()))), strict=True))
-    for placed in solid.teeth:
-        points |= {f"{placed.fdi}.{name}": point for name, point in _cervices(solid, placed).items()}
-    points |= _midline_points(solid, arch, points)
+    points |= _cervices(solid) | {"papilla": papilla(solid, arch), "midline": _midline(solid, points)}
     return {label: Landmark(points[label]) for label in labels_of(placed.fdi for placed in solid.teeth)}
 
 
@@ -43,7 +41,7 @@ def _crown_points(placed: PlacedTooth) -> dict[str, Point]:
 
 def _onto(solid: Solid, points: Points) -> Points:
     """Points (n, 3) moved onto the surface: where neighbours touch, their crease is rounded."""
-    for _ in range(3):
+    for _ in range(5):
         points = newton_step(points, *value_and_gradient(solid.distance, points), 0.2)
     return points
 
@@ -51,34 +49,49 @@ def _onto(solid: Solid, points: Points) -> Points:
 # Points on the margin of the gum
 
 
-def _cervices(solid: Solid, placed: PlacedTooth) -> dict[str, Point]:
-    """The lowest point of the margin on either side, where the scheme has it."""
-    names = [name for name in TOOTH_LANDMARKS[kind_of(placed.fdi)] if name.endswith("_cervix")]
-    return {name: _cervix(solid, placed, -1 if name.startswith("lingual") else 1) for name in names}
-
-
-def _cervix(solid: Solid, placed: PlacedTooth, side: int) -> Point:
-    """The lowest point of the margin on the buccal (+1) or lingual (-1) side."""
-    middle, reach = 0.0, REACH * placed.tooth.crown.half_width_mm
-    local = np.zeros((0, 3))
+def _cervices(solid: Solid) -> dict[str, Point]:
+    """The lowest points of the margin, where the scheme has them, by label."""
+    sides = [
+        (placed, name, -1 if name.startswith("lingual") else 1)
+        for placed in solid.teeth
+        for name in TOOTH_LANDMARKS[kind_of(placed.fdi)]
+        if name.endswith("_cervix")
+    ]
+    reach = np.array([REACH * placed.tooth.crown.half_width_mm for placed, _, _ in sides])[:, None]
+    middle, rows = np.zeros_like(reach), np.arange(len(sides))
+    local = np.zeros((len(sides), 0, 3))
     for _ in range(2):
-        local = _margin_points(solid, placed, side, middle + reach * np.linspace(-1.0, 1.0, 11))
-        middle, reach = local[local[:, 2].argmin(), 0], 0.2 * reach
-    return placed.to_jaw(local[local[:, 2].argmin()])
+        x = middle + reach * np.linspace(-1.0, 1.0, 9)
+        local = _margin_points(solid, [(placed, side) for placed, _, side in sides], x)
+        middle, reach = local[rows, local[:, :, 2].argmin(axis=1), 0][:, None], 0.25 * reach
+    lowest = local[rows, local[:, :, 2].argmin(axis=1)]
+    return {
+        f"{placed.fdi}.{name}": placed.to_jaw(point) for (placed, name, _), point in zip(sides, lowest, strict=True)
+    }
 
 
-def _margin_points(solid: Solid, placed: PlacedTooth, side: int, x: Values) -> Points:
-    """The points (n, 3) of the margin at given x (n,) on one side, in the frame of the tooth."""
+def _margin_points(
+    solid: Solid, sides: list[tuple[PlacedTooth, int]], x: Float[np.ndarray, "t n"]
+) -> Float[np.ndarray, "t n 3"]:
+    """The points of the margin at given x on a side of each tooth, in the frame of the tooth."""
+    local = np.concatenate([_start_of_margin(placed, side, row) for (placed, side), row in zip(sides, x, strict=True)])
+    axes = np.repeat([placed.axes for placed, _ in sides], x.shape[1], axis=0)
+    origins = np.repeat([placed.origin for placed, _ in sides], x.shape[1], axis=0)
+
+    def parts(points: Points) -> Float[np.ndarray, "n 2"]:
+        tooth, gum, _ = solid.parts(np.einsum("nij,nj->ni", axes, points) + origins)
+        return np.column_stack([tooth, gum]) - CREASE_MM / 4
+
+    return _root(parts, local, np.eye(3)[1:]).reshape(*x.shape, 3)
+
+
+def _start_of_margin(placed: PlacedTooth, side: int, x: Values) -> Points:
+    """A guess at the margin (n, 3): the side of the crown at the height that its collar aims at."""
     crown = placed.tooth.crown
     local = np.column_stack([x, np.zeros_like(x), np.zeros_like(x)])
     local[:, 2] = margin_height(placed, local)
     local[:, 1] = silhouettes(crown, local[:, 2] / crown.height_mm)[2 if side > 0 else 3]
-
-    def parts(points: Points) -> Float[np.ndarray, "n 2"]:
-        tooth, gum, _ = solid.parts(points @ placed.axes.T + placed.origin)
-        return np.column_stack([tooth, gum]) - CREASE_MM / 4
-
-    return _root(parts, local, np.eye(3)[1:])
+    return local
 
 
 def _root(
@@ -97,20 +110,26 @@ def _root(
 # Points at the midline
 
 
-def _midline_points(solid: Solid, arch: Arch, points: dict[str, Point]) -> dict[str, Point]:
-    """Papilla and midline, from the landmarks of the central incisors."""
-    left, right = (placed.fdi for placed in solid.teeth if placed.fdi % 10 == 1)
+def papilla(solid: Solid, arch: Arch) -> Point:
+    """The papilla behind the central incisors."""
+    return _incisive_papilla(solid) if arch == "upper" else _lingual_papilla(solid)
+
+
+def _midline(solid: Solid, points: dict[str, Point]) -> Point:
+    """The surface half-way between the mesial angles of the central incisors, seen from above; beside crowded incisors,
+    the surface nearest to that."""
+    left, right = (placed.fdi for placed in solid.teeth if placed.position == 1)
     middle = (points[f"{left}.mesial_angle"] + points[f"{right}.mesial_angle"]) / 2
-    return {
-        "papilla": _incisive_papilla(solid, points) if arch == "upper" else _lingual_papilla(solid),
-        "midline": _first_inside(solid, middle + [0.0, 0.0, 2.0], np.array([0.0, 0.0, -1.0]), 12.0),
-    }
+    below = np.linspace(0.0, 3.0, 60)[:, None] * [0.0, 0.0, -1.0]
+    if (solid.distance(middle + below) < 0).any():
+        return _first_inside(solid, middle + [0.0, 0.0, 2.0], np.array([0.0, 0.0, -1.0]), 6.0)
+    return _onto(solid, middle[None])[0]
 
 
-def _incisive_papilla(solid: Solid, points: dict[str, Point]) -> Point:
+def _incisive_papilla(solid: Solid) -> Point:
     """The point of the palatal gum behind the contact of the central incisors."""
     between, lingual = _between_centrals(solid)
-    level = np.mean([points[f"{p.fdi}.lingual_cervix"][2] for p in solid.teeth if p.fdi % 10 == 1])
+    level = np.mean([placed.origin[2] for placed in solid.teeth if placed.position == 1])
     start = np.array([*between[:2], level - PAPILLA_BELOW_MM])
     return _first_inside(solid, start + 12.0 * lingual, -lingual, 12.0)
 
@@ -118,7 +137,7 @@ def _incisive_papilla(solid: Solid, points: dict[str, Point]) -> Point:
 def _lingual_papilla(solid: Solid) -> Point:
     """The highest point of the gum between the central incisors, on their lingual side."""
     between, lingual = _between_centrals(solid)
-    along, up = np.meshgrid(np.linspace(0.0, 6.0, 61), np.linspace(-4.0, 9.0, 131), indexing="ij")
+    along, up = np.meshgrid(np.linspace(0.0, 5.0, 26), np.linspace(-3.0, 5.0, 41), indexing="ij")
     points = between * [1.0, 1.0, 0.0] + along.reshape(-1, 1) * lingual + up.reshape(-1, 1) * [0.0, 0.0, 1.0]
     points[:, 2] += between[2]
     tooth, gum, _ = solid.parts(points)
@@ -134,7 +153,7 @@ def _lingual_papilla(solid: Solid) -> Point:
 
 def _between_centrals(solid: Solid) -> tuple[Point, Point]:
     """The point between the central incisors where they are equally near, and the lingual direction there."""
-    one, other = (placed for placed in solid.teeth if placed.fdi % 10 == 1)
+    one, other = (placed for placed in solid.teeth if placed.position == 1)
     ends = [placed.to_jaw(np.array([0.0, 0.0, 0.4 * placed.tooth.crown.height_mm])) for placed in (one, other)]
     line = np.linspace(ends[0], ends[1], 201)
     lead = np.abs(
