@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import morphops
 import numpy as np
 import pytest
@@ -21,7 +22,8 @@ from cuspid.anatomy.procrustes import superpose
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Jaw, Landmark
 from cuspid.mesh import Mesh
-from cuspid.storage.shapes import ShapeModel, read_shape_model, write_shape_model
+from cuspid.reporting.shape_figures import save_modes_picture, save_variance_picture
+from cuspid.storage import ShapeModel, read_shape_model, write_shape_model
 
 SCORES = np.array([[1.2, -0.4, 0.9], [-0.9, 1.1, 0.4], [0.3, -1.3, -0.2], [-0.6, 0.6, -1.1]])
 """Weights of three known modes in each sample; they sum to zero."""
@@ -412,3 +414,41 @@ def test_a_broken_model_is_refused(tmp_path: Path, model: ShapeModel) -> None:
     modes.unlink()
     with pytest.raises(InputError, match=r"modes\.npz.*cannot be read"):
         read_shape_model(tmp_path)
+
+
+def test_a_model_that_was_not_finished_is_refused(tmp_path: Path, model: ShapeModel) -> None:
+    write_shape_model(tmp_path, model)
+    (tmp_path / "shape.json").unlink()
+    with pytest.raises(InputError, match=r"shape\.json.*cannot be read"):
+        read_shape_model(tmp_path)
+
+
+def test_pictures_of_a_model(tmp_path: Path, model: ShapeModel) -> None:
+    save_modes_picture(tmp_path / "modes.png", model, modes=1)
+    save_variance_picture(tmp_path / "variance.png", model)
+    picture = cv2.imread(str(tmp_path / "modes.png"))
+    assert picture.shape[1] > 2 * picture.shape[0]
+    minus, mean, plus = np.array_split(picture[:, : int(0.91 * picture.shape[1])].astype(float), 3, axis=1)
+    # The mean is drawn in plaster, what departs from it in blue and orange.
+    colorful = [np.mean(np.ptp(part, axis=2) > 60) for part in (minus, mean, plus)]
+    assert colorful[1] < 0.2 * min(colorful[0], colorful[2])
+    assert (tmp_path / "variance.png").stat().st_size > 2000
+
+
+def test_smoothing_keeps_constants_and_spreads_as_far_as_it_says(base: Jaw) -> None:
+    assert base.face_labels is not None
+    template = Template.of(base.mesh, base.face_labels)
+    everywhere = np.ones(len(base.mesh.vertices))
+    constant = np.tile([1.0, -2.0, 3.0], (len(everywhere), 1))
+    assert np.allclose(template.smoothed(constant, everywhere, 1.0), constant)
+    assert np.allclose(
+        template.smoothed(constant, (np.arange(len(everywhere)) % 2).astype(float), 1.0), constant, atol=1e-3
+    )
+    # A step across a flat place: its slope is that of a Gaussian of the width that was asked for.
+    x = base.mesh.vertices[:, 0]
+    for sigma_mm in (1.0, 2.0):
+        step = np.repeat((x > 0).astype(float)[:, None], 3, axis=1)
+        flat = np.abs(base.mesh.vertex_normals[:, 0]) < 0.2
+        near = flat & (np.abs(x) < 0.5 * sigma_mm)
+        slope = np.polyfit(x[near], template.smoothed(step, everywhere, sigma_mm)[near, 0], 1)[0]
+        assert 0.7 < slope * sigma_mm * np.sqrt(2 * np.pi) < 1.4

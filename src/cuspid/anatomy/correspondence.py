@@ -1,6 +1,6 @@
 """Which point of one jaw is which point of another: a thin-plate spline through landmarks, then the surface itself.
 
-The thin-plate spline in space has the kernel ``r`` and a linear part (F. L. Bookstein, IEEE PAMI 11, 1989). It is exact
+The thin-plate spline (F. L. Bookstein, IEEE PAMI 11, 1989) has in space the kernel ``r`` and a linear part. It is exact
 at the landmarks and only there: between them the warped template floats beside the sample. It is therefore drawn onto
 the sample's surface from coarse to fine: each vertex to the nearest point of the same tooth that faces the same way, a
 vertex on the border of two labels to that border, all displacements smoothed over the template. What finds no partner

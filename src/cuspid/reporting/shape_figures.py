@@ -18,8 +18,7 @@ from matplotlib.figure import Figure
 
 from cuspid.mesh import Mesh
 from cuspid.reporting.figures import OCCLUSAL, render
-from cuspid.storage import whole_file
-from cuspid.storage.shapes import ShapeModel
+from cuspid.storage import ShapeModel, whole_file
 
 _INK = "#333333"
 _MARGIN = 0.02
@@ -38,8 +37,8 @@ def save_modes_picture(path: Path, model: ShapeModel, *, modes: int = 3, deviati
     shifts = [[_outward_shift(model.mean.mesh, jaw) for jaw in row] for row in jaws]
     limit = float(np.percentile(np.abs(shifts), 99.5)) or 1.0
     low, high = _frame([jaw for row in jaws for jaw in row])
-    row_in = 3.6 * (high - low)[1] / (high - low)[0] + 0.4
-    figure = _figure(12, 0.1 + row_in * count)
+    row_in = float(3.6 * (high - low)[1] / (high - low)[0]) + 0.4
+    figure = _figure(12.0, 0.1 + row_in * count)
     for mode in range(count):
         for column, weight in enumerate(weights):
             axes = figure.add_subplot(count, 3, 3 * mode + column + 1)
@@ -57,7 +56,7 @@ def save_modes_picture(path: Path, model: ShapeModel, *, modes: int = 3, deviati
 
 def save_variance_picture(path: Path, model: ShapeModel) -> None:
     """PNG: the standard deviation of each mode, and how much of the variance the first modes explain together."""
-    figure = _figure(7, 3.6)
+    figure = _figure(7.0, 3.6)
     axes = figure.add_subplot()
     numbers = np.arange(1, len(model.modes) + 1)
     axes.bar(numbers, model.standard_deviations_mm, color="#7b93b8", width=0.7)

@@ -48,6 +48,7 @@ from cuspid.storage.reconstructions import (
     write_reconstruction,
     write_trueness,
 )
+from cuspid.storage.shapes import MeanStep, ShapeModel, read_shape_model, write_shape_model
 from cuspid.storage.tables import write_table
 
 __all__ = [
@@ -58,6 +59,8 @@ __all__ = [
     "PART",
     "LandmarkFile",
     "LandmarkFrame",
+    "MeanStep",
+    "ShapeModel",
     "Unit",
     "claim_folder",
     "claimed_folder",
@@ -75,6 +78,7 @@ __all__ = [
     "read_poses",
     "read_reconstruction",
     "read_rig_config",
+    "read_shape_model",
     "read_truth",
     "reading",
     "trueness_summary",
@@ -92,6 +96,7 @@ __all__ = [
     "write_poses",
     "write_reconstruction",
     "write_rig_config",
+    "write_shape_model",
     "write_table",
     "write_trueness",
     "write_truth",

@@ -93,6 +93,7 @@ class ShapeModel:
 
 def write_shape_model(folder: Path, model: ShapeModel) -> None:
     """Write ``mean.ply`` (with ``mean.json``), ``modes.npz`` and, last, ``shape.json``, which completes them."""
+    (folder / "shape.json").unlink(missing_ok=True)
     write_jaw(folder / "mean.ply", model.mean)
     buffer = BytesIO()
     # A mesh file does not keep the order of the vertices.
