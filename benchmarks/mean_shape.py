@@ -2,8 +2,9 @@
 
     python benchmarks/mean_shape.py [--out benchmarks/results/mean_shape.json] [--work FOLDER] [--count 40]
 
-Phantoms are made once and kept in the work folder. *Population*: phantoms of different seeds; the mean is found twice,
-each time in a process of its own, from two different first samples, and the two means are compared. *Known mean*: one
+Phantoms are made once and kept in the work folder. *Population*: drawn from the lower jaws of
+Table 2.1; the mean is found twice, each time in a process of its own, from two different first samples, and the two
+means are compared. *Known mean*: one
 phantom, meshed anew for every sample and deformed by three smooth fields whose weights sum to zero, so that the phantom
 itself is the mean.
 """
@@ -27,11 +28,15 @@ from scipy.linalg import subspace_angles
 from cuspid import storage
 from cuspid.anatomy.mean_shape import MeanShapeOptions, mean_shape, vertex_areas
 from cuspid.anatomy.phantom import PhantomOptions, build_phantom
+from cuspid.anatomy.population import GroupName, draw_population
 from cuspid.anatomy.procrustes import best_rotation
+from cuspid.errors import InputError
 from cuspid.jaw import GUM, Jaw, Landmark
 from cuspid.mesh import Mesh
-from cuspid.storage.shapes import ShapeModel, read_shape_model, write_shape_model
+from cuspid.storage import ShapeModel, read_shape_model, write_shape_model
 
+GROUP: GroupName = "lower-14"
+"""The population."""
 KNOWN = 6
 """Samples with a known mean."""
 
@@ -98,13 +103,38 @@ def summary(model: ShapeModel) -> dict[str, object]:
     }
 
 
+def make_population(folder: Path, count: int, edge_mm: float) -> np.ndarray:
+    """The first phantoms of a drawn population that can be built, in ``folder``; their dimensions (n, 3), mm."""
+    drawn = draw_population(GROUP, count + count // 4, np.random.default_rng(0), PhantomOptions(edge_mm=edge_mm))
+    widths: list[tuple[float, float, float]] = []
+    for options in drawn:
+        try:
+            jaw = make(folder / f"{len(widths):02d}.ply", options)
+        except InputError as error:
+            print(f"left out: {error}", flush=True)
+            continue
+        widths.append(widths_mm(jaw))
+        print(f"phantom {len(widths)}: {len(jaw.mesh.faces)} faces", flush=True)
+        if len(widths) == count:
+            break
+    return np.array(widths)
+
+
+def widths_mm(jaw: Jaw) -> tuple[float, float, float]:
+    """Arch dimensions a, b and c by the landmarks of a lower jaw."""
+
+    def wide(position: int, point: str) -> float:
+        ends = [jaw.landmarks[f"{quadrant + position}.{point}"].position for quadrant in (30, 40)]
+        return float(np.linalg.norm(ends[1] - ends[0]))
+
+    return wide(3, "cusp_tip"), wide(6, "buccal_groove"), wide(7, "buccal_groove")
+
+
 def population(work: Path, count: int, edge_mm: float) -> dict[str, object]:
     """Two means of one population of phantoms."""
     folder = work / f"population-{edge_mm:g}-{count}"
-    for seed in range(count):
-        jaw = make(folder / f"{seed:02d}.ply", PhantomOptions(seed=seed, edge_mm=edge_mm))
-        print(f"phantom {seed}: {len(jaw.mesh.faces)} faces", flush=True)
-    result: dict[str, object] = {"count": count, "edge_mm": edge_mm, "faces_of_last": len(jaw.mesh.faces)}
+    widths = make_population(folder, count, edge_mm)
+    result: dict[str, object] = {"group": GROUP, "count": len(widths), "edge_mm": edge_mm}
     models = {}
     for first in ("00", "01"):
         out = work / f"model-{edge_mm:g}-{count}-{first}"
@@ -113,6 +143,7 @@ def population(work: Path, count: int, edge_mm: float) -> dict[str, object]:
         result[f"first_{first}"] = {**timing, **summary(models[first])}
         print(first, timing, flush=True)
     one, other = models["00"].mean, models["01"].mean
+    result["a_b_c_mm"] = {"mean_of_the_jaws": widths.mean(axis=0).tolist(), "of_the_mean_jaw": widths_mm(one)}
     result["landmarks_apart_um"] = landmark_distance_um(one, other)
     result["surfaces_apart"] = {"00_to_01": between(one, other), "01_to_00": between(other, one)}
     return result
