@@ -132,7 +132,7 @@ def test_what_cannot_be_boxed_is_refused(coarse_phantom: Jaw) -> None:
     with pytest.raises(InputError, match="no tooth labels"):
         boxed(replace(coarse_phantom, face_labels=np.zeros(len(coarse_phantom.mesh.faces), dtype=np.int64)))
     opened = coarse_phantom.mesh.submesh(np.arange(len(coarse_phantom.mesh.faces)) > 100)
-    with pytest.raises(InputError, match="not a closed solid"):
+    with pytest.raises(InputError, match=r"boxed jaw: not a solid .* open edges"):
         boxed(Jaw(mesh=opened, face_labels=np.asarray(coarse_phantom.face_labels)[101:]))
     flipped = Mesh(coarse_phantom.mesh.vertices, coarse_phantom.mesh.faces[:, ::-1])
     with pytest.raises(InputError, match="inside out"):

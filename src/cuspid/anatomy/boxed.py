@@ -16,6 +16,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float, Int
 
+from cuspid.anatomy.booleans import solid_of
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
@@ -69,7 +70,7 @@ def boxed(jaw: Jaw, options: BoxOptions = BoxOptions()) -> Jaw:
     """
     if not jaw.teeth or jaw.face_labels is None:
         raise InputError("boxed jaw: the jaw has no tooth labels; label its faces with FDI numbers (0 = gum)")
-    body = _solid(jaw.mesh)
+    body = solid_of(jaw.mesh, "boxed jaw")
     boxes = [_solid_box(box, options) for box in crown_boxes(jaw).values()]
     joined = manifold3d.Manifold.batch_boolean([body, *boxes], manifold3d.OpType.Add)
     outside = max(joined.decompose(), key=lambda part: part.volume())
@@ -80,23 +81,6 @@ def boxed(jaw: Jaw, options: BoxOptions = BoxOptions()) -> Jaw:
     ]
     mesh = Mesh(np.asarray(out.vert_properties)[:, :3], np.asarray(out.tri_verts).astype(np.int64))
     return Jaw(mesh=mesh, face_labels=np.concatenate(labels), arch=jaw.arch)
-
-
-def _solid(mesh: Mesh) -> manifold3d.Manifold:
-    """A closed mesh as a solid that remembers its faces."""
-    solid = manifold3d.Manifold(
-        manifold3d.Mesh64(
-            vert_properties=np.array(mesh.vertices),
-            tri_verts=mesh.faces.astype(np.uint64),
-            run_index=np.array([0, mesh.faces.size], dtype=np.uint64),
-            run_original_id=np.array([manifold3d.Manifold.reserve_ids(1)], dtype=np.uint32),
-            face_id=np.arange(len(mesh.faces), dtype=np.uint64),
-        )
-    )
-    if solid.status() != manifold3d.Error.NoError or solid.volume() <= 0:
-        reason = "turned inside out" if solid.status() == manifold3d.Error.NoError else solid.status().name
-        raise InputError(f"boxed jaw: the mesh is not a closed solid ({reason}); close and repair it")
-    return solid
 
 
 def _origin(solid: manifold3d.Manifold) -> int:
@@ -157,7 +141,7 @@ def _solid_box(box: Box, options: BoxOptions) -> manifold3d.Manifold:
     """The box with its sides divided into a grid, sunk into the gum."""
     low = box.low - [_CLEARANCE_MM, _CLEARANCE_MM, options.sink_mm]
     vertices, faces = _grid_box(low, box.high + _CLEARANCE_MM, options.edge_mm)
-    return _solid(Mesh(vertices @ box.axes.T, faces))
+    return solid_of(Mesh(vertices @ box.axes.T, faces), "box of a crown")
 
 
 def _grid_box(
