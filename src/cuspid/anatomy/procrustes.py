@@ -52,8 +52,8 @@ def superpose(samples: Float[np.ndarray, "n l 3"], *, scale: bool = False) -> Su
     """Lay configurations on their mean by rotation, translation and, if asked, scale.
 
     The mean stands in the mean frame of the samples (the rotation that brings it nearest to the plain mean of the
-    coordinates); where they were scaled, it has the mean of their centroid sizes. Raises InputError for fewer than three points, or where the
-    points of one configuration lie in a line.
+    coordinates); where they were scaled, it has the mean of their centroid sizes. Raises InputError for fewer
+    than three points, or where the points of one configuration lie in a line.
     """
     for number, sample in enumerate(samples):
         if len(sample) < 3 or dimension(sample) < 2:
