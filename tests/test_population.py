@@ -44,7 +44,7 @@ def irregularity_of(landmarks: dict[str, Landmark], arch: Arch) -> float:
     return float(np.linalg.norm(points[1::2] - points[::2], axis=1).sum())
 
 
-@settings(max_examples=4)
+@settings(max_examples=3)
 @given(
     a=st.floats(25.0, 29.0),
     b=st.floats(49.5, 53.0),
@@ -75,7 +75,7 @@ def test_larger_teeth_make_a_longer_arch() -> None:
     assert 1.0 < gain[3] < 6.0
 
 
-@pytest.mark.parametrize("missing", [(37, 47), (34, 44), (35,)])
+@pytest.mark.parametrize("missing", [(37, 47), (35,)])
 def test_missing_teeth_are_missing_and_their_space_is_closed(missing: tuple[int, ...]) -> None:
     options = PhantomOptions(missing=missing, variation=0.0)
     teeth = phantom_teeth(options)
@@ -108,13 +108,14 @@ def test_a_tooth_is_rotated_by_the_asked_angle() -> None:
 
 def test_a_tooth_is_displaced_towards_the_asked_side() -> None:
     teeth = {placed.fdi: placed for placed in phantom_teeth(PhantomOptions(displace_mm={35: -1.5}, variation=0.0))}
-    chord = teeth[36].origin - teeth[34].origin
-    outwards = np.array([chord[1], -chord[0]]) / np.hypot(*chord[:2])
-    aside = (teeth[35].origin - teeth[34].origin)[:2] @ outwards
-    mirrored = (teeth[45].origin - teeth[44].origin)[:2] @ (
-        np.array([-1.0, 1.0]) * ((teeth[46].origin - teeth[44].origin)[:2])[::-1] / np.hypot(*chord[:2])
-    )
-    assert 0.5 < abs(aside - mirrored) < 3.5
+
+    def aside(front: int, middle: int, back: int) -> float:
+        """How far the middle tooth stands outside of the line of its neighbours, mm."""
+        chord, arm = (teeth[k].origin[:2] - teeth[front].origin[:2] for k in (back, middle))
+        outwards = np.array([-chord[1], chord[0]]) / np.linalg.norm(chord)
+        return float(arm @ outwards * np.sign(outwards @ teeth[middle].origin[:2]))
+
+    assert aside(34, 35, 36) < aside(44, 45, 46) - 1.0
 
 
 @pytest.fixture(
@@ -155,7 +156,6 @@ def test_the_landmarks_of_an_unusual_jaw_lie_on_its_surface(unusual: Jaw) -> Non
         (PhantomOptions(missing=(37,), arch_length_mm=33.0), "arch_length_mm"),
         (PhantomOptions(arch_length_mm=60.0), "nearest arch"),
         (PhantomOptions(inter_canine_mm=14.0), "inter_canine_mm"),
-        (PhantomOptions(arch="upper", crowding_mm=9.0), "crowding_mm"),
     ],
 )
 def test_what_cannot_be_is_said(options: PhantomOptions, word: str) -> None:
@@ -173,14 +173,18 @@ def within_sampling_bounds(values: np.ndarray, spread: Normal) -> bool:
 
 @pytest.mark.parametrize("name", GROUPS)
 def test_a_population_has_the_spread_of_its_table(name: GroupName) -> None:
-    jaws, _ = draw_and_count(name, 40, np.random.default_rng(5))
+    jaws, _ = draw_and_count(name, 30, np.random.default_rng(5))
     group = GROUPS[name]
     drawn = np.array([[jaw.inter_canine_mm, jaw.inter_first_molar_mm, jaw.inter_second_molar_mm] for jaw in jaws])
     spreads = (group.inter_canine, group.inter_first_molar, group.inter_second_molar)
     assert all(within_sampling_bounds(drawn[:, k], spread) for k, spread in enumerate(spreads))
     assert np.corrcoef(drawn.T)[0, 1] > 0.1
-    landmarks = phantom_landmarks(jaws[0])
-    assert np.abs(dimensions_of(landmarks, group.arch)[:3] - drawn[0]).max() < TOLERANCE_MM
+
+
+def test_a_drawn_jaw_has_the_dimensions_drawn() -> None:
+    (jaw,) = draw_population("upper-12", 1, np.random.default_rng(2))
+    asked = np.array([jaw.inter_canine_mm, jaw.inter_first_molar_mm, jaw.inter_second_molar_mm])
+    assert np.abs(dimensions_of(phantom_landmarks(jaw), "upper")[:3] - asked).max() < TOLERANCE_MM
 
 
 def test_a_population_is_drawn_again_the_same() -> None:

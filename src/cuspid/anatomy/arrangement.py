@@ -24,7 +24,7 @@ from cuspid.anatomy.landmarks import kind_of
 from cuspid.errors import InputError
 from cuspid.jaw import Arch
 
-CONTACT_OVERLAP_MM = 0.02
+CONTACT_OVERLAP_MM = 0.07
 """Neighbours overlap by this much, beside the rounding of creases: contact points are worn to small areas."""
 CONTACT_ROUNDS = 4
 """How often the teeth are moved together until they touch."""
@@ -32,6 +32,8 @@ MORE_ROUNDS = 14
 """How often more, where a crowded front or a rotated tooth has to find its place."""
 DIMENSION_POINTS: Mapping[int, str] = {3: "cusp_tip", 6: "buccal_groove", 7: "buccal_groove"}
 """Landmarks between which the arch is measured, by the position of the tooth."""
+CUBE = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 8)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+"""Points of a cube, for the search of a contact."""
 PIVOT = 0.7
 """Height of the contacts, about which a tooth is inclined, as a fraction of its crown."""
 CROWDED = {1: np.array([-5.0, 0.1]), 2: np.array([7.0, -1.0]), 3: np.array([-6.0, 0.3])}
@@ -373,11 +375,14 @@ def clearance(one: PlacedTooth, other: PlacedTooth) -> float:
     aside = np.array([-towards[1], towards[0], 0.0])
     along = crown.width_mm / (crown.width_mm + front.tooth.crown.width_mm) * np.hypot(*across[:2])
     reach, depth = 0.25 * crown.half_width_mm, 0.8 * crown.half_depth_mm
-    grid = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 13)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     middle = back.to_jaw(_contact_centre(crown)) + along * towards + across[2] / 2 * np.array([0.0, 0.0, 1.0])
-    points = middle + grid @ np.stack([reach * towards, depth * aside, [0.0, 0.0, 0.33 * crown.height_mm]])
-    one_side, other_side = (crown_distance(p.tooth.crown, p.to_tooth(points)) for p in (front, back))
-    return 2 * float(np.maximum(one_side, other_side).min())
+    box = np.stack([reach * towards, depth * aside, [0.0, 0.0, 0.33 * crown.height_mm]])
+    for _ in range(2):
+        points = middle + CUBE @ box
+        one_side, other_side = (crown_distance(p.tooth.crown, p.to_tooth(points)) for p in (front, back))
+        outside = np.maximum(one_side, other_side)
+        middle, box = points[outside.argmin()], 0.3 * box
+    return 2 * float(outside.min())
 
 
 # A crowded front

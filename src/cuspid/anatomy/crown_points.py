@@ -6,6 +6,7 @@ the occlusal surface to the side. The central groove is taken at its deepest: of
 central pit; of a premolar, whose pits lie to either side, half-way between mesial and distal.
 """
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -21,44 +22,76 @@ RIM = 0.62
 ANGLE_DEG = {"incisor": 45.0, "canine": 60.0}
 """Direction in which the angle of an edge is the farthest point, from the long axis to the side: the edge of a canine
 slopes."""
+GRID = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 5)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+"""Points of a square."""
 UP = np.array([0.0, 0.0, 1.0])
 """The occlusal direction."""
 STEEPEST = 0.02
 """Residual distance in mm above which a vertical line does not meet the crown."""
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Goal:
+    """A point of the occlusal surface: the farthest in a direction within a rectangle."""
+
+    start: Float[np.ndarray, "2"]
+    """Middle of the rectangle, mm."""
+    reach: Float[np.ndarray, "2"]
+    """Half its sides, mm."""
+    towards: Point
+    """The direction."""
+
+
 def crown_points(crown: Crown, kind: ToothKind) -> dict[str, Point]:
     """The landmarks on the crown by name, mm: those of `TOOTH_LANDMARKS` but for the cervices."""
     names = [name for name in TOOTH_LANDMARKS[kind] if not name.endswith("_cervix")]
-    return {name: crown_point(crown, kind, name) for name in names}
+    goals = [name for name in names if name != "buccal_groove"]
+    points = dict(zip(goals, _farthest(crown, [_goal(crown, kind, name) for name in goals]), strict=True))
+    return {name: points[name] if name in points else _buccal_groove(crown) for name in names}
 
 
 @lru_cache(maxsize=4096)
 def crown_point(crown: Crown, kind: ToothKind, name: str) -> Point:
     """One landmark on the crown, mm."""
-    if name == "central_groove":
-        return _deepest(crown, 0.15 if kind == "molar" else 0.0)
     if name == "buccal_groove":
         return _buccal_groove(crown)
+    return _farthest(crown, [_goal(crown, kind, name)])[0]
+
+
+def _goal(crown: Crown, kind: ToothKind, name: str) -> _Goal:
+    """What a landmark is."""
+    if name == "central_groove":
+        return _deepest(crown, 0.15 if kind == "molar" else 0.0)
     return _edge_point(crown, kind, name) if crown.edge else _tip(crown, name)
 
 
-def _edge_point(crown: Crown, kind: ToothKind, name: str) -> Point:
+def _edge_point(crown: Crown, kind: ToothKind, name: str) -> _Goal:
     """A corner of an incisal edge, or its middle or tip."""
     y = (crown.buccal[-2] - crown.lingual[-2]) / 2 * crown.depth_mm
     if name in ("cusp_tip", "incisal_edge"):
-        return _farthest(crown, (0.0, y), UP, (0.5 if name == "cusp_tip" else 0.0, 0.8))
+        reach = np.array([0.5 if name == "cusp_tip" else 0.0, 0.8])
+        return _Goal(start=np.array([0.0, y]), reach=reach, towards=UP)
     side, lean = (-1 if name == "mesial_angle" else 1), np.radians(ANGLE_DEG[kind])
     towards = np.array([side * np.sin(lean), 0.0, np.cos(lean)])
-    return _farthest(crown, (0.8 * side * crown.half_width_mm, y), towards, (1.0, 1.0))
+    return _Goal(start=np.array([0.8 * side * crown.half_width_mm, y]), reach=np.ones(2), towards=towards)
 
 
-def _tip(crown: Crown, name: str) -> Point:
+def _tip(crown: Crown, name: str) -> _Goal:
     """The tip of a cusp by its name: the mesial or distal one of its side."""
     side = 1 if "buccal" in name else -1
     row = sorted((cusp for cusp in crown.cusps if side * cusp.y > 0), key=lambda cusp: cusp.x)
     cusp = row[1 if name.startswith("disto") else 0]
-    return _farthest(crown, (cusp.x * crown.half_width_mm, cusp.y * crown.half_depth_mm), UP, (0.6, 0.6))
+    start = np.array([cusp.x * crown.half_width_mm, cusp.y * crown.half_depth_mm])
+    return _Goal(start=start, reach=np.full(2, 0.6), towards=UP)
+
+
+def _deepest(crown: Crown, wide: float) -> _Goal:
+    """The lowest point between buccal and lingual cusps, within a fraction of half the width about the middle."""
+    low = max(cusp.y for cusp in crown.cusps if cusp.y < 0)
+    high = min(cusp.y for cusp in crown.cusps if cusp.y > 0.25)
+    half = crown.half_depth_mm
+    reach = np.array([wide * crown.half_width_mm, 0.4 * (high - low) * half])
+    return _Goal(start=np.array([0.0, (low + high) / 2 * half]), reach=reach, towards=-UP)
 
 
 def _buccal_groove(crown: Crown) -> Point:
@@ -67,27 +100,19 @@ def _buccal_groove(crown: Crown) -> Point:
     return np.array([x, y, top_of(crown, x, y)])
 
 
-def _deepest(crown: Crown, wide: float) -> Point:
-    """The lowest point between buccal and lingual cusps, within a fraction of half the width about the middle."""
-    low = max(cusp.y for cusp in crown.cusps if cusp.y < 0)
-    high = min(cusp.y for cusp in crown.cusps if cusp.y > 0.25)
-    centre = (low + high) / 2 * crown.half_depth_mm
-    reach = (wide * crown.half_width_mm, 0.8 * (high - low) / 2 * crown.half_depth_mm)
-    return _farthest(crown, (0.0, centre), np.array([0.0, 0.0, -1.0]), reach)
-
-
-def _farthest(crown: Crown, start: tuple[float, float], towards: Point, reach: tuple[float, float]) -> Point:
-    """The point of the occlusal surface farthest in a direction, within `reach` mm of a start (x, y)."""
-    best, spread = np.array(start), np.array(reach)
-    low, high = best - spread, best + spread
-    axes = [np.linspace(-1.0, 1.0, 5) if reach_mm else np.zeros(1) for reach_mm in reach]
-    steps = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+def _farthest(crown: Crown, goals: list[_Goal]) -> Float[np.ndarray, "g 3"]:
+    """The points that are sought, by grids that narrow down."""
+    best = np.array([goal.start for goal in goals])
+    spread = np.array([goal.reach for goal in goals])
+    low, high = (best - spread)[:, None], (best + spread)[:, None]
+    towards = np.array([goal.towards for goal in goals])
     for _ in range(5):
-        xy = np.clip(best + spread * steps, low, high)
-        points = np.column_stack([xy, heights(crown, xy)])
-        best = xy[(points @ towards).argmax()]
+        xy = np.clip(best[:, None] + spread[:, None] * GRID, low, high)
+        z = heights(crown, xy.reshape(-1, 2)).reshape(xy.shape[:2])
+        score = np.einsum("gnk,gk->gn", xy, towards[:, :2]) + z * towards[:, 2:]
+        best = xy[np.arange(len(goals)), score.argmax(axis=1)]
         spread = 0.35 * spread
-    return np.array([*best, heights(crown, best[None])[0]])
+    return np.column_stack([best, heights(crown, best)])
 
 
 def heights(crown: Crown, xy: Float[np.ndarray, "n 2"]) -> Values:
