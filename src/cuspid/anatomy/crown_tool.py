@@ -26,7 +26,7 @@ from cuspid.mesh import Mesh
 
 EMERGENCE = 0.09
 """How far the proximal side at the finish line stands back from the contact, as a share of the crown's width: two
-thirds of half the difference between the mesiodistal diameters of crown and cervix in Wheeler's table; the line lies above."""
+thirds of half the difference between the mesiodistal diameters of crown and cervix in Wheeler's table."""
 SCALLOP_MM = {"incisor": 2.5, "canine": 2.0, "premolar": 1.0, "molar": 1.0}
 """Curvature of the cervical line towards the contacts, rounded from Wheeler's table of measurements."""
 SULCUS_MM = 0.4

@@ -1,0 +1,111 @@
+"""The edge of a preparation is found where it is, and what the detector cannot tell is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cuspid.errors import InputError
+from cuspid.evaluation.margin import MarginOptions, margin_error, margin_errors
+from cuspid.geometry import Rigid3
+from cuspid.jaw import Jaw
+from cuspid.mesh import Mesh
+
+TURNS = 180
+RADIUS_MM = 3.0
+
+
+def stump(fillet_mm: float = 0.0) -> Mesh:
+    """A cylinder of 3 mm radius whose upper edge, at z = 0, is rounded by a fillet; open below."""
+    angles = np.linspace(np.pi / 2, 0, 12)
+    arc = np.column_stack([RADIUS_MM - fillet_mm * (1 - np.cos(angles)), fillet_mm * (np.sin(angles) - 1)])
+    corner = arc if fillet_mm else np.array([[RADIUS_MM, 0.0]])
+    across = np.arange(0.4, RADIUS_MM - fillet_mm - 0.02, 0.1)
+    down = np.arange(-fillet_mm - 0.1, -2.5, -0.1)
+    profile = np.concatenate(
+        [np.column_stack([across, 0 * across]), corner, np.column_stack([0 * down + RADIUS_MM, down])]
+    )
+    turn = 2 * np.pi * np.arange(TURNS) / TURNS
+    r, z = profile[:, :1], profile[:, 1:]
+    vertices = np.stack([r * np.cos(turn), r * np.sin(turn), z + 0 * turn], axis=-1).reshape(-1, 3)
+    k = np.arange(len(profile) - 1)[:, None] * TURNS
+    a, b = k + np.arange(TURNS), k + (np.arange(TURNS) + 1) % TURNS
+    quads = [np.stack([a, a + TURNS, b + TURNS], axis=-1), np.stack([a, b + TURNS, b], axis=-1)]
+    return Mesh(vertices, np.concatenate([quad.reshape(-1, 3) for quad in quads]))
+
+
+def rim() -> np.ndarray:
+    """The edge of the sharp stump: closed, counter-clockwise from above."""
+    turn = 2 * np.pi * np.arange(TURNS + 1) / TURNS
+    return np.column_stack([RADIUS_MM * np.cos(turn), RADIUS_MM * np.sin(turn), 0 * turn])
+
+
+def test_the_reference_against_itself_is_the_floor() -> None:
+    error = margin_error(stump(), stump(), rim())
+    assert error.floor == error.scan
+    assert error.floor.found_pct == 100
+    assert error.floor.sections > 150
+    assert error.floor.max_um < 5
+
+
+@given(towards=st.floats(0, 2 * np.pi), shift_um=st.floats(10, 120))
+@settings(max_examples=4)
+def test_a_scan_that_is_too_high_or_too_low_is_measured(towards: float, shift_um: float) -> None:
+    sign = 1 if towards < np.pi else -1
+    moved = stump().transformed(Rigid3(np.eye(3), np.array([0.0, 0.0, sign * shift_um / 1000])))
+    found = margin_error(moved, stump(), rim()).scan
+    assert found.mean_um == pytest.approx(shift_um, abs=5)
+    # The edge is square: its bisector leans by 45 degrees, and lateral points down and outwards.
+    assert found.outward_um == pytest.approx(sign * shift_um / np.sqrt(2), abs=5)
+    assert found.lateral_um == pytest.approx(-sign * shift_um / np.sqrt(2), abs=5)
+
+
+def test_a_larger_stump_moves_the_margin_both_outwards_and_aside() -> None:
+    reference = stump()
+    larger = Mesh(reference.vertices * [1.01, 1.01, 1.0], reference.faces)
+    found = margin_error(larger, reference, rim()).scan
+    assert found.mean_um == pytest.approx(30, abs=5)
+    assert found.lateral_um == pytest.approx(30 / np.sqrt(2), abs=4)
+
+
+@pytest.mark.parametrize("fillet_mm", [0.04, 0.08])
+def test_a_rounded_edge_lies_inwards(fillet_mm: float) -> None:
+    found = margin_error(stump(fillet_mm), stump(), rim()).scan
+    expected_um = 1000 * fillet_mm * (np.sqrt(2) - 1)
+    assert found.outward_um == pytest.approx(-expected_um, abs=4)
+    assert found.lateral_um == pytest.approx(0, abs=4)
+    assert found.found_pct > 98
+
+
+def test_what_the_scan_lacks_is_not_found() -> None:
+    reference = stump()
+    half = reference.submesh(reference.face_centres[:, 0] > 0)
+    found = margin_error(half, reference, rim()).scan
+    assert 40 < found.found_pct < 52
+    assert found.mean_um < 5
+
+
+def test_a_scan_elsewhere_has_no_edge() -> None:
+    far = stump().transformed(Rigid3(np.eye(3), np.array([50.0, 0.0, 0.0])))
+    found = margin_error(far, stump(), rim()).scan
+    assert found.found_pct == 0
+    assert np.isnan(found.mean_um)
+
+
+def test_margins_are_named_by_tooth_and_the_alignment_is_applied() -> None:
+    away = Rigid3.from_rotation_vector(np.array([0.1, -0.2, 0.3]), np.array([1.0, 2.0, 3.0]))
+    jaw = Jaw(mesh=stump(), lines={"45.margin": rim(), "46.crack": rim()})
+    errors = margin_errors(stump().transformed(away), jaw, away.inverse())
+    assert list(errors) == [45]
+    assert errors[45].scan.max_um < 5
+
+
+def test_a_line_that_is_no_edge_is_refused() -> None:
+    with pytest.raises(InputError, match="no edge"):
+        margin_error(stump(), stump(), rim() * [0.6, 0.6, 1.0])
+    with pytest.raises(InputError, match="too short"):
+        margin_error(stump(), stump(), rim()[:4])
+    with pytest.raises(InputError, match="flanks"):
+        MarginOptions(flank_from_mm=0.5)
