@@ -9,6 +9,7 @@ what says otherwise.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +19,25 @@ from cuspid.errors import InputError
 
 GREEN_UM = 0.55
 """Wavelength for which diffraction is given."""
+
+
+Projection = Literal["rectilinear", "equidistant"]
+"""How a lens maps the angle from its axis to the radius in the image: r = f tan(angle) or r = f angle."""
+
+
+def horizontal_from_diagonal_deg(
+    diagonal_deg: float, width_px: int, height_px: int, projection: Projection = "rectilinear"
+) -> float:
+    """Full horizontal angle of view of a lens of which the diagonal one is published."""
+    if not (0 < diagonal_deg < 180 and width_px > 0 and height_px > 0):
+        raise InputError(
+            f"optics: the diagonal angle of view must lie in 0-180 deg and the image have a size, not {diagonal_deg:g} "
+            f"deg and {width_px} x {height_px} px"
+        )
+    share = width_px / float(np.hypot(width_px, height_px))
+    if projection == "equidistant":
+        return diagonal_deg * share
+    return float(np.rad2deg(2 * np.arctan(share * np.tan(np.deg2rad(diagonal_deg) / 2))))
 
 
 @dataclass(frozen=True, kw_only=True)
