@@ -1,0 +1,168 @@
+"""The named surfaces of the teeth of a labelled jaw, and of the gum around them (thesis, figure 3.13).
+
+Each tooth has axes of its own: distal along the tangent of the arch, outward (to cheek and lip) along its normal,
+occlusal along +Z of the occlusal frame. The origin is the middle of the crown's extent along them; *relative* places
+are divided by half that extent, so that the crown spans -1 to 1.
+
+- *occlusal* (premolars and molars): in the upper half, what looks upwards and does not slope outwards; and all that
+  looks up at all within the rim of that, but for the lowest quarter of the crown. The rim is smoothed around the tooth:
+  it follows the cusp ridges and marginal ridges.
+- *incisal* (incisors and canines): what looks upwards less than `SurfaceOptions.incisal_mm` below the edge.
+- the four *sides*: all other faces of a tooth, by where they look and, with half the weight, by where they lie. The
+  outer side is *buccal*, of incisors and canines *labial*; the inner one is called *lingual* in both jaws.
+- *gingival*: gum up to `SurfaceOptions.gingival_mm` from a tooth. Other gum has no name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import median_filter, uniform_filter1d
+
+from cuspid.anatomy.landmarks import kind_of
+from cuspid.errors import InputError
+from cuspid.jaw import Jaw
+
+SURFACES = ("occlusal", "incisal", "buccal", "labial", "lingual", "mesial", "distal", "gingival")
+"""Names of the surfaces, in the order of tables."""
+
+_ARCH_ORDER = (*range(48, 40, -1), *range(31, 39), *range(18, 10, -1), *range(21, 29))
+"""FDI numbers along the lower and the upper arch, from the patient's right to the left."""
+_UPWARDS = 0.5
+"""Least z of the normal of a face of an edge or rim: it is inclined by less than 60 degrees."""
+_OUTWARDS = 0.5
+"""A face slopes outwards if its normal has more than this along the way from the middle: by more than 30 degrees."""
+_WEDGES = 24
+"""Directions in which the rim is looked for."""
+_BINS = 12
+"""Places along a tooth at which its edge is looked for."""
+
+Local = Float[np.ndarray, "n 3"]
+"""Distal, outward and occlusal components for each face."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceOptions:
+    """Where surfaces end."""
+
+    incisal_mm: float = 1.0
+    """Height of the incisal surface."""
+    gingival_mm: float = 3.0
+    """Width of the gum around the teeth that counts as gingival surface."""
+
+    def __post_init__(self) -> None:
+        if not (self.incisal_mm > 0 and self.gingival_mm > 0):
+            raise InputError("surfaces: --incisal-mm and --gingival-mm must be positive")
+
+
+def named_surfaces(jaw: Jaw, options: SurfaceOptions = SurfaceOptions()) -> dict[str, Bool[np.ndarray, "f"]]:
+    """A mask over the faces for each of `SURFACES`; no face is in two of them, each face of a tooth is in one.
+
+    Raises InputError for a jaw with fewer than two labelled teeth, which do not tell how the arch runs.
+    """
+    codes = np.full(len(jaw.mesh.faces), -1)
+    for fdi, axes in tooth_axes(jaw).items():
+        faces = np.flatnonzero(jaw.tooth_faces(fdi))
+        codes[faces] = _codes(fdi, _places(jaw, faces, axes), jaw.mesh.face_normals[faces] @ axes.T, options)
+    codes[_beside_teeth(jaw, options.gingival_mm)] = SURFACES.index("gingival")
+    return {name: codes == code for code, name in enumerate(SURFACES)}
+
+
+def tooth_axes(jaw: Jaw) -> dict[int, Float[np.ndarray, "3 3"]]:
+    """Distal, outward and occlusal unit vectors as rows, for each tooth (FDI), in the order along the arch.
+
+    Raises InputError for a jaw with fewer than two labelled teeth.
+    """
+    order = [fdi for fdi in _ARCH_ORDER if fdi in jaw.teeth]
+    if len(order) < 2:
+        raise InputError(
+            f"surfaces: the jaw has {len(order)} labelled teeth; two at least are needed to know how the arch runs "
+            "(an FDI number for each face, 0 for gum)"
+        )
+    tangents = np.gradient([_centroid(jaw, fdi) for fdi in order], axis=0)
+    return {fdi: _axes(fdi, along / np.linalg.norm(along)) for fdi, along in zip(order, tangents, strict=True)}
+
+
+def _centroid(jaw: Jaw, fdi: int) -> Float[np.ndarray, "2"]:
+    faces = jaw.tooth_faces(fdi)
+    return np.asarray(np.average(jaw.mesh.face_centres[faces, :2], axis=0, weights=jaw.mesh.face_areas[faces]))
+
+
+def _axes(fdi: int, along: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3 3"]:
+    """``along`` points from the patient's right to the left: seen from +Z, counter-clockwise in a lower jaw only."""
+    quadrant = fdi // 10
+    outward = np.array([along[1], -along[0]]) * (1 if quadrant in (3, 4) else -1)
+    distal = along * (1 if quadrant in (2, 3) else -1)
+    return np.array([[*distal, 0.0], [*outward, 0.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Places:
+    """Where the faces of a tooth lie along its axes, from the middle of its extent."""
+
+    mm: Local
+    half_mm: Float[np.ndarray, "3"]
+    """Half the extent."""
+
+    @property
+    def relative(self) -> Local:
+        return self.mm / self.half_mm
+
+
+def _places(jaw: Jaw, faces: Int[np.ndarray, "n"], axes: Float[np.ndarray, "3 3"]) -> _Places:
+    corners = jaw.mesh.vertices[jaw.mesh.faces[faces]] @ axes.T
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    return _Places(mm=jaw.mesh.face_centres[faces] @ axes.T - (low + high) / 2, half_mm=(high - low) / 2)
+
+
+def _codes(fdi: int, places: _Places, normals: Local, options: SurfaceOptions) -> Int[np.ndarray, "n"]:
+    front = kind_of(fdi) in ("incisor", "canine")
+    names = ("incisal", "labial") if front else ("occlusal", "buccal")
+    top, outer, lingual, mesial, distal = (SURFACES.index(name) for name in (*names, "lingual", "mesial", "distal"))
+    towards = _unit(normals[:, :2]) + 0.5 * _unit(places.relative[:, :2])
+    proximal = np.abs(towards[:, 0]) > np.abs(towards[:, 1])
+    sides = np.where(proximal, np.where(towards[:, 0] > 0, distal, mesial), np.where(towards[:, 1] > 0, outer, lingual))
+    is_top = _is_incisal(places, normals, options.incisal_mm) if front else _is_occlusal(places, normals)
+    return np.asarray(np.where(is_top, top, sides))
+
+
+def _unit(vectors: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+
+
+def _is_incisal(places: _Places, normals: Local, height_mm: float) -> Bool[np.ndarray, "n"]:
+    """Little below the highest face at the same place along the tooth."""
+    bins = np.clip(np.floor((places.relative[:, 0] + 1) / 2 * _BINS).astype(int), 0, _BINS - 1)
+    top = np.full(_BINS, -np.inf)
+    np.maximum.at(top, bins, places.mm[:, 2])
+    return np.asarray((places.mm[:, 2] > top[bins] - height_mm) & (normals[:, 2] > _UPWARDS))
+
+
+def _is_occlusal(places: _Places, normals: Local) -> Bool[np.ndarray, "n"]:
+    """Within the rim of the crown."""
+    radius = np.linalg.norm(places.relative[:, :2], axis=1)
+    turns = np.arctan2(places.relative[:, 1], places.relative[:, 0]) / (2 * np.pi)
+    sloping = np.einsum("nk,nk->n", normals[:, :2], _unit(places.mm[:, :2]))
+    table = (normals[:, 2] > _UPWARDS) & (sloping < _OUTWARDS) & (places.relative[:, 2] > 0)
+    rim = _rim(turns[table], radius[table], turns)
+    return np.asarray(table | (radius <= rim) & (normals[:, 2] > 0) & (places.relative[:, 2] > -0.5))
+
+
+def _rim(
+    turns: Float[np.ndarray, "m"], radius: Float[np.ndarray, "m"], wanted: Float[np.ndarray, "n"]
+) -> Float[np.ndarray, "n"]:
+    """Largest radius in each direction (in turns), smoothed around the circle, at the wanted directions."""
+    largest = np.zeros(_WEDGES)
+    np.maximum.at(largest, np.floor(turns * _WEDGES).astype(int) % _WEDGES, radius)
+    smooth = uniform_filter1d(median_filter(largest, 3, mode="wrap"), 3, mode="wrap")
+    return np.interp(wanted, (np.arange(_WEDGES) + 0.5) / _WEDGES, smooth, period=1.0)
+
+
+def _beside_teeth(jaw: Jaw, reach_mm: float) -> Int[np.ndarray, "n"]:
+    """The faces of the gum that lie near a tooth."""
+    tooth = np.any([jaw.tooth_faces(fdi) for fdi in jaw.teeth], axis=0)
+    gum = np.flatnonzero(~tooth)
+    distances, _, _ = jaw.mesh.submesh(tooth).closest(jaw.mesh.face_centres[gum])
+    return np.asarray(gum[distances <= reach_mm])
