@@ -33,7 +33,8 @@ from cuspid.anatomy.procrustes import best_rotation
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Jaw, Landmark
 from cuspid.mesh import Mesh
-from cuspid.storage import ShapeModel, read_shape_model, write_shape_model
+from cuspid.shape_model import ShapeModel
+from cuspid.storage import read_shape_model, write_shape_model
 
 GROUP: GroupName = "lower-14"
 """The population."""

@@ -23,7 +23,8 @@ from cuspid.errors import InputError
 from cuspid.jaw import GUM, Jaw, Landmark
 from cuspid.mesh import Mesh
 from cuspid.reporting.shape_figures import save_modes_picture, save_variance_picture
-from cuspid.storage import ShapeModel, read_shape_model, write_shape_model
+from cuspid.shape_model import ShapeModel
+from cuspid.storage import read_shape_model, write_shape_model
 
 SCORES = np.array([[1.2, -0.4, 0.9], [-0.9, 1.1, 0.4], [0.3, -1.3, -0.2], [-0.6, 0.6, -1.1]])
 """Weights of three known modes in each sample; they sum to zero."""

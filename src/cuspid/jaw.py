@@ -18,6 +18,7 @@ from cuspid.geometry import read_only
 from cuspid.mesh import Mesh
 
 Arch = Literal["lower", "upper"]
+ARCHES: tuple[Arch, ...] = ("lower", "upper")
 GUM = 0
 """The label of faces that are not a tooth."""
 

@@ -28,7 +28,7 @@ from cuspid.anatomy.procrustes import Superposition, dimension, superpose
 from cuspid.errors import InputError
 from cuspid.jaw import Jaw, Landmark
 from cuspid.mesh import Mesh
-from cuspid.storage import MeanStep, ShapeModel
+from cuspid.shape_model import MeanStep, ShapeModel
 
 Progress = Callable[[str, int, int], None]
 """Told the stage, how much of it is done and how much there is."""

@@ -38,7 +38,7 @@ from cuspid.mesh import Mesh
 _OVERLAP_MM = 0.005
 
 
-def _within(kind: str, name: str, value: float, low: float, high: float) -> None:
+def _within(kind: str, name: str, value: float | int, low: float | int, high: float | int) -> None:
     if not low <= value <= high:
         raise InputError(f"{kind}: {name} is {value:g}; it must lie in {low:g} to {high:g}")
 
@@ -55,8 +55,8 @@ class CrackOptions:
     """The marginal ridge that it crosses."""
 
     def __post_init__(self) -> None:
-        _within("crack", "width_um", self.width_um, 20, 1000)
-        _within("crack", "depth_um", self.depth_um, 50, 3000)
+        _within("crack", "width_um", self.width_um, 20.0, 1000.0)
+        _within("crack", "depth_um", self.depth_um, 50.0, 3000.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,22 +126,22 @@ class InlayOptions:
     """Rounding of the internal edges between walls and floors."""
 
     def __post_init__(self) -> None:
-        _within("inlay", "isthmus_width_mm", self.isthmus_width_mm, 0.8, 6)
-        _within("inlay", "pulpal_depth_mm", self.pulpal_depth_mm, 0.5, 4)
-        _within("inlay", "box_width_mm", self.box_width_mm, self.isthmus_width_mm, 8)
-        _within("inlay", "gingival_floor_mm", self.gingival_floor_mm, 0.5, 3)
-        _within("inlay", "box_depth_mm", self.box_depth_mm, 0.3, 4)
-        _within("inlay", "divergence_deg", self.divergence_deg, 0, 20)
+        _within("inlay", "isthmus_width_mm", self.isthmus_width_mm, 0.8, 6.0)
+        _within("inlay", "pulpal_depth_mm", self.pulpal_depth_mm, 0.5, 4.0)
+        _within("inlay", "box_width_mm", self.box_width_mm, self.isthmus_width_mm, 8.0)
+        _within("inlay", "gingival_floor_mm", self.gingival_floor_mm, 0.5, 3.0)
+        _within("inlay", "box_depth_mm", self.box_depth_mm, 0.3, 4.0)
+        _within("inlay", "divergence_deg", self.divergence_deg, 0.0, 20.0)
         _within("inlay", "edge_radius_mm", self.edge_radius_mm, 0.05, self.isthmus_width_mm / 3)
 
 
 def _check_crown(name: str, options: CrownOptions | FullContourCrownOptions) -> None:
-    _within(name, "occlusal_reduction_mm", options.occlusal_reduction_mm, 0.3, 4)
-    _within(name, "axial_reduction_mm", options.axial_reduction_mm, 0.2, 3)
-    _within(name, "taper_deg", options.taper_deg, 1, 20)
-    _within(name, "finish_width_mm", options.finish_width_mm, 0.2, 2)
-    _within(name, "above_gum_mm", options.above_gum_mm, 0.2, 3)
-    _within(name, "edge_radius_mm", options.edge_radius_mm, 0.1, 1)
+    _within(name, "occlusal_reduction_mm", options.occlusal_reduction_mm, 0.3, 4.0)
+    _within(name, "axial_reduction_mm", options.axial_reduction_mm, 0.2, 3.0)
+    _within(name, "taper_deg", options.taper_deg, 1.0, 20.0)
+    _within(name, "finish_width_mm", options.finish_width_mm, 0.2, 2.0)
+    _within(name, "above_gum_mm", options.above_gum_mm, 0.2, 3.0)
+    _within(name, "edge_radius_mm", options.edge_radius_mm, 0.1, 1.0)
     if options.finish_line not in ("shoulder", "chamfer"):
         raise InputError(f"{name}: finish_line is {options.finish_line!r}; choose shoulder or chamfer")
 

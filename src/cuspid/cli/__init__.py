@@ -9,15 +9,20 @@ from typing import Any
 import tyro
 
 from cuspid.cli.handpieces import handpiece
-from cuspid.cli.jaws import phantom
+from cuspid.cli.jaws import box, phantom, prepare
 from cuspid.cli.mouth import mouth
 from cuspid.cli.scan import evaluate, reconstruct, run, simulate
 from cuspid.cli.shared import console
+from cuspid.cli.surveys import measure, shape
 from cuspid.errors import CuspidError
 
 COMMANDS: Mapping[str, Callable[..., Any]] = {
     "run": run,
     "phantom": phantom,
+    "measure": measure,
+    "shape": shape,
+    "prepare": prepare,
+    "box": box,
     "mouth": mouth,
     "handpiece": handpiece,
     "simulate": simulate,

@@ -1,14 +1,29 @@
-"""What is scanned: phantoms."""
+"""What is scanned: phantoms, their populations, and prepared teeth."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
+
+import numpy as np
+from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
 from cuspid import storage
+from cuspid.anatomy.boxed import boxed
 from cuspid.anatomy.phantom import PhantomOptions, build_phantom
+from cuspid.anatomy.population import GroupName, draw_population
+from cuspid.anatomy.preparation import (
+    CrackOptions,
+    CrownOptions,
+    FullContourCrownOptions,
+    InlayOptions,
+    PreparationOptions,
+    preset,
+)
+from cuspid.anatomy.preparation import prepare as prepare_teeth
 from cuspid.anatomy.sphere_arch import SphereArchOptions, build_sphere_arch
-from cuspid.cli.shared import Flat, console
+from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
 from cuspid.errors import InputError
 from cuspid.jaw import Jaw
 from cuspid.reporting.figures import save_picture
@@ -18,31 +33,103 @@ def phantom(
     *,
     out: Path,
     options: Annotated[PhantomOptions, Flat] = PhantomOptions(),
+    group: GroupName | None = None,
+    count: int = 10,
     spheres: bool = False,
     sphere: SphereArchOptions = SphereArchOptions(),
 ) -> None:
-    """Make the built-in phantom jaw: a mesh with tooth labels and landmarks, and a picture of it.
+    """Make the built-in phantom jaw, with tooth labels and landmarks, or a population of them, or the sphere arch.
 
     Args:
-        out: Mesh file to write (.ply keeps the labels; .stl, .obj), with landmarks as JSON beside it.
+        out: Mesh file to write (.ply keeps the labels; .stl, .obj), with landmarks as JSON and a picture beside it; for
+            a population a folder.
+        group: Draw a population from this group of Table 2.1 of the thesis instead; --seed seeds the draw.
+        count: How many jaws of the population.
         spheres: Make the sphere arch instead, a metrology object: spheres of known centres along the arch.
         sphere: Size of the sphere arch.
     """
-    check_mesh_name(out)
-    if spheres:
-        write_jaw_and_picture(out, build_sphere_arch(options.arch, sphere), f"{options.arch} sphere arch")
+    if group is not None:
+        _population(out, group, count, options)
+    elif spheres:
+        _write_jaw(out, lambda: build_sphere_arch(options.arch, sphere), f"{options.arch} sphere arch")
     else:
-        write_jaw_and_picture(out, build_phantom(options), f"{options.arch} phantom, seed {options.seed}")
+        _write_jaw(out, lambda: build_phantom(options), f"{options.arch} phantom, seed {options.seed}")
 
 
-def check_mesh_name(path: Path) -> None:
-    """Raise InputError where a file name is not that of a mesh."""
+def _population(out: Path, group: GroupName, count: int, options: PhantomOptions) -> None:
+    """Files that are there already are kept: a killed run goes on."""
+    drawn = draw_population(group, count, np.random.default_rng(options.seed), options)
+    with storage.claimed_folder(out, "phantom", {"group": group, "options": options}, {}), show_progress() as progress:
+        for number, jaw in enumerate(drawn):
+            path = out / f"{group}_{number:03d}.ply"
+            if not path.with_suffix(".json").exists():
+                storage.write_jaw(path, build_phantom(jaw))
+            progress("phantoms", number + 1, count)
+    console.print(f"{out}: {count} jaws of {group}")
+
+
+def prepare(
+    jaw: Annotated[Path | None, Positional, arg(metavar="[JAW]")] = None,
+    *,
+    out: Path,
+    source: Annotated[Source, Flat] = Source(),
+    preset_name: Annotated[Literal["thesis-reference"] | None, arg(name="preset")] = None,
+    tooth: int | None = None,
+    how: OmitSubcommandPrefixes[
+        Annotated[None, subcommand("as-preset")]
+        | Annotated[CrackOptions, subcommand("crack")]
+        | Annotated[CrownOptions, subcommand("crown")]
+        | Annotated[FullContourCrownOptions, subcommand("full-contour-crown")]
+        | Annotated[InlayOptions, subcommand("mod-inlay")]
+    ] = None,
+) -> None:
+    """Prepare teeth of a labelled jaw: a crack, a crown preparation, a full-contour crown, a MOD inlay; or a preset.
+
+    One tooth: cuspid prepare JAW --tooth 45 --out FILE crown --taper-deg 8. Several: give the result to the next run.
+
+    Args:
+        jaw: Mesh of a jaw with tooth labels; without it the built-in phantom.
+        out: Mesh file to write (.ply keeps the labels), with margins and landmarks as JSON and a picture beside it.
+        preset_name: thesis-reference: the mandible of Fig. 3.20 (46 cracked, 45 crown, 42 full-contour crown, 35 and 36
+            MOD inlays).
+        tooth: FDI number of the one tooth to prepare.
+        how: What is done to it.
+    """
+    asked = _asked(preset_name, tooth, how)
+    _write_jaw(out, lambda: prepare_teeth(load_source(jaw, source), asked), f"prepared: {', '.join(map(str, asked))}")
+
+
+def _asked(name: str | None, tooth: int | None, how: PreparationOptions | None) -> dict[int, PreparationOptions]:
+    if name is not None and tooth is None and how is None:
+        return dict(preset(name))
+    if name is None and tooth is not None and how is not None:
+        return {tooth: how}
+    raise InputError(
+        "prepare: give either --preset thesis-reference, or --tooth with a kind at the end of the line: crack, crown, "
+        "full-contour-crown or mod-inlay"
+    )
+
+
+def box(
+    jaw: Annotated[Path | None, Positional, arg(metavar="[JAW]")] = None,
+    *,
+    out: Path,
+    source: Annotated[Source, Flat] = Source(),
+) -> None:
+    """Make a box of every crown, of its own size: the hardest jaw for a handpiece that turns (thesis 3.5.3.2).
+
+    Args:
+        jaw: Mesh of a jaw with tooth labels, for example the mean of a shape model; without it the built-in phantom.
+        out: Mesh file to write, with a picture beside it.
+    """
+    _write_jaw(out, lambda: boxed(load_source(jaw, source)), "boxed jaw")
+
+
+def _write_jaw(path: Path, make: Callable[[], Jaw], title: str) -> None:
+    """Write a jaw, what its mesh file cannot hold, and a picture of it; say what it has."""
     if path.suffix.lower() not in storage.MESH_SUFFIXES:
         raise InputError(f"{path}: give a file name that ends in .ply, .stl or .obj")
-
-
-def write_jaw_and_picture(path: Path, jaw: Jaw, title: str) -> None:
-    """Write a jaw, what its mesh file cannot hold, and a picture of it; say what it has."""
+    jaw = make()
     storage.write_jaw(path, jaw)
     save_picture(path.with_suffix(".png"), jaw.mesh, title=title)
     console.print(f"{path}: {len(jaw.mesh.faces):,} faces, teeth {', '.join(map(str, jaw.teeth))}")

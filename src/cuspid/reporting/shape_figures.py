@@ -18,7 +18,8 @@ from matplotlib.figure import Figure
 
 from cuspid.mesh import Mesh
 from cuspid.reporting.figures import OCCLUSAL, render
-from cuspid.storage import ShapeModel, whole_file
+from cuspid.shape_model import ShapeModel
+from cuspid.storage import whole_file
 
 _INK = "#333333"
 _MARGIN = 0.02

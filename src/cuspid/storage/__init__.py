@@ -48,7 +48,7 @@ from cuspid.storage.reconstructions import (
     write_reconstruction,
     write_trueness,
 )
-from cuspid.storage.shapes import MeanStep, ShapeModel, read_shape_model, write_shape_model
+from cuspid.storage.shapes import read_shape_model, write_shape_model
 from cuspid.storage.tables import write_table
 
 __all__ = [
@@ -59,8 +59,6 @@ __all__ = [
     "PART",
     "LandmarkFile",
     "LandmarkFrame",
-    "MeanStep",
-    "ShapeModel",
     "Unit",
     "claim_folder",
     "claimed_folder",
