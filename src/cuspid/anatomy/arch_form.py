@@ -19,8 +19,6 @@ TOOTH_SIZES = (0.8, 1.2)
 """Sizes of the teeth, relative to the textbook's, among which one is chosen that fits an asked length of the arch."""
 WEIGHT_PER_MM = 100.0
 """How much a dimension missed by 1 mm counts, against one radian of a kink."""
-SIZE_WEIGHT = 4.0
-"""How much the logarithm of the tooth size counts: teeth 10 % too large as much as a kink of 0.4 radian."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -51,6 +49,8 @@ class Aim:
     """Distance f, where it is asked for."""
     free_size: bool = False
     """Whether the size of the teeth may be chosen."""
+    size_weight: float = 4.0
+    """How much the logarithm of a free size counts: at 4, teeth 10 % too large as much as a kink of 0.4 radian."""
 
     @property
     def values(self) -> Float[np.ndarray, "d"]:
@@ -93,7 +93,7 @@ def solve_shape(chains: tuple[Chain, Chain], size: float, aim: Aim, seen: Seen, 
     def misfit(x: Float[np.ndarray, "8"]) -> Float[np.ndarray, "_"]:
         shape = Shape(change=x[:7], size=float(np.exp(x[7])))
         miss = WEIGHT_PER_MM * (dimensions(chains, size, shape, aim, seen) - aim.values)
-        return np.concatenate([miss, np.diff(x[:7], prepend=0.0), [SIZE_WEIGHT * x[7]]])
+        return np.concatenate([miss, np.diff(x[:7], prepend=0.0), [aim.size_weight * x[7]]])
 
     free = np.log(TOOTH_SIZES) if aim.free_size else np.log(start.size) + np.array([-1e-9, 1e-9])
     low, high = np.append(np.full(7, -np.inf), free[0]), np.append(np.full(7, np.inf), free[1])

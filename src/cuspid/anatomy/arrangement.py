@@ -219,7 +219,9 @@ def _aim(options: PhantomOptions, rows: Rows) -> Aim:
     }
     given = [*asked.values(), options.arch_length_mm, options.crowding_mm or None]
     free = options.tooth_size is None and any(value is not None for value in given)
-    return Aim(widths_mm=widths, length_mm=options.arch_length_mm, free_size=free)
+    # A crowded arch shall be about as long as before, not its teeth as large as its shorter front allows.
+    weight = 10.0 if options.crowding_mm else 4.0
+    return Aim(widths_mm=widths, length_mm=options.arch_length_mm, free_size=free, size_weight=weight)
 
 
 def _sized(rows: Rows, size: float) -> Rows:
