@@ -16,6 +16,7 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
@@ -56,10 +57,28 @@ def conditions() -> dict[str, object]:
     }
 
 
-def measure(name: str, seed: int, simulate: list[str], work: Path, motion: str = "rig") -> dict[str, object]:
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """One scan that is measured."""
+
+    seed: int = 0
+    """Of texture, hand and noise."""
+    jaw: str | None = None
+    """Name of the jaw file in the work folder, or a path; None for the built-in phantom."""
+    make: tuple[str, ...] = ()
+    """The command that makes that jaw, without --out."""
+    simulate: tuple[str, ...] = ()
+    """More arguments of ``cuspid simulate``."""
+
+
+def measure(name: str, case: Case, work: Path, motion: str = "rig") -> dict[str, object]:
     """Simulate once, then time images to mesh, then evaluate."""
     folder = work / name
-    shared = [*simulate, "--seed", str(seed)]
+    work.mkdir(parents=True, exist_ok=True)
+    jaw = [] if case.jaw is None else [str(work / case.jaw)]
+    if case.make and not Path(jaw[0]).exists():
+        run_timed(*case.make, "--out", jaw[0])
+    shared = [*jaw, *case.simulate, "--seed", str(case.seed)]
     run_timed("simulate", *shared, "--out", str(folder))
     for stage in ("depth", "depth-between", "motion"):
         shutil.rmtree(folder / stage, ignore_errors=True)
@@ -69,8 +88,9 @@ def measure(name: str, seed: int, simulate: list[str], work: Path, motion: str =
     run_timed("evaluate", str(folder / "mesh.ply"), str(folder / "truth"), "--out", str(folder))
     return {
         "case": name,
-        "seed": seed,
+        "seed": case.seed,
         "commands": [
+            *([f"cuspid {' '.join(case.make)} --out {case.jaw}"] if case.make else []),
             f"cuspid simulate {' '.join(Path(argument).name for argument in shared)} --out {name}",
             f"cuspid reconstruct {name}/capture --out {name} --motion {motion}",
         ],
@@ -78,19 +98,33 @@ def measure(name: str, seed: int, simulate: list[str], work: Path, motion: str =
         "options": json.loads((folder / "run.json").read_text()),
         "images_to_mesh": reconstructed,
         "reconstruction": json.loads((folder / "motion" / "reconstruction.json").read_text())["log"],
-        "trueness": json.loads((folder / "trueness.json").read_text()),
+        **{
+            part: json.loads((folder / f"{part}.json").read_text())
+            for part in ("trueness", "spheres", "margins")
+            if (folder / f"{part}.json").exists()
+        },
         **conditions(),
     }
 
 
-def cases(jaw: Path | None) -> dict[str, tuple[int, list[str]]]:
-    """The cases of the bars: three seeds of a molar, the arch, and a user's own arch."""
-    table: dict[str, tuple[int, list[str]]] = {
-        f"molar-seed{seed}": (seed, ["--tooth", "46", "--jaw-seed", str(seed)]) for seed in range(3)
+PREPARED = (46, 45, 42, 36, 35)
+"""Teeth of the thesis' reference model (Fig. 3.20), in the order B to F of its Table 3.2: cracked, crown, full-contour
+crown, and two inlays (F and E)."""
+
+
+def cases(jaw: Path | None) -> dict[str, Case]:
+    """Three seeds of a molar, the arch, a user's own arch, the sphere arch, and the thesis' reference model."""
+    table = {
+        f"molar-seed{seed}": Case(seed=seed, simulate=("--tooth", "46", "--jaw-seed", str(seed))) for seed in range(3)
     }
-    table["arch"] = (0, [])
+    table["arch"] = Case()
     if jaw is not None:
-        table["real-arch"] = (0, [str(jaw)])
+        table["real-arch"] = Case(jaw=str(jaw.resolve()))
+    table["spheres"] = Case(jaw="spheres.ply", make=("phantom", "--spheres"))
+    prepare = ("prepare", "--preset", "thesis-reference")
+    for tooth in PREPARED:
+        table[f"prepared-{tooth}"] = Case(jaw="thesis-reference.ply", make=prepare, simulate=("--tooth", str(tooth)))
+    table["prepared-arch"] = Case(jaw="thesis-reference.ply", make=prepare)
     return table
 
 
@@ -103,11 +137,11 @@ def main() -> None:
     parser.add_argument("--jaw", type=Path, help="a real full-arch scan for the case real-arch")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    for name, (seed, simulate) in cases(options.jaw).items():
+    for name, case in cases(options.jaw).items():
         path = options.out / f"{name}.json"
-        if path.exists() or (options.case and not any(name.startswith(case) for case in options.case)):
+        if path.exists() or (options.case and not any(name.startswith(asked) for asked in options.case)):
             continue
-        result = measure(name, seed, simulate, options.work)
+        result = measure(name, case, options.work)
         path.write_text(json.dumps(result, indent=1) + "\n")
         print(f"{name}: {result['images_to_mesh']}")
 

@@ -88,11 +88,12 @@ def _print_survey(found: Survey) -> None:
     for jaw in found.jaws:
         table.add_row(jaw.name, jaw.group, *(_length(jaw.dimensions[name]) for name in DIMENSIONS))
     Console().print(table)
-    groups = Table(title="Groups: mean ± SD in mm (number of jaws)", title_justify="left")
-    for column in ("group", *DIMENSIONS):
+    groups = Table(title="Groups: mean ± SD in mm", title_justify="left")
+    for column in ("group", "jaws", *DIMENSIONS):
         groups.add_column(column, justify="left" if column == "group" else "right", no_wrap=True)
     for group, cells in found.groups.items():
-        groups.add_row(group, *(_spread(cells.get(name)) for name in DIMENSIONS))
+        count = str(max(cell.count for cell in cells.values()))
+        groups.add_row(group, count, *(_spread(cells.get(name)) for name in DIMENSIONS))
     Console().print(groups)
     for jaw in found.jaws:
         for flag in implausible(jaw):
@@ -110,7 +111,7 @@ def _length(found: Dimension | None) -> str:
 def _spread(cell: GroupStatistics | None) -> str:
     if cell is None:
         return "-"
-    return f"{cell.mean_mm:.1f}" + ("" if cell.std_mm is None else f"±{cell.std_mm:.1f}") + f" ({cell.count})"
+    return f"{cell.mean_mm:.1f}" + ("" if cell.std_mm is None else f"±{cell.std_mm:.1f}")
 
 
 def shape(
