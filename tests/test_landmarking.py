@@ -1,17 +1,20 @@
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cuspid.anatomy.arch import arch_dimensions
+from cuspid.anatomy.arch import arch_dimensions, needed_landmarks
 from cuspid.anatomy.landmarking import SIGMA_MM, estimate_landmarks, with_estimates
 from cuspid.anatomy.landmarks import TOOTH_LANDMARKS, labels_of, missing
 from cuspid.anatomy.phantom import PhantomOptions, build_phantom
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw, Landmark
+from cuspid.reporting.landmark_figures import save_landmark_picture, save_measure_picture
 
 # The uncertainties are from the phantoms of seeds 100 to 103, which no test uses.
 
@@ -121,3 +124,17 @@ def test_without_labels_it_says_so(coarse_phantom: Jaw):
 def test_every_kind_of_point_has_its_uncertainty():
     kinds = {f"{kind}.{name}" for kind, names in TOOTH_LANDMARKS.items() for name in names}
     assert set(SIGMA_MM) == kinds | {"papilla", "midline"}
+
+
+def test_the_pictures_show_the_jaw_and_name_what_is_missing(tmp_path: Path, coarse_phantom: Jaw):
+    save_landmark_picture(tmp_path / "points.png", coarse_phantom, (46,), title="points")
+    lines = needed_landmarks("lower")
+    save_measure_picture(tmp_path / "lengths.png", coarse_phantom, {"f": lines["f"]}, {"f": 33.0})
+    for name in ("points.png", "lengths.png"):
+        image = cv2.imread(str(tmp_path / name))
+        assert image is not None
+        assert 0.1 < np.mean(np.any(image != 255, axis=-1)) < 0.9
+    bare = replace(coarse_phantom, landmarks={})
+    with pytest.raises(InputError, match=r"no landmark 43\.cusp_tip, 33\.cusp_tip"):
+        save_measure_picture(tmp_path / "none.png", bare, {"a": lines["a"]}, {"a": 27.0})
+    assert not (tmp_path / "none.png").exists()
