@@ -128,7 +128,7 @@ def _reach_to_border(site: ToothSite, side: float, height: float) -> float | Non
     middle_x, middle_y = height * site.lean
     sign = np.cos(side)
     reaches = [
-        sign * (float(border.x(np.array(middle_y), np.array(height))) - middle_x)
+        sign * (float(border.x(np.array([middle_y]), np.array([height]))[0]) - middle_x)
         for border in site.borders
         if border.side * sign > 0
     ]

@@ -141,7 +141,7 @@ def _proximal_end(site: ToothSite, sign: float, y: float, z: float) -> tuple[flo
     reach = float((sign * vertices[:, 0]).max())
     for border in site.borders:
         if sign * border.side > 0:
-            reach = sign * float(border.x(np.array(y), np.array(z)))
+            reach = sign * float(border.x(np.array([y]), np.array([z]))[0])
     if len(here) >= 3:
         end = float((sign * here[:, 0]).max())
         return sign * end, sign * (max(reach, end) + 1.0), False

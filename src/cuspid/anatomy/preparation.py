@@ -24,12 +24,14 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from cuspid.anatomy.booleans import CAVITY, TROUGH, Cut, Tool, closed, rim_of, subtract
 from cuspid.anatomy.crack_tool import CrackShape, crack_tool
 from cuspid.anatomy.crown_tool import CrownShape, crown_tool
 from cuspid.anatomy.inlay_tool import InlayShape, inlay_tool
+from cuspid.anatomy.isosurface import graph_of, neighbours_of
 from cuspid.anatomy.tooth_site import ToothSite, site_of
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Jaw
@@ -280,12 +282,20 @@ def _assembled(jaw: Jaw, preparations: Mapping[int, PreparationOptions], tools: 
         bottom = tools[fdi].line
         if bottom is not None:
             lines[f"{fdi}.{name}_bottom"] = bottom
-        labels = _facets(cut.mesh, labels, cut.source == -2 - index, fdi)
+        standing = (cut.source == -2 - index) | _apart(cut.mesh, (labels == fdi) & kept)
+        labels = _facets(cut.mesh, labels, standing, fdi)
     mesh = Mesh(cut.mesh.vertices, cut.mesh.faces).submesh(kept)
     if jaw.mesh.colors is not None:
         _, nearest = cKDTree(jaw.mesh.vertices).query(mesh.vertices)
         mesh = replace(mesh, colors=jaw.mesh.colors[nearest])
     return replace(jaw, mesh=mesh, face_labels=labels[kept], lines=lines)
+
+
+def _apart(mesh: Mesh, mine: Bool[np.ndarray, "f"]) -> Bool[np.ndarray, "f"]:
+    """Faces of a tooth that no longer hang together with most of it: what is left of its side of a contact."""
+    pairs = neighbours_of(mesh.faces)
+    _, patch = connected_components(graph_of(pairs[mine[pairs].all(axis=1)], len(mine)), directed=False)
+    return mine & (patch != np.bincount(patch[mine]).argmax())
 
 
 def _facets(mesh: Mesh, labels: Int[np.ndarray, "f"], facets: Bool[np.ndarray, "f"], fdi: int) -> Int[np.ndarray, "f"]:

@@ -45,6 +45,8 @@ class MarginOptions:
     """The flanks end this far from the edge."""
     least_bend_deg: float = 25.0
     """Least angle by which the flanks differ in direction."""
+    most_floor_um: float = 20.0
+    """A section is judged only if the edge of the reference itself is found within this distance of the line."""
 
     def __post_init__(self) -> None:
         if not (self.step_mm > 0 and 0 <= self.flank_from_mm < self.flank_to_mm and self.reach_mm > 0):
@@ -79,6 +81,8 @@ class MarginError:
 
     scan: MarginStatistics
     """The scan's edge."""
+    judged_pct: float
+    """Share of the sections that are judged: not at corners of the line, nor where the reference's edge is unclear."""
     floor: MarginStatistics
     """The reference's own edge by the same detector: what it cannot tell apart from zero."""
 
@@ -111,13 +115,13 @@ def margin_error(
 
     Raises InputError where the line is too short or the reference has no edge along it.
     """
-    points, tangents = _stations(line, options.step_mm)
+    points, tangents, count = _stations(line, options.step_mm)
     slicers = _Slicer(reference, points), _Slicer(scan, points)
     own, found = [], []
     for point, tangent in zip(points, tangents, strict=True):
         axes = _axes(tangent)
         true = _edge(slicers[0].section(point, tangent, axes, options), options)
-        if true is None:
+        if true is None or 1000 * np.linalg.norm(true.point) > options.most_floor_um:
             continue
         frame = np.stack([true.outward, _lateral(axes, tangent, true.outward)])
         own.append(frame @ true.point)
@@ -125,7 +129,8 @@ def margin_error(
         found.append(np.full(2, np.nan) if edge is None else frame @ edge.point)
     if not own:
         raise InputError("margin: the reference has no edge along its margin line; does the line belong to this mesh?")
-    return MarginError(scan=_statistics(np.array(found)), floor=_statistics(np.array(own)))
+    judged_pct = 100 * len(own) / count
+    return MarginError(scan=_statistics(np.array(found)), judged_pct=judged_pct, floor=_statistics(np.array(own)))
 
 
 def _statistics(offsets_mm: Float[np.ndarray, "n 2"]) -> MarginStatistics:
@@ -151,8 +156,8 @@ def _statistics(offsets_mm: Float[np.ndarray, "n 2"]) -> MarginStatistics:
 
 def _stations(
     line: Float[np.ndarray, "n 3"], step_mm: float
-) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
-    """Points even along a closed line where it is straight enough, and its unit direction there."""
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"], int]:
+    """Points even along a closed line where it is straight enough, its unit direction there, and their number in all."""
     run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     length = run[-1]
     if length < 20 * step_mm or length < 8 * _TANGENT_MM:
@@ -165,7 +170,7 @@ def _stations(
     chords = at(s + _TANGENT_MM) - at(s - _TANGENT_MM)
     size = np.linalg.norm(chords, axis=1)
     straight = size > _STRAIGHT * 2 * _TANGENT_MM
-    return at(s)[straight], chords[straight] / size[straight, None]
+    return at(s)[straight], chords[straight] / size[straight, None], len(s)
 
 
 def _axes(tangent: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2 3"]:
@@ -270,7 +275,7 @@ def _edge(section: Float[np.ndarray, "m 2"] | None, options: MarginOptions) -> _
     after = points[arm + chord : count - arm + chord] - inner
     bend = -np.arctan2(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0], np.sum(before * after, axis=1))
     distance = np.linalg.norm(inner, axis=1)
-    weight = bend * np.exp(-0.5 * (distance / (0.5 * options.reach_mm)) ** 2)
+    weight = bend * np.exp(-0.5 * (distance / (0.25 * options.reach_mm)) ** 2)
     at = arm + int(np.argmax(weight))
     return _corner(points, at, arm, options)
 
