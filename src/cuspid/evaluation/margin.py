@@ -157,7 +157,7 @@ def _statistics(offsets_mm: Float[np.ndarray, "n 2"]) -> MarginStatistics:
 def _stations(
     line: Float[np.ndarray, "n 3"], step_mm: float
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"], int]:
-    """Points even along a closed line where it is straight enough, its unit direction there, and their number in all."""
+    """Points even along a closed line where it is straight enough, its unit direction there, and their number."""
     run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     length = run[-1]
     if length < 20 * step_mm or length < 8 * _TANGENT_MM:
