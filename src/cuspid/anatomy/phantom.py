@@ -77,9 +77,13 @@ def _through(
 ) -> Float[np.ndarray, "v 3"]:
     """The vertices, of which those next to the points are moved to them: the surface has sharp grooves and corners,
     which a mesh would cut off."""
-    moved = vertices.copy()
-    moved[cKDTree(vertices).query(points)[1]] = points
-    return without_folds(vertices, moved, faces)
+    near = cKDTree(vertices).query(points, 4)[1]
+    for candidates in near.T:
+        left = (vertices[near] != points[:, None]).any(axis=2).all(axis=1)
+        moved = vertices.copy()
+        moved[candidates[left]] = points[left]
+        vertices = without_folds(vertices, moved, faces)
+    return vertices
 
 
 # The labels
