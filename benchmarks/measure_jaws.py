@@ -14,6 +14,7 @@ import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from run import conditions
@@ -67,9 +68,9 @@ def measure_phantom(arch: Arch, seed: int, edge_mm: float) -> dict[str, object]:
     }
 
 
-def summary(phantoms: list[dict]) -> dict[str, dict[str, float]]:
+def summary(phantoms: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
     """Largest deviations over the phantoms, mm: given from asked for, estimated from given."""
-    table = {}
+    table: dict[str, dict[str, float]] = {}
     for arch in ARCHES:
         rows = [row for row in phantoms if row["arch"] == arch]
         asked = {k: max(abs(row["given_mm"][k] - row["asked_mm"][k]) for row in rows) for k in "abc"}
