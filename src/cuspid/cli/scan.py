@@ -16,6 +16,7 @@ from cuspid.capture import Capture
 from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress
 from cuspid.errors import InputError
 from cuspid.evaluation.deviation import EvaluationOptions
+from cuspid.evaluation.margin import margin_errors
 from cuspid.evaluation.spheres import SphereReport, evaluate_spheres
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
@@ -138,6 +139,8 @@ def _evaluate(mesh: Path, reference: Path, out: Path, source: Source, options: E
     _print_trueness(trueness)
     if known.spheres:
         _evaluate_spheres(scan, known, trueness, out)
+    if known.lines:
+        _evaluate_margins(scan, known, trueness, out)
 
 
 def _evaluate_spheres(scan: Mesh, reference: Jaw, trueness: Trueness, out: Path) -> None:
@@ -158,6 +161,26 @@ def _evaluate_spheres(scan: Mesh, reference: Jaw, trueness: Trueness, out: Path)
         title="Spheres in the scan, without a best fit",
     )
     _print_spheres(report)
+
+
+def _evaluate_margins(scan: Mesh, reference: Jaw, trueness: Trueness, out: Path) -> None:
+    """Margins of preparations, on the teeth that were scanned."""
+    lines = {name: line for name, line in reference.lines.items() if int(name.split(".")[0]) in trueness.per_tooth}
+    errors = margin_errors(scan, replace(reference, lines=lines), trueness.reference_from_scan)
+    storage.write_json(out / "margins.json", errors)
+    if not errors:
+        return
+    table = Table(
+        title="Margins of preparations in µm, distance of the scan's edge from the line", title_justify="left"
+    )
+    for column in ("tooth", "judged, %", "found, %", "mean", "SD", "P95", "max", "outward", "detector's floor"):
+        table.add_column(column, justify="right")
+    for fdi, error in sorted(errors.items()):
+        found = error.scan
+        figures = (error.judged_pct, found.found_pct, found.mean_um, found.std_um, found.p95_um, found.max_um)
+        figures += (found.outward_um, error.floor.mean_um)
+        table.add_row(str(fdi), *("-" if figure is None else f"{figure:.1f}" for figure in figures))
+    Console().print(table)
 
 
 def _print_spheres(report: SphereReport) -> None:
