@@ -8,8 +8,10 @@ are divided by half that extent, so that the crown spans -1 to 1.
   looks up at all within the rim of that, but for the lowest quarter of the crown. The rim is smoothed around the tooth:
   it follows the cusp ridges and marginal ridges.
 - *incisal* (incisors and canines): what looks upwards less than `SurfaceOptions.incisal_mm` below the edge.
-- the four *sides*: all other faces of a tooth, by where they look and, with half the weight, by where they lie. The
-  outer side is *buccal*, of incisors and canines *labial*; the inner one is called *lingual* in both jaws.
+- the four *sides*: all other faces of a tooth, by the horizontal direction in which they look plus, with half the
+  weight, that in which they relatively lie. What looks upwards on incisors and canines, as the hollow behind the edge
+  does, is named by the side of the edge that it lies on. The outer side is *buccal*, of incisors and canines *labial*;
+  the inner one is called *lingual* in both jaws.
 - *gingival*: gum up to `SurfaceOptions.gingival_mm` from a tooth. Other gum has no name.
 """
 
@@ -118,13 +120,17 @@ def _places(jaw: Jaw, faces: Int[np.ndarray, "n"], axes: Float[np.ndarray, "3 3"
 
 
 def _codes(fdi: int, places: _Places, normals: Local, options: SurfaceOptions) -> Int[np.ndarray, "n"]:
-    front = kind_of(fdi) in ("incisor", "canine")
-    names = ("incisal", "labial") if front else ("occlusal", "buccal")
-    top, outer, lingual, mesial, distal = (SURFACES.index(name) for name in (*names, "lingual", "mesial", "distal"))
     towards = _unit(normals[:, :2]) + 0.5 * _unit(places.relative[:, :2])
+    if kind_of(fdi) in ("incisor", "canine"):
+        names, upwards = ("incisal", "labial"), normals[:, 2] > _UPWARDS
+        from_edge = places.mm - _edge(places)
+        is_top = upwards & (from_edge[:, 2] > -options.incisal_mm)
+        towards[upwards] = from_edge[upwards, :2] * [0, 1]
+    else:
+        names, is_top = ("occlusal", "buccal"), _is_occlusal(places, normals)
+    top, outer, lingual, mesial, distal = (SURFACES.index(name) for name in (*names, "lingual", "mesial", "distal"))
     proximal = np.abs(towards[:, 0]) > np.abs(towards[:, 1])
     sides = np.where(proximal, np.where(towards[:, 0] > 0, distal, mesial), np.where(towards[:, 1] > 0, outer, lingual))
-    is_top = _is_incisal(places, normals, options.incisal_mm) if front else _is_occlusal(places, normals)
     return np.asarray(np.where(is_top, top, sides))
 
 
@@ -132,12 +138,13 @@ def _unit(vectors: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
 
 
-def _is_incisal(places: _Places, normals: Local, height_mm: float) -> Bool[np.ndarray, "n"]:
-    """Little below the highest face at the same place along the tooth."""
+def _edge(places: _Places) -> Local:
+    """For each face: the highest place of the tooth at about the same distance along it."""
     bins = np.clip(np.floor((places.relative[:, 0] + 1) / 2 * _BINS).astype(int), 0, _BINS - 1)
-    top = np.full(_BINS, -np.inf)
-    np.maximum.at(top, bins, places.mm[:, 2])
-    return np.asarray((places.mm[:, 2] > top[bins] - height_mm) & (normals[:, 2] > _UPWARDS))
+    upwards = np.argsort(places.mm[:, 2])
+    highest = np.zeros(_BINS, dtype=np.int64)
+    highest[bins[upwards]] = upwards
+    return places.mm[highest[bins]]
 
 
 def _is_occlusal(places: _Places, normals: Local) -> Bool[np.ndarray, "n"]:

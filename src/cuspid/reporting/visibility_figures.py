@@ -79,9 +79,10 @@ def save_shares_picture(path: Path, designs: Mapping[str, Sequence[Mapping[str, 
         axes.grid(axis="x", color="#dddddd", linewidth=0.6)
         axes.set_axisbelow(True)
     panels[0].invert_yaxis()
-    panels[-1].legend(title="cameras at once", loc="upper right", frameon=True, fontsize=9)
-    figure.suptitle(title, x=0.03, ha="left", fontsize=14, color=_INK, fontweight="bold")
-    figure.tight_layout()
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, title="cameras at once", loc="upper right", ncols=3, frameon=False, fontsize=10)
+    figure.text(0.02, 0.94, title, fontsize=14, color=_INK, va="center", fontweight="bold")
+    figure.tight_layout(rect=(0, 0, 1, 0.90))
     _save(figure, path)
 
 
@@ -94,7 +95,7 @@ def _save_views(
     title: str,
 ) -> None:
     colored = replace(mesh, colors=_vertex_colors(mesh, codes, palette))
-    figure = _figure(11, 6.6)
+    figure = _figure(11.0, 6.6)
     _draw(figure, (0.01, 0.10, 0.50, 0.80), render(colored, OCCLUSAL, width_px=640), "occlusal")
     _draw(figure, (0.53, 0.52, 0.46, 0.38), render(colored, look(90.0, 25.0), width_px=560), "from the front")
     _draw(figure, (0.53, 0.10, 0.46, 0.38), render(colored, look(-90.0, 35.0), width_px=560), "from behind")
@@ -121,7 +122,7 @@ def _draw(figure: Figure, place: tuple[float, float, float, float], view: View, 
 
 
 def _figure(width_in: float, height_in: float) -> Figure:
-    figure = Figure(figsize=(width_in, height_in), dpi=90, facecolor="white")
+    figure = Figure(figsize=(width_in, height_in), dpi=84, facecolor="white")
     FigureCanvasAgg(figure)
     return figure
 
