@@ -27,6 +27,7 @@ from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
 from cuspid.errors import InputError
 from cuspid.jaw import Jaw
 from cuspid.reporting.figures import save_picture
+from cuspid.reporting.preparation_figures import save_preparation_picture
 
 
 def phantom(
@@ -96,7 +97,9 @@ def prepare(
         how: What is done to it.
     """
     asked = _asked(preset_name, tooth, how)
-    _write_jaw(out, lambda: prepare_teeth(load_source(jaw, source), asked), f"prepared: {', '.join(map(str, asked))}")
+    title = f"prepared: {', '.join(map(str, asked))}"
+    prepared = _write_jaw(out, lambda: prepare_teeth(load_source(jaw, source), asked), title)
+    save_preparation_picture(out.with_suffix(".teeth.png"), prepared, title=title)
 
 
 def _asked(name: str | None, tooth: int | None, how: PreparationOptions | None) -> dict[int, PreparationOptions]:
@@ -125,7 +128,7 @@ def box(
     _write_jaw(out, lambda: boxed(load_source(jaw, source)), "boxed jaw")
 
 
-def _write_jaw(path: Path, make: Callable[[], Jaw], title: str) -> None:
+def _write_jaw(path: Path, make: Callable[[], Jaw], title: str) -> Jaw:
     """Write a jaw, what its mesh file cannot hold, and a picture of it; say what it has."""
     if path.suffix.lower() not in storage.MESH_SUFFIXES:
         raise InputError(f"{path}: give a file name that ends in .ply, .stl or .obj")
@@ -133,3 +136,4 @@ def _write_jaw(path: Path, make: Callable[[], Jaw], title: str) -> None:
     storage.write_jaw(path, jaw)
     save_picture(path.with_suffix(".png"), jaw.mesh, title=title)
     console.print(f"{path}: {len(jaw.mesh.faces):,} faces, teeth {', '.join(map(str, jaw.teeth))}")
+    return jaw

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +17,7 @@ from cuspid.capture import Capture
 from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress
 from cuspid.errors import InputError
 from cuspid.evaluation.deviation import EvaluationOptions
-from cuspid.evaluation.margin import margin_errors
+from cuspid.evaluation.margin import MarginError, margin_errors
 from cuspid.evaluation.spheres import SphereReport, evaluate_spheres
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
@@ -168,18 +169,19 @@ def _evaluate_margins(scan: Mesh, reference: Jaw, trueness: Trueness, out: Path)
     lines = {name: line for name, line in reference.lines.items() if int(name.split(".")[0]) in trueness.per_tooth}
     errors = margin_errors(scan, replace(reference, lines=lines), trueness.reference_from_scan)
     storage.write_json(out / "margins.json", errors)
-    if not errors:
-        return
-    table = Table(
-        title="Margins of preparations in µm, distance of the scan's edge from the line", title_justify="left"
-    )
-    for column in ("tooth", "judged, %", "found, %", "mean", "SD", "P95", "max", "outward", "detector's floor"):
+    if errors:
+        _print_margins(errors)
+
+
+def _print_margins(errors: Mapping[int, MarginError]) -> None:
+    table = Table(title="Margins in µm: distance of the scan's edge from the true line", title_justify="left")
+    for column in ("tooth", "judged, %", "found, %", "mean", "SD", "P95", "max", "outward", "floor"):
         table.add_column(column, justify="right")
     for fdi, error in sorted(errors.items()):
         found = error.scan
-        figures = (error.judged_pct, found.found_pct, found.mean_um, found.std_um, found.p95_um, found.max_um)
-        figures += (found.outward_um, error.floor.mean_um)
-        table.add_row(str(fdi), *("-" if figure is None else f"{figure:.1f}" for figure in figures))
+        shares = (error.judged_pct, found.found_pct)
+        figures = (found.mean_um, found.std_um, found.p95_um, found.max_um, found.outward_um, error.floor.mean_um)
+        table.add_row(str(fdi), *(f"{figure:.1f}" for figure in (*shares, *figures)))
     Console().print(table)
 
 
