@@ -89,7 +89,6 @@ def main() -> None:
     survey_visibility(jaw.mesh, handpiece, molar[:1], VisibilityOptions())
     fresh = Mesh(jaw.mesh.vertices, jaw.mesh.faces)
     result = {
-        "case": "visibility",
         "load_average": os.getloadavg()[0],
         "preparation": timed(lambda: visible_counts(fresh, handpiece, molar[:1], VisibilityOptions())),
         "naming": timed(lambda: named_surfaces(jaw)),

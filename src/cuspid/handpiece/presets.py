@@ -3,8 +3,8 @@
 The figures of each are marked in its ``source``: *published* was read at the named place; *reported* is known from
 memory of the maker's brief and could not be looked up; *inferred* was computed or assumed here, and how. The makers
 publish diagonal angles of view; they are converted for a lens without distortion (rectilinear). A real lens of 120
-degrees is nearer to equidistant: its horizontal angle is then 85 instead of 101 degrees, and it resolves the middle of
-the image better than said here.
+degrees may be nearer to equidistant: its horizontal angle is then 85 instead of 101 degrees, and it resolves the middle
+of the image better than said here.
 """
 
 from __future__ import annotations
