@@ -181,6 +181,15 @@ def test_the_survey_equals_brute_force_over_the_faces(seed: int) -> None:
         np.testing.assert_array_equal(enough, found.most_at_once >= cameras)
 
 
+def test_the_far_corners_of_the_image_are_not_left_out() -> None:
+    """A plate at the end of the depth range that fills the image; one camera asked for all its faces finds the same."""
+    wall = plate(DEPTHS[1] - 0.01, 6.0, cells=40)
+    seen = visible_counts(wall, looking_along({"only": Rigid3.identity()}), [Rigid3.identity()], VisibilityOptions())
+    alone = visible_faces(wall, CAMERA, Rigid3.identity(), DEPTHS, VisibilityOptions())
+    assert np.abs(wall.face_centres[alone]).max(axis=0)[:2].min() > 5.2
+    np.testing.assert_array_equal(np.flatnonzero(seen), alone)
+
+
 # --- laws on a jaw ----------------------------------------------------------------------------------------------------
 
 
