@@ -1,19 +1,21 @@
-"""The handpieces of the thesis: the essential four cameras (3.5.1) and the twelve (3.5.2).
+"""The handpieces of the thesis: the essential four cameras (3.5.1), the twelve (3.5.2) and the six (3.5.3).
 
 Rig frame: origin at the height of the cusp tips under the probe, +X along the arch in the direction of
 travel, +Y across the arch towards the cheek (buccal), +Z out of the gum. A group is four cameras with parallel axes in
 one plane: two across the arch and two along the curve of Spee, with the LEDs at the corners between them.
 
     image up        o occlusal: +X to the right of the image, buccal up
-     1              b buccal:   -X to the right, occlusal up
-   3   4            l lingual:  +X to the right, occlusal up
-     2
+     5              b buccal:   -X to the right, occlusal up
+     1              l lingual:  +X to the right, occlusal up
+   3   4
+     2              5 and 6 only where the design has outer cameras
+     6
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -52,6 +54,10 @@ class DesignOptions:
     """From the middle of the crown to where the side groups' axes meet its side (twelve cameras only)."""
     side_depth_mm: float = 2.5
     """From the cusp tips down to where the side groups' axes meet the side (twelve cameras only)."""
+    outer_distance_mm: float = 2.0
+    """From the outer of the four cameras across the arch to the one more on either side (six cameras only)."""
+    outer_tilt_deg: float = 0.0
+    """How far the axes of these two lean towards the middle of the tooth (six cameras only)."""
 
     def __post_init__(self) -> None:
         near, far = DEPTH_RANGE_MM
@@ -59,6 +65,8 @@ class DesignOptions:
             raise InputError(f"design: working distance {self.working_distance_mm} mm must lie in {near}-{far} mm")
         if not (self.baseline_across_mm > 0 and self.baseline_along_mm > 0):
             raise InputError("design: the baselines must be positive")
+        if not (self.outer_distance_mm > 0 and -90 < self.outer_tilt_deg < 90):
+            raise InputError("design: the outer cameras' distance must be positive and their tilt within -90 to 90 deg")
         if not 0 < self.field_of_view_deg < 180:
             raise InputError(f"design: field of view {self.field_of_view_deg} deg must lie between 0 and 180")
 
@@ -74,8 +82,26 @@ def twelve_cameras(options: DesignOptions = DesignOptions()) -> Handpiece:
     return _handpiece("twelve-cameras", views, options)
 
 
+def six_cameras(options: DesignOptions = DesignOptions()) -> Handpiece:
+    """The essential four and one more on either side of them, for a handpiece that is also rolled (thesis 3.5.3).
+
+    The thesis says "in both sides with a 2mm away from the essential sensors": read as farther out across the arch, in
+    line with the two cameras there, 2 mm from the nearer of them. Between the two lies an LED.
+    """
+    four = essential_four(options)
+    cameras = {f"o{5 + k}": _outer_camera(options, side) for k, side in enumerate((+1, -1))}
+    lights = {f"o{5 + k}": _outer_light(options, side) for k, side in enumerate((+1, -1))}
+    return replace(
+        four,
+        rig=Rig({**four.rig.cameras, **cameras}),
+        lights={**four.lights, **lights},
+        exposures=(Exposure(name="all", lights=(*four.lights, *lights)),),
+        name="six-cameras",
+    )
+
+
 DESIGNS: Mapping[str, Callable[[DesignOptions], Handpiece]] = MappingProxyType(
-    {"four": essential_four, "twelve": twelve_cameras}
+    {"four": essential_four, "six": six_cameras, "twelve": twelve_cameras}
 )
 """Designs by the name that the command line takes."""
 
@@ -106,6 +132,26 @@ def _side_view(options: DesignOptions, side: int) -> Rigid3:
     target = np.array([0, side * options.side_offset_mm, -options.side_depth_mm])
     axis = np.array([0, -side * np.sin(tilt), -np.cos(tilt)])
     return _looking_at(target, axis, np.array([-side, 0.0, 0.0]), options.working_distance_mm)
+
+
+def _outer_camera(options: DesignOptions, side: int) -> MountedCamera:
+    tilt = np.deg2rad(options.outer_tilt_deg)
+    axis = np.array([0, -side * np.sin(tilt), -np.cos(tilt)])
+    centre = np.array([0, side * _outer_place_mm(options), options.working_distance_mm])
+    camera = Camera.from_field_of_view(options.width_px, options.height_px, options.field_of_view_deg)
+    return MountedCamera(camera, _looking_at(centre, axis, np.array([1.0, 0, 0]), 0.0))
+
+
+def _outer_light(options: DesignOptions, side: int) -> Light:
+    middle = _outer_place_mm(options) - options.outer_distance_mm / 2
+    return Light(
+        position_mm=np.array([0, side * middle, options.working_distance_mm]), direction=np.array([0, 0, -1.0])
+    )
+
+
+def _outer_place_mm(options: DesignOptions) -> float:
+    """Of the outer cameras, from the middle of the rig across the arch."""
+    return options.baseline_across_mm / 2 + options.outer_distance_mm
 
 
 def _looking_at(

@@ -2,6 +2,11 @@
 
 Frames: the world is the jaw's occlusal frame. Rig frame as in :mod:`cuspid.handpiece.designs`: the origin rides on the
 arch curve, +X along it, +Y towards the cheek, +Z out of the gum. Seen from above (+Z), the path runs clockwise.
+
+A handpiece with few cameras is also rolled about the tangent of the arch (thesis 3.5.3), to scan a cross-section from
+several sides. ``hold`` is the rig frame of a handpiece held upright; a roll is positive when the cameras turn to the
+cheek. Each roll is a pass along the whole path, there and back in turn, from the cheek's side to the tongue's; at the
+end of a pass the handpiece turns on the spot. The *travel* is the way on all passes and turns, in mm.
 """
 
 from __future__ import annotations
@@ -43,6 +48,19 @@ _SAMPLE_MM = 0.1
 _WAVELENGTH_MM = 35.0
 """Bends of the arch of this wavelength are halved: the path keeps to the arch, but not to one crooked tooth."""
 
+_SIDE_DEG, _SIDE_MM = 60.0, (4.5, 2.5)
+"""A handpiece rolled so far looks at this place: across from the middle of the crown, and down from the cusp tips."""
+_TURN_RADIUS_MM = 5.0
+"""A turn by an angle counts as the way on a circle of this radius: halfway from the surface to the cameras."""
+_STATION_MM = 1.0
+"""Spacing of the places at which the room beside the teeth is measured."""
+_PATCH_MM = 1.5
+"""Half the side of the patch of rays that measures it."""
+_FAR_MM = 8.0
+"""Whence these rays come, from the place that the handpiece looks at; they end as far behind it."""
+_LIFT_MM = 3.0
+"""The nominal crown is corrected by this much at most."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ScanPathOptions:
@@ -65,6 +83,24 @@ class ScanPathOptions:
     """Share (0 to 1) of the surface in an image that the same camera's next image must see."""
     clearance_mm: float = 0.5
     """Cameras and lights keep this distance from the jaw."""
+    turns: int = 1
+    """Passes over the teeth, an odd number: 1 looks down only, 3 look from the cheek, down and from the tongue, more
+    look in finer steps between."""
+    turn_deg: float = 60.0
+    """How far the handpiece is rolled to either side in the first and the last pass."""
+
+    def __post_init__(self) -> None:
+        if self.turns < 1 or self.turns % 2 == 0:
+            raise InputError(f"scan path: the number of turns must be odd (1, 3, 5 ...), not {self.turns}")
+        if not 0 < self.turn_deg < 90:
+            raise InputError(f"scan path: --turn-deg must lie between 0 and 90, not {self.turn_deg:g}")
+
+    @property
+    def rolls_deg(self) -> tuple[float, ...]:
+        """Roll of each pass, in order."""
+        if self.turns == 1:
+            return (0.0,)
+        return tuple(map(float, np.linspace(self.turn_deg, -self.turn_deg, self.turns)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -132,12 +168,12 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
     too small for the overlap.
     """
     curve = arch_curve(jaw)
-    stretch = _stretch(jaw, curve, options)
-    hand = _hand_motion(stretch, options, rng)
-    frames = options.frames or (ARCH_FRAMES if options.tooth is None else TOOTH_FRAMES)
+    passes = _passes(jaw, curve, options)
+    hand = _hand_motion(passes.span_mm, options, rng)
+    frames = options.frames or round(passes.relative_length * (ARCH_FRAMES if options.tooth is None else TOOTH_FRAMES))
     most = frames if options.frames else 3 * frames
     while True:
-        path = _even_path(jaw.mesh, handpiece, curve, hand, np.linspace(*stretch, frames))
+        path = _even_path(jaw.mesh, handpiece, passes, hand, np.linspace(*passes.span_mm, frames))
         _check_clearance(jaw.mesh, handpiece, path.rig_from_world, options.clearance_mm)
         if path.minimum_overlap > options.minimum_overlap:
             return path
@@ -164,26 +200,131 @@ def _stretch(jaw: Jaw, curve: ArchCurve, options: ScanPathOptions) -> tuple[floa
 
 
 def _even_path(
-    mesh: Mesh, handpiece: Handpiece, curve: ArchCurve, hand: _HandMotion, lengths_mm: Float[np.ndarray, "n"]
+    mesh: Mesh, handpiece: Handpiece, passes: _Passes, hand: _HandMotion, travel_mm: Float[np.ndarray, "n"]
 ) -> ScanPath:
     """The path on which the hand goes slower where the images change faster, so that the overlap is about even."""
-    path = _sampled(mesh, handpiece, curve, hand, lengths_mm)
+    path = _sampled(mesh, handpiece, passes, hand, travel_mm)
     for _ in range(2):
         worst = 1 - np.min(path.overlap, axis=1, initial=1.0, where=np.isfinite(path.overlap))
         change = np.concatenate([[0], np.cumsum(np.maximum(worst, 0.25 * worst.max()))])
-        lengths_mm = np.interp(np.linspace(0, change[-1], len(lengths_mm)), change, lengths_mm)
-        path = _sampled(mesh, handpiece, curve, hand, lengths_mm)
+        travel_mm = np.interp(np.linspace(0, change[-1], len(travel_mm)), change, travel_mm)
+        path = _sampled(mesh, handpiece, passes, hand, travel_mm)
     return path
 
 
 def _sampled(
-    mesh: Mesh, handpiece: Handpiece, curve: ArchCurve, hand: _HandMotion, lengths_mm: Float[np.ndarray, "n"]
+    mesh: Mesh, handpiece: Handpiece, passes: _Passes, hand: _HandMotion, travel_mm: Float[np.ndarray, "n"]
 ) -> ScanPath:
-    poses = [hand.at(length) @ curve.rig_from_world(length) for length in lengths_mm]
+    poses = [hand.at(travel) @ passes.rig_from_world(travel) for travel in travel_mm]
     names = [f"{index:05d}" for index in range(len(poses))]
     return ScanPath(
-        rig_from_world=dict(zip(names, poses, strict=True)), overlap=image_overlap(mesh, handpiece, poses), curve=curve
+        rig_from_world=dict(zip(names, poses, strict=True)),
+        overlap=image_overlap(mesh, handpiece, poses),
+        curve=passes.curve,
     )
+
+
+# --- the passes -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Passes:
+    """The way of a steady hand on all passes and the turns between them."""
+
+    curve: ArchCurve
+    travel_mm: Float[np.ndarray, "k"]
+    """At the start and the end of each pass."""
+    lengths_mm: Float[np.ndarray, "k"]
+    """Places on the curve there."""
+    rolls_deg: Float[np.ndarray, "k"]
+    """Rolls there."""
+    stations_mm: Float[np.ndarray, "s"]
+    """Places on the curve at which the room was measured."""
+    lifts_mm: Float[np.ndarray, "p s"]
+    """For each pass: how far the surface lies outside of the nominal crown at those places."""
+
+    @property
+    def span_mm(self) -> tuple[float, float]:
+        """First and last travel."""
+        return float(self.travel_mm[0]), float(self.travel_mm[-1])
+
+    @property
+    def relative_length(self) -> float:
+        """Travel on all passes in lengths of one."""
+        return float((self.travel_mm[-1] - self.travel_mm[0]) / (self.travel_mm[1] - self.travel_mm[0]))
+
+    def rig_from_world(self, travel_mm: float) -> Rigid3:
+        """The handpiece without the drift of a hand."""
+        if len(self.travel_mm) == 2:
+            return self.curve.rig_from_world(travel_mm)
+        length = float(np.interp(travel_mm, self.travel_mm, self.lengths_mm))
+        hold_from_world = self.curve.rig_from_world(length)
+        roll = float(np.interp(travel_mm, self.travel_mm, self.rolls_deg))
+        at_passes = [np.interp(length, self.stations_mm, lifts) for lifts in self.lifts_mm]
+        # Passes run from the largest roll to the smallest.
+        lift = float(np.interp(-roll, -self.rolls_deg[::2], at_passes))
+        return _rig_from_hold(roll, lift) @ hold_from_world
+
+
+def _passes(jaw: Jaw, curve: ArchCurve, options: ScanPathOptions) -> _Passes:
+    start, end = _stretch(jaw, curve, options)
+    rolls = np.array(options.rolls_deg)
+    lengths = np.array([(start, end) if number % 2 == 0 else (end, start) for number in range(len(rolls))]).ravel()
+    turning = np.abs(np.diff(rolls, prepend=rolls[0])) * np.deg2rad(_TURN_RADIUS_MM)
+    steps = np.column_stack([turning, np.full(len(rolls), end - start)]).ravel()
+    travel = start + np.cumsum(steps)
+    travel[:2] = start, end
+    stations = np.linspace(start, end, max(2, round((end - start) / _STATION_MM)))
+    return _Passes(
+        curve=curve,
+        travel_mm=travel,
+        lengths_mm=lengths,
+        rolls_deg=np.repeat(rolls, 2),
+        stations_mm=stations,
+        lifts_mm=np.array([_lifts(jaw.mesh, curve, stations, roll) for roll in rolls]),
+    )
+
+
+def steady_poses(jaw: Jaw, options: ScanPathOptions, per_pass: int) -> tuple[Rigid3, ...]:
+    """``rig_from_world`` at so many places on each pass, evenly spaced, without the drift of a hand or the turns."""
+    passes = _passes(jaw, arch_curve(jaw), options)
+    ends = passes.travel_mm.reshape(-1, 2)
+    return tuple(passes.rig_from_world(float(at)) for first, last in ends for at in np.linspace(first, last, per_pass))
+
+
+def _rig_from_hold(roll_deg: float, lift_mm: float) -> Rigid3:
+    """A handpiece that looks square at the place of a rounded crown whose normal is rolled by an angle.
+
+    The crown is an ellipse across the arch; at `_SIDE_DEG` its place is that of `_SIDE_MM`, where the side groups of
+    the twelve cameras look.
+    """
+    roll, side = np.deg2rad([roll_deg, _SIDE_DEG])
+    outward = np.array([0, np.sin(roll), np.cos(roll)])
+    across = _SIDE_MM[0] * np.sin(roll) / np.sin(side)
+    down = _SIDE_MM[1] * (1 - np.cos(roll)) / (1 - np.cos(side))
+    rotation = np.stack([[1.0, 0, 0], np.cross(outward, [1.0, 0, 0]), outward])
+    return Rigid3(rotation, -rotation @ (np.array([0, across, -down]) + lift_mm * outward))
+
+
+def _lifts(
+    mesh: Mesh, curve: ArchCurve, stations_mm: Float[np.ndarray, "s"], roll_deg: float
+) -> Float[np.ndarray, "s"]:
+    """How far a rolled handpiece must move out, or in (negative), for its working distance to be kept.
+
+    Rays on a patch square before it find the surface; smoothed along the arch, for a hand does not follow each crown.
+    """
+    if roll_deg == 0:
+        return np.zeros(len(stations_mm))
+    ticks = np.linspace(-_PATCH_MM, _PATCH_MM, 5)
+    patch = np.stack(np.meshgrid(ticks, ticks, _FAR_MM), axis=-1).reshape(-1, 3)
+    lifts = np.zeros(len(stations_mm))
+    for index, length in enumerate(stations_mm):
+        world_from_rig = (_rig_from_hold(roll_deg, 0.0) @ curve.rig_from_world(float(length))).inverse()
+        hits = mesh.cast(world_from_rig.apply(patch), np.broadcast_to(-world_from_rig.rotation[:, 2], patch.shape))
+        heights = _FAR_MM - hits.distances[hits.distances < 2 * _FAR_MM]
+        lifts[index] = np.median(heights) if len(heights) else 0.0
+    smooth = gaussian_filter1d(lifts, _NEAR_MM / 2 / _STATION_MM, mode="nearest")
+    return np.asarray(np.clip(smooth, -_LIFT_MM, _LIFT_MM))
 
 
 # --- the arch ---------------------------------------------------------------------------------------------------------
