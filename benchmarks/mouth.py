@@ -7,11 +7,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 from typing import get_args
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 from run import conditions
 

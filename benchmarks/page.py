@@ -6,10 +6,12 @@ python benchmarks/page.py
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import anatomy_sections
 
 HERE = Path(__file__).parent
 
@@ -126,7 +128,17 @@ def motion_table(rows: list[Result]) -> str:
     return "\n".join(lines)
 
 
-def page(results: list[Result], motions: list[Result]) -> str:
+SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
+    "mouth": ("The mouth", anatomy_sections.mouth),
+    "measure": ("Arch dimensions", anatomy_sections.measured),
+    "populations": ("Phantom populations", anatomy_sections.populations),
+    "mean_shape": ("Mean shape", anatomy_sections.mean_shape),
+    "visibility": ("Visibility", anatomy_sections.visibility),
+}
+"""Title and text for each file of results that is not of scans, by its stem."""
+
+
+def page(results: list[Result], motions: list[Result], others: Mapping[str, Result]) -> str:
     """The whole page."""
     parts = [
         "# Benchmarks",
@@ -143,18 +155,28 @@ def page(results: list[Result], motions: list[Result]) -> str:
         chosen = [result for result in results if result["case"].split("-seed")[0] == group]
         if chosen:
             parts += [f"## {group}", "", table(chosen), ""]
+    sphere_scans = [result for result in results if "spheres" in result]
+    parts += [
+        text for result in sphere_scans for text in ("## The sphere arch", "", anatomy_sections.spheres(result), "")
+    ]
+    prepared = [result for result in results if result["case"].startswith("prepared-")]
+    if prepared:
+        parts += ["## Prepared teeth (Table 3.2 of the thesis)", "", anatomy_sections.prepared(prepared), ""]
     for motion in motions:
         parts += ["## Against COLMAP", "", motion_table(motion["rows"]), "", f"Commit {motion['commit']}.", ""]
+    for stem, (title, text) in SECTIONS.items():
+        if stem in others:
+            parts += [f"## {title}", "", text(others[stem]), "", f"Commit {others[stem]['commit']}.", ""]
     parts += ["## Conditions", "", *(f"{detail(result)}\n" for result in results)]
     return "\n".join(parts)
 
 
 def main() -> None:
     """Read the results, write the page."""
-    loaded = [json.loads(path.read_text()) for path in sorted((HERE / "results").glob("*.json"))]
-    results = [value for value in loaded if "case" in value]
-    motions = [value for value in loaded if "rows" in value]
-    (HERE.parent / "docs" / "benchmarks.md").write_text(page(results, motions))
+    loaded = {path.stem: json.loads(path.read_text()) for path in sorted((HERE / "results").glob("*.json"))}
+    scans = [value for value in loaded.values() if "images_to_mesh" in value]
+    motions = [value for value in loaded.values() if "rows" in value]
+    (HERE.parent / "docs" / "benchmarks.md").write_text(page(scans, motions, loaded))
 
 
 if __name__ == "__main__":

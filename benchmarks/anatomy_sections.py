@@ -1,0 +1,236 @@
+"""Sections of docs/benchmarks.md on jaws, mouths and metrology objects."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+Result = Mapping[str, Any]
+
+THESIS_TABLE_3_2 = {
+    46: ("B, cracked", 23, 211, 130, 100),
+    45: ("C, crown", 34, 230, 74, 86),
+    42: ("D, full-contour crown", 27, 188, 61, 50),
+    35: ("E, MOD inlay", 26, 290, 135, 121),
+    36: ("F, MOD inlay", 26, 285, 120, 96),
+    0: ("A, complete arch", 60, 590, 280, 200),
+}
+"""As printed: what, minimum, maximum, mean and SD in um, by FDI number."""
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table in Markdown."""
+    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    return "\n".join([*lines, *("| " + " | ".join(str(cell) for cell in row) + " |" for row in rows)])
+
+
+def mark(value: float, limit: float, digits: int = 2) -> str:
+    """A figure, marked where it misses the limit that it must not exceed."""
+    return f"{value:.{digits}f}" if abs(value) <= limit else f"**{value:.{digits}f}** (missed)"
+
+
+def spheres(result: Result) -> str:
+    """The sphere arch, scanned."""
+    report, trueness = result["spheres"], result["trueness"]
+    named = {
+        name: report[key]
+        for name, key in (
+            ("inter-canine", "inter_canine_um"),
+            ("inter-first-molar", "inter_first_molar_um"),
+            ("inter-second-molar", "inter_second_molar_um"),
+        )
+    } | {f"cross-arch {label}": error for label, error in report["cross_arch_um"].items()}
+    form = [sphere["form_rms_um"] for sphere in report["spheres"].values()]
+    size = [sphere["size_error_um"] for sphere in report["spheres"].values()]
+    rows = [
+        ("spheres measured", f"{len(report['spheres'])} of {len(report['spheres']) + len(report['not_measured'])}"),
+        ("sphere-spacing error, max of all pairs, um", f"{report['spacing_max_um']:.1f}"),
+        ("sphere-spacing error, RMS, um", f"{report['spacing_rms_um']:.1f}"),
+        ("scale, ppm", f"{report['scale_ppm']:+.0f}"),
+        ("RMS without scale, um", f"{report['spacing_rms_without_scale_um']:.1f}"),
+        *((f"{name}, um", f"{error:+.1f}") for name, error in named.items()),
+        ("form error of a sphere, RMS, worst, um", f"{max(form):.1f}"),
+        ("size error (diameter), mean, um", f"{sum(size) / len(size):+.1f}"),
+        ("beside it, best fit: mean abs. deviation, um", f"{trueness['mean_abs_um']:.1f}"),
+        ("images to mesh, s", f"{result['images_to_mesh']['wall_s']:.0f}"),
+    ]
+    return "\n".join(
+        ["Spheres fitted in the scan, all distances between their centres, no best fit (docs/sphere-arch.md).", ""]
+        + [markdown_table(("figure", "value"), rows)]
+    )
+
+
+def prepared(results: Sequence[Result]) -> str:
+    """The thesis' reference model in the form of its Table 3.2, and the margins."""
+    by_tooth = {int(result["case"].removeprefix("prepared-").replace("arch", "0")): result for result in results}
+    rows = []
+    for tooth, (what, *printed) in THESIS_TABLE_3_2.items():
+        if tooth in by_tooth:
+            trueness = by_tooth[tooth]["trueness"]
+            found = trueness["per_tooth"][str(tooth)] if tooth else trueness["accuracy"]
+            ours = (found["min_um"], found["max_um"], found["mean_abs_um"], found["std_abs_um"], found["p95_um"])
+            rows.append((what, tooth or "all", "/".join(map(str, printed)), *(f"{figure:.1f}" for figure in ours)))
+    head = ("part", "FDI", "thesis min/max/mean/SD", "min", "max", "mean", "SD", "P95")
+    margins = [
+        (result["case"], tooth, *_margin(entry))
+        for result in results
+        for tooth, entry in result.get("margins", {}).items()
+        if result["case"] in (f"prepared-{tooth}", "prepared-arch")
+    ]
+    margin_head = ("scan", "FDI", "judged %", "found %", "mean", "SD", "P95", "max", "outward", "detector's floor")
+    return "\n".join(
+        [
+            "Absolute deviations in um, all points of the scan on the tooth, 120 images for a tooth (the thesis measured "
+            "lines with few points).",
+            "",
+            markdown_table(head, rows),
+            "",
+            "Margins in um: distance of the edge in the scan from the true margin line, in sections across it; "
+            "`outward` is negative where the edge is rounded off (docs/preparations.md).",
+            "",
+            markdown_table(margin_head, margins),
+        ]
+    )
+
+
+def _margin(entry: Result) -> list[str]:
+    found = entry["scan"]
+    figures = [entry["judged_pct"], *(found[f"{name}"] for name in ("found_pct", "mean_um", "std_um", "p95_um"))]
+    figures += [found["max_um"], found["outward_um"], entry["floor"]["mean_um"]]
+    return ["-" if figure is None else f"{figure:.1f}" for figure in figures]
+
+
+def measured(result: Result) -> str:
+    """Arch dimensions of phantoms and of real jaws."""
+    rows = [
+        (
+            f"{arch}, {kind}",
+            *(
+                mark(found[f"{name}_{kind}_worst_mm"], 0.05 if kind == "given" else 0.5)
+                if f"{name}_{kind}_worst_mm" in found
+                else "-"
+                for name in "abcf"
+            ),
+        )
+        for arch, found in result["phantom_summary"].items()
+        for kind in ("given", "estimated")
+    ]
+    real = [
+        (group["group"], group["jaws"], *(_spread(group[f"{n}_mean_mm"], group[f"{n}_sd_mm"]) for n in "abcf"))
+        for group in result["real"]["groups"]
+    ]
+    flags = [f"- {name}: {', '.join(why)}" for name, why in result["real"]["beyond_3_sd_of_table_2_1"].items()]
+    return "\n".join(
+        [
+            "Worst error in mm over the phantoms, by landmarks that are given (bar 0.05) or estimated from tooth "
+            f"labels (bar 0.5), meshes with edges of {result['phantom_edge_mm']} mm:",
+            "",
+            markdown_table(("arch, landmarks", "a", "b", "c", "f"), rows),
+            "",
+            f"Twenty real intra-oral scans, estimated landmarks, mean ± SD in mm; not measured: "
+            f"{len(result['real']['failures'])}.",
+            "",
+            markdown_table(("group", "jaws", "a", "b", "c", "f"), real),
+            "",
+            "Farther than 3 SD from Table 2.1 of the thesis:",
+            "",
+            *flags,
+        ]
+    )
+
+
+def _spread(mean: float | None, sd: float | None) -> str:
+    if mean is None:
+        return "-"
+    return f"{mean:.1f}" + ("" if sd is None else f" ± {sd:.1f}")
+
+
+def populations(result: Result) -> str:
+    """Drawn populations, measured."""
+    rows = []
+    for group, found in result["groups"].items():
+        cells = []
+        for name in "abcf":
+            entry = found[name]
+            asked = entry.get("table") or entry.get("source")
+            printed = f"{asked['mean_mm']:.2f} ± {asked['sd_mm']:.2f}: " if asked else ""
+            cells.append(f"{printed}{entry['measured']['mean_mm']:.2f} ± {entry['measured']['sd_mm']:.2f}")
+        again = f"{100 * found['share_drawn_again']:.0f} %"
+        rows.append((group, found["jaws"], *cells, again, mark(found["max_abs_asked_minus_measured_mm"], 0.05, 3)))
+    build = result["build"]
+    return "\n".join(
+        [
+            "Drawn from the distribution before the colon, measured after it, mean ± SD in mm:",
+            "",
+            markdown_table(("group", "jaws", "a", "b", "c", "f", "drawn again", "worst, asked - measured"), rows),
+            "",
+            f"A phantom of {build['faces']:,} faces takes {build['cpu_s']} CPU-s.",
+        ]
+    )
+
+
+def mean_shape(result: Result) -> str:
+    """The mean of many phantoms, from two different first samples."""
+    population, known = result["population"], result["known_mean"]
+    rows = [
+        (name, mark(run["wall_s"], 600, 0), run["cpu_s"], mark(run["peak_gib"], 4), run["rounds"], run["converged"])
+        for name, run in ((first, population[f"first_{first}"]) for first in ("00", "01"))
+    ]
+    head = ("first sample", "wall s (bar 600)", "CPU s", "peak GiB (bar 4)", "rounds", "converged")
+    apart, teeth = (population["surfaces_apart"]["00_to_01"][part] for part in ("all", "teeth"))
+    mean_to_known = known["mean_to_known_mean"]["all"]
+    angles = ", ".join(f"{angle:.1f}" for angle in known["largest_angle_between_modes_deg"])
+    return "\n".join(
+        [
+            f"{population['count']} phantoms of {population['group']}, edges of {population['edge_mm']} mm (some 200,000 "
+            "faces each), from two different first samples:",
+            "",
+            markdown_table(head, rows),
+            "",
+            f"The two means lie {_quantiles(apart)} apart, on teeth {_quantiles(teeth)}; their landmarks at most "
+            f"{population['landmarks_apart_um']:.2g} um. Known mean, {known['count']} samples meshed anew: the mean "
+            f"lies {_quantiles(mean_to_known)} from it; angles between known and found modes {angles} deg.",
+        ]
+    )
+
+
+def _quantiles(found: Result) -> str:
+    return f"{found['median_um']:.1f} um (median) and {found['p95_um']:.0f} um (P95)"
+
+
+def mouth(result: Result) -> str:
+    """Whom 12 mm fit."""
+    rows = [
+        (
+            study,
+            sex,
+            "second molar" if position == "7" else "first molar",
+            f"{entry['gap_mm']['p50']:.1f} ({entry['gap_mm']['p5']:.1f}-{entry['gap_mm']['p95']:.1f})",
+            f"{entry['fit_pct']:.1f}",
+            f"{entry['fit_vertical_pct']:.1f}",
+        )
+        for study, groups in result["studies"].items()
+        for sex, teeth in groups.items()
+        for position, entry in teeth.items()
+    ]
+    head = ("openings", "sex", "tooth", "L: median (5-95 %), mm", "L fits, %", "V fits, %")
+    return "\n".join(
+        [f"A handpiece that needs {result['needed_mm']:g} mm, {result['people']:,} drawn of each sex:", ""]
+        + [markdown_table(head, rows)]
+    )
+
+
+def visibility(result: Result) -> str:
+    """How long it takes to ask what a design sees."""
+    rows = [
+        (
+            name,
+            f"{result[name]['faces']:,}",
+            f"{result[name]['cameras']} x {result[name]['positions']}",
+            mark(result[name]["survey"]["wall_s"], 60 if name == "arch" else 2),
+            result[name]["scannable"]["wall_s"],
+        )
+        for name in ("arch", "molar")
+    ]
+    head = ("surface", "faces", "cameras x positions", "survey, s (bar 60, molar 2)", "scannable faces, s")
+    return markdown_table(head, rows)
