@@ -80,8 +80,8 @@ def prepared(results: Sequence[Result]) -> str:
     margin_head = ("scan", "FDI", "judged %", "found %", "mean", "SD", "P95", "max", "outward", "detector's floor")
     return "\n".join(
         [
-            "Absolute deviations in um, all points of the scan on the tooth, 120 images for a tooth (the thesis measured "
-            "lines with few points).",
+            "Absolute deviations in um, all points of the scan on the tooth, 120 images for a tooth (the thesis "
+            "measured lines with few points).",
             "",
             markdown_table(head, rows),
             "",
@@ -182,8 +182,8 @@ def mean_shape(result: Result) -> str:
     angles = ", ".join(f"{angle:.1f}" for angle in known["largest_angle_between_modes_deg"])
     return "\n".join(
         [
-            f"{population['count']} phantoms of {population['group']}, edges of {population['edge_mm']} mm (some 200,000 "
-            "faces each), from two different first samples:",
+            f"{population['count']} phantoms of {population['group']}, edges of {population['edge_mm']} mm (some "
+            "200,000 faces each), from two different first samples:",
             "",
             markdown_table(head, rows),
             "",
