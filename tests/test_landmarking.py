@@ -48,21 +48,12 @@ def test_every_landmark_is_found_and_marked_as_estimated(phantom: Jaw):
 def test_the_dimensions_are_within_half_a_millimetre(phantom: Jaw):
     truth = arch_dimensions(phantom.landmarks, phantom.arch or "lower")
     found = arch_dimensions(estimated(phantom), phantom.arch or "lower")
-    for name in ("a", "b", "c"):
+    for name in ("a", "b", "c", "f"):
         known, measured = truth[name], found[name]
         assert known is not None
         assert measured is not None
         assert 0 < abs(measured.value_mm - known.value_mm) < 0.5
-
-
-def test_the_arch_length_is_near(phantom: Jaw):
-    # Within 1 mm, not 0.5: where a papilla has its tip is a matter of a crevice (docs/landmarks.md).
-    arch = phantom.arch or "lower"
-    truth, found = (arch_dimensions(points, arch).f for points in (phantom.landmarks, estimated(phantom)))
-    assert truth is not None
-    assert found is not None
-    assert 0 < abs(found.value_mm - truth.value_mm) < 1.0
-    assert abs(found.value_mm - truth.value_mm) < 2.5 * (found.sigma_mm or 0)
+        assert abs(measured.value_mm - known.value_mm) < 3 * (measured.sigma_mm or 0)
 
 
 def test_the_uncertainties_cover_the_errors(phantom: Jaw):

@@ -1,9 +1,10 @@
 """The anatomical points of a crown, in the frame of the tooth (see `cuspid.anatomy.crowns`).
 
 A cusp tip is the point farthest along the long axis; the angle of an incisal edge, the point farthest in a direction
-half-way between edge and side. The buccal groove of a molar crosses the rim at `RIM`, where its profile turns from
-the occlusal surface to the side. The central groove is taken at its deepest: of a molar, at its
-central pit; of a premolar, whose pits lie to either side, half-way between mesial and distal.
+half-way between edge and side. The rim of a molar is taken at `RIM`, where its profile turns from the occlusal
+surface to the side; the buccal groove crosses it at the lowest point between the two mesial buccal cusps. The central
+groove is taken at its deepest: of a molar, at its central pit; of a premolar, whose pits lie to either side, half-way
+between mesial and distal.
 """
 
 from dataclasses import dataclass
@@ -12,13 +13,13 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.anatomy.crowns import Crown, Values, crown_distance, top_of
+from cuspid.anatomy.crowns import Crown, Lobe, Values, crown_distance
 from cuspid.anatomy.landmarks import TOOTH_LANDMARKS, ToothKind
 
 Point = Float[np.ndarray, "3"]
 
 RIM = 0.62
-"""Where the buccal groove of a molar crosses the rim, as a fraction of half the depth of the crown."""
+"""Where the rim of a molar is, as a fraction of half the depth of the crown."""
 ANGLE_DEG = {"incisor": 45.0, "canine": 60.0}
 """Direction in which the angle of an edge is the farthest point, from the long axis to the side: the edge of a canine
 slopes."""
@@ -45,16 +46,12 @@ class _Goal:
 def crown_points(crown: Crown, kind: ToothKind) -> dict[str, Point]:
     """The landmarks on the crown by name, mm: those of `TOOTH_LANDMARKS` but for the cervices."""
     names = [name for name in TOOTH_LANDMARKS[kind] if not name.endswith("_cervix")]
-    goals = [name for name in names if name != "buccal_groove"]
-    points = dict(zip(goals, _farthest(crown, [_goal(crown, kind, name) for name in goals]), strict=True))
-    return {name: points[name] if name in points else _buccal_groove(crown) for name in names}
+    return dict(zip(names, _farthest(crown, [_goal(crown, kind, name) for name in names]), strict=True))
 
 
 @lru_cache(maxsize=4096)
 def crown_point(crown: Crown, kind: ToothKind, name: str) -> Point:
     """One landmark on the crown, mm."""
-    if name == "buccal_groove":
-        return _buccal_groove(crown)
     return _farthest(crown, [_goal(crown, kind, name)])[0]
 
 
@@ -62,6 +59,8 @@ def _goal(crown: Crown, kind: ToothKind, name: str) -> _Goal:
     """What a landmark is."""
     if name == "central_groove":
         return _deepest(crown, 0.15 if kind == "molar" else 0.0)
+    if name == "buccal_groove":
+        return _crossing(crown)
     return _edge_point(crown, kind, name) if crown.edge else _tip(crown, name)
 
 
@@ -78,11 +77,21 @@ def _edge_point(crown: Crown, kind: ToothKind, name: str) -> _Goal:
 
 def _tip(crown: Crown, name: str) -> _Goal:
     """The tip of a cusp by its name: the mesial or distal one of its side."""
-    side = 1 if "buccal" in name else -1
-    row = sorted((cusp for cusp in crown.cusps if side * cusp.y > 0), key=lambda cusp: cusp.x)
-    cusp = row[1 if name.startswith("disto") else 0]
+    cusp = _row(crown, 1 if "buccal" in name else -1)[1 if name.startswith("disto") else 0]
     start = np.array([cusp.x * crown.half_width_mm, cusp.y * crown.half_depth_mm])
     return _Goal(start=start, reach=np.full(2, 0.6), towards=UP)
+
+
+def _row(crown: Crown, side: int) -> list[Lobe]:
+    """The buccal (1) or lingual (-1) cusps from mesial to distal."""
+    return sorted((cusp for cusp in crown.cusps if side * cusp.y > 0), key=lambda cusp: cusp.x)
+
+
+def _crossing(crown: Crown) -> _Goal:
+    """The lowest point of the rim between the two mesial buccal cusps."""
+    mesial, distal = (cusp.x * crown.half_width_mm for cusp in _row(crown, 1)[:2])
+    start = np.array([(mesial + distal) / 2, RIM * crown.half_depth_mm])
+    return _Goal(start=start, reach=np.array([0.3 * (distal - mesial), 0.0]), towards=-UP)
 
 
 def _deepest(crown: Crown, wide: float) -> _Goal:
@@ -92,12 +101,6 @@ def _deepest(crown: Crown, wide: float) -> _Goal:
     half = crown.half_depth_mm
     reach = np.array([wide * crown.half_width_mm, 0.4 * (high - low) * half])
     return _Goal(start=np.array([0.0, (low + high) / 2 * half]), reach=reach, towards=-UP)
-
-
-def _buccal_groove(crown: Crown) -> Point:
-    """The (mesio)buccal groove where it crosses the rim."""
-    x, y = crown.grooves[0].x * crown.half_width_mm, RIM * crown.half_depth_mm
-    return np.array([x, y, top_of(crown, x, y)])
 
 
 def _farthest(crown: Crown, goals: list[_Goal]) -> Float[np.ndarray, "g 3"]:

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
 
 from cuspid.anatomy.arch import arch_of
@@ -29,6 +29,7 @@ from cuspid.anatomy.landmarks import TOOTH_LANDMARKS, ToothKind, kind_of, labels
 from cuspid.anatomy.tooth_view import Place, ToothView, view_teeth
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Arch, Jaw, Landmark
+from cuspid.mesh import Mesh
 
 Point = Float[np.ndarray, "3"]
 Points = Float[np.ndarray, "n 3"]
@@ -45,13 +46,15 @@ _FARTHEST_CUSP_MM = 3.0
 """No cusp is this far from where it is expected."""
 _RELIEF_MM = 0.8
 """A cusp without a summit is what stands out most from the surface smoothed by this."""
-RIM_BOW: Mapping[Arch, float] = MappingProxyType({"lower": 0.13, "upper": 0.09})
-"""How far buccally of the line through the tips of the buccal cusps the rim is crossed, as a fraction of half the depth
-of the tooth, seen from above; from the phantoms that `SIGMA_MM` is from."""
+RIM_BOW: Mapping[Arch, tuple[float, float]] = MappingProxyType({"lower": (0.122, 0.145), "upper": (0.081, 0.095)})
+"""How far buccally of the line through the tips of the buccal cusps the rim of first and of other molars is crossed, as
+a fraction of half the depth of the tooth, seen from above; from the phantoms that `SIGMA_MM` is from."""
 _GROOVE_CAP_MM = 0.02
 """The groove is the middle of what lies about this far above the lowest place of the rim."""
-_PAPILLA_CAP_MM = 0.15
-"""The tip of a papilla is the middle of what lies about this far below its highest point."""
+_PAPILLA_LEAN_DEG = 35.0
+"""Direction in which the tip of a lingual papilla is the farthest point, from up to lingual."""
+_PAPILLA_CAP_MM = 0.05
+"""The tip of a papilla is the middle of what falls about this far short of its farthest point."""
 _PAPILLA_BELOW_MM = 1.0
 """The incisive papilla is taken this far apical of the palatal margin of the gum at the central incisors."""
 
@@ -69,12 +72,12 @@ SIGMA_MM: Mapping[str, tuple[float, float]] = MappingProxyType(
         "incisor.lingual_cervix": (0.13, 0.05),
         "incisor.mesial_angle": (0.04, 0.27),
         "midline": (0.03, 0.34),
-        "molar.buccal_groove": (0.17, 0.00),
+        "molar.buccal_groove": (0.01, 0.08),
         "molar.central_groove": (0.26, 0.23),
         "molar.distobuccal_cusp": (0.10, 0.04),
         "molar.mesiobuccal_cusp": (0.10, 0.08),
         "molar.mesiolingual_cusp": (0.13, 0.05),
-        "papilla": (0.30, 0.60),
+        "papilla": (0.00, 0.37),
         "premolar.buccal_cervix": (0.06, 0.04),
         "premolar.buccal_cusp": (0.03, 0.06),
         "premolar.central_groove": (0.29, 0.00),
@@ -163,7 +166,7 @@ def _tooth_points(view: ToothView, arch: Arch) -> dict[str, Point]:
         places = _cusp_places(view, arch)
         places["central_groove"] = _central_groove(view, places, 0.15 if kind == "molar" else 0.0)
         if kind == "molar":
-            places["buccal_groove"] = _buccal_groove(view, RIM_BOW[arch], places)
+            places["buccal_groove"] = _buccal_groove(view, RIM_BOW[arch][view.fdi % 10 > 6], places)
     return {name: view.lift(place) for name, place in places.items()}
 
 
@@ -291,7 +294,7 @@ def _midline_points(
     """Papilla and midline, where both central incisors are there."""
     right, left = (41, 31) if arch == "lower" else (11, 21)
     labels = (f"{right}.mesial_angle", f"{left}.mesial_angle")
-    if not all(label in points for label in labels):
+    if jaw.face_labels is None or not all(label in points for label in labels):
         return {}
     middle = (points[labels[0]] + points[labels[1]]) / 2
     between = (views[right].origin + views[left].origin) / 2
@@ -299,9 +302,7 @@ def _midline_points(
     inwards /= np.linalg.norm(inwards)
     found = {"midline": _surface_below(jaw, middle)}
     if arch == "lower":
-        papilla = _lingual_papilla(
-            np.concatenate([margins.get(fdi, _NO_POINTS) for fdi in (right, left)]), middle, inwards
-        )
+        papilla = _lingual_papilla(jaw.mesh, jaw.face_labels, middle, inwards)
     else:
         cervices = [points[f"{fdi}.lingual_cervix"] for fdi in (right, left) if f"{fdi}.lingual_cervix" in points]
         papilla = _incisive_papilla(jaw, between, inwards, cervices)
@@ -315,15 +316,20 @@ def _surface_below(jaw: Jaw, point: Point) -> Point:
     return np.array([*point[:2], height]) if point[2] - height < 1.5 else point
 
 
-def _lingual_papilla(margin: Points, contact: Point, inwards: Point) -> Point | None:
-    """The highest points of the margin of the gum at the central incisors, lingual of their contact."""
-    offset = margin - contact
-    depth, aside = offset @ inwards, np.abs(offset @ np.array([-inwards[1], inwards[0], 0.0]))
-    near = margin[(depth > 0.2) & (depth < 5.0) & (aside < 1.5)]
-    if len(near) == 0:
+def _lingual_papilla(mesh: Mesh, labels: Int[np.ndarray, "f"], contact: Point, inwards: Point) -> Point | None:
+    """The tip of the gum that is seen from above lingual of the contact of the central incisors."""
+    lean = np.radians(_PAPILLA_LEAN_DEG)
+    aside = np.array([-inwards[1], inwards[0], 0.0])
+    depth, across = np.meshgrid(np.arange(-0.5, 5.0, 0.05), np.linspace(-0.45, 0.45, 7))
+    over = contact + depth.reshape(-1, 1) * inwards + across.reshape(-1, 1) * aside + 5.0 * _UP
+    hits = mesh.cast(over, np.broadcast_to(-_UP, over.shape))
+    gum = (hits.faces >= 0) & (labels[hits.faces] == GUM)
+    if not gum.any():
         return None
-    weights = np.exp((near[:, 2] - near[:, 2].max()) / _PAPILLA_CAP_MM)
-    return weights @ near / weights.sum()
+    seen = over[gum] - hits.distances[gum, None] * _UP
+    score = seen @ (np.sin(lean) * inwards + np.cos(lean) * _UP)
+    weights = np.exp((score - score.max()) / _PAPILLA_CAP_MM)
+    return weights @ seen / weights.sum()
 
 
 def _incisive_papilla(jaw: Jaw, between: Point, inwards: Point, cervices: Sequence[Point]) -> Point | None:

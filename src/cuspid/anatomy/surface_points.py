@@ -1,8 +1,9 @@
 """The landmarks of a phantom, exact points of its implicit surface (scheme: `cuspid.anatomy.landmarks`).
 
 A *cervix* is the lowest point of the gum's margin on that side of a tooth, along its long axis. The papilla of a lower
-jaw is the highest point of the gum between the central incisors on the lingual side; that of an upper jaw lies behind
-the central incisors, `PAPILLA_BELOW_MM` apical of their cervices.
+jaw is the tip of the gum that shows lingually between the central incisors: of what is seen from above, the point
+farthest in a direction that leans from occlusal to lingual. That of an upper jaw lies behind the central incisors,
+about 1 mm apical of the palatal margin.
 """
 
 from collections.abc import Callable
@@ -19,8 +20,12 @@ from cuspid.anatomy.landmarks import TOOTH_LANDMARKS, kind_of, labels_of
 from cuspid.anatomy.solid import CREASE_MM, Solid
 from cuspid.jaw import Arch, Landmark
 
-PAPILLA_BELOW_MM = 1.0
-"""Height of the cervices of the upper central incisors above the centre of the incisive papilla."""
+PAPILLA_ABOVE_MM = 0.35
+"""Height of the centre of the incisive papilla above the cervices of the upper central incisors, in the middle of which
+the palatal margin is about 1.35 mm high."""
+PAPILLA_LEAN_DEG = 35.0
+"""Direction in which the tip of a lingual papilla is the farthest point, from occlusal to lingual: its crest runs level
+into the crevice under the contact."""
 REACH = 0.5
 """Half the part of the margin that is searched for its lowest point, as a fraction of half the width of the tooth."""
 
@@ -122,7 +127,7 @@ def _midline(solid: Solid, points: dict[str, Point]) -> Point:
     middle = (points[f"{left}.mesial_angle"] + points[f"{right}.mesial_angle"]) / 2
     below = np.linspace(0.0, 3.0, 60)[:, None] * [0.0, 0.0, -1.0]
     if (solid.distance(middle + below) < 0).any():
-        return _first_inside(solid, middle + [0.0, 0.0, 2.0], np.array([0.0, 0.0, -1.0]), 6.0)
+        return _first_inside(solid, middle[None] + [0.0, 0.0, 2.0], np.array([0.0, 0.0, -1.0]), 6.0)[0]
     return _onto(solid, middle[None])[0]
 
 
@@ -130,25 +135,23 @@ def _incisive_papilla(solid: Solid) -> Point:
     """The point of the palatal gum behind the contact of the central incisors."""
     between, lingual = _between_centrals(solid)
     level = np.mean([placed.origin[2] for placed in solid.teeth if placed.position == 1])
-    start = np.array([*between[:2], level - PAPILLA_BELOW_MM])
-    return _first_inside(solid, start + 12.0 * lingual, -lingual, 12.0)
+    start = np.array([[*between[:2], level + PAPILLA_ABOVE_MM]])
+    return _first_inside(solid, start + 12.0 * lingual, -lingual, 12.0)[0]
 
 
 def _lingual_papilla(solid: Solid) -> Point:
-    """The highest point of the gum between the central incisors, on their lingual side."""
+    """The tip of the gum between the central incisors, seen from lingual and above."""
     between, lingual = _between_centrals(solid)
-    along, up = np.meshgrid(np.linspace(0.0, 5.0, 26), np.linspace(-3.0, 5.0, 41), indexing="ij")
-    points = between * [1.0, 1.0, 0.0] + along.reshape(-1, 1) * lingual + up.reshape(-1, 1) * [0.0, 0.0, 1.0]
-    points[:, 2] += between[2]
-    tooth, gum, _ = solid.parts(points)
-    inside = (gum < tooth) & (gum < CREASE_MM / 4)
-    start = points[inside][points[inside, 2].argmax()][None]
-
-    def parts(points: Points) -> Float[np.ndarray, "n 2"]:
-        tooth, gum, _ = solid.parts(points)
-        return np.column_stack([tooth, gum]) - CREASE_MM / 4
-
-    return _root(parts, start, np.stack([lingual, [0.0, 0.0, 1.0]]))[0]
+    lean = np.radians(PAPILLA_LEAN_DEG)
+    towards = lingual * np.sin(lean) + [0.0, 0.0, np.cos(lean)]
+    along, best = np.linspace(-1.0, 4.0, 26), between
+    for _ in range(3):
+        above = between + along[:, None] * lingual + [0.0, 0.0, 6.0]
+        seen = _first_inside(solid, above, np.array([0.0, 0.0, -1.0]), 12.0)
+        score = np.where(solid.lead_of_gum(seen) > 0, seen @ towards, -np.inf)
+        best = seen[score.argmax()]
+        along = (best - between) @ lingual + (along[1] - along[0]) * np.linspace(-1.0, 1.0, 11)
+    return best
 
 
 def _between_centrals(solid: Solid) -> tuple[Point, Point]:
@@ -164,9 +167,13 @@ def _between_centrals(solid: Solid) -> tuple[Point, Point]:
     return line[lead.argmin()], lingual / np.linalg.norm(lingual)
 
 
-def _first_inside(solid: Solid, start: Point, direction: Point, length_mm: float) -> Point:
-    """Where a ray first meets the surface."""
+def _first_inside(solid: Solid, starts: Points, direction: Point, length_mm: float) -> Points:
+    """Where parallel rays from points (n, 3) first meet the surface; the end of a ray that does not."""
     reach = np.linspace(0.0, length_mm, int(40 * length_mm))
-    distance = solid.distance(start + reach[:, None] * direction)
-    first = int(np.flatnonzero(distance < 0)[0])
-    return start + np.interp(0.0, distance[[first, first - 1]], reach[[first, first - 1]]) * direction
+    points = starts[:, None] + reach[:, None] * direction
+    distance = solid.distance(points.reshape(-1, 3)).reshape(points.shape[:2])
+    first = np.where((distance < 0).any(axis=1), (distance < 0).argmax(axis=1), len(reach) - 1)
+    rows = np.arange(len(starts))
+    before, after = distance[rows, first - 1], distance[rows, first]
+    share = np.where(after < 0, before / (before - after), 1.0)
+    return points[rows, first - 1] + share[:, None] * reach[1] * direction
