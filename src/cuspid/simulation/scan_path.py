@@ -50,8 +50,10 @@ _WAVELENGTH_MM = 35.0
 
 _SIDE_DEG, _SIDE_MM = 60.0, (4.5, 2.5)
 """A handpiece rolled so far looks at this place: across from the middle of the crown, and down from the cusp tips."""
-_TURN_RADIUS_MM = 5.0
-"""A turn by an angle counts as the way on a circle of this radius: halfway from the surface to the cameras."""
+_TURN_RADIUS_MM = 8.0
+"""A turn by an angle counts as the way on a circle of this radius: about that of the cameras around the crown."""
+_GROWTH = 1.15
+"""By so much at most the number of frames is raised at once, where there are turns."""
 _STATION_MM = 1.0
 """Spacing of the places at which the room beside the teeth is measured."""
 _PATCH_MM = 1.5
@@ -170,7 +172,7 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
     curve = arch_curve(jaw)
     passes = _passes(jaw, curve, options)
     hand = _hand_motion(passes.span_mm, options, rng)
-    frames = options.frames or round(passes.relative_length * (ARCH_FRAMES if options.tooth is None else TOOTH_FRAMES))
+    frames = options.frames or options.turns * (ARCH_FRAMES if options.tooth is None else TOOTH_FRAMES)
     most = frames if options.frames else 3 * frames
     while True:
         path = _even_path(jaw.mesh, handpiece, passes, hand, np.linspace(*passes.span_mm, frames))
@@ -179,6 +181,9 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
             return path
         # The surface that an image loses is about in proportion to the step.
         growth = (1 - path.minimum_overlap) / (1 - options.minimum_overlap)
+        if options.turns > 1:
+            # A single image on a turn is no reason for as many more everywhere.
+            growth = min(growth, _GROWTH)
         needed = max(frames + 1, int(np.ceil(1 + (frames - 1) * growth)))
         if needed > most:
             raise InputError(
@@ -247,11 +252,6 @@ class _Passes:
     def span_mm(self) -> tuple[float, float]:
         """First and last travel."""
         return float(self.travel_mm[0]), float(self.travel_mm[-1])
-
-    @property
-    def relative_length(self) -> float:
-        """Travel on all passes in lengths of one."""
-        return float((self.travel_mm[-1] - self.travel_mm[0]) / (self.travel_mm[1] - self.travel_mm[0]))
 
     def rig_from_world(self, travel_mm: float) -> Rigid3:
         """The handpiece without the drift of a hand."""
