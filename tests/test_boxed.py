@@ -126,14 +126,22 @@ def test_a_box_can_go_on_into_the_gum(coarse_phantom: Jaw, result: Jaw) -> None:
     assert len(deeper.mesh.faces) < len(result.mesh.faces)
 
 
+def test_an_open_scan_is_closed_below(coarse_phantom: Jaw) -> None:
+    scanned = coarse_phantom.mesh.face_centres[:, 2] > coarse_phantom.mesh.bounds[0, 2] + 3
+    made = boxed(Jaw(mesh=coarse_phantom.mesh.submesh(scanned), face_labels=coarse_phantom.face_labels[scanned]))
+    assert made.teeth == coarse_phantom.teeth
+    assert solid(made.mesh).is_watertight
+
+
 def test_what_cannot_be_boxed_is_refused(coarse_phantom: Jaw) -> None:
     with pytest.raises(InputError, match="no tooth labels"):
         boxed(replace(coarse_phantom, face_labels=None))
     with pytest.raises(InputError, match="no tooth labels"):
         boxed(replace(coarse_phantom, face_labels=np.zeros(len(coarse_phantom.mesh.faces), dtype=np.int64)))
-    opened = coarse_phantom.mesh.submesh(np.arange(len(coarse_phantom.mesh.faces)) > 100)
-    with pytest.raises(InputError, match=r"boxed jaw: not a solid .* open edges"):
-        boxed(Jaw(mesh=opened, face_labels=np.asarray(coarse_phantom.face_labels)[101:]))
+    doubled = np.concatenate([coarse_phantom.mesh.faces, coarse_phantom.mesh.faces[:1, ::-1]])
+    labels = np.concatenate([coarse_phantom.face_labels, [GUM]])
+    with pytest.raises(InputError, match=r"boxed jaw: not a solid .* shared by more than two faces"):
+        boxed(Jaw(mesh=Mesh(coarse_phantom.mesh.vertices, doubled), face_labels=labels))
     flipped = Mesh(coarse_phantom.mesh.vertices, coarse_phantom.mesh.faces[:, ::-1])
     with pytest.raises(InputError, match="inside out"):
         boxed(replace(coarse_phantom, mesh=flipped))

@@ -16,7 +16,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float, Int
 
-from cuspid.anatomy.booleans import solid_of
+from cuspid.anatomy.booleans import closed, solid_of
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
@@ -65,20 +65,20 @@ class Box:
 def boxed(jaw: Jaw, options: BoxOptions = BoxOptions()) -> Jaw:
     """The jaw with every crown replaced by its box, watertight, with the FDI number of each face.
 
-    Landmarks, lines and spheres are dropped: they would not lie on the boxes. Raises InputError where the jaw has no
-    tooth labels or its mesh is not closed.
+    An open scan is closed by a point below it. Landmarks, lines and spheres are dropped: they would not lie on the
+    boxes. Raises InputError where the jaw has no tooth labels or its mesh is not the border of a solid.
     """
     if not jaw.teeth or jaw.face_labels is None:
         raise InputError("boxed jaw: the jaw has no tooth labels; label its faces with FDI numbers (0 = gum)")
-    body = solid_of(jaw.mesh, "boxed jaw")
+    whole = closed(jaw.mesh)
+    before = np.pad(jaw.face_labels, (0, len(whole.faces) - len(jaw.mesh.faces)), constant_values=GUM)
+    body = solid_of(whole, "boxed jaw")
     boxes = [_solid_box(box, options) for box in crown_boxes(jaw).values()]
     joined = manifold3d.Manifold.batch_boolean([body, *boxes], manifold3d.OpType.Add)
     outside = max(joined.decompose(), key=lambda part: part.volume())
     out = outside.to_mesh64()
     numbers = dict(zip((_origin(solid) for solid in boxes), jaw.teeth, strict=True))
-    labels = [
-        np.full(length, numbers[run]) if run in numbers else jaw.face_labels[face] for run, length, face in _runs(out)
-    ]
+    labels = [np.full(length, numbers[run]) if run in numbers else before[face] for run, length, face in _runs(out)]
     mesh = Mesh(np.asarray(out.vert_properties)[:, :3], np.asarray(out.tri_verts).astype(np.int64))
     return Jaw(mesh=mesh, face_labels=np.concatenate(labels), arch=jaw.arch)
 
