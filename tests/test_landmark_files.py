@@ -203,7 +203,8 @@ def test_landmarks_go_to_another_frame_and_back(landmarks, b_from_a):
 
 
 def test_a_table_is_csv_with_empty_cells(tmp_path: Path):
-    write_table(
-        tmp_path / "t.csv", [{"jaw": "a, b", "a_mm": 26.81234, "c_mm": None}, {"jaw": "ü", "a_mm": 1.0, "c_mm": 2.0}]
-    )
-    assert (tmp_path / "t.csv").read_text() == 'jaw,a_mm,c_mm\n"a, b",26.812,\nü,1.000,2.000\n'
+    rows = [{"jaw": "a, b", "a_mm": 26.81234, "c_mm": None}, {"jaw": "ü", "c_mm": 2.0}]
+    write_table(tmp_path / "t.csv", rows, digits=3)
+    assert (tmp_path / "t.csv").read_text() == 'jaw,a_mm,c_mm\n"a, b",26.812,\nü,,2.000\n'
+    write_table(tmp_path / "t.csv", rows)
+    assert (tmp_path / "t.csv").read_text() == 'jaw,a_mm,c_mm\n"a, b",26.81234,\nü,,2.0\n'

@@ -67,8 +67,8 @@ def measure(
             return jaw, notes
 
         found = survey({path.stem: partial(load, number, path) for number, path in enumerate(files, start=1)})
-        storage.write_table(out / "jaws.csv", jaw_rows(found))
-        storage.write_table(out / "groups.csv", group_rows(found))
+        storage.write_table(out / "jaws.csv", jaw_rows(found), digits=3)
+        storage.write_table(out / "groups.csv", group_rows(found), digits=3)
         storage.write_json(out / "measure.json", found)
     _print_survey(found)
 

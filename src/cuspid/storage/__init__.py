@@ -49,7 +49,7 @@ from cuspid.storage.reconstructions import (
     write_trueness,
 )
 from cuspid.storage.shapes import read_shape_model, write_shape_model
-from cuspid.storage.tables import write_table
+from cuspid.storage.tables import csv_table, write_table
 
 __all__ = [
     "IMAGE_SUFFIXES",
@@ -62,6 +62,7 @@ __all__ = [
     "Unit",
     "claim_folder",
     "claimed_folder",
+    "csv_table",
     "hash_capture",
     "hash_file",
     "is_jaw",

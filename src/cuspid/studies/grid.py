@@ -8,8 +8,6 @@ else: what they return is written here.
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import multiprocessing
 import os
@@ -111,15 +109,14 @@ def run_grid(
 
 def table(outcomes: Sequence[Outcome]) -> str:
     """The outcomes as CSV: parameters, figures, and the reason where a case failed."""
-    parameters = list(dict.fromkeys(name for outcome in outcomes for name in outcome.case.parameters))
-    figures = list(dict.fromkeys(name for outcome in outcomes for name in outcome.figures))
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, ["case", *parameters, *figures, "failure"], lineterminator="\n")
-    writer.writeheader()
-    for outcome in outcomes:
-        cells = {**outcome.case.parameters, **outcome.figures}
-        writer.writerow({"case": outcome.case.name, **cells, "failure": outcome.failure})
-    return stream.getvalue()
+    heads = [{"case": outcome.case.name, **outcome.case.parameters} for outcome in outcomes]
+    columns = dict.fromkeys(name for outcome in outcomes for name in outcome.figures)
+    return storage.csv_table(
+        [
+            {**head, **columns, **outcome.figures, "failure": outcome.failure}
+            for head, outcome in zip(heads, outcomes, strict=True)
+        ]
+    )
 
 
 def _path(folder: Path, case: Case) -> Path:
