@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cuspid.errors import InputError
-from cuspid.handpiece.designs import DESIGNS, DesignOptions, essential_four, twelve_cameras
+from cuspid.handpiece.designs import DESIGNS, DesignOptions, essential_four, six_cameras, twelve_cameras
 from cuspid.rig import Handpiece
 
 OPTIONS = st.builds(
@@ -108,8 +108,52 @@ def test_every_named_design_can_be_built(name: str) -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"working_distance_mm": 1.0}, {"baseline_across_mm": 0.0}, {"field_of_view_deg": 180.0}],
+    [
+        {"working_distance_mm": 1.0},
+        {"baseline_across_mm": 0.0},
+        {"field_of_view_deg": 180.0},
+        {"outer_distance_mm": 0.0},
+        {"outer_tilt_deg": 90.0},
+    ],
 )
 def test_impossible_designs_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(InputError, match="design"):
         DesignOptions(**wrong)
+
+
+@given(OPTIONS)
+def test_six_are_the_four_and_one_more_on_either_side(options: DesignOptions) -> None:
+    four, six = essential_four(options), six_cameras(options)
+    assert six.rig.names == (*four.rig.names, "o5", "o6")
+    for name, mounted in four.rig.cameras.items():
+        np.testing.assert_array_equal(six.rig[name].cam_from_rig.matrix, mounted.cam_from_rig.matrix)
+    for name, light in four.lights.items():
+        np.testing.assert_array_equal(six.lights[name].position_mm, light.position_mm)
+    np.testing.assert_allclose(baseline(six, "o1", "o5"), [0, 2.0, 0], atol=1e-12)
+    np.testing.assert_allclose(baseline(six, "o2", "o6"), [0, -2.0, 0], atol=1e-12)
+    np.testing.assert_allclose(six.rig["o5"].cam_from_rig.rotation, six.rig["o1"].cam_from_rig.rotation, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_designs_are_symmetric(name: str) -> None:
+    handpiece = DESIGNS[name](DesignOptions(outer_tilt_deg=20.0))
+    mirrored = np.array([1, -1, 1])
+    centres = np.array([each.centre_in_rig for each in handpiece.rig.cameras.values()])
+    axes = np.array([each.axis_in_rig for each in handpiece.rig.cameras.values()])
+    lights = np.array([light.position_mm for light in handpiece.lights.values()])
+    both = np.concatenate([centres, axes], axis=1)
+    for places, mirror in ((both, np.tile(mirrored, 2)), (lights, mirrored)):
+        gaps = np.linalg.norm(places[:, None] - places[None] * mirror, axis=2).min(axis=1)
+        assert gaps.max() < 1e-12
+
+
+def test_outer_cameras_lean_inwards_by_the_tilt() -> None:
+    six = six_cameras(DesignOptions(outer_tilt_deg=20.0))
+    for name, side in (("o5", 1), ("o6", -1)):
+        axis = six.rig[name].axis_in_rig
+        np.testing.assert_allclose(axis, [0, -side * np.sin(np.deg2rad(20)), -np.cos(np.deg2rad(20))], atol=1e-12)
+        np.testing.assert_allclose(six.rig[name].cam_from_rig.rotation[0], [1, 0, 0], atol=1e-12)
+
+
+def test_six_cameras_are_one_group_for_stereo() -> None:
+    assert len(six_cameras().rig.groups(5.0)) == 1

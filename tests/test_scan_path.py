@@ -9,7 +9,8 @@ import pytest
 
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.handpiece.designs import DesignOptions, essential_four, twelve_cameras
+from cuspid.handpiece.designs import DesignOptions, essential_four, six_cameras, twelve_cameras
+from cuspid.handpiece.visibility import VisibilityOptions, scannable_faces
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece, Rig
@@ -21,6 +22,7 @@ from cuspid.simulation.scan_path import (
     arch_curve,
     image_overlap,
     plan_scan_path,
+    steady_poses,
 )
 
 STILL = ScanPathOptions(tooth=46, jitter_mm=0.0, jitter_deg=0.0)
@@ -191,3 +193,106 @@ def test_the_hand_moves_the_same_whatever_the_number_of_frames(coarse_phantom: J
         later = {"00000": "00000", "00009": "00018"}[name]
         np.testing.assert_allclose(first.rig_from_world[name].matrix, second.rig_from_world[later].matrix, atol=1e-9)
         assert np.abs(first.rig_from_world[name].matrix - other.rig_from_world[name].matrix).max() > 0.01
+
+
+# --- turns --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def turned_path(coarse_phantom: Jaw) -> ScanPath:
+    return plan(coarse_phantom, replace(STILL, turns=3), six_cameras())
+
+
+def rolls_deg(curve: ArchCurve, path: ScanPath) -> np.ndarray:
+    """Angle from the up direction of a handpiece held upright to that of each pose, towards the cheek."""
+    poses = [pose.inverse() for pose in path.rig_from_world.values()]
+    middle = curve.points.mean(axis=0)
+    outward = np.array([pose.translation - middle for pose in poses])[:, :2]
+    ups = np.array([pose.rotation[:, 2] for pose in poses])
+    side = np.sum(ups[:, :2] * outward, axis=1) / np.linalg.norm(outward, axis=1)
+    return np.asarray(np.rad2deg(np.arctan2(side, ups[:, 2])))
+
+
+def test_one_turn_is_the_path_along_the_curve_to_the_last_bit(coarse_phantom: Jaw) -> None:
+    """As planned before there were turns: a steady pose of the curve, moved by the hand, at evened places."""
+    options = ScanPathOptions(tooth=46)
+    curve, path = arch_curve(coarse_phantom), plan(coarse_phantom, options)
+    start, end = curve.span_of(coarse_phantom.mesh.face_centres[coarse_phantom.tooth_faces(46)])
+    stretch = (start + end) / 2 - 4.5, (start + end) / 2 + 4.5
+    hand = _hand_motion(stretch, options, np.random.default_rng(0))
+    for name, at in (("00000", stretch[0]), ("00009", stretch[1])):
+        expected = hand.at(at) @ curve.rig_from_world(at)
+        np.testing.assert_array_equal(path.rig_from_world[name].matrix, expected.matrix)
+
+
+def test_three_turns_look_from_the_cheek_down_and_from_the_tongue(curve: ArchCurve, turned_path: ScanPath) -> None:
+    assert list(turned_path.rig_from_world) == [f"{k:05d}" for k in range(len(turned_path.rig_from_world))]
+    rolls = rolls_deg(curve, turned_path)
+    assert rolls[0] == pytest.approx(60, abs=8)
+    assert rolls[len(rolls) // 2] == pytest.approx(0, abs=8)
+    assert rolls[-1] == pytest.approx(-60, abs=8)
+    assert np.all(np.diff(rolls) < 6), "it never turns back"
+    passes = [np.sum(np.abs(rolls - roll) < 8) for roll in (60, 0, -60)]
+    assert min(passes) >= 6
+
+
+def test_the_passes_go_there_and_back_and_overlap_at_the_turns_too(turned_path: ScanPath) -> None:
+    assert 0.75 < turned_path.minimum_overlap < 0.95
+    assert len(turned_path.overlap) == len(turned_path.rig_from_world) - 1
+    places = np.array([pose.inverse().translation for pose in turned_path.rig_from_world.values()])
+    assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() < 2.5, "no jump from the end of a pass to the next"
+
+
+def test_rolled_cameras_keep_the_working_distance(coarse_phantom: Jaw, turned_path: ScanPath) -> None:
+    rig, distances = six_cameras().rig, []
+    for pose in turned_path.rig_from_world.values():
+        world_from_cam = (rig["o3"].cam_from_rig @ pose).inverse()
+        hits = coarse_phantom.mesh.cast(world_from_cam.translation[None], world_from_cam.rotation[:, 2][None])
+        distances.append(hits.distances[0])
+    assert np.median(distances) == pytest.approx(5.0, abs=0.8)
+    assert np.percentile(distances, 10) > 3.5
+    assert np.percentile(distances, 90) < 7.0
+
+
+def test_three_turns_of_six_see_the_sides_as_well_as_twelve(coarse_phantom: Jaw, turned_path: ScanPath) -> None:
+    tooth, mesh = coarse_phantom.tooth_faces(46), coarse_phantom.mesh
+    towards_cheek = mesh.face_centres[tooth].mean(axis=0) - mesh.face_centres[:, :].mean(axis=0)
+    facing = mesh.face_normals[:, :2] @ towards_cheek[:2] / np.linalg.norm(towards_cheek[:2])
+    sides = {"buccal": tooth & (facing > 0.8), "lingual": tooth & (facing < -0.8)}
+
+    def shares(handpiece: Handpiece, path: ScanPath) -> dict[str, float]:
+        found = scannable_faces(mesh, handpiece, path.rig_from_world.values(), VisibilityOptions())
+        return {name: mesh.face_areas[mask & found].sum() / mesh.face_areas[mask].sum() for name, mask in sides.items()}
+
+    twelve, turned = shares(twelve_cameras(), plan(coarse_phantom, STILL)), shares(six_cameras(), turned_path)
+    flat = shares(six_cameras(), plan(coarse_phantom, STILL, six_cameras()))
+    for name in sides:
+        assert turned[name] > twelve[name] - 0.02
+        assert flat[name] < 0.6 < turned[name]
+
+
+def test_more_turns_are_finer_steps(curve: ArchCurve, coarse_phantom: Jaw) -> None:
+    assert ScanPathOptions(turns=5, turn_deg=60.0).rolls_deg == (60, 30, 0, -30, -60)
+    poses = steady_poses(coarse_phantom, replace(STILL, turns=5), 3)
+    assert len(poses) == 15
+    ups = np.array([pose.inverse().rotation[:, 2] for pose in poses])
+    np.testing.assert_allclose(np.rad2deg(np.arccos(ups[[1, 4, 7, 10, 13], 2])), [60, 30, 0, 30, 60], atol=4)
+
+
+def test_the_hand_drifts_on_turns_too(coarse_phantom: Jaw) -> None:
+    one = Handpiece(rig=Rig({"o1": six_cameras().rig["o1"]}))
+    steady, jittered = (
+        plan(coarse_phantom, options, one)
+        for options in (replace(STILL, turns=3, frames=60), ScanPathOptions(tooth=46, turns=3, frames=60))
+    )
+    moved = [
+        np.abs(steady.rig_from_world[name].inverse().translation - pose.inverse().translation).max()
+        for name, pose in jittered.rig_from_world.items()
+    ]
+    assert 0.02 < np.mean(moved) < 1.5
+
+
+@pytest.mark.parametrize("wrong", [{"turns": 2}, {"turns": 0}, {"turn_deg": 90.0}, {"turn_deg": 0.0}])
+def test_impossible_turns_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(InputError, match=r"scan path: .*turn"):
+        ScanPathOptions(**wrong)

@@ -123,7 +123,7 @@ def _handpiece(name: str, views: Mapping[str, Rigid3], options: DesignOptions) -
 
 
 def _occlusal_view(options: DesignOptions) -> Rigid3:
-    return _looking_at(np.zeros(3), np.array([0, 0, -1.0]), np.array([1.0, 0, 0]), options.working_distance_mm)
+    return looking_at(np.zeros(3), np.array([0, 0, -1.0]), np.array([1.0, 0, 0]), options.working_distance_mm)
 
 
 def _side_view(options: DesignOptions, side: int) -> Rigid3:
@@ -131,7 +131,7 @@ def _side_view(options: DesignOptions, side: int) -> Rigid3:
     tilt = np.deg2rad(options.side_tilt_deg)
     target = np.array([0, side * options.side_offset_mm, -options.side_depth_mm])
     axis = np.array([0, -side * np.sin(tilt), -np.cos(tilt)])
-    return _looking_at(target, axis, np.array([-side, 0.0, 0.0]), options.working_distance_mm)
+    return looking_at(target, axis, np.array([-side, 0.0, 0.0]), options.working_distance_mm)
 
 
 def _outer_camera(options: DesignOptions, side: int) -> MountedCamera:
@@ -139,7 +139,7 @@ def _outer_camera(options: DesignOptions, side: int) -> MountedCamera:
     axis = np.array([0, -side * np.sin(tilt), -np.cos(tilt)])
     centre = np.array([0, side * _outer_place_mm(options), options.working_distance_mm])
     camera = Camera.from_field_of_view(options.width_px, options.height_px, options.field_of_view_deg)
-    return MountedCamera(camera, _looking_at(centre, axis, np.array([1.0, 0, 0]), 0.0))
+    return MountedCamera(camera, looking_at(centre, axis, np.array([1.0, 0, 0]), 0.0))
 
 
 def _outer_light(options: DesignOptions, side: int) -> Light:
@@ -154,7 +154,7 @@ def _outer_place_mm(options: DesignOptions) -> float:
     return options.baseline_across_mm / 2 + options.outer_distance_mm
 
 
-def _looking_at(
+def looking_at(
     target: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"], right: Float[np.ndarray, "3"], distance_mm: float
 ) -> Rigid3:
     """``view_from_rig`` of a view along ``axis`` onto a point, with ``right`` to the right of the image."""
