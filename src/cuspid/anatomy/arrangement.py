@@ -328,8 +328,7 @@ def arch_dimensions(teeth: tuple[PlacedTooth, ...], aim: Aim, papilla_of: Papill
 def can_stand(options: PhantomOptions) -> bool:
     """Whether a row of textbook teeth can have the asked dimensions: quick, before contacts are looked at."""
     rows = _rows(options, dict.fromkeys((-1, 1), QUADRANTS[options.arch]))
-    aim = replace(_aim(options, rows), length_mm=None)
-    size = options.tooth_size or 1.0
+    aim, size = _aim(options, rows), options.tooth_size or 1.0
     chains = _chains(_sized(rows, size), {side: np.zeros(len(row)) for side, row in rows.items()}, options.arch)
     shape = solve_shape(chains, size, aim, Seen(), Shape(size=size))
     missed = np.abs(dimensions(chains, size, shape, aim, Seen()) - aim.values).max()

@@ -26,6 +26,8 @@ the palatal margin is about 1.35 mm high."""
 PAPILLA_LEAN_DEG = 35.0
 """Direction in which the tip of a lingual papilla is the farthest point, from occlusal to lingual: its crest runs level
 into the crevice under the contact."""
+SAMPLES_PER_MM = 12
+"""Density of the points at which a ray looks for the surface."""
 REACH = 0.5
 """Half the part of the margin that is searched for its lowest point, as a fraction of half the width of the tooth."""
 
@@ -64,12 +66,13 @@ def _cervices(solid: Solid) -> dict[str, Point]:
     ]
     reach = np.array([REACH * placed.tooth.crown.half_width_mm for placed, _, _ in sides])[:, None]
     middle, rows = np.zeros_like(reach), np.arange(len(sides))
-    local = np.zeros((len(sides), 0, 3))
+    lowest = np.zeros((len(sides), 3))
     for _ in range(2):
         x = middle + reach * np.linspace(-1.0, 1.0, 9)
-        local = _margin_points(solid, [(placed, side) for placed, _, side in sides], x)
-        middle, reach = local[rows, local[:, :, 2].argmin(axis=1), 0][:, None], 0.25 * reach
-    lowest = local[rows, local[:, :, 2].argmin(axis=1)]
+        local, missed_mm = _margin_points(solid, [(placed, side) for placed, _, side in sides], x)
+        # In a crowded row the neighbour may hide a part of the margin.
+        lowest = local[rows, np.where(missed_mm < 0.05, local[:, :, 2], np.inf).argmin(axis=1)]
+        middle, reach = lowest[:, :1], 0.25 * reach
     return {
         f"{placed.fdi}.{name}": placed.to_jaw(point) for (placed, name, _), point in zip(sides, lowest, strict=True)
     }
@@ -77,8 +80,9 @@ def _cervices(solid: Solid) -> dict[str, Point]:
 
 def _margin_points(
     solid: Solid, sides: list[tuple[PlacedTooth, int]], x: Float[np.ndarray, "t n"]
-) -> Float[np.ndarray, "t n 3"]:
-    """The points of the margin at given x on a side of each tooth, in the frame of the tooth."""
+) -> tuple[Float[np.ndarray, "t n 3"], Float[np.ndarray, "t n"]]:
+    """The points of the margin at given x on a side of each tooth, in the frame of the tooth, and by how much either of
+    its surfaces is missed there."""
     local = np.concatenate([_start_of_margin(placed, side, row) for (placed, side), row in zip(sides, x, strict=True)])
     axes = np.repeat([placed.axes for placed, _ in sides], x.shape[1], axis=0)
     origins = np.repeat([placed.origin for placed, _ in sides], x.shape[1], axis=0)
@@ -87,7 +91,8 @@ def _margin_points(
         tooth, gum, _ = solid.parts(np.einsum("nij,nj->ni", axes, points) + origins)
         return np.column_stack([tooth, gum]) - CREASE_MM / 4
 
-    return _root(parts, local, np.eye(3)[1:]).reshape(*x.shape, 3)
+    points = _root(parts, local, np.eye(3)[1:])
+    return points.reshape(*x.shape, 3), np.abs(parts(points)).max(axis=1).reshape(x.shape)
 
 
 def _start_of_margin(placed: PlacedTooth, side: int, x: Values) -> Points:
@@ -169,7 +174,7 @@ def _between_centrals(solid: Solid) -> tuple[Point, Point]:
 
 def _first_inside(solid: Solid, starts: Points, direction: Point, length_mm: float) -> Points:
     """Where parallel rays from points (n, 3) first meet the surface; the end of a ray that does not."""
-    reach = np.linspace(0.0, length_mm, int(40 * length_mm))
+    reach = np.linspace(0.0, length_mm, int(SAMPLES_PER_MM * length_mm))
     points = starts[:, None] + reach[:, None] * direction
     distance = solid.distance(points.reshape(-1, 3)).reshape(points.shape[:2])
     first = np.where((distance < 0).any(axis=1), (distance < 0).argmax(axis=1), len(reach) - 1)
