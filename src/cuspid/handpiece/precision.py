@@ -4,6 +4,13 @@ Camera i sees the point X at x_i = pi(K_i (R_i X + t_i)) + noise, normal with st
 directions. The Fisher matrix is I = sum_i J_i^T J_i / sigma_i^2 with J_i = d x_i / d X, and no unbiased estimate of X
 has a covariance smaller than I^-1. The thesis' Eq 3.9 lost its exponents; the closed form that is right for two ideal
 cameras and X in the plane of the baseline and the axes is :func:`planar_pair_bound`.
+
+The noise may depend on the circumstances. Two of them belong to a pair of cameras: the *convergence* is the angle
+between their rays to X; the *deformation* is how differently their images show the surface around X. With A_i = J_i T,
+T two vectors that span the tangent plane, it is the largest singular value of (A_b - A_a) ((A_a + A_b) / 2)^-1. Where
+the images differ only along the epipolar lines this is the disparity gradient of stereo vision (Burt and Julesz,
+Science 208, 1980): 2 tan(slant) tan(convergence / 2) straight ahead of a pair. A camera of many is matched with the
+partner that resembles it most, so of its convergences or deformations the smallest counts.
 """
 
 from __future__ import annotations
@@ -12,30 +19,38 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from cuspid.camera import Camera
 from cuspid.errors import InputError
-from cuspid.geometry import Rigid3
+from cuspid.geometry import Rigid3, read_only
 from cuspid.handpiece.optics import Optics
-from cuspid.rig import MountedCamera
+from cuspid.handpiece.visibility import VisibilityOptions, survey_visibility
+from cuspid.mesh import Mesh
+from cuspid.rig import Handpiece, MountedCamera
 
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseModel:
-    """Standard deviation of a matched image point, as its circumstances make it worse."""
+    """Standard deviation of a matched image point, as its circumstances make it worse; the terms add up."""
 
     sigma_px: float = 0.5
-    """On matching a sharp point seen from nearly the same direction by all cameras."""
+    """In each image and each direction, on matching a sharp point that all cameras see squarely."""
     convergence_deg: float | None = None
-    """Angle between rays at which foreshortening has doubled the variance: sigma^2 (1 + (gamma / this)^4), gamma the
-    largest angle from a camera's ray to that of another; None: no influence."""
+    """Convergence that doubles the variance: sigma^2 (1 + (gamma / this)^4); None: no influence."""
+    deformation: float | None = None
+    """Deformation (no unit) that doubles the variance: sigma^2 (1 + (g / this)^2). Needs the normals of the surface;
+    None: no influence."""
     blur_px: float | None = None
     """Diameter of the blur disc that doubles the variance: sigma^2 (1 + (c / this)^2); None: no influence."""
 
     def __post_init__(self) -> None:
-        if not self.sigma_px > 0 or any(v is not None and not v > 0 for v in (self.convergence_deg, self.blur_px)):
-            raise InputError("noise model: sigma, convergence and blur must be larger than 0")
+        terms = (self.convergence_deg, self.deformation, self.blur_px)
+        if not self.sigma_px > 0 or any(term is not None and not term > 0 for term in terms):
+            raise InputError(
+                f"noise model: sigma ({self.sigma_px:g} px) and what doubles the variance (convergence, deformation, "
+                f"blur: {terms}) must be larger than 0"
+            )
 
 
 def projection_jacobian(
@@ -70,32 +85,84 @@ def noise_px(
     points: Float[np.ndarray, "n 3"],
     model: NoiseModel,
     seen: Bool[np.ndarray, "c n"],
+    *,
     optics: Optics | None = None,
+    normals: Float[np.ndarray, "n 3"] | None = None,
 ) -> Float[np.ndarray, "c n"]:
     """Standard deviation of each camera's image of each point (rig frame, mm), in px.
 
-    Raises InputError where the model counts blur but no optics are given.
+    ``normals``: outward unit normals of the surface at the points. Raises InputError where the model counts deformation
+    but no normals are given, or blur but no optics.
     """
-    variance = np.full((len(cameras), len(points)), model.sigma_px**2)
-    growth = np.ones_like(variance)
+    growth = np.ones((len(cameras), len(points)))
     if model.convergence_deg is not None:
-        growth += (np.rad2deg(_convergence(cameras, points, seen)) / model.convergence_deg) ** 4
+        growth += (np.rad2deg(convergence(cameras, points, seen)) / model.convergence_deg) ** 4
+    if model.deformation is not None:
+        if normals is None:
+            raise InputError("noise model: deformation counts, so the normals of the surface must be given")
+        growth += (deformation(cameras, points, normals, seen) / model.deformation) ** 2
     if model.blur_px is not None:
         if optics is None:
             raise InputError("noise model: blur counts, so the optics that blur must be given")
         depths = np.stack([mounted.cam_from_rig.apply(points)[:, 2] for mounted in cameras])
         growth += (optics.blur_px(np.where(depths > 0, depths, np.nan)) / model.blur_px) ** 2
-    return np.sqrt(variance * growth)
+    return model.sigma_px * np.sqrt(growth)
 
 
-def _convergence(
+def convergence(
     cameras: Sequence[MountedCamera], points: Float[np.ndarray, "n 3"], seen: Bool[np.ndarray, "c n"]
 ) -> Float[np.ndarray, "c n"]:
-    """Largest angle in radians between each camera's ray and that of another which sees the point."""
+    """Smallest angle in radians from each camera's ray to that of another; 0 for a camera without a partner there."""
     rays = np.stack([points - mounted.centre_in_rig for mounted in cameras])
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    cosines = np.clip(np.einsum("ank,bnk->abn", rays, rays), -1.0, 1.0)
-    return np.where(seen[None] & seen[:, None], np.arccos(cosines), 0.0).max(axis=1)
+    cosines = np.einsum("ank,bnk->abn", rays, rays)
+    return _of_nearest(np.arccos(np.clip(cosines, -1.0, 1.0)), seen)
+
+
+def deformation(
+    cameras: Sequence[MountedCamera],
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    seen: Bool[np.ndarray, "c n"],
+) -> Float[np.ndarray, "c n"]:
+    """Smallest deformation between each camera's image and another's; 0 for a camera without a partner there."""
+    span = _tangents(normals)
+    images = np.stack([projection_jacobian(m.camera, m.cam_from_rig, points) @ span for m in cameras])
+    first, second = images[:, None], images[None]
+    difference, mean = second - first, (first + second) / 2
+    determinant = mean[..., 0, 0] * mean[..., 1, 1] - mean[..., 0, 1] * mean[..., 1, 0]
+    adjugate = np.stack(
+        [
+            np.stack([mean[..., 1, 1], -mean[..., 0, 1]], axis=-1),
+            np.stack([-mean[..., 1, 0], mean[..., 0, 0]], axis=-1),
+        ],
+        axis=-2,
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        between = _largest_singular_value(difference @ adjugate) / np.abs(determinant)
+    return _of_nearest(np.where(np.isnan(between), np.inf, between), seen)
+
+
+def _of_nearest(between: Float[np.ndarray, "c c n"], seen: Bool[np.ndarray, "c n"]) -> Float[np.ndarray, "c n"]:
+    """For each camera that sees a point the smallest value to another one that does."""
+    partners = seen[:, None] & seen[None] & ~np.eye(len(seen), dtype=bool)[..., None]
+    smallest = np.where(partners, between, np.inf).min(axis=1)
+    return np.where(partners.any(axis=1), smallest, 0.0)
+
+
+def _tangents(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 2"]:
+    """Two unit vectors square to each normal and to each other, as columns."""
+    aside = np.eye(3)[np.abs(normals).argmin(axis=1)]
+    first = np.cross(normals, aside)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(normals, first)], axis=-1)
+
+
+def _largest_singular_value(matrices: Float[np.ndarray, "*n 2 2"]) -> Float[np.ndarray, "*n"]:
+    """In closed form: the squares have the sum |M|^2 and the product det(M)^2."""
+    squares = np.sum(matrices**2, axis=(-2, -1))
+    determinant = matrices[..., 0, 0] * matrices[..., 1, 1] - matrices[..., 0, 1] * matrices[..., 1, 0]
+    return np.asarray(np.sqrt((squares + np.sqrt(np.maximum(squares**2 - 4 * determinant**2, 0.0))) / 2))
 
 
 def fisher_information(
@@ -105,10 +172,11 @@ def fisher_information(
     *,
     seen: Bool[np.ndarray, "c n"] | None = None,
     optics: Optics | None = None,
+    normals: Float[np.ndarray, "n 3"] | None = None,
 ) -> Float[np.ndarray, "n 3 3"]:
     """The Fisher matrix (1/mm^2) of each point (rig frame, mm), summed over the cameras that see it (default: all)."""
     seen = np.ones((len(cameras), len(points)), dtype=bool) if seen is None else seen
-    sigma = noise_px(cameras, points, model, seen, optics)
+    sigma = noise_px(cameras, points, model, seen, optics=optics, normals=normals)
     total = np.zeros((len(points), 3, 3))
     for mounted, sees, deviation in zip(cameras, seen, sigma, strict=True):
         weighted = projection_jacobian(mounted.camera, mounted.cam_from_rig, points) / deviation[:, None, None]
@@ -127,13 +195,63 @@ def bound_covariance(information: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarra
 
 def bound_rms_um(information: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n"]:
     """Root of tr(I^-1): the smallest RMS distance in um of an unbiased estimate from the point."""
-    return 1000 * np.sqrt(np.trace(bound_covariance(information), axis1=1, axis2=2))
+    return rms_um(bound_covariance(information))
+
+
+def rms_um(covariance: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n"]:
+    """Root of the trace of covariances (mm^2): RMS distance in um."""
+    return np.asarray(1000 * np.sqrt(np.trace(covariance, axis1=1, axis2=2)))
 
 
 def ellipsoids(covariance: Float[np.ndarray, "n 3 3"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
     """Standard deviations (mm, ascending) along the axes of the covariance ellipsoids, and the axes as columns."""
     variances, axes = np.linalg.eigh(covariance)
     return np.sqrt(np.maximum(variances, 0.0)), axes
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PrecisionMap:
+    """How precisely each face of a mesh could be triangulated from one position of a handpiece."""
+
+    cameras_at_once: Int[np.ndarray, "f"]
+    """How many cameras see it."""
+    covariance: Float[np.ndarray, "f 3 3"]
+    """Cramer-Rao bound at its centre in the frame of the mesh, mm^2; NaN where fewer than two cameras see it."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cameras_at_once", read_only(self.cameras_at_once))
+        object.__setattr__(self, "covariance", read_only(self.covariance))
+
+    @property
+    def rms_um(self) -> Float[np.ndarray, "f"]:
+        """Root of the bound's trace: RMS distance; NaN where fewer than two cameras see the face."""
+        return rms_um(self.covariance)
+
+    def normal_um(self, normals: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, "f"]:
+        """Standard deviation along the unit normal of each face, which is what a surface comparison measures."""
+        return np.asarray(1000 * np.sqrt(np.einsum("fi,fij,fj->f", normals, self.covariance, normals)))
+
+
+def precision_map(
+    mesh: Mesh,
+    handpiece: Handpiece,
+    rig_from_world: Rigid3,
+    model: NoiseModel = NoiseModel(),
+    *,
+    visibility: VisibilityOptions = VisibilityOptions(),
+    optics: Optics | None = None,
+) -> PrecisionMap:
+    """The bound over a mesh (world frame): each face by the cameras that see it from one pose."""
+    seen = survey_visibility(mesh, handpiece, [rig_from_world], visibility).by_camera.T
+    faces = np.flatnonzero(seen.sum(axis=0) >= 2)
+    cameras = tuple(handpiece.rig.cameras.values())
+    in_rig = rig_from_world.apply(mesh.face_centres[faces])
+    normals = rig_from_world.rotate(mesh.face_normals[faces])
+    information = fisher_information(cameras, in_rig, model, seen=seen[:, faces], optics=optics, normals=normals)
+    covariance = np.full((len(mesh.faces), 3, 3), np.nan)
+    world_from_rig = rig_from_world.rotation.T
+    covariance[faces] = world_from_rig @ bound_covariance(information) @ world_from_rig.T
+    return PrecisionMap(cameras_at_once=seen.sum(axis=0), covariance=covariance)
 
 
 def planar_pair_bound(

@@ -122,10 +122,11 @@ def visible_faces(
     cam_from_world: Rigid3,
     depth_range_mm: tuple[float, float],
     options: VisibilityOptions,
+    among: Int[np.ndarray, "m"] | None = None,
 ) -> Int[np.ndarray, "n"]:
-    """Indices of the faces that one camera sees."""
+    """Indices of the faces that one camera sees; only those ``among`` are asked for, but all are in the way."""
     view = _view(camera, Rigid3.identity(), depth_range_mm)
-    return _visible_among(mesh, view, cam_from_world, options, np.arange(len(mesh.faces)))
+    return _visible_among(mesh, view, cam_from_world, options, np.arange(len(mesh.faces)) if among is None else among)
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
