@@ -59,8 +59,14 @@ class Gum:
     def _tree(self) -> cKDTree:
         return cKDTree(self.path)
 
-    def ridge_distance(self, points: Points) -> Values:
-        """Approximate signed distance in mm, shape (n,), to the ridge."""
+    def ridge_distance(self, points: Points, far_mm: float) -> Values:
+        """Approximate signed distance in mm, shape (n,), to the ridge, no larger than ``far_mm``."""
+        distance = np.full(len(points), far_mm)
+        low = np.flatnonzero(points[:, 2] < self.crest.max() + far_mm)
+        distance[low] = np.minimum(self._ridge_distance(points[low]), far_mm)
+        return distance
+
+    def _ridge_distance(self, points: Points) -> Values:
         _, nearest = self._tree.query(points[:, :2])
         offset = points[:, :2] - self.path[nearest]
         across = np.hypot(offset[:, 0], offset[:, 1])

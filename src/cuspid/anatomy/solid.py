@@ -35,10 +35,11 @@ class Solid:
     def parts(self, points: Points) -> tuple[Values, Values, Int[np.ndarray, "n"]]:
         """Signed distances to the teeth and to the gum, and the FDI number of the nearest tooth, each (n,)."""
         tooth = np.full(len(points), FAR_MM)
-        gum = np.minimum(self.gum.ridge_distance(points), FAR_MM)
+        gum = self.gum.ridge_distance(points, FAR_MM)
         nearest = np.zeros(len(points), dtype=np.int64)
+        low, high = points[:, :2].min(axis=0, initial=np.inf), points[:, :2].max(axis=0, initial=-np.inf)
         for placed in self.teeth:
-            near = _within_reach(placed, points)
+            near = _within_reach(placed, points, low, high)
             if not len(near):
                 continue
             local = placed.to_tooth(points[near])
@@ -65,9 +66,14 @@ class Solid:
         return np.where(tooth <= gum, nearest, GUM)
 
 
-def _within_reach(placed: PlacedTooth, points: Points) -> Int[np.ndarray, "m"]:
-    """Indices (m,) of the points nearer to a tooth than about `FAR_MM`."""
+def _within_reach(
+    placed: PlacedTooth, points: Points, low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"]
+) -> Int[np.ndarray, "m"]:
+    """Indices (m,) of the points, all between two corners seen from above, nearer to a tooth than about `FAR_MM`."""
     crown = placed.tooth.crown
     reach = np.hypot(crown.half_width_mm, crown.half_depth_mm) + FAR_MM
-    from_axis = points[:, :2] - placed.to_jaw(np.array([0.0, 0.0, crown.height_mm / 2]))[:2]
-    return np.flatnonzero((from_axis**2).sum(axis=1) < reach**2)
+    axis = placed.to_jaw(np.array([0.0, 0.0, crown.height_mm / 2]))[:2]
+    if np.any(axis < low - reach) or np.any(axis > high + reach):
+        return np.zeros(0, dtype=np.int64)
+    x, y = points[:, 0] - axis[0], points[:, 1] - axis[1]
+    return np.flatnonzero(x * x + y * y < reach**2)
