@@ -48,8 +48,8 @@ def matching(jaw: Jaw, pictures: Path) -> dict[str, object]:
     """Bins, fits and their check for each matcher, and a picture."""
     fitted = sample_matching(jaw, FITTED, np.random.default_rng(0))
     checked = sample_matching(jaw, CHECKED, np.random.default_rng(1))
-    bins = {name: binned(samples, EDGES) for name, samples in fitted.items()}
-    laws = {name: (law.noise.sigma_px, law.noise.deformation or np.inf) for name, law in MATCHING.items()}
+    bins = {str(name): binned(samples, EDGES) for name, samples in fitted.items()}
+    laws = {str(name): (law.noise.sigma_px, law.noise.deformation or np.inf) for name, law in MATCHING.items()}
     save_noise_picture(
         pictures / "camera-pair-noise.png",
         bins,
@@ -57,7 +57,8 @@ def matching(jaw: Jaw, pictures: Path) -> dict[str, object]:
         title="Noise of matching on rendered pairs of the textured molar",
     )
     found: dict[str, object] = {}
-    for name, rows in bins.items():
+    for name in MATCHING:
+        rows = bins[name]
         fit = fit_noise([row for row in rows if row["matched_pct"] >= FITTED_SHARE_PCT])
         found[name] = {
             "fitted_sigma_px": fit.sigma_px,
@@ -113,7 +114,7 @@ def save_terms(rows: dict[Matcher, tuple[Row, ...]], surface: str, pictures: Pat
 
     def panel(title: str, unit: str, column: str, matcher: Matcher = "slanted") -> Panel:
         values = table(rows[matcher], surface, column, axis_angle_deg=0.0)[2]
-        return Panel(title=title, unit=unit, values=values, more_is_better=unit == "%")
+        return Panel(title=title, unit=unit, values=values, best="most" if unit == "%" else "least")
 
     panels = (
         panel("bound at the middle, constant noise", "µm", "bound_centre_um"),
@@ -129,7 +130,7 @@ def save_terms(rows: dict[Matcher, tuple[Row, ...]], surface: str, pictures: Pat
     baselines, distances, _ = table(rows["slanted"], surface, "seen_pct", axis_angle_deg=0.0)
     save_maps_picture(
         pictures / f"camera-pair-{surface}.png",
-        (*panels, Panel(title="axis angle with most seen by both", unit="deg", values=best + 1e-3)),
+        (*panels, Panel(title="axis angle with most seen by both", unit="deg", values=best, best="none")),
         baselines,
         distances,
         title=f"Pair over the {surface} surface of a lower second molar, parallel axes (framed: best of the distance)",

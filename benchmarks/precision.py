@@ -2,7 +2,7 @@
 
     python benchmarks/precision.py [--out benchmarks/results/precision.json] [--pictures docs/images]
 
-*Monte-Carlo*: points of several rigs, triangulated 40 000 times with normal noise; the scatter against the bound, for
+*Monte-Carlo*: points of several rigs, triangulated 20 000 times with normal noise; the scatter against the bound, for
 constant noise and for noise that grows, for several seeds. *Closed form*: pairs with any turn of the cameras and points
 in their plane. *Molar*: bounds of the designs over a lower second molar, at one position with noise of 0.5 px.
 """
@@ -42,7 +42,7 @@ from cuspid.storage import write_json
 from cuspid.studies.camera_pair import camera_pair
 
 CAMERA = Camera.from_field_of_view(512, 512, 62.0)
-TRIALS = 40_000
+TRIALS = 20_000
 SEEDS = (0, 1)
 TOOTH = 47
 NOISE: Mapping[str, NoiseModel] = {

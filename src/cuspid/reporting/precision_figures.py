@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -28,6 +29,9 @@ _ERRORS = colormaps["viridis_r"]
 _LINES = ("#3b7dd8", "#3fa66b", "#f2a33a", "#d1603d", "#8e5bb5")
 
 
+Best = Literal["least", "most", "none"]
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Panel:
     """A map over two axes."""
@@ -38,8 +42,8 @@ class Panel:
     """Of the values."""
     values: Float[np.ndarray, "m n"]
     """Rows along the first axis, drawn upwards, columns along the second; NaN is left empty."""
-    more_is_better: bool = False
-    """Shares are; errors are not. The best of each column is framed."""
+    best: Best = "least"
+    """Which value of each column is framed: the least of errors, the most of shares, which run from 0 to 100."""
 
 
 def save_precision_picture(
@@ -138,20 +142,21 @@ def save_maps_picture(
 
 
 def _draw_map(axes: Axes, panel: Panel, first: Float[np.ndarray, "m"], second: Float[np.ndarray, "n"]) -> None:
-    values = np.ma.masked_invalid(panel.values)
-    norm = Normalize(0, 100) if panel.more_is_better else LogNorm(*_range(panel.values))
-    axes.imshow(
-        values, origin="lower", aspect="auto", norm=norm, cmap=colormaps["viridis"] if panel.more_is_better else _ERRORS
+    norm = (
+        LogNorm(*_range(panel.values)) if panel.best == "least" else Normalize(0, 100 if panel.best == "most" else None)
     )
+    colours = colormaps["viridis"] if panel.best == "most" else _ERRORS
+    axes.imshow(np.ma.masked_invalid(panel.values), origin="lower", aspect="auto", norm=norm, cmap=colours)
     axes.set_yticks(range(len(first)), [f"{value:g}" for value in first])
     axes.set_xticks(range(len(second)), [f"{value:g}" for value in second])
     axes.set_title(f"{panel.title} / {panel.unit}" if panel.unit else panel.title, loc="left", fontsize=11, color=_INK)
     for (row, column), value in np.ndenumerate(panel.values):
         if np.isfinite(value):
-            light = (norm(value) < 0.5) == panel.more_is_better
-            text = f"{value:.0f}" if value >= 9.95 or panel.more_is_better else f"{value:.1f}"
+            light = (norm(value) < 0.5) == (panel.best == "most")
+            text = f"{value:.1f}" if panel.best == "least" and value < 9.95 else f"{value:.0f}"
             axes.text(column, row, text, ha="center", va="center", fontsize=8, color="white" if light else _INK)
-    _frame_best(axes, panel)
+    if panel.best != "none":
+        _frame_best(axes, panel.values, -1 if panel.best == "least" else 1)
 
 
 def _range(values: Float[np.ndarray, "m n"]) -> tuple[float, float]:
@@ -162,19 +167,13 @@ def _range(values: Float[np.ndarray, "m n"]) -> tuple[float, float]:
     return float(known.min()), float(max(known.max(), 1.2 * known.min()))
 
 
-def _frame_best(axes: Axes, panel: Panel) -> None:
-    """A frame around the best value of each column, where they differ."""
-    worst = -np.inf if panel.more_is_better else np.inf
-    values = np.where(np.isfinite(panel.values), panel.values, worst)
-    best = values.argmax(axis=0) if panel.more_is_better else values.argmin(axis=0)
-    for column, row in enumerate(best):
-        if np.isfinite(values[row, column]) and np.nanmax(panel.values[:, column]) > np.nanmin(panel.values[:, column]):
-            axes.plot(
-                column + np.array([-0.46, 0.46, 0.46, -0.46, -0.46]),
-                row + np.array([-0.44, -0.44, 0.44, 0.44, -0.44]),
-                color="#d12a1e",
-                linewidth=1.8,
-            )
+def _frame_best(axes: Axes, values: Float[np.ndarray, "m n"], sign: int) -> None:
+    """A frame around the largest value times the sign in each column, where they differ."""
+    ranked = np.where(np.isfinite(values), sign * values, -np.inf)
+    for column, row in enumerate(ranked.argmax(axis=0)):
+        if np.isfinite(ranked[row, column]) and np.nanmin(ranked[:, column]) < ranked[row, column]:
+            x, y = column + 0.46 * np.array([-1, 1, 1, -1, -1]), row + 0.44 * np.array([-1, -1, 1, 1, -1])
+            axes.plot(x, y, color="#d12a1e", linewidth=1.8)
 
 
 def save_best_picture(

@@ -63,8 +63,8 @@ class MatchingLaw:
 
 MATCHING: Mapping[Matcher, MatchingLaw] = MappingProxyType(
     {
-        "slanted": MatchingLaw(noise=NoiseModel(sigma_px=0.047, deformation=0.55)),
-        "upright": MatchingLaw(noise=NoiseModel(sigma_px=0.050, deformation=0.094), largest_deformation=0.9),
+        "slanted": MatchingLaw(noise=NoiseModel(sigma_px=0.048, deformation=0.52)),
+        "upright": MatchingLaw(noise=NoiseModel(sigma_px=0.040, deformation=0.055), largest_deformation=0.9),
     }
 )
 """Measured on rendered pairs of the textured phantom (:mod:`cuspid.studies.matching_noise`, docs/precision.md)."""
