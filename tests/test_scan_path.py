@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -203,14 +204,15 @@ def turned_path(coarse_phantom: Jaw) -> ScanPath:
     return plan(coarse_phantom, replace(STILL, turns=3), six_cameras())
 
 
-def rolls_deg(curve: ArchCurve, path: ScanPath) -> np.ndarray:
-    """Angle from the up direction of a handpiece held upright to that of each pose, towards the cheek."""
-    poses = [pose.inverse() for pose in path.rig_from_world.values()]
-    middle = curve.points.mean(axis=0)
-    outward = np.array([pose.translation - middle for pose in poses])[:, :2]
-    ups = np.array([pose.rotation[:, 2] for pose in poses])
-    side = np.sum(ups[:, :2] * outward, axis=1) / np.linalg.norm(outward, axis=1)
-    return np.asarray(np.rad2deg(np.arctan2(side, ups[:, 2])))
+def rolls_deg(curve: ArchCurve, poses: Iterable[Rigid3]) -> np.ndarray:
+    """Angle towards the cheek from a handpiece held upright over the nearest place of the curve to each pose."""
+    rolls = []
+    for pose in poses:
+        place = pose.inverse().translation
+        nearest = np.linalg.norm(curve.points[:, :2] - place[:2], axis=1).argmin()
+        up = (curve.rig_from_world(float(curve.lengths_mm[nearest])).rotation @ pose.rotation.T)[:, 2]
+        rolls.append(np.rad2deg(np.arctan2(up[1], up[2])))
+    return np.array(rolls)
 
 
 def test_one_turn_is_the_path_along_the_curve_to_the_last_bit(coarse_phantom: Jaw) -> None:
@@ -227,13 +229,11 @@ def test_one_turn_is_the_path_along_the_curve_to_the_last_bit(coarse_phantom: Ja
 
 def test_three_turns_look_from_the_cheek_down_and_from_the_tongue(curve: ArchCurve, turned_path: ScanPath) -> None:
     assert list(turned_path.rig_from_world) == [f"{k:05d}" for k in range(len(turned_path.rig_from_world))]
-    rolls = rolls_deg(curve, turned_path)
-    assert rolls[0] == pytest.approx(60, abs=8)
-    assert rolls[len(rolls) // 2] == pytest.approx(0, abs=8)
-    assert rolls[-1] == pytest.approx(-60, abs=8)
-    assert np.all(np.diff(rolls) < 6), "it never turns back"
-    passes = [np.sum(np.abs(rolls - roll) < 8) for roll in (60, 0, -60)]
-    assert min(passes) >= 6
+    rolls = rolls_deg(curve, turned_path.rig_from_world.values())
+    assert rolls[0] == pytest.approx(60, abs=2)
+    assert rolls[-1] == pytest.approx(-60, abs=2)
+    assert np.all(np.diff(rolls) < 2), "it never turns back"
+    assert min(np.sum(np.abs(rolls - roll) < 2) for roll in (60, 0, -60)) >= 6
 
 
 def test_the_passes_go_there_and_back_and_overlap_at_the_turns_too(turned_path: ScanPath) -> None:
@@ -249,9 +249,9 @@ def test_rolled_cameras_keep_the_working_distance(coarse_phantom: Jaw, turned_pa
         world_from_cam = (rig["o3"].cam_from_rig @ pose).inverse()
         hits = coarse_phantom.mesh.cast(world_from_cam.translation[None], world_from_cam.rotation[:, 2][None])
         distances.append(hits.distances[0])
-    assert np.median(distances) == pytest.approx(5.0, abs=0.8)
-    assert np.percentile(distances, 10) > 3.5
-    assert np.percentile(distances, 90) < 7.0
+    assert 4.5 < np.median(distances) < 6.2
+    assert np.percentile(distances, 5) > 3.5
+    assert np.percentile(distances, 80) < 7.5
 
 
 def test_three_turns_of_six_see_the_sides_as_well_as_twelve(coarse_phantom: Jaw, turned_path: ScanPath) -> None:
@@ -275,8 +275,7 @@ def test_more_turns_are_finer_steps(curve: ArchCurve, coarse_phantom: Jaw) -> No
     assert ScanPathOptions(turns=5, turn_deg=60.0).rolls_deg == (60, 30, 0, -30, -60)
     poses = steady_poses(coarse_phantom, replace(STILL, turns=5), 3)
     assert len(poses) == 15
-    ups = np.array([pose.inverse().rotation[:, 2] for pose in poses])
-    np.testing.assert_allclose(np.rad2deg(np.arccos(ups[[1, 4, 7, 10, 13], 2])), [60, 30, 0, 30, 60], atol=4)
+    np.testing.assert_allclose(rolls_deg(curve, poses), np.repeat([60, 30, 0, -30, -60], 3), atol=2)
 
 
 def test_the_hand_drifts_on_turns_too(coarse_phantom: Jaw) -> None:

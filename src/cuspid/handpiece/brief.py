@@ -55,8 +55,8 @@ class MouthBrief:
     """It must reach the distal end of this tooth, counted from the midline."""
     people: float = 0.95
     """Share (0 to 1) of people with enough room there."""
-    clearance_mm: float = 0.5
-    """Cameras and lights keep this distance from teeth and gum."""
+    clearance_mm: float = 1.0
+    """A steady handpiece keeps cameras and lights this far from teeth and gum; a hand that drifts takes up half."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,9 +181,8 @@ def parse_brief(content: Mapping[str, Any]) -> DesignBrief:
         values[name] = _table(values.get(name, {}), kind, name)
     shares = values["surfaces"]
     _check(isinstance(shares, Mapping) and _are_numbers(list(shares.values())), "[surfaces] must be name = share")
-    numbers = [values[name] for name in ("thickness_mm", "blur_px", "width_mm") if name in values]
-    _check(_are_numbers(numbers), "thickness_mm, blur_px and width_mm must be numbers")
-    return DesignBrief(**values)
+    values["surfaces"] = {surface: float(share) for surface, share in shares.items()}
+    return DesignBrief(**_typed(values, DesignBrief, ""))
 
 
 def _sensor(given: object) -> Optics:
@@ -203,20 +202,28 @@ def _figures(own: dict[str, Any], *, complete: bool) -> dict[str, Any]:
     needed = {each.name for each in fields(Optics) if each.default is MISSING} - {"name"} if complete else set()
     _check(not set(own) - known, f"sensor: unknown {', '.join(sorted(set(own) - known))}")
     _check(not needed - set(own), f"sensor: {', '.join(sorted(needed - set(own)))} missing; or name a preset")
-    numbers = [value for name, value in own.items() if name not in ("name", "source")]
-    _check(_are_numbers(numbers), "sensor: its figures must be numbers")
-    return own
+    return _typed(own, Optics, "sensor.")
 
 
 def _table(given: object, kind: type, name: str) -> Any:
     _check(isinstance(given, Mapping), f"{name} must be a table, [{name}]")
     values = dict(given)  # type: ignore[call-overload]
     _check_keys(values, kind, f"[{name}]")
-    _check(_are_numbers(list(values.values())), f"[{name}]: all values must be numbers")
+    return kind(**_typed(values, kind, f"{name}."))
+
+
+def _typed(values: Mapping[str, Any], kind: type, where: str) -> dict[str, Any]:
+    """Whole numbers where a length may have decimals become such; what is no number where one belongs is refused."""
+    typed = dict(values)
     for each in fields(kind):
-        if each.type == "int" and each.name in values:
-            _check(isinstance(values[each.name], int), f"{name}.{each.name} must be a whole number")
-    return kind(**values)
+        if each.name in values and each.type in ("float", "float | None"):
+            _check(_are_numbers([values[each.name]]), f"{where}{each.name} must be a number")
+            typed[each.name] = float(values[each.name])
+        if each.name in values and each.type == "int":
+            _check(_is_whole(values[each.name]), f"{where}{each.name} must be a whole number")
+        if each.name in values and each.type == "str":
+            _check(isinstance(values[each.name], str), f"{where}{each.name} must be text")
+    return typed
 
 
 def _check_keys(values: Mapping[str, Any], kind: type, where: str) -> None:
@@ -229,6 +236,10 @@ def _check_keys(values: Mapping[str, Any], kind: type, where: str) -> None:
 
 def _are_numbers(values: object) -> bool:
     return isinstance(values, list) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
 
 
 def _check(good: bool, message: str) -> None:

@@ -7,7 +7,8 @@ best position and for the best camera r, matched with its partners p:
 
     I = J_r^T J_r / sigma^2 + sum_p J_p^T J_p / sigma_rp^2
 
-where sigma_rp grows with the angle between the rays of r and p. It is asked at some of the faces, at fixed places.
+where sigma_rp is the noise of the pair (:mod:`cuspid.handpiece.precision`). It is asked at some of the faces,
+always the same ones.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.brief import DesignBrief
 from cuspid.handpiece.family import BOUNDS, LAYOUTS, Layout, Shape, build_handpiece
+from cuspid.handpiece.optics import Optics
 from cuspid.handpiece.precision import NoiseModel, bound_rms_um, noise_px, projection_jacobian
 from cuspid.handpiece.visibility import VisibilityOptions, visible_faces
 from cuspid.mesh import Mesh
@@ -312,7 +314,7 @@ def assess_handpiece(
     seen_mm2, area_mm2 = dict.fromkeys(_names(sections), 0.0), dict.fromkeys(_names(sections), 0.0)
     bounds: dict[str, list[float]] = {name: [] for name in area_mm2}
     for section in sections:
-        seen, places, bound_um = _survey(handpiece, section, options)
+        seen, places, bound_um = _survey(handpiece, section, options, brief.sensor)
         for name, mask in section.surfaces.items():
             area_mm2[name] += float(section.mesh.face_areas[mask].sum())
             seen_mm2[name] += float(section.mesh.face_areas[mask & seen].sum())
@@ -356,7 +358,10 @@ def _room(handpiece: Handpiece, brief: DesignBrief, sections: Sequence[Section],
     rig = list(handpiece.rig.cameras.values())
     spacing = min(float(np.linalg.norm(a.centre_in_rig - b.centre_in_rig)) for a, b in combinations(rig, 2))
     heights, clearances = zip(*(_height_and_clearance(handpiece, brief, each) for each in sections), strict=True)
-    at_most = {"height above the teeth, mm": (gap_mm, max(heights)), "cameras": (brief.cameras.most, len(rig))}
+    at_most = {
+        "height above the teeth, mm": (gap_mm, max(heights)),
+        "cameras": (float(brief.cameras.most), float(len(rig))),
+    }
     if brief.width_mm is not None:
         at_most["width, mm"] = (brief.width_mm, float(np.ptp(handpiece_outline(handpiece, brief.thickness_mm)[:, 0])))
     at_least = {
@@ -371,21 +376,24 @@ def _room(handpiece: Handpiece, brief: DesignBrief, sections: Sequence[Section],
 def _height_and_clearance(handpiece: Handpiece, brief: DesignBrief, section: Section) -> tuple[float, float]:
     """Height in mm of the holder's back above the tooth, and the least distance of cameras and lights from the mesh,
     negative within it, over all positions."""
-    rig = handpiece.rig.cameras.values()
-    parts = np.array([m.centre_in_rig for m in rig] + [light.position_mm for light in handpiece.lights.values()])
+    rig, lights = handpiece.rig.cameras.values(), handpiece.lights.values()
+    parts = np.array([m.centre_in_rig for m in rig] + [light.position_mm for light in lights])
+    axes = np.array([m.axis_in_rig for m in rig] + [light.direction for light in lights])
     backs = np.array([m.centre_in_rig - brief.thickness_mm * m.axis_in_rig for m in rig])
     world_from_rig = [pose.inverse() for pose in section.rig_from_world]
     tooth = np.any(list(section.surfaces.values()), axis=0)
     top = section.mesh.face_centres[tooth, 2].max()
     height = max(float(pose.apply(backs)[:, 2].max()) for pose in world_from_rig) - top
     places = np.concatenate([pose.apply(parts) for pose in world_from_rig])
-    distances, faces, nearest = section.mesh.closest(places)
-    inside = np.sum((places - nearest) * section.mesh.face_normals[faces], axis=1) < 0
-    return float(height), float(np.where(inside, -distances, distances).min())
+    directions = np.concatenate([pose.rotate(axes) for pose in world_from_rig])
+    distances, _, _ = section.mesh.closest(places)
+    hits = section.mesh.cast(places, directions)
+    behind = np.sum(section.mesh.face_normals[hits.faces] * directions, axis=1) > 0
+    return float(height), float(np.where((hits.faces >= 0) & behind, -distances, distances).min())
 
 
 def _survey(
-    handpiece: Handpiece, section: Section, options: SearchOptions
+    handpiece: Handpiece, section: Section, options: SearchOptions, optics: Optics
 ) -> tuple[Bool[np.ndarray, "f"], Int[np.ndarray, "p"], Float[np.ndarray, "p"]]:
     """Whether each face is seen; some faces, and the bound there (NaN where unseen)."""
     rig, mesh = handpiece.rig, section.mesh
@@ -401,8 +409,9 @@ def _survey(
             sees[row, visible] = True
         for first, second in np.argwhere(np.triu(paired)):
             found |= sees[first] & sees[second]
+        points, normals = pose.apply(mesh.face_centres[places]), pose.rotate(mesh.face_normals[places])
         bounds = _bounds_um(
-            tuple(rig.cameras.values()), pose.apply(mesh.face_centres[places]), sees[:, places], paired, options.noise
+            tuple(rig.cameras.values()), points, normals, sees[:, places], paired, options.noise, optics
         )
         best = np.fmin(best, bounds)
     return found, places, np.where(np.isfinite(best), best, np.nan)
@@ -420,16 +429,18 @@ def _paired(handpiece: Handpiece) -> Bool[np.ndarray, "c c"]:
 def _bounds_um(
     cameras: tuple[MountedCamera, ...],
     points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
     sees: Bool[np.ndarray, "c n"],
     paired: Bool[np.ndarray, "c c"],
     noise: NoiseModel,
+    optics: Optics,
 ) -> Float[np.ndarray, "n"]:
     """For each point: the bound of the best camera matched with its partners; NaN where no pair sees it."""
     best = np.full(len(points), np.nan)
     asked = np.flatnonzero((sees.T @ paired * sees.T).any(axis=1))
     if len(asked) == 0:
         return best
-    points, sees = points[asked], sees[:, asked]
+    points, normals, sees = points[asked], normals[asked], sees[:, asked]
     squares = []
     for each in cameras:
         jacobian = np.nan_to_num(projection_jacobian(each.camera, each.cam_from_rig, points))
@@ -437,7 +448,8 @@ def _bounds_um(
     information = np.array(squares) * (sees / noise.sigma_px**2)[..., None, None]
     for first, second in np.argwhere(np.triu(paired)):
         both = sees[[first, second]].all(axis=0)
-        sigma = noise_px([cameras[first], cameras[second]], points, noise, np.stack([both, both]))
+        pair, twice = [cameras[first], cameras[second]], np.stack([both, both])
+        sigma = noise_px(pair, points, noise, twice, optics=optics, normals=normals)
         for reference, partner, deviation in ((first, second, sigma[1]), (second, first, sigma[0])):
             information[reference] += squares[partner] * (both / deviation**2)[:, None, None]
     for own in information:

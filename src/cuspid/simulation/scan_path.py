@@ -311,7 +311,8 @@ def _lifts(
 ) -> Float[np.ndarray, "s"]:
     """How far a rolled handpiece must move out, or in (negative), for its working distance to be kept.
 
-    Rays on a patch square before it find the surface; smoothed along the arch, for a hand does not follow each crown.
+    Rays on a patch square before it find the surface. What stands out most nearby counts, so that the handpiece does
+    not dive behind the last crown; then smoothed along the arch, for a hand does not follow each crown.
     """
     if roll_deg == 0:
         return np.zeros(len(stations_mm))
@@ -323,7 +324,8 @@ def _lifts(
         hits = mesh.cast(world_from_rig.apply(patch), np.broadcast_to(-world_from_rig.rotation[:, 2], patch.shape))
         heights = _FAR_MM - hits.distances[hits.distances < 2 * _FAR_MM]
         lifts[index] = np.median(heights) if len(heights) else 0.0
-    smooth = gaussian_filter1d(lifts, _NEAR_MM / 2 / _STATION_MM, mode="nearest")
+    highest = maximum_filter(lifts, size=round(_NEAR_MM / _STATION_MM), mode="nearest")
+    smooth = gaussian_filter1d(highest, _NEAR_MM / 2 / _STATION_MM, mode="nearest")
     return np.asarray(np.clip(smooth, -_LIFT_MM, _LIFT_MM))
 
 
