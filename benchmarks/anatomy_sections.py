@@ -218,19 +218,3 @@ def mouth(result: Result) -> str:
         [f"A handpiece that needs {result['needed_mm']:g} mm, {result['people']:,} drawn of each sex:", ""]
         + [markdown_table(head, rows)]
     )
-
-
-def visibility(result: Result) -> str:
-    """How long it takes to ask what a design sees."""
-    rows = [
-        (
-            name,
-            f"{result[name]['faces']:,}",
-            f"{result[name]['cameras']} x {result[name]['positions']}",
-            mark(result[name]["survey"]["wall_s"], 60 if name == "arch" else 2),
-            result[name]["scannable"]["wall_s"],
-        )
-        for name in ("arch", "molar")
-    ]
-    head = ("surface", "faces", "cameras x positions", "survey, s (bar 60, molar 2)", "scannable faces, s")
-    return markdown_table(head, rows)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import anatomy_sections
+import handpiece_sections
 
 HERE = Path(__file__).parent
 
@@ -133,7 +134,9 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
     "measure": ("Arch dimensions", anatomy_sections.measured),
     "populations": ("Phantom populations", anatomy_sections.populations),
     "mean_shape": ("Mean shape", anatomy_sections.mean_shape),
-    "visibility": ("Visibility", anatomy_sections.visibility),
+    "visibility": ("Visibility", handpiece_sections.visibility),
+    "precision": ("Precision", handpiece_sections.precision),
+    "camera_pair": ("A pair of cameras", handpiece_sections.camera_pair),
 }
 """Title and text for each file of results that is not of scans, by its stem."""
 
@@ -175,7 +178,7 @@ def main() -> None:
     """Read the results, write the page."""
     loaded = {path.stem: json.loads(path.read_text()) for path in sorted((HERE / "results").glob("*.json"))}
     scans = [value for value in loaded.values() if "images_to_mesh" in value]
-    motions = [value for value in loaded.values() if "rows" in value]
+    motions = [value for stem, value in loaded.items() if stem.startswith("motion-")]
     (HERE.parent / "docs" / "benchmarks.md").write_text(page(scans, motions, loaded))
 
 
