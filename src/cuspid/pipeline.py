@@ -26,12 +26,16 @@ from jaxtyping import Bool
 from cuspid import storage
 from cuspid.anatomy.landmarking import with_estimates
 from cuspid.anatomy.landmarks import in_frame, missing, validate
+from cuspid.anatomy.mouth import MouthOptions, room_mm, study_mouths
 from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, labels_from_colors
+from cuspid.anatomy.surfaces import named_surfaces
 from cuspid.capture import Capture, Frame
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.evaluation.deviation import evaluate as compare_with_reference
 from cuspid.geometry import Rigid3
+from cuspid.handpiece.brief import DesignBrief
+from cuspid.handpiece.optimise import Section
 from cuspid.handpiece.visibility import VisibilityOptions, scannable_faces
 from cuspid.jaw import ARCHES, Arch, Jaw
 from cuspid.mesh import Mesh
@@ -43,7 +47,7 @@ from cuspid.rig import Handpiece
 from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.blender import render_with_blender
 from cuspid.simulation.raycast import Scene, render_capture
-from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path
+from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path, steady_poses
 from cuspid.stereo.between import BetweenOptions, measure_between
 from cuspid.stereo.matching import DepthEstimator, StereoOptions
 from cuspid.surface.cleaning import CleaningOptions, clean
@@ -136,6 +140,29 @@ def load_reference(
     truth = storage.read_truth(path)
     hashes = {name: storage.hash_file(path / name) for name in ("jaw.ply", "poses.json", "handpiece.json")}
     return truth.jaw, scannable(truth, VisibilityOptions()), hashes
+
+
+# --- What scans it -------------------------------------------------------------------------------------------------
+
+
+def room_for(brief: DesignBrief, mouth: MouthOptions) -> float:
+    """Gap in mm at the tooth that the brief names, which the asked share of men and of women have at least."""
+    _, people = study_mouths(mouth)
+    return min(
+        float(np.quantile(room_mm(group, mouth)[:, brief.mouth.tooth - 1], 1 - brief.mouth.people))
+        for group in people.values()
+    )
+
+
+def sections_of(jaw: Jaw, teeth: Sequence[int], brief: DesignBrief) -> list[Section]:
+    """The teeth for which a handpiece is sought, with the poses in which it passes over them."""
+    surfaces = named_surfaces(jaw)
+
+    def section(fdi: int) -> Section:
+        passes = ScanPathOptions(tooth=fdi, turns=brief.motion.turns, turn_deg=brief.motion.turn_deg)
+        return Section.near(jaw.mesh, jaw.tooth_faces(fdi), surfaces, steady_poses(jaw, passes, per_pass=5))
+
+    return [section(fdi) for fdi in teeth]
 
 
 # --- Simulation ----------------------------------------------------------------------------------------------------

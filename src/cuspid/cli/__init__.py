@@ -8,7 +8,7 @@ from typing import Any
 
 import tyro
 
-from cuspid.cli.handpieces import handpiece
+from cuspid.cli.handpieces import design, handpiece
 from cuspid.cli.jaws import box, phantom, prepare
 from cuspid.cli.mouth import mouth
 from cuspid.cli.scan import evaluate, reconstruct, run, simulate
@@ -25,6 +25,7 @@ COMMANDS: Mapping[str, Callable[..., Any]] = {
     "box": box,
     "mouth": mouth,
     "handpiece": handpiece,
+    "design": design,
     "simulate": simulate,
     "reconstruct": reconstruct,
     "evaluate": evaluate,

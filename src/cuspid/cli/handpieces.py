@@ -5,24 +5,72 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from cuspid import storage
-from cuspid.cli.shared import Flat, console
+from tyro.conf import Positional
+
+from cuspid import pipeline, storage
+from cuspid.anatomy.mouth import MouthOptions
+from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
+from cuspid.handpiece.brief import read_brief
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
+from cuspid.handpiece.optimise import SearchOptions, handpiece_outline, optimise_handpiece
+from cuspid.reporting.design_figures import save_design_picture
 
 
 def handpiece(
     *,
     out: Path,
-    design: Literal["four", "twelve"] = "twelve",
+    design: Literal["four", "six", "twelve"] = "twelve",
     options: Annotated[DesignOptions, Flat] = DesignOptions(),
 ) -> None:
     """Write a built-in handpiece as handpiece.json and COLMAP's rig_config.json, to use or to change.
 
     Args:
         out: Folder.
-        design: The essential four cameras, or the twelve.
+        design: The essential four cameras, six to be turned, or the twelve.
     """
     made = DESIGNS[design](options)
     storage.write_handpiece(out / "handpiece.json", made)
     storage.write_rig_config(out / "rig_config.json", made.rig)
     console.print(f"{out / 'handpiece.json'}: {len(made.rig.names)} cameras, {len(made.lights)} lights")
+
+
+def design(
+    brief: Annotated[Path, Positional],
+    *,
+    out: Path,
+    jaw: Path | None = None,
+    source: Annotated[Source, Flat] = Source(),
+    teeth: tuple[int, ...] = (46, 41),
+    mouth: MouthOptions = MouthOptions(),
+    search: Annotated[SearchOptions, Flat] = SearchOptions(),
+) -> None:
+    """Find a handpiece for a brief: a TOML file with sensor, size, mouth and the surfaces that must be seen.
+
+    Args:
+        brief: The brief (docs/designs.md).
+        out: Folder for handpiece.json, rig_config.json, design.json (what each condition reached) and design.png.
+        jaw: Mesh of a jaw with tooth labels; without it the built-in phantom.
+        teeth: FDI numbers of the teeth for which the handpiece is sought.
+        mouth: People whom it is to fit.
+    """
+    wanted = read_brief(brief)
+    settings = {"search": search, "mouth": mouth, "teeth": teeth, "source": source}
+    inputs = {"brief": storage.hash_file(brief)} | ({} if jaw is None else {"jaw": storage.hash_file(jaw)})
+    with storage.claimed_folder(out, "design", settings, inputs, replace=True), show_progress() as progress:
+        gap_mm = pipeline.room_for(wanted, mouth)
+        wanted.check_gap(gap_mm)
+        sections = pipeline.sections_of(load_source(jaw, source), teeth, wanted)
+        found = optimise_handpiece(wanted, sections, gap_mm, search, progress=progress)
+        storage.write_handpiece(out / "handpiece.json", found.handpiece)
+        storage.write_rig_config(out / "rig_config.json", found.handpiece.rig)
+        storage.write_json(out / "design.json", {"gap_mm": gap_mm, "best": found.best, "trials": found.trials})
+        middle = sections[0].rig_from_world[len(sections[0].rig_from_world) // 2]
+        below, outline = sections[0].mesh.transformed(middle), handpiece_outline(found.handpiece, wanted.thickness_mm)
+        save_design_picture(out / "design.png", found.handpiece, below, outline, title=wanted.name)
+    for condition in found.best.assessment.conditions:
+        console.print(f"{'met   ' if condition.met else 'missed'} {condition}")
+    console.print(
+        f"{out / 'handpiece.json'}: {len(found.handpiece.rig.names)} cameras, the best of {found.evaluations} designs; "
+        f"mean bound {found.best.assessment.mean_bound_um:.1f} µm, {found.best.assessment.unseen:.1%} unseen"
+    )
+    found.check(wanted)

@@ -40,8 +40,8 @@ class Source:
 class Probe:
     """What scans it."""
 
-    design: Literal["four", "twelve"] = "twelve"
-    """Built-in design: the essential four cameras, or the twelve."""
+    design: Literal["four", "six", "twelve"] = "twelve"
+    """Built-in design: the essential four cameras, six (give --turns 3), or the twelve."""
     handpiece: Path | None = None
     """A handpiece.json, or COLMAP's rig_config.json, of your own, instead of a built-in design."""
 
