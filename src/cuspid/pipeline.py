@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
@@ -63,6 +63,11 @@ MotionMethod = Literal["rig", "colmap", "colmap-rig"]
 
 def silent(stage: str, done: int, total: int) -> None:
     """A :data:`Progress` that says nothing."""
+
+
+def usable_cores() -> int:
+    """Cores that this process may run on: a case of a study is pinned to one."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 # --- What is scanned -----------------------------------------------------------------------------------------------
@@ -192,11 +197,24 @@ def simulate(
     Images that are there already are kept; a run that goes on gives the same bits as one that was not interrupted.
     """
     path = plan_scan_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
-    truth = GroundTruth(jaw=jaw, handpiece=handpiece, rig_from_world=path.rig_from_world)
-    storage.write_truth(folder / "truth", truth)
     storage.write_overlap(folder / "truth" / "path.json", path.minimum_overlap, path.mean_overlap)
+    return take_images(jaw, handpiece, path.rig_from_world, folder, options, progress=progress)
+
+
+def take_images(
+    jaw: Jaw,
+    handpiece: Handpiece,
+    rig_from_world: Mapping[str, Rigid3],
+    folder: Path,
+    options: SimulationOptions,
+    *,
+    progress: Progress = silent,
+) -> tuple[Capture, GroundTruth]:
+    """As :func:`simulate`, from given poses of the handpiece, by the name of the frame."""
+    truth = GroundTruth(jaw=jaw, handpiece=handpiece, rig_from_world=rig_from_world)
+    storage.write_truth(folder / "truth", truth)
     capture = Capture(
-        folder=folder / "capture", handpiece=handpiece, frames=tuple(Frame(name=name) for name in path.rig_from_world)
+        folder=folder / "capture", handpiece=handpiece, frames=tuple(Frame(name=name) for name in rig_from_world)
     )
     storage.write_capture(capture)
     for done, total in _render(capture, truth, options):
@@ -221,7 +239,7 @@ def _render(capture: Capture, truth: GroundTruth, options: SimulationOptions) ->
         truth.rig_from_world,
         lambda frame, camera, image: storage.write_image(capture.image_path(frame, camera), image),
         skip=lambda frame, camera: capture.image_path(frame, camera).exists(),
-        processes=os.cpu_count() or 1,
+        processes=usable_cores(),
     )
     for done, _ in enumerate(rendered, start=present + 1):
         yield done, total
@@ -312,7 +330,7 @@ def _measure_all(
         if not file.exists():
             storage.write_depth_maps(file, measure(frame))
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(usable_cores()) as pool:
         for done, _ in enumerate(pool.map(keep, frames, files), start=1):
             progress(done, len(files))
     return StoredDepthMaps(files)
