@@ -38,6 +38,7 @@ from cuspid.storage.jaws import (
     write_mesh,
 )
 from cuspid.storage.landmarks import MARKUPS_SUFFIX, LandmarkFile, LandmarkFrame, read_landmarks, write_landmarks
+from cuspid.storage.panoramas import read_panorama, write_panorama
 from cuspid.storage.reconstructions import (
     read_depth_maps,
     read_poses,
@@ -74,6 +75,7 @@ __all__ = [
     "read_labelled_mesh",
     "read_landmarks",
     "read_mesh",
+    "read_panorama",
     "read_poses",
     "read_reconstruction",
     "read_rig_config",
@@ -92,6 +94,7 @@ __all__ = [
     "write_landmarks",
     "write_mesh",
     "write_overlap",
+    "write_panorama",
     "write_poses",
     "write_reconstruction",
     "write_rig_config",

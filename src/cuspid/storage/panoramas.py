@@ -1,0 +1,109 @@
+"""Panoramas: a picture, where it lies in the world, and which frame each of its pixels came from.
+
+A panorama's folder holds ``panorama.png`` (RGBA, transparent where nothing was seen), ``panorama.json`` (scale, origin,
+method), the world file ``panorama.pgw`` that GIS programs read beside a PNG, ``frames.csv`` and ``source.npz``.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import cv2
+import numpy as np
+
+from cuspid.errors import InputError, OutputError
+from cuspid.panorama import FrameUse, Panorama
+from cuspid.storage.files import read_json, reading, whole_file, write_bytes, write_json
+from cuspid.storage.tables import write_table
+
+_HEADER = ("method", "mm_per_px", "origin_px", "part", "parts", "notes")
+
+
+def write_panorama(folder: Path, panorama: Panorama) -> None:
+    """Write a panorama into a folder. Raises OutputError."""
+    rgba = np.dstack([panorama.image, np.where(panorama.covered, 255, 0).astype(np.uint8)])
+    ok, encoded = cv2.imencode(".png", cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA))
+    if not ok:
+        raise OutputError(f"{folder / 'panorama.png'}: the image could not be encoded")
+    write_table(folder / "frames.csv", [dataclasses.asdict(frame) for frame in panorama.frames])
+    write_bytes(folder / "panorama.pgw", world_file(panorama).encode())
+    with whole_file(folder / "source.npz") as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, allow_pickle=False, **_source(panorama))
+    write_bytes(folder / "panorama.png", encoded.tobytes())
+    write_json(folder / "panorama.json", _header(panorama))
+
+
+def world_file(panorama: Panorama) -> str:
+    """The six lines of a world file: x of a column's step, two rotations of 0, y of a row's step, and the world's place
+    of the first pixel's centre, in mm (in px where the scale is unknown)."""
+    step = panorama.mm_per_px or 1.0
+    first = panorama.world_from_pixels(np.array([0.5, 0.5]))
+    return "".join(f"{value:.9f}\n" for value in (step, 0.0, 0.0, -step, *first))
+
+
+def _header(panorama: Panorama) -> dict[str, Any]:
+    height, width = panorama.covered.shape
+    return {
+        "width_px": width,
+        "height_px": height,
+        **{name: getattr(panorama, name) for name in _HEADER},
+        "size_mm": panorama.size_mm,
+        "frame": "occlusal: XY the occlusal plane, +Z out of the gum; x = (u - u0) s, y = (v0 - v) s",
+        "covered_pct": 100 * float(panorama.covered.mean()),
+        "frames_used": sum(frame.used for frame in panorama.frames),
+        "frames": len(panorama.frames),
+    }
+
+
+def _source(panorama: Panorama) -> dict[str, np.ndarray]:
+    arrays: dict[str, np.ndarray] = {"frame_index": panorama.frame_index, "frame_pixel": panorama.frame_pixel}
+    if panorama.height_mm is not None:
+        arrays["height_mm"] = panorama.height_mm
+    return arrays
+
+
+def read_panorama(folder: Path) -> Panorama:
+    """Read what :func:`write_panorama` wrote. Raises InputError where a file is missing or damaged."""
+    path = folder / "panorama.json"
+    value = read_json(path)
+    rgba = cv2.imread(str(folder / "panorama.png"), cv2.IMREAD_UNCHANGED)
+    if rgba is None or rgba.ndim != 3 or rgba.shape[2] != 4:
+        raise InputError(f"{folder / 'panorama.png'}: missing, or not a panorama's image; run cuspid stitch again")
+    frames, source = _read_frames(folder / "frames.csv"), _read_source(folder / "source.npz")
+    with reading(path):
+        if len(frames) != value["frames"]:
+            raise InputError(f"{folder / 'frames.csv'}: truncated; run cuspid stitch again")
+        header = {name: value[name] for name in _HEADER}
+        header |= {"origin_px": np.array(value["origin_px"], dtype=np.float64), "notes": tuple(value["notes"])}
+        image = np.asarray(cv2.cvtColor(rgba, cv2.COLOR_BGRA2RGB), dtype=np.uint8)
+        return Panorama(image=image, covered=rgba[..., 3] > 0, frames=frames, **header, **source)
+
+
+def _read_source(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in ("frame_index", "frame_pixel", "height_mm") if name in arrays}
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
+        raise InputError(f"{path}: missing or damaged; run cuspid stitch again") from error
+
+
+def _read_frames(path: Path) -> tuple[FrameUse, ...]:
+    try:
+        text = path.read_text()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    with reading(path):
+        return tuple(
+            FrameUse(
+                name=row["name"],
+                used=row["used"] == "True",
+                reason=row["reason"] or None,
+                inliers=int(row["inliers"]) if row["inliers"] else None,
+                overlap=float(row["overlap"]) if row["overlap"] else None,
+            )
+            for row in csv.DictReader(text.splitlines())
+        )
