@@ -1,0 +1,103 @@
+"""One trial: a jaw is scanned in simulation, reconstructed and compared with itself; a row of figures for a study."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from cuspid import pipeline
+from cuspid.capture import Capture
+from cuspid.errors import ReconstructionError
+from cuspid.evaluation.deviation import EvaluationOptions
+from cuspid.handpiece.visibility import VisibilityOptions
+from cuspid.jaw import Jaw
+from cuspid.pipeline import ReconstructionOptions, SimulationOptions
+from cuspid.reconstruction import Reconstruction
+from cuspid.rig import Handpiece
+from cuspid.trueness import GroundTruth, Trueness
+
+Shoot = Callable[[Path], tuple[Capture, GroundTruth]]
+"""Writes images to a folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialOptions:
+    """How each scan of a study is made and judged."""
+
+    simulation: SimulationOptions = field(default_factory=SimulationOptions)
+    """How the images are made."""
+    reconstruction: ReconstructionOptions = field(default_factory=ReconstructionOptions)
+    """How they become a mesh."""
+    evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)
+    """How the mesh is compared with the jaw."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Trial:
+    """What came of it."""
+
+    capture: Capture
+    """The images."""
+    truth: GroundTruth
+    """What the simulator knew."""
+    reconstruction: Reconstruction
+    """Poses that were found."""
+    points: int
+    """Vertices of the mesh."""
+    trueness: Trueness
+    """Mesh against jaw."""
+    simulation_s: float
+    """Wall time to the images."""
+    reconstruction_s: float
+    """Wall time from the images to the mesh."""
+
+    @property
+    def figures(self) -> dict[str, float | int]:
+        """The row: units in the names."""
+        accuracy, complete = self.trueness.accuracy, self.trueness.completeness_pct
+        frames = len(self.capture.frames)
+        return {
+            "frames": frames,
+            "located_frames": len(self.reconstruction.frames),
+            "images": frames * len(self.truth.handpiece.rig.names),
+            "points": self.points,
+            "mean_abs_um": accuracy.mean_abs_um,
+            "signed_mean_um": accuracy.signed_mean_um,
+            "std_um": accuracy.std_um,
+            "p95_um": accuracy.p95_um,
+            "max_um": accuracy.max_um,
+            "complete_50_um_pct": complete["50"],
+            "complete_100_um_pct": complete["100"],
+            "scannable_pct": self.trueness.scannable_pct,
+            "simulation_s": self.simulation_s,
+            "reconstruction_s": self.reconstruction_s,
+        }
+
+
+def scan(jaw: Jaw, handpiece: Handpiece, folder: Path, options: TrialOptions) -> Trial:
+    """Scan a jaw along the path that the options plan. Raises what the stages of the pipeline raise."""
+    return run_trial(lambda out: pipeline.simulate(jaw, handpiece, out, options.simulation), folder, options)
+
+
+def run_trial(shoot: Shoot, folder: Path, options: TrialOptions) -> Trial:
+    """Images to mesh to trueness. Raises what the stages raise, ReconstructionError where no surface is left."""
+    begin = time.perf_counter()
+    capture, truth = shoot(folder)
+    shot = time.perf_counter()
+    reconstruction, mesh = pipeline.reconstruct(capture, folder, options.reconstruction)
+    reconstructed = time.perf_counter()
+    if not len(mesh.faces):
+        raise ReconstructionError("nothing of the surface is left after cleaning")
+    scannable = pipeline.scannable(truth, VisibilityOptions())
+    trueness = pipeline.evaluate(mesh, truth.jaw, options.evaluation, scannable=scannable)
+    return Trial(
+        capture=capture,
+        truth=truth,
+        reconstruction=reconstruction,
+        points=len(mesh.vertices),
+        trueness=trueness,
+        simulation_s=shot - begin,
+        reconstruction_s=reconstructed - shot,
+    )
