@@ -77,13 +77,13 @@ def read_panorama(folder: Path) -> Panorama:
     with reading(path):
         if len(frames) != value["frames"]:
             raise InputError(f"{folder / 'frames.csv'}: truncated; run cuspid stitch again")
-        header = {name: value[name] for name in _HEADER}
+        header: dict[str, Any] = {name: value[name] for name in _HEADER}
         header |= {"origin_px": np.array(value["origin_px"], dtype=np.float64), "notes": tuple(value["notes"])}
         image = np.asarray(cv2.cvtColor(rgba, cv2.COLOR_BGRA2RGB), dtype=np.uint8)
         return Panorama(image=image, covered=rgba[..., 3] > 0, frames=frames, **header, **source)
 
 
-def _read_source(path: Path) -> dict[str, np.ndarray]:
+def _read_source(path: Path) -> dict[str, Any]:
     try:
         with np.load(path, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in ("frame_index", "frame_pixel", "height_mm") if name in arrays}
