@@ -7,12 +7,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Bool
+
 from cuspid import pipeline
 from cuspid.capture import Capture
 from cuspid.errors import ReconstructionError
 from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.handpiece.visibility import VisibilityOptions
 from cuspid.jaw import Jaw
+from cuspid.mesh import Mesh
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.reconstruction import Reconstruction
 from cuspid.rig import Handpiece
@@ -44,14 +48,23 @@ class Trial:
     """What the simulator knew."""
     reconstruction: Reconstruction
     """Poses that were found."""
-    points: int
-    """Vertices of the mesh."""
+    mesh: Mesh
+    """The surface, in the frame of the reconstruction."""
+    scannable: Bool[np.ndarray, "f"]
+    """The faces of the jaw that at least two cameras could see."""
     trueness: Trueness
-    """Mesh against jaw."""
+    """Mesh against jaw, where it was scannable."""
     simulation_s: float
     """Wall time to the images."""
     reconstruction_s: float
     """Wall time from the images to the mesh."""
+    reconstruction_cpu_s: float
+    """CPU time of this process for the same."""
+
+    @property
+    def points(self) -> int:
+        """Vertices of the mesh."""
+        return len(self.mesh.vertices)
 
     @property
     def figures(self) -> dict[str, float | int]:
@@ -73,6 +86,7 @@ class Trial:
             "scannable_pct": self.trueness.scannable_pct,
             "simulation_s": self.simulation_s,
             "reconstruction_s": self.reconstruction_s,
+            "reconstruction_cpu_s": self.reconstruction_cpu_s,
         }
 
 
@@ -85,9 +99,9 @@ def run_trial(shoot: Shoot, folder: Path, options: TrialOptions) -> Trial:
     """Images to mesh to trueness. Raises what the stages raise, ReconstructionError where no surface is left."""
     begin = time.perf_counter()
     capture, truth = shoot(folder)
-    shot = time.perf_counter()
+    shot, shot_cpu = time.perf_counter(), time.process_time()
     reconstruction, mesh = pipeline.reconstruct(capture, folder, options.reconstruction)
-    reconstructed = time.perf_counter()
+    reconstructed, reconstructed_cpu = time.perf_counter(), time.process_time()
     if not len(mesh.faces):
         raise ReconstructionError("nothing of the surface is left after cleaning")
     scannable = pipeline.scannable(truth, VisibilityOptions())
@@ -96,8 +110,10 @@ def run_trial(shoot: Shoot, folder: Path, options: TrialOptions) -> Trial:
         capture=capture,
         truth=truth,
         reconstruction=reconstruction,
-        points=len(mesh.vertices),
+        mesh=mesh,
+        scannable=scannable,
         trueness=trueness,
         simulation_s=shot - begin,
         reconstruction_s=reconstructed - shot,
+        reconstruction_cpu_s=reconstructed_cpu - shot_cpu,
     )
