@@ -46,6 +46,7 @@ from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece
 from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.blender import render_with_blender
+from cuspid.simulation.free_path import FreePathOptions, plan_free_path
 from cuspid.simulation.raycast import Scene, render_capture
 from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path, steady_poses
 from cuspid.stereo.between import BetweenOptions, measure_between
@@ -174,8 +175,8 @@ def sections_of(jaw: Jaw, teeth: Sequence[int], brief: DesignBrief) -> list[Sect
 
 
 @dataclass(frozen=True, kw_only=True)
-class SimulationOptions:
-    """How a jaw is scanned in simulation."""
+class RenderOptions:
+    """What the images of a simulation look like."""
 
     texture: Preset = "artificial"
     """Surface: artificial (strong matte texture, the thesis' condition), powder (weak speckle), enamel (plain, wet)."""
@@ -185,8 +186,24 @@ class SimulationOptions:
     """Rays through a pixel along each side."""
     seed: int = 0
     """Chooses texture, hand jitter and sensor noise."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationOptions(RenderOptions):
+    """How a jaw is scanned in simulation."""
+
     path: ScanPathOptions = field(default_factory=ScanPathOptions)
     """How the handpiece moves."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmOptions(RenderOptions):
+    """How a jaw is filmed by hand in simulation."""
+
+    texture: Preset = "enamel"
+    """Surface: artificial (strong matte texture, the thesis' condition), powder (weak speckle), enamel (plain, wet)."""
+    path: FreePathOptions = field(default_factory=FreePathOptions)
+    """How the hand moves the camera."""
 
 
 def simulate(
@@ -201,12 +218,20 @@ def simulate(
     return take_images(jaw, handpiece, path.rig_from_world, folder, options, progress=progress)
 
 
+def film(
+    jaw: Jaw, handpiece: Handpiece, folder: Path, options: FilmOptions, *, progress: Progress = silent
+) -> tuple[Capture, GroundTruth]:
+    """As :func:`simulate`, with a camera that a shaky hand moves freely over the arch."""
+    poses = plan_free_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
+    return take_images(jaw, handpiece, poses, folder, options, progress=progress)
+
+
 def take_images(
     jaw: Jaw,
     handpiece: Handpiece,
     rig_from_world: Mapping[str, Rigid3],
     folder: Path,
-    options: SimulationOptions,
+    options: RenderOptions,
     *,
     progress: Progress = silent,
 ) -> tuple[Capture, GroundTruth]:
@@ -222,7 +247,7 @@ def take_images(
     return capture, truth
 
 
-def _render(capture: Capture, truth: GroundTruth, options: SimulationOptions) -> Iterator[tuple[int, int]]:
+def _render(capture: Capture, truth: GroundTruth, options: RenderOptions) -> Iterator[tuple[int, int]]:
     names = truth.handpiece.rig.names
     total = len(capture.frames) * len(names)
     present = sum(capture.image_path(frame, name).exists() for frame in capture.frames for name in names)

@@ -8,6 +8,8 @@ from typing import Any
 
 import tyro
 
+from cuspid.cli.film import film
+from cuspid.cli.comparison import compare
 from cuspid.cli.handpieces import design, handpiece
 from cuspid.cli.jaws import box, phantom, prepare
 from cuspid.cli.mouth import mouth
@@ -26,7 +28,9 @@ COMMANDS: Mapping[str, Callable[..., Any]] = {
     "mouth": mouth,
     "handpiece": handpiece,
     "design": design,
+    "compare": compare,
     "simulate": simulate,
+    "film": film,
     "reconstruct": reconstruct,
     "evaluate": evaluate,
 }

@@ -176,7 +176,7 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
     most = frames if options.frames else 3 * frames
     while True:
         path = _even_path(jaw.mesh, handpiece, passes, hand, np.linspace(*passes.span_mm, frames))
-        _check_clearance(jaw.mesh, handpiece, path.rig_from_world, options.clearance_mm)
+        check_clearance(jaw.mesh, handpiece, path.rig_from_world, options.clearance_mm)
         if path.minimum_overlap > options.minimum_overlap:
             return path
         # The surface that an image loses is about in proportion to the step.
@@ -510,7 +510,7 @@ def _surface_at(
     return world_from_cam.translation + hits.distances[hit, None] * directions[hit]
 
 
-def _check_clearance(mesh: Mesh, handpiece: Handpiece, poses: Mapping[str, Rigid3], clearance_mm: float) -> None:
+def check_clearance(mesh: Mesh, handpiece: Handpiece, poses: Mapping[str, Rigid3], clearance_mm: float) -> None:
     """Raise InputError where a camera or light comes too near to the jaw or lies inside it."""
     parts = {f"camera {name}": (each.centre_in_rig, each.axis_in_rig) for name, each in handpiece.rig.cameras.items()}
     parts |= {f"light {name}": (light.position_mm, light.direction) for name, light in handpiece.lights.items()}

@@ -51,6 +51,7 @@ from cuspid.storage.reconstructions import (
 )
 from cuspid.storage.shapes import read_shape_model, write_shape_model
 from cuspid.storage.tables import csv_table, write_table
+from cuspid.storage.videos import write_video
 
 __all__ = [
     "IMAGE_SUFFIXES",
@@ -102,4 +103,5 @@ __all__ = [
     "write_table",
     "write_trueness",
     "write_truth",
+    "write_video",
 ]

@@ -1,0 +1,68 @@
+"""One intra-oral camera in a wand, with its LEDs in a ring around the lens (thesis chapter 4).
+
+Rig frame as in :mod:`cuspid.handpiece.designs`: origin at the cusp tips under the camera, +X along the arch and to
+the right of the image, +Y towards the cheek and up in the image, +Z out of the gum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cuspid.camera import Camera
+from cuspid.errors import InputError
+from cuspid.handpiece.designs import looking_at
+from cuspid.rig import Exposure, Handpiece, Light, MountedCamera, Rig
+
+
+@dataclass(frozen=True, kw_only=True)
+class IntraOralOptions:
+    """A video camera that is held over the teeth."""
+
+    width_px: int = 640
+    """Image width in px."""
+    height_px: int = 480
+    """Image height in px."""
+    field_of_view_deg: float = 62.0
+    """Full horizontal angle of view."""
+    working_distance_mm: float = 14.0
+    """From the camera to the cusp tips."""
+    leds: int = 4
+    """LEDs around the lens."""
+    led_ring_mm: float = 3.0
+    """Radius of the ring of LEDs."""
+
+    def __post_init__(self) -> None:
+        if self.width_px < 1 or self.height_px < 1:
+            raise InputError(f"camera: an image of {self.width_px} x {self.height_px} px shows nothing")
+        if not 0 < self.field_of_view_deg < 180:
+            raise InputError(f"camera: field of view {self.field_of_view_deg:g} deg must lie between 0 and 180")
+        if not self.working_distance_mm > 0:
+            raise InputError(f"camera: working distance {self.working_distance_mm:g} mm must be positive")
+        if self.leds < 1 or self.led_ring_mm < 0:
+            raise InputError("camera: at least one LED is needed, on a ring whose radius is not negative")
+
+
+def intra_oral_camera(options: IntraOralOptions = IntraOralOptions()) -> Handpiece:
+    """A handpiece of one camera, named ``camera``, that looks down on the teeth."""
+    camera = Camera.from_field_of_view(options.width_px, options.height_px, options.field_of_view_deg)
+    down, right = np.array([0, 0, -1.0]), np.array([1.0, 0, 0])
+    angles = 2 * np.pi * (np.arange(options.leds) + 0.5) / options.leds
+    lights = {
+        f"led{k + 1}": Light(
+            position_mm=np.array(
+                [*options.led_ring_mm * np.array([np.cos(angle), np.sin(angle)]), options.working_distance_mm]
+            ),
+            direction=down,
+        )
+        for k, angle in enumerate(angles)
+    }
+    return Handpiece(
+        rig=Rig({"camera": MountedCamera(camera, looking_at(np.zeros(3), down, right, options.working_distance_mm))}),
+        lights=lights,
+        exposures=(Exposure(name="all", lights=tuple(lights)),),
+        working_distance_mm=options.working_distance_mm,
+        depth_range_mm=(options.working_distance_mm / 3, 2.5 * options.working_distance_mm),
+        name="intra-oral-camera",
+    )

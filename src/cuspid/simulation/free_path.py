@@ -1,0 +1,107 @@
+"""Where a camera goes that a shaky hand moves over the teeth, unrestricted (thesis chapter 4, Fig. 4.2).
+
+The steady way is the arch curve of :mod:`cuspid.simulation.scan_path`, from the first crown to the last. To it the hand
+adds a random shift, tilt and turn, and it goes at a random speed. Each of these is smooth noise over the frames: a slow
+drift and a quick tremor, both Gaussian and of the asked standard deviation together, and none beyond `REACH` of it, for
+who holds the camera watches the picture. The camera is shifted and turned about the place on the teeth that it looks
+at, in the rig frame: X along the arch, Y to the cheek, Z out of the gum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
+
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
+from cuspid.jaw import Jaw
+from cuspid.rig import Handpiece
+from cuspid.simulation.scan_path import arch_curve, check_clearance
+
+REACH = 2.5
+"""The hand never goes farther than this many standard deviations from where it should be."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FreePathOptions:
+    """How a hand moves a camera over the arch; the defaults are a full shake."""
+
+    frames: int = 120
+    """Frames on the way from the first crown to the last."""
+    shake: float = 1.0
+    """Multiplies all standard deviations below: 1 is a full shake, 0 a steady hand at an even speed."""
+    position_mm: float = 1.0
+    """Standard deviation of the shift along and across the arch."""
+    distance_mm: float = 1.5
+    """Standard deviation of the distance to the teeth."""
+    tilt_deg: float = 6.0
+    """Standard deviation of the tilt along and across the arch."""
+    turn_deg: float = 8.0
+    """Standard deviation of the turn about the viewing axis."""
+    speed: float = 0.35
+    """Standard deviation of the logarithm of the speed."""
+    drift_frames: float = 6.0
+    """Frames over which the drift changes (standard deviation of its Gaussian filter)."""
+    tremor_frames: float = 1.0
+    """Frames over which the tremor changes, likewise."""
+    tremor: float = 0.15
+    """Share of the standard deviation that is tremor."""
+    clearance_mm: float = 2.0
+    """Camera and lights keep this distance from the jaw."""
+
+    def __post_init__(self) -> None:
+        if self.frames < 2:
+            raise InputError(f"free path: at least 2 frames are needed, not {self.frames}")
+        spreads = (self.shake, self.position_mm, self.distance_mm, self.tilt_deg, self.turn_deg, self.speed)
+        if min(spreads) < 0:
+            raise InputError("free path: the shake and its standard deviations must not be negative")
+        if not 0 <= self.tremor <= 1:
+            raise InputError(f"free path: the share of tremor must lie between 0 and 1, not {self.tremor:g}")
+        if not (self.drift_frames > 0 and self.tremor_frames > 0):
+            raise InputError("free path: drift and tremor must change over more than 0 frames")
+
+
+def plan_free_path(
+    jaw: Jaw, handpiece: Handpiece, options: FreePathOptions, rng: np.random.Generator
+) -> Mapping[str, Rigid3]:
+    """``rig_from_world`` by frame name. Raises InputError where the camera would come too near to the jaw."""
+    curve = arch_curve(jaw)
+    noise = hand_noise(options, 7, rng)
+    speeds = np.exp(options.shake * options.speed * noise[:, 6])
+    along = np.cumsum(speeds) - speeds[0]
+    spreads = [
+        *np.deg2rad([options.tilt_deg] * 2 + [options.turn_deg]),
+        *[options.position_mm] * 2,
+        options.distance_mm,
+    ]
+    motions = options.shake * np.array(spreads) * noise[:, :6]
+    poses = {
+        f"{index:05d}": Rigid3.from_rotation_vector(motion[:3], motion[3:]) @ curve.rig_from_world(float(length))
+        for index, (motion, length) in enumerate(zip(motions, along / along[-1] * curve.lengths_mm[-1], strict=True))
+    }
+    check_clearance(jaw.mesh, handpiece, poses, options.clearance_mm)
+    return poses
+
+
+def hand_noise(options: FreePathOptions, channels: int, rng: np.random.Generator) -> Float[np.ndarray, "f c"]:
+    """Independent smooth noise of unit standard deviation, within `REACH`: a drift and a tremor."""
+    drift = _smooth_noise(options.frames, channels, options.drift_frames, rng)
+    tremor = _smooth_noise(options.frames, channels, options.tremor_frames, rng)
+    both = np.sqrt(1 - options.tremor**2) * drift + options.tremor * tremor
+    return np.asarray(REACH * np.tanh(both / REACH))
+
+
+def _smooth_noise(
+    frames: int, channels: int, sigma_frames: float, rng: np.random.Generator
+) -> Float[np.ndarray, "f c"]:
+    """White noise behind a Gaussian filter, divided by the filter's own gain: its variance is 1 in expectation."""
+    padding = int(np.ceil(4 * sigma_frames))
+    impulse = np.zeros(2 * padding + 1)
+    impulse[padding] = 1
+    gain = np.linalg.norm(gaussian_filter1d(impulse, sigma_frames))
+    white = rng.standard_normal((frames + 2 * padding, channels))
+    return np.asarray(gaussian_filter1d(white, sigma_frames, axis=0)[padding : padding + frames] / gain)
