@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,9 @@ from cuspid import pipeline
 from cuspid.capture import Capture
 from cuspid.errors import ReconstructionError
 from cuspid.evaluation.deviation import EvaluationOptions
+from cuspid.evaluation.distance import Surface
+from cuspid.evaluation.registration import fit
+from cuspid.geometry import Rigid3
 from cuspid.handpiece.visibility import VisibilityOptions
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
@@ -53,7 +56,7 @@ class Trial:
     scannable: Bool[np.ndarray, "f"]
     """The faces of the jaw that at least two cameras could see."""
     trueness: Trueness
-    """Mesh against jaw, where it was scannable."""
+    """Mesh against jaw, where it was scannable, or on the faces that were asked for."""
     simulation_s: float
     """Wall time to the images."""
     reconstruction_s: float
@@ -95,8 +98,19 @@ def scan(jaw: Jaw, handpiece: Handpiece, folder: Path, options: TrialOptions) ->
     return run_trial(lambda out: pipeline.simulate(jaw, handpiece, out, options.simulation), folder, options)
 
 
-def run_trial(shoot: Shoot, folder: Path, options: TrialOptions) -> Trial:
-    """Images to mesh to trueness. Raises what the stages raise, ReconstructionError where no surface is left."""
+def run_trial(
+    shoot: Shoot,
+    folder: Path,
+    options: TrialOptions,
+    *,
+    judged: Bool[np.ndarray, "f"] | None = None,
+    start_from_truth: bool = False,
+) -> Trial:
+    """Images to mesh to trueness, on the faces of the jaw in ``judged`` (None: those that were scannable).
+
+    With ``start_from_truth`` the mesh is aligned from the true pose of its first frame on, which saves the search over
+    all poses (some ten seconds). Raises what the stages raise, ReconstructionError where no surface is left.
+    """
     begin = time.perf_counter()
     capture, truth = shoot(folder)
     shot, shot_cpu = time.perf_counter(), time.process_time()
@@ -105,15 +119,34 @@ def run_trial(shoot: Shoot, folder: Path, options: TrialOptions) -> Trial:
     if not len(mesh.faces):
         raise ReconstructionError("nothing of the surface is left after cleaning")
     scannable = pipeline.scannable(truth, VisibilityOptions())
-    trueness = pipeline.evaluate(mesh, truth.jaw, options.evaluation, scannable=scannable)
+    start = _true_start(reconstruction, truth) if start_from_truth else None
     return Trial(
         capture=capture,
         truth=truth,
         reconstruction=reconstruction,
         mesh=mesh,
         scannable=scannable,
-        trueness=trueness,
+        trueness=_compare(mesh, truth.jaw, scannable if judged is None else judged, start, options.evaluation),
         simulation_s=shot - begin,
         reconstruction_s=reconstructed - shot,
         reconstruction_cpu_s=reconstructed_cpu - shot_cpu,
     )
+
+
+def _true_start(reconstruction: Reconstruction, truth: GroundTruth) -> Rigid3:
+    """``world_from_scan`` by the first frame that was located."""
+    name, rig_from_scan = next(iter(reconstruction.rig_from_world.items()))
+    return truth.rig_from_world[name].inverse() @ rig_from_scan
+
+
+def _compare(
+    mesh: Mesh, jaw: Jaw, judged: Bool[np.ndarray, "f"], start: Rigid3 | None, options: EvaluationOptions
+) -> Trueness:
+    """Trueness of a mesh whose pose is to be found, or is near ``start``."""
+    if start is None or not options.align:
+        return pipeline.evaluate(mesh, jaw, options, scannable=judged)
+    points, _ = mesh.sample(options.registration.samples, np.random.default_rng(0))
+    aligned = fit(points, Surface(jaw.mesh), start, options.registration).reference_from_scan
+    moved = mesh.transformed(aligned)
+    found = pipeline.evaluate(moved, jaw, replace(options, align=False), scannable=judged)
+    return replace(found, reference_from_scan=aligned)
