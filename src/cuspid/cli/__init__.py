@@ -15,6 +15,7 @@ from cuspid.cli.jaws import box, phantom, prepare
 from cuspid.cli.mouth import mouth
 from cuspid.cli.scan import evaluate, reconstruct, run, simulate
 from cuspid.cli.shared import console
+from cuspid.cli.studies import sweep
 from cuspid.cli.surveys import measure, shape
 from cuspid.errors import CuspidError
 
@@ -29,6 +30,7 @@ COMMANDS: Mapping[str, Callable[..., Any]] = {
     "handpiece": handpiece,
     "design": design,
     "compare": compare,
+    "sweep": sweep,
     "simulate": simulate,
     "film": film,
     "reconstruct": reconstruct,
