@@ -1,0 +1,167 @@
+"""Pictures of handpieces beside each other: how large they are, what their images buy, and which surfaces they miss.
+
+Sections are drawn across the arch: y to the cheek, z up from the highest point of the tooth, mm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+from matplotlib.ticker import NullFormatter
+
+from cuspid.storage import whole_file
+
+_INK, _GAP, _TOOTH = "#333333", "#c8501e", "#f3ead9"
+_COLOURS = ("#3b7dd8", "#c8860a", "#3fa66b", "#8e5bb5", "#b8405e", "#5a6872", "#2a9d9d", "#8a6d3b")
+_TOOTH_MM = (9.0, 7.0)
+"""Width and height of the drawn tooth."""
+_TICKS = (50, 100, 200, 300, 500, 1000, 2000, 3000)
+"""Numbers of images that are named on an axis."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Curve:
+    """A design with its numbers of turns."""
+
+    turns: tuple[int, ...]
+    """Ascending."""
+    images: tuple[float, ...]
+    """Taken with so many turns."""
+    complete_pct: tuple[float, ...]
+    """Share of the tooth that was reconstructed."""
+    error_um: tuple[float, ...]
+    """Mean absolute deviation of the tooth."""
+
+
+def save_comparison_picture(
+    path: Path,
+    sections: Mapping[str, Sequence[Float[np.ndarray, "n 2"]]],
+    panels: Mapping[str, Mapping[str, Curve]],
+    gap_mm: float,
+    *,
+    title: str = "",
+    within_um: int = 50,
+) -> None:
+    """PNG: sections of the holders, and below, for each jaw, completeness and error by the number of images.
+
+    ``sections``: by design, outlines (y, z) of each pass; ``panels``: by jaw, the curve of each design;
+    ``gap_mm``: room between the jaws, drawn over the sections.
+    """
+    colours = {name: _COLOURS[index % len(_COLOURS)] for index, name in enumerate(sections)}
+    figure = _figure(max(9.0, 3.6 * max(len(panels), 2)), 10.6)
+    _draw_sections(figure, sections, colours, gap_mm)
+    for column, (name, curves) in enumerate(panels.items()):
+        complete, error = (figure.add_subplot(3, len(panels), row * len(panels) + column + 1) for row in (1, 2))
+        for design, curve in curves.items():
+            _draw_curve(complete, curve.images, curve.complete_pct, curve.turns, colours[design], design)
+            _draw_curve(error, curve.images, curve.error_um, curve.turns, colours[design], design)
+        complete.set_title(name, loc="left", fontsize=12, color=_INK)
+        _label_images(complete, f"tooth within {within_um} µm / %" if column == 0 else "")
+        _label_images(error, "mean deviation of the tooth / µm" if column == 0 else "")
+        error.set_ylim(bottom=0)
+        error.set_xlabel("images", color=_INK)
+    handles, labels = figure.axes[len(sections)].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="lower center", ncols=min(6, len(labels)), frameon=False, fontsize=10)
+    figure.text(0.02, 0.975, title, fontsize=14, color=_INK, va="center", fontweight="bold")
+    figure.tight_layout(rect=(0, 0.04, 1, 0.96))
+    _save(figure, path)
+
+
+def _draw_sections(
+    figure: Figure, sections: Mapping[str, Sequence[Float[np.ndarray, "n 2"]]], colours: Mapping[str, str], gap: float
+) -> None:
+    """Side by side, to one scale."""
+    points = np.concatenate([outline for outlines in sections.values() for outline in outlines])
+    half, top = np.abs(points[:, 0]).max() + 1, max(gap, points[:, 1].max()) + 2
+    for column, (name, outlines) in enumerate(sections.items(), start=1):
+        axes = figure.add_subplot(3, len(sections), column)
+        width, height = _TOOTH_MM
+        axes.add_patch(Polygon(_rounded_box(width, height), facecolor=_TOOTH, edgecolor=_INK, linewidth=0.8))
+        for outline in outlines:
+            axes.add_patch(Polygon(outline, facecolor=colours[name], alpha=0.16, edgecolor="none"))
+            axes.add_patch(Polygon(outline, facecolor="none", edgecolor=colours[name], linewidth=1.3))
+        axes.axhline(gap, color=_GAP, linewidth=1.2, linestyle="--")
+        swept = np.concatenate(list(outlines))
+        size = f"{np.ptp(swept[:, 0]):.0f} mm wide, {swept[:, 1].max():.0f} mm high"
+        axes.set_title(f"{name}\n{size}", loc="left", fontsize=10, color=_INK)
+        axes.set(xlim=(-half, half), ylim=(-_TOOTH_MM[1] - 1, top), aspect="equal")
+        axes.set_axis_off()
+
+
+def _rounded_box(width: float, height: float) -> Float[np.ndarray, "n 2"]:
+    """A crown in section: flat below, its top at z = 0."""
+    angle = np.linspace(0, np.pi, 40)
+    shape = np.column_stack([np.sign(np.cos(angle)) * np.abs(np.cos(angle)) ** 0.5, np.sin(angle) ** 0.5])
+    return shape * [width / 2, height] - [0, height]
+
+
+def _draw_curve(
+    axes: Axes, images: Sequence[float], values: Sequence[float], turns: Sequence[int], colour: str, name: str
+) -> None:
+    axes.plot(images, values, "-o", color=colour, markersize=5, linewidth=1.4, label=name)
+    if len(turns) > 1:
+        for number, x, y in zip(turns, images, values, strict=True):
+            axes.annotate(
+                str(number), (x, y), (0, 6), textcoords="offset points", fontsize=9, color=colour, ha="center"
+            )
+
+
+def _label_images(axes: Axes, label: str) -> None:
+    axes.set_xscale("log")
+    low, high = axes.get_xlim()
+    axes.set_xticks([tick for tick in _TICKS if low <= tick <= high], minor=False)
+    axes.set_xticklabels([str(tick) for tick in _TICKS if low <= tick <= high])
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_ylabel(label, color=_INK)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(color="#dddddd", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.margins(0.08, 0.12)
+
+
+def save_surface_shares_picture(
+    path: Path, panels: Mapping[str, Mapping[str, Mapping[str, float]]], *, title: str = ""
+) -> None:
+    """PNG: for each jaw a table of colours with a row for each design and a column for each surface, in %.
+
+    ``panels``: by jaw and design, the share of each surface.
+    """
+    columns = {
+        name: list(dict.fromkeys(s for shares in rows.values() for s in shares)) for name, rows in panels.items()
+    }
+    most = max(len(rows) for rows in panels.values())
+    figure = _figure(2.0 + 1.2 * sum(map(len, columns.values())) * 0.62 + 1.2 * len(panels), 1.9 + 0.34 * most)
+    places = figure.subplots(1, len(panels), squeeze=False, width_ratios=[len(c) for c in columns.values()])[0]
+    for axes, (name, rows) in zip(places, panels.items(), strict=True):
+        values = np.array([[shares.get(s, np.nan) for s in columns[name]] for shares in rows.values()])
+        axes.imshow(values, cmap=matplotlib.colormaps["RdYlGn"], vmin=60, vmax=100, aspect="auto")
+        for (row, column), value in np.ndenumerate(values):
+            if np.isfinite(value):
+                axes.text(column, row, f"{value:.1f}", ha="center", va="center", fontsize=9, color=_INK)
+        axes.set_xticks(range(len(columns[name])), columns[name], rotation=35, ha="right", color=_INK)
+        axes.set_yticks(range(len(rows)), list(rows), color=_INK)
+        axes.set_title(name, loc="left", fontsize=12, color=_INK)
+        axes.spines[:].set_visible(False)
+    figure.text(0.01, 0.96, title, fontsize=13, color=_INK, va="center", fontweight="bold")
+    figure.tight_layout(rect=(0, 0, 1, 0.93))
+    _save(figure, path)
+
+
+def _figure(width_in: float, height_in: float) -> Figure:
+    figure = Figure(figsize=(width_in, height_in), dpi=84, facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _save(figure: Figure, path: Path) -> None:
+    with whole_file(path) as temporary:
+        figure.savefig(temporary)
