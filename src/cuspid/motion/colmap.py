@@ -403,7 +403,7 @@ def _mapper_options(with_rig: bool, seed: int) -> pycolmap.IncrementalPipelineOp
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """COLMAP without its log lines."""
     before, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, 2
     try:
@@ -439,7 +439,7 @@ def locate_with_colmap(capture: Capture, folder: Path, *, with_rig: bool, seed: 
     """
     shutil.rmtree(folder, ignore_errors=True)
     (folder / "sparse").mkdir(parents=True)
-    with _quiet():
+    with quiet():
         models, seconds = _map(capture, folder, with_rig, seed)
     if not models:
         raise ReconstructionError(
