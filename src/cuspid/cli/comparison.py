@@ -43,6 +43,7 @@ def compare(
     out: Path,
     options: Annotated[ComparisonOptions, Flat] = ComparisonOptions(),
     texture: Preset = "artificial",
+    supersampling: int = 1,
     reconstruction: ReconstructionOptions = ReconstructionOptions(),
     workers: int | None = None,
     cluster: str | None = None,
@@ -53,13 +54,15 @@ def compare(
         out: Folder for results.csv, comparison.json, comparison.md and pictures. A killed run goes on when the same
             command is given again, and more designs, turns, teeth or seeds are added to what is there.
         texture: Surface of the teeth.
+        supersampling: Rays through a pixel along each side; 2 takes twice as long.
         reconstruction: How images become a mesh.
         workers: Processes on this machine, one core each (default: one for each core).
         cluster: Address of a Dask scheduler, whose workers see the folder too.
     """
     if workers is not None and workers < 1:
         raise InputError(f"compare: --workers is {workers}; at least one is needed")
-    trial = TrialOptions(simulation=SimulationOptions(texture=texture), reconstruction=reconstruction)
+    simulation = SimulationOptions(texture=texture, supersampling=supersampling)
+    trial = TrialOptions(simulation=simulation, reconstruction=reconstruction)
     settings = {
         "trial": trial,
         **{name: getattr(options, name) for name in ("edge_mm", "minimum_openness", "samples", "thickness_mm")},

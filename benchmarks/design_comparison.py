@@ -1,0 +1,118 @@
+"""Six cameras that are turned against twelve, and both against handpieces that were found with fewer cameras.
+
+    python benchmarks/design_comparison.py [--work FOLDER] [--workers 1] [--report]
+
+Every scan is one tooth. A killed run goes on where it stopped; ``--report`` writes the results of what is done without
+scanning. The found handpieces are in benchmarks/designs, made from the briefs beside them by
+
+    cuspid phantom --edge-mm 0.5 --out jaw.ply
+    cuspid design benchmarks/designs/ten-found.toml --jaw jaw.ply --out ten-found --noise.sigma-px 0.048
+        --noise.convergence-deg None --noise.deformation 0.52
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+from run import conditions
+
+from cuspid.cli.comparison import save_pictures
+from cuspid.pipeline import SimulationOptions
+from cuspid.storage import write_json
+from cuspid.studies.design_comparison import (
+    ComparisonOptions,
+    Row,
+    comparison_rows,
+    enough_turns,
+    markdown,
+    prepare_comparison,
+    scan_case,
+)
+from cuspid.studies.grid import Case, Outcome, run_grid
+from cuspid.studies.trial import TrialOptions
+
+FOUND = ("ten-found", "eight-found", "six-found")
+STILL = ("twelve", "ten-found", "eight-found")
+OPTIONS = ComparisonOptions(
+    designs=("twelve", "six", "four", *(f"benchmarks/designs/{name}.json" for name in FOUND)),
+    turned=("four", "six", "six-found"),
+    turns=(1, 3, 5, 7),
+    jaws=("phantom", "boxed-mean", "thesis-reference"),
+    tooth=(46, 41, 36),
+)
+TRIAL = TrialOptions(simulation=SimulationOptions(supersampling=1))
+
+
+def scans(jaw: str, tooth: int, designs: Mapping[str, Sequence[int]], seed: int = 0) -> list[Case]:
+    """Designs with their numbers of turns, on one tooth."""
+    return [
+        Case(
+            name=f"{jaw}_{tooth}_{design}_{number}_{seed}",
+            parameters={"jaw": jaw, "tooth": tooth, "design": design, "turns": number, "seed": seed},
+        )
+        for design, turns in designs.items()
+        for number in turns
+    ]
+
+
+ONCE = dict.fromkeys(STILL, (1,))
+CASES: tuple[Case, ...] = (
+    *scans("phantom", 46, {**ONCE, "six": (1, 3), "six-found": (3,)}),
+    *scans("boxed-mean", 46, {"twelve": (1,), "six": (1, 3), "four": (3,)}),
+    *scans("boxed-mean", 46, {"six": (5,)}),
+    *scans("phantom", 46, ONCE, seed=1),
+    *scans("thesis-reference", 36, {"twelve": (1,), "six": (3,)}),
+    *scans("phantom", 46, {"six": (5,)}),
+    *scans("phantom", 41, {**ONCE, "six": (3,)}),
+    *scans("thesis-reference", 36, {"ten-found": (1,), "eight-found": (1,), "six": (1,)}),
+    *scans("boxed-mean", 46, {"ten-found": (1,), "eight-found": (1,)}),
+    *scans("phantom", 46, ONCE, seed=2),
+    *scans("boxed-mean", 46, {"six": (7,), "four": (5,)}),
+    *scans("thesis-reference", 36, {"six": (5,)}),
+    *scans("phantom", 46, {"six": (3,)}, seed=1),
+)
+"""In the order in which they are run: what matters most first."""
+
+
+def summary(outcomes: Sequence[Outcome], rows: Sequence[Row]) -> dict[str, object]:
+    """Each scan, and means over the seeds."""
+    return {
+        "options": OPTIONS,
+        "trial": TRIAL,
+        "enough_turns": enough_turns(rows, OPTIONS),
+        "not_run": len(CASES) - len(outcomes),
+        "rows": rows,
+        "scans": {each.case.name: each.failure or each.figures for each in outcomes},
+        **conditions(),
+    }
+
+
+def main() -> None:
+    """Scan what is left, then write one JSON and the pictures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/design_comparison.json"))
+    parser.add_argument("--work", type=Path, default=Path("build/design-comparison"))
+    parser.add_argument("--pictures", type=Path, default=Path("docs/images"))
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--report", action="store_true", help="only write what is done")
+    arguments = parser.parse_args()
+    folder = arguments.work.resolve()
+    prepare_comparison(folder, OPTIONS)
+    cases = [case for case in CASES if not arguments.report or (folder / "cases" / f"{case.name}.json").exists()]
+    work = partial(scan_case, folder=folder, options=OPTIONS, trial=TRIAL)
+    outcomes = run_grid(
+        cases, work, folder, workers=arguments.workers, progress=lambda done, total: print(f"{done} of {total} scans")
+    )
+    rows = comparison_rows(outcomes, OPTIONS)
+    write_json(arguments.out, summary(outcomes, rows))
+    save_pictures(folder, rows, OPTIONS)
+    for name in ("comparison", "surfaces"):
+        (arguments.pictures / f"design-{name}.png").write_bytes((folder / f"{name}.png").read_bytes())
+    print(markdown(rows))
+
+
+if __name__ == "__main__":
+    main()
