@@ -1,8 +1,13 @@
 """Values that are costly to make, once for each worker."""
 
+from collections.abc import Iterator
+from pathlib import Path
+
+import jaxtyping
 import pytest
 from hypothesis import settings
 
+from cuspid import storage
 from cuspid.anatomy.phantom import PhantomOptions, build_phantom
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
@@ -12,10 +17,28 @@ settings.register_profile("cuspid", deadline=None)
 settings.load_profile("cuspid")
 
 
+@pytest.fixture(scope="module")
+def without_shape_checks() -> Iterator[None]:
+    """For modules that place teeth again and again: on few points the checks of shapes take five times as long as the
+    work itself. ``test_phantom.py`` has them on."""
+    before = jaxtyping.config.jaxtyping_disable
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", before)
+
+
 @pytest.fixture(scope="session")
 def coarse_phantom() -> Jaw:
     """The built-in lower jaw with coarse faces."""
     return build_phantom(PhantomOptions(edge_mm=0.5))
+
+
+@pytest.fixture(scope="session")
+def phantom_file(tmp_path_factory: pytest.TempPathFactory, coarse_phantom: Jaw) -> Path:
+    """The same as a file."""
+    path = tmp_path_factory.mktemp("jaw") / "phantom_lower.ply"
+    storage.write_jaw(path, coarse_phantom)
+    return path
 
 
 @pytest.fixture(scope="session")

@@ -16,13 +16,6 @@ def run(*arguments: object) -> None:
     cli.main([str(argument) for argument in arguments])
 
 
-@pytest.fixture(scope="module")
-def phantom_file(tmp_path_factory, coarse_phantom):
-    path = tmp_path_factory.mktemp("jaw") / "phantom_lower.ply"
-    storage.write_jaw(path, coarse_phantom)
-    return path
-
-
 def test_a_jaw_and_a_broken_one_are_measured(tmp_path, capsys, phantom_file, coarse_phantom):
     jaws = tmp_path / "jaws"
     storage.write_jaw(jaws / "good.ply", coarse_phantom)

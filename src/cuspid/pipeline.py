@@ -36,7 +36,8 @@ from cuspid.evaluation.deviation import evaluate as compare_with_reference
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.brief import DesignBrief
 from cuspid.handpiece.optimise import Section
-from cuspid.handpiece.visibility import VisibilityOptions, scannable_faces
+from cuspid.handpiece.precision import NoiseModel, PrecisionMap, at_best, precision_map
+from cuspid.handpiece.visibility import Visibility, VisibilityOptions, scannable_faces, survey_visibility
 from cuspid.jaw import ARCHES, Arch, Jaw
 from cuspid.mesh import Mesh
 from cuspid.motion.colmap import locate_with_colmap, read_model, write_model
@@ -169,6 +170,22 @@ def sections_of(jaw: Jaw, teeth: Sequence[int], brief: DesignBrief) -> list[Sect
         return Section.near(jaw.mesh, jaw.tooth_faces(fdi), surfaces, steady_poses(jaw, passes, per_pass=5))
 
     return [section(fdi) for fdi in teeth]
+
+
+def foresee(
+    jaw: Jaw, handpiece: Handpiece, path: ScanPathOptions, options: VisibilityOptions, *, seed: int = 0
+) -> Visibility:
+    """What the cameras will see of each face along the path of a simulated scan with the same seed."""
+    poses = plan_scan_path(jaw, handpiece, path, np.random.default_rng([seed, 1])).rig_from_world
+    return survey_visibility(jaw.mesh, handpiece, poses.values(), options)
+
+
+def bound_over(
+    jaw: Jaw, handpiece: Handpiece, path: ScanPathOptions, noise: NoiseModel, visibility: VisibilityOptions
+) -> PrecisionMap:
+    """How precisely each face could be measured from the best of five places on each pass of a steady hand."""
+    poses = steady_poses(jaw, path, per_pass=5)
+    return at_best([precision_map(jaw.mesh, handpiece, pose, noise, visibility=visibility) for pose in poses])
 
 
 # --- Simulation ----------------------------------------------------------------------------------------------------

@@ -8,8 +8,9 @@ from typing import Any
 
 import tyro
 
-from cuspid.cli.film import film
 from cuspid.cli.comparison import compare
+from cuspid.cli.film import film
+from cuspid.cli.forecasts import optics, precision, visibility
 from cuspid.cli.handpieces import design, handpiece
 from cuspid.cli.jaws import box, phantom, prepare
 from cuspid.cli.mouth import mouth
@@ -29,6 +30,9 @@ COMMANDS: Mapping[str, Callable[..., Any]] = {
     "mouth": mouth,
     "handpiece": handpiece,
     "design": design,
+    "optics": optics,
+    "visibility": visibility,
+    "precision": precision,
     "compare": compare,
     "sweep": sweep,
     "simulate": simulate,

@@ -254,6 +254,15 @@ def precision_map(
     return PrecisionMap(cameras_at_once=seen.sum(axis=0), covariance=covariance)
 
 
+def at_best(maps: Sequence[PrecisionMap]) -> PrecisionMap:
+    """Of several positions the one that is best for each face, by the trace of the bound."""
+    covariances = np.array([each.covariance for each in maps])
+    traces = np.nan_to_num(np.trace(covariances, axis1=2, axis2=3), nan=np.inf)
+    best, faces = traces.argmin(axis=0), np.arange(traces.shape[1])
+    counts = np.array([each.cameras_at_once for each in maps])
+    return PrecisionMap(cameras_at_once=counts.max(axis=0), covariance=covariances[best, faces])
+
+
 def planar_pair_bound(
     focal_px: float,
     sigma_px: float,

@@ -60,7 +60,8 @@ def save_precision_picture(
     ``views``: azimuth and elevation in degrees by name. The colours run from the first to the second limit, in steps of
     equal ratio.
     """
-    figure = _figure(3.2 * len(views) + 0.4, 3.1 * len(rms_um) + 1.1)
+    height_in = 3.1 * len(rms_um) + 1.6
+    figure = _figure(3.2 * len(views) + 0.4, height_in)
     axes = figure.subplots(len(rms_um), len(views), squeeze=False)
     norm = LogNorm(*limits_um)
     for row, (design, values) in zip(axes, rms_um.items(), strict=True):
@@ -69,8 +70,10 @@ def save_precision_picture(
             panel.imshow(render(colored, look(*angles), width_px=360).image)
             panel.set_axis_off()
             panel.set_title(f"{design}: {view}", loc="left", fontsize=11, color=_INK)
-    figure.subplots_adjust(left=0.02, right=0.98, top=0.88, bottom=0.15, wspace=0.05, hspace=0.15)
-    scale = figure.add_axes((0.25, 0.09, 0.5, 0.025))
+    figure.subplots_adjust(
+        left=0.02, right=0.98, top=1 - 0.75 / height_in, bottom=0.85 / height_in, wspace=0.05, hspace=0.15
+    )
+    scale = figure.add_axes((0.25, 0.6 / height_in, 0.5, 0.15 / height_in))
     bar = figure.colorbar(ScalarMappable(norm, _ERRORS), cax=scale, orientation="horizontal")
     ticks = [tick for tick in (1, 2, 3, 5, 10, 20, 30, 50, 100, 200) if limits_um[0] <= tick <= limits_um[1]]
     bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
