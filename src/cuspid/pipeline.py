@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -48,6 +49,7 @@ from cuspid.rig import Handpiece
 from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.blender import render_with_blender
 from cuspid.simulation.free_path import FreePathOptions, plan_free_path
+from cuspid.simulation.occlusal import OcclusalOptions, render_occlusal_view
 from cuspid.simulation.raycast import Scene, render_capture
 from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path, steady_poses
 from cuspid.stereo.between import BetweenOptions, measure_between
@@ -223,6 +225,10 @@ class FilmOptions(RenderOptions):
     """How the hand moves the camera."""
 
 
+SINGLE_SHOTS: Mapping[str, float | None] = MappingProxyType({"occlusal": None, "shot": 300.0})
+"""Height in mm of the camera of each picture of the true jaw; None for an orthographic view."""
+
+
 def simulate(
     jaw: Jaw, handpiece: Handpiece, folder: Path, options: SimulationOptions, *, progress: Progress = silent
 ) -> tuple[Capture, GroundTruth]:
@@ -238,9 +244,18 @@ def simulate(
 def film(
     jaw: Jaw, handpiece: Handpiece, folder: Path, options: FilmOptions, *, progress: Progress = silent
 ) -> tuple[Capture, GroundTruth]:
-    """As :func:`simulate`, with a camera that a shaky hand moves freely over the arch."""
+    """As :func:`simulate`, with a camera that a shaky hand moves freely over the arch.
+
+    Also the arch in a single shot from above: ``truth/occlusal``, orthographic, and ``truth/shot``, from far above.
+    """
     poses = plan_free_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
-    return take_images(jaw, handpiece, poses, folder, options, progress=progress)
+    capture, truth = take_images(jaw, handpiece, poses, folder, options, progress=progress)
+    for done, (name, height_mm) in enumerate(SINGLE_SHOTS.items(), start=1):
+        if not (folder / "truth" / name / "view.json").exists():
+            view = render_occlusal_view(_scene(truth, options), OcclusalOptions(camera_height_mm=height_mm))
+            storage.write_occlusal_view(folder / "truth" / name, view)
+        progress("single shots", done, len(SINGLE_SHOTS))
+    return capture, truth
 
 
 def take_images(
@@ -268,16 +283,9 @@ def _render(capture: Capture, truth: GroundTruth, options: RenderOptions) -> Ite
     names = truth.handpiece.rig.names
     total = len(capture.frames) * len(names)
     present = sum(capture.image_path(frame, name).exists() for frame in capture.frames for name in names)
-    scene = Scene(
-        jaw=truth.jaw,
-        handpiece=truth.handpiece,
-        appearance=APPEARANCES[options.texture],
-        supersampling=options.supersampling,
-        seed=options.seed,
-    )
     render = render_with_blender if options.renderer == "blender" else render_capture
     rendered = render(
-        scene,
+        _scene(truth, options),
         truth.rig_from_world,
         lambda frame, camera, image: storage.write_image(capture.image_path(frame, camera), image),
         skip=lambda frame, camera: capture.image_path(frame, camera).exists(),
@@ -285,6 +293,16 @@ def _render(capture: Capture, truth: GroundTruth, options: RenderOptions) -> Ite
     )
     for done, _ in enumerate(rendered, start=present + 1):
         yield done, total
+
+
+def _scene(truth: GroundTruth, options: RenderOptions) -> Scene:
+    return Scene(
+        jaw=truth.jaw,
+        handpiece=truth.handpiece,
+        appearance=APPEARANCES[options.texture],
+        supersampling=options.supersampling,
+        seed=options.seed,
+    )
 
 
 def scannable(truth: GroundTruth, options: VisibilityOptions) -> Bool[np.ndarray, "f"]:

@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int16, UInt8
 
-from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
+from cuspid.geometry import Rigid3, read_only
+from cuspid.jaw import GUM, Jaw
 from cuspid.rig import Handpiece
 
 
@@ -26,6 +26,59 @@ class GroundTruth:
     """The handpiece as it really was (the capture may hold a nominal one)."""
     rig_from_world: Mapping[str, Rigid3]
     """Pose of the handpiece for each frame."""
+
+
+NOTHING = -1
+"""The label of a pixel that shows nothing."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OcclusalView:
+    """A jaw as one shot from above shows it: what a panorama should look like. Columns run along +X, rows along -Y.
+
+    Pixel (u, v), the centre of the first one at (0.5, 0.5), shows x = (u - u0) s, y = (v0 - v) s of the occlusal frame,
+    where (u0, v0) is ``origin_px`` and s ``mm_per_px``; a camera at a finite height shows what lies above or below the
+    occlusal plane elsewhere.
+    """
+
+    image: UInt8[np.ndarray, "h w 3"]
+    """RGB; black where nothing is."""
+    labels: Int16[np.ndarray, "h w"]
+    """FDI number of the tooth at each pixel, 0 for gum, `NOTHING` for none."""
+    height_mm: Float[np.ndarray, "h w"]
+    """Height (z) of the surface at each pixel, NaN for none; float32."""
+    mm_per_px: float
+    """Millimetres a pixel, in the occlusal plane."""
+    origin_px: Float[np.ndarray, "2"]
+    """Pixel of the origin of the occlusal frame."""
+    camera_height_mm: float | None = None
+    """Of the camera above the occlusal plane; None for an orthographic view."""
+
+    def __post_init__(self) -> None:
+        for name in ("image", "labels", "height_mm", "origin_px"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    @property
+    def teeth(self) -> Bool[np.ndarray, "h w"]:
+        """Where teeth are; the whole surface where the jaw has no labels."""
+        on_teeth = self.labels > GUM
+        return on_teeth if on_teeth.any() else self.labels != NOTHING
+
+    def points_at(self, where: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "n 3"]:
+        """The points of the surface that some pixels show, in mm."""
+        rows, columns = np.nonzero(where)
+        z = self.height_mm[where].astype(np.float64)
+        plane = (np.column_stack([columns, rows]) + 0.5 - self.origin_px) * [1, -1] * self.mm_per_px
+        return np.column_stack([plane / self._spread(z)[:, None], z])
+
+    def project(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+        """The pixels at which points are seen."""
+        plane = points[:, :2] * self._spread(points[:, 2])[:, None]
+        return plane * [1, -1] / self.mm_per_px + self.origin_px
+
+    def _spread(self, z: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """How much farther out than it is a point of that height is seen on the occlusal plane."""
+        return np.ones_like(z) if self.camera_height_mm is None else self.camera_height_mm / (self.camera_height_mm - z)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -134,14 +134,21 @@ def radiance(scene: Scene, camera: Camera, cam_from_world: Rigid3, lights: Lamps
     """Linear light at each pixel, averaged over the pixel's area; 0 where nothing is hit."""
     world_from_cam = cam_from_world.inverse()
     directions = _turned(pixel_rays(camera, scene.supersampling), world_from_cam.rotation)
-    origin = world_from_cam.translation
-    hits = scene.jaw.mesh.cast(np.broadcast_to(origin, directions.shape), directions)
-    rays = _Rays(origin, directions, hits.faces, hits.distances, hits.barycentric)
+    origins = np.broadcast_to(world_from_cam.translation, directions.shape)
+    return radiance_along(scene, origins, directions, lights).reshape(camera.height, camera.width, 3)
+
+
+def radiance_along(
+    scene: Scene, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"], lights: Lamps
+) -> Float[np.ndarray, "m 3"]:
+    """Linear light (float32) of pixels, given their rays, ``supersampling**2`` in a row for each."""
+    hits = scene.jaw.mesh.cast(origins, directions)
+    rays = _Rays(origins, directions, hits.faces, hits.distances, hits.barycentric)
     chosen, row = _shadow_rows(hits.distances, scene.supersampling**2)
     lit, ambient = _lighting(scene, rays.take(chosen), lights)
-    out = np.zeros((camera.height * camera.width, 3), dtype=np.float32)
+    out = np.zeros((len(directions) // scene.supersampling**2, 3), dtype=np.float32)
     _shade(rays, scene.surface, scene.palette, lights, lit, ambient, row, out)
-    return out.reshape(camera.height, camera.width, 3)
+    return out
 
 
 def _shadow_rows(distances: Float[np.ndarray, "n"], samples: int) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "n"]]:
@@ -160,9 +167,9 @@ def _shadow_rows(distances: Float[np.ndarray, "n"], samples: int) -> tuple[Int[n
 
 
 class _Rays(NamedTuple):
-    """Rays from one point and their hits, as arrays for the compiled shading."""
+    """Rays and their hits, as arrays for the compiled shading."""
 
-    origin: np.ndarray
+    origins: np.ndarray
     directions: np.ndarray
     faces: np.ndarray
     distances: np.ndarray
@@ -170,8 +177,7 @@ class _Rays(NamedTuple):
 
     def take(self, chosen: Int[np.ndarray, "m"]) -> _Rays:
         """Some of the rays."""
-        arrays = (self.directions, self.faces, self.distances, self.barycentric)
-        return _Rays(self.origin, *(array[chosen] for array in arrays))
+        return _Rays(*(array[chosen] for array in self))
 
 
 @njit(cache=True, nogil=True)
@@ -205,9 +211,9 @@ def _lighting(scene: Scene, rays: _Rays, lights: Lamps) -> tuple[Bool[np.ndarray
 def _point(rays, i):
     t = rays.distances[i]
     return (
-        rays.origin[0] + t * rays.directions[i, 0],
-        rays.origin[1] + t * rays.directions[i, 1],
-        rays.origin[2] + t * rays.directions[i, 2],
+        rays.origins[i, 0] + t * rays.directions[i, 0],
+        rays.origins[i, 1] + t * rays.directions[i, 1],
+        rays.origins[i, 2] + t * rays.directions[i, 2],
     )
 
 

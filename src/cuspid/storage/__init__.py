@@ -38,6 +38,7 @@ from cuspid.storage.jaws import (
     write_mesh,
 )
 from cuspid.storage.landmarks import MARKUPS_SUFFIX, LandmarkFile, LandmarkFrame, read_landmarks, write_landmarks
+from cuspid.storage.occlusal_views import read_occlusal_view, write_occlusal_view
 from cuspid.storage.panoramas import read_panorama, write_panorama
 from cuspid.storage.reconstructions import (
     read_depth_maps,
@@ -76,6 +77,7 @@ __all__ = [
     "read_labelled_mesh",
     "read_landmarks",
     "read_mesh",
+    "read_occlusal_view",
     "read_panorama",
     "read_poses",
     "read_reconstruction",
@@ -94,6 +96,7 @@ __all__ = [
     "write_json",
     "write_landmarks",
     "write_mesh",
+    "write_occlusal_view",
     "write_overlap",
     "write_panorama",
     "write_poses",

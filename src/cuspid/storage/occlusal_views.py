@@ -1,0 +1,44 @@
+"""A single shot of the true jaw from above: ``view.json``, ``picture.png`` and ``surface.npz`` in a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from cuspid.capture import read_image
+from cuspid.errors import InputError
+from cuspid.storage.captures import write_image
+from cuspid.storage.files import read_json, reading, whole_file, write_json
+from cuspid.trueness import OcclusalView
+
+
+def write_occlusal_view(folder: Path, view: OcclusalView) -> None:
+    """Write a single shot; ``view.json`` comes last, so that what has one is whole."""
+    write_image(folder / "picture.png", view.image)
+    with whole_file(folder / "surface.npz") as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, allow_pickle=False, labels=view.labels, height_mm=view.height_mm)
+    numbers = {name: getattr(view, name) for name in ("mm_per_px", "origin_px", "camera_height_mm")}
+    write_json(folder / "view.json", numbers)
+
+
+def read_occlusal_view(folder: Path) -> OcclusalView:
+    """Read what :func:`write_occlusal_view` wrote. Raises InputError where a file is missing or damaged."""
+    path = folder / "view.json"
+    if not path.exists():
+        raise InputError(f"{folder}: no single shot of the jaw in it; make the truth with cuspid film")
+    value = read_json(path)
+    try:
+        with np.load(folder / "surface.npz", allow_pickle=False) as arrays:
+            surface = {name: arrays[name] for name in ("labels", "height_mm")}
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        raise InputError(f"{folder / 'surface.npz'}: missing or damaged; run cuspid film again") from error
+    with reading(path):
+        return OcclusalView(
+            image=read_image(folder / "picture.png"),
+            mm_per_px=value["mm_per_px"],
+            origin_px=np.array(value["origin_px"], dtype=np.float64),
+            camera_height_mm=value["camera_height_mm"],
+            **surface,
+        )
