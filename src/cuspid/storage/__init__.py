@@ -50,6 +50,7 @@ from cuspid.storage.reconstructions import (
     write_reconstruction,
     write_trueness,
 )
+from cuspid.storage.sequences import read_sequence
 from cuspid.storage.shapes import read_shape_model, write_shape_model
 from cuspid.storage.tables import csv_table, write_table
 from cuspid.storage.videos import write_video
@@ -82,6 +83,7 @@ __all__ = [
     "read_poses",
     "read_reconstruction",
     "read_rig_config",
+    "read_sequence",
     "read_shape_model",
     "read_truth",
     "reading",

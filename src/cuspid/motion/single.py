@@ -1,0 +1,490 @@
+"""Where one hand-held camera was: features on contrast-normalised frames, COLMAP's incremental mapper, broken models
+joined again.
+
+Frames: as in :mod:`cuspid.reconstruction`, with a rig of one camera whose frame is that of the camera. One camera does
+not know the scale: lengths are in units of the model, not millimetres.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Mapping
+from collections.abc import Sequence as List
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+from jaxtyping import Float, Int, UInt8
+
+from cuspid.camera import Camera
+from cuspid.errors import ReconstructionError
+from cuspid.geometry import Rigid3
+from cuspid.motion.colmap import quiet, rigid_from_colmap
+from cuspid.motion.features import FeatureOptions, Features, Progress, detect
+from cuspid.motion.pairs import MatchingOptions, match_unguided
+from cuspid.panorama import FrameUse
+from cuspid.reconstruction import Reconstruction, Tracks
+from cuspid.rig import MountedCamera, Rig
+from cuspid.sequence import Sequence
+
+CAMERA = "camera"
+"""Name of the one camera in the rig."""
+
+_DARK, _BURNT = 16, 245
+"""Grey levels outside of which an image says nothing: noise below, burnt-out highlights above."""
+_BLACK = 24
+"""A frame is black where its 99th percentile lies below this level."""
+_SAME = 0.8
+"""Mean difference, in grey levels of eightfold smaller images, below which a frame repeats the one before."""
+_SMALLER = 8
+_WINDOW = 15
+"""Frames with whose sharpness that of a frame is compared."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SingleOptions:
+    """How the way of one camera is found."""
+
+    features: FeatureOptions = field(default_factory=lambda: FeatureOptions(count=2000, contrast=0.004))
+    """Keypoints of the contrast-normalised frames; plain enamel needs a low threshold."""
+    clahe_clip: float = 4.0
+    """Clip limit of the contrast normalisation (CLAHE)."""
+    clahe_tiles: int = 8
+    """Tiles of the contrast normalisation along each side."""
+    matching: MatchingOptions = field(default_factory=lambda: MatchingOptions(ratio=0.85))
+    """First matching, when nothing is known of the motion."""
+    steps: tuple[int, ...] = (1, 2, 3, 4, 6)
+    """A frame is matched with those so many frames later."""
+    bridge_steps: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 8, 10)
+    """Where the model broke: frames to match with instead, at a looser ratio."""
+    bridge_ratio: float = 0.95
+    """Ratio test of the matching where the model broke."""
+    error_px: float = 2.0
+    """Largest distance of a match from its epipolar line, px."""
+    minimum_matches: int = 12
+    """Fewest consistent matches that tie two frames, or a frame to the model."""
+    blurred_share: float = 0.4
+    """A frame with less than this share (0 to 1) of the sharpness of its neighbours is left out."""
+    field_of_view_deg: float = 60.0
+    """First guess of the horizontal angle of view where there is no calibration."""
+    seed: int = 0
+    """Of the random samples."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SingleMotion:
+    """What is known of the camera's way: one model, or several that nothing ties together."""
+
+    parts: tuple[Reconstruction, ...]
+    """Largest first; lengths in the model's units."""
+    frames: tuple[FrameUse, ...]
+    """Every frame of the sequence; used means that it is in one of the parts."""
+    self_calibrated: bool
+    """Whether the focal length was found from the images."""
+
+
+# --- frames ------------------------------------------------------------------------------------------------------
+
+
+def normalise_contrast(image: UInt8[np.ndarray, "h w 3"], options: SingleOptions) -> UInt8[np.ndarray, "h w"]:
+    """Grey image of even local contrast; noise in the dark and burnt-out highlights are levelled first."""
+    gray = np.clip(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), _DARK, _BURNT)
+    tiles = (options.clahe_tiles, options.clahe_tiles)
+    return np.asarray(cv2.createCLAHE(options.clahe_clip, tiles).apply(gray), dtype=np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """One frame at a glance."""
+
+    features: Features
+    small: Float[np.ndarray, "a b"]
+    brightness: float
+    sharpness: float
+
+
+def _look(image: UInt8[np.ndarray, "h w 3"], options: SingleOptions) -> _Look:
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    small = cv2.resize(gray, None, fx=1 / _SMALLER, fy=1 / _SMALLER, interpolation=cv2.INTER_AREA).astype(np.float64)
+    smooth = cv2.GaussianBlur(np.clip(gray, _DARK, _BURNT), (0, 0), 1.0).astype(np.float32)
+    lit = gray > _DARK
+    sharpness = float(np.abs(cv2.Laplacian(smooth, cv2.CV_32F))[lit].mean()) if lit.any() else 0.0
+    normal = normalise_contrast(image, options)
+    return _Look(
+        features=detect(np.dstack([normal] * 3), options.features),
+        small=small,
+        brightness=float(np.percentile(gray, 99)),
+        sharpness=sharpness,
+    )
+
+
+def _look_at_all(sequence: Sequence, options: SingleOptions, progress: Progress | None) -> list[_Look]:
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        looks = []
+        for look in pool.map(lambda index: _look(sequence.image(index), options), range(len(sequence))):
+            looks.append(look)
+            if progress is not None:
+                progress("features", len(looks), len(sequence))
+    return looks
+
+
+def _refusals(looks: List[_Look], names: List[str], options: SingleOptions) -> dict[int, str]:
+    """Why frames are left out before anything is matched, by index: black, blurred, or the same as another."""
+    reasons, last = {}, -1
+    sharpness = np.array([look.sharpness for look in looks])
+    for index, look in enumerate(looks):
+        near = sharpness[max(0, index - _WINDOW // 2) : index + _WINDOW // 2 + 1]
+        if look.brightness < _BLACK:
+            reasons[index] = "black"
+        elif look.sharpness < options.blurred_share * np.median(near):
+            reasons[index] = f"blurred: {look.sharpness / np.median(near):.0%} of the sharpness of its neighbours"
+        elif last >= 0 and np.abs(look.small - looks[last].small).mean() < _SAME:
+            reasons[index] = f"the same picture as {names[last]}"
+        else:
+            last = index
+    return reasons
+
+
+# --- matches -----------------------------------------------------------------------------------------------------
+
+Pairs = Mapping[tuple[int, int], Int[np.ndarray, "_ 2"]]
+"""Consistent matches (keypoints) by indices of frames."""
+
+
+def _colmap_camera(camera: Camera | None, size: tuple[int, int], options: SingleOptions) -> pycolmap.Camera:
+    """The calibrated camera, or one with a guessed focal length."""
+    width, height = size
+    if camera is None:
+        focal = Camera.from_field_of_view(width, height, options.field_of_view_deg).focal_px[0]
+        parameters = [focal, width / 2, height / 2]
+        return pycolmap.Camera(camera_id=1, model="SIMPLE_PINHOLE", width=width, height=height, params=parameters)
+    parameters = camera.parameters.tolist()
+    return pycolmap.Camera(
+        camera_id=1, model="OPENCV", width=width, height=height, params=parameters, has_prior_focal_length=True
+    )
+
+
+def _verify(
+    camera: pycolmap.Camera, one: Features, other: Features, matches: Int[np.ndarray, "k 2"], options: SingleOptions
+) -> pycolmap.TwoViewGeometry | None:
+    """Matches that agree with one relative motion, or None where there are too few."""
+    if len(matches) < options.minimum_matches:
+        return None
+    how = pycolmap.TwoViewGeometryOptions(min_num_inliers=options.minimum_matches)
+    how.ransac.max_error, how.ransac.random_seed = options.error_px, options.seed
+    how.ransac.min_num_trials, how.ransac.max_num_trials = 30, 300
+    found = pycolmap.estimate_calibrated_two_view_geometry(
+        camera, one.pixels, camera, other.pixels, matches.astype(np.uint32), how
+    )
+    return found if len(found.inlier_matches) >= options.minimum_matches else None
+
+
+def _tie(
+    features: Mapping[int, Features],
+    pairs: List[tuple[int, int]],
+    camera: pycolmap.Camera,
+    matching: MatchingOptions,
+    options: SingleOptions,
+    progress: Progress | None,
+) -> dict[tuple[int, int], pycolmap.TwoViewGeometry]:
+    """Verified matches of pairs of frames; pairs that have too few are not in it."""
+
+    def tie(pair: tuple[int, int]) -> pycolmap.TwoViewGeometry | None:
+        one, other = (features[index] for index in pair)
+        return _verify(camera, one, other, match_unguided(one, other, matching), options)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        found = {}
+        for done, (pair, geometry) in enumerate(zip(pairs, pool.map(tie, pairs), strict=True), start=1):
+            if geometry is not None:
+                found[pair] = geometry
+            if progress is not None:
+                progress("matching", done, len(pairs))
+    return found
+
+
+def _pairs_at(kept: List[int], steps: List[int]) -> list[tuple[int, int]]:
+    """Pairs of kept frames so many frames apart."""
+    return [(kept[i], kept[i + step]) for i in range(len(kept)) for step in steps if i + step < len(kept)]
+
+
+# --- mapping -----------------------------------------------------------------------------------------------------
+
+
+def _fill_database(
+    path: Path,
+    camera: pycolmap.Camera,
+    features: Mapping[int, Features],
+    ties: Mapping[tuple[int, int], pycolmap.TwoViewGeometry],
+) -> None:
+    """A COLMAP database with keypoints and verified matches; frame i is image i + 1."""
+    with pycolmap.Database.open(path) as database:
+        database.write_camera(camera, use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=1)
+        rig.add_ref_sensor(camera.sensor_id)
+        database.write_rig(rig, use_rig_id=True)
+        for index, found in features.items():
+            image = pycolmap.Image(f"{index:06d}", found.pixels, 1, index + 1)
+            database.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame(frame_id=index + 1, rig_id=1)
+            frame.add_data_id(image.data_id)
+            database.write_frame(frame, use_frame_id=True)
+            database.write_keypoints(index + 1, found.pixels.astype(np.float32))
+        for (one, other), geometry in ties.items():
+            database.write_two_view_geometry(one + 1, other + 1, geometry)
+
+
+def _mapper_options(calibrated: bool, options: SingleOptions) -> pycolmap.IncrementalPipelineOptions:
+    """COLMAP's mapper for short steps over a low relief, with few and noisy matches."""
+    how = pycolmap.IncrementalPipelineOptions(random_seed=options.seed, extract_colors=False, min_model_size=3)
+    how.ba_refine_focal_length = how.mapper.abs_pose_refine_focal_length = not calibrated
+    how.ba_refine_extra_params = how.mapper.abs_pose_refine_extra_params = False
+    how.mapper.init_min_num_inliers, how.mapper.init_min_tri_angle = 2 * options.minimum_matches, 5.0
+    how.mapper.abs_pose_min_num_inliers = options.minimum_matches
+    how.mapper.abs_pose_max_error, how.mapper.abs_pose_min_inlier_ratio = 3 * options.error_px, 0.15
+    how.mapper.filter_max_reproj_error = 1.5 * options.error_px
+    how.ba_local_max_refinements, how.ba_global_max_refinements = 1, 2
+    how.ba_global_frames_ratio, how.ba_global_points_ratio = 1.3, 1.4
+    return how
+
+
+def _map(
+    camera: pycolmap.Camera,
+    features: Mapping[int, Features],
+    ties: Mapping[tuple[int, int], pycolmap.TwoViewGeometry],
+    calibrated: bool,
+    options: SingleOptions,
+    progress: Progress | None,
+) -> list[pycolmap.Reconstruction]:
+    """COLMAP's models, largest first."""
+    placed = 0
+
+    def count() -> None:
+        nonlocal placed
+        placed = min(placed + 1, len(features))
+        if progress is not None:
+            progress("mapping", placed, len(features))
+
+    with tempfile.TemporaryDirectory() as folder, quiet():
+        database = Path(folder) / "database.db"
+        _fill_database(database, camera, features, ties)
+        models = pycolmap.incremental_mapping(
+            database,
+            folder,
+            Path(folder) / "sparse",
+            _mapper_options(calibrated, options),
+            next_image_callback=count,
+        )
+    if progress is not None:
+        progress("mapping", len(features), len(features))
+    return sorted(models.values(), key=lambda model: -int(model.num_reg_images()))
+
+
+# --- models as values --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """A model while it is joined with others: poses by index of frame, points, and rows (point, frame, keypoint)."""
+
+    poses: Mapping[int, Rigid3]
+    points: Float[np.ndarray, "p 3"]
+    seen: Int[np.ndarray, "o 3"]
+
+
+def _model_of(found: pycolmap.Reconstruction) -> _Model:
+    images = {identifier: found.images[identifier] for identifier in sorted(found.reg_image_ids())}
+    points: list[np.ndarray] = []
+    rows: list[tuple[int, int, int]] = []
+    for _, point in sorted(found.points3D.items()):
+        rows += [(len(points), each.image_id - 1, each.point2D_idx) for each in point.track.elements]
+        points.append(point.xyz)
+    return _Model(
+        {identifier - 1: rigid_from_colmap(image.cam_from_world()) for identifier, image in images.items()},
+        np.array(points, dtype=np.float64).reshape(-1, 3),
+        np.array(rows, dtype=np.int64).reshape(-1, 3),
+    )
+
+
+def similarity(
+    source: Float[np.ndarray, "n d"], target: Float[np.ndarray, "n d"]
+) -> tuple[float, Float[np.ndarray, "d d"], Float[np.ndarray, "d"]]:
+    """Scale, rotation and shift that bring source to target with the least squares (Umeyama 1991)."""
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    u, spread, vt = np.linalg.svd(b.T @ a)
+    signs = np.ones(len(spread))
+    signs[-1] = np.sign(np.linalg.det(u @ vt))
+    rotation = u * signs @ vt
+    scale = float(np.sum(spread * signs) / np.sum(a**2))
+    return scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
+
+
+def _same_points(one: _Model, other: _Model) -> Int[np.ndarray, "k 2"]:
+    """Points of two models that were seen as the same keypoint."""
+    where = {(frame, keypoint): point for point, frame, keypoint in one.seen.tolist()}
+    pairs = {
+        (where[frame, keypoint], point) for point, frame, keypoint in other.seen.tolist() if (frame, keypoint) in where
+    }
+    return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
+
+
+def _joined(one: _Model, other: _Model, least: int) -> _Model | None:
+    """Both models in the frame of the first, tied by the points that they share; None where those do not agree."""
+    same = _same_points(one, other)
+    for _ in range(3):
+        if len(same) < least:
+            return None
+        scale, rotation, shift = similarity(other.points[same[:, 1]], one.points[same[:, 0]])
+        errors = np.linalg.norm(scale * other.points[same[:, 1]] @ rotation.T + shift - one.points[same[:, 0]], axis=1)
+        same = same[errors <= max(3 * float(np.median(errors)), 1e-9)]
+    poses = {
+        frame: Rigid3(pose.rotation @ rotation.T, scale * pose.translation - pose.rotation @ rotation.T @ shift)
+        for frame, pose in other.poses.items()
+    }
+    moved = scale * other.points @ rotation.T + shift
+    fresh = other.seen[~np.isin(other.seen[:, 1], list(one.poses))]
+    seen = np.concatenate([one.seen, fresh + [len(one.points), 0, 0]])
+    return _Model({**poses, **one.poses}, np.concatenate([one.points, moved]), seen)
+
+
+def _join_all(models: List[_Model], least: int) -> list[_Model]:
+    """Models joined as long as any two share enough points; frames of a smaller one that a larger one has are its."""
+    parts: list[_Model] = []
+    for model in models:
+        for index, part in enumerate(parts):
+            joined = _joined(part, model, least)
+            if joined is not None:
+                parts[index] = joined
+                break
+        else:
+            parts.append(model)
+    return sorted(parts, key=lambda part: -len(part.poses))
+
+
+def _reconstruction(
+    model: _Model, camera: Camera, names: List[str], features: Mapping[int, Features]
+) -> Reconstruction:
+    """A model as the noun; points that fewer than two frames still see are left out."""
+    order = sorted(model.poses)
+    place = {frame: index for index, frame in enumerate(order)}
+    counts = np.bincount(model.seen[:, 0], minlength=len(model.points))
+    seen = model.seen[counts[model.seen[:, 0]] >= 2]
+    kept, point_index = np.unique(seen[:, 0], return_inverse=True)
+    colors = np.zeros((len(kept), 3), dtype=np.uint8)
+    colors[point_index] = np.array([features[frame].colors[keypoint] for _, frame, keypoint in seen.tolist()])
+    return Reconstruction(
+        rig=Rig({CAMERA: MountedCamera(camera, Rigid3.identity())}),
+        rig_from_world={names[frame]: model.poses[frame] for frame in order},
+        tracks=Tracks(
+            points=model.points[kept],
+            colors=colors,
+            point_index=point_index.astype(np.int64),
+            frame_index=np.array([place[frame] for frame in seen[:, 1].tolist()], dtype=np.int64),
+            camera_index=np.zeros(len(seen), dtype=np.int64),
+            pixels=np.array([features[frame].pixels[keypoint] for _, frame, keypoint in seen.tolist()]),
+        ),
+    )
+
+
+def _camera_of(found: pycolmap.Camera, given: Camera | None) -> Camera:
+    """The given calibration, or the focal length that the mapper found."""
+    if given is not None:
+        return given
+    focal, *centre = found.params
+    return Camera(
+        width=found.width,
+        height=found.height,
+        focal_px=np.array([focal, focal]),
+        principal_point_px=np.array(centre),
+    )
+
+
+# --- all of it ---------------------------------------------------------------------------------------------------
+
+
+def locate_single(
+    sequence: Sequence, options: SingleOptions | None = None, *, progress: Progress | None = None
+) -> SingleMotion:
+    """The way of the one camera that took a sequence.
+
+    Frames that are black, blurred or repeated are skipped; where the model breaks, the frames are matched again at more
+    distances and with a looser ratio, and models that share frames are joined. Raises ReconstructionError, naming
+    the frames, where nothing can be placed.
+    """
+    options = options or SingleOptions()
+    names = sequence.names
+    looks = _look_at_all(sequence, options, progress)
+    refused = _refusals(looks, names, options)
+    kept = [index for index in range(len(names)) if index not in refused]
+    _check_enough(kept, refused, names)
+    features = {index: looks[index].features for index in kept}
+    camera = _colmap_camera(sequence.camera, sequence.size, options)
+    ties = _tie(features, _pairs_at(kept, options.steps), camera, options.matching, options, progress)
+    calibrated = sequence.camera is not None
+    models = _map(camera, features, ties, calibrated, options, progress) if ties else []
+    if not models or models[0].num_reg_images() < len(kept):
+        looser = replace(options.matching, ratio=options.bridge_ratio)
+        again = _tie(features, _pairs_at(kept, options.bridge_steps), camera, looser, options, progress)
+        ties = {**again, **ties}
+        wider = _map(camera, features, ties, calibrated, options, progress) if ties else []
+        models = max(models, wider, key=lambda each: each[0].num_reg_images() if each else 0)
+    if not models:
+        raise ReconstructionError(_why_nothing(sequence, kept, features, ties))
+    parts = _join_all([_model_of(model) for model in models], options.minimum_matches)
+    refined = _camera_of(models[0].cameras[1], sequence.camera)
+    return SingleMotion(
+        parts=tuple(_reconstruction(part, refined, names, features) for part in parts),
+        frames=_uses(names, refused, parts, ties),
+        self_calibrated=not calibrated,
+    )
+
+
+def _check_enough(kept: List[int], refused: Mapping[int, str], names: List[str]) -> None:
+    """Raises ReconstructionError where fewer than two frames are left."""
+    if len(kept) >= 2:
+        return
+    reasons = sorted({reason.split(":")[0].split(" as ")[0] for reason in refused.values()})
+    raise ReconstructionError(
+        f"{len(refused)} of {len(names)} frames ({names[0]} to {names[-1]}) cannot be used: {', '.join(reasons)}; "
+        "film slowly, with light, and with the teeth in focus"
+    )
+
+
+def _why_nothing(
+    sequence: Sequence, kept: List[int], features: Mapping[int, Features], ties: Mapping[tuple[int, int], object]
+) -> str:
+    """What to tell a user whose frames could not be placed."""
+    names, counts = sequence.names, [len(features[index]) for index in kept]
+    span = f"{sequence.source}: frames {names[kept[0]]} to {names[kept[-1]]}"
+    if np.median(counts) < 50:
+        return f"{span} show too little detail ({np.median(counts):.0f} keypoints a frame): out of focus, or no teeth"
+    if not ties:
+        return (
+            f"{span} have nothing in common with each other; film the arch in one sweep, each frame over half the last"
+        )
+    return f"{span} overlap, but the camera did not move enough between them to tell depth; move it along the arch"
+
+
+def _uses(
+    names: List[str],
+    refused: Mapping[int, str],
+    parts: List[_Model],
+    ties: Mapping[tuple[int, int], object],
+) -> tuple[FrameUse, ...]:
+    """What became of every frame."""
+
+    def use(index: int, name: str) -> FrameUse:
+        if index in refused:
+            return FrameUse(name=name, used=False, reason=refused[index])
+        for part in parts:
+            if index in part.poses:
+                return FrameUse(name=name, used=True, inliers=int(np.sum(part.seen[:, 1] == index)))
+        tied = sum(index in pair for pair in ties)
+        reason = f"does not agree with the {tied} frames that it matches" if tied else "matches no other frame"
+        return FrameUse(name=name, used=False, reason=reason)
+
+    return tuple(use(index, name) for index, name in enumerate(names))

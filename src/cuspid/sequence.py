@@ -1,0 +1,46 @@
+"""A sequence: the frames of one hand-held camera, images on disk that are read when asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from cuspid.camera import Camera
+from cuspid.capture import read_image
+from cuspid.errors import InputError
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sequence:
+    """Images of one camera in the order in which they were taken."""
+
+    source: Path
+    """What the user gave: a folder, a video or a capture."""
+    paths: tuple[Path, ...] = field(repr=False)
+    """One image file a frame; their stems are the frames' names."""
+    size: tuple[int, int]
+    """Width and height of every frame, px."""
+    camera: Camera | None = None
+    """Calibration, or None where it is to be found from the images."""
+    working_distance_mm: float | None = None
+    """Nominal distance of the camera from the teeth, where the calibration says so."""
+    notes: tuple[str, ...] = ()
+    """What was found while reading, one line each."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the frames."""
+        return tuple(path.stem for path in self.paths)
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def image(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
+        """RGB image of a frame. Raises InputError where the file is missing, broken, or of another size."""
+        image = read_image(self.paths[index])
+        if image.shape[1::-1] != self.size:
+            raise InputError(f"{self.paths[index]}: changed its size while it was used; start again")
+        return image

@@ -1,0 +1,178 @@
+"""Sequences of one camera: a folder of images, a video file, or a capture with one camera; and its calibration."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
+from cuspid.capture import image_size
+from cuspid.errors import InputError
+from cuspid.rig import Handpiece
+from cuspid.sequence import Sequence
+from cuspid.storage.captures import IMAGE_SUFFIXES, read_capture, write_image
+from cuspid.storage.files import finished, read_json, reading
+from cuspid.storage.handpieces import _camera_from_colmap, camera_from_json, read_handpiece
+
+VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm")
+MOST_FRAMES = 300
+"""A longer video is thinned evenly to about as many frames."""
+
+DecodeProgress = Callable[[int, int], None]
+"""Told how many frames of a video were read and how many there are."""
+
+
+def read_sequence(
+    source: Path, decoded: Path, *, calibration: Path | None = None, progress: DecodeProgress = lambda done, total: None
+) -> Sequence:
+    """Frames of one camera from a folder of images, a video or a capture.
+
+    A video is decoded into the folder ``decoded``. Raises InputError where there are fewer than two frames, a frame is
+    truncated or of another size than the others, or the calibration belongs to another size.
+    """
+    if source.is_dir():
+        found = _of_capture(source) if (source / "images").is_dir() else _of_folder(source)
+    elif source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():
+        found = _of_video(source, decoded, progress)
+    elif source.is_file():
+        raise InputError(f"{source}: neither a folder of images nor a video ({', '.join(VIDEO_SUFFIXES)})")
+    else:
+        raise InputError(f"{source}: no such folder or video")
+    return found if calibration is None else _calibrated(found, calibration)
+
+
+def _of_folder(folder: Path) -> Sequence:
+    paths = sorted(path for path in finished(folder) if path.suffix.lower() in IMAGE_SUFFIXES)
+    return Sequence(source=folder, paths=tuple(paths), size=_common_size(folder, paths))
+
+
+def _of_capture(folder: Path) -> Sequence:
+    capture = read_capture(folder)
+    names = capture.handpiece.rig.names
+    if len(names) > 1:
+        raise InputError(
+            f"{folder}: a capture of {len(names)} cameras; give the images of one, {folder / 'images' / names[0]}"
+        )
+    paths = [capture.image_path(frame, names[0]) for frame in capture.frames]
+    found = Sequence(source=folder, paths=tuple(paths), size=_common_size(folder, paths))
+    return _with_handpiece(found, capture.handpiece, folder / "handpiece.json")
+
+
+def _common_size(folder: Path, paths: list[Path]) -> tuple[int, int]:
+    """Raises InputError where there are fewer than two frames or they are not of one size."""
+    if len(paths) < 2:
+        raise InputError(f"{folder}: {len(paths)} image(s); a panorama needs a sequence of overlapping frames")
+    sizes = {path: image_size(path) for path in paths}
+    usual = Counter(sizes.values()).most_common(1)[0][0]
+    odd = [path for path, size in sizes.items() if size != usual]
+    if odd:
+        raise InputError(
+            f"{odd[0]}: {sizes[odd[0]][0]} x {sizes[odd[0]][1]} px, but most frames have {usual[0]} x {usual[1]} px "
+            f"({len(odd)} of {len(paths)} differ); take them out, or stitch each size for itself"
+        )
+    return usual
+
+
+def _of_video(video: Path, decoded: Path, progress: DecodeProgress) -> Sequence:
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    stream = cv2.VideoCapture(str(video))
+    announced = int(stream.get(cv2.CAP_PROP_FRAME_COUNT))
+    step = max(1, -(-announced // MOST_FRAMES))
+    paths, number = [], 0
+    while stream.grab():
+        if number % step == 0:
+            path = decoded / f"{number:05d}.png"
+            ok, image = stream.retrieve()
+            if not ok:
+                break
+            if not path.exists():
+                write_image(path, cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+            paths.append(path)
+        number += 1
+        progress(number, max(announced, number))
+    stream.release()
+    if len(paths) < 2:
+        raise InputError(f"{video}: {len(paths)} frame(s) could be decoded; not a video, truncated, or of one frame")
+    notes = []
+    if number < announced - 1:
+        notes.append(f"{video.name}: truncated, {number} of {announced} frames could be decoded; the rest is missing")
+    if step > 1:
+        notes.append(f"{video.name}: {number} frames; every {step}th is used")
+    return Sequence(source=video, paths=tuple(paths), size=_common_size(decoded, paths), notes=tuple(notes))
+
+
+# --- calibration ---------------------------------------------------------------------------------------------------
+
+
+def _calibrated(sequence: Sequence, path: Path) -> Sequence:
+    """With the calibration of a file: handpiece.json or rig_config.json of one camera, a camera alone as JSON, COLMAP's
+    cameras.txt, or OpenCV's YAML."""
+    if path.suffix.lower() in (".yml", ".yaml", ".xml"):
+        return _with_camera(sequence, _read_opencv(path), path)
+    if path.suffix.lower() == ".txt":
+        return _with_camera(sequence, _read_cameras_txt(path), path)
+    value = read_json(path)
+    if isinstance(value, dict) and "focal_px" in value:
+        with reading(path):
+            return _with_camera(sequence, camera_from_json(value), path)
+    return _with_handpiece(sequence, read_handpiece(path), path)
+
+
+def _with_handpiece(sequence: Sequence, handpiece: Handpiece, path: Path) -> Sequence:
+    cameras = list(handpiece.rig.cameras.values())
+    if len(cameras) > 1:
+        raise InputError(f"{path}: {len(cameras)} cameras; the calibration of one is needed")
+    found = _with_camera(sequence, cameras[0].camera, path)
+    return replace(found, working_distance_mm=handpiece.working_distance_mm)
+
+
+def _with_camera(sequence: Sequence, camera: Camera, path: Path) -> Sequence:
+    if (camera.width, camera.height) != sequence.size:
+        raise InputError(
+            f"{path}: calibration of {camera.width} x {camera.height} px, but the frames have {sequence.size[0]} x "
+            f"{sequence.size[1]} px; give the calibration that belongs to them, or none"
+        )
+    return replace(sequence, camera=camera)
+
+
+def _read_opencv(path: Path) -> Camera:
+    """OpenCV's calibration: camera_matrix, distortion_coefficients (k1 k2 p1 p2 [k3 = 0]), image_width and _height."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    except (cv2.error, SystemError) as error:
+        raise InputError(f"{path}: not OpenCV's calibration") from error
+    matrix, distortion = file.getNode("camera_matrix").mat(), file.getNode("distortion_coefficients").mat()
+    width, height = (int(file.getNode(name).real()) for name in ("image_width", "image_height"))
+    if matrix is None or matrix.shape != (3, 3) or not width or not height:
+        raise InputError(f"{path}: needs camera_matrix, image_width and image_height, as OpenCV's calibration writes")
+    coefficients = np.zeros(5) if distortion is None else np.pad(distortion.ravel().astype(np.float64), (0, 5))
+    if np.any(coefficients[4:]):
+        raise InputError(f"{path}: more than four distortion coefficients; calibrate with k1, k2, p1, p2 alone")
+    return Camera(
+        width=width,
+        height=height,
+        focal_px=np.array([matrix[0, 0], matrix[1, 1]]),
+        principal_point_px=matrix[:2, 2] + OPENCV_PIXEL_OFFSET,
+        distortion=coefficients[:4],
+    )
+
+
+def _read_cameras_txt(path: Path) -> Camera:
+    """COLMAP's cameras.txt with one camera: id, model, width, height, parameters."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    with reading(path):
+        rows = [line.split() for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
+        if len(rows) != 1:
+            raise InputError(f"{path}: {len(rows)} cameras; the calibration of one is needed")
+        _, model, width, height, *parameters = rows[0]
+        entry = {"camera_model_name": model, "camera_params": [float(value) for value in parameters]}
+        return _camera_from_colmap(entry, (int(width), int(height)))
