@@ -188,7 +188,7 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
         if needed > most:
             raise InputError(
                 f"scan path: with {frames} frames consecutive images overlap by only {path.minimum_overlap:.0%}, less "
-                f"than {options.minimum_overlap:.0%}; about {needed} frames would be needed"
+                f"than {options.minimum_overlap:.0%}; about {needed} would be needed: give --frames or a shorter path"
             )
         frames = needed
 
