@@ -5,16 +5,21 @@ import json
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from cuspid import storage
 from cuspid.cli import main
 from cuspid.errors import InputError
+from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DesignOptions, essential_four, six_cameras, twelve_cameras
 from cuspid.mesh import Mesh
+from cuspid.pipeline import SimulationOptions
 from cuspid.simulation.scan_path import ScanPathOptions
 from cuspid.studies.design_comparison import (
     ComparisonOptions,
+    compare_designs,
     comparison_cases,
     comparison_rows,
     data_mb,
@@ -23,11 +28,14 @@ from cuspid.studies.design_comparison import (
     load_design,
     markdown,
     open_surfaces,
+    prepare_comparison,
     section_outlines,
     tooth_completeness,
     way_mm,
+    with_smaller_images,
 )
 from cuspid.studies.grid import Case, Outcome
+from cuspid.studies.trial import TrialOptions
 
 TOOTH = 46
 OPTIONS = ComparisonOptions(samples=20_000)
@@ -107,6 +115,20 @@ def test_way_and_data_follow_from_the_frames():
     assert data_mb(handpiece, 4) == pytest.approx(4 * 4 * 200 * 100 / 1e6)
 
 
+@given(scale=st.floats(0.1, 1.0))
+def test_smaller_images_show_the_same(scale):
+    handpiece = twelve_cameras(DesignOptions(width_px=400, height_px=300))
+    smaller = with_smaller_images(handpiece, scale)
+    for name, mounted in handpiece.rig.cameras.items():
+        before, after = mounted.camera, smaller.rig[name].camera
+        corners = np.array([[0.0, 0.0], [0.3, 0.8], [1.0, 1.0]])
+        np.testing.assert_allclose(
+            before.rays(corners * [before.width, before.height]), after.rays(corners * [after.width, after.height])
+        )
+        assert after.width == round(400 * scale)
+    assert smaller.lights.keys() == handpiece.lights.keys()
+
+
 def test_only_turned_designs_are_turned_and_cheap_scans_come_first():
     options = ComparisonOptions(designs=("twelve", "six"), turns=(1, 3), seeds=(0, 1))
     cases = comparison_cases(options, dict(map(load_design, options.designs)))
@@ -151,14 +173,22 @@ def test_turns_are_enough_where_completeness_stops_to_grow():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"turns": (2,)}, {"designs": ()}, {"seeds": (1, 1)}, {"frame_rate_hz": 0.0}, {"minimum_openness": 1.0}]
+    "wrong",
+    [
+        {"turns": (2,)},
+        {"designs": ()},
+        {"seeds": (1, 1)},
+        {"frame_rate_hz": 0.0},
+        {"minimum_openness": 1.0},
+        {"image_scale": 0.0},
+    ],
 )
 def test_wrong_options_are_refused(wrong):
     with pytest.raises(InputError):
         ComparisonOptions(**wrong)
 
 
-# --- the verb ---------------------------------------------------------------------------------------------------------
+# --- whole studies ----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -170,24 +200,44 @@ def files(coarse_phantom, tmp_path_factory):
     return folder
 
 
-def test_the_verb_compares_goes_on_and_keeps_what_is_done(files, tmp_path, capsys):
+def test_a_scan_is_simulated_reconstructed_and_judged(files, tmp_path):
+    options = ComparisonOptions(designs=(str(files / "tiny.json"),), jaws=(str(files / "jaw.ply"),), samples=5000)
+    trial = TrialOptions(
+        simulation=SimulationOptions(supersampling=1, path=ScanPathOptions(frames=5, length_mm=4.0)),
+        evaluation=EvaluationOptions(samples=20_000),
+    )
+    (done,) = compare_designs(tmp_path, options, trial, workers=1)
+    assert done.failure is None
+    figures = done.figures
+    assert (figures["cameras"], figures["frames"], figures["images"]) == (4, 5, 20)
+    assert 75 < figures["minimum_overlap_pct"] < 100
+    assert figures["data_mb"] == pytest.approx(20 * 140 * 140 / 1e6)
+    assert 3 < figures["way_mm"] < 6
+    assert 0 < figures["tooth_mean_abs_um"] < 30
+    # What one exposure saw with two cameras, and little more, is there.
+    assert 60 < figures["occlusal_within_100_um_pct"] <= 100
+    assert 20 < figures["tooth_within_50_um_pct"] <= figures["tooth_within_100_um_pct"]
+    assert figures["tooth_within_100_um_pct"] < figures["tooth_seen_pct"] + 15
+
+
+def test_the_verb_shows_what_is_done_without_scanning_again(files, tmp_path, capsys):
     out = tmp_path / "comparison"
+    shares = {f"{name}_{what}_pct": 90.0 for name in ("tooth", "buccal") for what in ("seen", "within_50_um")}
+    for turns in (1, 3):
+        figures = outcome(turns).figures | shares | {"images": 40 * turns, "cameras": 4}
+        case = {"jaw": "jaw", "tooth": TOOTH, "design": "tiny", "turns": turns, "seed": 0}
+        entry = {"parameters": case, "figures": figures, "failure": None}
+        storage.write_json(out / "cases" / f"jaw_{TOOTH}_tiny_{turns}_0.json", entry)
     compare = ["compare", "--jaws", str(files / "jaw.ply"), "--designs", str(files / "tiny.json"), "--turned", "tiny"]
-    compare += ["--out", str(out), "--workers", "1", "--samples", "5000"]
-    main([*compare, "--turns", "1"])
-    (case,) = (out / "cases").iterdir()
-    figures = json.loads(case.read_text())["figures"]
-    assert figures["images"] == 4 * figures["frames"]
-    assert figures["minimum_overlap_pct"] > 75
-    assert 0 < figures["tooth_mean_abs_um"] < 60
-    assert 0 < figures["tooth_within_50_um_pct"] <= figures["tooth_within_100_um_pct"] <= 100
-    assert figures["tooth_within_100_um_pct"] < figures["tooth_seen_pct"] + 10
-    for name in ("results.csv", "comparison.json", "comparison.md", "comparison.png", "surfaces.png"):
-        assert (out / name).stat().st_size > 100
-    before = case.stat().st_mtime_ns
-    main([*compare, "--turns", "1"])
-    assert case.stat().st_mtime_ns == before
-    assert "tiny" in capsys.readouterr().out
+    main([*compare, "--turns", "1", "3", "--out", str(out)])
+    printed = capsys.readouterr()
+    assert "What each needs" in printed.out
+    assert "stops growing at 1 turns" in printed.err
+    assert len((out / "results.csv").read_text().splitlines()) == 3
+    assert len(json.loads((out / "comparison.json").read_text())["rows"]) == 2
+    assert (out / "comparison.md").read_text().count("| jaw | 46 | tiny |") == 4
+    for name in ("comparison.png", "surfaces.png"):
+        assert (out / name).read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(
@@ -210,8 +260,6 @@ def test_what_cannot_be_compared_is_refused_in_one_line(tmp_path, capsys, argume
 
 
 def test_another_file_of_the_same_name_is_refused(files, tmp_path):
-    from cuspid.studies.design_comparison import prepare_comparison
-
     design = tmp_path / "tiny.json"
     design.write_bytes((files / "tiny.json").read_bytes())
     options = ComparisonOptions(designs=(str(design),), jaws=(str(files / "jaw.ply"),), tooth=(TOOTH,))

@@ -37,6 +37,9 @@ from cuspid.studies.design_comparison import (
 from cuspid.studies.grid import Outcome
 from cuspid.studies.trial import TrialOptions
 
+CASE_OPTIONS = ("edge_mm", "image_scale", "minimum_openness", "samples", "thickness_mm")
+"""Options that a scan depends on: with others its results cannot be kept."""
+
 
 def compare(
     *,
@@ -65,7 +68,7 @@ def compare(
     trial = TrialOptions(simulation=simulation, reconstruction=reconstruction)
     settings = {
         "trial": trial,
-        **{name: getattr(options, name) for name in ("edge_mm", "minimum_openness", "samples", "thickness_mm")},
+        **{name: getattr(options, name) for name in CASE_OPTIONS},
     }
     with storage.claimed_folder(out, "compare", settings, {}), show_progress() as progress:
         outcomes = compare_designs(

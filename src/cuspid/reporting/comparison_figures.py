@@ -9,19 +9,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.ticker import NullFormatter
+from numpy.typing import NDArray
 
 from cuspid.storage import whole_file
 
 _INK, _GAP, _TOOTH = "#333333", "#c8501e", "#f3ead9"
 _COLOURS = ("#3b7dd8", "#c8860a", "#3fa66b", "#8e5bb5", "#b8405e", "#5a6872", "#2a9d9d", "#8a6d3b")
+_SHARES = LinearSegmentedColormap.from_list("shares", ["#f08a6b", "#fbe7a8", "#9fd8a4"])
+"""From little to all."""
 _TOOTH_MM = (9.0, 7.0)
 """Width and height of the drawn tooth."""
 _TICKS = (50, 100, 200, 300, 500, 1000, 2000, 3000)
@@ -57,33 +61,38 @@ def save_comparison_picture(
     ``gap_mm``: room between the jaws, drawn over the sections.
     """
     colours = {name: _COLOURS[index % len(_COLOURS)] for index, name in enumerate(sections)}
-    figure = _figure(max(9.0, 3.6 * max(len(panels), 2)), 10.6)
-    _draw_sections(figure, sections, colours, gap_mm)
-    for column, (name, curves) in enumerate(panels.items()):
-        complete, error = (figure.add_subplot(3, len(panels), row * len(panels) + column + 1) for row in (1, 2))
+    figure = _figure(max(9.0, 3.3 * len(panels)), 9.4)
+    halves: NDArray[np.object_] = np.asarray(figure.subfigures(2, 1, height_ratios=(1.0, 2.6)))
+    above, below = halves
+    above.suptitle(f"{title}\n", x=0.01, ha="left", fontsize=14, color=_INK, fontweight="bold")
+    _draw_sections(above.subplots(1, len(sections), squeeze=False)[0], sections, colours, gap_mm)
+    places = below.subplots(2, len(panels), squeeze=False)
+    for (complete, error), (name, curves) in zip(places.T, panels.items(), strict=True):
         for design, curve in curves.items():
-            _draw_curve(complete, curve.images, curve.complete_pct, curve.turns, colours[design], design)
-            _draw_curve(error, curve.images, curve.error_um, curve.turns, colours[design], design)
+            _draw_curve(complete, curve.images, curve.complete_pct, curve.turns, colours[design])
+            _draw_curve(error, curve.images, curve.error_um, curve.turns, colours[design])
         complete.set_title(name, loc="left", fontsize=12, color=_INK)
-        _label_images(complete, f"tooth within {within_um} µm / %" if column == 0 else "")
-        _label_images(error, "mean deviation of the tooth / µm" if column == 0 else "")
         error.set_ylim(bottom=0)
-        error.set_xlabel("images", color=_INK)
-    handles, labels = figure.axes[len(sections)].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=min(6, len(labels)), frameon=False, fontsize=10)
-    figure.text(0.02, 0.975, title, fontsize=14, color=_INK, va="center", fontweight="bold")
-    figure.tight_layout(rect=(0, 0.04, 1, 0.96))
+        error.set_xlabel("images (at the points: turns)", color=_INK)
+        for axes in (complete, error):
+            _label_images(axes)
+    places[0, 0].set_ylabel(f"tooth within {within_um} µm / %", color=_INK)
+    places[1, 0].set_ylabel("mean deviation of the tooth / µm", color=_INK)
+    handles = [Line2D([], [], color=colour, marker="o", label=name) for name, colour in colours.items()]
+    below.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False, fontsize=10)
     _save(figure, path)
 
 
 def _draw_sections(
-    figure: Figure, sections: Mapping[str, Sequence[Float[np.ndarray, "n 2"]]], colours: Mapping[str, str], gap: float
+    places: Sequence[Axes],
+    sections: Mapping[str, Sequence[Float[np.ndarray, "n 2"]]],
+    colours: Mapping[str, str],
+    gap: float,
 ) -> None:
     """Side by side, to one scale."""
     points = np.concatenate([outline for outlines in sections.values() for outline in outlines])
     half, top = np.abs(points[:, 0]).max() + 1, max(gap, points[:, 1].max()) + 2
-    for column, (name, outlines) in enumerate(sections.items(), start=1):
-        axes = figure.add_subplot(3, len(sections), column)
+    for axes, (name, outlines) in zip(places, sections.items(), strict=True):
         width, height = _TOOTH_MM
         axes.add_patch(Polygon(_rounded_box(width, height), facecolor=_TOOTH, edgecolor=_INK, linewidth=0.8))
         for outline in outlines:
@@ -105,9 +114,9 @@ def _rounded_box(width: float, height: float) -> Float[np.ndarray, "n 2"]:
 
 
 def _draw_curve(
-    axes: Axes, images: Sequence[float], values: Sequence[float], turns: Sequence[int], colour: str, name: str
+    axes: Axes, images: Sequence[float], values: Sequence[float], turns: Sequence[int], colour: str
 ) -> None:
-    axes.plot(images, values, "-o", color=colour, markersize=5, linewidth=1.4, label=name)
+    axes.plot(images, values, "-o", color=colour, markersize=5, linewidth=1.4)
     if len(turns) > 1:
         for number, x, y in zip(turns, images, values, strict=True):
             axes.annotate(
@@ -115,13 +124,12 @@ def _draw_curve(
             )
 
 
-def _label_images(axes: Axes, label: str) -> None:
+def _label_images(axes: Axes) -> None:
     axes.set_xscale("log")
     low, high = axes.get_xlim()
     axes.set_xticks([tick for tick in _TICKS if low <= tick <= high], minor=False)
     axes.set_xticklabels([str(tick) for tick in _TICKS if low <= tick <= high])
     axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_ylabel(label, color=_INK)
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(color="#dddddd", linewidth=0.6)
     axes.set_axisbelow(True)
@@ -139,25 +147,29 @@ def save_surface_shares_picture(
         name: list(dict.fromkeys(s for shares in rows.values() for s in shares)) for name, rows in panels.items()
     }
     most = max(len(rows) for rows in panels.values())
-    figure = _figure(2.0 + 1.2 * sum(map(len, columns.values())) * 0.62 + 1.2 * len(panels), 1.9 + 0.34 * most)
-    places = figure.subplots(1, len(panels), squeeze=False, width_ratios=[len(c) for c in columns.values()])[0]
-    for axes, (name, rows) in zip(places, panels.items(), strict=True):
+    lines = -(-len(panels) // 2)
+    widths = [max(map(len, list(columns.values())[k::2]), default=1) for k in range(min(2, len(panels)))]
+    figure = _figure(1.6 * len(widths) + 0.72 * sum(widths), 0.6 + lines * (1.2 + 0.3 * most))
+    figure.suptitle(f"{title}\n", x=0.01, ha="left", fontsize=13, color=_INK, fontweight="bold")
+    places = figure.subplots(lines, len(widths), squeeze=False, width_ratios=widths).ravel()
+    for axes in places[len(panels) :]:
+        axes.set_axis_off()
+    for axes, (name, rows) in zip(places, panels.items(), strict=False):
         values = np.array([[shares.get(s, np.nan) for s in columns[name]] for shares in rows.values()])
-        axes.imshow(values, cmap=matplotlib.colormaps["RdYlGn"], vmin=60, vmax=100, aspect="auto")
+        axes.imshow(values, cmap=_SHARES, vmin=60, vmax=100, aspect="auto")
         for (row, column), value in np.ndenumerate(values):
             if np.isfinite(value):
                 axes.text(column, row, f"{value:.1f}", ha="center", va="center", fontsize=9, color=_INK)
-        axes.set_xticks(range(len(columns[name])), columns[name], rotation=35, ha="right", color=_INK)
+        axes.set_xticks(range(len(columns[name])), columns[name], color=_INK, fontsize=9)
         axes.set_yticks(range(len(rows)), list(rows), color=_INK)
+        axes.tick_params(length=0)
         axes.set_title(name, loc="left", fontsize=12, color=_INK)
         axes.spines[:].set_visible(False)
-    figure.text(0.01, 0.96, title, fontsize=13, color=_INK, va="center", fontweight="bold")
-    figure.tight_layout(rect=(0, 0, 1, 0.93))
     _save(figure, path)
 
 
 def _figure(width_in: float, height_in: float) -> Figure:
-    figure = Figure(figsize=(width_in, height_in), dpi=84, facecolor="white")
+    figure = Figure(figsize=(width_in, height_in), dpi=84, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
