@@ -81,3 +81,27 @@ class Panorama:
     def pixels_from_world(self, world: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
         """Inverse of :meth:`world_from_pixels`."""
         return world / (self.mm_per_px or 1.0) * [1, -1] + self.origin_px
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Strip:
+    """A panorama unrolled along the arch curve: columns run along it, rows across, the cheek's side at the top."""
+
+    image: UInt8[np.ndarray, "h w 3"]
+    """RGB; black where nothing was seen."""
+    covered: Bool[np.ndarray, "h w"]
+    """Where something was seen."""
+    zone: Int16[np.ndarray, "h w"]
+    """What each pixel shows: an index into `ZONES`, -1 for none."""
+    curve: Float[np.ndarray, "w 2"]
+    """World (x, y) of the arch curve at each column, mm (px of the panorama where the scale is unknown)."""
+    mm_per_px: float | None
+    """Millimetres a pixel along the curve and across it; None where nothing told the scale."""
+
+    def __post_init__(self) -> None:
+        for name in ("image", "covered", "zone", "curve"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+
+ZONES = ("buccal", "occlusal", "lingual")
+"""Sides of the teeth, as :class:`Strip` names them."""

@@ -44,8 +44,10 @@ from cuspid.mesh import Mesh
 from cuspid.motion.colmap import locate_with_colmap, read_model, write_model
 from cuspid.motion.location import MotionOptions
 from cuspid.motion.location import locate as locate_with_rig
+from cuspid.motion.single import SingleOptions, locate_single
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece
+from cuspid.sequence import Sequence as FrameSequence
 from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.blender import render_with_blender
 from cuspid.simulation.free_path import FreePathOptions, plan_free_path
@@ -54,6 +56,7 @@ from cuspid.simulation.raycast import Scene, render_capture
 from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path, steady_poses
 from cuspid.stereo.between import BetweenOptions, measure_between
 from cuspid.stereo.matching import DepthEstimator, StereoOptions
+from cuspid.stitching.ortho import OrthoOptions, Stitched, orthophoto
 from cuspid.surface.cleaning import CleaningOptions, clean
 from cuspid.surface.fusion import FusionOptions
 from cuspid.surface.fusion import fuse as fuse_depth_maps
@@ -252,7 +255,8 @@ def film(
     capture, truth = take_images(jaw, handpiece, poses, folder, options, progress=progress)
     for done, (name, height_mm) in enumerate(SINGLE_SHOTS.items(), start=1):
         if not (folder / "truth" / name / "view.json").exists():
-            view = render_occlusal_view(_scene(truth, options), OcclusalOptions(camera_height_mm=height_mm))
+            scene = _scene(truth, dataclasses.replace(options, supersampling=max(2, options.supersampling)))
+            view = render_occlusal_view(scene, OcclusalOptions(camera_height_mm=height_mm))
             storage.write_occlusal_view(folder / "truth" / name, view)
         progress("single shots", done, len(SINGLE_SHOTS))
     return capture, truth
@@ -473,6 +477,37 @@ def _moved(handpiece: Handpiece, reconstruction: Reconstruction, tolerance_px: f
         if np.abs(shift).max() > tolerance_px:
             return True
     return False
+
+
+# --- Panorama: sees images and calibration alone -------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class StitchOptions(OrthoOptions):
+    """How the frames of one hand-held camera become a panorama."""
+
+    method: Literal["ortho"] = "ortho"
+    """ortho: frames located by structure from motion and rectified on the surface."""
+    motion: SingleOptions = field(default_factory=SingleOptions)
+    """Where the camera was."""
+
+
+def stitch(sequence: FrameSequence, options: StitchOptions, *, progress: Progress = silent) -> tuple[Stitched, ...]:
+    """The panorama of an arch from the frames of one camera; several parts where the sequence broke, largest first.
+
+    Raises ReconstructionError, naming the frames, where nothing can be placed.
+    """
+    motion = locate_single(sequence, options.motion, progress=progress)
+    notes = (*sequence.notes, *motion.notes)
+    parts: list[Stitched] = []
+    for number, located in enumerate(motion.parts, start=1):
+        frames = motion.frames_of(number - 1)
+        part = orthophoto(sequence, located, frames, options, progress=progress)
+        numbered = dataclasses.replace(
+            part.panorama, part=number, parts=len(motion.parts), notes=(*notes, *part.panorama.notes)
+        )
+        parts.append(dataclasses.replace(part, panorama=numbered))
+    return tuple(parts)
 
 
 # --- Evaluation ----------------------------------------------------------------------------------------------------

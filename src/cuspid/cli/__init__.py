@@ -14,6 +14,7 @@ from cuspid.cli.forecasts import optics, precision, visibility
 from cuspid.cli.handpieces import design, handpiece
 from cuspid.cli.jaws import box, phantom, prepare
 from cuspid.cli.mouth import mouth
+from cuspid.cli.panorama import stitch
 from cuspid.cli.scan import evaluate, reconstruct, run, simulate
 from cuspid.cli.shared import console
 from cuspid.cli.studies import sweep
@@ -39,6 +40,7 @@ COMMANDS: Mapping[str, Callable[..., Any]] = {
     "film": film,
     "reconstruct": reconstruct,
     "evaluate": evaluate,
+    "stitch": stitch,
 }
 
 

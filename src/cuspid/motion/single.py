@@ -83,8 +83,17 @@ class SingleMotion:
     """Largest first; lengths in the model's units."""
     frames: tuple[FrameUse, ...]
     """Every frame of the sequence; used means that it is in one of the parts."""
-    self_calibrated: bool
-    """Whether the focal length was found from the images."""
+    notes: tuple[str, ...] = ()
+    """What a user must know of it, one line each."""
+
+    def frames_of(self, part: int) -> tuple[FrameUse, ...]:
+        """Every frame of the sequence as one part sees it; those of other parts are not used."""
+        mine = set(self.parts[part].frames)
+        elsewhere = {name: n + 1 for n, other in enumerate(self.parts) for name in other.frames if name not in mine}
+        return tuple(
+            replace(frame, used=False, reason=f"in part {elsewhere[frame.name]}") if frame.name in elsewhere else frame
+            for frame in self.frames
+        )
 
 
 # --- frames ------------------------------------------------------------------------------------------------------
@@ -439,8 +448,21 @@ def locate_single(
     return SingleMotion(
         parts=tuple(_reconstruction(part, refined, names, features) for part in parts),
         frames=_uses(names, refused, parts, ties),
-        self_calibrated=not calibrated,
+        notes=_notes(refined, calibrated, parts),
     )
+
+
+def _notes(camera: Camera, calibrated: bool, parts: List[_Model]) -> tuple[str, ...]:
+    notes = []
+    if not calibrated:
+        notes.append(
+            f"self-calibrated: focal length {camera.focal_px[0]:.0f} px found from the images, no lens distortion; "
+            "give a calibration for true lengths"
+        )
+    if len(parts) > 1:
+        sizes = ", ".join(str(len(part.poses)) for part in parts)
+        notes.append(f"the sequence broke into {len(parts)} parts of {sizes} frames that nothing ties together")
+    return tuple(notes)
 
 
 def _check_enough(kept: List[int], refused: Mapping[int, str], names: List[str]) -> None:

@@ -39,7 +39,7 @@ from cuspid.storage.jaws import (
 )
 from cuspid.storage.landmarks import MARKUPS_SUFFIX, LandmarkFile, LandmarkFrame, read_landmarks, write_landmarks
 from cuspid.storage.occlusal_views import read_occlusal_view, write_occlusal_view
-from cuspid.storage.panoramas import read_panorama, write_panorama
+from cuspid.storage.panoramas import read_panorama, write_panorama, write_strip
 from cuspid.storage.reconstructions import (
     read_depth_maps,
     read_poses,
@@ -105,6 +105,7 @@ __all__ = [
     "write_reconstruction",
     "write_rig_config",
     "write_shape_model",
+    "write_strip",
     "write_table",
     "write_trueness",
     "write_truth",

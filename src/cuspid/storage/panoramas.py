@@ -14,9 +14,10 @@ from zipfile import BadZipFile
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 
 from cuspid.errors import InputError, OutputError
-from cuspid.panorama import FrameUse, Panorama
+from cuspid.panorama import ZONES, FrameUse, Panorama, Strip
 from cuspid.storage.files import read_json, reading, whole_file, write_bytes, write_json
 from cuspid.storage.tables import write_table
 
@@ -26,14 +27,11 @@ _HEADER = ("method", "mm_per_px", "origin_px", "part", "parts", "notes")
 def write_panorama(folder: Path, panorama: Panorama) -> None:
     """Write a panorama into a folder. Raises OutputError."""
     rgba = np.dstack([panorama.image, np.where(panorama.covered, 255, 0).astype(np.uint8)])
-    ok, encoded = cv2.imencode(".png", cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA))
-    if not ok:
-        raise OutputError(f"{folder / 'panorama.png'}: the image could not be encoded")
     write_table(folder / "frames.csv", [dataclasses.asdict(frame) for frame in panorama.frames])
     write_bytes(folder / "panorama.pgw", world_file(panorama).encode())
     with whole_file(folder / "source.npz") as temporary, temporary.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, **_source(panorama))
-    write_bytes(folder / "panorama.png", encoded.tobytes())
+    write_bytes(folder / "panorama.png", _png(folder / "panorama.png", rgba))
     write_json(folder / "panorama.json", _header(panorama))
 
 
@@ -107,3 +105,35 @@ def _read_frames(path: Path) -> tuple[FrameUse, ...]:
             )
             for row in csv.DictReader(text.splitlines())
         )
+
+
+def write_strip(folder: Path, strip: Strip) -> None:
+    """Write ``strip.png`` (RGBA), ``strip.json`` (scale, how much of each zone is seen) and ``strip.csv`` (the arch
+    curve: mm along it and world x, y of each column)."""
+    rgba = np.dstack([strip.image, np.where(strip.covered, 255, 0).astype(np.uint8)])
+    step = strip.mm_per_px or 1.0
+    write_bytes(folder / "strip.png", _png(folder / "strip.png", rgba))
+    rows = [
+        {"column": column, "along": column * step, "x": float(x), "y": float(y)}
+        for column, (x, y) in enumerate(strip.curve)
+    ]
+    write_table(folder / "strip.csv", rows, digits=4)
+    height, width = strip.covered.shape
+    zones = {name: float(np.mean(strip.zone == number)) for number, name in enumerate(ZONES)}
+    write_json(
+        folder / "strip.json",
+        {
+            "width_px": width,
+            "height_px": height,
+            "mm_per_px": strip.mm_per_px,
+            "length_mm": width * strip.mm_per_px if strip.mm_per_px else None,
+            "share_of_zone": zones,
+        },
+    )
+
+
+def _png(path: Path, rgba: UInt8[np.ndarray, "h w 4"]) -> bytes:
+    ok, encoded = cv2.imencode(".png", cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA))
+    if not ok:
+        raise OutputError(f"{path}: the image could not be encoded")
+    return bytes(encoded)

@@ -1,0 +1,79 @@
+"""Stitch the frames of a hand-held camera."""
+
+from __future__ import annotations
+
+import hashlib
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional
+
+from cuspid import pipeline, storage
+from cuspid.cli.shared import Flat, console, show_progress
+from cuspid.pipeline import StitchOptions
+from cuspid.reporting.panorama_figures import save_camera_path
+from cuspid.sequence import Sequence
+from cuspid.stitching.ortho import Stitched
+
+
+def stitch(
+    frames: Annotated[Path, Positional],
+    *,
+    out: Path,
+    calibration: Path | None = None,
+    options: Annotated[StitchOptions, Flat] = StitchOptions(),
+) -> None:
+    """Frames of one hand-held camera to a panorama of the arch: the occlusal view in true scale, the unrolled strip,
+    what became of each frame, and the camera's path.
+
+    Args:
+        frames: Folder of images, a video (mp4, avi, mov, mkv), or a capture with one camera.
+        out: Folder for the results; part-1/, part-2/ ... in it where the sequence broke.
+        calibration: handpiece.json or rig_config.json of one camera, COLMAP's cameras.txt, or OpenCV's YAML; without
+            one (and without a capture's own) the focal length is found from the images.
+    """
+    with show_progress() as progress:
+        sequence = storage.read_sequence(
+            frames, out / "frames", calibration=calibration, progress=partial(progress, "decoding")
+        )
+        hashes = _hashes(sequence, calibration)
+        with storage.claimed_folder(out, "stitch", {"stitch": options}, hashes, replace=True):
+            parts = pipeline.stitch(sequence, options, progress=progress)
+            for part in parts:
+                folder = out if len(parts) == 1 else out / f"part-{part.panorama.part}"
+                _write(folder, part)
+    _print(parts, out)
+
+
+def _hashes(sequence: Sequence, calibration: Path | None) -> dict[str, str]:
+    """Of the list of frames with their sizes, and of the calibration."""
+    listing = [(path.name, path.stat().st_size) for path in sequence.paths]
+    hashes = {"frames": hashlib.sha256(repr(listing).encode()).hexdigest()}
+    return hashes if calibration is None else {**hashes, "calibration": storage.hash_file(calibration)}
+
+
+def _write(folder: Path, part: Stitched) -> None:
+    storage.write_poses(folder / "poses.json", part.motion.rig_from_world)
+    save_camera_path(folder / "camera_path.png", part.panorama, part.motion)
+    if part.strip is not None:
+        storage.write_strip(folder, part.strip)
+    storage.write_panorama(folder, part.panorama)
+
+
+def _print(parts: tuple[Stitched, ...], out: Path) -> None:
+    for part in parts:
+        panorama = part.panorama
+        folder = out if len(parts) == 1 else out / f"part-{panorama.part}"
+        height, width = panorama.covered.shape
+        size = panorama.size_mm
+        measure = "no scale" if size is None else f"{size[0]:.1f} x {size[1]:.1f} mm"
+        used = sum(frame.used for frame in panorama.frames)
+        name = "panorama" if len(parts) == 1 else f"part {panorama.part} of {len(parts)}"
+        console.print(f"{name}: {folder / 'panorama.png'}, {width} x {height} px, {measure}; {used} frames")
+    whole = parts[0].panorama
+    for note in whole.notes:
+        console.print(f"note: {note}")
+    for frame in whole.frames:
+        if not frame.used:
+            console.print(f"  left out {frame.name}: {frame.reason}")

@@ -1,0 +1,86 @@
+"""Which frame each cell of the panorama is taken from: one that sees it well, with few and unseen seams.
+
+The choice minimises  sum_c cost(c, l_c) + sum_{c, d} V(c, d)  over neighbouring cells c, d, with V = 0 within a frame
+and V = seam + jump |colour(c, l_c) - colour(d, l_d)| across a seam; by iterated conditional modes (Besag 1986).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, Int16
+
+_ROUNDS = 10
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeamOptions:
+    """What makes a frame a good choice for a place, and what a seam costs."""
+
+    candidates: int = 4
+    """Best frames that are kept for each cell."""
+    oblique: float = 1.0
+    """Cost of looking at 45 degrees instead of straight down; it grows with the square of the tangent."""
+    glare: float = 2.0
+    """Cost of a place that is burnt out by a highlight."""
+    border_px: float = 20.0
+    """Distance from the border of a frame over which its cost falls to a third."""
+    border: float = 0.1
+    """Cost at the border of a frame."""
+    seam: float = 0.02
+    """Cost of a seam along the side of one cell."""
+    jump: float = 0.002
+    """Cost of each grey level by which the colours differ across a seam."""
+
+    def cost(
+        self, tangent2: Float[np.ndarray, "r c"], border_px: Float[np.ndarray, "r c"], glare: Float[np.ndarray, "r c"]
+    ) -> Float[np.ndarray, "r c"]:
+        """Cost of a frame in each cell, from the square of the tangent of its obliquity, the distance to its border and
+        the share of it that is burnt out."""
+        near = np.exp(-np.maximum(border_px, 0) / self.border_px)
+        return np.asarray(self.oblique * tangent2 + self.border * near + self.glare * np.minimum(glare, 1))
+
+
+def choose(
+    cost: Float[np.ndarray, "k r c"],
+    frame: Int16[np.ndarray, "k r c"],
+    color: Float[np.ndarray, "k r c 3"],
+    options: SeamOptions,
+) -> Int[np.ndarray, "r c"]:
+    """Frame of each cell among its candidates; -1 where there is none."""
+    chosen = np.zeros(cost.shape[1:], dtype=np.int64)
+    rows, columns = np.indices(chosen.shape)
+    even = (rows + columns) % 2 == 0
+    for round_number in range(2 * _ROUNDS):
+        label = np.take_along_axis(frame, chosen[None], axis=0)[0]
+        shown = np.take_along_axis(color, chosen[None, ..., None], axis=0)[0]
+        energy = cost.copy()
+        for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
+            energy += _seam(frame, color, _beside(label, axis, step, -2), _beside(shown, axis, step, 0.0), options)
+        better = np.argmin(energy, axis=0)
+        chosen = np.where(even == (round_number % 2 == 0), better, chosen)
+    label = np.take_along_axis(frame, chosen[None], axis=0)[0].astype(np.int64)
+    return np.where(np.isfinite(cost[0]), label, -1)
+
+
+def _beside(array: np.ndarray, axis: int, step: int, beyond: float) -> np.ndarray:
+    """What the neighbour of each cell has; ``beyond`` outside."""
+    moved = np.roll(array, step, axis=axis)
+    edge: list[slice | int] = [slice(None)] * array.ndim
+    edge[axis] = 0 if step > 0 else -1
+    moved[tuple(edge)] = beyond
+    return moved
+
+
+def _seam(
+    frame: Int16[np.ndarray, "k r c"],
+    color: Float[np.ndarray, "k r c 3"],
+    neighbour: Int16[np.ndarray, "r c"],
+    shown: Float[np.ndarray, "r c 3"],
+    options: SeamOptions,
+) -> Float[np.ndarray, "k r c"]:
+    """What a seam to one neighbour would cost each candidate."""
+    jump = np.abs(color - shown).mean(axis=-1)
+    apart = (frame != neighbour) & (neighbour >= 0)
+    return np.where(apart, options.seam + options.jump * jump, 0.0)

@@ -1,0 +1,129 @@
+"""The panorama unrolled along the arch: a straight strip in which lengths along the arch are true.
+
+The arch curve runs through the middle of the crowns. Across it the strip shows what the occlusal view shows, over the
+same number of millimetres; a pixel belongs to the occlusal zone as long as the surface stays near the ridge of its
+cross-section, and to the buccal or lingual zone beyond.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
+
+from cuspid.camera import OPENCV_PIXEL_OFFSET
+from cuspid.panorama import ZONES, Panorama, Strip
+from cuspid.reconstruction import Reconstruction
+from cuspid.stitching.surface import HeightMap
+
+
+@dataclass(frozen=True, kw_only=True)
+class StripOptions:
+    """The unrolled strip."""
+
+    half_width_mm: float = 8.0
+    """The strip reaches so far to either side of the arch curve."""
+    smoothing_mm: float = 5.0
+    """Standard deviation of the Gaussian filter along the arch curve."""
+    occlusal_mm: float = 2.5
+    """The occlusal zone ends where the surface lies this much below the ridge of the cross-section."""
+
+
+_STEP_MM = 0.25
+_LEAST_MM = 5.0
+
+
+def arch_curve(motion: Reconstruction, surface: HeightMap, options: StripOptions) -> Float[np.ndarray, "n 2"]:
+    """World (x, y) of the middle of the crowns, every `_STEP_MM`, in the order in which the camera went."""
+    centres = np.array([pose.inverse().translation[:2] for pose in motion.rig_from_world.values()])
+    curve = _even(_smooth(_even(_forward(centres)), options.smoothing_mm))
+    across = np.arange(-options.half_width_mm, options.half_width_mm + _STEP_MM, _STEP_MM)
+    for _ in range(2):
+        normals = _normals(curve)
+        places = curve[:, None] + across[:, None] * normals[:, None]
+        heights = surface.at(places)
+        weight = np.clip(heights - (heights.max(axis=1, keepdims=True) - options.occlusal_mm), 0, None)
+        middle = (weight * across).sum(axis=1) / weight.sum(axis=1)
+        curve = _even(_smooth(curve + middle[:, None] * normals, options.smoothing_mm))
+    return curve
+
+
+def _forward(path: Float[np.ndarray, "f 2"]) -> Float[np.ndarray, "n 2"]:
+    """A shaky path without its steps back: the mean of frames, in blocks that each go on by a millimetre."""
+    smooth = gaussian_filter1d(path, 3.0, axis=0, mode="nearest") if len(path) > 6 else path
+    kept = [smooth[0]]
+    for place in smooth[1:]:
+        if np.linalg.norm(place - kept[-1]) >= 1.0:
+            kept.append(place)
+    if len(kept) == 1:
+        kept.append(smooth[-1] + [_STEP_MM, 0])
+    return np.array(kept)
+
+
+def _even(curve: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
+    """The same curve, sampled every `_STEP_MM`."""
+    lengths = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+    at = np.arange(0, lengths[-1] + _STEP_MM / 2, _STEP_MM)
+    return np.stack([np.interp(at, lengths, curve[:, axis]) for axis in range(2)], axis=1)
+
+
+def _smooth(curve: Float[np.ndarray, "n 2"], sigma_mm: float) -> Float[np.ndarray, "n 2"]:
+    """Without short bends; the ends go on straight instead of shrinking."""
+    pad = min(len(curve) - 1, int(4 * sigma_mm / _STEP_MM))
+    if pad < 2:
+        return curve
+    head, tail = 2 * curve[0] - curve[pad:0:-1], 2 * curve[-1] - curve[-2 : -pad - 2 : -1]
+    longer = np.concatenate([head, curve, tail])
+    return np.asarray(gaussian_filter1d(longer, sigma_mm / _STEP_MM, axis=0)[pad : pad + len(curve)])
+
+
+def _normals(curve: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    """Unit normals towards the cheek: away from the inside of the bend."""
+    tangents = np.gradient(curve, axis=0)
+    tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
+    normals = np.stack([-tangents[:, 1], tangents[:, 0]], axis=1)
+    inwards = np.sum(normals * (curve.mean(axis=0) - curve)) > 0
+    return -normals if inwards else normals
+
+
+def unroll(
+    panorama: Panorama, motion: Reconstruction, surface: HeightMap, mm_per_px: float, options: StripOptions
+) -> Strip | None:
+    """The strip of a panorama at the panorama's own resolution; None where the camera hardly moved.
+
+    ``mm_per_px`` is the size of the panorama's pixels in the lengths of the motion.
+    """
+    curve = arch_curve(motion, surface, options)
+    if _STEP_MM * len(curve) < _LEAST_MM:
+        return None
+    columns = int(_STEP_MM * (len(curve) - 1) / mm_per_px)
+    at = np.linspace(0, len(curve) - 1, columns)
+    line = np.stack([np.interp(at, np.arange(len(curve)), curve[:, axis]) for axis in range(2)], axis=1)
+    normals = np.stack([np.interp(at, np.arange(len(curve)), _normals(curve)[:, axis]) for axis in range(2)], axis=1)
+    half = int(options.half_width_mm / mm_per_px)
+    across = mm_per_px * np.arange(half, -half - 1, -1)
+    places = line + across[:, None, None] * normals
+    where = (places * [1, -1] / mm_per_px + panorama.origin_px - OPENCV_PIXEL_OFFSET).astype(np.float32)
+    image = cv2.remap(panorama.image, where, None, cv2.INTER_LINEAR)
+    covered = cv2.remap(panorama.covered.astype(np.uint8), where, None, cv2.INTER_NEAREST) > 0
+    image[~covered] = 0
+    return Strip(
+        image=np.asarray(image, dtype=np.uint8),
+        covered=covered,
+        zone=np.where(covered, _zones(surface.at(places), half, options), -1).astype(np.int16),
+        curve=line if panorama.mm_per_px else line / mm_per_px,
+        mm_per_px=panorama.mm_per_px,
+    )
+
+
+def _zones(heights: Float[np.ndarray, "r c"], half: int, options: StripOptions) -> Float[np.ndarray, "r c"]:
+    """Zone of each pixel of a strip from the heights of its cross-sections."""
+    rows = np.arange(len(heights))[:, None]
+    near = heights > heights.max(axis=0) - options.occlusal_mm
+    first = np.where(near.any(axis=0), near.argmax(axis=0), half)
+    last = np.where(near.any(axis=0), len(heights) - 1 - near[::-1].argmax(axis=0), half)
+    buccal, lingual = ZONES.index("buccal"), ZONES.index("lingual")
+    return np.where(rows < first, buccal, np.where(rows > last, lingual, ZONES.index("occlusal"))).astype(np.float64)

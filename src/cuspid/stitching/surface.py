@@ -1,0 +1,255 @@
+"""The occlusal frame and a coarse surface, from what the motion of one camera gives: poses and sparse points.
+
+Frames: the *model* is the frame of the motion, in its own units; the *world* is the occlusal frame of
+:mod:`cuspid.panorama`, with z = 0 at the tips of the cusps. Where nothing tells the scale, lengths of the world are
+such that the camera was `NOMINAL_MM` from the teeth, and are not called millimetres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import KDTree
+
+from cuspid.errors import InputError, ReconstructionError
+from cuspid.geometry import Rigid3
+from cuspid.reconstruction import Reconstruction, Tracks
+
+NOMINAL_MM = 14.0
+"""Distance from an intra-oral camera to the teeth, where nothing else is known."""
+
+_PATCH_MM = 3.0
+"""Size of the patches of which each gives one height to the occlusal plane: about half a tooth."""
+_PATCH_SD_MM, _TILT_SD = 1.0, np.deg2rad(2.0)
+"""How far the tops of patches stand off the occlusal plane, and the mean of the optical axes off its normal."""
+_TEETH_MM = 4.0
+"""What lies so near to the occlusal plane is a tooth."""
+_STRAIGHT = 0.12
+"""A path is straight whose middle stands off its chord by less than this share of the chord."""
+_NEIGHBOURS, _REACH_MM = 8, 1.5
+"""A height is the median of that many points, of those within this distance."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleOptions:
+    """What one camera cannot know: how large things are."""
+
+    working_distance_mm: float | None = None
+    """Median height of the camera over the tips of the cusps; None takes it from the calibration file, and where that
+    does not say it, no millimetres are claimed."""
+    width_mm: float | None = None
+    """Known greatest width of the arch over the teeth, left to right; goes before the working distance."""
+
+    def __post_init__(self) -> None:
+        if min(self.working_distance_mm or 1.0, self.width_mm or 1.0) <= 0:
+            raise InputError("scale: working distance and width must be positive, in mm")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceOptions:
+    """How coarse the surface is."""
+
+    cell_mm: float = 0.4
+    """Spacing of the height map."""
+    smoothing_mm: float = 0.5
+    """Standard deviation of the Gaussian filter over the height map."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HeightMap:
+    """World Z over the occlusal plane, on a regular grid, known everywhere."""
+
+    corner: Float[np.ndarray, "2"]
+    """World (x, y) of the first cell; rows run along +Y."""
+    cell_mm: float
+    """Spacing."""
+    heights: Float[np.ndarray, "r c"]
+    """World Z of each cell. float32."""
+
+    def at(self, xy: Float[np.ndarray, "h w 2"]) -> Float[np.ndarray, "h w"]:
+        """Heights at a grid of places, bilinear; that of the border beyond it."""
+        place = ((xy - self.corner) / self.cell_mm).astype(np.float32)
+        return np.asarray(
+            cv2.remap(self.heights, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        )
+
+
+# --- the occlusal frame ------------------------------------------------------------------------------------------
+
+
+def in_occlusal_frame(model: Reconstruction, scale: ScaleOptions) -> Reconstruction:
+    """The motion with the occlusal frame as its world, scaled to the known width of the arch, else to the working
+    distance, else to `NOMINAL_MM`.
+
+    Raises ReconstructionError where there are no points.
+    """
+    near = scaled(model, NOMINAL_MM / float(np.median(_depths(model))))
+    points, (centres, axes) = _tracks_of(near).points, _centres_and_axes(near)
+    world_from_model = _upright(points, centres, axes)
+    world_from_model = _levelled(world_from_model.apply(points)) @ world_from_model
+    front = _facing_front(world_from_model.apply(centres), world_from_model.apply(points))
+    found = transformed(near, front @ world_from_model)
+    if scale.width_mm is not None:
+        return scaled(found, scale.width_mm / _width(_tracks_of(found).points))
+    heights = _centres_and_axes(found)[0][:, 2]
+    return scaled(found, (scale.working_distance_mm or NOMINAL_MM) / float(np.median(heights)))
+
+
+def _width(points: Float[np.ndarray, "p 3"]) -> float:
+    """Extent along X of what lies near the occlusal plane."""
+    teeth = points[np.abs(points[:, 2]) < _TEETH_MM]
+    return float(np.diff(np.percentile(teeth[:, 0], [0.2, 99.8]))[0])
+
+
+def transformed(model: Reconstruction, new_from_world: Rigid3) -> Reconstruction:
+    """The same motion in another world."""
+    world_from_new = new_from_world.inverse()
+    tracks = _tracks_of(model)
+    return replace(
+        model,
+        rig_from_world={name: pose @ world_from_new for name, pose in model.rig_from_world.items()},
+        tracks=replace(tracks, points=new_from_world.apply(tracks.points)),
+    )
+
+
+def _tracks_of(model: Reconstruction) -> Tracks:
+    if model.tracks is None or not len(model.tracks.points):
+        raise ReconstructionError("panorama: the motion has no points; the frames need more detail in common")
+    return model.tracks
+
+
+def _depths(model: Reconstruction) -> Float[np.ndarray, "o"]:
+    """Depth of every observation."""
+    tracks = _tracks_of(model)
+    rotations = np.stack([pose.rotation[2] for pose in model.rig_from_world.values()])
+    shifts = np.array([pose.translation[2] for pose in model.rig_from_world.values()])
+    along = np.einsum("oj,oj->o", rotations[tracks.frame_index], tracks.points[tracks.point_index])
+    return along + shifts[tracks.frame_index]
+
+
+def scaled(model: Reconstruction, scale: float) -> Reconstruction:
+    """All lengths times a scale."""
+    tracks = _tracks_of(model)
+    poses = {name: Rigid3(pose.rotation, scale * pose.translation) for name, pose in model.rig_from_world.items()}
+    return replace(model, rig_from_world=poses, tracks=replace(tracks, points=scale * tracks.points))
+
+
+def _centres_and_axes(model: Reconstruction) -> tuple[Float[np.ndarray, "f 3"], Float[np.ndarray, "f 3"]]:
+    """Where the camera was and where it looked."""
+    poses = [pose.inverse() for pose in model.rig_from_world.values()]
+    return np.array([pose.translation for pose in poses]), np.array([pose.rotation[:, 2] for pose in poses])
+
+
+def _upright(
+    points: Float[np.ndarray, "p 3"], centres: Float[np.ndarray, "f 3"], axes: Float[np.ndarray, "f 3"]
+) -> Rigid3:
+    """Z against the mean of the optical axes, origin in the middle of the points."""
+    up = -axes.mean(axis=0)
+    up /= np.linalg.norm(up)
+    along = np.linalg.svd(centres - centres.mean(axis=0))[2][0]
+    x = along - (along @ up) * up
+    if np.linalg.norm(x) < 0.1:
+        x = np.cross(up, [0.3, 0.5, 0.8])
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(up, x), up])
+    return Rigid3(rotation, -rotation @ np.median(points, axis=0))
+
+
+def _tops(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "k 3"]:
+    """The upper points of each patch."""
+    cells = np.floor(points[:, :2] / _PATCH_MM).astype(np.int64) @ [1, 1 << 20]
+    tops = []
+    for cell in np.unique(cells):
+        inside = points[cells == cell]
+        if len(inside) >= 5:
+            tops.append([*np.median(inside[:, :2], axis=0), np.percentile(inside[:, 2], 90)])
+    return np.array(tops, dtype=np.float64).reshape(-1, 3)
+
+
+def _levelled(points: Float[np.ndarray, "p 3"]) -> Rigid3:
+    """Turns the plane through the tops of the teeth to z = 0; the fewer and the closer they are, the less it turns.
+
+    Least squares with a prior on the tilt, the patches below the plane (gum) dropped in rounds.
+    """
+    tops = _tops(points)
+    if len(tops) < 3:
+        return Rigid3(np.eye(3), np.array([0, 0, -float(np.percentile(points[:, 2], 90))]))
+    prior = np.diag([0, 1, 1]) * (_PATCH_SD_MM / _TILT_SD) ** 2
+    for _ in range(4):
+        design = np.column_stack([np.ones(len(tops)), tops[:, :2]])
+        plane = np.linalg.solve(design.T @ design + prior, design.T @ tops[:, 2])
+        off = tops[:, 2] - design @ plane
+        kept = (off > -_PATCH_SD_MM) & (off < 2 * _PATCH_SD_MM)
+        if kept.sum() < 3:
+            break
+        tops = tops[kept]
+    normal = np.array([-plane[1], -plane[2], 1.0])
+    normal /= np.linalg.norm(normal)
+    x = np.array([1.0, 0, 0]) - normal[0] * normal
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(normal, x), normal])
+    return Rigid3(rotation, -rotation @ np.array([0, 0, plane[0]]))
+
+
+def _facing_front(centres: Float[np.ndarray, "f 3"], points: Float[np.ndarray, "p 3"]) -> Rigid3:
+    """Turns about Z so that +Y is anterior where the path bends (an arch), else so that the path runs along +X."""
+    first, last = centres[0, :2], centres[-1, :2]
+    chord = last - first
+    bulge = centres[:, :2].mean(axis=0) - (first + last) / 2
+    x = chord / max(float(np.linalg.norm(chord)), 1e-9)
+    bent = np.linalg.norm(bulge) > _STRAIGHT * np.linalg.norm(chord)
+    if bent:
+        y = bulge - (bulge @ x) * x if np.linalg.norm(chord) > 5 else bulge
+        y /= np.linalg.norm(y)
+        x = np.array([y[1], -y[0]])
+    rotation = np.array([[x[0], x[1], 0], [-x[1], x[0], 0], [0, 0, 1]])
+    middle = np.array([*np.median(points[:, :2], axis=0), 0])
+    return Rigid3(rotation, -rotation @ middle)
+
+
+# --- the surface -------------------------------------------------------------------------------------------------
+
+
+def height_map(model: Reconstruction, options: SurfaceOptions) -> HeightMap:
+    """A smooth surface through the sparse points of a motion in the occlusal frame; robust against single points."""
+    points = _sure_points(model)
+    low, high = points[:, :2].min(axis=0) - 4, points[:, :2].max(axis=0) + 4
+    columns, rows = np.ceil((high - low) / options.cell_mm).astype(int) + 1
+    x, y = np.meshgrid(low[0] + options.cell_mm * np.arange(columns), low[1] + options.cell_mm * np.arange(rows))
+    distances, nearest = KDTree(points[:, :2]).query(
+        np.stack([x, y], axis=-1), k=min(_NEIGHBOURS, len(points)), distance_upper_bound=_REACH_MM
+    )
+    near = np.isfinite(distances)
+    heights = np.where(near, points[np.minimum(nearest, len(points) - 1), 2], np.nan)
+    known = near.sum(axis=-1) >= 3
+    median = np.full(known.shape, np.nan)
+    median[known] = np.nanmedian(heights[known], axis=-1)
+    smooth = _filled(median, options.smoothing_mm / options.cell_mm, float(np.median(points[:, 2])))
+    return HeightMap(corner=low, cell_mm=options.cell_mm, heights=smooth.astype(np.float32))
+
+
+def _sure_points(model: Reconstruction) -> Float[np.ndarray, "p 3"]:
+    """Points that three frames saw and that do not stand apart in height."""
+    tracks = _tracks_of(model)
+    counts = np.bincount(tracks.point_index, minlength=len(tracks.points))
+    points = tracks.points[counts >= 3] if np.sum(counts >= 3) >= 20 else tracks.points
+    low, high = np.percentile(points[:, 2], [1, 99.5])
+    return points[(points[:, 2] >= low) & (points[:, 2] <= high)]
+
+
+def _filled(heights: Float[np.ndarray, "r c"], sigma: float, background: float) -> Float[np.ndarray, "r c"]:
+    """Smooth, and without holes: what is unknown takes the mean of what is known farther and farther away."""
+    known = np.isfinite(heights)
+    values, weights = np.where(known, heights, 0.0), known.astype(np.float64)
+    filled, level = np.full(heights.shape, background), sigma * 16
+    while level >= sigma:
+        total = gaussian_filter(weights, level)
+        mean = gaussian_filter(values, level) / np.maximum(total, 1e-12)
+        share = np.clip(total / 0.3, 0, 1)
+        filled = share * mean + (1 - share) * filled
+        level /= 2
+    return filled
