@@ -71,10 +71,9 @@ class OcclusalView:
         plane = (np.column_stack([columns, rows]) + 0.5 - self.origin_px) * [1, -1] * self.mm_per_px
         return np.column_stack([plane / self._spread(z)[:, None], z])
 
-    def project(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-        """The pixels at which points are seen."""
-        plane = points[:, :2] * self._spread(points[:, 2])[:, None]
-        return plane * [1, -1] / self.mm_per_px + self.origin_px
+    def on_plane(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+        """Where points are seen on the occlusal plane, mm."""
+        return points[:, :2] * self._spread(points[:, 2])[:, None]
 
     def _spread(self, z: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         """How much farther out than it is a point of that height is seen on the occlusal plane."""

@@ -15,6 +15,7 @@ from cuspid.cli.handpieces import design, handpiece
 from cuspid.cli.jaws import box, phantom, prepare
 from cuspid.cli.mouth import mouth
 from cuspid.cli.panorama import stitch
+from cuspid.cli.panorama_evaluation import stitch_eval
 from cuspid.cli.scan import evaluate, reconstruct, run, simulate
 from cuspid.cli.shared import console
 from cuspid.cli.studies import sweep
@@ -38,6 +39,7 @@ COMMANDS: Mapping[str, Callable[..., Any]] = {
     "sweep": sweep,
     "simulate": simulate,
     "film": film,
+    "stitch-eval": stitch_eval,
     "reconstruct": reconstruct,
     "evaluate": evaluate,
     "stitch": stitch,

@@ -1,0 +1,132 @@
+"""Judge a panorama."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import cv2
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from tyro.conf import Positional
+
+from cuspid import storage
+from cuspid.cli.shared import Flat, console
+from cuspid.errors import InputError
+from cuspid.evaluation.panorama import (
+    ImageScores,
+    PanoramaComparison,
+    PanoramaEvaluationOptions,
+    PanoramaScore,
+    evaluate_panorama,
+)
+from cuspid.panorama import FrameUse, Panorama
+from cuspid.reporting.panorama_evaluation_figures import save_panorama_evaluation
+from cuspid.trueness import OcclusalView
+
+
+def stitch_eval(
+    panorama: Annotated[Path, Positional],
+    truth: Annotated[Path, Positional],
+    *,
+    out: Path,
+    options: Annotated[PanoramaEvaluationOptions, Flat] = PanoramaEvaluationOptions(),
+) -> None:
+    """How far a panorama is from the arch that was filmed: score.json, a table, and score.png beside the truth.
+
+    Args:
+        panorama: Folder that cuspid stitch wrote, or a picture of another program (black or transparent is nothing).
+        truth: The folder truth/ of cuspid film.
+        out: Folder for the results.
+    """
+    known, view = storage.read_truth(truth), storage.read_occlusal_view(truth / "occlusal")
+    shot = storage.read_occlusal_view(truth / "shot")
+    made = storage.read_panorama(panorama) if panorama.is_dir() else read_picture(panorama)
+    pictured = panorama / "panorama.png" if panorama.is_dir() else panorama
+    hashes = {"panorama": storage.hash_file(pictured), "truth": storage.hash_file(truth / "poses.json")}
+    with storage.claimed_folder(out, "stitch-eval", {"evaluation": options}, hashes, replace=True):
+        comparison = evaluate_panorama(made, known, view, shot, options)
+        storage.write_json(out / "score.json", comparison.score)
+        _save_picture(out / "score.png", view, comparison)
+    _print(comparison.score)
+
+
+def read_picture(path: Path) -> Panorama:
+    """A picture that nothing is known of. Raises InputError where it cannot be read or shows nothing."""
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+    if pixels is None or pixels.dtype != np.uint8 or pixels.ndim != 3:
+        raise InputError(f"{path}: neither a folder of cuspid stitch nor a colour picture of 8 bits")
+    covered = pixels[..., 3] > 0 if pixels.shape[2] == 4 else pixels.max(axis=2) > 0
+    if not covered.any():
+        raise InputError(f"{path}: the picture is black or transparent everywhere; give a panorama")
+    frames: tuple[FrameUse, ...] = ()
+    return Panorama(
+        image=np.ascontiguousarray(pixels[..., 2::-1]),
+        covered=covered,
+        frame_index=np.full(covered.shape, -1, dtype=np.int16),
+        frame_pixel=np.full((*covered.shape, 2), np.nan, dtype=np.float32),
+        frames=frames,
+        method=path.stem,
+        origin_px=np.zeros(2),
+    )
+
+
+def _save_picture(path: Path, view: OcclusalView, comparison: PanoramaComparison) -> None:
+    score, places = comparison.score, comparison.points_mm
+    save_panorama_evaluation(
+        path,
+        view.image,
+        comparison.aligned,
+        places * [1, -1] / view.mm_per_px + view.origin_px,
+        comparison.errors_mm,
+        title=f"{score.method}: {score.frames_used} of {score.frames} frames" if score.frames else score.method,
+        captions=("single shot of the true jaw", _pictured(score), _measured(score)),
+    )
+
+
+def _pictured(score: PanoramaScore) -> str:
+    if score.failure or score.picture is None:
+        return f"failed: {score.failure}"
+    one = score.picture
+    return (
+        f"panorama: SSIM on teeth {one.ssim_teeth_fitted:.2f}, ZNCC {one.zncc:.2f}, covers {score.coverage_pct:.1f} %"
+    )
+
+
+def _measured(score: PanoramaScore) -> str:
+    if score.geometry is None:
+        return "geometric error not known"
+    found = score.geometry
+    return f"error: median {found.median_mm:.2f}, RMS {found.rms_mm:.2f}, P95 {found.p95_mm:.2f} mm"
+
+
+def _print(score: PanoramaScore) -> None:
+    table = Table(title="Likeness to the single shot", title_justify="left")
+    heads = ("picture", "ZNCC teeth", "SSIM teeth, fitted", "as it is", "SSIM canvas, fitted", "as it is")
+    for head in heads:
+        table.add_column(head, justify="left" if head == "picture" else "right")
+    rows: dict[str, ImageScores | None] = {score.method: score.picture, f"{score.method}, from a height": score.shot}
+    for name, one in {**rows, **score.trivial}.items():
+        if one is not None:
+            figures = (one.zncc, one.ssim_teeth_fitted, one.ssim_teeth, one.ssim_full_fitted, one.ssim_full)
+            table.add_row(name, *(f"{figure:.3f}" for figure in figures))
+    Console().print(table)
+    if score.failure:
+        console.print(f"failed: {score.failure}", style="red")
+        return
+    console.print(_measured(score) if score.geometry is None else f"geometric {_measured(score)}")
+    _print_extent(score)
+    for note in score.notes:
+        console.print(f"note: {note}")
+
+
+def _print_extent(score: PanoramaScore) -> None:
+    console.print(
+        f"shows {score.coverage_pct:.1f} % of the teeth, of which the frames saw {score.seen_pct:.1f} %; the arch is "
+        f"{'complete' if score.complete else 'not complete'} in {score.parts} part(s)"
+    )
+    if score.inter_molar_error_mm is not None:
+        console.print(f"inter-molar distance error {score.inter_molar_error_mm:+.2f} mm")
+    if score.geometry is not None and score.geometry.scale_error_pct is not None:
+        console.print(f"scale error {score.geometry.scale_error_pct:+.2f} %")
