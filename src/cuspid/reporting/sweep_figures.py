@@ -77,8 +77,7 @@ def _draw(
     axes: Axes, each: SweepMap, baselines: tuple[float, ...], angles: tuple[float, ...], thesis: Place | None
 ) -> None:
     table = np.array([[each.values.get((baseline, angle), np.nan) for angle in angles] for baseline in baselines])
-    colours = colormaps["viridis_r" if each.less_is_better else "viridis"].copy()
-    colours.set_bad("#bbbbbb")
+    colours = colormaps["viridis_r" if each.less_is_better else "viridis"].with_extremes(bad="#bbbbbb")
     norm = Normalize(*_limits(table))
     axes.imshow(np.ma.masked_invalid(table), origin="lower", aspect="auto", norm=norm, cmap=colours)
     _write(axes, each, baselines, angles, table, norm, colours)

@@ -60,6 +60,7 @@ _ALONG_THE_ARCH = ("incisal",)
 _FRONT_TEETH = ("incisal", "labial")
 _NEIGHBOURHOOD_MM = 13.0
 """What lies farther from the middle of the surface is out of every camera's reach."""
+_STEP_MM = 0.05
 _NEAREST_MM = 0.5
 """Depth range of a lens begins here at the least."""
 _BUDGET_UM = 10.0
@@ -91,6 +92,8 @@ class SweepOptions:
     """Width and height of an image."""
     field_of_view_deg: float = 62.0
     """Full angle of view along the width."""
+    supersampling: int = 1
+    """Rays through a pixel along each side; more cost time and change little here (docs/sweep.md)."""
     path_mm: float = 5.0
     """Length of the path along the arch."""
     frames: int = 6
@@ -99,7 +102,7 @@ class SweepOptions:
     """Surface of the teeth: artificial (the thesis' condition), powder, enamel."""
     between: bool = False
     """Also measure depth between consecutive exposures, which shows less of what the pair itself can do."""
-    contenders: int = 3
+    contenders: int = 2
     """So many settings that are best by completeness, and as many by accuracy, are repeated, and that of the thesis."""
     repeats: int = 2
     """How often: with other textures, hands and noise. 0 leaves the noise of the study unknown."""
@@ -115,6 +118,8 @@ class SweepOptions:
             raise InputError("sweep: distance, depth of field and path must be positive")
         if self.image_px < 32 or not 0 < self.field_of_view_deg < 180:
             raise InputError("sweep: --image-px must be 32 or more, --field-of-view-deg between 0 and 180")
+        if self.supersampling < 1:
+            raise InputError(f"sweep: --supersampling is {self.supersampling}; one at least is needed")
         if self.frames < 2:
             raise InputError(f"sweep: --frames is {self.frames}; two at least are needed")
         if self.contenders < 1 or self.repeats < 0:
@@ -224,16 +229,16 @@ def _baseline_axis(jaw: Jaw, options: SweepOptions) -> Float[np.ndarray, "3"]:
 def pair_handpiece(pair_from_rig: Rigid3, setting: Setting, options: SweepOptions) -> Handpiece:
     """Two cameras and four LEDs around them. The LEDs do not move with the baseline: the light is the same for all."""
     camera = Camera.from_field_of_view(options.image_px, options.image_px, options.field_of_view_deg)
-    pair = camera_pair(*setting, camera)
-    cameras = {name: MountedCamera(camera, each.cam_from_rig @ pair_from_rig) for name, each in pair.cameras.items()}
+    pair = camera_pair(*setting, camera).cameras
+    rig = Rig({name: MountedCamera(camera, each.cam_from_rig @ pair_from_rig) for name, each in pair.items()})
     near = max(options.distance_mm - options.depth_of_field_mm / 2, _NEAREST_MM)
     far = options.distance_mm + options.depth_of_field_mm / 2
     lights = _lights(pair_from_rig.inverse())
     return Handpiece(
-        rig=Rig(cameras),
+        rig=rig,
         lights=lights,
         exposures=(Exposure(name="all", lights=tuple(lights)),),
-        working_distance_mm=_pairing_distance_mm(pair, options.distance_mm, far),
+        working_distance_mm=_pairing_distance_mm(rig, options.distance_mm, far),
         depth_range_mm=(near, far),
         name=f"pair-{setting[0]:g}mm-{setting[1]:g}deg",
     )
@@ -256,8 +261,9 @@ def _pairing_distance_mm(pair: Rig, distance_mm: float, far_mm: float) -> float:
     """The nominal distance that the reconstruction is told: it takes two cameras for a pair only if they share enough
     of what they see there. A wide, parallel pair shares too little at the distance itself, but more a little behind it.
     Where no distance helps, the distance itself; the case then fails and says why."""
-    further = np.arange(distance_mm, far_mm, 0.05)
-    return float(next((each for each in further if pair.stereo_pairs(float(each))), distance_mm))
+    # They share it a step before already: what is enough by a rounding error here may not be enough there.
+    enough = (each for each in np.arange(distance_mm, far_mm, _STEP_MM) if pair.stereo_pairs(float(each - _STEP_MM)))
+    return float(next(enough, distance_mm))
 
 
 # --- A case -----------------------------------------------------------------------------------------------------------
@@ -284,7 +290,7 @@ def sweep_case(
     check_clearance(site.jaw.mesh, handpiece, poses, options.path.clearance_mm)
     overlap = image_overlap(site.jaw.mesh, handpiece, list(poses.values()))
     how = TrialOptions(
-        simulation=SimulationOptions(texture=options.texture, seed=seed),
+        simulation=SimulationOptions(texture=options.texture, supersampling=options.supersampling, seed=seed),
         reconstruction=ReconstructionOptions(between=BetweenOptions(enabled=options.between)),
         evaluation=EvaluationOptions(margin_mm=_ANY_DISTANCE_MM, samples=50_000),
     )
