@@ -15,7 +15,7 @@ Sections of a holder are drawn across the arch: y to the cheek, z up from the hi
 
 from __future__ import annotations
 
-import tempfile
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -35,7 +35,7 @@ from cuspid.anatomy.population import draw_population
 from cuspid.anatomy.preparation import prepare, preset
 from cuspid.anatomy.surfaces import named_surfaces
 from cuspid.camera import Camera
-from cuspid.errors import InputError
+from cuspid.errors import CuspidError, InputError
 from cuspid.evaluation.deviation import openness
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
@@ -80,7 +80,8 @@ class ComparisonOptions:
     edge_mm: float = 0.3
     """Length of the edges of the phantom."""
     image_scale: float = 1.0
-    """All images are made smaller by this factor: 0.5 takes a quarter of the time and about doubles the errors."""
+    """All images are made smaller by this factor: 0.5 takes a quarter of the time, but more than doubles the errors and
+    loses steep faces."""
     minimum_openness: float = 0.05
     """A face counts for completeness if so large a share of the directions above the occlusal plane is free."""
     samples: int = 60_000
@@ -191,9 +192,13 @@ def comparison_cases(options: ComparisonOptions, handpieces: Mapping[str, Handpi
                 "turns": turns,
                 "seed": seed,
             }
-            name = "_".join(map(str, scanned.values()))
-            cases.append((turns * len(handpieces[design].rig.names), Case(name=name, parameters=scanned)))
+            case = Case(name=_name(*scanned.values()), parameters=scanned)
+            cases.append((turns * len(handpieces[design].rig.names), case))
     return tuple(case for _, case in sorted(cases, key=lambda each: each[0]))
+
+
+def _name(*parameters: Value) -> str:
+    return "_".join(map(str, parameters))
 
 
 # --- one scan ---------------------------------------------------------------------------------------------------------
@@ -210,19 +215,22 @@ def scan_case(
     options: ComparisonOptions,
     trial: TrialOptions,
 ) -> dict[str, Value]:
-    """One scan, its figures and its size. The jaw and the design are read from ``folder``, the images are not kept."""
+    """One scan, its figures and its size. The jaw and the design are read from ``folder``; images and depth maps lie
+    there until the scan is done, so that a killed one goes on."""
     subject = storage.read_jaw(folder / "jaws" / f"{jaw}.ply")
     handpiece = storage.read_handpiece(folder / "handpieces" / f"{design}.json")
     path = replace(trial.simulation.path, tooth=tooth, turns=turns)
     how = replace(trial, simulation=replace(trial.simulation, path=path, seed=seed))
-    with tempfile.TemporaryDirectory(prefix="cuspid-") as scratch:
+    scratch = folder / "scans" / _name(jaw, tooth, design, turns, seed)
+    try:
         done = run_trial(
-            lambda out: pipeline.simulate(subject, handpiece, out, how.simulation),
-            Path(scratch),
-            how,
-            start_from_truth=True,
+            lambda out: pipeline.simulate(subject, handpiece, out, how.simulation), scratch, how, start_from_truth=True
         )
-        overlap = storage.read_json(Path(scratch) / "truth" / "path.json")["minimum_overlap"]
+        overlap = storage.read_json(scratch / "truth" / "path.json")["minimum_overlap"]
+    except CuspidError:
+        shutil.rmtree(scratch, ignore_errors=True)
+        raise
+    shutil.rmtree(scratch)
     tooth_accuracy = done.trueness.per_tooth.get(tooth)
     return {
         "cameras": len(handpiece.rig.names),
