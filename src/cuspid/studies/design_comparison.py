@@ -54,6 +54,7 @@ Outlines = tuple[Float[np.ndarray, "n 2"], ...]
 _WITHIN_UM = (50, 100)
 _JUDGED = "tooth_within_50_um_pct"
 """By this share is judged whether completeness grows."""
+_TIMES = ("simulation_s", "reconstruction_s", "reconstruction_cpu_s")
 _NEIGHBOURHOOD_MM = 15.0
 """What lies farther from a tooth does not cover it."""
 _MEAN_COUNT, _MEAN_EDGE_MM = 5, 0.4
@@ -216,12 +217,13 @@ def scan_case(
     trial: TrialOptions,
 ) -> dict[str, Value]:
     """One scan, its figures and its size. The jaw and the design are read from ``folder``; images and depth maps lie
-    there until the scan is done, so that a killed one goes on."""
+    there until the scan is done, so that a killed one goes on; its times are then not known."""
     subject = storage.read_jaw(folder / "jaws" / f"{jaw}.ply")
     handpiece = storage.read_handpiece(folder / "handpieces" / f"{design}.json")
     path = replace(trial.simulation.path, tooth=tooth, turns=turns)
     how = replace(trial, simulation=replace(trial.simulation, path=path, seed=seed))
     scratch = folder / "scans" / _name(jaw, tooth, design, turns, seed)
+    unknown = dict.fromkeys(_TIMES) if scratch.exists() else {}
     try:
         done = run_trial(
             lambda out: pipeline.simulate(subject, handpiece, out, how.simulation), scratch, how, start_from_truth=True
@@ -235,6 +237,7 @@ def scan_case(
     return {
         "cameras": len(handpiece.rig.names),
         **done.figures,
+        **unknown,
         "minimum_overlap_pct": 100 * overlap,
         "way_mm": way_mm(handpiece, tuple(done.truth.rig_from_world.values())),
         "data_mb": data_mb(handpiece, len(done.capture.frames)),
