@@ -25,13 +25,19 @@ PACKAGES = ("cuspid", "numpy", "numba", "opencv-contrib-python-headless", "pycol
 
 def run_timed(*arguments: str) -> dict[str, float]:
     """Run ``cuspid``; wall seconds, CPU seconds and peak memory in GiB."""
+    status, figures = timed(sys.executable, "-m", "cuspid", *arguments)
+    if status:
+        raise SystemExit(f"cuspid {' '.join(arguments)} failed with status {status}")
+    return figures
+
+
+def timed(*command: str) -> tuple[int, dict[str, float]]:
+    """Run a program; its exit status, wall seconds, CPU seconds and peak memory in GiB."""
     begin = time.perf_counter()
-    process = subprocess.Popen([sys.executable, "-m", "cuspid", *arguments])
+    process = subprocess.Popen(command)
     _, status, usage = os.wait4(process.pid, 0)
     seconds = time.perf_counter() - begin
-    if status:
-        raise SystemExit(f"cuspid {' '.join(arguments)} failed with status {os.waitstatus_to_exitcode(status)}")
-    return {
+    return os.waitstatus_to_exitcode(status), {
         "wall_s": round(seconds, 1),
         "cpu_s": round(usage.ru_utime + usage.ru_stime, 1),
         "peak_gib": round(usage.ru_maxrss / 2**20, 2),

@@ -9,7 +9,8 @@ pictures are compared.
 
 Pictures are compared in grey (Rec. 601), where the panorama shows nothing as black: ZNCC over the pixels of the teeth,
 SSIM (Wang et al. 2004, Gaussian window of 1.5 px) as the mean of its map over the teeth, and over the whole canvas as
-in the thesis; as they are, and after one gain and offset for the whole picture, fitted on the teeth that are shown.
+in the thesis; as they are, and after one gain and offset for the whole picture, fitted by least squares on the teeth
+that are shown, or for the score of the canvas on the canvas.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ FEWEST_MATCHES = 25
 """Image features that must agree, for an alignment by pictures."""
 _MATCH_MM = 0.5
 """Features agree where they lie within this distance of each other after the alignment."""
+_WINDOW_PX = 1.5
+"""Standard deviation of the window of SSIM."""
 _FEATURES = 6000
 """Features in each picture, at most."""
 
@@ -291,14 +294,15 @@ def image_scores(
 ) -> ImageScores:
     """Compare a grey picture (0 to 1) with the truth; what is not ``shown`` counts as black."""
     black = np.where(shown, picture, 0.0)
-    fitted = np.where(shown, _fitted(picture, truth, shown & teeth), 0.0)
-    (raw_teeth, raw_full), (fit_teeth, fit_full) = (_ssim(each, truth, teeth) for each in (black, fitted))
+    raw = _ssim_map(black, truth)
+    on_teeth = _ssim_map(np.where(shown, _fitted(picture, truth, shown & teeth), 0.0), truth)
+    on_canvas = _ssim_map(_fitted(black, truth, np.ones_like(shown)), truth)
     return ImageScores(
         zncc=_zncc(black[teeth], truth[teeth]),
-        ssim_teeth=raw_teeth,
-        ssim_full=raw_full,
-        ssim_teeth_fitted=fit_teeth,
-        ssim_full_fitted=fit_full,
+        ssim_teeth=float(raw[teeth].mean()),
+        ssim_full=_inner_mean(raw),
+        ssim_teeth_fitted=float(on_teeth[teeth].mean()),
+        ssim_full_fitted=_inner_mean(on_canvas),
     )
 
 
@@ -321,14 +325,15 @@ def _fitted(
     return np.clip(gain * (picture - a.mean()) + b.mean(), 0, 1)
 
 
-def _ssim(
-    picture: Float[np.ndarray, "h w"], truth: Float[np.ndarray, "h w"], teeth: Bool[np.ndarray, "h w"]
-) -> tuple[float, float]:
-    """Over the teeth and over the whole canvas."""
-    whole, each = structural_similarity(
-        truth, picture, data_range=1.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, full=True
-    )
-    return float(each[teeth].mean()), float(whole)
+def _ssim_map(picture: Float[np.ndarray, "h w"], truth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    options = {"gaussian_weights": True, "sigma": _WINDOW_PX, "use_sample_covariance": False, "full": True}
+    return np.asarray(structural_similarity(truth, picture, data_range=1.0, **options)[1])
+
+
+def _inner_mean(similarity: Float[np.ndarray, "h w"]) -> float:
+    """Without the border, where the window reaches out of the picture, as scikit-image does."""
+    border = int(3.5 * _WINDOW_PX + 0.5)
+    return float(similarity[border:-border, border:-border].mean())
 
 
 def trivial_scores(view: OcclusalView) -> dict[str, ImageScores]:

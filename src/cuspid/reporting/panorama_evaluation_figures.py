@@ -36,10 +36,10 @@ def save_panorama_evaluation(
     belong; none where they are not known. ``captions``: one line below each of the three.
     """
     height, width = truth.shape[:2]
-    figure = Figure(figsize=(15, 15 / 3 * height / width + 1.6), dpi=100, facecolor="white")
+    figure = Figure(figsize=(15, 15 / 3 * height / width + 1.9), dpi=100, facecolor="white")
     FigureCanvasAgg(figure)
     figure.text(0.02, 0.95, title, fontsize=15, color=_INK, va="center", fontweight="bold")
-    panels = [figure.add_axes((0.01 + 0.33 * k, 0.10, 0.32, 0.78)) for k in range(3)]
+    panels = [figure.add_axes((0.01 + 0.33 * k, 0.15, 0.32, 0.73)) for k in range(3)]
     for axes, caption in zip(panels, captions, strict=True):
         axes.set_axis_off()
         axes.set_title(caption, fontsize=11, color=_INK, loc="left", wrap=True)
@@ -66,7 +66,7 @@ def _draw_errors(
     axes.scatter(x, y, c=errors_mm[order], s=1.0, cmap=_COLOURS, vmin=0, vmax=_RANGE_MM, linewidths=0)
     colours = ScalarMappable(Normalize(0, _RANGE_MM), _COLOURS)
     bar = axes.figure.colorbar(
-        colours, cax=axes.figure.add_axes((0.70, 0.06, 0.26, 0.02)), orientation="horizontal", extend="max"
+        colours, cax=axes.figure.add_axes((0.70, 0.12, 0.26, 0.02)), orientation="horizontal", extend="max"
     )
     bar.outline.set_visible(False)
     bar.set_label("geometric error of tooth pixels / mm", fontsize=10, color=_INK)

@@ -1,0 +1,181 @@
+"""Measure panoramas of ten subjects filmed by a shaky hand, by cuspid's methods and by OpenCV's Stitcher.
+
+    python benchmarks/panorama.py --out benchmarks/results/panorama [--jaws FILE_OR_FOLDER ...] [--work FOLDER]
+        [--subject lower-14-0 ...] [--method ortho thesis opencv-panorama opencv-scans] [--films-only]
+
+Subjects are phantoms of the population, and jaws of your own, whose coarse faces are subdivided (Loop) first; the
+subdivided mesh is then the reference. All are filmed in 120 frames with full shake and the texture ``enamel``. One JSON
+a subject and method goes to the results folder; what is there already is not made again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable, Mapping
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from run import conditions, run_timed, timed
+
+from cuspid import pipeline, storage
+from cuspid.anatomy.phantom import PhantomOptions, build_phantom
+from cuspid.anatomy.population import GroupName, draw_population
+from cuspid.evaluation.panorama import PanoramaEvaluationOptions
+from cuspid.jaw import Jaw
+from cuspid.mesh import Mesh
+
+PHANTOMS: tuple[tuple[GroupName, int], ...] = (("lower-14", 2), ("upper-14", 2), ("lower-12", 1))
+"""Groups of the population and how many jaws of each."""
+EDGE_MM = 0.25
+"""Edge of the phantoms' faces, and about that to which other jaws are subdivided."""
+FEWEST_FRAMES_PCT = PanoramaEvaluationOptions().fewest_frames_pct
+SUPERSAMPLING = 1
+"""Rays through a pixel along each side."""
+
+
+def phantoms() -> dict[str, PhantomOptions]:
+    """The phantoms by name."""
+    drawn = {
+        group: draw_population(group, count, np.random.default_rng(0), PhantomOptions(edge_mm=EDGE_MM))
+        for group, count in PHANTOMS
+    }
+    return {f"{group}-{number}": jaw for group, jaws in drawn.items() for number, jaw in enumerate(jaws)}
+
+
+def real_jaw(path: Path) -> Jaw:
+    """A user's jaw with smooth faces, labelled where its file tells the teeth."""
+    jaw, _ = pipeline.load_jaw(path, arch="lower" if "lower" in path.stem else "upper")
+    smooth, labels = subdivided(jaw.mesh), jaw.face_labels
+    if labels is not None:
+        labels = labels[jaw.mesh.closest(smooth.face_centres)[1]]
+    return Jaw(mesh=smooth, face_labels=labels, arch=jaw.arch)
+
+
+def subdivided(mesh: Mesh) -> Mesh:
+    """The Loop surface, refined until its edges are as short as the phantoms' are."""
+    edges = np.linalg.norm(np.diff(mesh.vertices[mesh.faces], axis=1), axis=2)
+    rounds = max(0, round(float(np.log2(np.median(edges) / EDGE_MM))))
+    if rounds == 0:
+        return mesh
+    loaded = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    smooth = loaded.subdivide_loop(iterations=rounds)
+    return Mesh(np.asarray(smooth.vertices), np.asarray(smooth.faces))
+
+
+def film(name: str, source: PhantomOptions | Path, folder: Path, seed: int) -> None:
+    """Make the subject and its film, unless they are there."""
+    jaw = folder / "jaw.ply"
+    if not jaw.with_suffix(".json").exists():
+        storage.write_jaw(jaw, build_phantom(source) if isinstance(source, PhantomOptions) else real_jaw(source))
+    if not (folder / "film" / "truth" / "shot" / "view.json").exists():
+        timed = run_timed(*film_command(jaw, folder / "film", seed))
+        print(f"{name}: filmed in {timed['wall_s']} s", flush=True)
+
+
+def film_command(jaw: Path, out: Path, seed: int) -> list[str]:
+    """The arguments that film a subject."""
+    numbers = ("--seed", str(seed), "--supersampling", str(SUPERSAMPLING))
+    return ["film", str(jaw), "--out", str(out), *numbers]
+
+
+def measure(name: str, method: str, folder: Path, limit_s: int) -> dict[str, object]:
+    """Stitch a film by a method through its command line, and judge the panorama."""
+    out = folder / method
+    command = METHODS[method](folder / "film" / "capture", out, limit_s)
+    status, figures = timed(*command)
+    score, failure = None, f"the program ended with status {status}" if status else unmade(out)
+    if failure is None:
+        made = out if (out / "panorama.json").exists() else first_part(out)
+        run_timed("stitch-eval", str(made), str(folder / "film" / "truth"), "--out", str(folder / f"{method}-score"))
+        score = json.loads((folder / f"{method}-score" / "score.json").read_text())
+    placed = out / "result.json"
+    return {
+        "subject": name,
+        "method": method,
+        "command": " ".join([Path(command[0]).name, *(Path(part).name for part in command[1:])]),
+        "frames_to_panorama": figures,
+        "load_before": round(os.getloadavg()[0], 1),
+        "failure": failure or (score or {}).get("failure"),
+        "opencv": json.loads(placed.read_text()) if placed.exists() else None,
+        "score": score,
+        **conditions(),
+    }
+
+
+def unmade(out: Path) -> str | None:
+    """Why there is no panorama of OpenCV's to judge, or None."""
+    if not (out / "result.json").exists():
+        return None
+    result = json.loads((out / "result.json").read_text())
+    if result["status"] != "ok":
+        return str(result["status"])
+    placed, frames = len(result["placed"]), result["frames"]
+    return f"only {placed} of {frames} frames are placed" if 100 * placed < FEWEST_FRAMES_PCT * frames else None
+
+
+def first_part(out: Path) -> Path:
+    """Of a panorama in parts the first and largest; of another program's, its picture."""
+    return out / "part-1" if (out / "part-1").is_dir() else out / "panorama.png"
+
+
+def stitched(method: str) -> Callable[[Path, Path, int], list[str]]:
+    """The command of a method of cuspid."""
+    return lambda capture, out, _: [*CUSPID, "stitch", str(capture), "--method", method, "--out", str(out)]
+
+
+def opencv(mode: str) -> Callable[[Path, Path, int], list[str]]:
+    """The command of a mode of OpenCV's Stitcher."""
+    script = str(Path(__file__).with_name("opencv_stitcher.py"))
+    return lambda capture, out, limit_s: [
+        *(sys.executable, script, str(capture), "--mode", mode, "--out", str(out), "--cpu-s", str(limit_s))
+    ]
+
+
+CUSPID = (sys.executable, "-m", "cuspid")
+METHODS: Mapping[str, Callable[[Path, Path, int], list[str]]] = {
+    "ortho": stitched("ortho"),
+    "thesis": stitched("thesis"),
+    "opencv-panorama": opencv("panorama"),
+    "opencv-scans": opencv("scans"),
+}
+
+
+def jaw_files(given: list[Path]) -> dict[str, Path]:
+    """The jaws of files and folders by name."""
+    return {path.stem: path for each in given for path in pipeline.jaw_files(each)}
+
+
+def main() -> None:
+    """Run what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/panorama"))
+    parser.add_argument("--work", type=Path, default=Path("build/panorama"))
+    parser.add_argument("--jaws", type=Path, nargs="*", default=[], help="files or folders of your own jaws")
+    parser.add_argument("--subject", nargs="*", help="names; default: all")
+    parser.add_argument("--method", nargs="*", choices=METHODS, default=["ortho"], help="in this order")
+    parser.add_argument("--films-only", action="store_true")
+    parser.add_argument("--cpu-s", type=int, default=600, help="after which OpenCV's Stitcher is given up")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    subjects: Mapping[str, PhantomOptions | Path] = {**phantoms(), **jaw_files(options.jaws)}
+    wanted = [name for name in subjects if not options.subject or name in options.subject]
+    for name in wanted:
+        film(name, subjects[name], options.work / name, list(subjects).index(name))
+    for method, name in product([] if options.films_only else options.method, wanted):
+        path = options.out / f"{name}-{method}.json"
+        if not path.exists():
+            result = measure(name, method, options.work / name, options.cpu_s)
+            storage.write_json(path, result)
+            print(f"{name}, {method}: {result['failure'] or 'made'} {result['frames_to_panorama']}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
