@@ -86,7 +86,7 @@ def perfect(truth: GroundTruth, view: OcclusalView) -> Panorama:
 
 
 def score(known: Known, panorama: Panorama, **options: float):
-    return evaluate_panorama(panorama, known.truth, known.view, known.shot, PanoramaEvaluationOptions(**options)).score
+    return evaluate_panorama(panorama, known.truth, known.view, None, PanoramaEvaluationOptions(**options)).score
 
 
 def test_a_perfect_panorama_has_no_error(known: Known) -> None:
@@ -160,7 +160,7 @@ def tilted_places(panorama: Panorama, pixels: int) -> Panorama:
     )
 
 
-@pytest.mark.parametrize("pixels", [1, 2, 5])
+@pytest.mark.parametrize("pixels", [1, 5])
 def test_shifts_of_s_mm_score_s(known: Known, pixels: int) -> None:
     found = score(known, tilted_places(known.panorama, pixels)).geometry
     shift = pixels * STEP_MM
