@@ -1,5 +1,6 @@
 """Functions that the tests of the grid run in other processes."""
 
+import multiprocessing
 import os
 import signal
 import time
@@ -11,6 +12,15 @@ from cuspid.errors import ReconstructionError
 def square(x: int, delay_s: float = 0.0) -> dict[str, float]:
     time.sleep(delay_s)
     return {"square_mm2": float(x * x)}
+
+
+def starts_a_child(x: int) -> dict[str, float]:
+    """As a pipeline does that finds more than one core."""
+    cores = os.sched_getaffinity(0)
+    if len(cores) > 1:
+        multiprocessing.get_context("fork").Process(target=print).start()
+    time.sleep(0.3)
+    return {"core": float(min(cores))}
 
 
 def refuses_two(x: int) -> dict[str, float]:

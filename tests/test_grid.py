@@ -87,6 +87,13 @@ def cluster():
         yield made.scheduler_address
 
 
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
+def test_each_worker_of_a_cluster_has_a_core_of_its_own(tmp_path, cluster):
+    outcomes = run_grid(cases(range(6)), grid_cases.starts_a_child, tmp_path, cluster=cluster)
+    assert [outcome.failure for outcome in outcomes] == [None] * 6
+    assert len({outcome.figures["core"] for outcome in outcomes}) == 2
+
+
 def test_a_cluster_that_loses_a_worker_gives_the_serial_table(tmp_path, cluster):
     for name in ("serial", "cluster"):
         (tmp_path / name).mkdir()

@@ -2,8 +2,8 @@
 
 Every finished case is a file ``cases/<name>.json`` at once, so that a killed study goes on where it stopped. A case
 that fails is recorded with its reason and does not stop the others. Locally each case is a process of its own, pinned
-to one core; with the address of a Dask scheduler the same calls go to its workers, which need the package and nothing
-else: what they return is written here.
+to one core; with the address of a Dask scheduler the same calls go to its workers, each thread of them pinned to one
+core, too. They need the package and nothing else: what they return is written here.
 """
 
 from __future__ import annotations
@@ -11,12 +11,15 @@ from __future__ import annotations
 import itertools
 import multiprocessing
 import os
+import threading
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import Any
 
 from cuspid import storage
 from cuspid.errors import CuspidError, InputError, MissingDependencyError
@@ -235,12 +238,9 @@ def _on_cluster(cases: Sequence[Case], work: Work, address: str) -> Iterator[Out
             raise InputError(
                 f"--cluster {address}: the scheduler has no workers; start some with: dask worker {address}"
             )
-        futures = {
-            client.submit(
-                _attempt, work, case, pure=False, retries=WORKER_DEATHS, key=f"cuspid-{uuid.uuid4().hex}"
-            ): case
-            for case in cases
-        }
+        slots = _slots(client.scheduler_info(n_workers=-1)["workers"])
+        submit = partial(client.submit, _attempt_on_worker, work, slots=slots, pure=False, retries=WORKER_DEATHS)
+        futures = {submit(case, key=f"cuspid-{uuid.uuid4().hex}"): case for case in cases}
         for future in distributed.as_completed(list(futures)):
             if future.status == "finished":
                 yield future.result()
@@ -249,3 +249,30 @@ def _on_cluster(cases: Sequence[Case], work: Work, address: str) -> Iterator[Out
                 yield Outcome(
                     case=futures[future], figures={}, failure=f"{type(lost).__name__}: {lost}".splitlines()[0]
                 )
+
+
+def _slots(workers: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
+    """For each worker, by address: how many threads the workers before it have on the same host."""
+    used: dict[str, int] = {}
+    slots = {}
+    for address, worker in workers.items():
+        slots[address] = used.get(worker["host"], 0)
+        used[worker["host"]] = slots[address] + int(worker["nthreads"])
+    return slots
+
+
+_threads: dict[int, int] = {}
+"""Of this worker: the number of each thread that has had a case."""
+
+
+def _attempt_on_worker(work: Work, case: Case, slots: Mapping[str, int]) -> Outcome:
+    """As :func:`_attempt`, with one core for this thread of a worker.
+
+    A worker is a daemon, which may have no children: a pipeline that found more cores would try to start some.
+    """
+    import distributed
+
+    cores = sorted(os.sched_getaffinity(os.getpid()))
+    number = _threads.setdefault(threading.get_ident(), len(_threads))
+    os.sched_setaffinity(0, {cores[(slots.get(distributed.get_worker().address, 0) + number) % len(cores)]})
+    return _attempt(work, case)
