@@ -63,6 +63,8 @@ class AdjustmentOptions:
     """A round ends when a step moves the unknowns by less than this share of their standard deviations."""
     minimum_angle_deg: float = 1.0
     """Points whose rays meet at less than this angle are dropped."""
+    covariance: bool = True
+    """Whether the covariance of the poses is found; one camera without a scale has none."""
 
 
 # --- states ------------------------------------------------------------------------------------------------------
@@ -354,11 +356,14 @@ def _posterior(
 
 def _adjusted_rig(state: State, prior: _Prior, covariance: Float[np.ndarray, "c 14 14"] | None) -> Rig:
     """The rig with the refined calibration and what is still uncertain of it; what was held stays as given."""
-    if covariance is None:
+    if not prior.is_free:
         return prior.rig
     cameras = {}
     for index, name in enumerate(prior.rig.names):
         mounted = prior.camera_at(index, state.whitened[index])
+        if covariance is None:
+            cameras[name] = mounted
+            continue
         if mounted.camera.covariance is not None:
             camera = replace(mounted.camera, covariance=covariance[index, 6:, 6:])
             mounted = replace(mounted, camera=camera)
@@ -394,7 +399,7 @@ def adjust(reconstruction: Reconstruction, options: AdjustmentOptions | None = N
         unknowns = state.points.size + POSE * (len(state.frame_rotation) - 1)
         sigma_px = _sigma_px(state, observations, weighting, unknowns)
         limit_px = options.outlier_sigmas * sigma_px
-    return _result(reconstruction, state, observations, colors, prior, sigma_px)
+    return _result(reconstruction, state, observations, colors, prior, sigma_px, options.covariance)
 
 
 def _result(
@@ -404,10 +409,13 @@ def _result(
     colors: Any,
     prior: _Prior,
     sigma_px: float,
+    with_covariance: bool,
 ) -> Reconstruction:
-    """The adjusted reconstruction with its covariances."""
+    """The adjusted reconstruction, with its covariances where they are asked for."""
+    poses, calibration = None, None
     try:
-        poses, calibration = _posterior(state, observations, Weighting(sigma_px, np.inf, prior.is_free))
+        if with_covariance:
+            poses, calibration = _posterior(state, observations, Weighting(sigma_px, np.inf, prior.is_free))
     except LinAlgError as error:
         raise ReconstructionError(
             "adjustment: the tracks do not tie every frame to the others; more overlap is needed"

@@ -39,6 +39,8 @@ class FeatureOptions:
     """Most keypoints in an image; the strongest of each cell come first."""
     contrast: float = 0.02
     """Least contrast of a keypoint, share of the grey range (OpenCV's ``contrastThreshold``)."""
+    edge: float = 10.0
+    """Largest ratio of the curvatures of a keypoint (OpenCV's ``edgeThreshold``); more takes in points on edges."""
     cell_px: int = 25
     """Size of the cells over which keypoints are spread."""
     upright: bool = True
@@ -95,7 +97,7 @@ def detect(image: UInt8[np.ndarray, "h w 3"], options: FeatureOptions | None = N
     """Keypoints of an RGB image, well spread, at most ``options.count``."""
     options = options or FeatureOptions()
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    sift = cv2.SIFT.create(contrastThreshold=options.contrast, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(contrastThreshold=options.contrast, edgeThreshold=options.edge, enable_precise_upscale=True)
     keypoints = list(sift.detect(gray, None))
     if options.upright:
         keypoints = _without_doubles(keypoints)

@@ -25,6 +25,7 @@ from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.motion.colmap import quiet, rigid_from_colmap
 from cuspid.motion.features import FeatureOptions, Features, Progress, detect
+from cuspid.motion.guided import GuidedOptions, refine
 from cuspid.motion.pairs import MatchingOptions, match_unguided
 from cuspid.panorama import FrameUse
 from cuspid.reconstruction import Reconstruction, Tracks
@@ -49,7 +50,7 @@ _WINDOW = 15
 class SingleOptions:
     """How the way of one camera is found."""
 
-    features: FeatureOptions = field(default_factory=lambda: FeatureOptions(count=2000, contrast=0.004))
+    features: FeatureOptions = field(default_factory=lambda: FeatureOptions(count=2500, contrast=0.002, edge=30.0))
     """Keypoints of the contrast-normalised frames; plain enamel needs a low threshold."""
     clahe_clip: float = 4.0
     """Clip limit of the contrast normalisation (CLAHE)."""
@@ -59,6 +60,10 @@ class SingleOptions:
     """First matching, when nothing is known of the motion."""
     steps: tuple[int, ...] = (1, 2, 3, 4, 6)
     """A frame is matched with those so many frames later."""
+    guided: GuidedOptions = field(default_factory=GuidedOptions)
+    """How the mapper's poses are refined."""
+    focal_share: float = 0.03
+    """Without a calibration: standard deviation of the mapper's focal length, as a share (0 to 1) of it."""
     bridge_steps: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 8, 10)
     """Where the model broke: frames to match with instead, at a looser ratio."""
     bridge_ratio: float = 0.95
@@ -399,16 +404,19 @@ def _reconstruction(
     )
 
 
-def _camera_of(found: pycolmap.Camera, given: Camera | None) -> Camera:
-    """The given calibration, or the focal length that the mapper found."""
+def _camera_of(found: pycolmap.Camera, given: Camera | None, options: SingleOptions) -> Camera:
+    """The given calibration, or the focal length that the mapper found, free to be refined."""
     if given is not None:
         return given
     focal, *centre = found.params
+    covariance = np.zeros((8, 8))
+    covariance[:2, :2] = (options.focal_share * focal) ** 2
     return Camera(
         width=found.width,
         height=found.height,
         focal_px=np.array([focal, focal]),
         principal_point_px=np.array(centre),
+        covariance=covariance,
     )
 
 
@@ -444,15 +452,24 @@ def locate_single(
     if not models:
         raise ReconstructionError(_why_nothing(sequence, kept, features, ties))
     parts = _join_all([_model_of(model) for model in models], options.minimum_matches)
-    refined = _camera_of(models[0].cameras[1], sequence.camera)
+    first = _camera_of(models[0].cameras[1], sequence.camera, options)
+    refined = [
+        refine(
+            _reconstruction(part, first, names, features),
+            [features[index] for index in sorted(part.poses)],
+            options.guided,
+            progress=progress,
+        )
+        for part in parts
+    ]
     return SingleMotion(
-        parts=tuple(_reconstruction(part, refined, names, features) for part in parts),
-        frames=_uses(names, refused, parts, ties),
-        notes=_notes(refined, calibrated, parts),
+        parts=tuple(refined),
+        frames=_uses(names, refused, refined, ties),
+        notes=_notes(refined[0].rig[CAMERA].camera, calibrated, refined),
     )
 
 
-def _notes(camera: Camera, calibrated: bool, parts: List[_Model]) -> tuple[str, ...]:
+def _notes(camera: Camera, calibrated: bool, parts: List[Reconstruction]) -> tuple[str, ...]:
     notes = []
     if not calibrated:
         notes.append(
@@ -460,7 +477,7 @@ def _notes(camera: Camera, calibrated: bool, parts: List[_Model]) -> tuple[str, 
             "give a calibration for true lengths"
         )
     if len(parts) > 1:
-        sizes = ", ".join(str(len(part.poses)) for part in parts)
+        sizes = ", ".join(str(len(part.frames)) for part in parts)
         notes.append(f"the sequence broke into {len(parts)} parts of {sizes} frames that nothing ties together")
     return tuple(notes)
 
@@ -494,17 +511,21 @@ def _why_nothing(
 def _uses(
     names: List[str],
     refused: Mapping[int, str],
-    parts: List[_Model],
+    parts: List[Reconstruction],
     ties: Mapping[tuple[int, int], object],
 ) -> tuple[FrameUse, ...]:
     """What became of every frame."""
+    inliers: dict[str, int] = {}
+    for part in parts:
+        seen = np.zeros(0, np.int64) if part.tracks is None else part.tracks.frame_index
+        counts = np.bincount(seen, minlength=len(part.frames)).tolist()
+        inliers |= dict(zip(part.frames, counts, strict=True))
 
     def use(index: int, name: str) -> FrameUse:
         if index in refused:
             return FrameUse(name=name, used=False, reason=refused[index])
-        for part in parts:
-            if index in part.poses:
-                return FrameUse(name=name, used=True, inliers=int(np.sum(part.seen[:, 1] == index)))
+        if name in inliers:
+            return FrameUse(name=name, used=True, inliers=inliers[name])
         tied = sum(index in pair for pair in ties)
         reason = f"does not agree with the {tied} frames that it matches" if tied else "matches no other frame"
         return FrameUse(name=name, used=False, reason=reason)

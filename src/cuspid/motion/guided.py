@@ -1,0 +1,239 @@
+"""One camera's way made precise: matched anew where the first poses say, joined to long tracks, adjusted; in rounds.
+
+The first rounds look far beyond what the poses say, so that their errors are not matched into place.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float, Int
+from numba import njit
+from scipy.spatial import KDTree
+
+from cuspid.camera import Camera
+from cuspid.errors import ReconstructionError
+from cuspid.geometry import Rigid3
+from cuspid.motion.adjustment import AdjustmentOptions, adjust
+from cuspid.motion.features import Features, Progress
+from cuspid.motion.pairs import MatchingOptions, View, make_view, match_guided
+from cuspid.motion.tracks import intersect_rays
+from cuspid.reconstruction import Reconstruction, Tracks
+
+_DEPTH = 14.0
+"""Depth to which a model is scaled here: guided matching takes lengths for millimetres."""
+_NEIGHBOURS = 5
+"""Points near a keypoint whose depths tell its own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GuidedOptions:
+    """How the first poses are refined."""
+
+    steps: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 8)
+    """A frame is matched with those so many frames later."""
+    tolerances_px: tuple[float, ...] = (8.0, 4.0, 4.0)
+    """Largest distance of a match from the epipolar line in each round."""
+    depth_share: float = 0.28
+    """A point's depth is looked for within this share of the depth that its neighbours have."""
+    matching: MatchingOptions = field(default_factory=lambda: MatchingOptions(ratio=0.8, similarity=0.85))
+    """What else counts as a match."""
+    minimum_views: int = 4
+    """Shorter tracks are left out, but where a frame would lose all."""
+    start_px: float = 12.0
+    """Residual beyond which an observation is dropped before the first adjustment; half of it later."""
+    adjustment: AdjustmentOptions = field(
+        default_factory=lambda: AdjustmentOptions(
+            sigma_px=0.5, outlier_sigmas=3.0, rounds=4, iterations=60, covariance=False
+        )
+    )
+    """The adjustment."""
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _root(parent, node):
+    while parent[node] != node:
+        node = parent[node]
+    return node
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _join(matches, image_of):
+    """Union of matches in order; one that would bring two keypoints of an image together is left out."""
+    count = len(image_of)
+    parent, tail, size = np.arange(count), np.arange(count), np.ones(count, np.int64)
+    following, mark = np.full(count, -1), np.full(image_of.max() + 1, -1)
+    for m in range(len(matches)):
+        a, b = _root(parent, matches[m, 0]), _root(parent, matches[m, 1])
+        if a == b:
+            continue
+        if size[a] < size[b]:
+            a, b = b, a
+        member = a
+        while member >= 0:
+            mark[image_of[member]] = m
+            member = following[member]
+        member, clash = b, False
+        while member >= 0 and not clash:
+            clash = mark[image_of[member]] == m
+            member = following[member]
+        if not clash:
+            parent[b] = a
+            following[tail[a]] = b
+            tail[a] = tail[b]
+            size[a] += size[b]
+    return parent, size
+
+
+def join_in_order(matches: Int[np.ndarray, "m 2"], image_of: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+    """Track of each of n keypoints, -1 for none: matches are joined in their order, and one that would give a track two
+    keypoints of an image is left out (where :func:`cuspid.motion.tracks.join` gives up the track)."""
+    parent, _ = _join(matches, image_of)
+    roots = np.array([_root(parent, node) for node in range(len(image_of))])
+    _, label, counts = np.unique(roots, return_inverse=True, return_counts=True)
+    kept = counts >= 2
+    return np.where(kept, np.cumsum(kept) - 1, -1)[label]
+
+
+def refine(
+    model: Reconstruction,
+    features: Sequence[Features],
+    options: GuidedOptions,
+    *,
+    progress: Progress | None = None,
+) -> Reconstruction:
+    """The model of one camera with refined poses and new tracks; ``features`` of its frames, in their order.
+
+    The scale is free and changes. Raises ReconstructionError where too little is consistent.
+    """
+    model = _rescaled(model)
+    for number, tolerance_px in enumerate(options.tolerances_px):
+        views = [make_view(each, _camera(model)) for each in features]
+        matching = replace(options.matching, tolerance_px=tolerance_px)
+        track, image_of = _tracks(model, views, matching, options)
+        limit_px = options.start_px / (1 if number == 0 else 2)
+        found = _triangulated(model, features, views, track, image_of, limit_px, options)
+        model = _rescaled(adjust(found, replace(options.adjustment, start_px=limit_px)))
+        if progress is not None:
+            progress("refining", number + 1, len(options.tolerances_px))
+    return model
+
+
+def _camera(model: Reconstruction) -> Camera:
+    """The one camera."""
+    return model.rig[model.rig.names[0]].camera
+
+
+def _rescaled(model: Reconstruction) -> Reconstruction:
+    """With a median depth of `_DEPTH`."""
+    tracks = _known(model)
+    scale = _DEPTH / float(np.median(_depths(model)))
+    poses = {name: Rigid3(pose.rotation, scale * pose.translation) for name, pose in model.rig_from_world.items()}
+    return replace(model, rig_from_world=poses, tracks=replace(tracks, points=scale * tracks.points))
+
+
+def _known(model: Reconstruction) -> Tracks:
+    if model.tracks is None or not len(model.tracks.point_index):
+        raise ReconstructionError("motion: nothing that several frames see is consistent; more detail is needed")
+    return model.tracks
+
+
+def _depths(model: Reconstruction) -> Float[np.ndarray, "o"]:
+    """Depth of every observation."""
+    tracks = _known(model)
+    axes = np.stack([pose.rotation[2] for pose in model.rig_from_world.values()])
+    shifts = np.array([pose.translation[2] for pose in model.rig_from_world.values()])
+    along = np.einsum("oj,oj->o", axes[tracks.frame_index], tracks.points[tracks.point_index])
+    return along + shifts[tracks.frame_index]
+
+
+def _bounds(
+    model: Reconstruction, frame: int, features: Features, share: float
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Least and greatest depth of each keypoint, about those of the points seen near it."""
+    tracks = _known(model)
+    mine = tracks.frame_index == frame
+    depths = _depths(model)[mine]
+    if len(depths) < _NEIGHBOURS:
+        return np.full(len(features), (1 - share) * _DEPTH), np.full(len(features), (1 + share) * _DEPTH)
+    _, nearest = KDTree(tracks.pixels[mine]).query(features.pixels, k=_NEIGHBOURS)
+    about = np.median(depths[nearest], axis=1)
+    return (1 - share) * about, (1 + share) * about
+
+
+def _tracks(
+    model: Reconstruction, views: Sequence[View], matching: MatchingOptions, options: GuidedOptions
+) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+    """Track and frame of every keypoint of all frames, one after the other."""
+    poses = list(model.rig_from_world.values())
+    sizes = np.array([len(view.features) for view in views])
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    bounds = [_bounds(model, index, view.features, options.depth_share) for index, view in enumerate(views)]
+    pairs = [(i, i + step) for step in options.steps for i in range(len(views) - step)]
+
+    def match(pair: tuple[int, int]) -> Int[np.ndarray, "k 2"]:
+        one, other = pair
+        motion = poses[other] @ poses[one].inverse()
+        found = match_guided(views[one], views[other], motion, bounds[one], bounds[other], matching)
+        return found + [starts[one], starts[other]]
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        matches = np.concatenate([np.zeros((0, 2), np.int64), *pool.map(match, pairs)])
+    image_of = np.repeat(np.arange(len(views)), sizes)
+    return join_in_order(matches, image_of), image_of
+
+
+def _triangulated(
+    model: Reconstruction,
+    features: Sequence[Features],
+    views: Sequence[View],
+    track: Int[np.ndarray, "n"],
+    image_of: Int[np.ndarray, "n"],
+    limit_px: float,
+    options: GuidedOptions,
+) -> Reconstruction:
+    """The model with the tracks whose rays about meet."""
+    world_from_cam = [pose.inverse() for pose in model.rig_from_world.values()]
+    centres = np.array([pose.translation for pose in world_from_cam])
+    turns = np.stack([pose.rotation for pose in world_from_cam])
+    rays = np.concatenate([np.column_stack([view.ideal, np.ones(len(view.ideal))]) for view in views])
+    seen, count = np.flatnonzero(track >= 0), int(track.max(initial=-1)) + 1
+    frame = image_of[seen]
+    points = intersect_rays(centres[frame], np.einsum("oij,oj->oi", turns[frame], rays[seen]), track[seen], count)
+    pixels = np.concatenate([each.pixels for each in features])[seen]
+    colors = np.zeros((count, 3), np.uint8)
+    colors[track[seen]] = np.concatenate([each.colors for each in features])[seen]
+    good = _errors_px(model, points[track[seen]], frame, pixels) < limit_px
+    views_of = np.bincount(track[seen][good], minlength=count)
+    good &= views_of[track[seen]] >= options.minimum_views
+    kept, point_index = np.unique(track[seen][good], return_inverse=True)
+    tracks = Tracks(
+        points=points[kept],
+        colors=colors[kept],
+        point_index=point_index.astype(np.int64),
+        frame_index=frame[good],
+        camera_index=np.zeros(int(good.sum()), np.int64),
+        pixels=pixels[good],
+    )
+    return replace(model, tracks=tracks)
+
+
+def _errors_px(
+    model: Reconstruction,
+    points: Float[np.ndarray, "o 3"],
+    frame: Int[np.ndarray, "o"],
+    pixels: Float[np.ndarray, "o 2"],
+) -> Float[np.ndarray, "o"]:
+    """Distance of every observation from its point's projection; infinite behind the camera."""
+    rotations = np.stack([pose.rotation for pose in model.rig_from_world.values()])
+    shifts = np.array([pose.translation for pose in model.rig_from_world.values()])
+    projected = _camera(model).project(np.einsum("oij,oj->oi", rotations[frame], points) + shifts[frame])
+    errors = np.linalg.norm(projected - pixels, axis=1)
+    return np.where(np.isfinite(errors), errors, np.inf)
