@@ -65,7 +65,7 @@ def save_comparison_picture(
     halves: NDArray[np.object_] = np.asarray(figure.subfigures(2, 1, height_ratios=(1.0, 2.6)))
     above, below = halves
     above.suptitle(f"{title}\n", x=0.01, ha="left", fontsize=14, color=_INK, fontweight="bold")
-    _draw_sections(above.subplots(1, len(sections), squeeze=False)[0], sections, colours, gap_mm)
+    _draw_sections(above.subplots(1, len(sections), squeeze=False)[0].tolist(), sections, colours, gap_mm)
     places = below.subplots(2, len(panels), squeeze=False)
     for (complete, error), (name, curves) in zip(places.T, panels.items(), strict=True):
         for design, curve in curves.items():
