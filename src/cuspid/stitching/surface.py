@@ -24,8 +24,10 @@ NOMINAL_MM = 14.0
 
 _PATCH_MM = 3.0
 """Size of the patches of which each gives one height to the occlusal plane: about half a tooth."""
-_PATCH_SD_MM, _TILT_SD = 1.0, np.deg2rad(2.0)
+_PATCH_SD_MM, _TILT_SD = 1.0, np.deg2rad(4.0)
 """How far the tops of patches stand off the occlusal plane, and the mean of the optical axes off its normal."""
+_RIDGE_MM, _BELOW_MM = 6.0, 1.2
+"""A patch lower by more than the second than the highest patch within the first is no top of a tooth."""
 _TEETH_MM = 4.0
 """What lies so near to the occlusal plane is a tooth."""
 _STRAIGHT = 0.12
@@ -160,20 +162,26 @@ def _upright(
 
 
 def _tops(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "k 3"]:
-    """The upper points of each patch."""
+    """The upper points of each patch that is about as high as the highest near it: tops of teeth, not gum."""
     cells = np.floor(points[:, :2] / _PATCH_MM).astype(np.int64) @ [1, 1 << 20]
     tops = []
     for cell in np.unique(cells):
         inside = points[cells == cell]
         if len(inside) >= 5:
-            tops.append([*np.median(inside[:, :2], axis=0), np.percentile(inside[:, 2], 90)])
-    return np.array(tops, dtype=np.float64).reshape(-1, 3)
+            high = inside[inside[:, 2] >= np.percentile(inside[:, 2], 75)]
+            tops.append([*high[:, :2].mean(axis=0), np.median(high[:, 2])])
+    found = np.array(tops, dtype=np.float64).reshape(-1, 3)
+    if not len(found):
+        return found
+    near = KDTree(found[:, :2]).query_ball_point(found[:, :2], _RIDGE_MM)
+    highest = np.array([found[which, 2].max() for which in near])
+    return found[found[:, 2] > highest - _BELOW_MM]
 
 
 def _levelled(points: Float[np.ndarray, "p 3"]) -> Rigid3:
     """Turns the plane through the tops of the teeth to z = 0; the fewer and the closer they are, the less it turns.
 
-    Least squares with a prior on the tilt, the patches below the plane (gum) dropped in rounds.
+    Least squares with a prior on the tilt; what stands off the plane is dropped in rounds.
     """
     tops = _tops(points)
     if len(tops) < 3:
@@ -183,7 +191,7 @@ def _levelled(points: Float[np.ndarray, "p 3"]) -> Rigid3:
         design = np.column_stack([np.ones(len(tops)), tops[:, :2]])
         plane = np.linalg.solve(design.T @ design + prior, design.T @ tops[:, 2])
         off = tops[:, 2] - design @ plane
-        kept = (off > -_PATCH_SD_MM) & (off < 2 * _PATCH_SD_MM)
+        kept = np.abs(off) < 2 * _PATCH_SD_MM
         if kept.sum() < 3:
             break
         tops = tops[kept]
