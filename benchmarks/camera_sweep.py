@@ -45,7 +45,8 @@ def measure(surface: str, work: Path, workers: int) -> dict[str, object]:
     """Run or finish the sweep of a surface, and what came of it."""
     out = work / surface
     before = len(list((out / "cases").glob("*.json"))) if out.exists() else 0
-    arguments = ["sweep", "--surface", surface, "--repeats", str(REPEATS.get(surface, 1))]
+    tooth = str(SweepOptions(surface=surface).chosen_tooth)
+    arguments = ["sweep", "--surface", surface, "--tooth", tooth, "--repeats", str(REPEATS.get(surface, 1))]
     load = os.getloadavg()[0]
     timed = run_timed(*arguments, "--out", str(out), "--workers", str(workers))
     rows = list(csv.DictReader((out / "results.csv").open()))

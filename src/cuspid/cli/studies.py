@@ -25,6 +25,8 @@ _TITLES: dict[Term, tuple[str, int]] = {
     "points": ("points on the surface", 0),
     "mean_abs_um": ("mean absolute deviation / µm", 2),
 }
+_LISTED = 4
+"""So many settings that are level are named on the screen; sweep.json has all."""
 
 
 def sweep(
@@ -82,15 +84,15 @@ def _save(out: Path, outcomes: Sequence[Outcome], options: SweepOptions) -> None
 
 
 def save_maps(path: Path, outcomes: Sequence[Outcome], options: SweepOptions) -> None:
-    """sweep.png: the terms over baseline and angle, means over the seeds."""
+    """sweep.png: the terms over baseline and angle. Of the first seed, which all settings have in common."""
     maps = []
     for term, sign in TERMS.items():
         found, (title, digits) = best_setting(outcomes, term), _TITLES[term]
-        means = {setting: float(np.mean(list(each.values()))) for setting, each in values_of(outcomes, term).items()}
+        first = {setting: each[0] for setting, each in values_of(outcomes, term).items() if 0 in each}
         maps.append(
             SweepMap(
                 title=title,
-                values=means,
+                values=first,
                 best=None if found is None else found.setting,
                 level=() if found is None else found.level,
                 less_is_better=sign < 0,
@@ -117,7 +119,7 @@ def _means(outcomes: Sequence[Outcome], setting: Setting) -> dict[str, float]:
 def _print(outcomes: Sequence[Outcome], best: dict[Term, Best], options: SweepOptions) -> None:
     table = Table(title=f"{options.surface} surface of tooth {options.chosen_tooth}", title_justify="left")
     for column in ("best by", "baseline, angle", *(title for title, _ in _TITLES.values()), "level with it"):
-        table.add_column(column)
+        table.add_column(column, no_wrap=column == "baseline, angle")
     for term, found in best.items():
         table.add_row(_TITLES[term][0], *_cells(outcomes, found.setting), _level(found))
     if options.thesis is not None:
@@ -138,4 +140,6 @@ def _name(setting: Setting) -> str:
 def _level(found: Best) -> str:
     if found.noise is None:
         return "unknown: nothing was repeated"
+    if len(found.level) > _LISTED:
+        return f"{len(found.level)} others"
     return "; ".join(map(_name, found.level)) or "none"

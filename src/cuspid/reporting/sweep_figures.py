@@ -126,7 +126,7 @@ def _frame(axes: Axes, kind: str, column: int, row: int) -> None:
 
 
 def _explain(figure: Figure, with_thesis: bool) -> None:
-    kinds = {"best": "best", "thesis": "best of the thesis"}
+    kinds = {"best": "best of those repeated", "thesis": "best of the thesis"}
     lines = [
         Line2D([], [], color=_MARKS[kind], linestyle=_DASHES[kind], linewidth=2.0, label=text)
         for kind, text in kinds.items()
