@@ -104,7 +104,7 @@ def _save(out: Path, outcomes: Sequence[Outcome], options: ComparisonOptions) ->
 def save_pictures(out: Path, rows: Sequence[Row], options: ComparisonOptions) -> None:
     """comparison.png and surfaces.png."""
     panels: dict[str, dict[str, list[Row]]] = {}
-    for row in sorted(rows, key=lambda row: number(row, "turns")):
+    for row in rows:
         panels.setdefault(f"{row['jaw']}, tooth {row['tooth']}", {}).setdefault(str(row["design"]), []).append(row)
     mouth = MouthOptions()
     room = room_mm(study_mouths(mouth)[1]["women"], mouth)
@@ -126,7 +126,7 @@ def _sections(out: Path, rows: Sequence[Row], thickness_mm: float) -> Mapping[st
     """Of each design with its largest number of turns, over the first tooth."""
     most = {str(row["design"]): row for row in sorted(rows, key=lambda row: number(row, "turns"))}
     found: dict[str, Outlines] = {}
-    for design, row in most.items():
+    for design, row in sorted(most.items(), key=lambda item: -number(item[1], "cameras")):
         jaw = storage.read_jaw(out / "jaws" / f"{row['jaw']}.ply")
         handpiece = storage.read_handpiece(out / "handpieces" / f"{design}.json")
         path = replace(ScanPathOptions(), tooth=int(number(row, "tooth")), turns=int(number(row, "turns")))

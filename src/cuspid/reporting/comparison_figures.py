@@ -61,7 +61,7 @@ def save_comparison_picture(
     ``gap_mm``: room between the jaws, drawn over the sections.
     """
     colours = {name: _COLOURS[index % len(_COLOURS)] for index, name in enumerate(sections)}
-    figure = _figure(max(9.0, 3.3 * len(panels)), 9.4)
+    figure = _figure(max(9.0, 3.3 * len(panels), 1.7 * len(sections)), 9.4)
     halves: NDArray[np.object_] = np.asarray(figure.subfigures(2, 1, height_ratios=(1.0, 2.6)))
     above, below = halves
     above.suptitle(f"{title}\n", x=0.01, ha="left", fontsize=14, color=_INK, fontweight="bold")
@@ -100,7 +100,7 @@ def _draw_sections(
             axes.add_patch(Polygon(outline, facecolor="none", edgecolor=colours[name], linewidth=1.3))
         axes.axhline(gap, color=_GAP, linewidth=1.2, linestyle="--")
         swept = np.concatenate(list(outlines))
-        size = f"{np.ptp(swept[:, 0]):.0f} mm wide, {swept[:, 1].max():.0f} mm high"
+        size = f"{np.ptp(swept[:, 0]):.0f} x {swept[:, 1].max():.0f} mm"
         axes.set_title(f"{name}\n{size}", loc="left", fontsize=10, color=_INK)
         axes.set(xlim=(-half, half), ylim=(-_TOOTH_MM[1] - 1, top), aspect="equal")
         axes.set_axis_off()
@@ -156,7 +156,7 @@ def save_surface_shares_picture(
         axes.set_axis_off()
     for axes, (name, rows) in zip(places, panels.items(), strict=False):
         values = np.array([[shares.get(s, np.nan) for s in columns[name]] for shares in rows.values()])
-        axes.imshow(values, cmap=_SHARES, vmin=60, vmax=100, aspect="auto")
+        axes.imshow(values, cmap=_SHARES, vmin=0, vmax=100, aspect="auto")
         for (row, column), value in np.ndenumerate(values):
             if np.isfinite(value):
                 axes.text(column, row, f"{value:.1f}", ha="center", va="center", fontsize=9, color=_INK)

@@ -382,10 +382,19 @@ def comparison_rows(
         if outcome.failure is None:
             key = tuple(outcome.case.parameters[name] for name in ("jaw", "tooth", "design", "turns"))
             groups.setdefault(key, []).append(outcome.figures)
-    rows = [
-        {**dict(zip(("jaw", "tooth", "design", "turns"), key, strict=True)), "seeds": len(rows), **_mean(rows)}
-        for key, rows in sorted(groups.items(), key=lambda group: tuple(map(str, group[0])))
+    rows: list[dict[str, Value]] = [
+        {**dict(zip(("jaw", "tooth", "design", "turns"), key, strict=True)), "seeds": len(found), **_mean(found)}
+        for key, found in groups.items()
     ]
+    rows.sort(
+        key=lambda row: (
+            str(row["jaw"]),
+            number(row, "tooth"),
+            -number(row, "cameras"),
+            str(row["design"]),
+            number(row, "turns"),
+        )
+    )
     _, people = study_mouths(mouth)
     rooms = {sex: room_mm(group, mouth) for sex, group in people.items()}
     for row in rows:
