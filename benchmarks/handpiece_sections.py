@@ -69,3 +69,101 @@ def camera_pair(result: Result) -> str:
             markdown_table(head, rows),
         ]
     )
+
+
+def camera_sweep(result: Result) -> str:
+    """The best pair of cameras for each surface, by simulated scans."""
+    head = (
+        "surface",
+        "most complete (mm, deg)",
+        "within 50 um %",
+        "most accurate (mm, deg)",
+        "mean um",
+        "thesis (mm, deg): within 50 um %, mean um",
+        "scans",
+        "failed",
+        "CPU s",
+        "wall s on 2 cores (bar 1800)",
+    )
+    return markdown_table(head, [_sweep_row(name, found) for name, found in result["surfaces"].items()])
+
+
+def _sweep_row(surface: str, found: Result) -> tuple[object, ...]:
+    complete, accurate, thesis, run = (
+        found["best"]["complete_50_um_pct"],
+        found["best"]["mean_abs_um"],
+        found["thesis"],
+        found["run"],
+    )
+    beside = "-" if thesis is None else f"{thesis['complete_50_um_pct']:.1f}, {thesis['mean_abs_um']:.2f}"
+    return (
+        surface,
+        _setting(complete["setting"]),
+        f"{complete['value']:.1f} ± {complete['noise']:.1f}",
+        _setting(accurate["setting"]),
+        f"{accurate['value']:.2f} ± {accurate['noise']:.2f}",
+        beside if thesis is None else f"{_setting(thesis['setting'])}: {beside}",
+        found["cases"],
+        found["failed"],
+        f"{found['cases_cpu_s']:.0f}",
+        "in several goes" if run is None else f"{mark(run['wall_s'], 1800, 0)} (load {run['load_before']:.0f})",
+    )
+
+
+def _setting(setting: tuple[float, float]) -> str:
+    return f"{setting[0]:g}, {setting[1]:g}"
+
+
+def grid(result: Result) -> str:
+    """How much faster two workers are than one."""
+    rows = [
+        (way, f"{ratio:.2f}" if ratio >= 1.7 else f"**{ratio:.2f}** (missed)", ", ".join(f"{x:.2f}" for x in each))
+        for (way, ratio), each in zip(result["median_speed_up"].items(), result["speed_up"].values(), strict=True)
+    ]
+    load = result["load_average_before"][0]
+    return "\n".join(
+        [
+            f"{result['cases']} cases of the sweep, {len(result['rounds'])} rounds, load average before: {load:.1f}.",
+            "",
+            markdown_table(("workers", "two against one, median (bar >= 1.7)", "each round"), rows),
+        ]
+    )
+
+
+def design_comparison(result: Result) -> str:
+    """Six cameras or twelve, and found handpieces with fewer."""
+    head = (
+        "jaw",
+        "tooth",
+        "design",
+        "turns",
+        "seeds",
+        "cameras",
+        "positions",
+        "images",
+        "mean um",
+        "P95 um",
+        "tooth within 50 um %",
+        "reconstruction CPU s",
+    )
+    rows = [
+        (
+            *(f"{row[name]:g}" if isinstance(row[name], float) else row[name] for name in head[:6] if name in row),
+            f"{row['frames']:.0f}",
+            f"{row['images']:.0f}",
+            f"{row['tooth_mean_abs_um']:.2f}",
+            f"{row['tooth_p95_um']:.1f}",
+            f"{row['tooth_within_50_um_pct']:.1f}",
+            f"{row['reconstruction_cpu_s']:.0f}",
+        )
+        for row in result["rows"]
+    ]
+    scale = result["options"]["image_scale"]
+    return "\n".join(
+        [
+            f"One tooth a scan, images scaled by {scale:g}; the share is of all faces of the tooth that are open to "
+            "the occlusal side, the same for all designs (docs/six-or-twelve.md).",
+            "",
+            markdown_table(head, rows),
+        ]
+    )
