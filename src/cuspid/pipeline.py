@@ -57,6 +57,7 @@ from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path, steady_
 from cuspid.stereo.between import BetweenOptions, measure_between
 from cuspid.stereo.matching import DepthEstimator, StereoOptions
 from cuspid.stitching.ortho import OrthoOptions, Stitched, orthophoto
+from cuspid.stitching.thesis_method import ThesisOptions, stitch_as_thesis
 from cuspid.surface.cleaning import CleaningOptions, clean
 from cuspid.surface.fusion import FusionOptions
 from cuspid.surface.fusion import fuse as fuse_depth_maps
@@ -486,10 +487,16 @@ def _moved(handpiece: Handpiece, reconstruction: Reconstruction, tolerance_px: f
 class StitchOptions(OrthoOptions):
     """How the frames of one hand-held camera become a panorama."""
 
-    method: Literal["ortho"] = "ortho"
-    """ortho: frames located by structure from motion and rectified on the surface."""
+    method: Literal["ortho", "thesis"] = "ortho"
+    """ortho: frames located by structure from motion and rectified on the surface. thesis: chapter 4 of the thesis,
+    homographies chained from normal map to normal map, as a baseline. PATENT NOTICE: the method thesis appears to be
+    claimed by US 11,044,400; check the law where you are before you use it. The method ortho does not use it."""
     motion: SingleOptions = field(default_factory=SingleOptions)
-    """Where the camera was."""
+    """Where the camera was (method ortho)."""
+    examination: bool = True
+    """Leave out frames that fail the examination of the thesis (method thesis)."""
+    thesis: ThesisOptions = field(default_factory=ThesisOptions)
+    """The method thesis."""
 
 
 def stitch(sequence: FrameSequence, options: StitchOptions, *, progress: Progress = silent) -> tuple[Stitched, ...]:
@@ -497,6 +504,9 @@ def stitch(sequence: FrameSequence, options: StitchOptions, *, progress: Progres
 
     Raises ReconstructionError, naming the frames, where nothing can be placed.
     """
+    if options.method == "thesis":
+        panoramas = stitch_as_thesis(sequence, options.thesis, examination=options.examination, progress=progress)
+        return tuple(Stitched(panorama=panorama, motion=None, strip=None) for panorama in panoramas)
     motion = locate_single(sequence, options.motion, progress=progress)
     notes = (*sequence.notes, *motion.notes)
     parts: list[Stitched] = []

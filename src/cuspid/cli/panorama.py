@@ -54,8 +54,9 @@ def _hashes(sequence: Sequence, calibration: Path | None) -> dict[str, str]:
 
 
 def _write(folder: Path, part: Stitched) -> None:
-    storage.write_poses(folder / "poses.json", part.motion.rig_from_world)
-    save_camera_path(folder / "camera_path.png", part.panorama, part.motion)
+    if part.motion is not None:
+        storage.write_poses(folder / "poses.json", part.motion.rig_from_world)
+        save_camera_path(folder / "camera_path.png", part.panorama, part.motion)
     if part.strip is not None:
         storage.write_strip(folder, part.strip)
     storage.write_panorama(folder, part.panorama)

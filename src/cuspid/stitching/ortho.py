@@ -36,10 +36,10 @@ class Stitched:
 
     panorama: Panorama
     """The occlusal view."""
-    motion: Reconstruction
-    """The camera's way, in the panorama's world and its lengths."""
+    motion: Reconstruction | None
+    """The camera's way, in the panorama's world and its lengths; None where the method locates no camera."""
     strip: Strip | None
-    """The panorama unrolled along the arch; None where the camera hardly moved."""
+    """The panorama unrolled along the arch; None where the camera hardly moved, or is not located."""
 
 
 def orthophoto(
