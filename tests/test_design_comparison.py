@@ -168,6 +168,8 @@ def test_turns_are_enough_where_completeness_stops_to_grow():
     options = ComparisonOptions(designs=("six",), turns=(1, 3, 5, 7), enough_pct=0.5)
     rows = comparison_rows([outcome(t, complete=c) for t, c in ((1, 70), (3, 90.0), (5, 96.0), (7, 96.3))], options)
     assert enough_turns(rows, options) == {"phantom, 46, six": 5}
+    growing = [row for row in rows if row["turns"] in (1, 3, 5)]
+    assert enough_turns(growing, options) == {}
     still = comparison_rows([outcome(1, design="twelve")], options)
     assert enough_turns(still, options) == {}
 

@@ -419,12 +419,13 @@ def _mean(rows: Sequence[Row]) -> dict[str, float]:
 
 
 def enough_turns(rows: Sequence[Row], options: ComparisonOptions) -> dict[str, int]:
-    """For each jaw, tooth and turned design the least number of turns after which completeness does not grow."""
+    """For each jaw, tooth and turned design the least number of turns after which completeness does not grow; not there
+    where it grows up to the largest number that was scanned."""
     found: dict[str, int] = {}
     for row in sorted(rows, key=lambda row: number(row, "turns")):
         same = [other for other in rows if all(other[name] == row[name] for name in ("jaw", "tooth", "design"))]
         more = [number(other, _JUDGED) for other in same if number(other, "turns") > number(row, "turns")]
-        if row["design"] in options.turned and max(more, default=0.0) < number(row, _JUDGED) + options.enough_pct:
+        if row["design"] in options.turned and more and max(more) < number(row, _JUDGED) + options.enough_pct:
             found.setdefault(f"{row['jaw']}, {row['tooth']}, {row['design']}", int(number(row, "turns")))
     return found
 
