@@ -72,10 +72,10 @@ def save_comparison_picture(
             _draw_curve(complete, curve.images, curve.complete_pct, curve.turns, colours[design])
             _draw_curve(error, curve.images, curve.error_um, curve.turns, colours[design])
         complete.set_title(name, loc="left", fontsize=12, color=_INK)
-        error.set_ylim(bottom=0)
         error.set_xlabel("images (at the points: turns)", color=_INK)
         for axes in (complete, error):
             _label_images(axes)
+        error.set_ylim(0.0, 1.15 * max(np.nanmax(curve.error_um) for curve in curves.values()))
     places[0, 0].set_ylabel(f"tooth within {within_um} µm / %", color=_INK)
     places[1, 0].set_ylabel("mean deviation of the tooth / µm", color=_INK)
     handles = [Line2D([], [], color=colour, marker="o", label=name) for name, colour in colours.items()]
