@@ -206,15 +206,19 @@ def test_gain_and_offset_do_not_change_the_fitted_scores(known: Known) -> None:
     everywhere = np.ones_like(teeth)
     same = image_scores(truth, everywhere, truth, teeth)
     dimmed = image_scores(0.5 * truth + 0.1, everywhere, truth, teeth)
-    for name in ("zncc", "ssim_teeth_fitted", "ssim_full_fitted"):
+    for name in ("zncc", "ssim_teeth_fitted"):
         assert getattr(dimmed, name) == pytest.approx(getattr(same, name), abs=1e-9) == 1
     assert dimmed.ssim_teeth < 0.95
+    halved = image_scores(0.5 * truth, everywhere, truth, teeth)
+    assert halved.ssim_full_fitted == pytest.approx(1, abs=1e-9)
+    assert halved.ssim_full < 0.95
 
 
 def test_trivial_pictures_score_as_they_deserve(known: Known) -> None:
     scores = trivial_scores(known.view)
     assert scores["empty"].zncc == scores["grey canvas"].zncc == 0
     assert scores["empty"].ssim_teeth < 0.1
+    assert scores["empty"].ssim_teeth_fitted < 0.1
     # The whole canvas flatters: an empty picture agrees with the background.
     assert scores["empty"].ssim_full > 0.4
     assert scores["grey jaw"].ssim_full > scores["empty"].ssim_full

@@ -10,7 +10,7 @@ pictures are compared.
 Pictures are compared in grey (Rec. 601), where the panorama shows nothing as black: ZNCC over the pixels of the teeth,
 SSIM (Wang et al. 2004, Gaussian window of 1.5 px) as the mean of its map over the teeth, and over the whole canvas as
 in the thesis; as they are, and after one gain and offset for the whole picture, fitted by least squares on the teeth
-that are shown, or for the score of the canvas on the canvas.
+that are shown. For the score of the canvas it is one gain alone: an offset would lift the black around the jaw.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class ImageScores:
     ssim_teeth_fitted: float
     """As ``ssim_teeth``, after one gain and offset."""
     ssim_full_fitted: float
-    """As ``ssim_full``, after one gain and offset."""
+    """As ``ssim_full``, after one gain."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -296,7 +296,8 @@ def image_scores(
     black = np.where(shown, picture, 0.0)
     raw = _ssim_map(black, truth)
     on_teeth = _ssim_map(np.where(shown, _fitted(picture, truth, shown & teeth), 0.0), truth)
-    on_canvas = _ssim_map(_fitted(black, truth, np.ones_like(shown)), truth)
+    gain = float(np.sum(black * truth)) / max(float(np.sum(black**2)), 1e-12)
+    on_canvas = _ssim_map(np.clip(gain * black, 0, 1), truth)
     return ImageScores(
         zncc=_zncc(black[teeth], truth[teeth]),
         ssim_teeth=float(raw[teeth].mean()),
@@ -338,18 +339,18 @@ def _inner_mean(similarity: Float[np.ndarray, "h w"]) -> float:
 
 def trivial_scores(view: OcclusalView) -> dict[str, ImageScores]:
     """What pictures score that show no work."""
-    truth, everywhere = grey(view.image), np.ones_like(view.teeth)
+    truth, everywhere, nowhere = grey(view.image), np.ones_like(view.teeth), np.zeros_like(view.teeth)
     jaw, level = view.labels != NOTHING, float(truth[view.teeth].mean())
     step = round(1.0 / view.mm_per_px)
     moved = np.zeros_like(truth)
     moved[:, step:] = truth[:, :-step]
     pictures = {
-        "empty": np.zeros_like(truth),
-        "grey canvas": np.full_like(truth, level),
-        "grey jaw": np.where(jaw, level, 0.0),
-        "truth shifted by 1 mm": moved,
+        "empty": (np.zeros_like(truth), nowhere),
+        "grey canvas": (np.full_like(truth, level), everywhere),
+        "grey jaw": (np.where(jaw, level, 0.0), jaw),
+        "truth shifted by 1 mm": (moved, everywhere),
     }
-    return {name: image_scores(picture, everywhere, truth, view.teeth) for name, picture in pictures.items()}
+    return {name: image_scores(picture, shown, truth, view.teeth) for name, (picture, shown) in pictures.items()}
 
 
 def lay_over(
