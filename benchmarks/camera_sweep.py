@@ -51,12 +51,13 @@ def measure(surface: str, work: Path, workers: int) -> dict[str, object]:
     timed = run_timed(*arguments, "--out", str(out), "--workers", str(workers))
     rows = list(csv.DictReader((out / "results.csv").open()))
     shutil.copy(out / "sweep.png", Path("docs/images") / f"sweep-{surface}.png")
-    run = {**timed, "workers": workers, "load_before": load, "load_after": os.getloadavg()[0]}
+    record = work / f"{surface}.run.json"
+    if before == 0:  # only a sweep that was run in one go says how long it takes
+        write_json(record, {**timed, "workers": workers, "load_before": load, "load_after": os.getloadavg()[0]})
     return {
         "command": f"cuspid {' '.join(arguments)} --out {surface}",
         "settings": read_json(out / "run.json")["sweep"]["settings"]["options"],
-        # Only a sweep that was run in one go says how long it takes.
-        "run": run if before == 0 else None,
+        "run": read_json(record) if record.exists() else None,
         "cases": len(rows),
         "failed": sum(bool(row["failure"]) for row in rows),
         "cases_cpu_s": round(sum(float(row["cpu_s"]) for row in rows if not row["failure"]), 1),
