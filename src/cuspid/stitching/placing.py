@@ -30,7 +30,7 @@ class Placed:
     """Its width and height in px."""
     canvas_from_frame: Float[np.ndarray, "3 3"]
     """Homography of the whole frame, where no segment has one."""
-    cells: Float[np.ndarray, "c 3 3"]
+    cells: Float[np.ndarray, "k 3 3"]
     """Homographies of its segments."""
     segments: Int16[np.ndarray, "r c"]
     """Which segment each place belongs to, `SEGMENT_PX` times as coarse as the frame."""

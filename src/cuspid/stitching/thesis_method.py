@@ -302,7 +302,8 @@ def _frame_uses(sequence: Sequence, parts: list[Chain], mine: int, reasons: Mapp
             )
         part, found = placed[index]
         if part != mine:
-            return FrameUse(name=name, used=False, reason=f"in part {part + 1}")
+            refused = parts[mine].refused.get(index)
+            return FrameUse(name=name, used=False, reason=f"in part {part + 1}" + (f"; {refused}" if refused else ""))
         return FrameUse(name=name, used=True, inliers=found.inliers, overlap=found.overlap)
 
     return tuple(use(index, name) for index, name in enumerate(sequence.names))
