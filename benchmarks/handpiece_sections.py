@@ -154,7 +154,7 @@ def design_comparison(result: Result) -> str:
             f"{row['tooth_mean_abs_um']:.2f}",
             f"{row['tooth_p95_um']:.1f}",
             f"{row['tooth_within_50_um_pct']:.1f}",
-            f"{row['reconstruction_cpu_s']:.0f}",
+            f"{row['reconstruction_cpu_s']:.0f}" if "reconstruction_cpu_s" in row else "-",
         )
         for row in result["rows"]
     ]
