@@ -72,6 +72,8 @@ class SingleOptions:
     """Largest distance of a match from its epipolar line, px."""
     minimum_matches: int = 12
     """Fewest consistent matches that tie two frames, or a frame to the model."""
+    minimum_share: float = 0.2
+    """Least share (0 to 1) of the matches of two frames that must be consistent."""
     blurred_share: float = 0.4
     """A frame with less than this share (0 to 1) of the sharpness of its neighbours is left out."""
     field_of_view_deg: float = 60.0
@@ -194,7 +196,8 @@ def _verify(
     found = pycolmap.estimate_calibrated_two_view_geometry(
         camera, one.pixels, camera, other.pixels, matches.astype(np.uint32), how
     )
-    return found if len(found.inlier_matches) >= options.minimum_matches else None
+    least = max(options.minimum_matches, options.minimum_share * len(matches))
+    return found if len(found.inlier_matches) >= least else None
 
 
 def _tie(

@@ -389,7 +389,7 @@ def _put(
     view: View,
     surface: HeightMap,
     px: Float[np.ndarray, "h w 2"],
-    image: UInt8[np.ndarray, "h w 3"],
+    image: UInt8[np.ndarray, "a b 3"],
     chosen: Bool[np.ndarray, "h w"],
     light: Light,
     index: int,

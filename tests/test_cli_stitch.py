@@ -1,0 +1,140 @@
+"""The verb stitch: bad input is one line and leaves nothing behind; what it reads, it reads as it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cuspid import storage
+from cuspid.camera import Camera
+from cuspid.cli import main
+from cuspid.storage.handpieces import camera_to_json
+
+
+def picture(seed: int, size: tuple[int, int] = (160, 120)) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    small = rng.integers(0, 255, (size[1] // 8, size[0] // 8, 3), dtype=np.uint8)
+    return np.asarray(cv2.resize(small, size, interpolation=cv2.INTER_CUBIC))
+
+
+def write_frames(folder: Path, count: int) -> Path:
+    for index in range(count):
+        storage.write_image(folder / f"{index:03d}.png", picture(index))
+    return folder
+
+
+def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line that a refused command prints."""
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert stopped.value.code == 1
+    printed = capsys.readouterr().err
+    assert "Traceback" not in printed
+    return next(line for line in printed.splitlines() if line.startswith("cuspid:"))
+
+
+def test_no_such_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = refused(["stitch", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out")], capsys)
+    assert "no such folder or video" in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_one_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_frames(tmp_path / "frames", 1)
+    assert "1 image(s)" in refused(["stitch", str(folder), "--out", str(tmp_path / "out")], capsys)
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_sizes_name_the_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_frames(tmp_path / "frames", 3)
+    storage.write_image(folder / "001.png", picture(1, (80, 120)))
+    line = refused(["stitch", str(folder), "--out", str(tmp_path / "out")], capsys)
+    assert "001.png: 80 x 120 px, but most frames have 160 x 120 px" in line
+
+
+def test_a_truncated_frame_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_frames(tmp_path / "frames", 3)
+    (folder / "002.png").write_bytes((folder / "002.png").read_bytes()[:-40])
+    assert "002.png: truncated" in refused(["stitch", str(folder), "--out", str(tmp_path / "out")], capsys)
+
+
+def test_something_that_is_no_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "film.mp4").write_bytes(b"not a film")
+    line = refused(["stitch", str(tmp_path / "film.mp4"), "--out", str(tmp_path / "out")], capsys)
+    assert "0 frame(s) could be decoded" in line
+
+
+def test_frames_without_overlap_leave_nothing_half_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_frames(tmp_path / "frames", 4)
+    line = refused(["stitch", str(folder), "--out", str(tmp_path / "out")], capsys)
+    assert "000 to 003" in line
+    assert not (tmp_path / "out").exists()
+
+
+def write_video(path: Path, count: int) -> Path:
+    stream = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (160, 120))
+    for index in range(count):
+        stream.write(cv2.cvtColor(picture(index), cv2.COLOR_RGB2BGR))
+    stream.release()
+    return path
+
+
+def test_a_video_is_decoded_frame_by_frame(tmp_path: Path) -> None:
+    sequence = storage.read_sequence(write_video(tmp_path / "film.avi", 6), tmp_path / "decoded")
+    assert sequence.names == tuple(f"{index:05d}" for index in range(6))
+    assert sequence.size == (160, 120)
+    shown = sequence.image(3).astype(float)
+    assert np.abs(shown - picture(3)).mean() < 12 < np.abs(shown - picture(2)).mean()
+
+
+def test_a_truncated_video_gives_what_it_holds_and_says_so(tmp_path: Path) -> None:
+    video = write_video(tmp_path / "film.avi", 30)
+    data = video.read_bytes()
+    video.write_bytes(data[: len(data) // 2])
+    sequence = storage.read_sequence(video, tmp_path / "decoded")
+    assert 10 < len(sequence) < 20
+    assert f"truncated, {len(sequence)} of 30 frames" in sequence.notes[0]
+
+
+CAMERA = Camera(
+    width=160,
+    height=120,
+    focal_px=np.array([130.0, 131.0]),
+    principal_point_px=np.array([81.0, 59.5]),
+    distortion=np.array([-0.1, 0.02, 0.001, -0.002]),
+)
+
+
+def write_calibration(folder: Path, kind: str) -> Path:
+    path = folder / {"json": "camera.json", "colmap": "cameras.txt", "opencv": "camera.yml"}[kind]
+    if kind == "json":
+        storage.write_json(path, camera_to_json(CAMERA))
+    elif kind == "colmap":
+        path.write_text("# cameras\n1 OPENCV 160 120 " + " ".join(map(str, CAMERA.parameters)) + "\n")
+    else:
+        file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+        file.write("image_width", 160)
+        file.write("image_height", 120)
+        file.write("camera_matrix", CAMERA.opencv_matrix)
+        file.write("distortion_coefficients", np.append(CAMERA.distortion, 0.0)[None])
+        file.release()
+    return path
+
+
+@pytest.mark.parametrize("kind", ["json", "colmap", "opencv"])
+def test_calibrations_are_read_alike(tmp_path: Path, kind: str) -> None:
+    folder = write_frames(tmp_path / "frames", 2)
+    sequence = storage.read_sequence(folder, tmp_path / "d", calibration=write_calibration(tmp_path, kind))
+    assert sequence.camera is not None
+    np.testing.assert_allclose(sequence.camera.parameters, CAMERA.parameters, atol=1e-9)
+
+
+def test_a_calibration_of_another_size_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for index in range(3):
+        storage.write_image(tmp_path / "frames" / f"{index}.png", picture(index, (320, 240)))
+    calibration = write_calibration(tmp_path, "json")
+    arguments = ["stitch", str(tmp_path / "frames"), "--out", str(tmp_path / "out"), "--calibration", str(calibration)]
+    assert "calibration of 160 x 120 px, but the frames have 320 x 240 px" in refused(arguments, capsys)
