@@ -3,10 +3,12 @@
 import multiprocessing
 import os
 import signal
+import sys
 import time
 from pathlib import Path
 
 from cuspid.errors import ReconstructionError
+from cuspid.studies.grid import Case, run_grid
 
 
 def square(x: int, delay_s: float = 0.0) -> dict[str, float]:
@@ -48,3 +50,15 @@ def is_killed_once(x: int, folder: str) -> dict[str, float]:
         first.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return {"y": float(10 * x)}
+
+
+def takes_long(folder: str) -> dict[str, float]:
+    mark = Path(folder) / "process"
+    mark.with_suffix(".new").write_text(str(os.getpid()))
+    mark.with_suffix(".new").rename(mark)
+    time.sleep(120)
+    return {}
+
+
+if __name__ == "__main__":
+    run_grid([Case(name="long", parameters={"folder": sys.argv[1]})], takes_long, Path(sys.argv[1]), workers=1)

@@ -2,6 +2,11 @@
 
 import csv
 import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import pytest
 
@@ -75,6 +80,29 @@ def test_other_parameters_under_the_same_name_are_refused(tmp_path):
         run_grid([Case(name="a", parameters={"x": 2})], grid_cases.square, tmp_path, workers=1)
     with pytest.raises(InputError, match="two cases are called a"):
         run_grid([Case(name="a", parameters={"x": 2})] * 2, grid_cases.square, tmp_path, workers=1)
+
+
+def test_no_workers_are_refused(tmp_path):
+    with pytest.raises(InputError, match="--workers is 0"):
+        run_grid(cases([1]), grid_cases.square, tmp_path, workers=0)
+
+
+def test_the_processes_of_a_killed_study_end_with_it(tmp_path):
+    study = subprocess.Popen([sys.executable, grid_cases.__file__, str(tmp_path)])
+    mark = tmp_path / "process"
+    for _ in range(600):
+        if mark.exists():
+            break
+        time.sleep(0.1)
+    study.kill()
+    study.wait()
+    number = int(mark.read_text())
+    for _ in range(100):
+        if not Path(f"/proc/{number}").exists() or "(zombie)" in Path(f"/proc/{number}/status").read_text():
+            return
+        time.sleep(0.1)
+    os.kill(number, signal.SIGKILL)
+    pytest.fail("its process works on")
 
 
 @pytest.fixture(scope="module")

@@ -51,8 +51,6 @@ def sweep(
         cluster: Address of a Dask scheduler, tcp://host:port, to work on its workers instead.
         retry_failed: Run again what failed before.
     """
-    if workers is not None and workers < 1:
-        raise InputError(f"sweep: --workers is {workers}; at least one is needed")
     inputs = {} if jaw is None else {"jaw": storage.hash_file(jaw)}
     with storage.claimed_folder(out, "sweep", {"options": options, "source": source}, inputs):
         scanned = load_source(jaw, source)

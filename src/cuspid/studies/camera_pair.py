@@ -158,7 +158,7 @@ def baseline_axis(jaw: Jaw, tooth: int, surface: str, direction: Direction) -> F
     distal, outward, occlusal = tooth_axes(jaw)[tooth]
     if direction == "along":
         return distal
-    return outward if surface == "occlusal" else occlusal
+    return outward if surface in ("occlusal", "incisal") else occlusal
 
 
 def study_camera_pair(

@@ -176,7 +176,8 @@ def find_site(jaw: Jaw, options: SweepOptions) -> Site:
     the images overlap too little.
     """
     mask = surface_faces(jaw, options.chosen_tooth, options.surface)
-    pair_from_world = facing(jaw.mesh, mask, _baseline_axis(jaw, options), options.distance_mm)
+    axis = baseline_axis(jaw, options.chosen_tooth, options.surface, options.chosen_direction)
+    pair_from_world = facing(jaw.mesh, mask, axis, options.distance_mm)
     middle = steady_poses(jaw, options.path, per_pass=3)[1]
     pair_from_rig = pair_from_world @ middle.inverse()
     narrowest = pair_handpiece(pair_from_rig, (min(options.baseline_mm), options.angle_deg[0]), options)
@@ -217,13 +218,6 @@ def _outside_of(jaw: Jaw, tooth: int, faces: Bool[np.ndarray, "f"]) -> Bool[np.n
     middle = (out[faces].min() + out[faces].max()) / 2
     within = (along >= along[faces].min()) & (along <= along[faces].max())
     return within & (out > middle) & (out < out[faces].max() + _NEIGHBOURHOOD_MM)
-
-
-def _baseline_axis(jaw: Jaw, options: SweepOptions) -> Float[np.ndarray, "3"]:
-    seen_from_above = options.surface in ("occlusal", "incisal")
-    return baseline_axis(
-        jaw, options.chosen_tooth, "occlusal" if seen_from_above else options.surface, options.chosen_direction
-    )
 
 
 def pair_handpiece(pair_from_rig: Rigid3, setting: Setting, options: SweepOptions) -> Handpiece:

@@ -88,9 +88,12 @@ def run_grid(
     """Run the cases that have no result in ``folder`` yet and return all outcomes, in the order of the cases.
 
     ``workers`` local processes (default: one for each core), or the workers of the Dask scheduler at ``cluster``.
-    Writes ``cases/<name>.json`` for each case and the table ``results.csv``. Raises InputError where two cases share a
-    name or the cluster cannot be reached, MissingDependencyError where Dask is not installed.
+    Writes ``cases/<name>.json`` for each case and the table ``results.csv``. Raises InputError for fewer than one
+    worker, where two cases share a name or the cluster cannot be reached, MissingDependencyError where Dask is not
+    installed.
     """
+    if workers is not None and workers < 1:
+        raise InputError(f"study: --workers is {workers}; at least one is needed")
     names = [case.name for case in cases]
     if len(set(names)) < len(names):
         raise InputError(f"study: two cases are called {next(name for name in names if names.count(name) > 1)}")
@@ -203,8 +206,17 @@ def _start(case: Case, work: Work, core: int) -> _Running:
 
 
 def _work_alone(sending: Connection, work: Work, case: Case, core: int) -> None:
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     os.sched_setaffinity(0, {core})
     sending.send(_attempt(work, case))
+
+
+def _end_with_parent() -> None:
+    """A study that is killed cannot tell its processes: each watches for itself."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _collect(finished: _Running) -> Outcome:
