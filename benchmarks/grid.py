@@ -25,8 +25,10 @@ from cuspid.jaw import Jaw
 from cuspid.storage import write_json
 from cuspid.studies.camera_sweep import SweepOptions, sweep
 
-OPTIONS = SweepOptions(baseline_mm=(1.0, 2.0), angle_deg=(0.0, 9.0), image_px=256, path_mm=2.0, frames=3, repeats=0)
-"""Four cases of some six CPU seconds, half of which a local process needs to start."""
+OPTIONS = SweepOptions(
+    baseline_mm=(1.0, 1.5, 2.0, 2.5, 3.0), angle_deg=(0.0, 9.0), image_px=256, path_mm=2.0, frames=3, repeats=0
+)
+"""Ten cases of some six CPU seconds, half of which a local process needs to start."""
 EDGE_MM = 0.3
 
 
