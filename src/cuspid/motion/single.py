@@ -70,9 +70,9 @@ class SingleOptions:
     """Ratio test of the matching where the model broke."""
     error_px: float = 2.0
     """Largest distance of a match from its epipolar line, px."""
-    minimum_matches: int = 12
+    minimum_matches: int = 15
     """Fewest consistent matches that tie two frames, or a frame to the model."""
-    minimum_share: float = 0.2
+    minimum_share: float = 0.3
     """Least share (0 to 1) of the matches of two frames that must be consistent."""
     blurred_share: float = 0.4
     """A frame with less than this share (0 to 1) of the sharpness of its neighbours is left out."""

@@ -34,12 +34,18 @@ class StripOptions:
 
 _STEP_MM = 0.25
 _LEAST_MM = 5.0
+"""A shorter way of the camera is not unrolled."""
+_TREMOR_FRAMES = 3.0
+"""Standard deviation of the Gaussian filter over the camera's path, in frames."""
 
 
-def arch_curve(motion: Reconstruction, surface: HeightMap, options: StripOptions) -> Float[np.ndarray, "n 2"]:
-    """World (x, y) of the middle of the crowns, every `_STEP_MM`, in the order in which the camera went."""
+def arch_curve(motion: Reconstruction, surface: HeightMap, options: StripOptions) -> Float[np.ndarray, "n 2"] | None:
+    """World (x, y) of the middle of the crowns, every `_STEP_MM`, in the order in which the camera went; None where it
+    hardly moved."""
     centres = np.array([pose.inverse().translation[:2] for pose in motion.rig_from_world.values()])
     curve = _even(_smooth(_even(_forward(centres)), options.smoothing_mm))
+    if _STEP_MM * len(curve) < _LEAST_MM:
+        return None
     across = np.arange(-options.half_width_mm, options.half_width_mm + _STEP_MM, _STEP_MM)
     for _ in range(2):
         normals = _normals(curve)
@@ -48,12 +54,23 @@ def arch_curve(motion: Reconstruction, surface: HeightMap, options: StripOptions
         weight = np.clip(heights - (heights.max(axis=1, keepdims=True) - options.occlusal_mm), 0, None)
         middle = (weight * across).sum(axis=1) / weight.sum(axis=1)
         curve = _even(_smooth(curve + middle[:, None] * normals, options.smoothing_mm))
-    return curve
+    return _longer(curve, options.half_width_mm)
+
+
+def _longer(curve: Float[np.ndarray, "n 2"], by_mm: float) -> Float[np.ndarray, "m 2"]:
+    """The curve, straight on beyond its ends: the camera sees farther than it goes."""
+    steps = _STEP_MM * np.arange(1, round(by_mm / _STEP_MM) + 1)[:, None]
+    head, tail = (_unit(curve[a] - curve[b]) for a, b in ((0, min(8, len(curve) - 1)), (-1, max(-9, -len(curve)))))
+    return np.concatenate([curve[0] + steps[::-1] * head, curve, curve[-1] + steps * tail])
+
+
+def _unit(vector: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+    return vector / max(float(np.linalg.norm(vector)), 1e-9)
 
 
 def _forward(path: Float[np.ndarray, "f 2"]) -> Float[np.ndarray, "n 2"]:
     """A shaky path without its steps back: the mean of frames, in blocks that each go on by a millimetre."""
-    smooth = gaussian_filter1d(path, 3.0, axis=0, mode="nearest") if len(path) > 6 else path
+    smooth = _smooth(path, _TREMOR_FRAMES * _STEP_MM)
     kept = [smooth[0]]
     for place in smooth[1:]:
         if np.linalg.norm(place - kept[-1]) >= 1.0:
@@ -97,7 +114,7 @@ def unroll(
     ``mm_per_px`` is the size of the panorama's pixels in the lengths of the motion.
     """
     curve = arch_curve(motion, surface, options)
-    if _STEP_MM * len(curve) < _LEAST_MM:
+    if curve is None:
         return None
     columns = int(_STEP_MM * (len(curve) - 1) / mm_per_px)
     at = np.linspace(0, len(curve) - 1, columns)
@@ -110,11 +127,16 @@ def unroll(
     image = cv2.remap(panorama.image, where, None, cv2.INTER_LINEAR)
     covered = cv2.remap(panorama.covered.astype(np.uint8), where, None, cv2.INTER_NEAREST) > 0
     image[~covered] = 0
+    zones = np.where(covered, _zones(surface.at(places), half, options), -1).astype(np.int16)
+    shown = np.flatnonzero(covered[half])
+    if not len(shown):
+        return None
+    ends = slice(int(shown[0]), int(shown[-1]) + 1)
     return Strip(
-        image=np.asarray(image, dtype=np.uint8),
-        covered=covered,
-        zone=np.where(covered, _zones(surface.at(places), half, options), -1).astype(np.int16),
-        curve=line if panorama.mm_per_px else line / mm_per_px,
+        image=np.asarray(image, dtype=np.uint8)[:, ends],
+        covered=covered[:, ends],
+        zone=zones[:, ends],
+        curve=(line if panorama.mm_per_px else line / mm_per_px)[ends],
         mm_per_px=panorama.mm_per_px,
     )
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, grey_dilation
 from scipy.spatial import KDTree
 
 from cuspid.errors import InputError, ReconstructionError
@@ -32,8 +32,13 @@ _TEETH_MM = 4.0
 """What lies so near to the occlusal plane is a tooth."""
 _STRAIGHT = 0.12
 """A path is straight whose middle stands off its chord by less than this share of the chord."""
-_NEIGHBOURS, _REACH_MM = 8, 1.5
-"""A height is the median of that many points, of those within this distance."""
+_NEIGHBOURS, _REACH_MM, _UPPER = 12, 2.5, 75
+"""A height is this percentile of that many points, of those within this distance: smooth enamel has few points, and the
+gum deep beside it many."""
+_DEEP_MM = 8.0
+"""No tooth is seen so far below the cusps; what lies deeper does not shape the surface."""
+_ROUND_MM = 0.8
+"""Crowns bulge out below their edges: the surface goes on by one cell, at most so much lower."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,19 +239,26 @@ def height_map(model: Reconstruction, options: SurfaceOptions) -> HeightMap:
     near = np.isfinite(distances)
     heights = np.where(near, points[np.minimum(nearest, len(points) - 1), 2], np.nan)
     known = near.sum(axis=-1) >= 3
-    median = np.full(known.shape, np.nan)
-    median[known] = np.nanmedian(heights[known], axis=-1)
-    smooth = _filled(median, options.smoothing_mm / options.cell_mm, float(np.median(points[:, 2])))
+    upper = np.full(known.shape, np.nan)
+    upper[known] = np.nanpercentile(heights[known], _UPPER, axis=-1)
+    smooth = _filled(_bulging(upper), options.smoothing_mm / options.cell_mm, float(np.median(points[:, 2])))
     return HeightMap(corner=low, cell_mm=options.cell_mm, heights=smooth.astype(np.float32))
 
 
+def _bulging(heights: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r c"]:
+    """Edges of crowns moved outwards by one cell; unknown cells beside known ones take their height."""
+    highest = grey_dilation(np.where(np.isfinite(heights), heights, -np.inf), size=3)
+    beside = np.where(np.isfinite(highest), highest, np.nan)
+    return np.where(np.isfinite(heights), np.maximum(heights, beside - _ROUND_MM), beside)
+
+
 def _sure_points(model: Reconstruction) -> Float[np.ndarray, "p 3"]:
-    """Points that three frames saw and that do not stand apart in height."""
+    """Points that three frames saw, that do not stand apart in height and are not deep below the teeth."""
     tracks = _tracks_of(model)
     counts = np.bincount(tracks.point_index, minlength=len(tracks.points))
     points = tracks.points[counts >= 3] if np.sum(counts >= 3) >= 20 else tracks.points
     low, high = np.percentile(points[:, 2], [1, 99.5])
-    return points[(points[:, 2] >= low) & (points[:, 2] <= high)]
+    return points[(points[:, 2] >= max(low, min(-_DEEP_MM, high - 1))) & (points[:, 2] <= high)]
 
 
 def _filled(heights: Float[np.ndarray, "r c"], sigma: float, background: float) -> Float[np.ndarray, "r c"]:
