@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 import multiprocessing
 import os
+import sys
 import threading
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -209,6 +210,10 @@ def _work_alone(sending: Connection, work: Work, case: Case, core: int) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     os.sched_setaffinity(0, {core})
     sending.send(_attempt(work, case))
+    sending.close()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)  # With the watching thread alive, libraries complain of leaks while Python ends.
 
 
 def _end_with_parent() -> None:
