@@ -94,7 +94,8 @@ def test_the_gum_of_a_tooth_lies_on_its_outer_side(coarse_phantom):
 def test_every_setting_of_the_thesis_is_taken_for_a_pair(site, baseline, angle):
     handpiece = pair_handpiece(site.pair_from_rig, (baseline, angle), SMALL)
     assert handpiece.rig.groups(handpiece.working_distance_mm) == (("left", "right"),)
-    assert 5.0 <= handpiece.working_distance_mm < 5.6
+    # 4 mm are 60 % of the view at 5.5 mm; turned inwards by little, it is the far corner that decides.
+    assert 5.0 <= handpiece.working_distance_mm < 6.4
 
 
 @pytest.mark.parametrize(
