@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from cuspid.camera import Camera
+from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.rig import Rig
 
@@ -96,3 +97,25 @@ class Reconstruction:
     def frames(self) -> tuple[str, ...]:
         """Names of the located frames."""
         return tuple(self.rig_from_world)
+
+    @property
+    def known_tracks(self) -> Tracks:
+        """The sparse model. Raises ReconstructionError where there is none."""
+        if self.tracks is None or not len(self.tracks.point_index):
+            raise ReconstructionError("motion: nothing that several frames see is consistent; more detail is needed")
+        return self.tracks
+
+    @property
+    def depths_in_rig(self) -> Float[np.ndarray, "o"]:
+        """Z in the rig frame of the point of every observation, mm: of one camera at its origin, the depth."""
+        tracks = self.known_tracks
+        axes = np.stack([pose.rotation[2] for pose in self.rig_from_world.values()])
+        shifts = np.array([pose.translation[2] for pose in self.rig_from_world.values()])
+        along = np.einsum("oj,oj->o", axes[tracks.frame_index], tracks.points[tracks.point_index])
+        return np.asarray(along + shifts[tracks.frame_index])
+
+    def scaled(self, scale: float) -> Reconstruction:
+        """Poses and points times a scale, for one camera, whose rig fixes none. Raises ReconstructionError."""
+        tracks = self.known_tracks
+        poses = {name: Rigid3(pose.rotation, scale * pose.translation) for name, pose in self.rig_from_world.items()}
+        return replace(self, rig_from_world=poses, tracks=replace(tracks, points=scale * tracks.points))

@@ -531,59 +531,79 @@ def _assumptions(options: MouthOptions) -> tuple[str, ...]:
 _ARCH_LENGTHS_MM = MappingProxyType({"Lower-14": 51.23, "Upper-14": 55.37, "Lower-12": 45.40, "Upper-12": 46.00})
 """Column f of the thesis' Table 2.1."""
 _RAMUS_MM, _TURN_RAD = 49.23, 0.45
+_OPENINGS_MM = (35.0, 60.0)
 _RADII_MM = (77.7, 134.0)
 """r as the thesis prints it."""
 
 
 def thesis_lines() -> tuple[ThesisLine, ...]:
     """The thesis' Eq. 2.1 to 2.4 beside what its own inputs give, and what this model gives for a mean person."""
-    near, far = (opening / _TURN_RAD for opening in (35.0, 60.0))
-    narrow, wide = (Mouth(interincisal_mm=opening) for opening in (35.0, 60.0))
-    behind = float(tooth_ends_mm(Anatomy().molar_depth_mm.mean)[-1])
-    angles = [np.arcsin(_RAMUS_MM / radius) for radius in _RADII_MM]
-    exact = [_distance_mm(radius, angle, 51.23) for radius, angle in zip(_RADII_MM, angles, strict=True)]
-    projected = [
-        (radius - length * np.cos(angle))
-        for length in _ARCH_LENGTHS_MM.values()
-        for radius, angle in zip(_RADII_MM, angles, strict=True)
-    ]
-    first = projected[:2]
+    angles = tuple(float(np.arcsin(_RAMUS_MM / radius)) for radius in _RADII_MM)
+    narrow, wide = (Mouth(interincisal_mm=opening) for opening in _OPENINGS_MM)
     return (
-        ThesisLine(
-            what="Eq. 2.1: r = C / theta, mm",
-            printed="77.7-134",
-            recomputed=f"{near:.1f}-{far:.1f}; the model turns by {np.rad2deg(narrow.turn_rad):.1f} and "
-            f"{np.rad2deg(wide.turn_rad):.1f} deg for 35 and 60 mm, with one r",
-            reason="the smallest and the largest opening are divided by the mean angle, though who opens wider turns "
-            "farther; r then varies for want of theta. Here theta follows from the opening",
-        ),
-        ThesisLine(
-            what="Eq. 2.2: alpha, deg",
-            printed="21-39",
-            recomputed=f"{np.rad2deg(angles[1]):.1f}-{np.rad2deg(angles[0]):.1f}; the model has "
-            f"{float(np.asarray(narrow.balkwill_deg)):.1f}",
-            reason="printed as a sine, meant as its inverse. The ramus height goes from condyle to gonion, below the "
-            "occlusal plane, and makes alpha too large; here the measured height of the condyles above that plane",
-        ),
-        ThesisLine(
-            what="Eq. 2.3: d = r - f cos(alpha), mm (Lower-14)",
-            printed="no number",
-            recomputed=f"{first[0]:.1f}-{first[1]:.1f}; by the law of cosines {exact[0]:.1f}-{exact[1]:.1f}",
-            reason="a projection; the distance from condyle to second molar is d^2 = r^2 + f^2 - 2 r f cos(alpha). The "
-            "column f of Table 2.1 agrees with column b to 0.06 mm in every row and looks like a copy of it",
-        ),
-        ThesisLine(
-            what="Eq. 2.4: L, mm",
-            printed="12-26.6",
-            recomputed=f"{min(projected) * _TURN_RAD:.1f}-{max(projected) * _TURN_RAD:.1f} over the rows of Table 2.1 "
-            f"(Lower-14: {first[0] * _TURN_RAD:.1f}-{first[1] * _TURN_RAD:.1f}); the model, at the distal end of the "
-            f"second molar, {float(np.asarray(narrow.gap_mm(behind))):.1f}-{float(np.asarray(wide.gap_mm(behind))):.1f}"
-            " for openings of 35-60 mm",
-            reason="the printed range does not follow from the printed inputs: r - f = 26.55 for the smallest r, and "
-            "0.45 times that is 11.95, so the two numbers look like d and L of one case without cos(alpha). As a "
-            "conservative gap for a handpiece 12 mm is sound, but not for that reason",
-        ),
+        _radius_line(narrow, wide),
+        _angle_line(angles, narrow),
+        _depth_line(angles),
+        _gap_line(angles, narrow, wide),
     )
+
+
+def _radius_line(narrow: Mouth, wide: Mouth) -> ThesisLine:
+    near, far = (opening / _TURN_RAD for opening in _OPENINGS_MM)
+    return ThesisLine(
+        what="Eq. 2.1: r = C / theta, mm",
+        printed="77.7-134",
+        recomputed=f"{near:.1f}-{far:.1f}; the model turns by {np.rad2deg(narrow.turn_rad):.1f} and "
+        f"{np.rad2deg(wide.turn_rad):.1f} deg for 35 and 60 mm, with one r",
+        reason="the smallest and the largest opening are divided by the mean angle, though who opens wider turns "
+        "farther; r then varies for want of theta. Here theta follows from the opening",
+    )
+
+
+def _angle_line(angles: tuple[float, ...], narrow: Mouth) -> ThesisLine:
+    return ThesisLine(
+        what="Eq. 2.2: alpha, deg",
+        printed="21-39",
+        recomputed=f"{np.rad2deg(angles[1]):.1f}-{np.rad2deg(angles[0]):.1f}; the model has "
+        f"{float(np.asarray(narrow.balkwill_deg)):.1f}",
+        reason="printed as a sine, meant as its inverse. The ramus height goes from condyle to gonion, below the "
+        "occlusal plane, and makes alpha too large; here the measured height of the condyles above that plane",
+    )
+
+
+def _depth_line(angles: tuple[float, ...]) -> ThesisLine:
+    length = _ARCH_LENGTHS_MM["Lower-14"]
+    printed = _projected_mm(angles, length)
+    exact = [_distance_mm(radius, angle, length) for radius, angle in zip(_RADII_MM, angles, strict=True)]
+    return ThesisLine(
+        what="Eq. 2.3: d = r - f cos(alpha), mm (Lower-14)",
+        printed="no number",
+        recomputed=f"{printed[0]:.1f}-{printed[1]:.1f}; by the law of cosines {exact[0]:.1f}-{exact[1]:.1f}",
+        reason="a projection; the distance from condyle to second molar is d^2 = r^2 + f^2 - 2 r f cos(alpha). The "
+        "column f of Table 2.1 agrees with column b to 0.06 mm in every row and looks like a copy of it",
+    )
+
+
+def _gap_line(angles: tuple[float, ...], narrow: Mouth, wide: Mouth) -> ThesisLine:
+    every = [_TURN_RAD * depth for length in _ARCH_LENGTHS_MM.values() for depth in _projected_mm(angles, length)]
+    lower = [_TURN_RAD * depth for depth in _projected_mm(angles, _ARCH_LENGTHS_MM["Lower-14"])]
+    behind = float(tooth_ends_mm(Anatomy().molar_depth_mm.mean)[-1])
+    model = [float(np.asarray(mouth.gap_mm(behind))) for mouth in (narrow, wide)]
+    return ThesisLine(
+        what="Eq. 2.4: L, mm",
+        printed="12-26.6",
+        recomputed=f"{min(every):.1f}-{max(every):.1f} over the rows of Table 2.1 (Lower-14: {lower[0]:.1f}-"
+        f"{lower[1]:.1f}); the model, at the distal end of the second molar, {model[0]:.1f}-{model[1]:.1f} for "
+        "openings of 35-60 mm",
+        reason="the printed range does not follow from the printed inputs: r - f = 26.55 for the smallest r, and "
+        "0.45 times that is 11.95, so the two numbers look like d and L of one case without cos(alpha). As a "
+        "conservative gap for a handpiece 12 mm is sound, but not for that reason",
+    )
+
+
+def _projected_mm(angles: tuple[float, ...], length_mm: float) -> list[float]:
+    """d of Eq. 2.3 as printed, for each r."""
+    return [radius - length_mm * float(np.cos(angle)) for radius, angle in zip(_RADII_MM, angles, strict=True)]
 
 
 def _distance_mm(radius_mm: float, angle_rad: float, length_mm: float) -> float:

@@ -161,6 +161,8 @@ def read_brief(path: Path) -> DesignBrief:
     """Read and check a TOML file. Raises InputError with the file and the first condition that fails."""
     try:
         return parse_brief(tomllib.loads(path.read_text(encoding="utf-8")))
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file") from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"{path}: cannot be read as TOML: {error}") from error
     except InputError as error:

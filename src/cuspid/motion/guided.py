@@ -17,8 +17,6 @@ from numba import njit
 from scipy.spatial import KDTree
 
 from cuspid.camera import Camera
-from cuspid.errors import ReconstructionError
-from cuspid.geometry import Rigid3
 from cuspid.motion.adjustment import AdjustmentOptions, adjust
 from cuspid.motion.features import Features, Progress
 from cuspid.motion.pairs import MatchingOptions, View, make_view, match_guided
@@ -133,34 +131,16 @@ def _camera(model: Reconstruction) -> Camera:
 
 def _rescaled(model: Reconstruction) -> Reconstruction:
     """With a median depth of `_DEPTH`."""
-    tracks = _known(model)
-    scale = _DEPTH / float(np.median(_depths(model)))
-    poses = {name: Rigid3(pose.rotation, scale * pose.translation) for name, pose in model.rig_from_world.items()}
-    return replace(model, rig_from_world=poses, tracks=replace(tracks, points=scale * tracks.points))
-
-
-def _known(model: Reconstruction) -> Tracks:
-    if model.tracks is None or not len(model.tracks.point_index):
-        raise ReconstructionError("motion: nothing that several frames see is consistent; more detail is needed")
-    return model.tracks
-
-
-def _depths(model: Reconstruction) -> Float[np.ndarray, "o"]:
-    """Depth of every observation."""
-    tracks = _known(model)
-    axes = np.stack([pose.rotation[2] for pose in model.rig_from_world.values()])
-    shifts = np.array([pose.translation[2] for pose in model.rig_from_world.values()])
-    along = np.einsum("oj,oj->o", axes[tracks.frame_index], tracks.points[tracks.point_index])
-    return along + shifts[tracks.frame_index]
+    return model.scaled(_DEPTH / float(np.median(model.depths_in_rig)))
 
 
 def _bounds(
     model: Reconstruction, frame: int, features: Features, share: float
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Least and greatest depth of each keypoint, about those of the points seen near it."""
-    tracks = _known(model)
+    tracks = model.known_tracks
     mine = tracks.frame_index == frame
-    depths = _depths(model)[mine]
+    depths = model.depths_in_rig[mine]
     if len(depths) < _NEIGHBOURS:
         return np.full(len(features), (1 - share) * _DEPTH), np.full(len(features), (1 + share) * _DEPTH)
     _, nearest = KDTree(tracks.pixels[mine]).query(features.pixels, k=_NEIGHBOURS)

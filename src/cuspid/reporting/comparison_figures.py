@@ -12,15 +12,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
-from cuspid.storage import whole_file
+from cuspid.reporting.figures import new_figure, save_figure
 
 _INK, _GAP, _TOOTH = "#333333", "#c8501e", "#f3ead9"
 _COLOURS = ("#3b7dd8", "#c8860a", "#3fa66b", "#8e5bb5", "#b8405e", "#5a6872", "#2a9d9d", "#8a6d3b")
@@ -61,7 +59,7 @@ def save_comparison_picture(
     ``gap_mm``: room between the jaws, drawn over the sections.
     """
     colours = {name: _COLOURS[index % len(_COLOURS)] for index, name in enumerate(sections)}
-    figure = _figure(max(9.0, 3.3 * len(panels), 1.7 * len(sections)), 9.4)
+    figure = new_figure(max(9.0, 3.3 * len(panels), 1.7 * len(sections)), 9.4, dpi=84, layout="constrained")
     halves: NDArray[np.object_] = np.asarray(figure.subfigures(2, 1, height_ratios=(1.0, 2.6)))
     above, below = halves
     above.suptitle(f"{title}\n", x=0.01, ha="left", fontsize=14, color=_INK, fontweight="bold")
@@ -80,7 +78,7 @@ def save_comparison_picture(
     places[1, 0].set_ylabel("mean deviation of the tooth / µm", color=_INK)
     handles = [Line2D([], [], color=colour, marker="o", label=name) for name, colour in colours.items()]
     below.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False, fontsize=10)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _draw_sections(
@@ -149,7 +147,9 @@ def save_surface_shares_picture(
     most = max(len(rows) for rows in panels.values())
     lines = -(-len(panels) // 2)
     widths = [max(map(len, list(columns.values())[k::2]), default=1) for k in range(min(2, len(panels)))]
-    figure = _figure(1.6 * len(widths) + 0.72 * sum(widths), 0.6 + lines * (1.2 + 0.3 * most))
+    figure = new_figure(
+        1.6 * len(widths) + 0.72 * sum(widths), 0.6 + lines * (1.2 + 0.3 * most), dpi=84, layout="constrained"
+    )
     figure.suptitle(f"{title}\n", x=0.01, ha="left", fontsize=13, color=_INK, fontweight="bold")
     places = figure.subplots(lines, len(widths), squeeze=False, width_ratios=widths).ravel()
     for axes in places[len(panels) :]:
@@ -165,15 +165,4 @@ def save_surface_shares_picture(
         axes.tick_params(length=0)
         axes.set_title(name, loc="left", fontsize=12, color=_INK)
         axes.spines[:].set_visible(False)
-    _save(figure, path)
-
-
-def _figure(width_in: float, height_in: float) -> Figure:
-    figure = Figure(figsize=(width_in, height_in), dpi=84, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _save(figure: Figure, path: Path) -> None:
-    with whole_file(path) as temporary:
-        figure.savefig(temporary)
+    save_figure(figure, path)

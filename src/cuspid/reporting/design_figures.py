@@ -11,15 +11,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures import look, render
+from cuspid.reporting.figures import look, new_figure, render, save_figure
 from cuspid.rig import Handpiece, MountedCamera
-from cuspid.storage import whole_file
 
 GROUP_COLOURS: Mapping[str, str] = {"o": "#c8860a", "b": "#3b7dd8", "l": "#8e5bb5"}
 """By the first letter of a camera's name: occlusal, buccal, lingual."""
@@ -54,8 +51,7 @@ def save_design_picture(
     ``mesh``: what lies below, in the rig frame (mm). ``outline``: cross-section of the holder as a polygon in (y, z).
     ``notes``: lines of text below the title.
     """
-    figure = Figure(figsize=(13.0, 5.6), dpi=84, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure(13.0, 5.6, dpi=84)
     places = ((0.02, 0.10, 0.31, 0.70), (0.345, 0.10, 0.31, 0.70), (0.67, 0.10, 0.31, 0.70))
     views = ((ALONG, "along the arch"), (ABOVE, "from above"), (OBLIQUE, "oblique"))
     for place, (axes, name) in zip(places, views, strict=True):
@@ -65,8 +61,7 @@ def save_design_picture(
     figure.text(0.02, 0.955, title or handpiece.name, fontsize=15, color=_INK, va="center", fontweight="bold")
     figure.text(0.02, 0.90, "   ".join(notes), fontsize=10.5, color=_INK, va="center")
     figure.legend(handles=_legend(handpiece), loc="lower center", ncols=6, frameon=False, fontsize=10)
-    with whole_file(path) as temporary:
-        figure.savefig(temporary)
+    save_figure(figure, path)
 
 
 def _draw_view(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -148,10 +149,10 @@ def _crevices(depth_mm: Float[np.ndarray, "h w"], step_mm: float) -> Float[np.nd
 
 def save_picture(path: Path, mesh: Mesh, *, title: str = "", width_px: int = 1000) -> None:
     """PNG of a mesh in its own colours: occlusal, and two oblique views."""
-    figure = _figure(6.6)
+    figure = new_figure(12.0, 6.6, dpi=130)
     _draw_views(figure, mesh, 0.04, width_px=width_px)
     _draw_title(figure, title)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def save_deviation_picture(
@@ -160,21 +161,23 @@ def save_deviation_picture(
     """PNG of a scan (in its own frame) coloured by its deviation, with the colour bar, histogram and key figures."""
     colors = deviation_colors(trueness.deviation_um, options)
     colored = replace(scan.transformed(trueness.reference_from_scan), colors=colors)
-    figure = _figure(8.4)
+    figure = new_figure(12.0, 8.4, dpi=130)
     _draw_views(figure, colored, 0.30, width_px=options.width_px)
     _draw_histogram(figure, colored, trueness.deviation_um, options)
     _draw_figures(figure, trueness)
     _draw_title(figure, title)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
-def _figure(height_in: float) -> Figure:
-    figure = Figure(figsize=(12, height_in), dpi=130, facecolor="white")
+def new_figure(width_in: float, height_in: float, *, dpi: int, layout: Literal["constrained"] | None = None) -> Figure:
+    """A white page of a size in inches, without a screen."""
+    figure = Figure(figsize=(width_in, height_in), dpi=dpi, facecolor="white", layout=layout)
     FigureCanvasAgg(figure)
     return figure
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure, whole or not at all. Raises OutputError."""
     with whole_file(path) as temporary:
         figure.savefig(temporary)
 

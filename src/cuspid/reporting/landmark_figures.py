@@ -12,14 +12,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Jaw, Landmark
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures import OCCLUSAL, render
-from cuspid.storage import whole_file
+from cuspid.reporting.figures import OCCLUSAL, new_figure, render, save_figure
 
 _INK = "#333333"
 _COLORS = {"cusp": "#c4262e", "groove": "#1f5fd6", "angle": "#8a3ab9", "edge": "#8a3ab9", "cervix": "#1d7d4f"}
@@ -34,8 +32,7 @@ Extent = tuple[float, float, float, float]
 def save_landmark_picture(path: Path, jaw: Jaw, teeth: Sequence[int] = (), *, title: str = "") -> None:
     """PNG of a jaw with its landmarks, and of some of its teeth enlarged with the names of theirs."""
     columns = max(1, (len(teeth) + 1) // 2)
-    figure = Figure(figsize=(7.4 + 3.4 * (columns if teeth else 0), 6.6), dpi=78, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure(7.4 + 3.4 * (columns if teeth else 0), 6.6, dpi=78)
     share = 7.0 / figure.get_size_inches()[0]
     _draw_points(_jaw_axes(figure, (0.01, 0.03, share, 0.89), painted(jaw), 900), jaw.landmarks, size=4.0)
     width = (0.99 - share) / columns
@@ -43,7 +40,7 @@ def save_landmark_picture(path: Path, jaw: Jaw, teeth: Sequence[int] = (), *, ti
         place = (share + 0.01 + (k // 2) * width, 0.50 - 0.46 * (k % 2), width - 0.01, 0.40)
         _draw_tooth(figure, place, jaw, fdi)
     figure.text(0.02, 0.955, title, fontsize=15, color=_INK, va="center", fontweight="bold")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def save_measure_picture(
@@ -59,13 +56,12 @@ def save_measure_picture(
     ``lines`` names the landmarks that each length is between: two, or three for the one from the first to the middle of
     the others; ``values_mm`` are written beside them. Raises InputError where the jaw lacks a landmark.
     """
-    figure = Figure(figsize=(8.4, 6.6), dpi=78, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure(8.4, 6.6, dpi=78)
     axes = _jaw_axes(figure, (0.02, 0.03, 0.96, 0.89), painted(jaw), 900)
     for name, labels in lines.items():
         _draw_length(axes, name, _ends(jaw.landmarks, labels), values_mm[name])
     figure.text(0.03, 0.955, title, fontsize=15, color=_INK, va="center", fontweight="bold")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def painted(jaw: Jaw) -> Mesh:
@@ -159,8 +155,3 @@ def _draw_length(axes: Axes, name: str, ends: Float[np.ndarray, "2 3"], value_mm
         va="center",
         bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5, "alpha": 0.9},
     )
-
-
-def _save(figure: Figure, path: Path) -> None:
-    with whole_file(path) as temporary:
-        figure.savefig(temporary)

@@ -12,11 +12,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
 
-from cuspid.storage import whole_file
+from cuspid.reporting.figures import new_figure, save_figure
 
 TOOTH_NAMES = (
     "central incisor",
@@ -53,8 +51,7 @@ def save_sagittal_picture(
     ``lower_mm``: the same of the lower jaw with the mouth open; ``condyle_mm``: the condyle then (closed: 0, 0);
     ``arcs_mm``: ways of the lower incisal edges and of the last tooth's end.
     """
-    figure = Figure(figsize=(11, 8.6), dpi=110, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure(11.0, 8.6, dpi=110)
     figure.text(0.03, 0.965, title, fontsize=15, color=_INK, va="center", fontweight="bold")
     axes = figure.add_axes((0.02, 0.02, 0.96, 0.91))
     _draw_teeth(axes, upper_mm, np.array([0.0, 1.0]))
@@ -70,8 +67,7 @@ def save_sagittal_picture(
     axes.autoscale_view()
     axes.margins(0.06)
     axes.set_axis_off()
-    with whole_file(path) as temporary:
-        figure.savefig(temporary)
+    save_figure(figure, path)
 
 
 def _draw_teeth(axes: Axes, edge: Float[np.ndarray, "k 2"], rootwards: Float[np.ndarray, "2"]) -> None:
@@ -156,8 +152,7 @@ def save_fit_picture(
     title: str = "",
 ) -> None:
     """PNG: for each group, share of people with at least the needed room at each tooth; ``total_mm`` is marked."""
-    figure = Figure(figsize=(12, 5.2), dpi=110, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure(12.0, 5.2, dpi=110)
     figure.text(0.03, 0.955, title, fontsize=15, color=_INK, va="center", fontweight="bold")
     for place, (group, shares) in enumerate(share_pct.items()):
         axes = figure.add_axes((0.07 + 0.48 * place, 0.12, 0.42, 0.73))
@@ -172,8 +167,7 @@ def save_fit_picture(
         axes.set_title(group, loc="left", fontsize=13, color=_INK)
         if place == 0:
             axes.legend(frameon=True, framealpha=1, edgecolor="white", fontsize=10, loc="lower left")
-    with whole_file(path) as temporary:
-        figure.savefig(temporary)
+    save_figure(figure, path)
 
 
 def save_gap_picture(
@@ -184,8 +178,7 @@ def save_gap_picture(
     title: str = "",
 ) -> None:
     """PNG: distribution of the gap at the second molar by group, and the range that the thesis prints."""
-    figure = Figure(figsize=(9, 5), dpi=110, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure(9.0, 5.0, dpi=110)
     figure.text(0.03, 0.955, title, fontsize=15, color=_INK, va="center", fontweight="bold")
     axes = figure.add_axes((0.08, 0.13, 0.88, 0.74))
     top = max(float(np.percentile(gap, 99.8)) for gap in gap_mm.values())
@@ -201,8 +194,7 @@ def save_gap_picture(
     axes.set_ylim(0, 1.35 * axes.get_ylim()[1])
     axes.legend(frameon=False, fontsize=11, loc="upper left")
     _style(axes, "gap L at the distal end of the second molar / mm", "share of people / % per mm")
-    with whole_file(path) as temporary:
-        figure.savefig(temporary)
+    save_figure(figure, path)
 
 
 def _style(axes: Axes, x: str, y: str) -> None:

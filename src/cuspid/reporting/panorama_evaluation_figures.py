@@ -7,12 +7,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 
-from cuspid.storage import whole_file
+from cuspid.reporting.figures import new_figure, save_figure
 
 _INK = "#333333"
 _COLOURS = "YlOrRd"
@@ -36,8 +34,7 @@ def save_panorama_evaluation(
     belong; none where they are not known. ``captions``: one line below each of the three.
     """
     height, width = truth.shape[:2]
-    figure = Figure(figsize=(15, 15 / 3 * height / width + 1.9), dpi=100, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure(15.0, 15 / 3 * height / width + 1.9, dpi=100)
     figure.text(0.02, 0.95, title, fontsize=15, color=_INK, va="center", fontweight="bold")
     panels = [figure.add_axes((0.01 + 0.33 * k, 0.15, 0.32, 0.73)) for k in range(3)]
     for axes, caption in zip(panels, captions, strict=True):
@@ -46,8 +43,7 @@ def save_panorama_evaluation(
     panels[0].imshow(truth)
     panels[1].imshow(np.zeros_like(truth) if aligned is None else np.clip(aligned, 0, 1))
     _draw_errors(panels[2], truth, places_px, errors_mm)
-    with whole_file(path) as temporary:
-        figure.savefig(temporary)
+    save_figure(figure, path)
 
 
 def _draw_errors(

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from cuspid.panorama import Panorama
 from cuspid.reconstruction import Reconstruction
-from cuspid.storage import whole_file
+from cuspid.reporting.figures import new_figure, save_figure
 
 _TICK = 10
 """Every so many frames one is named."""
@@ -24,12 +23,11 @@ def save_camera_path(path: Path, panorama: Panorama, motion: Reconstruction) -> 
     poses = [pose.inverse() for pose in motion.rig_from_world.values()]
     centres = np.array([pose.translation for pose in poses])
     axes = np.array([pose.rotation[:, 2] for pose in poses])
-    figure = Figure(figsize=(8, 8.5), dpi=110, layout="constrained")
+    figure = new_figure(8.0, 8.5, dpi=110, layout="constrained")
     above, below = figure.subplots(2, 1, height_ratios=[3.2, 1])
     _draw_above(above, panorama, centres, axes, motion.frames)
     _draw_heights(below, panorama, centres, axes)
-    with whole_file(path) as temporary:
-        figure.savefig(temporary)
+    save_figure(figure, path)
 
 
 def _draw_above(axis: Axes, panorama: Panorama, centres: np.ndarray, axes: np.ndarray, names: tuple[str, ...]) -> None:

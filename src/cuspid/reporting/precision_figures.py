@@ -14,15 +14,13 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures import NOT_COUNTED, look, render
-from cuspid.storage import whole_file
+from cuspid.reporting.figures import NOT_COUNTED, look, new_figure, render, save_figure
 
 _INK = "#333333"
 _ERRORS = colormaps["viridis_r"]
@@ -61,7 +59,7 @@ def save_precision_picture(
     equal ratio.
     """
     height_in = 3.1 * len(rms_um) + 1.6
-    figure = _figure(3.2 * len(views) + 0.4, height_in)
+    figure = new_figure(3.2 * len(views) + 0.4, height_in, dpi=84)
     axes = figure.subplots(len(rms_um), len(views), squeeze=False)
     norm = LogNorm(*limits_um)
     for row, (design, values) in zip(axes, rms_um.items(), strict=True):
@@ -99,7 +97,7 @@ def save_ellipsoids_picture(
     height, width = view.image.shape[:2]
     centre = (low + high)[:2] / 2
     half = np.array([width, height]) * view.mm_per_px / 2
-    figure = _figure(7.0, 7.0 * height / width + 0.8)
+    figure = new_figure(7.0, 7.0 * height / width + 0.8, dpi=84)
     panel = figure.add_axes((0.02, 0.08, 0.96, 0.80))
     panel.imshow(
         view.image, extent=(centre[0] - half[0], centre[0] + half[0], centre[1] - half[1], centre[1] + half[1])
@@ -132,7 +130,7 @@ def save_maps_picture(
 ) -> None:
     """PNG: panels over the same two axes (first upwards, second to the right), with their numbers written in."""
     rows = -(-len(panels) // columns)
-    figure = _figure(4.6 * columns, 3.3 * rows + 0.6)
+    figure = new_figure(4.6 * columns, 3.3 * rows + 0.6, dpi=84)
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.ravel()[len(panels) :]:
         axes.set_axis_off()
@@ -187,7 +185,7 @@ def save_best_picture(
     title: str = "",
 ) -> None:
     """PNG: a panel for each name with curves by name, each x and y. Curves that meet are drawn a little apart."""
-    figure = _figure(4.4 * len(curves), 3.9)
+    figure = new_figure(4.4 * len(curves), 3.9, dpi=84)
     panels = figure.subplots(1, len(curves), sharey=True, squeeze=False)[0]
     for axes, (name, lines) in zip(panels, curves.items(), strict=True):
         for index, (line, (x, y)) in enumerate(lines.items()):
@@ -213,7 +211,7 @@ def save_noise_picture(
     ``measured``: for each matcher bins with ``low``, ``high``, ``sigma_px`` and ``matched_pct``; ``laws``: sigma in px
     and the deformation that doubles the variance.
     """
-    figure = _figure(9.6, 4.0)
+    figure = new_figure(9.6, 4.0, dpi=84)
     noise, share = figure.subplots(1, 2)
     for (name, rows), colour in zip(measured.items(), _LINES[::3], strict=False):
         middles = np.array([(row["low"] + row["high"]) / 2 for row in rows])
@@ -251,13 +249,6 @@ def _decorate(axes: Axes, label: str) -> None:
     axes.set_axisbelow(True)
 
 
-def _figure(width_in: float, height_in: float) -> Figure:
-    figure = Figure(figsize=(width_in, height_in), dpi=84, facecolor="white")
-    FigureCanvasAgg(figure)
-    return figure
-
-
 def _finish(figure: Figure, path: Path, title: str) -> None:
     figure.text(0.02, 1 - 0.25 / figure.get_figheight(), title, fontsize=13, color=_INK, va="center", fontweight="bold")
-    with whole_file(path) as temporary:
-        figure.savefig(temporary)
+    save_figure(figure, path)

@@ -10,14 +10,12 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures import OCCLUSAL, look, render
-from cuspid.storage import whole_file
+from cuspid.reporting.figures import OCCLUSAL, look, new_figure, render, save_figure
 
 _INK = "#333333"
 _LINE = "#c1121f"
@@ -36,8 +34,7 @@ def save_preparation_picture(path: Path, jaw: Jaw, *, title: str = "", width_px:
     teeth = sorted({int(name.split(".")[0]) for name in jaw.lines if name.split(".")[0].isdigit()})
     if not teeth:
         raise InputError("preparation picture: the jaw has no prepared tooth (no line such as 45.margin)")
-    figure = Figure(figsize=(3.1 * len(teeth), 6.4), dpi=110, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure(3.1 * len(teeth), 6.4, dpi=110)
     figure.text(0.02, 0.965, title, fontsize=14, color=_INK, va="center", fontweight="bold")
     for column, fdi in enumerate(teeth):
         near = _surroundings(jaw, fdi)
@@ -48,8 +45,7 @@ def save_preparation_picture(path: Path, jaw: Jaw, *, title: str = "", width_px:
             place = (column / len(teeth) + 0.004, 0.47 - 0.46 * row, 1 / len(teeth) - 0.008, 0.44)
             _draw(figure, place, near, axes, lines, width_px)
         figure.text((column + 0.5) / len(teeth), 0.925, f"FDI {fdi}", fontsize=12, color=_INK, ha="center")
-    with whole_file(path) as temporary:
-        figure.savefig(temporary)
+    save_figure(figure, path)
 
 
 def _surroundings(jaw: Jaw, fdi: int) -> Mesh:

@@ -11,15 +11,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize
-from matplotlib.figure import Figure
 
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures import OCCLUSAL, render
+from cuspid.reporting.figures import OCCLUSAL, new_figure, render, save_figure
 from cuspid.shape_model import ShapeModel
-from cuspid.storage import whole_file
 
 _INK = "#333333"
 _MARGIN = 0.02
@@ -39,7 +36,7 @@ def save_modes_picture(path: Path, model: ShapeModel, *, modes: int = 3, deviati
     limit = float(np.percentile(np.abs(shifts), 99.5)) or 1.0
     low, high = _frame([jaw for row in jaws for jaw in row])
     row_in = float(3.6 * (high - low)[1] / (high - low)[0]) + 0.4
-    figure = _figure(12.0, 0.1 + row_in * count)
+    figure = new_figure(12.0, 0.1 + row_in * count, dpi=100)
     for mode in range(count):
         for column, weight in enumerate(weights):
             axes = figure.add_subplot(count, 3, 3 * mode + column + 1)
@@ -52,12 +49,12 @@ def save_modes_picture(path: Path, model: ShapeModel, *, modes: int = 3, deviati
     figure.subplots_adjust(left=0.01, right=0.91, bottom=0.01, top=top, wspace=0.02, hspace=0.4 / (row_in - 0.4))
     bar = figure.colorbar(ScalarMappable(Normalize(-limit, limit), _MAP), cax=figure.add_axes((0.93, 0.25, 0.012, 0.5)))
     bar.set_label("shift along the normal / mm (positive: outwards)", fontsize=11, color=_INK)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def save_variance_picture(path: Path, model: ShapeModel) -> None:
     """PNG: the standard deviation of each mode, and how much of the variance the first modes explain together."""
-    figure = _figure(7.0, 3.6)
+    figure = new_figure(7.0, 3.6, dpi=100)
     axes = figure.add_subplot()
     numbers = np.arange(1, len(model.modes) + 1)
     axes.bar(numbers, model.standard_deviations_mm, color="#7b93b8", width=0.7)
@@ -71,7 +68,7 @@ def save_variance_picture(path: Path, model: ShapeModel) -> None:
     for side in (axes, together):
         side.spines["top"].set_visible(False)
     figure.tight_layout()
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _outward_shift(mean: Mesh, jaw: Mesh) -> Float[np.ndarray, "v"]:
@@ -98,14 +95,3 @@ def _draw(axes: Axes, mesh: Mesh, low: Float[np.ndarray, "2"], high: Float[np.nd
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_axis_off()
-
-
-def _figure(width_in: float, height_in: float) -> Figure:
-    figure = Figure(figsize=(width_in, height_in), dpi=100, facecolor="white")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _save(figure: Figure, path: Path) -> None:
-    with whole_file(path) as temporary:
-        figure.savefig(temporary)

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from cuspid.jaw import Jaw
-from cuspid.storage import whole_file
+from cuspid.reporting.figures import new_figure, save_figure
 
 _INK, _FAINT, _LINE = "#333333", "#9a9a9a", "#1f5fd6"
 _COLOURS = "YlOrRd"
@@ -37,13 +36,11 @@ def save_sphere_picture(
     ``form_um``: RMS form error by label; a sphere that is not in it is drawn as not measured. ``named_um``: errors of
     distances to be written into the plan, by "<label>-<label>". ``scale_ppm``: slope of the line through zero.
     """
-    figure = Figure(figsize=(13, 6.4), dpi=110, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure(13.0, 6.4, dpi=110)
     figure.text(0.03, 0.955, title, fontsize=16, color=_INK, va="center", fontweight="bold")
     _draw_plan(figure, reference, form_um, named_um)
     _draw_spacing(figure.add_axes((0.60, 0.13, 0.38, 0.73)), nominal_mm, spacing_error_um, scale_ppm)
-    with whole_file(path) as temporary:
-        figure.savefig(temporary)
+    save_figure(figure, path)
 
 
 def _draw_plan(figure: Figure, reference: Jaw, form_um: Mapping[str, float], named_um: Mapping[str, float]) -> None:

@@ -13,12 +13,11 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from cuspid.storage import whole_file
+from cuspid.reporting.figures import new_figure, save_figure
 
 _INK = "#333333"
 _MARKS = {"best": "#d12a1e", "thesis": "#111111"}
@@ -58,8 +57,7 @@ def save_sweep_picture(
 ) -> None:
     """PNG: maps side by side, baselines upwards and angles to the right, with the thesis' place framed in each."""
     rows = -(-len(maps) // 2)
-    figure = Figure(figsize=(10.0, 0.9 + (0.9 + 0.38 * len(baselines_mm)) * rows), dpi=84, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure(10.0, 0.9 + (0.9 + 0.38 * len(baselines_mm)) * rows, dpi=84)
     grid = figure.subplots(rows, 2, squeeze=False).ravel()
     for axes, each in zip(grid, maps, strict=False):
         _draw(axes, each, tuple(baselines_mm), tuple(angles_deg), thesis)
@@ -69,8 +67,7 @@ def save_sweep_picture(
     figure.tight_layout(rect=(0, 0.42 / height, 1, 1 - 0.5 / height), w_pad=2.5, h_pad=1.2)
     figure.text(0.02, 1 - 0.25 / height, title, fontsize=13, color=_INK, va="center", fontweight="bold")
     _explain(figure, thesis is not None)
-    with whole_file(path) as temporary:
-        figure.savefig(temporary)
+    save_figure(figure, path)
 
 
 def _draw(

@@ -11,14 +11,12 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures import OCCLUSAL, PLASTER, View, look, render
-from cuspid.storage import whole_file
+from cuspid.reporting.figures import OCCLUSAL, PLASTER, View, look, new_figure, render, save_figure
 
 SURFACE_COLOURS: Mapping[str, str] = {
     "occlusal": "#f2c14e",
@@ -64,7 +62,7 @@ def save_shares_picture(path: Path, designs: Mapping[str, Sequence[Mapping[str, 
 
     ``designs``: rows with the keys ``surface`` and ``seen_by_1_pct`` to ``seen_by_3_pct``, by the name of the design.
     """
-    figure = _figure(5.2 * len(designs), 4.2)
+    figure = new_figure(5.2 * len(designs), 4.2, dpi=84)
     panels = figure.subplots(1, len(designs), sharey=True, squeeze=False)[0]
     for axes, (design, rows) in zip(panels, designs.items(), strict=True):
         places = np.arange(len(rows))
@@ -83,7 +81,7 @@ def save_shares_picture(path: Path, designs: Mapping[str, Sequence[Mapping[str, 
     figure.legend(handles, labels, title="cameras at once", loc="upper right", ncols=3, frameon=False, fontsize=10)
     figure.text(0.02, 0.94, title, fontsize=14, color=_INK, va="center", fontweight="bold")
     figure.tight_layout(rect=(0, 0, 1, 0.90))
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _save_views(
@@ -95,14 +93,14 @@ def _save_views(
     title: str,
 ) -> None:
     colored = replace(mesh, colors=_vertex_colors(mesh, codes, palette))
-    figure = _figure(11.0, 6.6)
+    figure = new_figure(11.0, 6.6, dpi=84)
     _draw(figure, (0.01, 0.10, 0.50, 0.80), render(colored, OCCLUSAL, width_px=640), "occlusal")
     _draw(figure, (0.53, 0.52, 0.46, 0.38), render(colored, look(90.0, 25.0), width_px=560), "from the front")
     _draw(figure, (0.53, 0.10, 0.46, 0.38), render(colored, look(-90.0, 35.0), width_px=560), "from behind")
     handles = [Patch(facecolor=colour, label=name) for name, colour in legend.items()]
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), frameon=False, fontsize=11)
     figure.text(0.02, 0.955, title, fontsize=15, color=_INK, va="center", fontweight="bold")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _vertex_colors(mesh: Mesh, codes: Int[np.ndarray, "f"], palette: Sequence[str]) -> UInt8[np.ndarray, "v 3"]:
@@ -119,14 +117,3 @@ def _draw(figure: Figure, place: tuple[float, float, float, float], view: View, 
     axes.imshow(view.image, interpolation="antialiased")
     axes.set_axis_off()
     axes.set_title(name, loc="left", fontsize=11, color=_INK, pad=3)
-
-
-def _figure(width_in: float, height_in: float) -> Figure:
-    figure = Figure(figsize=(width_in, height_in), dpi=84, facecolor="white")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _save(figure: Figure, path: Path) -> None:
-    with whole_file(path) as temporary:
-        figure.savefig(temporary)

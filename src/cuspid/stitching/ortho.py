@@ -13,7 +13,7 @@ from cuspid.reconstruction import Reconstruction
 from cuspid.sequence import Sequence
 from cuspid.stitching.mosaic import Mosaic, MosaicOptions, Progress, compose
 from cuspid.stitching.strip import StripOptions, unroll
-from cuspid.stitching.surface import ScaleOptions, SurfaceOptions, height_map, in_occlusal_frame, scaled
+from cuspid.stitching.surface import ScaleOptions, SurfaceOptions, height_map, in_occlusal_frame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +62,7 @@ def orthophoto(
     panorama = _panorama(mosaic, motion, frames, index, metric)
     panorama = replace(panorama, notes=(_scale_note(scale, given=scale == options.scale),))
     strip = unroll(panorama, motion, surface, mosaic.canvas.mm_per_px, options.strip)
-    in_its_units = motion if metric else scaled(motion, 1 / mosaic.canvas.mm_per_px)
+    in_its_units = motion if metric else motion.scaled(1 / mosaic.canvas.mm_per_px)
     return Stitched(panorama=panorama, motion=in_its_units, strip=strip)
 
 

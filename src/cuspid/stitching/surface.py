@@ -15,9 +15,9 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter, grey_dilation
 from scipy.spatial import KDTree
 
-from cuspid.errors import InputError, ReconstructionError
+from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.reconstruction import Reconstruction, Tracks
+from cuspid.reconstruction import Reconstruction
 
 NOMINAL_MM = 14.0
 """Distance from an intra-oral camera to the teeth, where nothing else is known."""
@@ -94,16 +94,16 @@ def in_occlusal_frame(model: Reconstruction, scale: ScaleOptions) -> Reconstruct
 
     Raises ReconstructionError where there are no points.
     """
-    near = scaled(model, NOMINAL_MM / float(np.median(_depths(model))))
-    points, (centres, axes) = _tracks_of(near).points, _centres_and_axes(near)
+    near = model.scaled(NOMINAL_MM / float(np.median(model.depths_in_rig)))
+    points, (centres, axes) = near.known_tracks.points, _centres_and_axes(near)
     world_from_model = _upright(points, centres, axes)
     world_from_model = _levelled(world_from_model.apply(points)) @ world_from_model
     front = _facing_front(world_from_model.apply(centres), world_from_model.apply(points))
     found = transformed(near, front @ world_from_model)
     if scale.width_mm is not None:
-        return scaled(found, scale.width_mm / _width(_tracks_of(found).points))
+        return found.scaled(scale.width_mm / _width(found.known_tracks.points))
     heights = _centres_and_axes(found)[0][:, 2]
-    return scaled(found, (scale.working_distance_mm or NOMINAL_MM) / float(np.median(heights)))
+    return found.scaled((scale.working_distance_mm or NOMINAL_MM) / float(np.median(heights)))
 
 
 def _width(points: Float[np.ndarray, "p 3"]) -> float:
@@ -115,34 +115,12 @@ def _width(points: Float[np.ndarray, "p 3"]) -> float:
 def transformed(model: Reconstruction, new_from_world: Rigid3) -> Reconstruction:
     """The same motion in another world."""
     world_from_new = new_from_world.inverse()
-    tracks = _tracks_of(model)
+    tracks = model.known_tracks
     return replace(
         model,
         rig_from_world={name: pose @ world_from_new for name, pose in model.rig_from_world.items()},
         tracks=replace(tracks, points=new_from_world.apply(tracks.points)),
     )
-
-
-def _tracks_of(model: Reconstruction) -> Tracks:
-    if model.tracks is None or not len(model.tracks.points):
-        raise ReconstructionError("panorama: the motion has no points; the frames need more detail in common")
-    return model.tracks
-
-
-def _depths(model: Reconstruction) -> Float[np.ndarray, "o"]:
-    """Depth of every observation."""
-    tracks = _tracks_of(model)
-    rotations = np.stack([pose.rotation[2] for pose in model.rig_from_world.values()])
-    shifts = np.array([pose.translation[2] for pose in model.rig_from_world.values()])
-    along = np.einsum("oj,oj->o", rotations[tracks.frame_index], tracks.points[tracks.point_index])
-    return along + shifts[tracks.frame_index]
-
-
-def scaled(model: Reconstruction, scale: float) -> Reconstruction:
-    """All lengths times a scale."""
-    tracks = _tracks_of(model)
-    poses = {name: Rigid3(pose.rotation, scale * pose.translation) for name, pose in model.rig_from_world.items()}
-    return replace(model, rig_from_world=poses, tracks=replace(tracks, points=scale * tracks.points))
 
 
 def _centres_and_axes(model: Reconstruction) -> tuple[Float[np.ndarray, "f 3"], Float[np.ndarray, "f 3"]]:
@@ -254,7 +232,7 @@ def _bulging(heights: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r c"]:
 
 def _sure_points(model: Reconstruction) -> Float[np.ndarray, "p 3"]:
     """Points that three frames saw, that do not stand apart in height and are not deep below the teeth."""
-    tracks = _tracks_of(model)
+    tracks = model.known_tracks
     counts = np.bincount(tracks.point_index, minlength=len(tracks.points))
     points = tracks.points[counts >= 3] if np.sum(counts >= 3) >= 20 else tracks.points
     low, high = np.percentile(points[:, 2], [1, 99.5])

@@ -164,7 +164,7 @@ def read_rig_config(path: Path, image_size_px: tuple[int, int] | None = None) ->
                     np.array(entry["cam_from_rig_translation"], dtype=np.float64),
                 )
             )
-            cameras[name] = MountedCamera(_camera_from_colmap(entry, image_size_px), cam_from_rig)
+            cameras[name] = MountedCamera(camera_from_colmap(entry, image_size_px), cam_from_rig)
         return Rig(cameras)
 
 
@@ -178,7 +178,7 @@ _COLMAP_PARAMETERS: Mapping[str, Sequence[int]] = {
 """Where (fx, fy, cx, cy, k1, k2, p1, p2) stand among a COLMAP model's parameters."""
 
 
-def _camera_from_colmap(entry: Mapping[str, Any], image_size_px: tuple[int, int] | None) -> Camera:
+def camera_from_colmap(entry: Mapping[str, Any], image_size_px: tuple[int, int] | None) -> Camera:
     model = entry["camera_model_name"]
     if model not in _COLMAP_PARAMETERS:
         raise InputError(f"camera model {model} is not known here; use one of {', '.join(_COLMAP_PARAMETERS)}")

@@ -18,7 +18,7 @@ from cuspid.rig import Handpiece
 from cuspid.sequence import Sequence
 from cuspid.storage.captures import IMAGE_SUFFIXES, read_capture, write_image
 from cuspid.storage.files import finished, read_json, reading
-from cuspid.storage.handpieces import _camera_from_colmap, camera_from_json, read_handpiece
+from cuspid.storage.handpieces import camera_from_colmap, camera_from_json, read_handpiece
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm")
 MOST_FRAMES = 300
@@ -175,4 +175,4 @@ def _read_cameras_txt(path: Path) -> Camera:
             raise InputError(f"{path}: {len(rows)} cameras; the calibration of one is needed")
         _, model, width, height, *parameters = rows[0]
         entry = {"camera_model_name": model, "camera_params": [float(value) for value in parameters]}
-        return _camera_from_colmap(entry, (int(width), int(height)))
+        return camera_from_colmap(entry, (int(width), int(height)))
