@@ -280,3 +280,14 @@ def test_files_are_whole_or_absent(tmp_path):
         fill_the_disk()
     assert storage.read_json(path) == {"a": None, "b": 0.5}
     assert [item.name for item in tmp_path.iterdir()] == ["value.json"]
+
+
+def test_a_film_that_the_disk_cannot_hold_is_no_film(tmp_path, monkeypatch):
+    """OpenCV's writer fails in silence."""
+    capture = make_capture(tmp_path / "capture")
+    storage.write_video(tmp_path / "whole.mp4", capture)
+    assert (tmp_path / "whole.mp4").stat().st_size > 100
+    monkeypatch.setattr("cuspid.storage.videos.cv2.cvtColor", lambda image, code: np.zeros((3, 3, 3), np.uint8))
+    with pytest.raises(OutputError, match="0 of 2 frames were written"):
+        storage.write_video(tmp_path / "broken.mp4", capture)
+    assert not (tmp_path / "broken.mp4").exists()
