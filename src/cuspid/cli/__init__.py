@@ -16,6 +16,7 @@ from cuspid.cli.jaws import box, phantom, prepare
 from cuspid.cli.mouth import mouth
 from cuspid.cli.panorama import stitch
 from cuspid.cli.panorama_evaluation import stitch_eval
+from cuspid.cli.report import report
 from cuspid.cli.scan import evaluate, reconstruct, run, simulate
 from cuspid.cli.shared import console
 from cuspid.cli.studies import sweep
@@ -43,6 +44,7 @@ COMMANDS: Mapping[str, Callable[..., Any]] = {
     "reconstruct": reconstruct,
     "evaluate": evaluate,
     "stitch": stitch,
+    "report": report,
 }
 
 

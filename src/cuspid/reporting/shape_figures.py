@@ -21,7 +21,8 @@ from cuspid.shape_model import ShapeModel
 _INK = "#333333"
 _MARGIN = 0.02
 """Of a rendered view, as a share of its longer side."""
-_MAP = LinearSegmentedColormap.from_list("shift", ["#1f5fd6", "#a9c4ee", "#ded6c8", "#f3b98a", "#c2410c"])
+SHIFT_COLORS = LinearSegmentedColormap.from_list("shift", ["#1f5fd6", "#a9c4ee", "#ded6c8", "#f3b98a", "#c2410c"])
+"""Of a shift along the normals: blue inwards, the colour of plaster for none, orange outwards."""
 
 
 def save_modes_picture(path: Path, model: ShapeModel, *, modes: int = 3, deviations: float = 2.0) -> None:
@@ -47,7 +48,9 @@ def save_modes_picture(path: Path, model: ShapeModel, *, modes: int = 3, deviati
             )
     top = 1 - 0.35 / (0.1 + row_in * count)
     figure.subplots_adjust(left=0.01, right=0.91, bottom=0.01, top=top, wspace=0.02, hspace=0.4 / (row_in - 0.4))
-    bar = figure.colorbar(ScalarMappable(Normalize(-limit, limit), _MAP), cax=figure.add_axes((0.93, 0.25, 0.012, 0.5)))
+    bar = figure.colorbar(
+        ScalarMappable(Normalize(-limit, limit), SHIFT_COLORS), cax=figure.add_axes((0.93, 0.25, 0.012, 0.5))
+    )
     bar.set_label("shift along the normal / mm (positive: outwards)", fontsize=11, color=_INK)
     save_figure(figure, path)
 
@@ -76,7 +79,7 @@ def _outward_shift(mean: Mesh, jaw: Mesh) -> Float[np.ndarray, "v"]:
 
 
 def _colors(shift: Float[np.ndarray, "v"], limit: float) -> UInt8[np.ndarray, "v 3"]:
-    return np.asarray(_MAP(0.5 + 0.5 * shift / limit, bytes=True)[:, :3])
+    return np.asarray(SHIFT_COLORS(0.5 + 0.5 * shift / limit, bytes=True)[:, :3])
 
 
 def _frame(meshes: list[Mesh]) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:

@@ -31,6 +31,7 @@ from cuspid.storage.jaws import (
     MM_PER_UNIT,
     Unit,
     is_jaw,
+    read_deviations,
     read_jaw,
     read_labelled_mesh,
     read_mesh,
@@ -50,6 +51,15 @@ from cuspid.storage.reconstructions import (
     write_reconstruction,
     write_trueness,
 )
+from cuspid.storage.results import (
+    PanoramaResult,
+    Result,
+    ScanResult,
+    ScoreResult,
+    ShapeResult,
+    StudyResult,
+    read_result,
+)
 from cuspid.storage.sequences import read_sequence
 from cuspid.storage.shapes import read_shape_model, write_shape_model
 from cuspid.storage.tables import csv_table, write_table
@@ -63,6 +73,12 @@ __all__ = [
     "PART",
     "LandmarkFile",
     "LandmarkFrame",
+    "PanoramaResult",
+    "Result",
+    "ScanResult",
+    "ScoreResult",
+    "ShapeResult",
+    "StudyResult",
     "Unit",
     "claim_folder",
     "claimed_folder",
@@ -72,6 +88,7 @@ __all__ = [
     "is_jaw",
     "read_capture",
     "read_depth_maps",
+    "read_deviations",
     "read_handpiece",
     "read_jaw",
     "read_json",
@@ -82,6 +99,7 @@ __all__ = [
     "read_panorama",
     "read_poses",
     "read_reconstruction",
+    "read_result",
     "read_rig_config",
     "read_sequence",
     "read_shape_model",

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 import trimesh
-from jaxtyping import Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from cuspid.errors import InputError
 from cuspid.jaw import FDI_FROM_UNIVERSAL, Arch, Jaw, Landmark, Sphere
@@ -107,13 +107,36 @@ def _fdi_labels(labels: Int[np.ndarray, "f"], path: Path) -> Int[np.ndarray, "f"
     raise InputError(f"{path}: tooth labels {sorted(values)[:6]} are neither FDI nor Universal numbers")
 
 
-def write_mesh(path: Path, mesh: Mesh, face_labels: Int[np.ndarray, "f"] | None = None) -> None:
-    """Write a mesh in mm: binary PLY (with colour and labels), binary STL or OBJ, by the file's suffix."""
+DEVIATION = "deviation_um"
+"""Name of the vertex property of a PLY file that holds signed deviations; CloudCompare shows it as a scalar field."""
+
+
+def write_mesh(
+    path: Path,
+    mesh: Mesh,
+    face_labels: Int[np.ndarray, "f"] | None = None,
+    *,
+    deviation_um: Float[np.ndarray, "v"] | None = None,
+) -> None:
+    """Write a mesh in mm: binary PLY (with colour, labels and deviations), binary STL or OBJ, by the file's suffix."""
     exported = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
+    if deviation_um is not None:
+        exported.vertex_attributes[DEVIATION] = deviation_um.astype(np.float32)
     if face_labels is not None:
         exported.face_attributes["label"] = face_labels.astype(np.int32)
     data = exported.export(file_type=path.suffix.lower().lstrip("."))
     write_bytes(path, data.encode() if isinstance(data, str) else data)
+
+
+def read_deviations(path: Path) -> tuple[Mesh, Float[np.ndarray, "v"] | None]:
+    """As :func:`read_mesh`, with the signed deviation of each vertex in um (NaN: not counted); None where the file has
+    none."""
+    mesh, loaded = _read_triangles(path, "mm")
+    raw = loaded.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
+    if raw is None or DEVIATION not in (raw.dtype.names or ()):
+        return mesh, None
+    _, first = np.unique(np.asarray(loaded.vertices, dtype=np.float64), axis=0, return_index=True)
+    return mesh, np.asarray(raw[DEVIATION], dtype=np.float64).reshape(-1)[first]
 
 
 def write_jaw(path: Path, jaw: Jaw) -> None:

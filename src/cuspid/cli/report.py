@@ -1,0 +1,41 @@
+"""Show what was found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional
+
+from cuspid import storage
+from cuspid.cli.shared import Flat, console
+from cuspid.reporting.report import report_page
+from cuspid.reporting.scan_page import ReportOptions
+
+
+def report(
+    folder: Annotated[Path, Positional],
+    *,
+    out: Path | None = None,
+    reference: Path | None = None,
+    options: Annotated[ReportOptions, Flat] = ReportOptions(),
+) -> None:
+    """Write one HTML page of what lies in a folder: the surface in 3-D, figures, pictures, and what it was made of.
+
+    The page is one file that opens without a network.
+
+    Args:
+        folder: What run, reconstruct, evaluate, shape, sweep, compare, repeat, stitch or stitch-eval wrote.
+        out: The page (default: report.html in the folder).
+        reference: Mesh that a scan was compared with, where the folder does not hold it (evaluate).
+    """
+    path = write_report(folder, out or folder / "report.html", reference, options)
+    console.print(f"{path}: {path.stat().st_size / 1e6:.1f} MB", highlight=False)
+
+
+def write_report(
+    folder: Path, path: Path, reference: Path | None = None, options: ReportOptions = ReportOptions()
+) -> Path:
+    """Write the page of a folder."""
+    storage.write_bytes(path, report_page(storage.read_result(folder, reference), options).encode())
+    return path

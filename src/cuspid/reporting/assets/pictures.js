@@ -1,0 +1,37 @@
+// Pictures to zoom and move; those of one group move together. The work is panzoom's.
+"use strict";
+(() => {
+  const groups = new Map();
+  for (const frame of document.querySelectorAll(".zoomed")) {
+    const image = frame.querySelector("img");
+    const fit = () => {
+      const scale = Math.min(frame.clientWidth / image.naturalWidth, frame.clientHeight / image.naturalHeight);
+      image.style.width = `${image.naturalWidth * scale}px`;
+      image.style.left = `${(frame.clientWidth - image.naturalWidth * scale) / 2}px`;
+      image.style.top = `${(frame.clientHeight - image.naturalHeight * scale) / 2}px`;
+    };
+    image.decode().then(fit, fit);
+    new ResizeObserver(fit).observe(frame);
+    const zoom = Panzoom(image, { maxScale: 20, minScale: 1, canvas: true, step: 0.35, animate: false });
+    const group = groups.get(frame.dataset.group) ?? [];
+    groups.set(frame.dataset.group, [...group, zoom]);
+    frame.addEventListener("wheel", (event) => zoom.zoomWithWheel(event));
+    frame.addEventListener("dblclick", () => zoom.reset());
+    image.addEventListener("panzoomchange", ({ detail }) => {
+      for (const other of groups.get(frame.dataset.group)) {
+        if (other === zoom || !detail.originalEvent) continue;
+        other.zoom(detail.scale);
+        other.pan(detail.x, detail.y);
+      }
+    });
+  }
+  for (const button of document.querySelectorAll("[data-zoom]")) {
+    button.addEventListener("click", () => {
+      for (const each of groups.get(button.dataset.group)) {
+        if (button.dataset.zoom === "in") each.zoomIn();
+        else if (button.dataset.zoom === "out") each.zoomOut();
+        else each.reset();
+      }
+    });
+  }
+})();

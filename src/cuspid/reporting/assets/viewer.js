@@ -1,0 +1,394 @@
+// The 3-D view of a page: surfaces with the colours of their deviation, lines, standard views, places to go to.
+//
+// Everything is drawn by three.js in the occlusal frame (mm) with an orthographic camera, so that the length bar holds
+// everywhere. What to draw stands in the element #scene; arrays are base64 of gzip of little-endian numbers. A picture
+// is drawn only when something changed.
+"use strict";
+(async () => {
+  const scene = JSON.parse(document.getElementById("scene").textContent);
+  const root = document.getElementById("viewer");
+  const find = (selector) => root.querySelector(selector);
+  const canvas = find("canvas");
+  const still = find(".still");
+  const UNKNOWN = -32768;
+  const PLAIN = [0.87, 0.84, 0.78];
+  const ACCENT = 0xd9480f;
+
+  // --- reading -------------------------------------------------------------------------------------------------------
+
+  const types = { Float32Array, Uint32Array, Uint16Array, Int16Array, Uint8Array };
+
+  async function unpack({ type, data }) {
+    const bytes = Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0));
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+    return new types[type](await new Response(stream).arrayBuffer());
+  }
+
+  const linear = (value) => (value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4);
+
+  // --- drawing -------------------------------------------------------------------------------------------------------
+
+  let renderer;
+  try {
+    renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true, preserveDrawingBuffer: true });
+    if (typeof DecompressionStream === "undefined") throw new Error("too old");
+  } catch {
+    find(".loading").textContent = "This browser cannot draw in 3-D; a picture is shown instead.";
+    return;
+  }
+  const world = new THREE.Scene();
+  const camera = new THREE.OrthographicCamera(-1, 1, 1, -1, 0.1, 2000);
+  const light = new THREE.DirectionalLight(0xffffff, 1.9);
+  light.position.set(-0.45, 0.6, 0.66);
+  camera.add(light);
+  world.add(camera, new THREE.HemisphereLight(0xffffff, 0xd8dde2, 1.75));
+  const controls = new THREE.TrackballControls(camera, canvas);
+  Object.assign(controls, { rotateSpeed: 3.2, zoomSpeed: 1.4, panSpeed: 0.5, dynamicDampingFactor: 0.25 });
+
+  const layers = new Map();
+  let range = scene.range;
+  let colored = true;
+  let dirty = true;
+  let snapshotTimer = 0;
+
+  function surfaceMaterial(layer) {
+    const behind = layer.behind ? { polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 3000 } : {};
+    const material = new THREE.MeshLambertMaterial({ vertexColors: true, side: THREE.DoubleSide, ...behind });
+    material.onBeforeCompile = (shader) => {
+      const grey = "#include <color_fragment>\nif (!gl_FrontFacing) diffuseColor.rgb = vec3(0.36);";
+      shader.fragmentShader = shader.fragmentShader.replace("#include <color_fragment>", grey);
+    };
+    return material;
+  }
+
+  async function addMesh(layer) {
+    const [steps, faces] = await Promise.all([unpack(layer.vertices), unpack(layer.faces)]);
+    const positions = new Float32Array(steps.length);
+    for (let k = 0; k < steps.length; k++) positions[k] = layer.origin[k % 3] + layer.step * steps[k];
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
+    geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(steps.length), 3));
+    geometry.setIndex(new THREE.BufferAttribute(faces, 1));
+    geometry.computeVertexNormals();
+    geometry.computeBoundingSphere();
+    const object = new THREE.Mesh(geometry, surfaceMaterial(layer));
+    object.userData = { values: layer.values ? await unpack(layer.values) : null, color: layer.color };
+    return object;
+  }
+
+  async function addLines(layer) {
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(await unpack(layer.points), 3));
+    const path = layer.kind === "line";
+    const look = path ? { color: 0xb5179e } : { color: 0x1c5d99, transparent: true, opacity: 0.45 };
+    const material = new THREE.LineBasicMaterial(look);
+    return path ? new THREE.Line(geometry, material) : new THREE.LineSegments(geometry, material);
+  }
+
+  const table = (await unpack(scene.colors)).map((value) => value);
+  const bar = Array.from(table, (value) => linear(value / 255));
+  const last = table.length / 3 - 1;
+
+  function paint(object) {
+    const { values, color } = object.userData;
+    const colors = object.geometry.attributes.color;
+    const plain = color.map((value) => linear(value / 255));
+    const grey = linear(168 / 255);
+    for (let k = 0; k < colors.count; k++) {
+      if (!values || !colored) {
+        colors.setXYZ(k, ...plain);
+      } else if (values[k] === UNKNOWN) {
+        colors.setXYZ(k, grey, grey, grey);
+      } else {
+        const share = 0.5 + (0.5 * values[k] * scene.per_step) / range;
+        const at = 3 * Math.round(last * Math.min(1, Math.max(0, share)));
+        colors.setXYZ(k, bar[at], bar[at + 1], bar[at + 2]);
+      }
+    }
+    colors.needsUpdate = true;
+  }
+
+  function draw() {
+    if (!dirty) return;
+    dirty = false;
+    renderer.render(world, camera);
+    placeTeeth();
+    showLength();
+    clearTimeout(snapshotTimer);
+    snapshotTimer = setTimeout(snapshot, 400);
+  }
+
+  // The picture that is printed: it is made smaller there, so the length bar must be part of it.
+  function snapshot() {
+    renderer.render(world, camera);
+    const picture = document.createElement("canvas");
+    [picture.width, picture.height] = [canvas.width, canvas.height];
+    const pen = picture.getContext("2d");
+    pen.drawImage(canvas, 0, 0);
+    const scale = canvas.width / canvas.clientWidth;
+    const bar = find(".length span").offsetWidth * scale;
+    const [left, bottom, size] = [14 * scale, picture.height - 14 * scale, 14 * scale];
+    pen.fillRect(left, bottom - 0.3 * size, bar, 0.14 * size);
+    pen.font = `600 ${size}px sans-serif`;
+    pen.fillText(find(".length b").textContent, left + bar + 0.4 * size, bottom);
+    still.src = picture.toDataURL("image/png");
+  }
+
+  function change() {
+    dirty = true;
+  }
+
+  // --- the view ------------------------------------------------------------------------------------------------------
+
+  let half = 10;
+
+  function resize() {
+    const { clientWidth: width, clientHeight: height } = canvas.parentElement;
+    if (!width || !height) return;
+    renderer.setPixelRatio(Math.min(2, devicePixelRatio));
+    renderer.setSize(width, height, false);
+    const across = half * Math.max(1, width / height);
+    const above = half * Math.max(1, height / width);
+    Object.assign(camera, { left: -across, right: across, top: above, bottom: -above });
+    camera.updateProjectionMatrix();
+    controls.handleResize();
+    change();
+  }
+
+  function lookAt(target, eye, up, radius) {
+    half = 1.05 * radius;
+    camera.zoom = 1;
+    controls.target.copy(target);
+    camera.position.copy(target).addScaledVector(eye.clone().normalize(), 500);
+    camera.up.copy(up);
+    camera.lookAt(target);
+    resize();
+    controls.update();
+    change();
+  }
+
+  const vector = (values) => new THREE.Vector3(...values);
+
+  function whole(name) {
+    const view = scene.views.find((each) => each.name === name) ?? scene.views[0];
+    const sphere = main().geometry.boundingSphere;
+    lookAt(sphere.center, vector(view.eye), vector(view.up), 0.9 * sphere.radius);
+  }
+
+  function goTo(place) {
+    const eye = place.towards ? vector(place.towards) : new THREE.Vector3(0, 0, 1);
+    const up = Math.abs(eye.clone().normalize().y) < 0.9 ? vector([0, 1, 0]) : vector([0, 0, 1]);
+    lookAt(vector(place.position_mm), eye, up, place.radius_mm);
+    mark(place.towards ? vector(place.position_mm) : null);
+    root.scrollIntoView({ behavior: "instant", block: "start" });
+  }
+
+  const marker = new THREE.Mesh(new THREE.SphereGeometry(1, 24, 12), new THREE.MeshBasicMaterial({ color: ACCENT, wireframe: true, transparent: true, opacity: 0.35 }));
+  marker.visible = false;
+  marker.scale.setScalar(0.25);
+  world.add(marker);
+
+  function mark(position) {
+    marker.visible = position !== null;
+    if (position) marker.position.copy(position);
+    change();
+  }
+
+  const main = () => layers.get(scene.layers[0].name);
+
+  // --- what is written over the view -------------------------------------------------------------------------------
+
+  const labels = scene.teeth.map((tooth) => {
+    const label = document.createElement("span");
+    label.textContent = tooth.name;
+    find(".teeth").append(label);
+    return [label, vector(tooth.position_mm)];
+  });
+  find(".teeth").hidden = true;
+
+  function placeTeeth() {
+    if (find(".teeth").hidden) return;
+    for (const [label, position] of labels) {
+      const at = position.clone().project(camera);
+      label.style.left = `${50 + 50 * at.x}%`;
+      label.style.top = `${50 - 50 * at.y}%`;
+    }
+  }
+
+  function showLength() {
+    const pixelsPerMm = (canvas.clientWidth * camera.zoom) / (camera.right - camera.left);
+    const steps = [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50];
+    const length = steps.filter((each) => each * pixelsPerMm <= 0.28 * canvas.clientWidth).pop() ?? steps[0];
+    find(".length span").style.width = `${length * pixelsPerMm}px`;
+    find(".length b").textContent = `${length} mm`;
+  }
+
+  function showTicks() {
+    const sign = (value) => (value > 0 ? "+" : value < 0 ? "−" : "");
+    root.querySelectorAll(".ticks span").forEach((tick, k) => {
+      const value = range * (k / 2 - 1);
+      tick.textContent = value ? `${sign(value)}${Number(Math.abs(value).toPrecision(3))}` : "0";
+    });
+    const unit = find(".unit");
+    if (unit) unit.textContent = scene.unit;
+  }
+
+  function read(event) {
+    const box = canvas.getBoundingClientRect();
+    const at = new THREE.Vector2((2 * (event.clientX - box.left)) / box.width - 1, 1 - (2 * (event.clientY - box.top)) / box.height);
+    const ray = new THREE.Raycaster();
+    ray.setFromCamera(at, camera);
+    const surfaces = [...layers.values()].filter((each) => each.isMesh && each.visible && each.userData.values);
+    const [hit] = ray.intersectObjects(surfaces, false);
+    const readout = find(".readout");
+    readout.hidden = !hit;
+    if (!hit) return;
+    const value = hit.object.userData.values[hit.face.a];
+    const amount = value * scene.per_step;
+    const where = hit.point.toArray().map((each) => each.toFixed(2)).join(", ");
+    const text = value === UNKNOWN ? "not counted" : `${amount > 0 ? "+" : ""}${amount.toFixed(scene.unit === "mm" ? 3 : 1)} ${scene.unit}`;
+    readout.textContent = `${text}  at ${where} mm`.replace(/-/g, "−");
+  }
+
+  // --- buttons -------------------------------------------------------------------------------------------------------
+
+  const press = (button, on) => button.setAttribute("aria-pressed", String(on));
+  const toggled = (button) => {
+    const on = button.getAttribute("aria-pressed") !== "true";
+    press(button, on);
+    change();
+    return on;
+  };
+
+  function bind() {
+    for (const button of root.querySelectorAll("[data-layer]")) {
+      button.addEventListener("click", () => {
+        layers.get(button.dataset.layer).visible = toggled(button);
+      });
+    }
+    for (const button of root.querySelectorAll("[data-view]")) {
+      button.addEventListener("click", () => {
+        mark(null);
+        whole(button.dataset.view);
+      });
+    }
+    find("[data-reset]").addEventListener("click", () => {
+      mark(null);
+      whole();
+    });
+    find("[data-colors]")?.addEventListener("click", (event) => {
+      colored = toggled(event.currentTarget);
+      layers.forEach((each) => each.userData.values && paint(each));
+    });
+    find("[data-range]")?.addEventListener("change", (event) => {
+      range = Number(event.target.value);
+      layers.forEach((each) => each.userData.values && paint(each));
+      showTicks();
+      change();
+    });
+    if (labels.length) {
+      find("[data-teeth]").hidden = false;
+      find("[data-teeth]").addEventListener("click", (event) => {
+        find(".teeth").hidden = !toggled(event.currentTarget);
+      });
+    }
+    for (const button of document.querySelectorAll("[data-place]")) {
+      button.addEventListener("click", () => goTo(scene.teeth[Number(button.dataset.place)]));
+    }
+    for (const button of document.querySelectorAll("[data-worst]")) {
+      button.addEventListener("click", () => goTo(scene.worst[Number(button.dataset.worst)]));
+    }
+    for (const button of document.querySelectorAll("[data-frame]")) {
+      button.addEventListener("click", () => showFrame(button.dataset.frame));
+    }
+    let down = null;
+    canvas.addEventListener("pointerdown", (event) => (down = [event.clientX, event.clientY]));
+    canvas.addEventListener("pointerup", (event) => {
+      if (down && Math.hypot(event.clientX - down[0], event.clientY - down[1]) < 4) read(event);
+    });
+    addEventListener("beforeprint", snapshot);
+  }
+
+  // The cameras of one frame, in another colour.
+  let chosen = null;
+
+  function showFrame(name) {
+    const layer = scene.layers.find((each) => each.name === "cameras");
+    const index = layer?.frames.indexOf(name) ?? -1;
+    if (chosen) world.remove(chosen);
+    chosen = null;
+    if (index < 0) return;
+    const all = layers.get("cameras").geometry.attributes.position;
+    const count = 3 * layer.points_per_frame;
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(all.array.slice(index * count, (index + 1) * count), 3));
+    chosen = new THREE.LineSegments(geometry, new THREE.LineBasicMaterial({ color: ACCENT }));
+    world.add(chosen);
+    mark(null);
+    whole("Front");
+    root.scrollIntoView({ behavior: "instant", block: "start" });
+  }
+
+  // --- modes of a shape model ----------------------------------------------------------------------------------------
+
+  async function bindModes() {
+    if (!scene.modes) return;
+    const surface = main();
+    const { geometry } = surface;
+    const rest = geometry.attributes.position.array.slice();
+    const normals = geometry.attributes.normal.array.slice();
+    const fields = await Promise.all(scene.modes.map((mode) => unpack(mode.field)));
+    const inputs = [...root.querySelectorAll("[data-mode]")];
+    surface.userData.values = new Int16Array(rest.length / 3);
+    const move = () => {
+      const { array } = geometry.attributes.position;
+      array.set(rest);
+      inputs.forEach((input, k) => {
+        const weight = Number(input.value);
+        input.nextElementSibling.textContent = `${weight > 0 ? "+" : weight < 0 ? "−" : ""}${Math.abs(weight)} SD`;
+        const scale = weight * scene.modes[k].step;
+        if (scale) for (let i = 0; i < array.length; i++) array[i] += scale * fields[k][i];
+      });
+      for (let v = 0; v < array.length; v += 3) {
+        let shift = 0;
+        for (let i = v; i < v + 3; i++) shift += (array[i] - rest[i]) * normals[i];
+        surface.userData.values[v / 3] = Math.max(-32767, Math.min(32767, Math.round(shift / scene.per_step)));
+      }
+      geometry.attributes.position.needsUpdate = true;
+      geometry.computeVertexNormals();
+      paint(surface);
+      change();
+    };
+    inputs.forEach((input) => input.addEventListener("input", move));
+    find("[data-mean]").addEventListener("click", () => {
+      inputs.forEach((input) => (input.value = 0));
+      move();
+    });
+    move();
+  }
+
+  // --- start ---------------------------------------------------------------------------------------------------------
+
+  for (const layer of scene.layers) {
+    const object = await (layer.kind === "mesh" ? addMesh(layer) : addLines(layer));
+    object.visible = layer.visible;
+    layers.set(layer.name, object);
+    world.add(object);
+    if (object.isMesh) paint(object);
+  }
+  await bindModes();
+  bind();
+  showTicks();
+  whole();
+  controls.addEventListener("change", change);
+  new ResizeObserver(resize).observe(canvas.parentElement);
+  root.classList.add("live");
+  const loop = () => {
+    controls.update();
+    draw();
+    requestAnimationFrame(loop);
+  };
+  loop();
+  snapshot();
+  root.dataset.ready = "";
+})();

@@ -1,0 +1,194 @@
+"""The page of a study: its pictures, what it found, and all of its cases in a table that can be sorted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from cuspid.errors import InputError
+from cuspid.reporting.page import number, picture_uri, provenance, render_page, signed
+from cuspid.storage import StudyResult
+
+Table = dict[str, Any]
+Tile = tuple[str, str, str]
+
+_UNITS = {"um": "µm", "mm": "mm", "pct": "%", "deg": "°", "s": "s", "ppm": "ppm", "mb": "MB", "mm2": "mm²", "px": "px"}
+_TITLES = {
+    "sweep": "Baseline and angle of a pair",
+    "compare": "Handpieces compared",
+    "repeat": "Repeated scans: trueness and precision",
+}
+_WHEN = ("simulation_s", "reconstruction_s", "reconstruction_cpu_s", "cpu_s")
+
+
+def study_page(result: StudyResult) -> str:
+    """The HTML of a study. Raises InputError where none of its cases is done."""
+    if not result.rows and result.summary is None:
+        raise InputError(f"{result.name}: nothing to report; no case of the study is done yet")
+    summary = result.summary or {}
+    failures = {row["case"]: row["failure"] for row in result.rows if row.get("failure")}
+    return render_page(
+        "study.html.j2",
+        title=_TITLES[result.verb],
+        name=result.name,
+        missing=result.missing,
+        lead=_lead(result.verb, summary, len(result.rows), len(failures)),
+        tables=_TABLES[result.verb](summary) if summary else [],
+        notes=_notes(result.verb, summary),
+        pictures=[(caption, picture_uri(path)) for caption, path in result.pictures.items()],
+        all_rows=_all_rows(result.rows),
+        failures=failures,
+        made=provenance(result.run),
+    )
+
+
+def heading(column: str) -> str:
+    """The name of a column for people: words, and the unit at the end."""
+    *words, last = column.split("_")
+    if last in _UNITS and words:
+        return f"{' '.join(words)}, {_UNITS[last]}"
+    return column.replace("_", " ")
+
+
+def _all_rows(rows: Sequence[Mapping[str, str]]) -> Table | None:
+    """The columns in which cases differ; one that is the same for all tells nothing."""
+    if not rows:
+        return None
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    told = [name for name in names if name not in ("failure", *_WHEN)]
+    columns = [name for name in told if name == "case" or len({row.get(name) for row in rows}) > 1]
+    return {
+        "heads": [heading(name) for name in columns],
+        "rows": [[_short(row.get(name, "")) for name in columns] for row in rows],
+    }
+
+
+def _short(cell: str | None) -> str:
+    """A number with four digits that count."""
+    try:
+        value = float(cell or "")
+    except ValueError:
+        return cell or ""
+    return cell or "" if value == int(value) else f"{value:.4g}" if abs(value) < 1e4 else f"{value:.0f}"
+
+
+def _lead(verb: str, summary: Mapping[str, Any], cases: int, failed: int) -> list[Tile]:
+    tiles: list[Tile] = [("cases" if verb != "repeat" else "scans", str(cases), f"{failed} failed" if failed else "")]
+    if verb == "repeat" and summary.get("precision"):
+        trueness, precision = summary["trueness"], summary["precision"]
+        tiles += [
+            ("trueness: mean |d|, mean of the scans", number(trueness["mean_abs_um"]["mean"], 2), "µm"),
+            ("precision: mean |d|, mean of all pairs", number(precision["mean_abs_um"]["mean"], 2), "µm"),
+            ("repeatability SD at a point", number(summary["spread"]["repeatability_sd_um"], 2), "µm"),
+            ("systematic part at a point, RMS", number(summary["spread"]["bias_rms_um"], 2), "µm"),
+        ]
+    if verb == "sweep" and summary:
+        tiles += [("surface", str(summary["surface"]), ""), ("tooth", str(summary["tooth"]), "")]
+        tiles += [("the pair lies", str(summary["direction"]), "the arch")]
+    return tiles
+
+
+# --- what was found ---------------------------------------------------------------------------------------------------
+
+_TERMS = {
+    "complete_50_um_pct": "most surface within 50 µm",
+    "complete_10_um_pct": "most surface within 10 µm",
+    "points": "most points",
+    "mean_abs_um": "smallest mean deviation",
+}
+
+
+def _sweep_tables(summary: Mapping[str, Any]) -> list[Table]:
+    rows = [
+        [
+            _TERMS.get(term, heading(term)),
+            _setting(found["setting"]),
+            number(found["value"], 2),
+            "not repeated" if found["noise"] is None else number(found["noise"], 2),
+            "; ".join(map(_setting, found["level"])) or "none",
+        ]
+        for term, found in summary["best"].items()
+    ]
+    heads = ["best by", "baseline, angle", "value", "noise", "level with it"]
+    caption = "Level: settings whose difference from the best one is within the noise of repeated scans."
+    tables: list[Table] = [{"title": "Best settings", "caption": caption, "heads": heads, "rows": rows}]
+    if summary.get("thesis"):
+        thesis = summary["thesis"]
+        tables.append(
+            {
+                "title": "The setting of the thesis",
+                "caption": None,
+                "heads": ["baseline, angle", *(heading(term) for term in _TERMS if term in thesis)],
+                "rows": [[_setting(thesis["setting"]), *(number(thesis[t], 2) for t in _TERMS if t in thesis)]],
+            }
+        )
+    return tables
+
+
+def _setting(pair: Sequence[float]) -> str:
+    return f"{pair[0]:g} mm, {pair[1]:g}°"
+
+
+_NEEDS = ("cameras", "swept_width_mm", "height_mm", "frames", "images", "data_mb", "reconstruction_cpu_s")
+_GIVES = (
+    "tooth_mean_abs_um",
+    "tooth_p95_um",
+    "complete_50_um_pct",
+    "tooth_seen_pct",
+    "tooth_within_50_um_pct",
+    "tooth_within_100_um_pct",
+)
+
+
+def _compare_tables(summary: Mapping[str, Any]) -> list[Table]:
+    keys = ("design", "turns", "jaw", "tooth")
+
+    def table(title: str, columns: Sequence[str]) -> Table:
+        there = [name for name in columns if any(row.get(name) is not None for row in summary["rows"])]
+        rows = [[str(row[k]) for k in keys] + [_cell(row.get(name)) for name in there] for row in summary["rows"]]
+        return {"title": title, "caption": None, "heads": [*keys, *map(heading, there)], "rows": rows}
+
+    return [table("What each needs", _NEEDS), table("What each gives, means over the seeds", _GIVES)]
+
+
+def _cell(value: float | None) -> str:
+    return "–" if value is None else f"{value:g}" if isinstance(value, int) else number(value, 2)
+
+
+def _repeat_tables(summary: Mapping[str, Any]) -> list[Table]:
+    tables = []
+    for name, title, caption in (
+        ("trueness", "Trueness", "Each scan to the reference, in µm, as in the report of a scan."),
+        ("precision", "Precision", "Each pair of scans, one to the other after rigid alignment, both ways, in µm."),
+    ):
+        if summary.get(name):
+            heads = ["figure", "mean", "SD", "smallest", "largest"]
+            rows = [
+                [heading(figure), *(number(spread[each], 2) for each in ("mean", "sd", "min", "max"))]
+                for figure, spread in summary[name].items()
+            ]
+            tables.append({"title": title, "caption": caption, "heads": heads, "rows": rows})
+    if summary.get("pairs"):
+        rows = [
+            [f"{pair['first']} – {pair['second']}", *(number(pair[each], 2) for each in ("mean_abs_um", "rms_um"))]
+            + [number(pair["p95_um"], 2), signed(pair["signed_mean_um"], 2)]
+            for pair in summary["pairs"]
+        ]
+        heads = ["pair", "mean |d|", "RMS", "P95", "signed mean"]
+        tables.append({"title": "All pairs", "caption": "In µm.", "heads": heads, "rows": rows})
+    return tables
+
+
+_TABLES: Mapping[str, Callable[[Mapping[str, Any]], list[Table]]] = {
+    "sweep": _sweep_tables,
+    "compare": _compare_tables,
+    "repeat": _repeat_tables,
+}
+
+
+def _notes(verb: str, summary: Mapping[str, Any]) -> list[str]:
+    if verb == "compare":
+        return [
+            f"{where}: completeness stops growing at {n} turns" for where, n in summary.get("enough_turns", {}).items()
+        ]
+    return list(summary.get("notes", ()))

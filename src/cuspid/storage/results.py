@@ -1,0 +1,327 @@
+"""What lies in a folder that a verb wrote, gathered for those who show it.
+
+A folder may hold less than its verb writes, because the run was killed or only some stages were run: what is missing is
+listed, one line each, with the command that makes it.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from cuspid.capture import Capture
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
+from cuspid.jaw import Jaw
+from cuspid.mesh import Mesh
+from cuspid.panorama import Panorama
+from cuspid.reconstruction import Reconstruction
+from cuspid.shape_model import ShapeModel
+from cuspid.storage.captures import read_capture
+from cuspid.storage.files import read_json, reading
+from cuspid.storage.jaws import is_jaw, read_deviations, read_jaw, read_labelled_mesh, read_mesh
+from cuspid.storage.panoramas import read_panorama
+from cuspid.storage.reconstructions import read_reconstruction
+from cuspid.storage.shapes import read_shape_model
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Result:
+    """What all folders have."""
+
+    name: str
+    """Of the folder."""
+    run: Mapping[str, Any]
+    """``run.json``: for each stage its version, settings and the hashes of its inputs."""
+    pictures: Mapping[str, Path] = field(default_factory=dict)
+    """Pictures that the verb drew, by their caption."""
+    missing: tuple[str, ...] = ()
+    """What is not there, and how to get it."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScanResult(_Result):
+    """A folder of ``run``, ``reconstruct`` or ``evaluate``."""
+
+    scan: Mesh | None
+    """The surface in its own frame."""
+    deviation_um: Float[np.ndarray, "v"] | None
+    """Signed deviation of each of its vertices, NaN where it does not count; None before it was evaluated."""
+    trueness: Mapping[str, Any] | None
+    """``trueness.json``."""
+    reference_from_scan: Rigid3 | None
+    """The alignment of the evaluation."""
+    reference: Jaw | None
+    """What it was compared with."""
+    capture: Capture | None
+    """The images."""
+    reconstruction: Reconstruction | None
+    """Where the frames were, in the frame of the scan."""
+    cleaning: Mapping[str, Any] | None
+    """``mesh.json``."""
+    margins: Mapping[str, Any] | None
+    """``margins.json``."""
+    spheres: Mapping[str, Any] | None
+    """``spheres.json``."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ShapeResult(_Result):
+    """A folder of ``shape``."""
+
+    model: ShapeModel
+    """The mean and the modes."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StudyResult(_Result):
+    """A folder of ``sweep``, ``compare`` or ``repeat``."""
+
+    verb: str
+    """Which of them."""
+    summary: Mapping[str, Any] | None
+    """What was found: the JSON file with the name of the verb."""
+    rows: Sequence[Mapping[str, str]]
+    """``results.csv``, or what stands in ``cases/`` so far."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PanoramaResult(_Result):
+    """A folder of ``stitch``."""
+
+    parts: tuple[Panorama, ...]
+    """The panorama, or its parts where the sequence broke."""
+    folders: tuple[Path, ...]
+    """Where each of them lies."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScoreResult(_Result):
+    """A folder of ``stitch-eval``."""
+
+    score: Mapping[str, Any]
+    """``score.json``."""
+    made: Path | None
+    """The panorama laid over the true jaw, a picture of the same size as ``true``."""
+    true: Path | None
+    """The single shot of the true jaw."""
+
+
+Result = ScanResult | ShapeResult | StudyResult | PanoramaResult | ScoreResult
+
+
+def read_result(folder: Path, reference: Path | None = None) -> Result:
+    """What lies in a folder that ``run``, ``evaluate``, ``shape``, ``sweep``, ``compare``, ``repeat``, ``stitch`` or
+    ``stitch-eval`` wrote.
+
+    ``reference``: the mesh with which a scan was compared, where the folder does not hold it. Raises InputError where
+    there is nothing to report, or a file is damaged.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; give one that a verb of cuspid wrote into")
+    run = read_json(folder / "run.json") if (folder / "run.json").exists() else {}
+    for is_there, read in _READERS:
+        if is_there(folder, run):
+            return read(folder, run, reference)
+    made = f"; it holds {', '.join(run)} alone" if run else ""
+    raise InputError(
+        f"{folder}: nothing to report{made}; give the --out folder of run, reconstruct, evaluate, shape, sweep, "
+        "compare, repeat, stitch or stitch-eval"
+    )
+
+
+# --- a scan -----------------------------------------------------------------------------------------------------------
+
+
+def _is_scan(folder: Path, run: Mapping[str, Any]) -> bool:
+    return bool(run.keys() & {"reconstruct", "evaluate"}) or (folder / "mesh.ply").exists()
+
+
+def _read_scan(folder: Path, run: Mapping[str, Any], reference: Path | None) -> ScanResult:
+    missing: list[str] = []
+    scan, deviation_um = _surface(folder, missing)
+    trueness = _optional_json(folder / "trueness.json")
+    if trueness is None and scan is not None:
+        missing.append("the trueness: run cuspid evaluate")
+    jaw = _reference(folder, reference)
+    if jaw is None and trueness is not None:
+        missing.append("the reference: give it with cuspid report --reference")
+    known = trueness is not None
+    if known and deviation_um is None:
+        missing.append("the deviation of each vertex, which an older version did not keep: run cuspid evaluate again")
+    located, captured = folder / "motion" / "reconstruction.json", folder / "capture" / "handpiece.json"
+    if not located.exists():
+        missing.append("where the cameras were: a folder of cuspid run or reconstruct has it")
+    if not captured.exists():
+        missing.append("the images: a folder of cuspid run has them")
+    return ScanResult(
+        name=folder.resolve().name,
+        run=run,
+        missing=tuple(missing),
+        scan=scan,
+        deviation_um=deviation_um if known else None,
+        trueness=trueness,
+        reference_from_scan=None if trueness is None else _alignment(folder / "trueness.json", trueness),
+        reference=jaw,
+        capture=read_capture(folder / "capture") if captured.exists() else None,
+        reconstruction=read_reconstruction(folder / "motion") if located.exists() else None,
+        cleaning=_optional_json(folder / "mesh.json"),
+        margins=_optional_json(folder / "margins.json"),
+        spheres=_optional_json(folder / "spheres.json"),
+        pictures=_pictures(folder, {"spheres.png": "The spheres, measured without a best fit"}),
+    )
+
+
+def _surface(folder: Path, missing: list[str]) -> tuple[Mesh | None, Float[np.ndarray, "v"] | None]:
+    if (folder / "deviation.ply").exists():
+        return read_deviations(folder / "deviation.ply")
+    if (folder / "mesh.ply").exists():
+        return read_mesh(folder / "mesh.ply"), None
+    missing.append("the surface: the run is not complete; give the same command again, it goes on where it stopped")
+    return None, None
+
+
+def _reference(folder: Path, given: Path | None) -> Jaw | None:
+    path = given or folder / "truth" / "jaw.ply"
+    if given is None and not path.exists():
+        return None
+    if path.is_dir():
+        path = path / "jaw.ply"
+    if is_jaw(path):
+        return read_jaw(path)
+    mesh, labels, _ = read_labelled_mesh(path)
+    return Jaw(mesh=mesh, face_labels=labels)
+
+
+def _alignment(path: Path, trueness: Mapping[str, Any]) -> Rigid3:
+    with reading(path):
+        return Rigid3.from_matrix(np.array(trueness["reference_from_scan"], dtype=np.float64))
+
+
+# --- the others -------------------------------------------------------------------------------------------------------
+
+
+def _read_shape(folder: Path, run: Mapping[str, Any], reference: Path | None) -> ShapeResult:
+    captions = {"modes.png": "Modes to either side of the mean", "variance.png": "Share of the variance"}
+    return ShapeResult(
+        name=folder.resolve().name,
+        run=run,
+        model=read_shape_model(folder),
+        pictures=_pictures(folder, captions),
+    )
+
+
+_STUDIES: Mapping[str, tuple[str, Mapping[str, str]]] = {
+    "sweep": ("sweep.json", {"sweep.png": "Each figure over baseline and angle"}),
+    "compare": (
+        "comparison.json",
+        {"comparison.png": "What each handpiece needs and gives", "surfaces.png": "What each reconstructs, by surface"},
+    ),
+    "repeat": ("repeat.json", {"repeat.png": "Where the scans agree with each other and with the reference"}),
+}
+
+
+def _study_of(folder: Path, run: Mapping[str, Any]) -> str | None:
+    return next((verb for verb, (file, _) in _STUDIES.items() if verb in run or (folder / file).exists()), None)
+
+
+def _is_study(folder: Path, run: Mapping[str, Any]) -> bool:
+    return _study_of(folder, run) is not None
+
+
+def _read_study(folder: Path, run: Mapping[str, Any], reference: Path | None) -> StudyResult:
+    verb = _study_of(folder, run) or ""
+    file, captions = _STUDIES[verb]
+    summary, rows = _optional_json(folder / file), _rows(folder)
+    missing = []
+    if summary is None:
+        missing.append(f"{file}: {len(rows)} cases are done; give the same cuspid {verb} command again to go on")
+    return StudyResult(
+        name=folder.resolve().name,
+        run=run,
+        verb=verb,
+        summary=summary,
+        rows=rows,
+        missing=tuple(missing),
+        pictures=_pictures(folder, captions),
+    )
+
+
+def _rows(folder: Path) -> list[Mapping[str, str]]:
+    """The table of a study, or what is known before it is complete."""
+    table = folder / "results.csv"
+    if table.exists():
+        return list(csv.DictReader(table.read_text().splitlines()))
+    found: list[Mapping[str, str]] = []
+    for path in sorted((folder / "cases").glob("*.json")):
+        entry = read_json(path)
+        with reading(path):
+            cells = {**entry["parameters"], **entry["figures"], "failure": entry["failure"]}
+        found.append({"case": path.stem, **{name: "" if cell is None else str(cell) for name, cell in cells.items()}})
+    return found
+
+
+def _is_panorama(folder: Path, run: Mapping[str, Any]) -> bool:
+    return "stitch" in run or (folder / "panorama.json").exists()
+
+
+def _read_panorama(folder: Path, run: Mapping[str, Any], reference: Path | None) -> PanoramaResult:
+    folders = [folder, *sorted(folder.glob("part-*"))]
+    there = tuple(each for each in folders if (each / "panorama.json").exists())
+    if not there:
+        raise InputError(f"{folder}: the panorama is not complete; run the same cuspid stitch command again")
+    pictures = _pictures(there[0], {"camera_path.png": "The path of the camera over the arch"})
+    return PanoramaResult(
+        name=folder.resolve().name,
+        run=run,
+        parts=tuple(read_panorama(each) for each in there),
+        folders=there,
+        pictures=pictures,
+    )
+
+
+def _read_score(folder: Path, run: Mapping[str, Any], reference: Path | None) -> ScoreResult:
+    made, true = (_if_there(folder / name) for name in ("made.png", "true.png"))
+    missing = () if made and true else ("the pictures beside each other: run cuspid stitch-eval again",)
+    return ScoreResult(
+        name=folder.resolve().name,
+        run=run,
+        score=read_json(folder / "score.json"),
+        made=made,
+        true=true,
+        missing=missing,
+        pictures=_pictures(folder, {"score.png": "The true jaw, the panorama over it, and where it errs"}),
+    )
+
+
+def _holds(file: str) -> Callable[[Path, Mapping[str, Any]], bool]:
+    return lambda folder, run: (folder / file).exists()
+
+
+_READERS: tuple[
+    tuple[Callable[[Path, Mapping[str, Any]], bool], Callable[[Path, Mapping[str, Any], Path | None], Result]], ...
+] = (
+    (_holds("shape.json"), _read_shape),
+    (_holds("score.json"), _read_score),
+    (_is_panorama, _read_panorama),
+    (_is_study, _read_study),
+    (_is_scan, _read_scan),
+)
+
+
+def _optional_json(path: Path) -> Any:
+    return read_json(path) if path.exists() else None
+
+
+def _if_there(path: Path) -> Path | None:
+    return path if path.exists() else None
+
+
+def _pictures(folder: Path, captions: Mapping[str, str]) -> dict[str, Path]:
+    return {caption: folder / name for name, caption in captions.items() if (folder / name).exists()}
