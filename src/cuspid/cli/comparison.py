@@ -13,6 +13,7 @@ from rich.table import Table
 
 from cuspid import storage
 from cuspid.anatomy.mouth import MouthOptions, room_mm, study_mouths
+from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
 from cuspid.errors import InputError
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
@@ -97,7 +98,9 @@ def _save(out: Path, outcomes: Sequence[Outcome], options: ComparisonOptions) ->
         console.print(f"{where}: completeness stops growing at {turns} turns")
     for name, reason in failures.items():
         console.print(f"  failed: {name}: {reason}", highlight=False)
-    if not rows:
+    if rows:
+        report(out)
+    else:
         raise InputError(f"compare: none of the {len(failures)} scans succeeded; the reasons are listed above")
 
 

@@ -12,6 +12,7 @@ from rich.table import Table
 from tyro.conf import Positional
 
 from cuspid import storage
+from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console
 from cuspid.errors import InputError
 from cuspid.evaluation.panorama import (
@@ -49,7 +50,9 @@ def stitch_eval(
         comparison = evaluate_panorama(made, known, view, shot, options)
         storage.write_json(out / "score.json", comparison.score)
         _save_picture(out / "score.png", view, comparison)
+        _save_beside(out, view, comparison)
     _print(comparison.score)
+    report(out)
 
 
 def read_picture(path: Path) -> Panorama:
@@ -83,6 +86,13 @@ def _save_picture(path: Path, view: OcclusalView, comparison: PanoramaComparison
         title=f"{score.method}: {score.frames_used} of {score.frames} frames" if score.frames else score.method,
         captions=("single shot of the true jaw", _pictured(score), _measured(score)),
     )
+
+
+def _save_beside(out: Path, view: OcclusalView, comparison: PanoramaComparison) -> None:
+    """true.png and made.png: the single shot and the panorama laid over it, pixel by pixel."""
+    storage.write_image(out / "true.png", view.image)
+    if comparison.aligned is not None:
+        storage.write_image(out / "made.png", np.rint(255 * np.clip(comparison.aligned, 0, 1)).astype(np.uint8))
 
 
 def _pictured(score: PanoramaScore) -> str:

@@ -18,6 +18,7 @@ def report(
     *,
     out: Path | None = None,
     reference: Path | None = None,
+    unit: storage.Unit = "mm",
     options: Annotated[ReportOptions, Flat] = ReportOptions(),
 ) -> None:
     """Write one HTML page of what lies in a folder: the surface in 3-D, figures, pictures, and what it was made of.
@@ -28,14 +29,9 @@ def report(
         folder: What run, reconstruct, evaluate, shape, sweep, compare, repeat, stitch or stitch-eval wrote.
         out: The page (default: report.html in the folder).
         reference: Mesh that a scan was compared with, where the folder does not hold it (evaluate).
+        unit: Length unit of the reference.
     """
-    path = write_report(folder, out or folder / "report.html", reference, options)
+    path = out or folder / "report.html"
+    page = report_page(storage.read_result(folder, reference, unit), options)
+    storage.write_bytes(path, page.encode())
     console.print(f"{path}: {path.stat().st_size / 1e6:.1f} MB", highlight=False)
-
-
-def write_report(
-    folder: Path, path: Path, reference: Path | None = None, options: ReportOptions = ReportOptions()
-) -> Path:
-    """Write the page of a folder."""
-    storage.write_bytes(path, report_page(storage.read_result(folder, reference), options).encode())
-    return path

@@ -14,6 +14,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from cuspid import pipeline, storage
 from cuspid.capture import Capture
+from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress
 from cuspid.errors import InputError
 from cuspid.evaluation.deviation import EvaluationOptions
@@ -143,6 +144,7 @@ def _evaluate(mesh: Path, reference: Path, out: Path, source: Source, options: E
         _evaluate_spheres(scan, known, trueness, out)
     if known.lines:
         _evaluate_margins(scan, known, trueness, out)
+    report(out, reference=reference, unit=source.unit)
 
 
 def _evaluate_spheres(scan: Mesh, reference: Jaw, trueness: Trueness, out: Path) -> None:

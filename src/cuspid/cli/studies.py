@@ -12,6 +12,7 @@ from rich.table import Table
 from tyro.conf import Positional
 
 from cuspid import storage
+from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
 from cuspid.errors import InputError
 from cuspid.reporting.sweep_figures import SweepMap, save_sweep_picture
@@ -79,6 +80,7 @@ def _save(out: Path, outcomes: Sequence[Outcome], options: SweepOptions) -> None
         raise InputError(f"sweep: all {len(failures)} scans failed; the reasons are listed above and in {out}")
     save_maps(out / "sweep.png", outcomes, options)
     _print(outcomes, best, options)
+    report(out)
 
 
 def save_maps(path: Path, outcomes: Sequence[Outcome], options: SweepOptions) -> None:

@@ -25,6 +25,7 @@ from cuspid.anatomy.arch import (
     survey,
 )
 from cuspid.anatomy.mean_shape import MeanShapeOptions, mean_shape
+from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
 from cuspid.errors import InputError
 from cuspid.jaw import Arch, Jaw
@@ -140,6 +141,7 @@ def shape(
         save_modes_picture(out / "modes.png", model)
         save_variance_picture(out / "variance.png", model)
     _print_model(model)
+    report(out)
 
 
 def _print_model(model: ShapeModel) -> None:

@@ -85,7 +85,7 @@ def score_page(result: ScoreResult) -> str:
         score=score,
         tiles=_tiles(score),
         made=provenance(result.run),
-        true=None if result.true is None else photo_uri(result.true, widest_px=_WIDEST_PX),
+        true_picture=None if result.true is None else photo_uri(result.true, widest_px=_WIDEST_PX),
         rows=rows,
         pictures=[(caption, picture_uri(path)) for caption, path in result.pictures.items()],
         made_picture=None if result.made is None else photo_uri(result.made, widest_px=_WIDEST_PX),

@@ -9,6 +9,8 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from markupsafe import Markup, escape
+
 from cuspid.reporting.page import render_page
 
 Table = tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]
@@ -160,4 +162,12 @@ def _escaped(text: str) -> str:
 
 def html(page: Page, pictures: Mapping[str, str]) -> str:
     """One file: ``pictures`` are addresses that hold the data, by the names of the files; others are left out."""
-    return render_page("reproduction.html.j2", page=page, pictures=pictures)
+    return render_page("reproduction.html.j2", page=page, pictures=pictures, words=_words)
+
+
+def _words(text: str) -> Markup:
+    """Escaped, with what stands between backticks as code."""
+    parts = [escape(part) for part in text.split("`")]
+    return Markup("").join(
+        Markup("<code>{}</code>").format(part) if number % 2 else part for number, part in enumerate(parts)
+    )

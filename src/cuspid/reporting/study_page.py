@@ -46,7 +46,7 @@ def heading(column: str) -> str:
     """The name of a column for people: words, and the unit at the end."""
     *words, last = column.split("_")
     if last in _UNITS and words:
-        return f"{' '.join(words)}, {_UNITS[last]}"
+        return f"{' '.join(words)}, {_UNITS[last]}".replace(" um", " µm")
     return column.replace("_", " ")
 
 
@@ -103,8 +103,8 @@ def _sweep_tables(summary: Mapping[str, Any]) -> list[Table]:
         [
             _TERMS.get(term, heading(term)),
             _setting(found["setting"]),
-            number(found["value"], 2),
-            "not repeated" if found["noise"] is None else number(found["noise"], 2),
+            _figure(term, found["value"]),
+            "not repeated" if found["noise"] is None else _figure(term, found["noise"]),
             "; ".join(map(_setting, found["level"])) or "none",
         ]
         for term, found in summary["best"].items()
@@ -114,15 +114,20 @@ def _sweep_tables(summary: Mapping[str, Any]) -> list[Table]:
     tables: list[Table] = [{"title": "Best settings", "caption": caption, "heads": heads, "rows": rows}]
     if summary.get("thesis"):
         thesis = summary["thesis"]
+        terms = [term for term in _TERMS if term in thesis]
         tables.append(
             {
                 "title": "The setting of the thesis",
                 "caption": None,
-                "heads": ["baseline, angle", *(heading(term) for term in _TERMS if term in thesis)],
-                "rows": [[_setting(thesis["setting"]), *(number(thesis[t], 2) for t in _TERMS if t in thesis)]],
+                "heads": ["baseline, angle", *map(heading, terms)],
+                "rows": [[_setting(thesis["setting"]), *(_figure(term, thesis[term]) for term in terms)]],
             }
         )
     return tables
+
+
+def _figure(term: str, value: float) -> str:
+    return number(value, 0 if term == "points" else 2)
 
 
 def _setting(pair: Sequence[float]) -> str:

@@ -24,8 +24,8 @@ from cuspid.panorama import Panorama
 from cuspid.reconstruction import Reconstruction
 from cuspid.shape_model import ShapeModel
 from cuspid.storage.captures import read_capture
-from cuspid.storage.files import read_json, reading
-from cuspid.storage.jaws import is_jaw, read_deviations, read_jaw, read_labelled_mesh, read_mesh
+from cuspid.storage.files import hash_file, read_json, reading
+from cuspid.storage.jaws import Unit, is_jaw, read_deviations, read_jaw, read_labelled_mesh, read_mesh
 from cuspid.storage.panoramas import read_panorama
 from cuspid.storage.reconstructions import read_reconstruction
 from cuspid.storage.shapes import read_shape_model
@@ -116,19 +116,22 @@ class ScoreResult(_Result):
 Result = ScanResult | ShapeResult | StudyResult | PanoramaResult | ScoreResult
 
 
-def read_result(folder: Path, reference: Path | None = None) -> Result:
+def read_result(folder: Path, reference: Path | None = None, unit: Unit = "mm") -> Result:
     """What lies in a folder that ``run``, ``evaluate``, ``shape``, ``sweep``, ``compare``, ``repeat``, ``stitch`` or
     ``stitch-eval`` wrote.
 
-    ``reference``: the mesh with which a scan was compared, where the folder does not hold it. Raises InputError where
-    there is nothing to report, or a file is damaged.
+    ``reference``: the mesh (in a unit) with which a scan was compared, or the folder ``truth`` of a simulation, where
+    the folder does not hold it. Raises InputError where there is nothing to report, a file is damaged, or the reference
+    is another one.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give one that a verb of cuspid wrote into")
     run = read_json(folder / "run.json") if (folder / "run.json").exists() else {}
     for is_there, read in _READERS:
         if is_there(folder, run):
-            return read(folder, run, reference)
+            return read(folder, run)
+    if _is_scan(folder, run):
+        return _read_scan(folder, run, reference, unit)
     made = f"; it holds {', '.join(run)} alone" if run else ""
     raise InputError(
         f"{folder}: nothing to report{made}; give the --out folder of run, reconstruct, evaluate, shape, sweep, "
@@ -143,13 +146,13 @@ def _is_scan(folder: Path, run: Mapping[str, Any]) -> bool:
     return bool(run.keys() & {"reconstruct", "evaluate"}) or (folder / "mesh.ply").exists()
 
 
-def _read_scan(folder: Path, run: Mapping[str, Any], reference: Path | None) -> ScanResult:
+def _read_scan(folder: Path, run: Mapping[str, Any], reference: Path | None, unit: Unit) -> ScanResult:
     missing: list[str] = []
     scan, deviation_um = _surface(folder, missing)
     trueness = _optional_json(folder / "trueness.json")
     if trueness is None and scan is not None:
         missing.append("the trueness: run cuspid evaluate")
-    jaw = _reference(folder, reference)
+    jaw = _reference(folder, run, reference, unit)
     if jaw is None and trueness is not None:
         missing.append("the reference: give it with cuspid report --reference")
     known = trueness is not None
@@ -187,15 +190,17 @@ def _surface(folder: Path, missing: list[str]) -> tuple[Mesh | None, Float[np.nd
     return None, None
 
 
-def _reference(folder: Path, given: Path | None) -> Jaw | None:
-    path = given or folder / "truth" / "jaw.ply"
+def _reference(folder: Path, run: Mapping[str, Any], given: Path | None, unit: Unit) -> Jaw | None:
+    path = folder / "truth" if given is None else given
+    path = path / "jaw.ply" if given is None or path.is_dir() else path
     if given is None and not path.exists():
         return None
-    if path.is_dir():
-        path = path / "jaw.ply"
+    known = run.get("evaluate", {}).get("inputs_sha256", {})
+    if given is not None and known and hash_file(path) not in known.values():
+        raise InputError(f"{path}: not the reference that this scan was compared with; give that one")
     if is_jaw(path):
         return read_jaw(path)
-    mesh, labels, _ = read_labelled_mesh(path)
+    mesh, labels, _ = read_labelled_mesh(path, unit)
     return Jaw(mesh=mesh, face_labels=labels)
 
 
@@ -207,7 +212,7 @@ def _alignment(path: Path, trueness: Mapping[str, Any]) -> Rigid3:
 # --- the others -------------------------------------------------------------------------------------------------------
 
 
-def _read_shape(folder: Path, run: Mapping[str, Any], reference: Path | None) -> ShapeResult:
+def _read_shape(folder: Path, run: Mapping[str, Any]) -> ShapeResult:
     captions = {"modes.png": "Modes to either side of the mean", "variance.png": "Share of the variance"}
     return ShapeResult(
         name=folder.resolve().name,
@@ -235,7 +240,7 @@ def _is_study(folder: Path, run: Mapping[str, Any]) -> bool:
     return _study_of(folder, run) is not None
 
 
-def _read_study(folder: Path, run: Mapping[str, Any], reference: Path | None) -> StudyResult:
+def _read_study(folder: Path, run: Mapping[str, Any]) -> StudyResult:
     verb = _study_of(folder, run) or ""
     file, captions = _STUDIES[verb]
     summary, rows = _optional_json(folder / file), _rows(folder)
@@ -271,7 +276,7 @@ def _is_panorama(folder: Path, run: Mapping[str, Any]) -> bool:
     return "stitch" in run or (folder / "panorama.json").exists()
 
 
-def _read_panorama(folder: Path, run: Mapping[str, Any], reference: Path | None) -> PanoramaResult:
+def _read_panorama(folder: Path, run: Mapping[str, Any]) -> PanoramaResult:
     folders = [folder, *sorted(folder.glob("part-*"))]
     there = tuple(each for each in folders if (each / "panorama.json").exists())
     if not there:
@@ -286,7 +291,7 @@ def _read_panorama(folder: Path, run: Mapping[str, Any], reference: Path | None)
     )
 
 
-def _read_score(folder: Path, run: Mapping[str, Any], reference: Path | None) -> ScoreResult:
+def _read_score(folder: Path, run: Mapping[str, Any]) -> ScoreResult:
     made, true = (_if_there(folder / name) for name in ("made.png", "true.png"))
     missing = () if made and true else ("the pictures beside each other: run cuspid stitch-eval again",)
     return ScoreResult(
@@ -304,14 +309,11 @@ def _holds(file: str) -> Callable[[Path, Mapping[str, Any]], bool]:
     return lambda folder, run: (folder / file).exists()
 
 
-_READERS: tuple[
-    tuple[Callable[[Path, Mapping[str, Any]], bool], Callable[[Path, Mapping[str, Any], Path | None], Result]], ...
-] = (
+_READERS: tuple[tuple[Callable[[Path, Mapping[str, Any]], bool], Callable[[Path, Mapping[str, Any]], Result]], ...] = (
     (_holds("shape.json"), _read_shape),
     (_holds("score.json"), _read_score),
     (_is_panorama, _read_panorama),
     (_is_study, _read_study),
-    (_is_scan, _read_scan),
 )
 
 

@@ -155,8 +155,8 @@
     change();
   }
 
-  function lookAt(target, eye, up, radius) {
-    half = 1.05 * radius;
+  function lookAt(target, eye, up, size) {
+    half = size;
     camera.zoom = 1;
     controls.target.copy(target);
     camera.position.copy(target).addScaledVector(eye.clone().normalize(), 500);
@@ -171,14 +171,37 @@
 
   function whole(name) {
     const view = scene.views.find((each) => each.name === name) ?? scene.views[0];
-    const sphere = main().geometry.boundingSphere;
-    lookAt(sphere.center, vector(view.eye), vector(view.up), 0.9 * sphere.radius);
+    const eye = vector(view.eye).normalize();
+    const right = vector(view.up).cross(eye).normalize();
+    const axes = [right, eye.clone().cross(right), eye];
+    const [lows, highs] = extents(axes);
+    const target = new THREE.Vector3();
+    axes.forEach((axis, k) => target.addScaledVector(axis, (lows[k] + highs[k]) / 2));
+    const [width, height] = [highs[0] - lows[0], highs[1] - lows[1]];
+    const { clientWidth, clientHeight } = canvas.parentElement;
+    const shorter = Math.min(clientWidth, clientHeight);
+    lookAt(target, eye, axes[1], 0.54 * shorter * Math.max(width / clientWidth, height / clientHeight));
+  }
+
+  // How far the main surface reaches along some directions.
+  function extents(axes) {
+    const { array } = main().geometry.attributes.position;
+    const lows = axes.map(() => Infinity);
+    const highs = axes.map(() => -Infinity);
+    for (let v = 0; v < array.length; v += 3) {
+      axes.forEach((axis, k) => {
+        const at = array[v] * axis.x + array[v + 1] * axis.y + array[v + 2] * axis.z;
+        lows[k] = Math.min(lows[k], at);
+        highs[k] = Math.max(highs[k], at);
+      });
+    }
+    return [lows, highs];
   }
 
   function goTo(place) {
     const eye = place.towards ? vector(place.towards) : new THREE.Vector3(0, 0, 1);
     const up = Math.abs(eye.clone().normalize().y) < 0.9 ? vector([0, 1, 0]) : vector([0, 0, 1]);
-    lookAt(vector(place.position_mm), eye, up, place.radius_mm);
+    lookAt(vector(place.position_mm), eye, up, 1.05 * place.radius_mm);
     mark(place.towards ? vector(place.position_mm) : null);
     root.scrollIntoView({ behavior: "instant", block: "start" });
   }
