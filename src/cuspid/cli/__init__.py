@@ -17,6 +17,7 @@ from cuspid.cli.mouth import mouth
 from cuspid.cli.panorama import stitch
 from cuspid.cli.panorama_evaluation import stitch_eval
 from cuspid.cli.report import report
+from cuspid.cli.reproduction import reproduce
 from cuspid.cli.scan import evaluate, reconstruct, run, simulate
 from cuspid.cli.shared import console
 from cuspid.cli.studies import sweep
@@ -44,6 +45,7 @@ COMMANDS: Mapping[str, Callable[..., Any]] = {
     "reconstruct": reconstruct,
     "evaluate": evaluate,
     "stitch": stitch,
+    "reproduce": reproduce,
     "report": report,
 }
 

@@ -1,0 +1,110 @@
+"""The thesis beside ours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from difflib import get_close_matches
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from cuspid import storage
+from cuspid.cli.shared import console, show_progress
+from cuspid.errors import InputError
+from cuspid.reporting.page import photo_uri
+from cuspid.reporting.reproduction_page import Page, html, markdown
+from cuspid.studies.reproduction.catalogue import BY_ID, ITEMS, Item
+from cuspid.studies.reproduction.judging import judge
+from cuspid.studies.reproduction.page import make_page
+from cuspid.studies.reproduction.pictures import draw_pictures
+from cuspid.studies.reproduction.runs import gather, missing, run_missing
+
+
+def reproduce(
+    *,
+    out: Path,
+    quick: bool = False,
+    only: tuple[str, ...] = (),
+    results: Path | None = None,
+    images: Path | None = None,
+    run: bool = True,
+    workers: int | None = None,
+) -> None:
+    """Set every table, figure and equation of the thesis beside ours: reproduction.md and reproduction.html.
+
+    What has no results yet is run: hours for all, or a quarter of an hour on two cores with --quick. A killed run goes
+    on when the same command is given again.
+
+    Args:
+        out: Folder for the pages, the results (results/, results-quick/) and what they were made from (work/).
+        quick: Run a reduced version: fewer jaws, settings and subjects; the complete arch is left out.
+        only: Items, for example fig-2.5 table-3.2 eq-3.9 (default: all).
+        results: Folder with results that are there already, for example benchmarks/results; they are not run again.
+        images: Folder with pictures that were made before, for example docs/images.
+        run: Run what is missing; --no-run only makes the pages of what is there.
+        workers: Runs at once, one core each (default: one for each core).
+    """
+    items = asked_items(only)
+    if workers is not None and workers < 1:
+        raise InputError(f"reproduce: --workers is {workers}; at least one is needed")
+    if images is not None and not images.is_dir():
+        raise InputError(f"--images {images}: no such folder")
+    found = gather(out, results)
+    with storage.claimed_folder(out, "reproduce", {}, {}):
+        if run:
+            _run(out, items, quick, workers, results)
+            found = gather(out, results)
+        page = make_page(judge(found, items), found)
+        draw_pictures(out / "images", found)
+        storage.write_bytes(out / "reproduction.md", markdown(page).encode())
+        storage.write_bytes(out / "reproduction.html", html(page, _pictures(page, out / "images", images)).encode())
+    _print(page)
+    console.print(f"{out / 'reproduction.html'}, {out / 'reproduction.md'}", highlight=False)
+
+
+def asked_items(only: Sequence[str]) -> tuple[Item, ...]:
+    """Items by their ids, in the order of the page; all where none is asked for. Raises InputError for another id."""
+    for name in only:
+        if name not in BY_ID:
+            near = get_close_matches(name, BY_ID, n=3)
+            raise InputError(
+                f"--only {name}: no such item; "
+                + (f"did you mean {' or '.join(near)}?" if near else "they are fig-1.1 to fig-4.5, table-1.1 to eq-3.9")
+            )
+    return tuple(item for item in ITEMS if not only or item.id in only)
+
+
+def _run(out: Path, items: Sequence[Item], quick: bool, workers: int | None, results: Path | None) -> None:
+    wanted = missing(items, gather(out, results), quick)
+    if not wanted:
+        return
+    console.print(f"to run: {', '.join(wanted)}", highlight=False)
+    with show_progress() as progress:
+        failures = run_missing(
+            out, wanted, quick=quick, workers=workers, progress=lambda done, total: progress("runs", done, total)
+        )
+    for name, reason in failures.items():
+        console.print(f"failed: {name}: {reason}", highlight=False)
+
+
+def _pictures(page: Page, made: Path, given: Path | None) -> dict[str, str]:
+    """Addresses that hold the pictures that there are, those of this folder first; the page's own copies are kept."""
+    found = {}
+    for name in dict.fromkeys(name for entry in page.entries for name, _ in entry.pictures):
+        if not (made / name).exists() and given is not None and (given / name).exists():
+            storage.write_bytes(made / name, (given / name).read_bytes())
+        if (made / name).exists():
+            found[name] = photo_uri(made / name, widest_px=900)
+    return found
+
+
+def _print(page: Page) -> None:
+    table = Table(title=page.title, title_justify="left")
+    for column in ("item", "what it shows", "verdict", "its figures"):
+        table.add_column(column, no_wrap=column == "item")
+    for entry in page.entries:
+        table.add_row(entry.name, escape(entry.title), entry.verdict, entry.tally)
+    Console().print(table)
+    console.print(", ".join(f"{number} {verdict}" for verdict, number, _ in page.counts), highlight=False)

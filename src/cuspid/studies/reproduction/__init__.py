@@ -1,0 +1,1 @@
+"""Every table, figure and equation of the thesis beside ours: what it states, what we find, and a verdict by a rule."""
