@@ -35,6 +35,8 @@ Results = Mapping[str, Result]
 Table = tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]
 """Headings, and rows of cells."""
 
+CHECKED = "thesis_checks"
+"""Name of the results of what is computed in seconds."""
 PANORAMA = "panorama/"
 """How the names of results of panoramas begin; then follow subject and method."""
 SUBJECTS = 10
@@ -114,7 +116,7 @@ def _check(results: Results, check: str, *names: str, **fields: Any) -> Comparis
         values = tuple(result[check][name] for name in names)
         return values[0] if len(values) == 1 else values
 
-    return compare(results, "checks", ours, **fields)
+    return compare(results, CHECKED, ours, **fields)
 
 
 def _exact(results: Results, check: str, name: str, quantity: str, unit: str = "", limit: float = EXACT) -> Comparison:
@@ -128,7 +130,7 @@ def _exact(results: Results, check: str, name: str, quantity: str, unit: str = "
 def _fig_1_3(item: Item, results: Results) -> Finding:
     row = compare(
         results,
-        "checks",
+        CHECKED,
         lambda found: found["stereo_matches"]["enamel_right"] / found["stereo_matches"]["artificial_right"],
         quantity="right matches on enamel, as a share of those on the artificial texture",
         printed="few",
@@ -260,7 +262,7 @@ def _eq_2_2(item: Item, results: Results) -> Finding:
         rule=Equals(thesis=(21.0, 39.0), within=1.0),
     )
     model = "{:.1f} deg is the angle of our model: the ramus goes from condyle to gonion, below the occlusal plane."
-    notes = (model.format(results["checks"]["ramus_angle"]["model_deg"]),) if "checks" in results else ()
+    notes = (model.format(results[CHECKED]["ramus_angle"]["model_deg"]),) if CHECKED in results else ()
     return Finding(item=item, comparisons=(same,), notes=notes)
 
 
@@ -479,7 +481,7 @@ def _studied(name: str) -> Callable[[Results], Comparison]:
 
     return lambda results: compare(
         results,
-        "checks",
+        CHECKED,
         ours,
         quantity=f"{name.split('_')[0]} of the pairs that are studied",
         unit=name.split("_")[1],
@@ -944,7 +946,7 @@ def _fig_4_1(item: Item, results: Results) -> Finding:
     def more(one: str, other: str, claim: str, because: str) -> Comparison:
         return compare(
             results,
-            "checks",
+            CHECKED,
             lambda found: (
                 found["normal_map_features"][f"{one}_matches"] > found["normal_map_features"][f"{other}_matches"]
             ),
@@ -978,7 +980,7 @@ def _fig_4_1(item: Item, results: Results) -> Finding:
 def _fig_4_2(item: Item, results: Results) -> Finding:
     row = compare(
         results,
-        "checks",
+        CHECKED,
         lambda found: found["free_path"]["unrestricted_height_sd_mm"] > found["free_path"]["restricted_height_sd_mm"],
         quantity="height of the camera over the occlusal plane varies more on the unrestricted path",
         unit="mm",
@@ -1012,7 +1014,7 @@ def _fig_4_3(item: Item, results: Results) -> Finding:
 def _refused(results: Results, name: str, tests: tuple[str, ...]) -> Comparison:
     return compare(
         results,
-        "checks",
+        CHECKED,
         lambda found: tuple(found["rejections"][name].split("; ")) == tests,
         quantity=f"tests that refuse a frame with {name.replace('_', ' ')}",
         printed=", ".join(tests) or "none",

@@ -11,6 +11,7 @@ Names of results are those of the benchmarks (benchmarks/results). Under the fol
 from __future__ import annotations
 
 import csv
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -36,7 +37,7 @@ from cuspid.studies.camera_sweep import SweepOptions
 from cuspid.studies.grid import Case, Progress, Value, run_grid
 from cuspid.studies.reproduction.catalogue import Item
 from cuspid.studies.reproduction.checks import CHECKS
-from cuspid.studies.reproduction.judging import PANORAMA, SUBJECTS, WITHOUT, Results, judge, panoramas
+from cuspid.studies.reproduction.judging import CHECKED, PANORAMA, SUBJECTS, WITHOUT, Results, judge, panoramas
 from cuspid.studies.reproduction.samples import (
     MEAN_EDGE_MM,
     best_camera_pairs,
@@ -101,7 +102,7 @@ class Run:
 
 
 def _checks(task: Task) -> Iterator[tuple[str, Result]]:
-    yield "checks", {name: check() for name, check in CHECKS.items()}
+    yield CHECKED, {name: check() for name, check in CHECKS.items()}
 
 
 def _populations(task: Task) -> Iterator[tuple[str, Result]]:
@@ -301,7 +302,7 @@ RUNS: Mapping[str, Run] = MappingProxyType(
         "populations": Run(makes=("populations",), make=_populations, minutes=3),
         "camera_pair": Run(makes=("camera_pair",), make=_camera_pair, minutes=0.6),
         "visibility": Run(makes=("visibility",), make=_visibility, minutes=0.4),
-        "checks": Run(makes=("checks",), make=_checks, minutes=0.4, quick="same"),
+        CHECKED: Run(makes=(CHECKED,), make=_checks, minutes=0.4, quick="same"),
     }
 )
 """All runs by name."""
@@ -385,8 +386,14 @@ def run_one(*, run: str, folder: Path, wanted: Mapping[str, tuple[str, ...]], qu
     """Make the results of a run that are missing; each is written as soon as it is there."""
     reduced = quick and RUNS[run].quick == "reduced"
     target = folder / ("results-quick" if reduced else "results")
-    begin = time.perf_counter()
+    wall, cpu = time.perf_counter(), _cpu_s()
     task = Task(name=run, folder=folder, quick=reduced, wanted=wanted[run])
     for name, result in RUNS[run].make(task):
         storage.write_json(target / f"{name}.json", {**result, **conditions()})
-    return {"wall_s": round(time.perf_counter() - begin, 1)}
+    return {"wall_s": round(time.perf_counter() - wall, 1), "cpu_s": round(_cpu_s() - cpu, 1)}
+
+
+def _cpu_s() -> float:
+    """CPU seconds of this process and of the programs that it has run."""
+    used = os.times()
+    return used.user + used.system + used.children_user + used.children_system
