@@ -62,8 +62,9 @@ class TruenessRow:
         return f"prepared-{self.tooth or 'arch'}"
 
 
-def _row(part: str, tooth: int | None, what: str, *um: float) -> TruenessRow:
-    return TruenessRow(part=part, tooth=tooth, what=what, min_um=um[0], max_um=um[1], mean_um=um[2], std_um=um[3])
+def _row(part: str, tooth: int | None, what: str, *um: int) -> TruenessRow:
+    least, largest, mean, std = map(float, um)
+    return TruenessRow(part=part, tooth=tooth, what=what, min_um=least, max_um=largest, mean_um=mean, std_um=std)
 
 
 TABLE_3_2 = (
@@ -125,9 +126,8 @@ ITEMS: tuple[Item, ...] = (
         section="2.2.1",
         title="Measures of the ramus",
         states="Mean height of the ramus 49.23 ± 7.22 mm (910 patients of another study).",
-        lost="A drawing of another study's measures, lost in our copy. Its 49.23 mm enter Eq 2.2; we have no "
-        "patients to "
-        "measure it on.",
+        lost="A drawing of another study's measures, lost in our copy. Its 49.23 mm enter Eq 2.2; we have no patients "
+        "to measure it on.",
     ),
     Item(
         id="fig-2.5",
@@ -216,26 +216,23 @@ ITEMS: tuple[Item, ...] = (
         section="3.5",
         title="The steps of incremental structure from motion",
         states="Correspondences, then registration, triangulation and bundle adjustment.",
-        lost="A diagram that is lost in our copy. The steps of ours are in docs/architecture.md; its errors are "
-        "those of "
-        "Table 3.2.",
+        lost="A diagram that is lost in our copy. The steps of ours are in docs/architecture.md; its errors are those "
+        "of Table 3.2.",
     ),
     Item(
         id="fig-3.13",
         section="3.5.1",
         title="The surfaces of the teeth on which pairs are tested",
-        states="Occlusal, incisal, buccal, lingual, labial, distal, mesial and gingival; the pairs that are best "
-        "for the "
-        "top surfaces also suit the buccal, lingual and gingival ones (3.5.2).",
+        states="Occlusal, incisal, buccal, lingual, labial, distal, mesial and gingival; the pairs that are best for "
+        "the top surfaces also suit the buccal, lingual and gingival ones (3.5.2).",
         pictures=(("visibility-twelve.png", "The surfaces, and what twelve cameras see of them"),),
     ),
     Item(
         id="fig-3.14",
         section="3.5.1",
         title="The best pair over the occlusal and the incisal surface",
-        states="Of baselines 1 to 4 mm and angles 0 to 9 deg, 2.5 mm and 0 deg is best over the occlusal surface, "
-        "1.5 mm "
-        "and 0 deg over the incisal one (512 px, 62 deg, 5 mm).",
+        states="Of baselines 1 to 4 mm and angles 0 to 9 deg, 2.5 mm and 0 deg is best over the occlusal surface, 1.5 "
+        "mm and 0 deg over the incisal one (512 px, 62 deg, 5 mm).",
         pictures=(("sweep-occlusal.png", "Our sweep over the occlusal surface"),),
     ),
     Item(
@@ -343,9 +340,8 @@ ITEMS: tuple[Item, ...] = (
         id="table-3.1",
         section="3.5.4",
         title="Six cameras against twelve",
-        states="The table is lost. The text: the twelve are the more plausible design, moved only; many cameras "
-        "make time "
-        "and error small (3.5.2).",
+        states="The table is lost. The text: the twelve are the more plausible design, moved only; many cameras make "
+        "time and error small (3.5.2).",
         pictures=(("design-comparison.png", "Size, completeness and error of both, and of other designs"),),
     ),
     Item(

@@ -281,7 +281,7 @@ def _panorama_run(subject: str) -> Run:
     return Run(
         makes=names,
         make=_panoramas,
-        minutes=8,
+        minutes=8.0,
         quick="same" if subject in _QUICK_SUBJECTS else "none",
         quick_makes=names if subject == _QUICK_SUBJECTS[0] else names[:1],
     )
@@ -289,17 +289,17 @@ def _panorama_run(subject: str) -> Run:
 
 RUNS: Mapping[str, Run] = MappingProxyType(
     {
-        "prepared-arch": Run(makes=("prepared-arch",), make=_prepared, minutes=25, quick="none"),
+        "prepared-arch": Run(makes=("prepared-arch",), make=_prepared, minutes=25.0, quick="none"),
         **{
-            name: Run(makes=(name,), make=_prepared, minutes=3, quick="same")
+            name: Run(makes=(name,), make=_prepared, minutes=3.0, quick="same")
             for name in prepared_cases()
             if name != "prepared-arch"
         },
         **{f"panorama-{name}": _panorama_run(name) for name in SUBJECT_NAMES},
-        "camera_sweep": Run(makes=("camera_sweep",), make=_camera_sweep, minutes=30),
-        "design_comparison": Run(makes=("design_comparison",), make=_design_comparison, minutes=15),
-        "mean_shape": Run(makes=("mean_shape",), make=_mean_shape, minutes=9),
-        "populations": Run(makes=("populations",), make=_populations, minutes=3),
+        "camera_sweep": Run(makes=("camera_sweep",), make=_camera_sweep, minutes=30.0),
+        "design_comparison": Run(makes=("design_comparison",), make=_design_comparison, minutes=15.0),
+        "mean_shape": Run(makes=("mean_shape",), make=_mean_shape, minutes=9.0),
+        "populations": Run(makes=("populations",), make=_populations, minutes=3.0),
         "camera_pair": Run(makes=("camera_pair",), make=_camera_pair, minutes=0.6),
         "visibility": Run(makes=("visibility",), make=_visibility, minutes=0.4),
         CHECKED: Run(makes=(CHECKED,), make=_checks, minutes=0.4, quick="same"),
