@@ -16,6 +16,7 @@ from cuspid.cli.jaws import box, phantom, prepare
 from cuspid.cli.mouth import mouth
 from cuspid.cli.panorama import stitch
 from cuspid.cli.panorama_evaluation import stitch_eval
+from cuspid.cli.repeat import repeat
 from cuspid.cli.report import report
 from cuspid.cli.reproduction import reproduce
 from cuspid.cli.scan import evaluate, reconstruct, run, simulate
@@ -46,6 +47,7 @@ COMMANDS: Mapping[str, Callable[..., Any]] = {
     "evaluate": evaluate,
     "stitch": stitch,
     "reproduce": reproduce,
+    "repeat": repeat,
     "report": report,
 }
 

@@ -136,7 +136,7 @@ def _evaluate(mesh: Path, reference: Path, out: Path, source: Source, options: E
     with storage.claimed_folder(out, "evaluate", {"evaluation": options}, hashes, replace=True):
         trueness = pipeline.evaluate(scan, known, options, scannable=scannable)
         coloured = replace(scan, colors=deviation_colors(trueness.deviation_um))
-        storage.write_mesh(out / "deviation.ply", coloured, deviation_um=trueness.deviation_um)
+        storage.write_mesh(out / "deviation.ply", coloured, values={"deviation_um": trueness.deviation_um})
         save_deviation_picture(out / "deviation.png", scan, trueness)
         storage.write_trueness(out / "trueness.json", trueness)
     _print_trueness(trueness)

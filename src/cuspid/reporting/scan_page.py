@@ -34,7 +34,7 @@ from cuspid.reporting.scene import (
     path_layer,
     standard_views,
 )
-from cuspid.reporting.shown_mesh import ShownMesh, simplified
+from cuspid.reporting.shown_mesh import UM_PER_STEP, ShownMesh, simplified
 from cuspid.storage import ScanResult
 
 _BINS = 80
@@ -164,7 +164,7 @@ def _scene(
         "colors": color_table(),
         "range": range_um,
         "unit": "µm",
-        "per_step": 0.1,
+        "per_step": UM_PER_STEP,
         "views": standard_views(arch),
         "teeth": [asdict(place) for place in _teeth(result)],
     }

@@ -5,9 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from cuspid.errors import InputError
-from cuspid.reporting.page import number, picture_uri, provenance, render_page, signed
+from cuspid.mesh import Mesh
+from cuspid.reporting.figures import FigureOptions, deviation_colors, render
+from cuspid.reporting.page import jpeg_uri, number, picture_uri, provenance, render_page, script_json, signed
+from cuspid.reporting.repeat_figures import faces_around
+from cuspid.reporting.scene import RANGES_UM, color_table, css_gradient, fitting_range_um, mesh_layer, standard_views
+from cuspid.reporting.shown_mesh import UM_PER_STEP, simplified
 from cuspid.storage import StudyResult
+
+_MOST_FACES = 120_000
 
 Table = dict[str, Any]
 Tile = tuple[str, str, str]
@@ -26,6 +36,7 @@ def study_page(result: StudyResult) -> str:
     if not result.rows and result.summary is None:
         raise InputError(f"{result.name}: nothing to report; no case of the study is done yet")
     summary = result.summary or {}
+    view = None if result.surface is None else _view(result.surface, result.values)
     failures = {row["case"]: row["failure"] for row in result.rows if row.get("failure")}
     return render_page(
         "study.html.j2",
@@ -34,12 +45,46 @@ def study_page(result: StudyResult) -> str:
         missing=result.missing,
         lead=_lead(result.verb, summary, len(result.rows), len(failures)),
         tables=_TABLES[result.verb](summary) if summary else [],
+        view=view,
         notes=_notes(result.verb, summary),
         pictures=[(caption, picture_uri(path)) for caption, path in result.pictures.items()],
         all_rows=_all_rows(result.rows),
         failures=failures,
         made=provenance(result.run),
     )
+
+
+def _view(surface: Mesh, values: Mapping[str, Float[np.ndarray, "v"]]) -> dict[str, Any]:
+    """The reference with the mean deviation and with its spread, one at a time."""
+    faces = faces_around(surface, np.isfinite(values["sd_um"]))
+    part, keep = surface.submesh(faces), np.unique(surface.faces[faces])
+    shown = simplified(part, _MOST_FACES)
+    maps = {"mean": ("Mean deviation", "mean_deviation_um"), "sd": ("SD over the scans", "sd_um")}
+    carried = {name: shown.carried(values[column][keep]) for name, (_, column) in maps.items()}
+    layers = [
+        {
+            **mesh_layer(name, label, shown.mesh, visible=name == "mean", deviation_um=carried[name]),
+            "group": "map",
+        }
+        for name, (label, _) in maps.items()
+    ]
+    range_um = fitting_range_um(float(np.nanpercentile(np.abs(carried["mean"]), 95)))
+    colors = deviation_colors(carried["mean"], FigureOptions(range_um=range_um, tolerance_um=range_um / 4))
+    still = render(Mesh(shown.mesh.vertices, shown.mesh.faces, colors), width_px=900, supersampling=1)
+    views = standard_views(None)
+    scene = {"layers": layers, "colors": color_table(), "range": range_um, "unit": "µm", "per_step": UM_PER_STEP}
+    return {
+        "scene": script_json({**scene, "views": views, "teeth": [], "worst": []}),
+        "still": jpeg_uri(still.image),
+        "toggles": [(layer["name"], layer["label"], layer["visible"]) for layer in layers],
+        "views": [each["name"] for each in views],
+        "shown": [
+            {"name": "reference", "full": shown.full_faces, "shown": len(shown.mesh.faces), "off_um": shown.off_um}
+        ],
+        "gradient": css_gradient(),
+        "range_um": range_um,
+        "ranges_um": RANGES_UM,
+    }
 
 
 def heading(column: str) -> str:

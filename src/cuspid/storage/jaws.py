@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -19,6 +20,7 @@ Unit = Literal["mm", "cm", "m", "in", "um"]
 MM_PER_UNIT: Mapping[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "um": 0.001}
 """Length units that a mesh file may be in."""
 
+_PLACE_AND_COLOR = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"}
 MESH_SUFFIXES = (".stl", ".ply", ".obj")
 
 OCCLUSAL = "occlusal"
@@ -107,36 +109,31 @@ def _fdi_labels(labels: Int[np.ndarray, "f"], path: Path) -> Int[np.ndarray, "f"
     raise InputError(f"{path}: tooth labels {sorted(values)[:6]} are neither FDI nor Universal numbers")
 
 
-DEVIATION = "deviation_um"
-"""Name of the vertex property of a PLY file that holds signed deviations; CloudCompare shows it as a scalar field."""
-
-
 def write_mesh(
     path: Path,
     mesh: Mesh,
     face_labels: Int[np.ndarray, "f"] | None = None,
     *,
-    deviation_um: Float[np.ndarray, "v"] | None = None,
+    values: Mapping[str, Float[np.ndarray, "v"]] = MappingProxyType({}),
 ) -> None:
-    """Write a mesh in mm: binary PLY (with colour, labels and deviations), binary STL or OBJ, by the file's suffix."""
+    """Write a mesh in mm: binary PLY (with colour, labels and values of the vertices by name), binary STL or OBJ, by
+    the file's suffix. CloudCompare shows such values as scalar fields."""
     exported = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
-    if deviation_um is not None:
-        exported.vertex_attributes[DEVIATION] = deviation_um.astype(np.float32)
+    for name, each in values.items():
+        exported.vertex_attributes[name] = each.astype(np.float32)
     if face_labels is not None:
         exported.face_attributes["label"] = face_labels.astype(np.int32)
     data = exported.export(file_type=path.suffix.lower().lstrip("."))
     write_bytes(path, data.encode() if isinstance(data, str) else data)
 
 
-def read_deviations(path: Path) -> tuple[Mesh, Float[np.ndarray, "v"] | None]:
-    """As :func:`read_mesh`, with the signed deviation of each vertex in um (NaN: not counted); None where the file has
-    none."""
+def read_vertex_values(path: Path) -> tuple[Mesh, dict[str, Float[np.ndarray, "v"]]]:
+    """As :func:`read_mesh`, with the values of the vertices by name, which :func:`write_mesh` wrote to a PLY file."""
     mesh, loaded = _read_triangles(path, "mm")
     raw = loaded.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
-    if raw is None or DEVIATION not in (raw.dtype.names or ()):
-        return mesh, None
+    names = [] if raw is None else [name for name in raw.dtype.names or () if name not in _PLACE_AND_COLOR]
     _, first = np.unique(np.asarray(loaded.vertices, dtype=np.float64), axis=0, return_index=True)
-    return mesh, np.asarray(raw[DEVIATION], dtype=np.float64).reshape(-1)[first]
+    return mesh, {name: np.asarray(raw[name], dtype=np.float64).reshape(-1)[first] for name in names}
 
 
 def write_jaw(path: Path, jaw: Jaw) -> None:

@@ -25,7 +25,7 @@ from cuspid.reconstruction import Reconstruction
 from cuspid.shape_model import ShapeModel
 from cuspid.storage.captures import read_capture
 from cuspid.storage.files import hash_file, read_json, reading
-from cuspid.storage.jaws import Unit, is_jaw, read_deviations, read_jaw, read_labelled_mesh, read_mesh
+from cuspid.storage.jaws import Unit, is_jaw, read_jaw, read_labelled_mesh, read_mesh, read_vertex_values
 from cuspid.storage.panoramas import read_panorama
 from cuspid.storage.reconstructions import read_reconstruction
 from cuspid.storage.shapes import read_shape_model
@@ -89,6 +89,10 @@ class StudyResult(_Result):
     """What was found: the JSON file with the name of the verb."""
     rows: Sequence[Mapping[str, str]]
     """``results.csv``, or what stands in ``cases/`` so far."""
+    surface: Mesh | None = None
+    """The reference of ``repeat``."""
+    values: Mapping[str, Float[np.ndarray, "v"]] = field(default_factory=dict)
+    """What is known at its vertices: ``mean_deviation_um`` and ``sd_um``."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -183,7 +187,8 @@ def _read_scan(folder: Path, run: Mapping[str, Any], reference: Path | None, uni
 
 def _surface(folder: Path, missing: list[str]) -> tuple[Mesh | None, Float[np.ndarray, "v"] | None]:
     if (folder / "deviation.ply").exists():
-        return read_deviations(folder / "deviation.ply")
+        mesh, values = read_vertex_values(folder / "deviation.ply")
+        return mesh, values.get("deviation_um")
     if (folder / "mesh.ply").exists():
         return read_mesh(folder / "mesh.ply"), None
     missing.append("the surface: the run is not complete; give the same command again, it goes on where it stopped")
@@ -247,7 +252,11 @@ def _read_study(folder: Path, run: Mapping[str, Any]) -> StudyResult:
     missing = []
     if summary is None:
         missing.append(f"{file}: {len(rows)} cases are done; give the same cuspid {verb} command again to go on")
+    known = folder / "repeat.ply"
+    surface, values = read_vertex_values(known) if verb == "repeat" and known.exists() else (None, {})
     return StudyResult(
+        surface=surface,
+        values=values,
         name=folder.resolve().name,
         run=run,
         verb=verb,

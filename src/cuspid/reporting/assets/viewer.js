@@ -283,11 +283,23 @@
     return on;
   };
 
+  const groupOf = (button) => scene.layers.find((each) => each.name === button.dataset.layer).group;
+
+  // Of the layers of a group one is seen.
+  function show(button) {
+    const group = groupOf(button);
+    layers.get(button.dataset.layer).visible = toggled(button) || Boolean(group);
+    if (!group) return;
+    for (const other of root.querySelectorAll("[data-layer]")) {
+      if (groupOf(other) !== group) continue;
+      press(other, other === button);
+      layers.get(other.dataset.layer).visible = other === button;
+    }
+  }
+
   function bind() {
     for (const button of root.querySelectorAll("[data-layer]")) {
-      button.addEventListener("click", () => {
-        layers.get(button.dataset.layer).visible = toggled(button);
-      });
+      button.addEventListener("click", () => show(button));
     }
     for (const button of root.querySelectorAll("[data-view]")) {
       button.addEventListener("click", () => {

@@ -1,0 +1,162 @@
+"""Precision of repeated scans of one object: how well they agree with each other, whatever the truth is.
+
+Terms of ISO 5725-1: *trueness* is how near the mean of many results lies to the reference, *precision* how near the
+results lie to one another; here under repeatability conditions (the same object, handpiece and software). Two views:
+
+- *All pairs*, the usual one in dentistry (for example Schimmel et al. 2021, doi:10.1007/s00784-020-03486-z: 45 pairs of
+  10 scans): each scan is laid on each other one and their distances are taken, here in both directions. No reference is
+  needed.
+- *At each place* of the reference, with d_k the deviation of scan k there along the normal, positive outside: the
+  mean over the scans is the systematic part, their standard deviation s the random one. Over the surface,
+  s_r = sqrt(mean s^2) is the repeatability standard deviation and 2.8 s_r the repeatability limit (ISO 5725-6), which
+  the difference of two scans at one place exceeds in 5 % of cases. The mean of n scans still holds s_r^2 / n of the
+  random part, which is taken away from the systematic one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from cuspid.errors import InputError
+from cuspid.evaluation.deviation import statistics
+from cuspid.evaluation.distance import Surface
+from cuspid.evaluation.registration import RegistrationOptions, refine
+from cuspid.geometry import Rigid3
+from cuspid.mesh import Mesh
+from cuspid.trueness import DeviationStatistics
+
+LIMIT_FACTOR = 2.8
+"""Repeatability limit over repeatability standard deviation: 1.96 sqrt(2), rounded as in ISO 5725-6."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairOptions:
+    """How scans are compared with each other."""
+
+    align: bool = True
+    """Lay one on the other first; off for what lies in a common frame already."""
+    registration: RegistrationOptions = field(default_factory=RegistrationOptions)
+    """How."""
+    samples: int = 100_000
+    """Points on each surface, even by area."""
+    farthest_mm: float = 0.5
+    """A point farther than this from the other scan shows something that the other one does not."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PairDeviation:
+    """Two scans of the same object."""
+
+    deviation: DeviationStatistics
+    """Signed distances in both directions; positive where the second lies outside the first."""
+    common_pct: float
+    """Share of their surfaces that both show."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Spread:
+    """Deviations of several scans over the reference, in um."""
+
+    mean_um: Float[np.ndarray, "v"]
+    """Mean over the scans, around each vertex of the reference; NaN where not all of them have surface."""
+    sd_um: Float[np.ndarray, "v"]
+    """Standard deviation over the scans, with n - 1, likewise."""
+    scans: int
+    """How many."""
+    repeatability_sd_um: float
+    """s_r: root mean square of the standard deviation over the surface."""
+    bias_rms_um: float
+    """Root mean square of the systematic part over the surface; 0 where it drowns in the random one."""
+    common_pct: float
+    """Share of the asked surface that all scans have."""
+
+    @property
+    def repeatability_limit_um(self) -> float:
+        """2.8 s_r."""
+        return LIMIT_FACTOR * self.repeatability_sd_um
+
+
+def compare_pair(first: Mesh, second: Mesh, options: PairOptions, *, rng: np.random.Generator) -> PairDeviation:
+    """Distances between two scans that lie nearly on each other.
+
+    What lies past the border of the other scan, or far from it, does not count. Raises InputError where they have no
+    surface in common.
+    """
+    surface = Surface(first)
+    if options.align:
+        points, _ = second.sample(options.registration.samples, rng)
+        second = second.transformed(refine(points, surface, Rigid3.identity(), options.registration))
+    onto_first, first_counts = _signed(second, surface, options, rng)
+    onto_second, second_counts = _signed(first, Surface(second), options, rng)
+    common = np.concatenate([first_counts, second_counts])
+    if not common.any():
+        raise InputError("repeatability: two scans have no surface in common; check that both show the same teeth")
+    signed_mm = np.concatenate([onto_first[first_counts], -onto_second[second_counts]])
+    return PairDeviation(deviation=statistics(signed_mm), common_pct=float(100 * common.mean()))
+
+
+def _signed(
+    scan: Mesh, surface: Surface, options: PairOptions, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+    """Signed distances of points of a scan from a surface, and which of them count."""
+    feet = surface.feet(scan.sample(options.samples, rng)[0])
+    return feet.signed_mm, ~feet.on_border & (np.abs(feet.signed_mm) <= options.farthest_mm)
+
+
+def spread(
+    reference: Mesh,
+    asked: Bool[np.ndarray, "f"],
+    scans: Sequence[Mesh],
+    options: PairOptions = PairOptions(),
+    *,
+    rng: np.random.Generator,
+) -> Spread:
+    """How the scans deviate at points even by area on the asked faces of the reference, in whose frame they lie.
+
+    Raises InputError for fewer than two scans, or where no place is on all of them.
+    """
+    if len(scans) < 2:
+        raise InputError(f"repeatability: {len(scans)} scan; at least two are needed")
+    indices = np.flatnonzero(asked)
+    if not len(indices):
+        raise InputError("repeatability: no face of the reference could be seen in all scans")
+    points, picks = Mesh(reference.vertices, reference.faces[indices]).sample(options.samples, rng)
+    faces = indices[picks]
+    normals = reference.face_normals[faces]
+    found = np.stack([_deviations_um(points, normals, scan, options.farthest_mm) for scan in scans])
+    on_all = np.isfinite(found).all(axis=0)
+    if not on_all.any():
+        raise InputError("repeatability: no place of the reference is on all scans; check that they are aligned")
+    means, sds = found[:, on_all].mean(axis=0), found[:, on_all].std(axis=0, ddof=1)
+    random = float(np.mean(sds**2))
+    corners = reference.faces[faces[on_all]]
+    return Spread(
+        mean_um=_at_vertices(means, corners, len(reference.vertices)),
+        sd_um=np.sqrt(_at_vertices(sds**2, corners, len(reference.vertices))),
+        scans=len(scans),
+        repeatability_sd_um=float(np.sqrt(random)),
+        bias_rms_um=float(np.sqrt(max(0.0, np.mean(means**2) - random / len(scans)))),
+        common_pct=float(100 * on_all.mean()),
+    )
+
+
+def _deviations_um(
+    places: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], scan: Mesh, farthest_mm: float
+) -> Float[np.ndarray, "n"]:
+    """How far outside each place the scan lies along the normal; NaN where it has no surface near."""
+    outside, inside = scan.cast(places, normals).distances, scan.cast(places, -normals).distances
+    signed_mm = np.where(outside <= inside, outside, -inside)
+    return np.where(np.abs(signed_mm) <= farthest_mm, 1000 * signed_mm, np.nan)
+
+
+def _at_vertices(
+    values: Float[np.ndarray, "n"], corners: Int[np.ndarray, "n 3"], length: int
+) -> Float[np.ndarray, "length"]:
+    """Mean of the values on the faces around each vertex; NaN where there are none."""
+    counts = np.bincount(corners.ravel(), minlength=length)
+    sums = np.bincount(corners.ravel(), np.repeat(values, 3), minlength=length)
+    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
