@@ -5,17 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-Result = Mapping[str, Any]
+from cuspid.studies.reproduction.catalogue import TABLE_3_2
+from cuspid.studies.reproduction.trueness_findings import trueness_of
 
-THESIS_TABLE_3_2 = {
-    46: ("B, cracked", 23, 211, 130, 100),
-    45: ("C, crown", 34, 230, 74, 86),
-    42: ("D, full-contour crown", 27, 188, 61, 50),
-    35: ("E, MOD inlay", 26, 290, 135, 121),
-    36: ("F, MOD inlay", 26, 285, 120, 96),
-    0: ("A, complete arch", 60, 590, 280, 200),
-}
-"""As printed: what, minimum, maximum, mean and SD in um, by FDI number."""
+Result = Mapping[str, Any]
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -62,14 +55,14 @@ def spheres(result: Result) -> str:
 
 def prepared(results: Sequence[Result]) -> str:
     """The thesis' reference model in the form of its Table 3.2, and the margins."""
-    by_tooth = {int(result["case"].removeprefix("prepared-").replace("arch", "0")): result for result in results}
+    by_case = {result["case"]: result for result in results}
     rows = []
-    for tooth, (what, *printed) in THESIS_TABLE_3_2.items():
-        if tooth in by_tooth:
-            trueness = by_tooth[tooth]["trueness"]
-            found = trueness["per_tooth"][str(tooth)] if tooth else trueness["accuracy"]
+    for row in TABLE_3_2:
+        if row.result in by_case:
+            found = trueness_of(by_case[row.result], row)
             ours = (found["min_um"], found["max_um"], found["mean_abs_um"], found["std_abs_um"], found["p95_um"])
-            rows.append((what, tooth or "all", "/".join(map(str, printed)), *(f"{figure:.1f}" for figure in ours)))
+            printed = "/".join(f"{value:g}" for value in (row.min_um, row.max_um, row.mean_um, row.std_um))
+            rows.append((f"{row.part}, {row.what}", row.tooth or "all", printed, *(f"{figure:.1f}" for figure in ours)))
     head = ("part", "FDI", "thesis min/max/mean/SD", "min", "max", "mean", "SD", "P95")
     margins = [
         (result["case"], tooth, *_margin(entry))

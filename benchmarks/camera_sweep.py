@@ -9,10 +9,9 @@ benchmarks/results/camera_sweep.json, the maps to docs/images. Surfaces that are
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from run import conditions, run_timed
@@ -22,56 +21,26 @@ from cuspid.jaw import Jaw
 from cuspid.storage import read_json, write_json
 from cuspid.studies.camera_pair import CameraPairOptions, Row, Term, best_pairs, study_camera_pair
 from cuspid.studies.camera_sweep import SweepOptions
+from cuspid.studies.reproduction.runs import SWEPT, sweep_arguments, sweep_result
 
 SURFACES = ("occlusal", "incisal", "buccal", "lingual", "labial")
-REPEATS: Mapping[str, int] = {"occlusal": 2, "incisal": 2}
-"""Other seeds for the best settings; one for the surfaces that are not here."""
 IN_THEORY = ("occlusal", "buccal", "lingual")
 """Surfaces that the theoretical study faces."""
-KEPT = (
-    "seen_pct",
-    "points",
-    "mean_abs_um",
-    "std_um",
-    "p95_um",
-    "complete_10_um_pct",
-    "complete_50_um_pct",
-    "cpu_s",
-)
-"""Columns that go to the results."""
 
 
 def measure(surface: str, work: Path, workers: int) -> dict[str, object]:
     """Run or finish the sweep of a surface, and what came of it."""
     out = work / surface
     before = len(list((out / "cases").glob("*.json"))) if out.exists() else 0
-    tooth = str(SweepOptions(surface=surface).chosen_tooth)
-    arguments = ["sweep", "--surface", surface, "--tooth", tooth, "--repeats", str(REPEATS.get(surface, 1))]
+    arguments = sweep_arguments(surface, SWEPT.get(surface, 1))
     load = os.getloadavg()[0]
     timed = run_timed(*arguments, "--out", str(out), "--workers", str(workers))
-    rows = list(csv.DictReader((out / "results.csv").open()))
     shutil.copy(out / "sweep.png", Path("docs/images") / f"sweep-{surface}.png")
     record = work / f"{surface}.run.json"
     if before == 0:  # only a sweep that was run in one go says how long it takes
         write_json(record, {**timed, "workers": workers, "load_before": load, "load_after": os.getloadavg()[0]})
-    return {
-        "command": f"cuspid {' '.join(arguments)} --out {surface}",
-        "settings": read_json(out / "run.json")["sweep"]["settings"]["options"],
-        "run": read_json(record) if record.exists() else None,
-        "cases": len(rows),
-        "failed": sum(bool(row["failure"]) for row in rows),
-        "cases_cpu_s": round(sum(float(row["cpu_s"]) for row in rows if not row["failure"]), 1),
-        **read_json(out / "sweep.json"),
-        "rows": [compact(row) for row in rows],
-    }
-
-
-def compact(row: Mapping[str, str]) -> dict[str, object]:
-    """Setting, seed and the main figures of a case."""
-    setting = {name: float(row[name]) for name in ("baseline_mm", "angle_deg", "seed")}
-    if row["failure"]:
-        return {**setting, "failure": row["failure"]}
-    return {**setting, **{name: round(float(row[name]), 2) for name in KEPT}}
+    run = read_json(record) if record.exists() else None
+    return {**sweep_result(out, arguments), "run": run}
 
 
 def theory(jaw: Jaw, surface: str) -> dict[str, object]:

@@ -27,26 +27,15 @@ from scipy.linalg import subspace_angles
 
 from cuspid import storage
 from cuspid.anatomy.mean_shape import MeanShapeOptions, mean_shape, vertex_areas
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
-from cuspid.anatomy.population import GroupName, draw_population
+from cuspid.anatomy.phantom import PhantomOptions
 from cuspid.anatomy.procrustes import best_rotation
-from cuspid.errors import InputError
 from cuspid.jaw import GUM, Jaw, Landmark
 from cuspid.mesh import Mesh
-from cuspid.shape_model import ShapeModel
 from cuspid.storage import read_shape_model, write_shape_model
+from cuspid.studies.reproduction.samples import MEAN_GROUP, iteration, make_phantom, make_population
 
-GROUP: GroupName = "lower-14"
-"""The population."""
 KNOWN = 6
 """Samples with a known mean."""
-
-
-def make(path: Path, options: PhantomOptions) -> Jaw:
-    """A phantom, from the work folder where it is there already."""
-    if not path.with_suffix(".json").exists():
-        storage.write_jaw(path, build_phantom(options))
-    return storage.read_jaw(path)
 
 
 def run_timed(folder: Path, first: str, out: Path) -> dict[str, float]:
@@ -93,34 +82,6 @@ def landmark_distance_um(one: Jaw, other: Jaw) -> float:
     return float(1e3 * np.max(apart))
 
 
-def summary(model: ShapeModel) -> dict[str, object]:
-    """What the iteration did, and the modes."""
-    return {
-        "rounds": len(model.log),
-        "converged": model.converged,
-        "log": [vars(step) for step in model.log],
-        "standard_deviations_mm": model.standard_deviations_mm.round(4).tolist(),
-        "variance_shares": model.variance_shares.round(4).tolist(),
-    }
-
-
-def make_population(folder: Path, count: int, edge_mm: float) -> np.ndarray:
-    """The first phantoms of a drawn population that can be built, in ``folder``; their dimensions (n, 3), mm."""
-    drawn = draw_population(GROUP, count + count // 4, np.random.default_rng(0), PhantomOptions(edge_mm=edge_mm))
-    widths: list[tuple[float, float, float]] = []
-    for options in drawn:
-        try:
-            jaw = make(folder / f"{len(widths):02d}.ply", options)
-        except InputError as error:
-            print(f"left out: {error}", flush=True)
-            continue
-        widths.append(widths_mm(jaw))
-        print(f"phantom {len(widths)}: {len(jaw.mesh.faces)} faces", flush=True)
-        if len(widths) == count:
-            break
-    return np.array(widths)
-
-
 def widths_mm(jaw: Jaw) -> tuple[float, float, float]:
     """Arch dimensions a, b and c by the landmarks of a lower jaw."""
 
@@ -134,14 +95,14 @@ def widths_mm(jaw: Jaw) -> tuple[float, float, float]:
 def population(work: Path, count: int, edge_mm: float) -> dict[str, object]:
     """Two means of one population of phantoms."""
     folder = work / f"population-{edge_mm:g}-{count}"
-    widths = make_population(folder, count, edge_mm)
-    result: dict[str, object] = {"group": GROUP, "count": len(widths), "edge_mm": edge_mm}
+    widths = np.array([widths_mm(jaw) for jaw in make_population(folder, count, edge_mm).values()])
+    result: dict[str, object] = {"group": MEAN_GROUP, "count": len(widths), "edge_mm": edge_mm}
     models = {}
     for first in ("00", "01"):
         out = work / f"model-{edge_mm:g}-{count}-{first}"
         timing = run_timed(folder, first, out)
         models[first] = read_shape_model(out)
-        result[f"first_{first}"] = {**timing, **summary(models[first])}
+        result[f"first_{first}"] = {**timing, **iteration(models[first])}
         print(first, timing, flush=True)
     one, other = models["00"].mean, models["01"].mean
     result["a_b_c_mm"] = {"mean_of_the_jaws": widths.mean(axis=0).tolist(), "of_the_mean_jaw": widths_mm(one)}
@@ -185,13 +146,13 @@ def deformed(jaw: Jaw, weights: np.ndarray, landmarks: Mapping[str, Landmark]) -
 
 def known_mean(work: Path, edge_mm: float) -> dict[str, object]:
     """The error of the mean and of the modes where both are known."""
-    base = make(work / f"base-{edge_mm:g}.ply", PhantomOptions(edge_mm=edge_mm))
+    base = make_phantom(work / f"base-{edge_mm:g}.ply", PhantomOptions(edge_mm=edge_mm))
     weights = np.random.default_rng(0).standard_normal((KNOWN, 3))
     weights -= weights.mean(axis=0)
     jaws = {}
     for number in range(KNOWN):
         edge = edge_mm * (1 + 0.03 * (number + 1))
-        meshed = make(work / f"base-{edge:g}.ply", PhantomOptions(edge_mm=edge))
+        meshed = make_phantom(work / f"base-{edge:g}.ply", PhantomOptions(edge_mm=edge))
         jaws[f"{number:02d}"] = deformed(meshed, weights[number], base.landmarks)
     meshing = between(meshed, base)
     model = mean_shape(jaws)
@@ -202,7 +163,7 @@ def known_mean(work: Path, edge_mm: float) -> dict[str, object]:
     return {
         "count": KNOWN,
         "edge_mm": edge_mm,
-        **summary(model),
+        **iteration(model),
         "samples_to_known_mean": between(jaws["00"], base),
         "another_meshing_to_known_mean": meshing,
         "mean_to_known_mean": between(mean, base),

@@ -13,28 +13,26 @@ import argparse
 import json
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 from run import conditions
 
 from cuspid.anatomy.phantom import PhantomOptions, build_phantom
 from cuspid.anatomy.surfaces import named_surfaces
 from cuspid.geometry import Rigid3
-from cuspid.handpiece.designs import essential_four, twelve_cameras
+from cuspid.handpiece.designs import twelve_cameras
 from cuspid.handpiece.visibility import (
     VisibilityOptions,
     scannable_faces,
-    surface_rows,
     survey_visibility,
     visible_counts,
 )
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
-from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path
 from cuspid.storage import write_json
+from cuspid.studies.reproduction.samples import path_over, surfaces_seen
 
 EDGE_MM = 0.29
 """Edges that give the phantom about 200 000 faces."""
@@ -49,12 +47,6 @@ def timed(work: Callable[[], object]) -> dict[str, float]:
     return {"wall_s": round(time.perf_counter() - wall, 2), "cpu_s": round(time.process_time() - cpu, 2)}
 
 
-def path_over(jaw: Jaw, handpiece: Handpiece, tooth: int | None) -> tuple[Rigid3, ...]:
-    """The scan path of a seed."""
-    path = plan_scan_path(jaw, handpiece, ScanPathOptions(tooth=tooth), np.random.default_rng(0))
-    return tuple(path.rig_from_world.values())
-
-
 def measure(jaw: Jaw, handpiece: Handpiece, poses: tuple[Rigid3, ...]) -> dict[str, object]:
     """Times of the three questions."""
     options = VisibilityOptions()
@@ -66,17 +58,6 @@ def measure(jaw: Jaw, handpiece: Handpiece, poses: tuple[Rigid3, ...]) -> dict[s
         "counts": timed(lambda: visible_counts(jaw.mesh, handpiece, poses, options)),
         "survey": timed(lambda: survey_visibility(jaw.mesh, handpiece, poses, options)),
     }
-
-
-def surfaces_seen(
-    jaw: Jaw, poses: tuple[Rigid3, ...], surfaces: Mapping[str, np.ndarray]
-) -> dict[str, list[dict[str, object]]]:
-    """The table of each design along the same path."""
-    found = {
-        design.name: survey_visibility(jaw.mesh, design, poses, VisibilityOptions())
-        for design in (essential_four(), twelve_cameras())
-    }
-    return {name: surface_rows(seen, jaw.mesh.face_areas, surfaces) for name, seen in found.items()}
 
 
 def main() -> None:
@@ -94,7 +75,7 @@ def main() -> None:
         "naming": timed(lambda: named_surfaces(jaw)),
         "arch": measure(jaw, handpiece, arch),
         "molar": measure(jaw, handpiece, molar),
-        "surfaces": surfaces_seen(jaw, arch, named_surfaces(jaw)),
+        "surfaces": surfaces_seen(jaw, arch),
         **conditions(),
     }
     write_json(out, result)

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from cuspid.reporting.reproduction_page import Entry, FigureRow, Page
-from cuspid.studies.reproduction.judging import PANORAMA, Finding, Result, Results
+from cuspid.studies.reproduction.findings import PANORAMA, Finding, Result, Results
 from cuspid.studies.reproduction.rules import FAVOUR, Comparison, Figure, Verdict
 
 TITLE = "The thesis, reproduced"
@@ -28,22 +28,16 @@ MEANINGS: dict[Verdict, str] = {
 }
 INTRO = (
     "Every figure, table and numbered equation of the thesis (M. Ghanoum, Passive method for 3D reconstruction of "
-    "human "
-    "jaw: theory and application, University of Louisville, 2021) beside what cuspid finds. Our copy of the thesis "
-    "lacks "
-    "all pictures, Tables 1.1 and 3.1 and the references; what its text still tells of them is compared.",
+    "human jaw: theory and application, University of Louisville, 2021) beside what cuspid finds. Our copy of the "
+    "thesis lacks all pictures, Tables 1.1 and 3.1 and the references; what its text still tells of them is compared.",
     "Verdicts are given by rules, which stand below each item; nobody types them. An item has the least favourable "
-    "verdict "
-    "of its figures, and the count of all stands beside it. What is not there yet counts as nothing.",
+    "verdict of its figures, and the count of all stands beside it. What is not there yet counts as nothing.",
     "All of ours is simulation: ideal optics, an artificial texture on the teeth as in the thesis unless said "
-    "otherwise, an "
-    "exactly known rig. The thesis' jaws are not public; ours are the built-in phantom and others named below. "
-    "Teeth have "
-    "FDI numbers (the thesis' 30, 29, 26, 20 and 19 are 46, 45, 42, 35 and 36).",
-    "Generated from `benchmarks/results/` by `python benchmarks/reproduction.py`; do not edit. `cuspid reproduce --out "
-    "FOLDER` runs everything anew, `--quick` a reduced version in a quarter of an hour, `--only table-3.2` a part; "
-    "a killed "
-    "run goes on.",
+    "otherwise, an exactly known rig. The thesis' jaws are not public; ours are the built-in phantom and others named "
+    "below. Teeth have FDI numbers (the thesis' 30, 29, 26, 20 and 19 are 46, 45, 42, 35 and 36).",
+    "Generated from `benchmarks/results/` by `python benchmarks/reproduction.py`; do not edit. `cuspid reproduce "
+    "--out FOLDER` runs everything anew, `--quick` a reduced version in a quarter of an hour, `--only table-3.2` a "
+    "part; a killed run goes on.",
 )
 
 

@@ -20,7 +20,7 @@ from fnmatch import fnmatch
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -37,7 +37,9 @@ from cuspid.studies.camera_sweep import SweepOptions
 from cuspid.studies.grid import Case, Progress, Value, run_grid
 from cuspid.studies.reproduction.catalogue import Item
 from cuspid.studies.reproduction.checks import CHECKS
-from cuspid.studies.reproduction.judging import CHECKED, PANORAMA, SUBJECTS, WITHOUT, Results, judge, panoramas
+from cuspid.studies.reproduction.findings import CHECKED, PANORAMA, Result, Results
+from cuspid.studies.reproduction.judging import judge
+from cuspid.studies.reproduction.panorama_findings import SUBJECTS, WITHOUT, panoramas
 from cuspid.studies.reproduction.samples import (
     MEAN_EDGE_MM,
     best_camera_pairs,
@@ -48,7 +50,6 @@ from cuspid.studies.reproduction.samples import (
 )
 from cuspid.studies.scan_cases import conditions, measure_scan, prepared_cases, run_timed
 
-Result = Mapping[str, Any]
 READ_ONLY = ("measure", "design_comparison_full_size")
 """Results that the page shows and no run here makes: they need data that is not public, or hours."""
 
