@@ -23,6 +23,7 @@ from cuspid.cli.scan import evaluate, reconstruct, run, simulate
 from cuspid.cli.shared import console
 from cuspid.cli.studies import sweep
 from cuspid.cli.surveys import measure, shape
+from cuspid.cli.view import view
 from cuspid.errors import CuspidError
 
 COMMANDS: Mapping[str, Callable[..., Any]] = {
@@ -49,6 +50,7 @@ COMMANDS: Mapping[str, Callable[..., Any]] = {
     "reproduce": reproduce,
     "repeat": repeat,
     "report": report,
+    "view": view,
 }
 
 

@@ -32,6 +32,8 @@ from cuspid.reporting.scene import (
     fitting_range_um,
     mesh_layer,
     path_layer,
+    poses_from,
+    shown_frame,
     standard_views,
 )
 from cuspid.reporting.shown_mesh import UM_PER_STEP, ShownMesh, simplified
@@ -69,7 +71,7 @@ def scan_page(result: ScanResult, options: ReportOptions = ReportOptions()) -> s
     """The HTML of a scan. Raises InputError where there is no surface."""
     if result.scan is None:
         raise InputError(f"{result.name}: nothing to show; {'; '.join(result.missing)}")
-    shown_from_scan = result.reference_from_scan or _levelling(result)
+    shown_from_scan = shown_frame(result)
     scan = result.scan.transformed(shown_from_scan)
     range_um = options.range_um or _range_of(result)
     worst = worst_places(scan, result.deviation_um, result.reference, options.worst)
@@ -116,24 +118,6 @@ def _range_of(result: ScanResult) -> float:
     return fitting_range_um(float(result.trueness["p95_um"])) if result.trueness else 100.0
 
 
-def _levelling(result: ScanResult) -> Rigid3:
-    """Without a reference: the mean line of sight of the cameras points down."""
-    if result.reconstruction is None:
-        return Rigid3.identity()
-    axes = [
-        pose.inverse().rotate(mounted.axis_in_rig)
-        for pose in result.reconstruction.rig_from_world.values()
-        for mounted in result.reconstruction.rig.cameras.values()
-    ]
-    up = -np.mean(axes, axis=0)
-    up /= np.linalg.norm(up)
-    turn = np.cross(up, [0.0, 0.0, 1.0])
-    sine = float(np.linalg.norm(turn))
-    if sine < 1e-9:
-        return Rigid3(np.diag([1.0, np.sign(up[2]), np.sign(up[2])]), np.zeros(3))
-    return Rigid3.from_rotation_vector(turn / sine * np.arctan2(sine, up[2]), np.zeros(3))
-
-
 # --- what is drawn ----------------------------------------------------------------------------------------------------
 
 
@@ -155,8 +139,7 @@ def _scene(
         )
         sizes.append(_size("reference", truth.full_faces, len(truth.mesh.faces), truth.off_um))
     if result.reconstruction is not None:
-        rig, scan_from_shown = result.reconstruction.rig, shown_from_scan.inverse()
-        poses = {name: pose @ scan_from_shown for name, pose in result.reconstruction.rig_from_world.items()}
+        rig, poses = result.reconstruction.rig, poses_from(result.reconstruction, shown_from_scan)
         layers += [camera_layer(rig, poses), path_layer(rig, poses)]
     arch = None if result.reference is None else result.reference.arch
     scene = {

@@ -16,10 +16,12 @@ from matplotlib.colors import Colormap
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Arch
 from cuspid.mesh import Mesh
+from cuspid.reconstruction import Reconstruction
 from cuspid.reporting.figures import FigureOptions, deviation_map
 from cuspid.reporting.page import packed
 from cuspid.reporting.shown_mesh import pack_deviation, pack_mesh
 from cuspid.rig import Rig
+from cuspid.storage import ScanResult
 
 RANGES_UM = (5.0, 10.0, 25.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
 """Ends of the colour bar from which the reader chooses."""
@@ -48,6 +50,32 @@ class Place:
 def fitting_range_um(p95_um: float) -> float:
     """The smallest range of the colour bar that is at least two and a half times the 95th percentile."""
     return next((each for each in RANGES_UM if each >= 2.5 * p95_um), RANGES_UM[-1])
+
+
+def shown_frame(result: ScanResult) -> Rigid3:
+    """``shown_from_scan``: the frame of the reference; without one the cameras look down on average."""
+    if result.reference_from_scan is not None:
+        return result.reference_from_scan
+    if result.reconstruction is None:
+        return Rigid3.identity()
+    axes = [
+        pose.inverse().rotate(mounted.axis_in_rig)
+        for pose in result.reconstruction.rig_from_world.values()
+        for mounted in result.reconstruction.rig.cameras.values()
+    ]
+    up = -np.mean(axes, axis=0)
+    up /= np.linalg.norm(up)
+    turn = np.cross(up, [0.0, 0.0, 1.0])
+    sine = float(np.linalg.norm(turn))
+    if sine < 1e-9:
+        return Rigid3(np.diag([1.0, np.sign(up[2]), np.sign(up[2])]), np.zeros(3))
+    return Rigid3.from_rotation_vector(turn / sine * np.arctan2(sine, up[2]), np.zeros(3))
+
+
+def poses_from(reconstruction: Reconstruction, shown_from_scan: Rigid3) -> dict[str, Rigid3]:
+    """``rig_from_shown`` of each frame."""
+    scan_from_shown = shown_from_scan.inverse()
+    return {name: pose @ scan_from_shown for name, pose in reconstruction.rig_from_world.items()}
 
 
 def standard_views(arch: Arch | None) -> list[dict[str, Any]]:
@@ -82,18 +110,23 @@ def mesh_layer(
 
 def camera_layer(rig: Rig, rig_from_shown: Mapping[str, Rigid3]) -> dict[str, Any]:
     """Every camera at every frame as a small pyramid of lines."""
-    outlines = [_frustum(rig, name) for name in rig.names]
-    in_rig = np.concatenate(outlines)
-    points = [pose.inverse().apply(in_rig) for pose in rig_from_shown.values()]
+    points = camera_lines(rig, rig_from_shown)
     return {
         "kind": "segments",
         "name": "cameras",
         "label": "Cameras",
         "visible": False,
-        "points": packed(np.concatenate(points).astype(np.float32)),
+        "points": packed(points.astype(np.float32)),
         "frames": list(rig_from_shown),
-        "points_per_frame": len(in_rig),
+        "points_per_frame": len(points) // max(1, len(rig_from_shown)),
     }
+
+
+def camera_lines(rig: Rig, rig_from_shown: Mapping[str, Rigid3]) -> Float[np.ndarray, "n 3"]:
+    """Ends of lines, two by two, frame by frame: what each camera sees, as a pyramid of eight edges."""
+    in_rig = np.concatenate([_frustum(rig, name) for name in rig.names])
+    points = [pose.inverse().apply(in_rig) for pose in rig_from_shown.values()]
+    return np.concatenate(points) if points else np.empty((0, 3))
 
 
 def _frustum(rig: Rig, name: str) -> Float[np.ndarray, "16 3"]:
@@ -109,8 +142,7 @@ def _frustum(rig: Rig, name: str) -> Float[np.ndarray, "16 3"]:
 
 def path_layer(rig: Rig, rig_from_shown: Mapping[str, Rigid3]) -> dict[str, Any]:
     """The way of the middle of the cameras."""
-    middle = np.mean([mounted.centre_in_rig for mounted in rig.cameras.values()], axis=0)
-    points = np.array([pose.inverse().apply(middle) for pose in rig_from_shown.values()])
+    points = camera_path(rig, rig_from_shown)
     return {
         "kind": "line",
         "name": "path",
@@ -118,6 +150,12 @@ def path_layer(rig: Rig, rig_from_shown: Mapping[str, Rigid3]) -> dict[str, Any]
         "visible": False,
         "points": packed(points.astype(np.float32)),
     }
+
+
+def camera_path(rig: Rig, rig_from_shown: Mapping[str, Rigid3]) -> Float[np.ndarray, "n 3"]:
+    """Where the middle of the cameras was at each frame."""
+    middle = np.mean([mounted.centre_in_rig for mounted in rig.cameras.values()], axis=0)
+    return np.array([pose.inverse().apply(middle) for pose in rig_from_shown.values()]).reshape(-1, 3)
 
 
 def color_table(colors: Colormap | None = None) -> dict[str, str]:

@@ -1,0 +1,41 @@
+"""Look at a result at full resolution."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional
+
+from cuspid import storage
+from cuspid.cli.shared import console
+from cuspid.errors import InputError
+from cuspid.reporting.live_view import serve
+
+
+def view(
+    folder: Annotated[Path, Positional],
+    *,
+    reference: Path | None = None,
+    unit: storage.Unit = "mm",
+    host: str = "127.0.0.1",
+    port: int = 8080,
+) -> None:
+    """Show a scan or a shape model in the browser, with all its faces, until Ctrl-C. Needs the extra: cuspid[view].
+
+    Args:
+        folder: What run, reconstruct, evaluate or shape wrote.
+        reference: Mesh that a scan was compared with, where the folder does not hold it (evaluate).
+        unit: Length unit of the reference.
+        host: Address to listen at; 0.0.0.0 lets other machines in.
+        port: Port; the next free one is taken where it is busy.
+    """
+    if not 0 < port < 65536:
+        raise InputError(f"view: --port is {port}; give one from 1 to 65535")
+    server = serve(storage.read_result(folder, reference, unit), host, port)
+    console.print(f"http://{host}:{server.get_port()} shows {folder}; Ctrl-C ends it", highlight=False, soft_wrap=True)
+    try:
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        server.stop()

@@ -1,0 +1,156 @@
+"""A live view in the browser at full resolution, by viser: surfaces, cameras and path, or the modes of a shape model.
+
+The frame is that of the page of the same folder (mm).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, UInt8
+
+from cuspid.errors import InputError, MissingDependencyError
+from cuspid.mesh import Mesh
+from cuspid.reporting.figures import FigureOptions, deviation_colors
+from cuspid.reporting.scene import (
+    PLASTER_COLOR,
+    RANGES_UM,
+    REFERENCE_COLOR,
+    camera_lines,
+    camera_path,
+    fitting_range_um,
+    poses_from,
+    shown_frame,
+)
+from cuspid.shape_model import ShapeModel
+from cuspid.storage import Result, ScanResult, ShapeResult
+
+if TYPE_CHECKING:
+    import viser
+
+_MOST_MODES = 5
+
+
+class _Node(Protocol):
+    """What viser shows."""
+
+    visible: bool
+
+
+def serve(result: Result, host: str, port: int) -> viser.ViserServer:
+    """A server that shows a scan or a shape model until it is stopped; it takes the next free port.
+
+    Raises MissingDependencyError without viser, InputError where there is nothing to show in 3-D.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise MissingDependencyError("view needs viser: pip install 'cuspid[view]'") from error
+    show = _what_to_show(result)
+    server = viser.ViserServer(host=host, port=port, label="cuspid", verbose=False)
+    server.scene.set_up_direction("+z")
+    show(server)
+    return server
+
+
+def _what_to_show(result: Result) -> Callable[[viser.ViserServer], None]:
+    match result:
+        case ScanResult(scan=Mesh() as scan):
+            return lambda server: _show_scan(server, result, scan)
+        case ShapeResult():
+            return lambda server: _show_shape(server, result.model)
+        case _:
+            why = "; ".join(result.missing) or "open its report instead: cuspid report"
+            raise InputError(f"{result.name}: nothing to view in 3-D; {why}")
+
+
+def _show_scan(server: viser.ViserServer, result: ScanResult, scan: Mesh) -> None:
+    shown_from_scan = shown_frame(result)
+    moved = scan.transformed(shown_from_scan)
+    _look_down_on(server, moved)
+    nodes: dict[str, _Node] = {}
+
+    def paint(range_um: float) -> None:
+        visible = nodes["scan"].visible if "scan" in nodes else True
+        nodes["scan"] = _add(server, "/scan", moved, _deviation_rgb(moved, result.deviation_um, range_um), visible)
+
+    range_um = 100.0 if result.trueness is None else fitting_range_um(float(result.trueness["p95_um"]))
+    paint(range_um)
+    if result.reference is not None:
+        mesh = result.reference.mesh
+        nodes["reference"] = _add(server, "/reference", mesh, _plain(mesh, REFERENCE_COLOR), False)
+    if result.reconstruction is not None:
+        rig, poses = result.reconstruction.rig, poses_from(result.reconstruction, shown_from_scan)
+        path = camera_path(rig, poses)
+        lines = {
+            "cameras": (camera_lines(rig, poses).reshape(-1, 2, 3), (28, 93, 153)),
+            "path": (np.stack([path[:-1], path[1:]], axis=1), (181, 23, 158)),
+        }
+        for name, (points, color) in lines.items():
+            nodes[name] = server.scene.add_line_segments(f"/{name}", points, np.array(color), visible=False)
+    _add_toggles(server, nodes)
+    if result.deviation_um is not None:
+        ranges = [f"{each:g}" for each in RANGES_UM]
+        choice = server.gui.add_dropdown("Range, ± µm", ranges, initial_value=f"{range_um:g}")
+        choice.on_update(lambda _: paint(float(choice.value)))
+
+
+def _show_shape(server: viser.ViserServer, model: ShapeModel) -> None:
+    _look_down_on(server, model.mean.mesh)
+    count = min(_MOST_MODES, len(model.modes))
+    sliders = [
+        server.gui.add_slider(
+            f"Mode {k + 1}, {100 * model.variance_shares[k]:.0f} %", min=-3.0, max=3.0, step=0.1, initial_value=0.0
+        )
+        for k in range(count)
+    ]
+
+    def bend(_: Any = None) -> None:
+        mesh = model.sample([float(slider.value) for slider in sliders]).mesh
+        _add(server, "/jaw", mesh, _plain(mesh, PLASTER_COLOR), True)
+
+    for slider in sliders:
+        slider.on_update(bend)
+    bend()
+
+
+def _add_toggles(server: viser.ViserServer, nodes: dict[str, _Node]) -> None:
+    """A check box for each node; a node that is painted again is found by its name."""
+
+    def add(name: str) -> None:
+        box = server.gui.add_checkbox(name.capitalize(), nodes[name].visible)
+
+        def update(_: Any) -> None:
+            nodes[name].visible = box.value
+
+        box.on_update(update)
+
+    for name in nodes:
+        add(name)
+
+
+def _look_down_on(server: viser.ViserServer, mesh: Mesh) -> None:
+    low, high = mesh.bounds
+    middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
+    server.initial_camera.look_at = tuple(map(float, middle))
+    server.initial_camera.position = tuple(map(float, middle + size * np.array([0.0, -0.35, 1.0])))
+
+
+def _add(server: viser.ViserServer, name: str, mesh: Mesh, rgb: UInt8[np.ndarray, "v 3"], visible: bool) -> _Node:
+    shown = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=rgb, process=False)
+    return server.scene.add_mesh_trimesh(name, shown, visible=visible)
+
+
+def _plain(mesh: Mesh, color: tuple[int, int, int]) -> UInt8[np.ndarray, "v 3"]:
+    return np.tile(np.array(color, dtype=np.uint8), (len(mesh.vertices), 1))
+
+
+def _deviation_rgb(
+    mesh: Mesh, deviation_um: Float[np.ndarray, "v"] | None, range_um: float
+) -> UInt8[np.ndarray, "v 3"]:
+    if deviation_um is None:
+        return _plain(mesh, PLASTER_COLOR)
+    return deviation_colors(deviation_um, FigureOptions(range_um=range_um, tolerance_um=range_um / 4))
