@@ -1,7 +1,7 @@
 """Measure panoramas of ten subjects filmed by a shaky hand, by cuspid's methods and by OpenCV's Stitcher.
 
     python benchmarks/panorama.py --out benchmarks/results/panorama [--jaws FILE_OR_FOLDER ...] [--work FOLDER]
-        [--subject lower-14-0 ...] [--method ortho thesis opencv-panorama opencv-scans] [--films-only]
+        [--subject lower-14-0 ...] [--method ortho thesis thesis-unexamined opencv-panorama opencv-scans] [--films-only]
 
 Subjects are phantoms of the population, and jaws of your own, whose coarse faces are subdivided (Loop) first; the
 subdivided mesh is then the reference. All are filmed in 120 frames with full shake and the texture ``enamel``. One JSON
@@ -125,9 +125,9 @@ def first_part(out: Path) -> Path:
     return out / "part-1" if (out / "part-1").is_dir() else out / "panorama.png"
 
 
-def stitched(method: str) -> Callable[[Path, Path, int], list[str]]:
+def stitched(*options: str) -> Callable[[Path, Path, int], list[str]]:
     """The command of a method of cuspid."""
-    return lambda capture, out, _: [*CUSPID, "stitch", str(capture), "--method", method, "--out", str(out)]
+    return lambda capture, out, _: [*CUSPID, "stitch", str(capture), "--method", *options, "--out", str(out)]
 
 
 def opencv(mode: str) -> Callable[[Path, Path, int], list[str]]:
@@ -142,6 +142,7 @@ CUSPID = (sys.executable, "-m", "cuspid")
 METHODS: Mapping[str, Callable[[Path, Path, int], list[str]]] = {
     "ortho": stitched("ortho"),
     "thesis": stitched("thesis"),
+    "thesis-unexamined": stitched("thesis", "--no-examination"),
     "opencv-panorama": opencv("panorama"),
     "opencv-scans": opencv("scans"),
 }
@@ -161,7 +162,7 @@ def main() -> None:
     parser.add_argument("--subject", nargs="*", help="names; default: all")
     parser.add_argument("--method", nargs="*", choices=METHODS, default=["ortho"], help="in this order")
     parser.add_argument("--films-only", action="store_true")
-    parser.add_argument("--cpu-s", type=int, default=600, help="after which OpenCV's Stitcher is given up")
+    parser.add_argument("--cpu-s", type=int, default=180, help="after which OpenCV's Stitcher is given up")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     subjects: Mapping[str, PhantomOptions | Path] = {**phantoms(), **jaw_files(options.jaws)}
