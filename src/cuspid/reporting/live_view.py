@@ -6,7 +6,7 @@ The frame is that of the page of the same folder (mm).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -28,19 +28,15 @@ from cuspid.reporting.scene import (
 from cuspid.shape_model import ShapeModel
 from cuspid.storage import Result, ScanResult, ShapeResult
 
-if TYPE_CHECKING:
-    import viser
-
+Server = Any
+"""``viser.ViserServer``; viser may be missing."""
+Node = Any
+"""What viser shows, with ``visible``."""
 _MOST_MODES = 5
+_GAMMA = 2.2
 
 
-class _Node(Protocol):
-    """What viser shows."""
-
-    visible: bool
-
-
-def serve(result: Result, host: str, port: int) -> viser.ViserServer:
+def serve(result: Result, host: str, port: int) -> Server:
     """A server that shows a scan or a shape model until it is stopped; it takes the next free port.
 
     Raises MissingDependencyError without viser, InputError where there is nothing to show in 3-D.
@@ -52,11 +48,12 @@ def serve(result: Result, host: str, port: int) -> viser.ViserServer:
     show = _what_to_show(result)
     server = viser.ViserServer(host=host, port=port, label="cuspid", verbose=False)
     server.scene.set_up_direction("+z")
+    _light(server)
     show(server)
     return server
 
 
-def _what_to_show(result: Result) -> Callable[[viser.ViserServer], None]:
+def _what_to_show(result: Result) -> Callable[[Server], None]:
     match result:
         case ScanResult(scan=Mesh() as scan):
             return lambda server: _show_scan(server, result, scan)
@@ -67,11 +64,11 @@ def _what_to_show(result: Result) -> Callable[[viser.ViserServer], None]:
             raise InputError(f"{result.name}: nothing to view in 3-D; {why}")
 
 
-def _show_scan(server: viser.ViserServer, result: ScanResult, scan: Mesh) -> None:
+def _show_scan(server: Server, result: ScanResult, scan: Mesh) -> None:
     shown_from_scan = shown_frame(result)
     moved = scan.transformed(shown_from_scan)
     _look_down_on(server, moved)
-    nodes: dict[str, _Node] = {}
+    nodes: dict[str, Node] = {}
 
     def paint(range_um: float) -> None:
         visible = nodes["scan"].visible if "scan" in nodes else True
@@ -98,7 +95,7 @@ def _show_scan(server: viser.ViserServer, result: ScanResult, scan: Mesh) -> Non
         choice.on_update(lambda _: paint(float(choice.value)))
 
 
-def _show_shape(server: viser.ViserServer, model: ShapeModel) -> None:
+def _show_shape(server: Server, model: ShapeModel) -> None:
     _look_down_on(server, model.mean.mesh)
     count = min(_MOST_MODES, len(model.modes))
     sliders = [
@@ -117,7 +114,7 @@ def _show_shape(server: viser.ViserServer, model: ShapeModel) -> None:
     bend()
 
 
-def _add_toggles(server: viser.ViserServer, nodes: dict[str, _Node]) -> None:
+def _add_toggles(server: Server, nodes: dict[str, Node]) -> None:
     """A check box for each node; a node that is painted again is found by its name."""
 
     def add(name: str) -> None:
@@ -132,15 +129,26 @@ def _add_toggles(server: viser.ViserServer, nodes: dict[str, _Node]) -> None:
         add(name)
 
 
-def _look_down_on(server: viser.ViserServer, mesh: Mesh) -> None:
+def _light(server: Server) -> None:
+    """Light from all sides, some more from above: no surroundings that are mirrored, no shadows."""
+    server.scene.configure_environment_map(None)
+    server.scene.configure_default_lights(enabled=False)
+    server.scene.add_light_ambient("/lights/ambient", intensity=2.4)
+    for name, position in (("above", (-20.0, 30.0, 60.0)), ("front", (0.0, 80.0, 20.0)), ("back", (30.0, -80.0, 20.0))):
+        server.scene.add_light_directional(f"/lights/{name}", intensity=1.8, position=position)
+
+
+def _look_down_on(server: Server, mesh: Mesh) -> None:
     low, high = mesh.bounds
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     server.initial_camera.look_at = tuple(map(float, middle))
     server.initial_camera.position = tuple(map(float, middle + size * np.array([0.0, -0.35, 1.0])))
 
 
-def _add(server: viser.ViserServer, name: str, mesh: Mesh, rgb: UInt8[np.ndarray, "v 3"], visible: bool) -> _Node:
-    shown = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=rgb, process=False)
+def _add(server: Server, name: str, mesh: Mesh, rgb: UInt8[np.ndarray, "v 3"], visible: bool) -> Node:
+    # The colours of vertices are linear in glTF, in which the mesh is sent.
+    linear = np.rint(255 * (rgb / 255) ** _GAMMA).astype(np.uint8)
+    shown = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=linear, process=False)
     return server.scene.add_mesh_trimesh(name, shown, visible=visible)
 
 
