@@ -9,7 +9,7 @@ from pathlib import Path
 
 from cuspid.reporting.reproduction_page import markdown
 from cuspid.studies.reproduction.judging import judge
-from cuspid.studies.reproduction.page import make_page
+from cuspid.studies.reproduction.page import GENERATED, make_page
 from cuspid.studies.reproduction.pictures import LIKENESS, TRUENESS, draw_likeness, draw_trueness
 from cuspid.studies.reproduction.runs import read_results
 
@@ -19,9 +19,11 @@ HERE = Path(__file__).parent
 def main() -> None:
     """Read the results, write the page and the charts."""
     docs, results = HERE.parent / "docs", read_results(HERE / "results")
-    (docs / "reproduction.md").write_text(markdown(make_page(judge(results), results), images="images/"))
     draw_trueness(docs / "images" / TRUENESS, results)
     draw_likeness(docs / "images" / LIKENESS, results)
+    pictures = {path.name for path in (docs / "images").iterdir()}
+    page = make_page(judge(results), results, pictures=pictures, origin=GENERATED)
+    (docs / "reproduction.md").write_text(markdown(page))
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
 """Runs that take no time, or wait: the processes of the grid import this file, too, where it is the program."""
 
 import sys
-import time
 from pathlib import Path
 
 from cuspid.studies.reproduction import runs
 from cuspid.studies.reproduction.catalogue import BY_ID
 from cuspid.studies.reproduction.runs import Run, gather, missing, run_missing
+from cuspid.studies.scan_cases import timed
 
 ITEMS = (BY_ID["fig-2.2"], BY_ID["fig-3.15"])
 POPULATIONS = {"groups": {"lower-14": {"max_abs_asked_minus_measured_mm": 0.001}}}
@@ -19,10 +19,19 @@ def at_once(task):
     yield "populations", POPULATIONS
 
 
+PROGRAM = """
+import os, sys, time
+from pathlib import Path
+folder = Path(sys.argv[1])
+(folder / "new").write_text(str(os.getpid()))
+(folder / "new").rename(folder / "waiting")
+while not (folder / "go").exists():
+    time.sleep(0.02)
+"""
+
+
 def waits(task):
-    (task.folder / "waiting").touch()
-    while not (task.folder / "go").exists():
-        time.sleep(0.02)
+    timed(sys.executable, "-c", PROGRAM, str(task.folder))
     yield "visibility", {"surfaces": {"twelve-cameras": SEEN}}
 
 

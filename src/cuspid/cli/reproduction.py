@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -52,14 +52,16 @@ def reproduce(
     if images is not None and not images.is_dir():
         raise InputError(f"--images {images}: no such folder")
     found = gather(out, results)
+    judge(found, items)  # What is broken is refused before hours of work.
     with storage.claimed_folder(out, "reproduce", {}, {}):
         if run:
             _run(out, items, quick, workers, results)
             found = gather(out, results)
-        page = make_page(judge(found, items), found)
         draw_pictures(out / "images", found)
+        pictures = _pictures(out / "images", images)
+        page = make_page(judge(found, items), found, pictures=pictures)
         storage.write_bytes(out / "reproduction.md", markdown(page).encode())
-        storage.write_bytes(out / "reproduction.html", html(page, _pictures(page, out / "images", images)).encode())
+        storage.write_bytes(out / "reproduction.html", html(page, _embedded(page, out / "images", pictures)).encode())
     _print(page)
     console.print(f"{out / 'reproduction.html'}, {out / 'reproduction.md'}", highlight=False)
 
@@ -89,15 +91,19 @@ def _run(out: Path, items: Sequence[Item], quick: bool, workers: int | None, res
         console.print(f"failed: {name}: {reason}", highlight=False)
 
 
-def _pictures(page: Page, made: Path, given: Path | None) -> dict[str, str]:
-    """Addresses that hold the pictures that there are, those of this folder first; the page's own copies are kept."""
-    found = {}
-    for name in dict.fromkeys(name for entry in page.entries for name, _ in entry.pictures):
-        if not (made / name).exists() and given is not None and (given / name).exists():
-            storage.write_bytes(made / name, (given / name).read_bytes())
-        if (made / name).exists():
-            found[name] = photo_uri(made / name, widest_px=900)
-    return found
+def _pictures(*folders: Path | None) -> dict[str, Path]:
+    """Pictures by name, those of the first folder first."""
+    there = [path for folder in folders if folder is not None and folder.is_dir() for path in folder.iterdir()]
+    return {path.name: path for path in reversed(there)}
+
+
+def _embedded(page: Page, folder: Path, pictures: Mapping[str, Path]) -> dict[str, str]:
+    """Addresses that hold the pictures of the page, which are kept in the folder for the Markdown."""
+    names = dict.fromkeys(name for entry in page.entries for name, _ in entry.pictures)
+    for name in names:
+        if pictures[name].parent != folder:
+            storage.write_bytes(folder / name, pictures[name].read_bytes())
+    return {name: photo_uri(pictures[name], widest_px=900) for name in names}
 
 
 def _print(page: Page) -> None:

@@ -6,10 +6,12 @@ case, with the commands, the options, the times, the errors and what they depend
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import platform
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -27,6 +29,8 @@ PACKAGES = ("cuspid", "numpy", "numba", "opencv-contrib-python-headless", "pycol
 PREPARED = (46, 45, 42, 36, 35)
 """Teeth (FDI) of the thesis' reference model (Fig 3.20), in the order B, C, D, F, E of its Table 3.2: cracked, crown,
 full-contour crown, and two inlays."""
+_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
+_PR_SET_PDEATHSIG = 1
 _STAGES = ("depth", "depth-between", "motion")
 
 
@@ -34,7 +38,7 @@ def timed(*command: str, log: IO[bytes] | None = None) -> tuple[int, dict[str, f
     """Run a program; its exit status, wall seconds, CPU seconds and peak memory in GiB. It writes to ``log``, or where
     this process does."""
     begin = time.perf_counter()
-    process = subprocess.Popen(command, stdout=log, stderr=log)
+    process = subprocess.Popen(command, stdout=log, stderr=log, preexec_fn=_end_with_parent)
     _, status, usage = os.wait4(process.pid, 0)
     seconds = time.perf_counter() - begin
     return os.waitstatus_to_exitcode(status), {
@@ -42,6 +46,12 @@ def timed(*command: str, log: IO[bytes] | None = None) -> tuple[int, dict[str, f
         "cpu_s": round(usage.ru_utime + usage.ru_stime, 1),
         "peak_gib": round(usage.ru_maxrss / 2**20, 2),
     }
+
+
+def _end_with_parent() -> None:
+    """A killed run cannot tell its programs; on Linux the kernel does (prctl)."""
+    if _LIBC is not None:
+        _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def run_timed(*arguments: str, log: Path | None = None) -> dict[str, float]:

@@ -247,7 +247,7 @@ ITEMS: tuple[Item, ...] = (
         section="3.5.3.1",
         title="The mean shape of the jaws",
         states="Found by thin-plate splines in a few iterations.",
-        pictures=(("shape-mean.png", "The mean of 40 phantoms"),),
+        pictures=(("shape-mean.png", "The mean of phantoms drawn from Table 2.1"),),
     ),
     Item(
         id="fig-3.17",
@@ -281,13 +281,18 @@ ITEMS: tuple[Item, ...] = (
         section="3.6",
         title="Five teeth, reconstructed, with colour maps of their RMS error",
         states="The maps are lost; the RMS follows from mean and SD of Table 3.2.",
-        pictures=(("molar-deviation.png", "A molar of our phantom, scanned by twelve cameras"),),
+        pictures=(
+            ("molar-deviation.png", "A molar of our phantom, scanned by twelve cameras"),
+            ("prepared-46.png", "B, the cracked tooth, scanned by twelve cameras"),
+            ("prepared-36.png", "F, an inlay, scanned by twelve cameras"),
+        ),
     ),
     Item(
         id="fig-3.22",
         section="3.6",
         title="The complete arch, reconstructed, with a colour map of its RMS error",
         states="The map is lost; the RMS follows from mean and SD of Table 3.2.",
+        pictures=(("prepared-arch.png", "The arch, scanned by twelve cameras"),),
     ),
     Item(
         id="fig-4.1",
@@ -320,7 +325,12 @@ ITEMS: tuple[Item, ...] = (
         section="4.3",
         title="Panoramas with and without the examination of frames",
         states="With it the panorama is much better, and better than that of an automatic stitcher.",
-        pictures=(("panorama-thesis-parts.png", "Parts of a panorama with (upper row) and without the examination"),),
+        pictures=(
+            ("panorama-thesis-parts.png", "Parts of a panorama with (upper row) and without the examination"),
+            ("panorama-lower-14-0-thesis.png", "The thesis' method, with the examination"),
+            ("panorama-lower-14-0-thesis-unexamined.png", "The thesis' method, without the examination"),
+            ("panorama-lower-14-0-ortho.png", "Our default method"),
+        ),
     ),
     Item(
         id="table-1.1",

@@ -57,7 +57,7 @@ def _behind(results: Results, surface: str, term: str) -> Comparison:
         results,
         "camera_sweep",
         ours,
-        quantity=f"{surface}: {title} of its pair, standard errors behind the best pair",
+        quantity=f"{surface}, {title}: how far its pair is behind the best one, in standard errors",
         printed="the best" if surface in ("occlusal", "incisal") else "suitable",
         rule=AtMost(limit=2.0),
         because=_SWEEP_BECAUSE[term],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 
 from cuspid.reporting.reproduction_page import Entry, FigureRow, Page
 from cuspid.studies.reproduction.findings import PANORAMA, Finding, Result, Results
@@ -35,21 +35,27 @@ INTRO = (
     "All of ours is simulation: ideal optics, an artificial texture on the teeth as in the thesis unless said "
     "otherwise, an exactly known rig. The thesis' jaws are not public; ours are the built-in phantom and others named "
     "below. Teeth have FDI numbers (the thesis' 30, 29, 26, 20 and 19 are 46, 45, 42, 35 and 36).",
-    "Generated from `benchmarks/results/` by `python benchmarks/reproduction.py`; do not edit. `cuspid reproduce "
-    "--out FOLDER` runs everything anew, `--quick` a reduced version in a quarter of an hour, `--only table-3.2` a "
-    "part; a killed run goes on.",
 )
+MADE = "Made by `cuspid reproduce`. What has been run in a reduced version (`--quick`) is marked."
+GENERATED = (
+    "Generated from `benchmarks/results/` by `python benchmarks/reproduction.py`; do not edit. `cuspid reproduce --out "
+    "FOLDER` runs everything anew, `--quick` a reduced version in a quarter of an hour, `--only table-3.2` a part; a "
+    "killed run goes on."
+)
+"""Of the page in the documentation."""
 
 
-def make_page(findings: Sequence[Finding], results: Results) -> Page:
-    """The page of some findings and the results that they come from."""
+def make_page(
+    findings: Sequence[Finding], results: Results, *, pictures: Container[str] = (), origin: str = MADE
+) -> Page:
+    """The page of some findings and the results that they come from, with those of the pictures that there are."""
     counts = Counter(finding.verdict for finding in findings)
     used = dict.fromkeys(name for finding in findings for name in sources(finding, results))
     return Page(
         title=TITLE,
-        intro=INTRO,
+        intro=(*INTRO, origin),
         counts=tuple((WORDS[each], counts[each], MEANINGS[each]) for each in WORDS if counts[each]),
-        entries=tuple(_entry(finding, sources(finding, results)) for finding in findings),
+        entries=tuple(_entry(finding, sources(finding, results), pictures) for finding in findings),
         conditions=tuple((name, conditions(results[name])) for name in used),
     )
 
@@ -63,9 +69,8 @@ def sources(finding: Finding, results: Results) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _entry(finding: Finding, names: tuple[str, ...]) -> Entry:
+def _entry(finding: Finding, names: tuple[str, ...], pictures: Container[str]) -> Entry:
     item = finding.item
-    judged = [each for each in finding.comparisons if each.verdict != "not run"]
     return Entry(
         id=item.id,
         name=item.name,
@@ -76,13 +81,31 @@ def _entry(finding: Finding, names: tuple[str, ...]) -> Entry:
         tally=_tally(finding.comparisons),
         lost=item.lost,
         rows=tuple(map(_row, finding.comparisons)),
-        rules=tuple(dict.fromkeys(each.rule.text for each in judged)),
+        rules=_rules(finding.comparisons),
         notes=finding.notes,
         table=finding.table,
-        pictures=item.pictures,
+        pictures=tuple((name, caption) for name, caption in item.pictures if name in pictures),
         command=f"cuspid reproduce --only {item.id} --out FOLDER" if finding.missing else "",
         sources=names,
     )
+
+
+def _rules(comparisons: Sequence[Comparison]) -> tuple[str, ...]:
+    """Each rule once, with the rows that it is for where there are several rules."""
+    rows: dict[str, list[int]] = {}
+    for number, each in enumerate(comparisons, start=1):
+        rows.setdefault(each.rule.text, []).append(number)
+    if len(rows) == 1:
+        return tuple(rows)
+    return tuple(f"{_row_numbers(numbers)}: {text}" for text, numbers in rows.items())
+
+
+def _row_numbers(numbers: Sequence[int]) -> str:
+    if len(numbers) == 1:
+        return f"row {numbers[0]}"
+    if len(numbers) > 2 and numbers[-1] - numbers[0] == len(numbers) - 1:
+        return f"rows {numbers[0]} to {numbers[-1]}"
+    return f"rows {', '.join(map(str, numbers[:-1]))} and {numbers[-1]}"
 
 
 def _tally(comparisons: Sequence[Comparison]) -> str:

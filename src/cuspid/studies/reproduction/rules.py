@@ -75,6 +75,8 @@ class Equals:
     @property
     def text(self) -> str:
         """How it decides."""
+        if self.within < 1e-6:
+            return "reproduced: the same number; else it differs"
         each = " at each end" if isinstance(self.thesis, tuple) else ""
         return f"reproduced: no farther than {self.within:.3g} from it{each}; else it differs"
 

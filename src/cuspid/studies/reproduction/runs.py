@@ -15,7 +15,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from functools import partial
 from pathlib import Path
@@ -207,11 +207,18 @@ def _design_comparison(task: Task) -> Iterator[tuple[str, Result]]:
     yield "design_comparison", {"command": f"cuspid {' '.join(arguments)} --out comparison", **found}
 
 
+_QUICK_TEETH = ("prepared-46", "prepared-45", "prepared-36")
+"""A crack, a crown and an inlay."""
+
+
 def _prepared(task: Task) -> Iterator[tuple[str, Result]]:
-    case = prepared_cases()[task.name]
-    yield task.name, measure_scan(task.name, case, task.work, afresh=False, log=task.log)
-    task.keep(task.work / "thesis-reference.teeth.png", "preparation-thesis-reference.png")
-    task.keep(task.work / task.name / "deviation.png", f"{task.name}.png")
+    for name in task.wanted:
+        case = prepared_cases()[name]
+        if task.quick:
+            case = replace(case, simulate=(*case.simulate, "--supersampling", "1"))
+        yield name, measure_scan(name, case, task.work, afresh=False, log=task.log)
+        task.keep(task.work / "thesis-reference.teeth.png", "preparation-thesis-reference.png")
+        task.keep(task.work / name / "deviation.png", f"{name}.png")
 
 
 # --- Panoramas --------------------------------------------------------------------------------------------------------
@@ -290,12 +297,13 @@ def _panorama_run(subject: str) -> Run:
 
 RUNS: Mapping[str, Run] = MappingProxyType(
     {
-        "prepared-arch": Run(makes=("prepared-arch",), make=_prepared, minutes=25.0, quick="none"),
-        **{
-            name: Run(makes=(name,), make=_prepared, minutes=3.0, quick="same")
-            for name in prepared_cases()
-            if name != "prepared-arch"
-        },
+        "prepared-arch": Run(makes=("prepared-arch",), make=_prepared, minutes=35.0, quick="none"),
+        "prepared-teeth": Run(
+            makes=tuple(name for name in prepared_cases() if name != "prepared-arch"),
+            make=_prepared,
+            minutes=25.0,
+            quick_makes=_QUICK_TEETH,
+        ),
         **{f"panorama-{name}": _panorama_run(name) for name in SUBJECT_NAMES},
         "camera_sweep": Run(makes=("camera_sweep",), make=_camera_sweep, minutes=30.0),
         "design_comparison": Run(makes=("design_comparison",), make=_design_comparison, minutes=15.0),
