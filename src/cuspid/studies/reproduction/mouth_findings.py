@@ -185,6 +185,7 @@ _SE = 3.0
 """Means that are so many standard errors apart differ; with a dozen rows, two happen by chance."""
 
 
+_MEANING = f"{_SE:g} standard errors"
 _COPY = "the printed column f repeats column b to 0.06 mm and is very likely a copy of it"
 
 
@@ -227,7 +228,7 @@ def _drawn(results: Results, group: str, name: str) -> Comparison:
         quantity=f"{name}, {group}, phantoms",
         unit="mm",
         printed=f"{mean:.2f} ± {sd:.2f}",
-        rule=Equals(thesis=mean, within=round(_SE * sd / np.sqrt(jaws), 2)),
+        rule=Equals(thesis=mean, within=round(_SE * sd / np.sqrt(jaws), 2), meaning=_MEANING),
         because=_COPY if name == "f" else "drawn jaws that cannot stand are drawn again",
         shown=lambda result: _mean_sd(result["groups"][entry][name]["measured"], "mean_mm", "sd_mm"),
     )
@@ -250,7 +251,7 @@ def _scanned(results: Results, group: str, name: str) -> Comparison:
         quantity=f"{name}, {group}, {count} scans",
         unit="mm",
         printed=f"{mean:.2f} ± {sd:.2f}",
-        rule=Equals(thesis=mean, within=round(float(_SE * error), 2)),
+        rule=Equals(thesis=mean, within=round(float(_SE * error), 2), meaning=_MEANING),
         because=_COPY if name == "f" else "other people, few of them",
         shown=lambda result: _mean_sd(entry, f"{name}_mean_mm", f"{name}_sd_mm"),
     )

@@ -71,6 +71,8 @@ class Equals:
     """As printed: a number, or the ends of an interval."""
     within: float
     """Largest difference, in the same unit."""
+    meaning: str = ""
+    """What that difference is, where it is another one for each row."""
 
     @property
     def text(self) -> str:
@@ -78,7 +80,7 @@ class Equals:
         if self.within < 1e-6:
             return "reproduced: the same number; else it differs"
         each = " at each end" if isinstance(self.thesis, tuple) else ""
-        return f"reproduced: no farther than {self.within:.3g} from it{each}; else it differs"
+        return f"reproduced: no farther than {self.meaning or f'{self.within:.3g}'} from it{each}; else it differs"
 
     def verdict(self, ours: float | tuple[float, ...]) -> Verdict:
         """Of a figure of the same kind. Raises InputError for one of another kind."""
