@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: demo test lint format benchmarks clean
+.PHONY: demo test lint format docs benchmarks clean
 
 demo: $(STAMP)
 	$(BIN)/cuspid run --tooth 46 --out demo
@@ -23,6 +23,11 @@ format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+# A warning, as of a link that leads nowhere, is an error.
+docs: $(STAMP).docs
+	$(BIN)/sphinx-build --quiet --fail-on-warning --doctree-dir build/doctrees docs build/docs
+	@echo "build/docs/index.html"
+
 benchmarks: $(STAMP)
 	$(BIN)/python benchmarks/run.py --out benchmarks/results
 
@@ -33,5 +38,9 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
 	touch $(STAMP)
 
+$(STAMP).docs: $(STAMP)
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'
+	touch $@
+
 clean:
-	rm -rf $(VENV) demo
+	rm -rf $(VENV) demo build docs/api docs/cli

@@ -1,0 +1,185 @@
+"""The documentation says nothing that does not work: its commands are read by the real parser, those of the tutorial
+and of the how-to pages run as they stand there, and every verb and every module has its page."""
+
+import ast
+import functools
+import importlib
+import importlib.util
+import inspect
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cuspid import cli
+from documents import ROOT, Block, blocks, commands, mentions, pages, words
+
+RUN = ["tutorial.md", *(f"how-to/{path.name}" for path in sorted((ROOT / "docs/how-to").glob("*.md")))]
+"""Pages whose commands run, each page in a folder of its own, in their order."""
+SHELL = ("sh", "bash", "console")
+NOT_PYTHON = ("", "sh", "bash", "console", "toml", "json", "text", "math", "{toctree}")
+
+
+def name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+@pytest.fixture
+def parsed(monkeypatch):
+    """Verbs that only have their arguments read."""
+    seen = []
+
+    def stub(verb):
+        @functools.wraps(verb)
+        def remember(*args, **kwargs):
+            seen.append(verb)
+
+        return remember
+
+    monkeypatch.setattr(cli, "COMMANDS", {verb: stub(command) for verb, command in cli.COMMANDS.items()})
+    return seen
+
+
+def refused(arguments: list[str], capsys) -> str | None:
+    """What the parser says against a command."""
+    try:
+        cli.main(arguments)
+    except SystemExit:
+        return capsys.readouterr().err
+    return None
+
+
+@pytest.mark.parametrize("page", pages(), ids=name)
+def test_the_parser_takes_every_command(page, parsed, capsys):
+    found = list(commands(page))
+    complaints = {place: said for place, arguments in found if (said := refused(arguments, capsys)) is not None}
+    assert not complaints
+    assert len(parsed) == len(found)
+    assert not [place for place, arguments in mentions(page) if not is_understood(arguments, capsys)]
+
+
+def is_understood(arguments: list[str], capsys) -> bool:
+    """Whether nothing is wrong with a command but what it leaves out."""
+    said = refused(arguments, capsys)
+    return said is None or ("Missing from" in said and "Unrecognized" not in said)
+
+
+@pytest.mark.parametrize("wrong", ["run --tooht 46 --out scan/", "scan --out scan/", "run --tooth six --out scan/"])
+def test_the_parser_refuses_what_does_not_exist(wrong, parsed, capsys):
+    assert refused(wrong.split(), capsys)
+    assert not parsed
+
+
+def test_a_mention_may_be_incomplete_but_not_wrong(parsed, capsys):
+    assert is_understood(["run", "--tooth", "46"], capsys)
+    assert not is_understood(["run", "--tooht", "46"], capsys)
+
+
+def test_commands_are_found_wherever_they_stand(tmp_path, monkeypatch):
+    monkeypatch.setattr("documents.ROOT", tmp_path)
+    page = tmp_path / "page.md"
+    page.write_text(
+        "Text `cuspid run --out a/` text, `cuspid run` text.\n\n    cuspid shape JAWS/ --out b/   # comment\n\n"
+        "<!-- not run: why -->\n```sh\n$ cuspid run \\\n    --out c/\nls\n```\n\n```sh\ncuspid optics\n```\n"
+    )
+    assert [" ".join(words) for _, words in commands(page)] == ["shape JAWS/ --out b/", "run --out c/", "optics"]
+    assert [" ".join(words) for _, words in mentions(page)] == ["run --out a/"]
+    assert [block.run for block in blocks(page)] == [True, False, True]
+
+
+@pytest.mark.parametrize("page", RUN)
+def test_the_commands_of_a_page_run(page, tmp_path, monkeypatch, phantom_file, without_shape_checks):
+    """In their order, in an empty folder; a how-to page has ``jaw.ply``, as it says."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    if page != "tutorial.md":
+        for suffix in (".ply", ".json"):
+            shutil.copy(phantom_file.with_suffix(suffix), f"jaw{suffix}")
+    done = [line for block in blocks(ROOT / "docs" / page) for line in follow(block)]
+    assert any(line.startswith("cuspid") for line in done)
+
+
+def follow(block: Block) -> list[str]:
+    """Do what a block says: run its commands, or write the file of that name that it shows."""
+    if block.language == "toml":
+        Path("brief.toml").write_text(block.text)
+    if block.language not in SHELL or not block.run:
+        return []
+    for line in block.lines():
+        run(line)
+    return list(block.lines())
+
+
+def run(line: str) -> None:
+    if line.startswith("cuspid "):
+        cli.main(words(line))
+        return
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, env={**os.environ, "PATH": path})
+    assert done.returncode == 0, f"{line}: {done.stderr}"
+
+
+@pytest.mark.parametrize("page", pages(), ids=name)
+def test_python_on_a_page_is_python_and_imports_what_there_is(page):
+    for block in blocks(page):
+        assert block.language in (*NOT_PYTHON, "python"), f"{block.place}: {block.language}"
+        if block.language == "python":
+            check_imports(block)
+
+
+def check_imports(block: Block) -> None:
+    for node in ast.walk(compile(block.text, block.place, "exec", ast.PyCF_ONLY_AST)):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                importlib.import_module(alias.name)
+        if isinstance(node, ast.ImportFrom):
+            module = importlib.import_module(node.module)
+            for alias in node.names:
+                there = hasattr(module, alias.name) or importlib.util.find_spec(f"{node.module}.{alias.name}")
+                assert there, f"{block.place}: {node.module} has no {alias.name}"
+
+
+def test_every_verb_is_documented():
+    told = {arguments[0] for page in pages() for _, arguments in commands(page)}
+    assert set(cli.COMMANDS) <= told
+
+
+def test_the_command_line_has_a_page_for_every_verb(monkeypatch):
+    command_pages = generator("command_pages", monkeypatch)
+    found = command_pages.pages()
+    assert set(found) == {"index.rst", *(f"{verb}.rst" for verb in cli.COMMANDS)}
+    for verb, command in cli.COMMANDS.items():
+        text = found[f"{verb}.rst"]
+        assert f".. program:: cuspid {verb}" in text
+        assert ".. option:: --out" in text
+        assert all(argument in text.replace("-", "_") for argument in own_options(command)), verb
+    assert ".. program:: cuspid prepare crown" in found["prepare.rst"]
+    assert ".. option:: --taper-deg FLOAT" in found["prepare.rst"]
+    assert "*(default: 46 41)*" in found["design.rst"]
+    assert "--noise.…" in found["design.rst"]
+
+
+def own_options(command) -> list[str]:
+    """Arguments of a verb that are plain values."""
+    plain = (str, "int", "int | None", "bool", "str | None")
+    return [each.name for each in inspect.signature(command).parameters.values() if each.annotation in plain]
+
+
+def test_every_public_module_has_its_docstrings_on_a_page(monkeypatch):
+    module_pages = generator("module_pages", monkeypatch)
+    text = "\n".join(module_pages.pages().values())
+    shown = {line.split()[-1] for line in text.splitlines() if line.startswith(".. automodule::")}
+    source = ROOT / "src"
+    files = {path.relative_to(source).with_suffix("") for path in (source / "cuspid").rglob("*.py")}
+    dotted = {".".join(path.parts).removesuffix(".__init__") for path in files}
+    assert dotted - shown == set(module_pages.SCRIPTS)
+    assert all(module_pages.public_modules().values()), "a module without a docstring"
+
+
+def generator(module: str, monkeypatch):
+    """A module of the site's own, that writes pages."""
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    return importlib.import_module(f"_site.{module}")
