@@ -91,12 +91,12 @@ def photo_uri(path: Path, *, widest_px: int = 1600) -> str:
     return jpeg_uri(read_image(path), widest_px=widest_px)
 
 
-def number(value: float | None, digits: int = 1) -> str:
+def number(value: float | int | None, digits: int = 1) -> str:
     """A number with thin spaces between thousands; a dash where it is not known."""
     return "–" if value is None else f"{value:z,.{digits}f}".replace(",", "\u202f").replace("-", "−")
 
 
-def signed(value: float | None, digits: int = 1) -> str:
+def signed(value: float | int | None, digits: int = 1) -> str:
     """As :func:`number`, with its sign."""
     return "–" if value is None else f"{value:+z,.{digits}f}".replace(",", "\u202f").replace("-", "−")
 

@@ -171,11 +171,11 @@ def _sweep_tables(summary: Mapping[str, Any]) -> list[Table]:
     return tables
 
 
-def _figure(term: str, value: float) -> str:
+def _figure(term: str, value: float | int) -> str:
     return number(value, 0 if term == "points" else 2)
 
 
-def _setting(pair: Sequence[float]) -> str:
+def _setting(pair: Sequence[float | int]) -> str:
     return f"{pair[0]:g} mm, {pair[1]:g}°"
 
 
@@ -201,7 +201,7 @@ def _compare_tables(summary: Mapping[str, Any]) -> list[Table]:
     return [table("What each needs", _NEEDS), table("What each gives, means over the seeds", _GIVES)]
 
 
-def _cell(value: float | None) -> str:
+def _cell(value: float | int | None) -> str:
     return "–" if value is None else f"{value:g}" if isinstance(value, int) else number(value, 2)
 
 

@@ -16,7 +16,7 @@
     const group = groups.get(frame.dataset.group) ?? [];
     groups.set(frame.dataset.group, [...group, zoom]);
     frame.addEventListener("wheel", (event) => zoom.zoomWithWheel(event));
-    frame.addEventListener("dblclick", () => zoom.reset());
+    frame.addEventListener("dblclick", () => zoom.reset({ animate: false }));
     image.addEventListener("panzoomchange", ({ detail }) => {
       for (const other of groups.get(frame.dataset.group)) {
         if (other === zoom || !detail.originalEvent) continue;
@@ -30,7 +30,7 @@
       for (const each of groups.get(button.dataset.group)) {
         if (button.dataset.zoom === "in") each.zoomIn();
         else if (button.dataset.zoom === "out") each.zoomOut();
-        else each.reset();
+        else each.reset({ animate: false });
       }
     });
   }

@@ -43,7 +43,7 @@
   camera.add(light);
   world.add(camera, new THREE.HemisphereLight(0xffffff, 0xd8dde2, 1.75));
   const controls = new THREE.TrackballControls(camera, canvas);
-  Object.assign(controls, { rotateSpeed: 3.2, zoomSpeed: 1.4, panSpeed: 0.5, dynamicDampingFactor: 0.25 });
+  Object.assign(controls, { rotateSpeed: 3.2, zoomSpeed: 1.4, panSpeed: 0.5, staticMoving: true });
 
   const layers = new Map();
   let range = scene.range;
@@ -79,10 +79,13 @@
   async function addLines(layer) {
     const geometry = new THREE.BufferGeometry();
     geometry.setAttribute("position", new THREE.BufferAttribute(await unpack(layer.points), 3));
-    const path = layer.kind === "line";
-    const look = path ? { color: 0xb5179e } : { color: 0x1c5d99, transparent: true, opacity: 0.45 };
-    const material = new THREE.LineBasicMaterial(look);
-    return path ? new THREE.Line(geometry, material) : new THREE.LineSegments(geometry, material);
+    if (layer.kind === "segments") {
+      const look = { color: 0x1c5d99, transparent: true, opacity: 0.45 };
+      return new THREE.LineSegments(geometry, new THREE.LineBasicMaterial(look));
+    }
+    const line = new THREE.Line(geometry, new THREE.LineBasicMaterial({ color: 0xb5179e }));
+    line.add(new THREE.Points(geometry, new THREE.PointsMaterial({ color: 0xb5179e, size: 6, sizeAttenuation: false })));
+    return line;
   }
 
   const table = (await unpack(scene.colors)).map((value) => value);
@@ -141,6 +144,7 @@
   // --- the view ------------------------------------------------------------------------------------------------------
 
   let half = 10;
+  let chosen = null;
 
   function resize() {
     const { clientWidth: width, clientHeight: height } = canvas.parentElement;
@@ -183,17 +187,19 @@
     lookAt(target, eye, axes[1], 0.54 * shorter * Math.max(width / clientWidth, height / clientHeight));
   }
 
-  // How far the main surface reaches along some directions.
+  // How far the main surface, and the cameras and paths that are shown, reach along some directions.
   function extents(axes) {
-    const { array } = main().geometry.attributes.position;
+    const lines = [...layers.values(), chosen].filter((each) => each && !each.isMesh && each.visible);
     const lows = axes.map(() => Infinity);
     const highs = axes.map(() => -Infinity);
-    for (let v = 0; v < array.length; v += 3) {
-      axes.forEach((axis, k) => {
-        const at = array[v] * axis.x + array[v + 1] * axis.y + array[v + 2] * axis.z;
-        lows[k] = Math.min(lows[k], at);
-        highs[k] = Math.max(highs[k], at);
-      });
+    for (const { array } of [main(), ...lines].map((each) => each.geometry.attributes.position)) {
+      for (let v = 0; v < array.length; v += 3) {
+        axes.forEach((axis, k) => {
+          const at = array[v] * axis.x + array[v + 1] * axis.y + array[v + 2] * axis.z;
+          lows[k] = Math.min(lows[k], at);
+          highs[k] = Math.max(highs[k], at);
+        });
+      }
     }
     return [lows, highs];
   }
@@ -308,6 +314,8 @@
       });
     }
     find("[data-reset]").addEventListener("click", () => {
+      if (chosen) world.remove(chosen);
+      chosen = null;
       mark(null);
       whole();
     });
@@ -345,13 +353,10 @@
   }
 
   // The cameras of one frame, in another colour.
-  let chosen = null;
-
   function showFrame(name) {
     const layer = scene.layers.find((each) => each.name === "cameras");
     const index = layer?.frames.indexOf(name) ?? -1;
     if (chosen) world.remove(chosen);
-    chosen = null;
     if (index < 0) return;
     const all = layers.get("cameras").geometry.attributes.position;
     const count = 3 * layer.points_per_frame;

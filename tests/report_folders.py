@@ -1,0 +1,157 @@
+"""Folders to report on, made without a scan: what verbs would have written of a surface that is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from cuspid import storage
+from cuspid.camera import Camera
+from cuspid.capture import Capture, Frame
+from cuspid.evaluation.deviation import statistics
+from cuspid.geometry import Rigid3
+from cuspid.jaw import Jaw
+from cuspid.mesh import Mesh
+from cuspid.reconstruction import Dropped, Reconstruction
+from cuspid.reporting.figures import deviation_colors
+from cuspid.rig import Exposure, Handpiece, MountedCamera, Rig
+from cuspid.shape_model import MeanStep, ShapeModel
+from cuspid.trueness import Trueness
+
+TOOTH = 46
+BUMP_UM = 80.0
+"""Of the one place where the scan is wrong."""
+CAMERA = Camera.from_field_of_view(64, 48, 60.0)
+REFERENCE_FROM_SCAN = Rigid3.from_rotation_vector(np.array([0.3, -0.2, 1.0]), np.array([4.0, -9.0, 2.0]))
+FRAMES = ("00000", "00001", "00002")
+
+
+def tooth_alone(jaw: Jaw) -> Jaw:
+    """One tooth of a jaw."""
+    return Jaw(mesh=jaw.mesh.submesh(jaw.tooth_faces(TOOTH)), arch=jaw.arch)
+
+
+def scanned_tooth(jaw: Jaw) -> tuple[Mesh, np.ndarray, int]:
+    """A tooth with a bump, in the frame of the reference, its deviation in um and the vertex at the top of the bump."""
+    tooth = jaw.mesh.submesh(jaw.tooth_faces(TOOTH))
+    top = int(tooth.vertices[:, 2].argmax())
+    distances = np.linalg.norm(tooth.vertices - tooth.vertices[top], axis=1)
+    deviation_um = 2.0 * np.sin(tooth.vertices[:, 0]) + BUMP_UM * np.exp(-((distances / 0.4) ** 2))
+    moved = Mesh(tooth.vertices + 1e-3 * deviation_um[:, None] * tooth.vertex_normals, tooth.faces)
+    return moved, deviation_um, top
+
+
+def known_trueness(deviation_um: np.ndarray) -> Trueness:
+    found = statistics(deviation_um / 1000)
+    within = {"50": 98.0, "100": 99.0, "200": 100.0}
+    return Trueness(
+        accuracy=found,
+        completeness=found,
+        completeness_pct=within,
+        scannable_pct=7.0,
+        per_tooth={TOOTH: found},
+        per_tooth_completeness_pct={TOOTH: within},
+        scale_error_ppm=-24.0,
+        inter_molar_error_um=None,
+        inter_canine_error_um=None,
+        drift_um={},
+        reference_from_scan=REFERENCE_FROM_SCAN,
+        deviation_um=deviation_um,
+        notes=("<script>notes are text</script>",),
+    )
+
+
+def looking_down(jaw: Jaw, shift_mm: float) -> Rigid3:
+    """A rig 8 mm over the tooth, moved along +Y; ``rig_from_reference``."""
+    x, y, z = jaw.mesh.face_centres[jaw.tooth_faces(TOOTH)].mean(axis=0)
+    eye = np.array([x, y + shift_mm, z + 8.0])
+    down = np.diag([1.0, -1.0, -1.0])
+    return Rigid3(down, -down @ eye)
+
+
+def write_evaluation(folder: Path, jaw: Jaw) -> None:
+    """As ``cuspid evaluate`` leaves it."""
+    aligned, deviation_um, _ = scanned_tooth(jaw)
+    scan = aligned.transformed(REFERENCE_FROM_SCAN.inverse())
+    colored = Mesh(scan.vertices, scan.faces, deviation_colors(deviation_um))
+    storage.claim_folder(folder, "evaluate", {"evaluation": {"samples": 100, "seed": 7}}, {"mesh": "a" * 64})
+    storage.write_mesh(folder / "deviation.ply", colored, values={"deviation_um": deviation_um})
+    storage.write_trueness(folder / "trueness.json", known_trueness(deviation_um))
+
+
+def write_scan(folder: Path, jaw: Jaw) -> None:
+    """As ``cuspid run`` leaves it, with two cameras and three frames."""
+    names = ("left", "right")
+    rig = Rig(
+        {name: MountedCamera(CAMERA, Rigid3(np.eye(3), np.array([-2.0 * k, 0, 0]))) for k, name in enumerate(names)}
+    )
+    handpiece = Handpiece(rig=rig, exposures=(Exposure(name="all"),))
+    capture = Capture(folder=folder / "capture", handpiece=handpiece, frames=tuple(Frame(name=name) for name in FRAMES))
+    rng = np.random.default_rng(0)
+    storage.claim_folder(folder, "simulate", {"simulation": {"seed": 3, "path": {"tooth": TOOTH}}}, {})
+    storage.claim_folder(folder, "reconstruct", {"reconstruction": {"motion": "rig"}}, {"images": "b" * 64})
+    for frame in FRAMES:
+        for name in names:
+            storage.write_image(capture.image_path(frame, name), rng.integers(0, 255, (48, 64, 3), dtype=np.uint8))
+    storage.write_capture(capture)
+    storage.write_jaw(folder / "truth" / "jaw.ply", jaw)
+    poses = {name: looking_down(jaw, 4.0 * k - 2.0) @ REFERENCE_FROM_SCAN for k, name in enumerate(FRAMES[:2])}
+    lost = (Dropped(what="frame 00002", reason="too few points"),)
+    storage.write_reconstruction(
+        folder / "motion", Reconstruction(rig=rig, rig_from_world=poses, dropped=lost), handpiece
+    )
+    cleaning = {"holes": [{"perimeter_mm": 3.0, "area_mm2": 0.5}], "removed_pieces": 2, "removed_ghost_faces": 0}
+    storage.write_json(folder / "mesh.json", cleaning)
+    write_evaluation(folder, jaw)
+
+
+def write_shape(folder: Path, jaw: Jaw) -> None:
+    """A mean jaw whose one mode makes it wider."""
+    mode = np.zeros((1, *jaw.mesh.vertices.shape))
+    mode[0, :, 0] = jaw.mesh.vertices[:, 0] / np.sqrt(np.mean(jaw.mesh.vertices[:, 0] ** 2))
+    model = ShapeModel(
+        mean=Jaw(mesh=jaw.mesh, face_labels=jaw.face_labels, arch=jaw.arch),
+        modes=mode,
+        landmark_modes=np.zeros((1, 0, 3)),
+        standard_deviations_mm=np.array([1.5]),
+        variance_shares=np.array([1.0]),
+        scores=np.array([[1.0], [-1.0]]),
+        names=("one", "two"),
+        scales=np.ones(2),
+        scaled=False,
+        first="one",
+        correspondence="surface",
+        converged=True,
+        log=(MeanStep(change_um=5.0, surface_change_um=4.0, largest_change_um=9.0, covered_pct=99.0),),
+        notes=(),
+    )
+    storage.claim_folder(folder, "shape", {"shape": {"modes": 1}}, {"one.ply": "c" * 64})
+    storage.write_shape_model(folder, model)
+
+
+def write_score(folder: Path) -> None:
+    """As ``cuspid stitch-eval`` leaves it."""
+    scores = dict.fromkeys(("zncc", "ssim_teeth", "ssim_full", "ssim_teeth_fitted", "ssim_full_fitted"), 0.5)
+    storage.claim_folder(folder, "stitch-eval", {"evaluation": {"samples": 10}}, {"panorama": "d" * 64})
+    geometry = {"median_mm": 0.3, "p95_mm": 0.8, "rms_mm": 0.4, "scale_error_pct": -1.0}
+    storage.write_json(
+        folder / "score.json",
+        {
+            "method": "ortho",
+            "failure": None,
+            "geometry": geometry,
+            "inter_molar_error_mm": None,
+            "coverage_pct": 99.0,
+            "tooth_coverage_pct": {"46": 99.0},
+            "frames": 3,
+            "frames_used": 2,
+            "picture": scores,
+            "shot": None,
+            "trivial": {"empty": dict.fromkeys(scores, 0.1)},
+            "notes": [],
+        },
+    )
+    rng = np.random.default_rng(1)
+    for name in ("made.png", "true.png"):
+        storage.write_image(folder / name, rng.integers(0, 255, (90, 120, 3), dtype=np.uint8))

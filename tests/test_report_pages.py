@@ -1,0 +1,301 @@
+"""Pages in a real browser: what is drawn, what buttons do, and that nothing is asked of a network."""
+
+from __future__ import annotations
+
+import base64
+import re
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cuspid import cli
+from cuspid.jaw import Jaw
+from report_folders import tooth_alone, write_scan, write_score, write_shape
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed: pip install playwright")
+
+ARGUMENTS = (
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+)
+LAPTOP, PHONE = {"width": 1366, "height": 768}, {"width": 390, "height": 844}
+READY_MS = 60_000
+PICTURE = """async () => {
+  for (let k = 0; k < 3; k++) await new Promise((done) => requestAnimationFrame(done));
+  return document.querySelector("canvas").toDataURL("image/png").split(",")[1];
+}"""
+
+
+@dataclass
+class Visit:
+    """A page that was opened, and what the browser said meanwhile."""
+
+    page: object
+    complaints: list[str] = field(default_factory=list)
+    requests: list[str] = field(default_factory=list)
+
+    def picture(self) -> np.ndarray:
+        """What the viewer shows, after it was drawn; without the labels and bars that lie over it."""
+        return decoded(self.page.evaluate(PICTURE))
+
+    def settle(self) -> None:
+        """Wait until what was asked of the view is drawn."""
+        self.page.evaluate(PICTURE)
+
+    def press(self, selector: str) -> None:
+        self.page.locator(selector).first.click()
+
+
+def decoded(base64_png: str) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(base64.b64decode(base64_png), np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+def differing(one: np.ndarray, other: np.ndarray) -> float:
+    """Share of the pixels that differ visibly."""
+    return float(np.mean(np.abs(one.astype(int) - other.astype(int)).max(axis=2) > 8))
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[object]:
+    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if found is None:
+        pytest.skip("no Chromium here; on Debian: apt-get install chromium")
+    with sync_api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=found, headless=True, args=list(ARGUMENTS))
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory: pytest.TempPathFactory, coarse_phantom: Jaw) -> dict[str, Path]:
+    """Reports, by what they are of."""
+    folder = tmp_path_factory.mktemp("reports")
+    write_scan(folder / "scan", coarse_phantom)
+    write_shape(folder / "shape", tooth_alone(coarse_phantom))
+    write_score(folder / "score")
+    for name in ("scan", "shape", "score"):
+        cli.main(["report", str(folder / name)])
+    return {name: folder / name / "report.html" for name in ("scan", "shape", "score")}
+
+
+def visit(browser, path: Path, *, viewer: bool = True, before: str | None = None, **context) -> Visit:
+    page = browser.new_context(**{"viewport": LAPTOP, "offline": True, **context}).new_page()
+    found = Visit(page)
+    page.on("console", lambda message: found.complaints.append(message.text))
+    page.on("pageerror", lambda error: found.complaints.append(str(error)))
+    page.on("request", lambda request: found.requests.append(request.url))
+    if before:
+        page.add_init_script(before)
+    page.goto(path.as_uri())
+    if viewer:
+        page.wait_for_selector("#viewer[data-ready]", state="attached", timeout=READY_MS)
+    return found
+
+
+@pytest.fixture(scope="module")
+def scan(browser, pages) -> Iterator[Visit]:
+    found = visit(browser, pages["scan"])
+    yield found
+    found.page.context.close()
+
+
+@pytest.fixture
+def fresh(scan: Visit) -> Visit:
+    """The page of the scan as it was when it was opened."""
+    for button in scan.page.locator("#viewer [data-layer], #viewer [data-colors], #viewer [data-teeth]").all():
+        wanted = "true" if button.inner_text() in ("Scan", "Colours") else "false"
+        if button.get_attribute("aria-pressed") != wanted:
+            button.click()
+    scan.press("[data-reset]")
+    return scan
+
+
+def test_the_surface_is_drawn(fresh):
+    seen = fresh.picture()
+    fresh.press("[data-layer=scan]")
+    empty = fresh.picture()
+    assert 0.1 < differing(seen, empty) < 0.9
+    assert empty[..., 3].max() == 0, "without a layer there is only the background"
+
+
+def test_it_fills_the_view_but_not_more(fresh):
+    rows, columns = np.nonzero(fresh.picture()[..., 3])
+    height, width = fresh.picture().shape[:2]
+    assert 0.8 < max(np.ptp(rows) / height, np.ptp(columns) / width) < 1
+    assert min(rows.min(), columns.min()) > 0
+    assert rows.max() < height - 1
+
+
+def test_colours_are_those_of_the_deviation(fresh):
+    """The bump is red, the rest green; without colours it is plaster."""
+    blue, green, red = np.moveaxis(fresh.picture()[..., :3].astype(int), 2, 0)
+    assert 0.0005 < np.mean((red > green + 60) & (red > blue + 60)) < 0.05
+    assert np.mean((green > red + 30) & (green > blue + 30)) > 0.1
+    fresh.press("[data-colors]")
+    blue, green, red = np.moveaxis(fresh.picture()[..., :3].astype(int), 2, 0)
+    assert np.abs(red - green).max() < 40
+
+
+def test_turning_changes_the_picture_and_reset_brings_it_back(fresh):
+    before = fresh.picture()
+    box = fresh.page.locator("canvas").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    fresh.page.mouse.move(x, y)
+    fresh.page.mouse.down()
+    fresh.page.mouse.move(x + 120, y + 60, steps=6)
+    fresh.page.mouse.up()
+    assert differing(before, fresh.picture()) > 0.05
+    fresh.press("[data-reset]")
+    assert differing(before, fresh.picture()) < 0.002
+
+
+def test_the_wheel_zooms_and_the_length_bar_follows(fresh):
+    def millimetres_per_px() -> float:
+        length = float(fresh.page.locator(".length b").inner_text().split()[0])
+        return length / fresh.page.locator(".length span").bounding_box()["width"]
+
+    before = millimetres_per_px()
+    fresh.page.locator("canvas").hover()
+    fresh.page.mouse.wheel(0, -400)
+    fresh.settle()
+    assert millimetres_per_px() < 0.9 * before
+
+
+@pytest.mark.parametrize("layer", ["scan", "reference", "cameras", "path"])
+def test_layers_are_toggled(fresh, layer):
+    before = fresh.picture()
+    fresh.press(f"[data-layer={layer}]")
+    assert differing(before, fresh.picture()) > 1e-4
+    fresh.press(f"[data-layer={layer}]")
+    assert differing(before, fresh.picture()) == 0
+
+
+@pytest.mark.parametrize("view", ["Front", "Right", "Left", "Behind"])
+def test_standard_views_differ_from_the_occlusal_one(fresh, view):
+    before = fresh.picture()
+    fresh.press(f"[data-view={view}]")
+    assert differing(before, fresh.picture()) > 0.03
+    fresh.press("[data-view=Occlusal]")
+    assert differing(before, fresh.picture()) < 0.002
+
+
+def test_the_range_changes_colours_and_the_legend(fresh):
+    before, ticks = fresh.picture(), fresh.page.locator(".ticks").inner_text()
+    chosen = fresh.page.locator("[data-range]").input_value()
+    fresh.page.select_option("[data-range]", "500.0")
+    assert "+500" in fresh.page.locator(".ticks").inner_text()
+    assert differing(before, fresh.picture()) > 0.001
+    fresh.page.select_option("[data-range]", chosen)
+    assert fresh.page.locator(".ticks").inner_text() == ticks
+
+
+def test_the_worst_place_is_the_bump_and_the_view_goes_there(fresh):
+    before = fresh.page.locator(".length b").inner_text()
+    fresh.press("[data-worst='0']")
+    fresh.settle()
+    assert fresh.page.locator(".length b").inner_text() != before
+    box = fresh.page.locator("canvas").bounding_box()
+    fresh.page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    value = float(re.match(r"[+−]?[\d.]+", fresh.page.locator(".readout").inner_text())[0])
+    assert 60 < value < 90
+
+
+def test_a_frame_shows_where_its_cameras_were(fresh):
+    fresh.press("[data-view=Front]")
+    before = fresh.picture()
+    fresh.press("[data-frame='00000']")
+    assert differing(before, fresh.picture()) > 1e-4
+
+
+def test_tooth_numbers_lie_over_the_teeth(fresh):
+    fresh.press("[data-teeth]")
+    label = fresh.page.locator(".teeth span")
+    assert label.inner_text() == "46"
+    box, canvas = label.bounding_box(), fresh.page.locator("canvas").bounding_box()
+    assert canvas["x"] < box["x"] < canvas["x"] + canvas["width"]
+    assert canvas["y"] < box["y"] < canvas["y"] + canvas["height"]
+
+
+def test_nothing_is_complained_of_and_nothing_asked_of_a_network(scan, pages):
+    """Runs after the others of this page, which have pressed every button."""
+    assert scan.complaints == []
+    assert {url for url in scan.requests if not url.startswith(("data:", "blob:"))} == {pages["scan"].as_uri()}
+
+
+def test_on_paper_the_view_is_a_picture_and_settings_are_open(fresh):
+    fresh.page.wait_for_timeout(600)
+    fresh.page.emulate_media(media="print")
+    shown = fresh.page.locator(".still")
+    assert shown.is_visible()
+    assert not fresh.page.locator("canvas").is_visible()
+    assert not fresh.page.locator(".toolbar").is_visible()
+    still = decoded(shown.get_attribute("src").split(",")[1])
+    assert 0.05 < np.mean(still[..., 3] > 0) < 0.95
+    document = fresh.page.pdf(format="A4", print_background=True)
+    fresh.page.emulate_media(media="screen")
+    assert document.startswith(b"%PDF")
+    assert 1 <= len(re.findall(rb"/Type\s*/Page\b", document)) <= 5
+
+
+def test_on_a_phone(browser, pages):
+    phone = visit(browser, pages["scan"], viewport=PHONE, has_touch=True, is_mobile=True, device_scale_factor=2)
+    assert phone.page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
+    assert 0.05 < np.mean(phone.picture()[..., 3] > 0) < 0.95
+    box = phone.page.locator("canvas").bounding_box()
+    assert box["height"] < 0.75 * PHONE["height"], "the page can still be moved by a finger beside the view"
+    phone.page.touchscreen.tap(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    assert "µm" in phone.page.locator(".readout").inner_text()
+    assert phone.complaints == []
+    phone.page.context.close()
+
+
+def test_without_webgl_a_picture_is_shown(browser, pages):
+    blind = "HTMLCanvasElement.prototype.getContext = () => null;"
+    found = visit(browser, pages["scan"], viewer=False, before=blind)
+    found.page.locator(".loading", has_text="picture").wait_for()
+    assert found.page.locator(".still").is_visible()
+    assert "46" in found.page.locator("table.figures").first.inner_text()
+    found.page.context.close()
+
+
+def test_modes_bend_the_mean(browser, pages):
+    shape = visit(browser, pages["shape"])
+    before = shape.picture()
+    shape.page.locator("[data-mode='0']").fill("2")
+    bent = shape.picture()
+    assert differing(before, bent) > 0.05
+    assert shape.page.locator("output").first.inner_text() == "+2 SD"
+    shape.press("[data-mean]")
+    assert differing(before, shape.picture()) < 0.002
+    assert shape.complaints == []
+    shape.page.context.close()
+
+
+def test_pictures_zoom_together(browser, pages):
+    score = visit(browser, pages["score"], viewer=False)
+    score.page.locator(".zoomed img[style*=width]").nth(1).wait_for()
+    widths = [image.bounding_box()["width"] for image in score.page.locator(".zoomed img").all()]
+    score.page.locator(".zoomed").first.hover()
+    score.page.mouse.wheel(0, -300)
+    score.page.wait_for_timeout(200)
+    zoomed = [image.bounding_box()["width"] for image in score.page.locator(".zoomed img").all()]
+    assert all(after > 1.1 * before for before, after in zip(widths, zoomed, strict=True))
+    assert zoomed[0] == pytest.approx(zoomed[1])
+    score.press("[data-zoom=reset]")
+    score.page.wait_for_timeout(200)
+    assert score.page.locator(".zoomed img").first.bounding_box()["width"] == pytest.approx(widths[0], rel=0.01)
+    assert score.complaints == []
+    assert all(url == pages["score"].as_uri() or url.startswith("data:") for url in score.requests)
+    score.page.context.close()
