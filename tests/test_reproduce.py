@@ -18,7 +18,7 @@ from cuspid import storage
 from cuspid.cli import main
 from cuspid.errors import CuspidError, InputError
 from cuspid.reporting.reproduction_page import html, markdown
-from cuspid.studies.reproduction import camera_checks, mouth_checks
+from cuspid.studies.reproduction import camera_checks, mouth_checks, runs
 from cuspid.studies.reproduction.catalogue import BY_ID, ITEMS, TABLE_3_2
 from cuspid.studies.reproduction.judging import judge
 from cuspid.studies.reproduction.page import GENERATED, conditions, figure_text, make_page
@@ -325,10 +325,10 @@ def test_reduced_results_do_for_quick_alone_and_never_hide_full_ones(tmp_path):
 
 
 def test_quick_leaves_the_arch_out_and_takes_two_subjects():
-    runs = missing(ITEMS, {}, quick=True)
-    assert "prepared-arch" not in runs
-    assert len(runs["prepared-teeth"]) == 3
-    assert [name for name in runs if name.startswith("panorama")] == ["panorama-lower-14-0", "panorama-upper-14-0"]
+    wanted = missing(ITEMS, {}, quick=True)
+    assert "prepared-arch" not in wanted
+    assert len(wanted["prepared-teeth"]) == 3
+    assert [name for name in wanted if name.startswith("panorama")] == ["panorama-lower-14-0", "panorama-upper-14-0"]
     assert set(missing(ITEMS, {}, quick=False)) == set(RUNS)
 
 
@@ -377,6 +377,26 @@ def test_a_run_that_fails_is_named_and_left_to_be_tried_again(tmp_path):
     results = gather(tmp_path, None)
     assert set(results) == {"populations"}
     assert missing([BY_ID["fig-2.2"], BY_ID["fig-3.15"]], results, quick=True).keys() >= {"visibility"}
+
+
+def test_what_cannot_be_stitched_is_a_result_and_the_next_method_is_tried(tmp_path, monkeypatch):
+    def pretend(*arguments: str, log: Path) -> dict[str, float]:
+        if arguments[0] == "stitch" and "ortho" in arguments:
+            raise CuspidError("cuspid stitch failed with status 1: no frame could be placed")
+        if arguments[0] == "stitch-eval":
+            storage.write_json(Path(arguments[-1]) / "score.json", panorama("x")["score"])
+        return {"wall_s": 1.0, "cpu_s": 1.0, "peak_gib": 1.0}
+
+    monkeypatch.setattr(runs, "run_timed", pretend)
+    storage.write_json(tmp_path / "work" / "panorama-lower-14-0" / "jaw.json", {})
+    wanted = {"panorama-lower-14-0": ("panorama/lower-14-0-ortho", "panorama/lower-14-0-thesis")}
+    runs.run_one(run="panorama-lower-14-0", folder=tmp_path, wanted=wanted, quick=True)
+    found = gather(tmp_path, None)
+    assert "no frame could be placed" in found["panorama/lower-14-0-ortho"]["failure"]
+    assert found["panorama/lower-14-0-thesis"]["failure"] is None
+    least = finding("fig-4.4", found).comparisons
+    assert (least[0].ours, least[2].ours) == (0.0, 0.8)
+    assert "quick" not in found["panorama/lower-14-0-thesis"]
 
 
 def test_a_command_that_fails_is_told_with_its_last_words(tmp_path):

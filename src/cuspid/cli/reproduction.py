@@ -12,7 +12,7 @@ from rich.table import Table
 
 from cuspid import storage
 from cuspid.cli.shared import console, show_progress
-from cuspid.errors import InputError
+from cuspid.errors import CuspidError, InputError
 from cuspid.reporting.page import photo_uri
 from cuspid.reporting.reproduction_page import Page, html, markdown
 from cuspid.studies.reproduction.catalogue import BY_ID, ITEMS, Item
@@ -53,9 +53,10 @@ def reproduce(
         raise InputError(f"--images {images}: no such folder")
     found = gather(out, results)
     judge(found, items)  # What is broken is refused before hours of work.
+    failures: dict[str, str] = {}
     with storage.claimed_folder(out, "reproduce", {}, {}):
         if run:
-            _run(out, items, quick, workers, results)
+            failures = _run(out, missing(items, found, quick), quick, workers)
             found = gather(out, results)
         draw_pictures(out / "images", found)
         pictures = _pictures(out / "images", images)
@@ -64,6 +65,8 @@ def reproduce(
         storage.write_bytes(out / "reproduction.html", html(page, _embedded(page, out / "images", pictures)).encode())
     _print(page)
     console.print(f"{out / 'reproduction.html'}, {out / 'reproduction.md'}", highlight=False)
+    if failures:
+        raise CuspidError(f"reproduce: {', '.join(failures)} failed, as told above; the same command tries again")
 
 
 def asked_items(only: Sequence[str]) -> tuple[Item, ...]:
@@ -78,10 +81,9 @@ def asked_items(only: Sequence[str]) -> tuple[Item, ...]:
     return tuple(item for item in ITEMS if not only or item.id in only)
 
 
-def _run(out: Path, items: Sequence[Item], quick: bool, workers: int | None, results: Path | None) -> None:
-    wanted = missing(items, gather(out, results), quick)
+def _run(out: Path, wanted: Mapping[str, tuple[str, ...]], quick: bool, workers: int | None) -> dict[str, str]:
     if not wanted:
-        return
+        return {}
     console.print(f"to run: {', '.join(wanted)}", highlight=False)
     with show_progress() as progress:
         failures = run_missing(
@@ -89,6 +91,7 @@ def _run(out: Path, items: Sequence[Item], quick: bool, workers: int | None, res
         )
     for name, reason in failures.items():
         console.print(f"failed: {name}: {reason}", highlight=False)
+    return failures
 
 
 def _pictures(*folders: Path | None) -> dict[str, Path]:
