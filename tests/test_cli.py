@@ -30,7 +30,7 @@ def test_every_verb_has_help(capsys, verb):
     assert caught.value.code == 0
     printed = capsys.readouterr().out
     assert cli.COMMANDS[verb].__doc__.split(".")[0].split()[0] in printed
-    assert "--out" in printed
+    assert "--out" in printed or verb == "view"
 
 
 def test_what_is_no_jaw_is_refused_and_nothing_is_written(tmp_path, capsys):
@@ -110,6 +110,7 @@ def test_evaluate_works_on_meshes_that_cuspid_never_saw(tmp_path, capsys, jaw_li
     assert abs(trueness["scale_error_ppm"]) < 10
     assert trueness["inter_molar_error_um"] is None
     assert (tmp_path / "result" / "deviation.png").stat().st_size > 10_000
+    assert "mean absolute deviation" in (tmp_path / "result" / "report.html").read_text()
     assert "Trueness" in capsys.readouterr().out
 
 

@@ -19,15 +19,18 @@ import numpy as np
 from jaxtyping import Bool
 
 from cuspid import pipeline, storage
+from cuspid.capture import Capture
 from cuspid.errors import CuspidError, InputError, ReconstructionError
 from cuspid.evaluation.repeatability import PairOptions, Spread, compare_pair, spread
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
+from cuspid.pipeline import SimulationOptions
 from cuspid.rig import Handpiece
 from cuspid.simulation.scan_path import plan_scan_path
 from cuspid.studies.grid import Case, Outcome, Value, run_grid
 from cuspid.studies.trial import TrialOptions, run_trial
+from cuspid.trueness import GroundTruth
 
 TRUENESS = ("mean_abs_um", "signed_mean_um", "std_um", "p95_um", "complete_50_um_pct")
 """Figures of a scan of which the spread is reported."""
@@ -167,13 +170,9 @@ def scan_again(*, seed: int, folder: Path, options: RepeatOptions, trial: TrialO
     handpiece = storage.read_handpiece(folder / "handpiece.json")
     name = f"scan-{seed - trial.simulation.seed}"
     scratch = folder / "scans" / name
-    simulation = replace(trial.simulation, seed=seed if options.new_texture else trial.simulation.seed)
     try:
-        path = plan_scan_path(jaw, handpiece, simulation.path, np.random.default_rng([seed, 1]))
-        # The noise of an image follows the name of its frame, the texture the seed alone.
-        poses = {f"{name}-{frame}": pose for frame, pose in path.rig_from_world.items()}
         done = run_trial(
-            lambda out: pipeline.take_images(jaw, handpiece, poses, out, simulation),
+            lambda out: shoot_again(jaw, handpiece, out, options, trial.simulation, seed=seed),
             scratch,
             trial,
             start_from_truth=True,
@@ -184,6 +183,17 @@ def scan_again(*, seed: int, folder: Path, options: RepeatOptions, trial: TrialO
     _keep(folder, name, done.mesh, done.trueness.reference_from_scan, done.trueness.deviation_um, done.scannable)
     shutil.rmtree(scratch)
     return dict(done.figures)
+
+
+def shoot_again(
+    jaw: Jaw, handpiece: Handpiece, folder: Path, options: RepeatOptions, simulation: SimulationOptions, *, seed: int
+) -> tuple[Capture, GroundTruth]:
+    """The images of one scan: the hand and the noise of this seed, the texture of the first one unless it is new."""
+    path = plan_scan_path(jaw, handpiece, simulation.path, np.random.default_rng([seed, 1]))
+    # The noise of an image follows the name of its frame, the texture the seed alone.
+    poses = {f"{seed:03d}-{frame}": pose for frame, pose in path.rig_from_world.items()}
+    render = simulation if not options.new_texture else replace(simulation, seed=seed)
+    return pipeline.take_images(jaw, handpiece, poses, folder, render)
 
 
 def _keep(
