@@ -18,7 +18,7 @@ from cuspid import storage
 from cuspid.cli import main
 from cuspid.errors import CuspidError, InputError
 from cuspid.reporting.reproduction_page import html, markdown
-from cuspid.studies.reproduction import camera_checks, mouth_checks, runs
+from cuspid.studies.reproduction import camera_checks, camera_findings, mouth_checks, runs
 from cuspid.studies.reproduction.catalogue import BY_ID, ITEMS, TABLE_3_2
 from cuspid.studies.reproduction.judging import judge
 from cuspid.studies.reproduction.page import GENERATED, conditions, figure_text, make_page
@@ -236,7 +236,11 @@ def test_the_printed_numbers_of_chapter_2_come_out_as_the_errata_say():
 def test_a_smaller_baseline_is_less_precise_by_the_bound():
     found = camera_checks.baseline_bound()
     assert found["rms_1_mm_um"] > 2 * found["rms_2.5_mm_um"] > found["rms_4_mm_um"] > 0
-    assert not found["smaller_is_more_accurate"]
+    results = {"thesis_checks": {"baseline_bound": found}}
+    rows = camera_findings._BASELINE_ROWS
+    assert rows[0](results).verdict == "differs"
+    turned = dict(zip(found, reversed(found.values()), strict=True))
+    assert rows[0]({"thesis_checks": {"baseline_bound": turned}}).verdict == "reproduced"
 
 
 # --- The page ---------------------------------------------------------------------------------------------------------

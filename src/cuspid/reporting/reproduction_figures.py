@@ -52,22 +52,25 @@ def save_ssim_picture(
     title: str,
 ) -> None:
     """PNG: SSIM of each subject by each method, the thesis' limit, and what a grey outline scores (a line each)."""
-    figure = new_figure(9.0, 4.2, dpi=100)
-    axes = figure.add_axes((0.08, 0.2, 0.89, 0.66))
+    figure = new_figure(9.0, 4.6, dpi=100)
+    axes = figure.add_axes((0.08, 0.19, 0.89, 0.61))
     places, width = np.arange(len(subjects)), 0.8 / max(len(methods), 1)
     for number, (name, values) in enumerate(methods):
         at = places - 0.4 + (number + 0.5) * width
-        heights = [np.nan if value is None else value for value in values]
-        axes.bar(at, heights, 0.92 * width, color=(_OURS, "#d98e32", "#7a6fb0")[number % 3], label=name)
+        heights = np.array([np.nan if value is None else value for value in values])
+        colour = (_OURS, "#d98e32", "#7a6fb0")[number % 3]
+        axes.bar(at, heights, 0.92 * width, color=colour, label=name)
+        axes.plot(at[heights == 0], np.full((heights == 0).sum(), 0.03), "x", color=colour, markersize=9)
     for place, value in zip(places, grey, strict=True):
         if value is not None:
             axes.plot([place - 0.45, place + 0.45], [value, value], color=_INK, linewidth=1.4)
     axes.plot([], [], color=_INK, linewidth=1.4, label="constant grey in the outline of the jaw")
     axes.axhline(0.70, color="#b3261e", linestyle="--", linewidth=1.2, label="the thesis: more than 0.70")
+    axes.plot([], [], "x", color=_INK, markersize=8, label="failed")
     axes.set_ylim(0, 1)
     axes.set_ylabel("SSIM, whole canvas", color=_INK)
-    axes.set_xticks(places, subjects, rotation=25, ha="right", fontsize=9, color=_INK)
+    axes.set_xticks(places, subjects, rotation=20, ha="right", fontsize=9, color=_INK)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8.5, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 0.99))
-    figure.text(0.02, 0.965, title, fontsize=13, color=_INK, va="center", fontweight="bold")
+    axes.legend(frameon=False, fontsize=9, ncols=3, loc="lower left", bbox_to_anchor=(-0.02, 1.0))
+    figure.text(0.02, 0.955, title, fontsize=13, color=_INK, va="center", fontweight="bold")
     save_figure(figure, path)

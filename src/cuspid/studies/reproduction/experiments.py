@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
+from itertools import product
 from types import MappingProxyType
 
 import cv2
@@ -32,7 +33,8 @@ from cuspid.stitching.examination import ExaminationOptions, examine
 from cuspid.stitching.normal_map import LIGHT, grey_normal_map, normal_map, rectify
 from cuspid.stitching.shading import ShadingOptions, shape_from_shading
 from cuspid.stitching.warps import Points, WarpOptions, find_points, link
-from cuspid.studies.camera_pair import CameraPairOptions, Matcher, study_camera_pair
+from cuspid.studies.camera_pair import MATCHING, CameraPairOptions, Matcher, study_camera_pair
+from cuspid.studies.reproduction.camera_checks import BASELINES_MM
 from cuspid.studies.reproduction.findings import Check, Figures
 
 EDGE_MM = 0.4
@@ -53,6 +55,20 @@ def occlusion() -> Figures:
             row = _pair_row(baseline, angle, distance, matcher)
             figures[f"{name}_{matcher}_noise_growth"] = float(row["noise_growth"] or 0)
             figures[f"{name}_seen_pct"] = float(row["seen_pct"] or 0)
+    return figures
+
+
+def baseline_terms() -> Figures:
+    """Section 3.4, the terms apart, for a parallel pair 5 mm over the second molar, by its baseline: the bound with
+    constant noise, what both cameras see, how matching grows noisier, and what is expected of it all, for windows that
+    turn with the surface (slanted) and windows that do not (upright)."""
+    figures: Figures = {}
+    for baseline, matcher in product(BASELINES_MM, MATCHING):
+        row, end = _pair_row(baseline, 0.0, 5.0, matcher), f"{baseline:g}_mm"
+        figures[f"bound_{end}_um"] = float(row["bound_rms_um"] or 0)
+        figures[f"seen_{end}_pct"] = float(row["seen_pct"] or 0)
+        figures[f"{matcher}_noise_growth_{end}"] = float(row["noise_growth"] or 0)
+        figures[f"{matcher}_expected_{end}_um"] = float(row["expected_rms_um"] or 0)
     return figures
 
 
@@ -220,6 +236,7 @@ def normals() -> Figures:
 CHECKS: Mapping[str, Check] = MappingProxyType(
     {
         "occlusion": occlusion,
+        "baseline_terms": baseline_terms,
         "surfaces": surfaces,
         "designs": designs,
         "box_sizes": box_sizes,

@@ -100,10 +100,16 @@ def of_check(results: Results, check: str, *names: str, **fields: Any) -> Compar
 
 
 def vanishes(
-    results: Results, check: str, name: str, quantity: str, unit: str = "", limit: float = EXACT
+    results: Results,
+    check: str,
+    name: str,
+    quantity: str,
+    unit: str = "",
+    limit: float = EXACT,
+    printed: str = "the formula",
 ) -> Comparison:
     """A residual that should vanish."""
-    return of_check(results, check, name, quantity=quantity, unit=unit, printed="the formula", rule=AtMost(limit=limit))
+    return of_check(results, check, name, quantity=quantity, unit=unit, printed=printed, rule=AtMost(limit=limit))
 
 
 def only(*rows: Callable[[Results], Comparison], notes: tuple[str, ...] = ()) -> Finder:
@@ -112,12 +118,14 @@ def only(*rows: Callable[[Results], Comparison], notes: tuple[str, ...] = ()) ->
 
 
 def vanishing(
-    check: str, name: str, quantity: str, unit: str = "", limit: float = EXACT
+    check: str, name: str, quantity: str, unit: str = "", limit: float = EXACT, printed: str = "the formula"
 ) -> Callable[[Results], Comparison]:
-    return lambda results: vanishes(results, check, name, quantity, unit, limit)
+    """A row with a residual that should vanish."""
+    return lambda results: vanishes(results, check, name, quantity, unit, limit, printed)
 
 
 def counted(check: str, name: str, quantity: str, thesis: float, unit: str = "") -> Callable[[Results], Comparison]:
+    """A row with a number that should be the same."""
     return lambda results: of_check(
         results,
         check,

@@ -132,7 +132,7 @@ def _eq_2_2(item: Item, results: Results) -> Finding:
     )
     model = "{:.1f} deg is the angle of our model: the ramus goes from condyle to gonion, below the occlusal plane."
     notes = (model.format(results[CHECKED]["ramus_angle"]["model_deg"]),) if CHECKED in results else ()
-    return Finding(item=item, comparisons=(same,), notes=notes)
+    return Finding(item=item, comparisons=(same,), notes=("Printed as a sine, meant as its inverse.", *notes))
 
 
 def _eq_2_3(item: Item, results: Results) -> Finding:
