@@ -37,8 +37,9 @@ class GuidedOptions:
     """A frame is matched with those so many frames later."""
     tolerances_px: tuple[float, ...] = (8.0, 4.0, 4.0)
     """Largest distance of a match from the epipolar line in each round."""
-    depth_share: float = 0.28
-    """A point's depth is looked for within this share of the depth that its neighbours have."""
+    depth_shares: tuple[float, ...] = (0.28, 0.12, 0.06)
+    """A point's depth is looked for within this share of the depth that its neighbours have, in each round: along edges
+    there are keypoints enough to match a wrong one farther off."""
     matching: MatchingOptions = field(default_factory=lambda: MatchingOptions(ratio=0.8, similarity=0.85))
     """What else counts as a match."""
     minimum_views: int = 4
@@ -112,10 +113,10 @@ def refine(
     The scale is free and changes. Raises ReconstructionError where too little is consistent.
     """
     model = _rescaled(model)
-    for number, tolerance_px in enumerate(options.tolerances_px):
+    for number, (tolerance_px, share) in enumerate(zip(options.tolerances_px, options.depth_shares, strict=True)):
         views = [make_view(each, _camera(model)) for each in features]
         matching = replace(options.matching, tolerance_px=tolerance_px)
-        track, image_of = _tracks(model, views, matching, options)
+        track, image_of = _tracks(model, views, matching, share, options.steps)
         limit_px = options.start_px / (1 if number == 0 else 2)
         found = _triangulated(model, features, views, track, image_of, limit_px, options)
         model = _rescaled(adjust(found, replace(options.adjustment, start_px=limit_px)))
@@ -149,14 +150,14 @@ def _bounds(
 
 
 def _tracks(
-    model: Reconstruction, views: Sequence[View], matching: MatchingOptions, options: GuidedOptions
+    model: Reconstruction, views: Sequence[View], matching: MatchingOptions, share: float, steps: Sequence[int]
 ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
     """Track and frame of every keypoint of all frames, one after the other."""
     poses = list(model.rig_from_world.values())
     sizes = np.array([len(view.features) for view in views])
     starts = np.concatenate([[0], np.cumsum(sizes)])
-    bounds = [_bounds(model, index, view.features, options.depth_share) for index, view in enumerate(views)]
-    pairs = [(i, i + step) for step in options.steps for i in range(len(views) - step)]
+    bounds = [_bounds(model, index, view.features, share) for index, view in enumerate(views)]
+    pairs = [(i, i + step) for step in steps for i in range(len(views) - step)]
 
     def match(pair: tuple[int, int]) -> Int[np.ndarray, "k 2"]:
         one, other = pair

@@ -50,11 +50,11 @@ _WINDOW = 15
 class SingleOptions:
     """How the way of one camera is found."""
 
-    features: FeatureOptions = field(default_factory=lambda: FeatureOptions(count=2500, contrast=0.002, edge=30.0))
+    features: FeatureOptions = field(default_factory=lambda: FeatureOptions(count=2500, contrast=0.004, edge=30.0))
     """Keypoints of the contrast-normalised frames; plain enamel needs a low threshold."""
-    clahe_clip: float = 4.0
+    clahe_clip: float = 1.5
     """Clip limit of the contrast normalisation (CLAHE)."""
-    clahe_tiles: int = 8
+    clahe_tiles: int = 4
     """Tiles of the contrast normalisation along each side."""
     matching: MatchingOptions = field(default_factory=lambda: MatchingOptions(ratio=0.85))
     """First matching, when nothing is known of the motion."""
