@@ -1,0 +1,380 @@
+"""What pages hold: numbers that survive packing, honest simplification, what is missing, and nothing from outside."""
+
+import base64
+import gzip
+import json
+import re
+import shutil
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cuspid import cli, storage
+from cuspid.errors import InputError, MissingDependencyError
+from cuspid.mesh import Mesh
+from cuspid.panorama import FrameUse, Panorama
+from cuspid.reporting import live_view
+from cuspid.reporting.page import LARGEST_PAGE_BYTES, flat_settings, number, packed, script_json, signed
+from cuspid.reporting.report import report_page
+from cuspid.reporting.scan_page import ReportOptions, histogram, worst_places
+from cuspid.reporting.scene import RANGES_UM, camera_lines, fitting_range_um
+from cuspid.reporting.shown_mesh import UM_PER_STEP, UNKNOWN, pack_deviation, pack_mesh, simplified
+from cuspid.reporting.study_page import heading
+from report_folders import (
+    BUMP_UM,
+    FRAMES,
+    TOOTH,
+    looking_down,
+    scanned_tooth,
+    tooth_alone,
+    write_evaluation,
+    write_scan,
+    write_score,
+    write_shape,
+)
+
+
+def unpacked(value: dict[str, str]) -> np.ndarray:
+    """What the viewer makes of it."""
+    kinds = {"Float32Array": "<f4", "Uint32Array": "<u4", "Uint16Array": "<u2", "Int16Array": "<i2", "Uint8Array": "u1"}
+    return np.frombuffer(gzip.decompress(base64.b64decode(value["data"])), kinds[value["type"]])
+
+
+def scene_of(page: str) -> dict:
+    return json.loads(re.search(r'<script type="application/json" id="scene">(.*?)</script>', page, re.DOTALL)[1])
+
+
+@pytest.fixture
+def scan_folder(tmp_path, coarse_phantom):
+    write_scan(tmp_path / "scan", coarse_phantom)
+    return tmp_path / "scan"
+
+
+def refused(capsys, *arguments: object) -> str:
+    with pytest.raises(SystemExit) as caught:
+        cli.main([str(argument) for argument in arguments])
+    assert caught.value.code == 1
+    [line] = [line for line in capsys.readouterr().err.splitlines() if line.startswith("cuspid: ")]
+    return line
+
+
+# --- packing ----------------------------------------------------------------------------------------------------------
+
+
+@given(st.lists(st.floats(-3000, 3000), min_size=1))
+def test_deviations_survive_to_half_a_step(values):
+    given_um = np.array([*values, np.nan])
+    found = unpacked(pack_deviation(given_um))
+    assert found[-1] == UNKNOWN
+    assert np.abs(UM_PER_STEP * found[:-1] - given_um[:-1]).max() <= 0.5001 * UM_PER_STEP
+
+
+def test_what_is_off_the_scale_is_clipped_and_not_taken_for_unknown():
+    assert list(unpacked(pack_deviation(np.array([-1e6, 1e6])))) == [UNKNOWN + 1, 32767]
+
+
+def test_a_jaw_survives_to_a_micrometre(coarse_phantom):
+    mesh = coarse_phantom.mesh
+    layer = pack_mesh(mesh)
+    vertices = layer["origin"] + layer["step"] * unpacked(layer["vertices"]).reshape(-1, 3)
+    assert 0 < np.abs(vertices - mesh.vertices).max() < 1e-3
+    assert np.array_equal(unpacked(layer["faces"]).reshape(-1, 3), mesh.faces)
+
+
+def test_text_cannot_end_the_script_that_holds_it():
+    text = str(script_json({"name": "</script><b>\u2028"}))
+    assert "<" not in text
+    assert json.loads(text) == {"name": "</script><b>\u2028"}
+
+
+@given(st.floats(-1e7, 1e7))
+def test_numbers_read_back(value):
+    for written in (number(value, 2), signed(value, 2)):
+        assert float(written.replace("\u202f", "").replace("−", "-")) == pytest.approx(value, abs=0.0051)
+    assert signed(value, 2)[0] in "+−"
+    assert not re.fullmatch(r"−0\.0+", number(value, 2))
+
+
+def test_settings_are_flat():
+    assert flat_settings({"a": {"b": 1, "c": None}, "d": "x"}) == [("a.b", "1"), ("a.c", "–"), ("d", "x")]
+
+
+# --- simplification ---------------------------------------------------------------------------------------------------
+
+
+def test_a_simplified_surface_is_near_and_carries_its_values(coarse_phantom):
+    mesh = coarse_phantom.mesh
+    shown = simplified(mesh, 8000)
+    assert 7000 < len(shown.mesh.faces) <= 8000
+    assert shown.full_faces == len(mesh.faces)
+    distances, _, _ = mesh.closest(shown.mesh.vertices)
+    assert shown.off_um == pytest.approx(1000 * np.percentile(distances, 95))
+    assert 0 < shown.off_um < 60
+    height = shown.carried(mesh.vertices[:, 2])
+    assert np.abs(height - shown.mesh.vertices[:, 2]).max() < 1.0
+
+
+def test_a_small_surface_is_left_as_it_is(coarse_phantom):
+    shown = simplified(coarse_phantom.mesh, len(coarse_phantom.mesh.faces))
+    assert shown.mesh is coarse_phantom.mesh
+    assert shown.off_um == 0
+
+
+# --- what is measured on the surface ----------------------------------------------------------------------------------
+
+
+def test_the_worst_place_is_the_bump(coarse_phantom):
+    scan, deviation_um, top = scanned_tooth(coarse_phantom)
+    found = worst_places(scan, deviation_um, coarse_phantom, 5)
+    places = list(found)
+    assert places[0].name == str(TOOTH)
+    assert np.linalg.norm(np.array(places[0].position_mm) - scan.vertices[top]) < 0.1
+    assert BUMP_UM - 3 < found[places[0]] < BUMP_UM + 3
+    apart = np.linalg.norm(np.diff([place.position_mm for place in places], axis=0), axis=1)
+    assert apart.min() >= 1.0
+    assert np.all(np.diff(np.abs(list(found.values()))) <= 0)
+
+
+def test_the_worst_of_few_are_few():
+    mesh = Mesh(np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]), np.array([[0, 1, 2]]))
+    assert len(worst_places(mesh, np.array([1.0, np.nan, 2.0]), None, 8)) == 1
+    assert worst_places(mesh, np.full(3, np.nan), None, 8) == {}
+
+
+@given(range_um=st.sampled_from(RANGES_UM))
+def test_the_histogram_is_by_area(range_um):
+    """Two triangles, one of nine times the area of the other."""
+    vertices = np.array([[0, 0, 0], [3, 0, 0], [0, 3, 0], [10, 0, 0], [11, 0, 0], [10, 1, 0]], dtype=float)
+    mesh = Mesh(vertices, np.array([[0, 1, 2], [3, 4, 5]]))
+    found = histogram(mesh, np.array([2.0, 2, 2, 1e4, 1e4, 1e4]), range_um)
+    assert found["above_pct"] == pytest.approx(10)
+    assert found["below_pct"] == 0
+    assert sum(bar["height"] > 0 for bar in found["bars"]) == 1
+
+
+@given(st.floats(0.01, 300))
+def test_the_range_holds_the_95th_percentile_and_is_not_wasteful(p95_um):
+    found = fitting_range_um(p95_um)
+    assert found in RANGES_UM
+    assert found >= 2.5 * p95_um
+    assert found == RANGES_UM[0] or found < 2.5 * 2.5 * p95_um + 1e-9
+
+
+def test_cameras_point_at_what_they_see(scan_folder, coarse_phantom):
+    rig = storage.read_reconstruction(scan_folder / "motion").rig
+    lines = camera_lines(rig, {"0": looking_down(coarse_phantom, 0.0)}).reshape(2, 8, 2, 3)
+    eyes, ends = lines[:, 0, 0], lines[:, :4, 1]
+    assert np.linalg.norm(eyes[0] - eyes[1]) == pytest.approx(2.0)
+    assert np.all(ends[..., 2] < eyes[:, None, 2]), "they look down"
+
+
+# --- pages ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_page_of_a_scan(scan_folder):
+    page = report_page(storage.read_result(scan_folder))
+    assert len(page) < LARGEST_PAGE_BYTES
+    assert f"Scan of tooth {TOOTH}" in page
+    assert "Not in this report" not in page
+    assert "&lt;script&gt;notes are text" in page
+    assert "frame 00002: too few points" in page
+    for known in ("reconstruct: images", "b" * 64, "evaluation.samples", "simulate: simulation.seed"):
+        assert known in page
+    scene = scene_of(page)
+    assert [layer["name"] for layer in scene["layers"]] == ["scan", "reference", "cameras", "path"]
+    assert scene["layers"][2]["frames"] == list(FRAMES[:2])
+    assert [place["name"] for place in scene["teeth"]] == [str(TOOTH)]
+
+
+def test_nothing_comes_from_outside(scan_folder):
+    """No address but those of data; what three.js names for itself is not fetched (the tests in Chromium tell)."""
+    page = report_page(storage.read_result(scan_folder))
+    without_scripts = re.sub(r"<script>.*?</script>", "", page, flags=re.DOTALL)
+    assert not re.search(r"https?://", without_scripts)
+    assert all(address.startswith("data:") for address in re.findall(r'(?:src|href)="([^"]*)"', without_scripts))
+    assert "default-src 'none'" in page
+
+
+def test_the_shown_surface_lies_on_the_reference(scan_folder, coarse_phantom):
+    """The frame of the page is that of the reference, whatever that of the scan."""
+    layer = scene_of(report_page(storage.read_result(scan_folder)))["layers"][0]
+    shown = layer["origin"] + layer["step"] * unpacked(layer["vertices"]).reshape(-1, 3)
+    distances, _, _ = coarse_phantom.mesh.closest(shown)
+    assert 0.05 < distances.max() < 0.2, "the bump, and no more"
+    assert np.abs(UM_PER_STEP * unpacked(layer["values"])).max() == pytest.approx(BUMP_UM, abs=3)
+
+
+def test_a_large_surface_is_simplified_and_the_page_says_so(scan_folder):
+    page = report_page(storage.read_result(scan_folder), ReportOptions(most_faces=500, most_reference_faces=2000))
+    full = len(storage.read_mesh(scan_folder / "deviation.ply").faces)
+    assert f"of its {full:,}".replace(",", "\u202f") + " faces" in page
+    layers = scene_of(page)["layers"]
+    assert 400 < len(unpacked(layers[0]["faces"])) / 3 <= 500
+    assert 1900 < len(unpacked(layers[1]["faces"])) / 3 <= 2000
+
+
+def test_what_a_folder_lacks_is_said(scan_folder):
+    shutil.rmtree(scan_folder / "motion")
+    shutil.rmtree(scan_folder / "truth")
+    shutil.rmtree(scan_folder / "capture")
+    page = report_page(storage.read_result(scan_folder))
+    for missing in ("the reference", "where the cameras were", "the images"):
+        assert f"<li>{missing}" in page
+    (scan_folder / "trueness.json").unlink()
+    page = report_page(storage.read_result(scan_folder))
+    assert "run cuspid evaluate" in page
+    assert "not evaluated" in page
+    assert scene_of(page)["layers"][0]["values"] is None
+
+
+def test_a_scan_before_its_evaluation_is_seen_from_where_its_cameras_were(scan_folder):
+    shutil.move(scan_folder / "deviation.ply", scan_folder / "mesh.ply")
+    (scan_folder / "trueness.json").unlink()
+    layer = scene_of(report_page(storage.read_result(scan_folder)))["layers"][0]
+    vertices = layer["origin"] + layer["step"] * unpacked(layer["vertices"]).reshape(-1, 3)
+    normals = Mesh(vertices, unpacked(layer["faces"]).reshape(-1, 3).astype(int)).vertex_normals
+    assert normals[:, 2].mean() > 0.2
+
+
+def test_an_evaluation_needs_the_reference_that_it_had(tmp_path, coarse_phantom, capsys):
+    folder = tmp_path / "result"
+    write_evaluation(folder, coarse_phantom)
+    storage.write_mesh(tmp_path / "reference.stl", coarse_phantom.mesh)
+    assert "not the reference" in refused(capsys, "report", folder, "--reference", tmp_path / "reference.stl")
+    run = storage.read_json(folder / "run.json")
+    run["evaluate"]["inputs_sha256"]["reference"] = storage.hash_file(tmp_path / "reference.stl")
+    storage.write_json(folder / "run.json", run)
+    cli.main(["report", str(folder), "--reference", str(tmp_path / "reference.stl"), "--out", str(tmp_path / "x.html")])
+    assert "reference" in [layer["name"] for layer in scene_of((tmp_path / "x.html").read_text())["layers"]]
+
+
+def test_a_folder_with_nothing_to_report(tmp_path, capsys, scan_folder):
+    assert "no such folder" in refused(capsys, "report", tmp_path / "missing")
+    (tmp_path / "empty").mkdir()
+    assert "nothing to report" in refused(capsys, "report", tmp_path / "empty")
+    storage.claim_folder(tmp_path / "images", "simulate", {}, {})
+    assert "it holds simulate alone" in refused(capsys, "report", tmp_path / "images")
+    storage.claim_folder(tmp_path / "killed", "reconstruct", {}, {})
+    assert "goes on where it stopped" in refused(capsys, "report", tmp_path / "killed")
+    (scan_folder / "trueness.json").write_text("{")
+    assert "not valid JSON" in refused(capsys, "report", scan_folder)
+    assert "--most-faces" in refused(capsys, "report", scan_folder, "--most-faces", 3)
+    assert not list(tmp_path.glob("**/report.html"))
+
+
+def test_the_page_of_a_shape_model(tmp_path, coarse_phantom):
+    write_shape(tmp_path / "shape", tooth_alone(coarse_phantom))
+    scene = scene_of(report_page(storage.read_result(tmp_path / "shape")))
+    [mode] = scene["modes"]
+    field = mode["step"] * unpacked(mode["field"]).reshape(-1, 3)
+    assert np.sqrt(np.mean(np.sum(field**2, axis=1))) == pytest.approx(1.5, rel=1e-3), "one SD of 1.5 mm"
+
+
+def test_the_pages_of_a_panorama_and_its_score(tmp_path):
+    image = np.zeros((30, 40, 3), dtype=np.uint8)
+    image[5:20, 5:30] = 200
+    covered = image.any(axis=2)
+    frames = (FrameUse(name="00000", used=True, inliers=50), FrameUse(name="00001", used=False, reason="too blurred"))
+    panorama = Panorama(
+        image=image,
+        covered=covered,
+        frame_index=np.where(covered, 0, -1).astype(np.int16),
+        frame_pixel=np.full((30, 40, 2), np.nan, dtype=np.float32),
+        frames=frames,
+        method="ortho",
+        origin_px=np.zeros(2),
+        mm_per_px=0.05,
+        notes=("the scale is a guess",),
+    )
+    storage.claim_folder(tmp_path / "pano", "stitch", {}, {})
+    storage.write_panorama(tmp_path / "pano", panorama)
+    page = report_page(storage.read_result(tmp_path / "pano"))
+    for known in ("too blurred", "the scale is a guess", "1 of 2 frames", "2.0 × 1.5"):
+        assert known in page
+    write_score(tmp_path / "score")
+    page = report_page(storage.read_result(tmp_path / "score"))
+    assert page.count('class="zoomed"') == 2
+    assert "seen from a height" not in page, "there is no such picture in this folder"
+    (tmp_path / "score" / "made.png").unlink()
+    assert "run cuspid stitch-eval again" in report_page(storage.read_result(tmp_path / "score"))
+
+
+def test_a_study_that_was_killed_shows_what_is_done(tmp_path):
+    storage.claim_folder(tmp_path, "sweep", {"options": {"surface": "occlusal"}}, {})
+    with pytest.raises(InputError, match="no case of the study is done"):
+        report_page(storage.read_result(tmp_path))
+    for number_of_case, failure in enumerate([None, "too dark"]):
+        entry = {"parameters": {"baseline_mm": 1.0 + number_of_case}, "figures": {"points": 5}, "failure": failure}
+        storage.write_json(tmp_path / "cases" / f"case-{number_of_case}.json", entry)
+    page = report_page(storage.read_result(tmp_path))
+    assert "sweep.json: 2 cases are done" in page
+    assert "too dark" in page
+    assert "baseline, mm" in page
+
+
+def test_the_page_of_a_sweep(tmp_path):
+    rows = [{"case": f"{k}", "baseline_mm": float(k), "points": 100 + k, "failure": None} for k in range(3)]
+    storage.claim_folder(tmp_path, "sweep", {}, {})
+    storage.write_table(tmp_path / "results.csv", rows)
+    best = {"term": "points", "setting": [2.0, 3.0], "value": 102.0, "seeds": 1, "noise": None, "level": [[1.0, 3.0]]}
+    thesis = {"setting": [2.5, 0.0], "points": 99.0}
+    summary = {"surface": "occlusal", "tooth": 47, "direction": "across", "best": {"points": best}, "thesis": thesis}
+    storage.write_json(tmp_path / "sweep.json", summary)
+    page = report_page(storage.read_result(tmp_path))
+    for known in ("most points", "2 mm, 3°", "1 mm, 3°", "2.5 mm, 0°", "3 cases"):
+        assert known in page
+
+
+@pytest.mark.parametrize(
+    ("column", "told"),
+    [("baseline_mm", "baseline, mm"), ("complete_50_um_pct", "complete 50 µm, %"), ("case", "case"), ("mm", "mm")],
+)
+def test_headings(column, told):
+    assert heading(column) == told
+
+
+# --- the files behind them --------------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_values_of_vertices_are_read_as_they_were_written(tmp_path_factory, seed):
+    rng = np.random.default_rng(seed)
+    vertices, values = rng.normal(size=(20, 3)).astype(np.float32).astype(float), rng.normal(size=20)
+    values[3] = np.nan
+    path = tmp_path_factory.mktemp("mesh") / "mesh.ply"
+    storage.write_mesh(path, Mesh(vertices, rng.permutation(20)[:18].reshape(6, 3)), values={"deviation_um": values})
+    mesh, found = storage.read_vertex_values(path)
+    order = [int(np.argmin(np.linalg.norm(vertices - vertex, axis=1))) for vertex in mesh.vertices]
+    np.testing.assert_allclose(found["deviation_um"], values[order], rtol=1e-6)
+
+
+def test_an_array_is_packed_with_its_type():
+    assert packed(np.arange(3, dtype=np.uint16))["type"] == "Uint16Array"
+    assert list(unpacked(packed(np.arange(3, dtype=np.uint16)))) == [0, 1, 2]
+
+
+# --- the live view ----------------------------------------------------------------------------------------------------
+
+
+def test_the_live_view_starts_and_stops(scan_folder):
+    pytest.importorskip("viser", reason="viser is not installed: pip install 'cuspid[view]'")
+    from urllib.request import urlopen
+
+    server = live_view.serve(storage.read_result(scan_folder), "127.0.0.1", 18080)
+    try:
+        with urlopen(f"http://127.0.0.1:{server.get_port()}", timeout=20) as answer:
+            assert answer.status == 200
+    finally:
+        server.stop()
+
+
+def test_what_cannot_be_viewed(tmp_path, monkeypatch, capsys, scan_folder):
+    write_score(tmp_path / "score")
+    assert "nothing to view in 3-D" in refused(capsys, "view", tmp_path / "score")
+    assert "--port" in refused(capsys, "view", scan_folder, "--port", 0)
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(MissingDependencyError, match=r"cuspid\[view\]"):
+        live_view.serve(storage.read_result(scan_folder), "127.0.0.1", 18081)
