@@ -19,6 +19,8 @@ from documents import ROOT, Block, blocks, commands, mentions, pages, words
 
 RUN = ["tutorial.md", *(f"how-to/{path.name}" for path in sorted((ROOT / "docs/how-to").glob("*.md")))]
 """Pages whose commands run, each page in a folder of its own, in their order."""
+WHOLE = ["mouth.md", "optics.md"]
+"""Further pages whose Python needs nothing that is not on the page, and no more than seconds."""
 SHELL = ("sh", "bash", "console")
 NOT_PYTHON = ("", "sh", "bash", "console", "toml", "json", "text", "math", "{toctree}")
 
@@ -103,9 +105,11 @@ def test_the_commands_of_a_page_run(page, tmp_path, monkeypatch, phantom_file, w
 
 
 def follow(block: Block) -> list[str]:
-    """Do what a block says: run its commands, or write the file of that name that it shows."""
+    """Do what a block says: run its commands or its Python, or write the brief that it shows."""
     if block.language == "toml":
         Path("brief.toml").write_text(block.text)
+    if block.language == "python":
+        execute(block)
     if block.language not in SHELL or not block.run:
         return []
     for line in block.lines():
@@ -120,6 +124,18 @@ def run(line: str) -> None:
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, env={**os.environ, "PATH": path})
     assert done.returncode == 0, f"{line}: {done.stderr}"
+
+
+def execute(block: Block) -> None:
+    exec(compile(block.text, block.place, "exec"), {"__name__": "page"})
+
+
+@pytest.mark.parametrize("page", WHOLE)
+def test_python_that_is_whole_runs(page):
+    found = [block for block in blocks(ROOT / "docs" / page) if block.language == "python"]
+    assert found
+    for block in found:
+        execute(block)
 
 
 @pytest.mark.parametrize("page", pages(), ids=name)
@@ -154,7 +170,6 @@ def test_the_command_line_has_a_page_for_every_verb(monkeypatch):
     for verb, command in cli.COMMANDS.items():
         text = found[f"{verb}.rst"]
         assert f".. program:: cuspid {verb}" in text
-        assert ".. option:: --out" in text
         assert all(argument in text.replace("-", "_") for argument in own_options(command)), verb
     assert ".. program:: cuspid prepare crown" in found["prepare.rst"]
     assert ".. option:: --taper-deg FLOAT" in found["prepare.rst"]

@@ -12,7 +12,9 @@ if TYPE_CHECKING:
 
 KEPT = re.compile(r"(``.+?``|:\w+:`[^`]+`)")
 MARKUP = re.compile(r"([\\*`|]|(?<=\w)_(?!\w))")
-LETTERED = re.compile(r"\s+\([a-z]\) ")
+LETTERED = re.compile(r"^( +\([a-z]\) )", re.MULTILINE)
+DRAWING = re.compile(r"(?<=\n\n)((?: {4}.*(?:\n  .*)*(?:\n+|\Z))+)")
+"""Paragraphs that are indented as a whole stay as they are drawn."""
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
@@ -32,17 +34,10 @@ def _sign(app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: 
 
 
 def _process(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    paragraphs = "\n".join(lines).split("\n\n")
-    lines[:] = "\n\n".join(_drawing(each) if what == "module" else _text(each) for each in paragraphs).split("\n")
+    text = "\n".join(lines)
+    parts = DRAWING.split(text) if what == "module" else [text]
+    lines[:] = "".join(f"::\n\n{part}" if k % 2 else _text(part) for k, part in enumerate(parts)).split("\n")
 
 
-def _drawing(paragraph: str) -> str:
-    """A paragraph that is indented as a whole stays as it is drawn."""
-    if paragraph.startswith("    ") and all(line.startswith("  ") for line in paragraph.rstrip().split("\n")):
-        return f"::\n\n{paragraph}"
-    return _text(paragraph)
-
-
-def _text(paragraph: str) -> str:
-    lines = [f"\n{line}" if LETTERED.match(line) else line for line in escaped(paragraph).split("\n")]
-    return "\n".join(lines)
+def _text(text: str) -> str:
+    return LETTERED.sub(r"\n\1", escaped(text))
