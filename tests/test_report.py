@@ -330,7 +330,12 @@ def test_the_page_of_a_sweep(tmp_path):
 
 @pytest.mark.parametrize(
     ("column", "told"),
-    [("baseline_mm", "baseline, mm"), ("complete_50_um_pct", "complete 50 µm, %"), ("case", "case"), ("mm", "mm")],
+    [
+        ("baseline_mm", "baseline, mm"),
+        ("complete_50_um_pct", "complete 50 µm, %"),
+        ("case", "case"),
+        ("tooth_p95_um", "tooth P95, µm"),
+    ],
 )
 def test_headings(column, told):
     assert heading(column) == told

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.errors import InputError
+from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.reporting.figures import FigureOptions, deviation_colors, render
 from cuspid.reporting.page import jpeg_uri, number, picture_uri, provenance, render_page, script_json, signed
@@ -23,6 +24,7 @@ Table = dict[str, Any]
 Tile = tuple[str, str, str]
 
 _UNITS = {"um": "µm", "mm": "mm", "pct": "%", "deg": "°", "s": "s", "ppm": "ppm", "mb": "MB", "mm2": "mm²", "px": "px"}
+_WORDS = {"std": "SD", "rms": "RMS", "p95": "P95", "um": "µm"}
 _TITLES = {
     "sweep": "Baseline and angle of a pair",
     "compare": "Handpieces compared",
@@ -54,8 +56,9 @@ def study_page(result: StudyResult) -> str:
     )
 
 
-def _view(surface: Mesh, values: Mapping[str, Float[np.ndarray, "v"]]) -> dict[str, Any]:
+def _view(reference: Jaw, values: Mapping[str, Float[np.ndarray, "v"]]) -> dict[str, Any]:
     """The reference with the mean deviation and with its spread, one at a time."""
+    surface = reference.mesh
     faces = faces_around(surface, np.isfinite(values["sd_um"]))
     part, keep = surface.submesh(faces), np.unique(surface.faces[faces])
     shown = simplified(part, _MOST_FACES)
@@ -71,7 +74,7 @@ def _view(surface: Mesh, values: Mapping[str, Float[np.ndarray, "v"]]) -> dict[s
     range_um = fitting_range_um(float(np.nanpercentile(np.abs(carried["mean"]), 95)))
     colors = deviation_colors(carried["mean"], FigureOptions(range_um=range_um, tolerance_um=range_um / 4))
     still = render(Mesh(shown.mesh.vertices, shown.mesh.faces, colors), width_px=900, supersampling=1)
-    views = standard_views(None)
+    views = standard_views(reference.arch)
     scene = {"layers": layers, "colors": color_table(), "range": range_um, "unit": "µm", "per_step": UM_PER_STEP}
     return {
         "scene": script_json({**scene, "views": views, "teeth": [], "worst": []}),
@@ -90,9 +93,10 @@ def _view(surface: Mesh, values: Mapping[str, Float[np.ndarray, "v"]]) -> dict[s
 def heading(column: str) -> str:
     """The name of a column for people: words, and the unit at the end."""
     *words, last = column.split("_")
-    if last in _UNITS and words:
-        return f"{' '.join(words)}, {_UNITS[last]}".replace(" um", " µm")
-    return column.replace("_", " ")
+    if last not in _UNITS or not words:
+        return column.replace("_", " ")
+    told = " ".join(_WORDS.get(word, word) for word in words).replace("mean abs", "mean |d|")
+    return f"{told}, {_UNITS[last]}"
 
 
 def _all_rows(rows: Sequence[Mapping[str, str]]) -> Table | None:

@@ -89,7 +89,7 @@ class StudyResult(_Result):
     """What was found: the JSON file with the name of the verb."""
     rows: Sequence[Mapping[str, str]]
     """``results.csv``, or what stands in ``cases/`` so far."""
-    surface: Mesh | None = None
+    surface: Jaw | None = None
     """The reference of ``repeat``."""
     values: Mapping[str, Float[np.ndarray, "v"]] = field(default_factory=dict)
     """What is known at its vertices: ``mean_deviation_um`` and ``sd_um``."""
@@ -252,8 +252,7 @@ def _read_study(folder: Path, run: Mapping[str, Any]) -> StudyResult:
     missing = []
     if summary is None:
         missing.append(f"{file}: {len(rows)} cases are done; give the same cuspid {verb} command again to go on")
-    known = folder / "repeat.ply"
-    surface, values = read_vertex_values(known) if verb == "repeat" and known.exists() else (None, {})
+    surface, values = _repeated(folder) if verb == "repeat" else (None, {})
     return StudyResult(
         surface=surface,
         values=values,
@@ -265,6 +264,15 @@ def _read_study(folder: Path, run: Mapping[str, Any]) -> StudyResult:
         missing=tuple(missing),
         pictures=_pictures(folder, captions),
     )
+
+
+def _repeated(folder: Path) -> tuple[Jaw | None, dict[str, Float[np.ndarray, "v"]]]:
+    """The reference of repeated scans, and what is known at its vertices."""
+    if not (folder / "repeat.ply").exists():
+        return None, {}
+    mesh, values = read_vertex_values(folder / "repeat.ply")
+    scanned = _optional_json(folder / "reference.json")
+    return Jaw(mesh=mesh, arch=None if scanned is None else scanned["arch"]), values
 
 
 def _rows(folder: Path) -> list[Mapping[str, str]]:

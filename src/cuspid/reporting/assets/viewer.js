@@ -11,7 +11,6 @@
   const canvas = find("canvas");
   const still = find(".still");
   const UNKNOWN = -32768;
-  const PLAIN = [0.87, 0.84, 0.78];
   const ACCENT = 0xd9480f;
 
   // --- reading -------------------------------------------------------------------------------------------------------
@@ -88,9 +87,8 @@
     return line;
   }
 
-  const table = (await unpack(scene.colors)).map((value) => value);
-  const bar = Array.from(table, (value) => linear(value / 255));
-  const last = table.length / 3 - 1;
+  const bar = Array.from(await unpack(scene.colors), (value) => linear(value / 255));
+  const last = bar.length / 3 - 1;
 
   function paint(object) {
     const { values, color } = object.userData;
@@ -115,7 +113,7 @@
     if (!dirty) return;
     dirty = false;
     renderer.render(world, camera);
-    placeTeeth();
+    placeOverlays();
     showLength();
     clearTimeout(snapshotTimer);
     snapshotTimer = setTimeout(snapshot, 400);
@@ -212,14 +210,12 @@
     root.scrollIntoView({ behavior: "instant", block: "start" });
   }
 
-  const marker = new THREE.Mesh(new THREE.SphereGeometry(1, 24, 12), new THREE.MeshBasicMaterial({ color: ACCENT, wireframe: true, transparent: true, opacity: 0.35 }));
-  marker.visible = false;
-  marker.scale.setScalar(0.25);
-  world.add(marker);
+  // A ring around a place, over all that hides it.
+  let marked = null;
 
   function mark(position) {
-    marker.visible = position !== null;
-    if (position) marker.position.copy(position);
+    marked = position;
+    find(".ring").hidden = !position;
     change();
   }
 
@@ -235,13 +231,15 @@
   });
   find(".teeth").hidden = true;
 
-  function placeTeeth() {
-    if (find(".teeth").hidden) return;
-    for (const [label, position] of labels) {
-      const at = position.clone().project(camera);
-      label.style.left = `${50 + 50 * at.x}%`;
-      label.style.top = `${50 - 50 * at.y}%`;
-    }
+  function place(element, position) {
+    const at = position.clone().project(camera);
+    element.style.left = `${50 + 50 * at.x}%`;
+    element.style.top = `${50 - 50 * at.y}%`;
+  }
+
+  function placeOverlays() {
+    if (!find(".teeth").hidden) labels.forEach(([label, position]) => place(label, position));
+    if (marked) place(find(".ring"), marked);
   }
 
   function showLength() {
