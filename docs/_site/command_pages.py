@@ -77,8 +77,9 @@ def _described(program: str, parser: argparse.ArgumentParser, underline: str = "
 
 
 def _group(group: Any, actions: list[argparse.Action], underline: str) -> Iterator[str]:
-    if group.title not in ("positional arguments", "options"):
-        yield heading(_title(group), underline)
+    title = _title(group)
+    if title:
+        yield heading(title, underline)
     for action in actions:
         text, remark = _help(action)
         default = f" *({escaped(remark)})*" if remark else ""
@@ -88,8 +89,8 @@ def _group(group: Any, actions: list[argparse.Action], underline: str) -> Iterat
 def _title(group: Any) -> str:
     """What a group of options is about, and the prefix that they share where it has one."""
     prefix = group.title.removesuffix(" options")
-    about = (group.description or prefix).strip().rstrip(".").replace("``", "")
     shared = all("".join(action.option_strings).startswith(f"--{prefix}.") for action in group._group_actions)
+    about = (group.description or (prefix if shared else "")).strip().rstrip(".").replace("``", "")
     return f"{about} (--{prefix}.…)" if shared else about
 
 
