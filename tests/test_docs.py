@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from cuspid import cli
+from cuspid import cli, storage
 from documents import ROOT, Block, blocks, commands, mentions, pages, words
 
 RUN = ["tutorial.md", *(f"how-to/{path.name}" for path in sorted((ROOT / "docs/how-to").glob("*.md")))]
@@ -156,6 +156,15 @@ def check_imports(block: Block) -> None:
             for alias in node.names:
                 there = hasattr(module, alias.name) or importlib.util.find_spec(f"{node.module}.{alias.name}")
                 assert there, f"{block.place}: {node.module} has no {alias.name}"
+
+
+def test_the_calibration_on_a_page_can_be_read(tmp_path):
+    page = ROOT / "docs/how-to/bring-your-own-rig.md"
+    (shown,) = (block.text for block in blocks(page) if block.language == "json")
+    (tmp_path / "handpiece.json").write_text(shown)
+    rig = storage.read_handpiece(tmp_path / "handpiece.json").rig
+    assert rig.stereo_pairs(6.0) == (("left", "right"),)
+    assert 0.7 < rig.overlap("left", "right", 6.0) < 0.8
 
 
 def test_every_verb_is_documented():
