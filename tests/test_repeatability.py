@@ -103,6 +103,7 @@ def test_systematic_and_random_parts_are_told_apart():
     assert found.bias_rms_um == pytest.approx(np.sqrt(np.mean(systematic**2)), rel=0.15)
     assert found.repeatability_limit_um == pytest.approx(2.8 * found.repeatability_sd_um)
     assert found.common_pct > 97
+    assert 0.5 * noise_um < found.median_sd_um < found.repeatability_sd_um
     assert np.nanmax(np.abs(found.mean_um)) < 3 * (bias_um + noise_um)
 
 
@@ -200,7 +201,11 @@ def test_the_report_of_repeated_scans(tmp_path):
             "scans": 2,
             "trueness": {"mean_abs_um": figures},
             "precision": {"mean_abs_um": figures},
-            "spread": {"repeatability_sd_um": found.repeatability_sd_um, "bias_rms_um": found.bias_rms_um},
+            "spread": {
+                "repeatability_sd_um": found.repeatability_sd_um,
+                "median_sd_um": found.median_sd_um,
+                "bias_rms_um": found.bias_rms_um,
+            },
             "pairs": [pair],
             "failures": {},
         },

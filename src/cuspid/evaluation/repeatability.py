@@ -69,6 +69,8 @@ class Spread:
     """How many."""
     repeatability_sd_um: float
     """s_r: root mean square of the standard deviation over the surface."""
+    median_sd_um: float
+    """Standard deviation at the median place: a few rough places, which rule s_r, hardly change it."""
     bias_rms_um: float
     """Root mean square of the systematic part over the surface; 0 where it drowns in the random one."""
     common_pct: float
@@ -139,6 +141,7 @@ def spread(
         sd_um=np.sqrt(_at_vertices(sds**2, corners, len(reference.vertices))),
         scans=len(scans),
         repeatability_sd_um=float(np.sqrt(random)),
+        median_sd_um=float(np.median(sds)),
         bias_rms_um=float(np.sqrt(max(0.0, np.mean(means**2) - random / len(scans)))),
         common_pct=float(100 * on_all.mean()),
     )

@@ -129,6 +129,7 @@ def _lead(verb: str, summary: Mapping[str, Any], cases: int, failed: int) -> lis
             ("trueness: mean |d|, mean of the scans", number(trueness["mean_abs_um"]["mean"], 2), "µm"),
             ("precision: mean |d|, mean of all pairs", number(precision["mean_abs_um"]["mean"], 2), "µm"),
             ("repeatability SD at a point", number(summary["spread"]["repeatability_sd_um"], 2), "µm"),
+            ("the same at the median point", number(summary["spread"]["median_sd_um"], 2), "µm"),
             ("systematic part at a point, RMS", number(summary["spread"]["bias_rms_um"], 2), "µm"),
         ]
     if verb == "sweep" and summary:

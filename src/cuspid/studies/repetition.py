@@ -99,6 +99,7 @@ def _spread_summary(found: Spread) -> dict[str, float]:
     return {
         "repeatability_sd_um": found.repeatability_sd_um,
         "repeatability_limit_um": found.repeatability_limit_um,
+        "median_sd_um": found.median_sd_um,
         "bias_rms_um": found.bias_rms_um,
         "common_pct": found.common_pct,
     }
