@@ -110,8 +110,8 @@ def test_a_simplified_surface_is_near_and_carries_its_values(coarse_phantom):
     shown = simplified(mesh, 8000)
     assert 7000 < len(shown.mesh.faces) <= 8000
     assert shown.full_faces == len(mesh.faces)
-    distances, _, _ = mesh.closest(shown.mesh.vertices)
-    assert shown.off_um == pytest.approx(1000 * np.percentile(distances, 95))
+    distances, _, _ = shown.mesh.closest(mesh.vertices)
+    assert shown.off_um == pytest.approx(1000 * np.percentile(distances, 95), rel=0.05)
     assert 0 < shown.off_um < 60
     height = shown.carried(mesh.vertices[:, 2])
     assert np.abs(height - shown.mesh.vertices[:, 2]).max() < 1.0

@@ -119,7 +119,7 @@ def _print(summary: Mapping[str, Any]) -> None:
     found = summary["spread"]
     console.print(
         f"at a place of the reference: repeatability SD {found['repeatability_sd_um']:.2f} µm (limit "
-        f"{found['repeatability_limit_um']:.2f} µm; at the median place {found['median_sd_um']:.2f} µm), systematic part "
-        f"{found['bias_rms_um']:.2f} µm RMS; on {found['common_pct']:.1f} % of what could be seen",
+        f"{found['repeatability_limit_um']:.2f} µm; at the median place {found['median_sd_um']:.2f} µm), "
+        f"systematic part {found['bias_rms_um']:.2f} µm RMS; on {found['common_pct']:.1f} % of what could be seen",
         highlight=False,
     )
