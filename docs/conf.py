@@ -16,7 +16,6 @@ author = "the cuspid authors"
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
-    "sphinx.ext.napoleon",
     "sphinx_copybutton",
     "_site.command_pages",
     "_site.module_pages",
@@ -52,5 +51,3 @@ add_module_names = False
 toc_object_entries = False
 
 copybutton_exclude = ".linenos, .gp, .go, .c1"
-
-suppress_warnings = ["ref.python"]  # Words of shapes and fields, as `cameras`, that several classes use.

@@ -34,9 +34,18 @@ def _sign(app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: 
 
 
 def _process(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    text = "\n".join(lines)
+    text = "\n".join(_with_fields(lines))
     parts = DRAWING.split(text) if what == "module" else [text]
     lines[:] = "".join(f"::\n\n{part}" if k % 2 else _text(part) for k, part in enumerate(parts)).split("\n")
+
+
+def _with_fields(lines: list[str]) -> list[str]:
+    """A section "Args:" as fields. Not left to napoleon as a whole, which takes "Surface: matt" of a field for a type."""
+    if "Args:" not in lines:
+        return lines
+    from sphinx.ext.napoleon import GoogleDocstring
+
+    return list(GoogleDocstring(lines, what="function").lines())
 
 
 def _text(text: str) -> str:

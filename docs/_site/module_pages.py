@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from _site.writing import heading, listed, write_pages
 
 if TYPE_CHECKING:
+    from docutils import nodes
     from sphinx.application import Sphinx
 
 SOURCE = Path(__file__).parents[2] / "src"
@@ -21,7 +22,14 @@ GROUND_FLOOR = "cuspid"
 
 def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("builder-inited", lambda app: write_pages(Path(app.srcdir) / "api", pages()))
+    app.connect("doctree-read", _take_names_exactly)
     return {"parallel_read_safe": True}
+
+
+def _take_names_exactly(app: Sphinx, page: nodes.document) -> None:
+    """Types are named in full. Sphinx would also look for each word of a shape, as ``n``, in all names that end so."""
+    for name in page.findall(lambda node: getattr(node, "attributes", {}).get("refspecific") is False):
+        del name["refspecific"]
 
 
 def pages() -> dict[str, str]:
