@@ -40,7 +40,7 @@ def _process(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: l
 
 
 def _with_fields(lines: list[str]) -> list[str]:
-    """A section "Args:" as fields. Not left to napoleon as a whole, which takes "Surface: matt" of a field for a type."""
+    """A section "Args:" as fields. Not left to napoleon as a whole, which takes "Surface: matt" for a field's type."""
     if "Args:" not in lines:
         return lines
     from sphinx.ext.napoleon import GoogleDocstring
