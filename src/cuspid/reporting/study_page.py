@@ -82,7 +82,12 @@ def _view(reference: Jaw, values: Mapping[str, Float[np.ndarray, "v"]]) -> dict[
         "toggles": [(layer["name"], layer["label"], layer["visible"]) for layer in layers],
         "views": [each["name"] for each in views],
         "shown": [
-            {"name": "reference", "full": shown.full_faces, "shown": len(shown.mesh.faces), "off_um": shown.off_um}
+            {
+                "name": "scanned part of the reference",
+                "full": shown.full_faces,
+                "shown": len(shown.mesh.faces),
+                "off_um": shown.off_um,
+            }
         ],
         "gradient": css_gradient(),
         "range_um": range_um,
