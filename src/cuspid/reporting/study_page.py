@@ -71,6 +71,7 @@ def _view(reference: Jaw, values: Mapping[str, Float[np.ndarray, "v"]]) -> dict[
         }
         for name, (label, _) in maps.items()
     ]
+    size = {"full": shown.full_faces, "shown": len(shown.mesh.faces), "off_um": shown.off_um}
     range_um = fitting_range_um(float(np.nanpercentile(np.abs(carried["mean"]), 95)))
     colors = deviation_colors(carried["mean"], FigureOptions(range_um=range_um, tolerance_um=range_um / 4))
     still = render(Mesh(shown.mesh.vertices, shown.mesh.faces, colors), width_px=900, supersampling=1)
@@ -81,14 +82,7 @@ def _view(reference: Jaw, values: Mapping[str, Float[np.ndarray, "v"]]) -> dict[
         "still": jpeg_uri(still.image),
         "toggles": [(layer["name"], layer["label"], layer["visible"]) for layer in layers],
         "views": [each["name"] for each in views],
-        "shown": [
-            {
-                "name": "scanned part of the reference",
-                "full": shown.full_faces,
-                "shown": len(shown.mesh.faces),
-                "off_um": shown.off_um,
-            }
-        ],
+        "shown": [{"name": "scanned part of the reference", **size}],
         "gradient": css_gradient(),
         "range_um": range_um,
         "ranges_um": RANGES_UM,
