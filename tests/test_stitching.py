@@ -28,6 +28,7 @@ from cuspid.rig import MountedCamera, Rig
 from cuspid.sequence import Sequence
 from cuspid.simulation.scan_path import arch_curve
 from cuspid.stitching.exposure import ExposureOptions, Samples, balance
+from cuspid.stitching.mosaic import unlit
 from cuspid.stitching.ortho import Stitched
 from cuspid.stitching.seams import SeamOptions, choose
 from cuspid.stitching.surface import ScaleOptions, SurfaceOptions, height_map, in_occlusal_frame
@@ -343,3 +344,12 @@ def test_the_height_map_follows_the_points_and_is_known_everywhere() -> None:
     assert np.isfinite(surface.heights).all()
     heights = surface.at(np.array([[top[:2], gum[:2]]])).ravel()
     np.testing.assert_allclose(heights, [top[2], gum[2]], atol=0.7)
+
+
+def test_the_dark_beyond_the_jaw_is_nothing_but_a_dark_fissure_is_kept() -> None:
+    image = np.full((200, 200, 3), 120, np.uint8)
+    image[:, 100:] = 2
+    image[95:101, :80] = 0
+    dark = unlit(image)
+    assert dark[:, 106:].all()
+    assert not dark[:, :97].any()

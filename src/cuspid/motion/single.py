@@ -23,10 +23,12 @@ from jaxtyping import Float, Int, UInt8
 from cuspid.camera import Camera
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
+from cuspid.motion.adjustment import adjust
 from cuspid.motion.colmap import quiet, rigid_from_colmap
 from cuspid.motion.features import FeatureOptions, Features, Progress, detect
 from cuspid.motion.guided import GuidedOptions, refine
 from cuspid.motion.pairs import MatchingOptions, match_unguided
+from cuspid.motion.patches import PatchOptions, lengthen
 from cuspid.panorama import FrameUse
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
@@ -62,6 +64,8 @@ class SingleOptions:
     """A frame is matched with those so many frames later."""
     guided: GuidedOptions = field(default_factory=GuidedOptions)
     """How the mapper's poses are refined."""
+    patches: PatchOptions = field(default_factory=PatchOptions)
+    """How points are followed into more frames at the end."""
     focal_share: float = 0.03
     """Without a calibration: standard deviation of the mapper's focal length, as a share (0 to 1) of it."""
     bridge_steps: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 8, 10)
@@ -456,20 +460,33 @@ def locate_single(
         raise ReconstructionError(_why_nothing(sequence, kept, features, ties))
     parts = _join_all([_model_of(model) for model in models], options.minimum_matches)
     first = _camera_of(models[0].cameras[1], sequence.camera, options)
-    refined = [
-        refine(
-            _reconstruction(part, first, names, features),
-            [features[index] for index in sorted(part.poses)],
-            options.guided,
-            progress=progress,
-        )
-        for part in parts
-    ]
+    refined = [_refined(part, first, sequence, features, options, progress) for part in parts]
     return SingleMotion(
         parts=tuple(refined),
         frames=_uses(names, refused, refined, ties),
         notes=_notes(refined[0].rig[CAMERA].camera, calibrated, refined),
     )
+
+
+def _refined(
+    part: _Model,
+    camera: Camera,
+    sequence: Sequence,
+    features: Mapping[int, Features],
+    options: SingleOptions,
+    progress: Progress | None,
+) -> Reconstruction:
+    """A part with its poses made precise: by keypoints, then by patches too."""
+    own = [features[index] for index in sorted(part.poses)]
+    start = _reconstruction(part, camera, sequence.names, features)
+    by_keypoints = refine(start, own, options.guided, progress=progress)
+    number = {name: index for index, name in enumerate(sequence.names)}
+
+    def read(name: str) -> UInt8[np.ndarray, "h w"]:
+        return normalise_contrast(sequence.image(number[name]), options)
+
+    longer = lengthen(by_keypoints, read, options.patches, progress=progress)
+    return adjust(longer, options.guided.adjustment)
 
 
 def _notes(camera: Camera, calibrated: bool, parts: List[Reconstruction]) -> tuple[str, ...]:

@@ -34,6 +34,9 @@ _GRID_PX = 12
 """Spacing in px of the places that are projected exactly; between them the map is bilinear."""
 _MARGIN_MM = 4.0
 """The canvas reaches so far beyond the points of the motion."""
+_UNLIT, _UNLIT_PX = 8, 25
+"""What is darker than the first (grey level of the largest channel) over a width of the second, in px of the panorama,
+shows nothing: the depth of the mouth behind the teeth."""
 BURNT, DARK = 245, 20
 """Grey levels (largest and smallest channel) beyond which a pixel says nothing of brightness."""
 
@@ -373,14 +376,21 @@ def _render(
             _put(bands, canvas, view, surface, px, read(name), chosen, light, index, options)
             frame_pixel[view.window][chosen] = px[chosen]
         progress("mosaic", index + 1, len(names))
-    seen = frame >= 0
     image = np.clip(np.rint(bands.image()), 0, 255).astype(np.uint8)
-    image[~seen] = 0
+    nothing = (frame < 0) | unlit(image)
+    image[nothing], frame[nothing], frame_pixel[nothing] = 0, -1, np.nan
     whole = View(views[0].camera, views[0].cam_from_world, 0, 0, canvas.width, canvas.height)
     heights = cv2.resize(positions(canvas, whole, surface, CELL_PX)[..., 2].astype(np.float32), shape[::-1])
     return Mosaic(
         canvas=canvas, image=image, frame=frame, frame_pixel=frame_pixel, height_mm=heights, overlaps=overlaps
     )
+
+
+def unlit(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
+    """Where no light came back: dark places wider than `_UNLIT_PX`, so not the fissures and the gaps between teeth."""
+    dark = (cv2.blur(image, (5, 5)).max(axis=-1) < _UNLIT).astype(np.uint8)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_UNLIT_PX, _UNLIT_PX))
+    return np.asarray(cv2.morphologyEx(dark, cv2.MORPH_OPEN, disc) > 0)
 
 
 def _put(

@@ -1,0 +1,254 @@
+"""Tracks of one camera, followed into the frames where no keypoint of theirs was found, by aligning patches.
+
+Keypoints of plain enamel come and go: a track of them is short and its places are uncertain by about a pixel, and so an
+arch bends. Once the poses are known, the patch around each point, from the frame that has it nearest to the middle of
+the picture, is laid over all frames around where it should be seen, and shifted until it fits (Lucas and Kanade 1981,
+with the template's gradients, Baker and Matthews 2004; gain and offset are free).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple, no_type_check
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+from numba import njit
+
+from cuspid.camera import OPENCV_PIXEL_OFFSET
+from cuspid.motion.features import Progress
+from cuspid.reconstruction import Reconstruction, Tracks
+
+_LEAST_CONTRAST = 0.5
+"""Standard deviation of the grey levels of a patch, below which it says nothing."""
+_STILL_PX = 0.01
+"""The alignment ends when a step is shorter."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatchOptions:
+    """Which patches are followed, and what counts as found."""
+
+    radius_px: int = 7
+    """Half the width of a patch."""
+    blur_px: float = 1.0
+    """Standard deviation of the Gaussian filter before."""
+    reach: int = 12
+    """A patch is looked for so many frames before and after its own."""
+    turn_deg: float = 40.0
+    """Not in frames that look at it from a direction that differs by more."""
+    limit_px: float = 3.0
+    """Farthest from where it should be."""
+    correlation: float = 0.85
+    """Least correlation (-1 to 1) of the patch with where it is found."""
+    iterations: int = 15
+    """Most steps of an alignment."""
+    minimum_views: int = 4
+    """Points that are found in fewer frames are left as they were."""
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+@no_type_check
+def _at(image, x, y):
+    """Bilinear; NaN outside."""
+    height, width = image.shape
+    if not (0 <= x < width - 1 and 0 <= y < height - 1):
+        return np.nan
+    i, j = int(x), int(y)
+    a, b = x - i, y - j
+    top = (1 - a) * image[j, i] + a * image[j, i + 1]
+    return (1 - b) * top + b * ((1 - a) * image[j + 1, i] + a * image[j + 1, i + 1])
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _template(image, x, y, radius, levels, slopes):
+    """Fill in the levels of a patch less their mean, and their slopes; their standard deviation, NaN at the border."""
+    k = 0
+    for dy in range(-radius, radius + 1):
+        for dx in range(-radius, radius + 1):
+            u, v = x + dx, y + dy
+            levels[k] = _at(image, u, v)
+            slopes[k, 0] = (_at(image, u + 1, v) - _at(image, u - 1, v)) / 2
+            slopes[k, 1] = (_at(image, u, v + 1) - _at(image, u, v - 1)) / 2
+            k += 1
+    levels -= levels.mean()
+    return np.sqrt((levels**2).mean()) + 0 * slopes.sum()
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _aligned(template, image, here, there, warps, radius, limit, iterations, shifts, correlations):
+    """Fill in for every patch its shift from where it should be, and the correlation there; NaN where it is lost."""
+    count = (2 * radius + 1) ** 2
+    levels, slopes, found = np.empty(count), np.empty((count, 2)), np.empty(count)
+    for n in range(len(here)):
+        shifts[n] = 0.0
+        correlations[n] = np.nan
+        spread = _template(template, here[n, 0], here[n, 1], radius, levels, slopes)
+        if not spread > _LEAST_CONTRAST:
+            continue
+        warp = warps[n]
+        slopes_there = slopes @ np.linalg.inv(warp)
+        square = slopes_there.T @ slopes_there
+        determinant = square[0, 0] * square[1, 1] - square[0, 1] ** 2
+        if determinant <= 1e-6 * (square[0, 0] + square[1, 1]) ** 2:
+            continue
+        x, y = there[n, 0], there[n, 1]
+        for _ in range(iterations):
+            k = 0
+            for dy in range(-radius, radius + 1):
+                for dx in range(-radius, radius + 1):
+                    found[k] = _at(image, x + warp[0, 0] * dx + warp[0, 1] * dy, y + warp[1, 0] * dx + warp[1, 1] * dy)
+                    k += 1
+            found -= found.mean()
+            power, common = (found**2).sum(), (found * levels).sum()
+            correlations[n] = common / (np.sqrt(power * count) * spread + 1e-9)
+            off = slopes_there.T @ (levels - common / (power + 1e-9) * found)
+            step_x = (square[1, 1] * off[0] - square[0, 1] * off[1]) / determinant
+            step_y = (square[0, 0] * off[1] - square[0, 1] * off[0]) / determinant
+            x, y = x + step_x, y + step_y
+            if not (x - there[n, 0]) ** 2 + (y - there[n, 1]) ** 2 <= limit**2:
+                correlations[n] = np.nan
+                break
+            if step_x**2 + step_y**2 < _STILL_PX**2:
+                break
+        shifts[n, 0], shifts[n, 1] = x - there[n, 0], y - there[n, 1]
+
+
+def align_patches(
+    template: Float32[np.ndarray, "h w"],
+    image: Float32[np.ndarray, "h w"],
+    here_px: Float[np.ndarray, "n 2"],
+    there_px: Float[np.ndarray, "n 2"],
+    warps: Float[np.ndarray, "n 2 2"],
+    options: PatchOptions,
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
+    """Where patches of one picture are in another, px, and their correlation there (NaN where they are not found).
+
+    ``warps`` take an offset from the middle of a patch to the one in the other picture; ``there_px`` is where to start.
+    """
+    shifts, correlations = np.empty_like(there_px), np.empty(len(here_px))
+    starts = [np.ascontiguousarray(px - OPENCV_PIXEL_OFFSET) for px in (here_px, there_px)]
+    _aligned(
+        *(template, image, *starts, np.ascontiguousarray(warps), options.radius_px),
+        *(options.limit_px, options.iterations, shifts, correlations),
+    )
+    return there_px + shifts, correlations
+
+
+class _Poses(NamedTuple):
+    """The poses as arrays."""
+
+    rotations: np.ndarray
+    shifts: np.ndarray
+
+    @staticmethod
+    def of(model: Reconstruction) -> _Poses:
+        """``cam_from_world`` of all frames."""
+        poses = list(model.rig_from_world.values())
+        return _Poses(np.stack([pose.rotation for pose in poses]), np.array([pose.translation for pose in poses]))
+
+    def inside(self, frame: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Points in the camera of a frame."""
+        return points @ self.rotations[frame].T + self.shifts[frame]
+
+    def directions(self, frame: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Unit vectors from points to the camera."""
+        towards = -self.rotations[frame].T @ self.shifts[frame] - points
+        return np.asarray(towards / np.linalg.norm(towards, axis=1, keepdims=True))
+
+
+def lengthen(
+    model: Reconstruction,
+    read: Callable[[str], UInt8[np.ndarray, "h w"]],
+    options: PatchOptions,
+    *,
+    progress: Progress | None = None,
+) -> Reconstruction:
+    """The model of one camera with a second track for each point whose patch was found in enough frames.
+
+    ``read`` gives the picture of a frame by its name; only those within reach are held at a time.
+    """
+    own = _own_observations(model)
+    tracks, names = model.known_tracks, model.frames
+    poses, pictures = _Poses.of(model), dict[int, np.ndarray]()
+    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for frame in range(len(names)):
+            near = range(max(0, frame - options.reach), min(len(names), frame + options.reach + 1))
+            kept = {other: pictures[other] for other in near if other in pictures}
+            pictures = kept | {n: _smooth(read(names[n]), options.blur_px) for n in near if n not in kept}
+            mine = np.flatnonzero(tracks.frame_index[own] == frame)
+            follow = partial(_follow, model, poses, pictures, frame, mine, own[mine], options)
+            found += [
+                (mine, np.full(len(mine), frame), tracks.pixels[own[mine]]),
+                *pool.map(follow, [other for other in near if other != frame]),
+            ]
+            if progress is not None:
+                progress("patches", frame + 1, len(names))
+    point, seen_in, pixels = (np.concatenate(each) for each in zip(*found, strict=True))
+    return replace(model, tracks=_with_second(tracks, point, seen_in, pixels, options))
+
+
+def _own_observations(model: Reconstruction) -> Int[np.ndarray, "p"]:
+    """The observation of each point that is nearest to the middle of its frame."""
+    tracks, camera = model.known_tracks, model.rig[model.rig.names[0]].camera
+    off = np.linalg.norm(tracks.pixels - np.array([camera.width, camera.height]) / 2, axis=1)
+    order = np.lexsort((off, tracks.point_index))
+    return np.asarray(order[np.unique(tracks.point_index[order], return_index=True)[1]])
+
+
+def _smooth(picture: UInt8[np.ndarray, "h w"], sigma_px: float) -> Float32[np.ndarray, "h w"]:
+    return np.asarray(cv2.GaussianBlur(picture.astype(np.float32), (0, 0), sigma_px))
+
+
+def _follow(
+    model: Reconstruction,
+    poses: _Poses,
+    pictures: Mapping[int, np.ndarray],
+    here: int,
+    mine: Int[np.ndarray, "k"],
+    observations: Int[np.ndarray, "k"],
+    options: PatchOptions,
+    there: int,
+) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"], Float[np.ndarray, "m 2"]]:
+    """Of the points ``mine`` of one frame those found in another: points, frames, pixels."""
+    camera, points = model.rig[model.rig.names[0]].camera, model.known_tracks.points[mine]
+    turn = np.sum(poses.directions(here, points) * poses.directions(there, points), axis=1)
+    depth = poses.inside(here, points)[:, 2]
+    expected = camera.project(poses.inside(there, points))
+    seen = camera.contains(expected, 2.0 * options.radius_px) & (turn > np.cos(np.deg2rad(options.turn_deg)))
+    points, mine, expected = points[seen], mine[seen], expected[seen]
+    step = (depth[seen] / float(np.mean(camera.focal_px)))[:, None]
+    beside = [camera.project(poses.inside(there, points + poses.rotations[here][axis] * step)) for axis in (0, 1)]
+    warps = np.stack([each - expected for each in beside], axis=-1)
+    own_px = model.known_tracks.pixels[observations[seen]]
+    pixels, correlation = align_patches(pictures[here], pictures[there], own_px, expected, warps, options)
+    good = correlation > options.correlation
+    return mine[good], np.full(int(good.sum()), there), pixels[good]
+
+
+def _with_second(
+    tracks: Tracks,
+    point: Int[np.ndarray, "m"],
+    frame: Int[np.ndarray, "m"],
+    pixels: Float[np.ndarray, "m 2"],
+    options: PatchOptions,
+) -> Tracks:
+    """The tracks, and behind them those of the patches."""
+    enough = np.bincount(point, minlength=len(tracks.points))[point] >= options.minimum_views
+    kept, number = np.unique(point[enough], return_inverse=True)
+    return Tracks(
+        points=np.concatenate([tracks.points, tracks.points[kept]]),
+        colors=np.concatenate([tracks.colors, tracks.colors[kept]]),
+        point_index=np.concatenate([tracks.point_index, len(tracks.points) + number]),
+        frame_index=np.concatenate([tracks.frame_index, frame[enough]]),
+        camera_index=np.concatenate([tracks.camera_index, np.zeros(int(enough.sum()), np.int64)]),
+        pixels=np.concatenate([tracks.pixels, pixels[enough]]),
+    )

@@ -1,0 +1,111 @@
+"""Laws of the patches: what was truly moved is found where it went, and a lost patch says so."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from cuspid.camera import Camera
+from cuspid.geometry import Rigid3
+from cuspid.motion.patches import PatchOptions, align_patches, lengthen
+from cuspid.reconstruction import Reconstruction, Tracks
+from cuspid.rig import MountedCamera, Rig
+
+
+def wall(seed: int = 0, size: int = 400) -> np.ndarray:
+    """A smooth random texture, 0 to 255."""
+    noise = cv2.GaussianBlur(np.random.default_rng(seed).random((size, size)).astype(np.float32), (0, 0), 2.5)
+    return np.asarray(255 * (noise - noise.min()) / np.ptp(noise), dtype=np.float32)
+
+
+CENTRES = np.array([[x, y] for x in (150.0, 200.3, 251.7) for y in (150.0, 204.4, 247.2)])
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    shift=st.tuples(st.floats(-1.2, 1.2), st.floats(-1.2, 1.2)),
+    turn_deg=st.floats(-10, 10),
+    scale=st.floats(0.9, 1.1),
+    gain=st.floats(0.5, 1.0),
+)
+def test_a_patch_is_found_where_it_went(shift: tuple[float, float], turn_deg: float, scale: float, gain: float) -> None:
+    picture, angle = wall(), np.deg2rad(turn_deg)
+    linear = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    offset = np.array([200.0, 200.0]) - linear @ [200.0, 200.0]
+    # OpenCV's first pixel has its centre at 0.
+    matrix = np.column_stack([linear, offset + linear @ [0.5, 0.5] - 0.5])
+    moved = gain * cv2.warpAffine(picture, matrix, picture.shape[::-1], flags=cv2.INTER_CUBIC) + 9
+    true = CENTRES @ linear.T + offset
+    warps = np.broadcast_to(linear, (len(CENTRES), 2, 2))
+    found, correlation = align_patches(picture, moved, CENTRES, true + shift, warps, PatchOptions())
+    assert np.all(correlation > 0.98)
+    assert np.abs(found - true).max() < 0.06
+
+
+def test_what_is_not_there_is_not_found() -> None:
+    here, other, flat = wall(), wall(1), np.full((400, 400), 80, np.float32)
+    warps = np.broadcast_to(np.eye(2), (len(CENTRES), 2, 2))
+    _, on_other = align_patches(here, other, CENTRES, CENTRES, warps, PatchOptions())
+    assert not np.any(on_other > 0.85)
+    assert np.isnan(align_patches(flat, flat, CENTRES, CENTRES, warps, PatchOptions())[1]).all()
+    border = np.full_like(CENTRES, 3.0)
+    assert np.isnan(align_patches(here, here, border, border, warps, PatchOptions())[1]).all()
+
+
+def over_a_wall(frames: int = 8) -> tuple[Reconstruction, dict[str, np.ndarray]]:
+    """A camera that moves over a textured wall; every point is known from two frames alone, up to a pixel."""
+    texture, camera = wall(3, 800), Camera.from_field_of_view(320, 240, 60.0)
+    rng, px_per_mm = np.random.default_rng(1), 20.0
+    poses, pictures = {}, {}
+    for k in range(frames):
+        rotation = Rotation.from_rotvec(np.deg2rad([2 * np.sin(k), 1.5 * np.cos(k), 3 * np.sin(2 * k)])).as_matrix()
+        turned = rotation @ np.diag([1.0, -1.0, -1.0])
+        poses[f"{k}"] = Rigid3(turned, -turned @ [0.6 * k - 2.0, 0.1 * k, 14.0])
+        plane = np.column_stack([poses[f"{k}"].rotation[:, :2], poses[f"{k}"].translation])
+        calibration = np.array([[camera.focal_px[0], 0, 159.5], [0, camera.focal_px[1], 119.5], [0, 0, 1]])
+        onto_wall = np.array([[px_per_mm, 0, 399.5], [0, px_per_mm, 399.5], [0, 0, 1]])
+        homography = calibration @ plane @ np.linalg.inv(onto_wall)
+        pictures[f"{k}"] = cv2.warpPerspective(texture, homography, (320, 240)).astype(np.uint8)
+    points = np.column_stack([rng.uniform(-3, 3, (60, 2)), np.zeros(60)])
+    pairs = [(p, f) for p in range(60) for f in (3, 4)]
+    pixels = np.array([camera.project(poses[f"{f}"].apply(points[p : p + 1]))[0] for p, f in pairs])
+    tracks = Tracks(
+        points=points,
+        colors=np.zeros((60, 3), np.uint8),
+        point_index=np.array([p for p, _ in pairs]),
+        frame_index=np.array([f for _, f in pairs]),
+        camera_index=np.zeros(len(pairs), np.int64),
+        pixels=pixels,
+    )
+    rig = Rig({"camera": MountedCamera(camera, Rigid3.identity())})
+    return Reconstruction(rig=rig, rig_from_world=poses, tracks=tracks), pictures
+
+
+def test_points_are_followed_into_every_frame_that_sees_them() -> None:
+    model, pictures = over_a_wall()
+    given_tracks, camera = model.known_tracks, model.rig["camera"].camera
+    longer = lengthen(model, lambda name: pictures[name], PatchOptions()).known_tracks
+    second = longer.point_index >= len(given_tracks.points)
+    assert len(longer.points) - len(given_tracks.points) >= 50
+    assert np.array_equal(longer.pixels[~second], given_tracks.pixels)
+    poses = list(model.rig_from_world.values())
+    true = np.array(
+        [
+            camera.project(poses[frame].apply(longer.points[point : point + 1]))[0]
+            for point, frame in zip(longer.point_index[second], longer.frame_index[second], strict=True)
+        ]
+    )
+    errors = np.linalg.norm(longer.pixels[second] - true, axis=1)
+    assert 0 < np.median(errors) < 0.1
+    assert np.quantile(errors, 0.95) < 0.3
+    assert second.sum() / 60 > 5
+
+
+def test_points_seen_in_too_few_frames_stay_as_they_were() -> None:
+    model, pictures = over_a_wall()
+    options = replace(PatchOptions(), minimum_views=9)
+    longer = lengthen(model, lambda name: pictures[name], options).known_tracks
+    assert len(longer.points) == len(model.known_tracks.points)
