@@ -13,6 +13,7 @@ from typing import Any
 
 import anatomy_sections
 import handpiece_sections
+import panorama_sections
 
 HERE = Path(__file__).parent
 
@@ -145,7 +146,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
 """Title and text for each file of results that is not of scans, by its stem."""
 
 
-def page(results: list[Result], motions: list[Result], others: Mapping[str, Result]) -> str:
+def page(results: list[Result], motions: list[Result], others: Mapping[str, Result], panoramas: list[Result]) -> str:
     """The whole page."""
     parts = [
         "# Benchmarks",
@@ -174,6 +175,8 @@ def page(results: list[Result], motions: list[Result], others: Mapping[str, Resu
     for stem, (title, text) in SECTIONS.items():
         if stem in others:
             parts += [f"## {title}", "", text(others[stem]), "", f"Commit {others[stem]['commit']}.", ""]
+    if panoramas:
+        parts += ["## Panoramas", "", panorama_sections.panoramas(panoramas), ""]
     parts += ["## Conditions", "", *(f"{detail(result)}\n" for result in results)]
     return "\n".join(parts)
 
@@ -183,7 +186,8 @@ def main() -> None:
     loaded = {path.stem: json.loads(path.read_text()) for path in sorted((HERE / "results").glob("*.json"))}
     scans = [value for value in loaded.values() if "images_to_mesh" in value]
     motions = [value for stem, value in loaded.items() if stem.startswith("motion-")]
-    (HERE.parent / "docs" / "benchmarks.md").write_text(page(scans, motions, loaded))
+    panoramas = [json.loads(path.read_text()) for path in sorted((HERE / "results" / "panorama").glob("*.json"))]
+    (HERE.parent / "docs" / "benchmarks.md").write_text(page(scans, motions, loaded, panoramas))
 
 
 if __name__ == "__main__":

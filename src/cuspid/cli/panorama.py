@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +11,9 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from cuspid import pipeline, storage
+from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
+from cuspid.panorama import FrameUse
 from cuspid.pipeline import StitchOptions
 from cuspid.reporting.panorama_figures import save_camera_path
 from cuspid.sequence import Sequence
@@ -40,10 +43,11 @@ def stitch(
         hashes = _hashes(sequence, calibration)
         with storage.claimed_folder(out, "stitch", {"stitch": options}, hashes, replace=True):
             parts = pipeline.stitch(sequence, options, progress=progress)
-            for part in parts:
-                folder = out if len(parts) == 1 else out / f"part-{part.panorama.part}"
+            folders = [out if len(parts) == 1 else out / f"part-{part.panorama.part}" for part in parts]
+            for folder, part in zip(folders, parts, strict=True):
                 _write(folder, part)
-    _print(parts, out)
+    _print(parts, folders)
+    report(out)
 
 
 def _hashes(sequence: Sequence, calibration: Path | None) -> dict[str, str]:
@@ -62,10 +66,9 @@ def _write(folder: Path, part: Stitched) -> None:
     storage.write_panorama(folder, part.panorama)
 
 
-def _print(parts: tuple[Stitched, ...], out: Path) -> None:
-    for part in parts:
+def _print(parts: tuple[Stitched, ...], folders: list[Path]) -> None:
+    for part, folder in zip(parts, folders, strict=True):
         panorama = part.panorama
-        folder = out if len(parts) == 1 else out / f"part-{panorama.part}"
         height, width = panorama.covered.shape
         size = panorama.size_mm
         measure = "no scale" if size is None else f"{size[0]:.1f} x {size[1]:.1f} mm"
@@ -75,6 +78,21 @@ def _print(parts: tuple[Stitched, ...], out: Path) -> None:
     whole = parts[0].panorama
     for note in whole.notes:
         console.print(f"note: {note}")
-    for frame in whole.frames:
-        if not frame.used:
-            console.print(f"  left out {frame.name}: {frame.reason}")
+    for line in left_out(whole.frames):
+        console.print(f"  left out {line}")
+
+
+def left_out(frames: Iterable[FrameUse]) -> list[str]:
+    """The frames that are in no part, a line for each reason."""
+    names: dict[str, list[str]] = {}
+    for frame in frames:
+        if not frame.used and frame.reason is not None and not frame.reason.startswith("in part "):
+            names.setdefault(frame.reason.split(":")[0], []).append(frame.name)
+    return [f"{len(each)} frames, {reason}: {named(each)}" for reason, each in names.items()]
+
+
+def named(names: list[str], most: int = 6) -> str:
+    """Names in a row, the middle of many left out."""
+    if len(names) <= most:
+        return ", ".join(names)
+    return f"{', '.join(names[: most - 1])} ... {names[-1]}"

@@ -404,8 +404,8 @@ def _mapper_options(with_rig: bool, seed: int) -> pycolmap.IncrementalPipelineOp
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """COLMAP without its log lines."""
-    before, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, 2
+    """COLMAP without its log lines, its errors too: what they mean is said by the caller."""
+    before, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, 3
     try:
         yield
     finally:

@@ -23,7 +23,7 @@ class SeamOptions:
     oblique: float = 1.0
     """Cost of looking at 45 degrees instead of straight down; it grows with the square of the tangent."""
     glare: float = 2.0
-    """Cost of a place that is burnt out by a highlight."""
+    """Cost of a place that is burnt out by a highlight, or lies in the dark."""
     border_px: float = 20.0
     """Distance from the border of a frame over which its cost falls to a third."""
     border: float = 0.1
@@ -37,7 +37,7 @@ class SeamOptions:
         self, tangent2: Float[np.ndarray, "r c"], border_px: Float[np.ndarray, "r c"], glare: Float[np.ndarray, "r c"]
     ) -> Float[np.ndarray, "r c"]:
         """Cost of a frame in each cell, from the square of the tangent of its obliquity, the distance to its border and
-        the share of it that is burnt out."""
+        the share of it that is burnt out or dark."""
         near = np.exp(-np.maximum(border_px, 0) / self.border_px)
         return np.asarray(self.oblique * tangent2 + self.border * near + self.glare * np.minimum(glare, 1))
 

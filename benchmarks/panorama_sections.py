@@ -1,0 +1,112 @@
+"""Section of docs/benchmarks.md on panoramas of ten subjects."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from statistics import median
+from typing import Any
+
+from anatomy_sections import mark, markdown_table
+
+Result = Mapping[str, Any]
+
+METHODS = ("ortho", "thesis", "thesis-unexamined", "opencv-panorama", "opencv-scans")
+MEDIAN_MM, P95_MM, SSIM_TEETH, SSIM_CANVAS, WALL_S = 0.15, 0.5, 0.80, 0.93, 90.0
+"""Bars: greatest errors, least likeness, longest time."""
+
+
+def panoramas(results: Sequence[Result]) -> str:
+    """All methods side by side, then the default method subject by subject."""
+    by_method = {name: [each for each in results if each["method"] == name] for name in METHODS}
+    ortho = by_method["ortho"]
+    commits = sorted({result["commit"] for result in results})
+    return "\n".join(
+        [
+            "Phantoms of the population and real jaws (`benchmarks/panorama.py`), each filmed in 120 frames of "
+            "640 x 480 px by a hand with full shake, texture `enamel`; docs/panorama-evaluation.md says what the "
+            "figures mean. *No arch* counts the panoramas that failed: too few frames, collapsed, or nowhere near the "
+            "jaw. Medians are over those that did not.",
+            "",
+            markdown_table(
+                (
+                    *("method", "subjects", "no arch", "complete", "frames placed, %", "error: median mm", "P95 mm"),
+                    *("SSIM teeth, fitted", "SSIM canvas, as it is", "CPU-s"),
+                ),
+                [method_row(name, rows) for name, rows in by_method.items() if rows],
+            ),
+            "",
+            f"The default method, subject by subject. Bars: median {MEDIAN_MM} mm, P95 {P95_MM} mm, SSIM on teeth "
+            f"{SSIM_TEETH}, on the canvas {SSIM_CANVAS}, {WALL_S:.0f} s on 2 cores, complete, in one part. Where SSIM "
+            "is fitted, one gain and offset (canvas: a gain) is taken out; `grey jaw` is what constant grey in the "
+            "outline of the jaw scores.",
+            "",
+            markdown_table(
+                (
+                    *("subject", "frames", "parts", "complete", "median mm", "P95 mm", "SSIM teeth", "grey jaw"),
+                    *("SSIM canvas", "grey jaw", "ZNCC teeth", "inter-molar mm", "scale %", "wall s", "CPU-s", "GiB"),
+                ),
+                [subject_row(result) for result in ortho],
+            ),
+            "",
+            f"Commits: {', '.join(commits)}.",
+        ]
+    )
+
+
+def method_row(name: str, results: Sequence[Result]) -> list[str]:
+    """Medians of a method over the subjects that it made an arch of."""
+    made = [result for result in results if result["failure"] is None]
+
+    def middle(*path: str, digits: int = 2) -> str:
+        found = [value for value in (at(result["score"], path) for result in made) if value is not None]
+        return f"{median(found):.{digits}f}" if found else "-"
+
+    placed = [100 * share for share in map(placed_share, results) if share is not None]
+    return [
+        *(f"`{name}`", str(len(results)), str(len(results) - len(made))),
+        str(sum(bool(result["score"]["complete"]) for result in made)),
+        f"{median(placed):.0f}" if placed else "-",
+        *(middle("geometry", key) for key in ("median_mm", "p95_mm")),
+        *(middle("picture", key) for key in ("ssim_teeth_fitted", "ssim_full")),
+        f"{median(result['frames_to_panorama']['cpu_s'] for result in results):.0f}",
+    ]
+
+
+def placed_share(result: Result) -> float | None:
+    """Share of the frames that are in the panorama."""
+    opencv, score = result.get("opencv"), result.get("score")
+    if opencv is not None:
+        return len(opencv.get("placed", ())) / opencv["frames"] if opencv.get("frames") else None
+    return None if not score else score["frames_used"] / score["frames"]
+
+
+def subject_row(result: Result) -> list[str]:
+    """One panorama of the default method."""
+    name, score, took = result["subject"], result["score"], result["frames_to_panorama"]
+    if result["failure"] is not None or score["geometry"] is None:
+        return [name, "-", "-", f"no: {result['failure']}", *["-"] * 9, str(took["wall_s"]), str(took["cpu_s"]), "-"]
+    geometry, picture, grey = score["geometry"], score["picture"], score["trivial"]["grey jaw"]
+    inter_molar = score["inter_molar_error_mm"]
+    return [
+        *(name, f"{score['frames_used']} of {score['frames']}", str(score["parts"])),
+        "yes" if score["complete"] else "**no**",
+        *(mark(geometry["median_mm"], MEDIAN_MM), mark(geometry["p95_mm"], P95_MM)),
+        *(least(picture["ssim_teeth_fitted"], SSIM_TEETH), f"{grey['ssim_teeth_fitted']:.2f}"),
+        *(least(picture["ssim_full_fitted"], SSIM_CANVAS), f"{grey['ssim_full_fitted']:.2f}"),
+        f"{picture['zncc']:.2f}",
+        "-" if inter_molar is None else f"{inter_molar:+.2f}",
+        "-" if geometry["scale_error_pct"] is None else f"{geometry['scale_error_pct']:+.1f}",
+        *(mark(took["wall_s"], WALL_S, 0), f"{took['cpu_s']:.0f}", f"{took['peak_gib']:.1f}"),
+    ]
+
+
+def least(value: float, limit: float) -> str:
+    """A figure, marked where it is below the limit."""
+    return f"{value:.2f}" if value >= limit else f"**{value:.2f}** (missed)"
+
+
+def at(value: Any, path: Sequence[str]) -> Any:
+    """What lies at a path of keys, None where a key has nothing."""
+    for key in path:
+        value = None if value is None else value.get(key)
+    return value
