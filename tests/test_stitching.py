@@ -20,7 +20,7 @@ from cuspid.geometry import Rigid3
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
 from cuspid.jaw import GUM, Jaw
 from cuspid.motion.guided import join_in_order
-from cuspid.motion.single import SingleOptions, locate_single, normalise_contrast, similarity
+from cuspid.motion.single import SingleOptions, locate_single, mouth_share, normalise_contrast, similarity
 from cuspid.panorama import Panorama
 from cuspid.pipeline import RenderOptions, StitchOptions, take_images
 from cuspid.reconstruction import Reconstruction, Tracks
@@ -344,6 +344,28 @@ def test_the_height_map_follows_the_points_and_is_known_everywhere() -> None:
     assert np.isfinite(surface.heights).all()
     heights = surface.at(np.array([[top[:2], gum[:2]]])).ravel()
     np.testing.assert_allclose(heights, [top[2], gum[2]], atol=0.7)
+
+
+@pytest.mark.parametrize(
+    ("color", "alike"),
+    [
+        ((215, 200, 160), 1),
+        ((190, 80, 75), 1),
+        ((200, 200, 200), 1),
+        ((60, 90, 200), 0),
+        ((50, 160, 60), 0),
+        ((5, 5, 9), 1),
+    ],
+)
+def test_colours_of_a_mouth_are_told_from_others(color: tuple[int, int, int], alike: float) -> None:
+    assert mouth_share(np.full((20, 20, 3), color, np.uint8)) == alike
+
+
+def test_frames_of_other_colours_are_noted_by_name(sequence: Sequence, tmp_path: Path) -> None:
+    blue = np.array([0.3, 0.5, 1.0])
+    images = [sequence.image(0), *((sequence.image(index) * blue).astype(np.uint8) for index in range(1, 6))]
+    notes = locate_single(images_in(tmp_path, images)).notes
+    assert any("5 of 6 frames" in note and "is this a film of teeth" in note for note in notes)
 
 
 def test_the_dark_beyond_the_jaw_is_nothing_but_a_dark_fissure_is_kept() -> None:

@@ -44,6 +44,9 @@ _BLACK = 24
 _SAME = 0.8
 """Mean difference, in grey levels of eightfold smaller images, below which a frame repeats the one before."""
 _SMALLER = 8
+_LIT, _PALE, _WARM = 40, 50, (35, 165)
+"""Brighter pixels are lit; of them those less saturated are pale like enamel and plaster, and those whose hue (0 to
+180) lies below the first or above the second are red to yellow, like gums and dentine."""
 _WINDOW = 15
 """Frames with whose sharpness that of a frame is compared."""
 
@@ -125,6 +128,15 @@ class _Look:
     small: Float[np.ndarray, "a b"]
     brightness: float
     sharpness: float
+    mouth_share: float
+
+
+def mouth_share(image: UInt8[np.ndarray, "h w 3"]) -> float:
+    """Share (0 to 1) of the lit pixels that have a colour of teeth, gums or plaster; 1 where nothing is lit."""
+    hue, saturation, value = np.moveaxis(cv2.cvtColor(image, cv2.COLOR_RGB2HSV), -1, 0)
+    alike = (saturation < _PALE) | (hue <= _WARM[0]) | (hue >= _WARM[1])
+    lit = value > _LIT
+    return float(alike[lit].mean()) if lit.any() else 1.0
 
 
 def _look(image: UInt8[np.ndarray, "h w 3"], options: SingleOptions) -> _Look:
@@ -139,6 +151,7 @@ def _look(image: UInt8[np.ndarray, "h w 3"], options: SingleOptions) -> _Look:
         small=small,
         brightness=float(np.percentile(gray, 99)),
         sharpness=sharpness,
+        mouth_share=mouth_share(image[::_SMALLER, ::_SMALLER]),
     )
 
 
@@ -464,7 +477,7 @@ def locate_single(
     return SingleMotion(
         parts=tuple(refined),
         frames=_uses(names, refused, refined, ties),
-        notes=_notes(refined[0].rig[CAMERA].camera, calibrated, refined),
+        notes=(*_strangers(looks, names), *_notes(refined[0].rig[CAMERA].camera, calibrated, refined)),
     )
 
 
@@ -487,6 +500,15 @@ def _refined(
 
     longer = lengthen(by_keypoints, read, options.patches, progress=progress)
     return adjust(longer, options.guided.adjustment)
+
+
+def _strangers(looks: List[_Look], names: List[str]) -> tuple[str, ...]:
+    """A note where frames have little of the colours of a mouth."""
+    strange = [name for name, look in zip(names, looks, strict=True) if look.mouth_share < 0.5]
+    if not strange:
+        return ()
+    which = f"{len(strange)} of {len(names)} frames ({strange[0]} to {strange[-1]})"
+    return (f"{which} show little that has the colour of teeth or gums: is this a film of teeth?",)
 
 
 def _notes(camera: Camera, calibrated: bool, parts: List[Reconstruction]) -> tuple[str, ...]:
