@@ -4,12 +4,15 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cuspid.camera import Camera
+from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.motion.guided import GuidedOptions
 from cuspid.motion.patches import PatchOptions, align_patches, lengthen
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
@@ -109,3 +112,10 @@ def test_points_seen_in_too_few_frames_stay_as_they_were() -> None:
     options = replace(PatchOptions(), minimum_views=9)
     longer = lengthen(model, lambda name: pictures[name], options).known_tracks
     assert len(longer.points) == len(model.known_tracks.points)
+
+
+def test_each_round_needs_a_tolerance_and_a_depth_share() -> None:
+    with pytest.raises(InputError, match="3 tolerances and 2 depth shares"):
+        GuidedOptions(depth_shares=(0.2, 0.1))
+    with pytest.raises(InputError, match="at least one"):
+        GuidedOptions(tolerances_px=(), depth_shares=())

@@ -17,6 +17,7 @@ from numba import njit
 from scipy.spatial import KDTree
 
 from cuspid.camera import Camera
+from cuspid.errors import InputError
 from cuspid.motion.adjustment import AdjustmentOptions, adjust
 from cuspid.motion.features import Features, Progress
 from cuspid.motion.pairs import MatchingOptions, View, make_view, match_guided
@@ -52,6 +53,13 @@ class GuidedOptions:
         )
     )
     """The adjustment."""
+
+    def __post_init__(self) -> None:
+        if not self.tolerances_px or len(self.tolerances_px) != len(self.depth_shares):
+            raise InputError(
+                f"guided matching: {len(self.tolerances_px)} tolerances and {len(self.depth_shares)} depth shares; "
+                "give one of each for every round, at least one"
+            )
 
 
 @njit(cache=True, nogil=True)

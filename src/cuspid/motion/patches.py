@@ -52,7 +52,7 @@ class PatchOptions:
     """Points that are found in fewer frames are left as they were."""
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _at(image, x, y):
     """Bilinear; NaN outside."""

@@ -11,7 +11,7 @@ from cuspid.reporting.figures import render
 from cuspid.reporting.page import jpeg_uri, packed, picture_uri, provenance, render_page, script_json
 from cuspid.reporting.scene import color_table, css_gradient, mesh_layer, standard_views
 from cuspid.reporting.shape_figures import SHIFT_COLORS
-from cuspid.reporting.shown_mesh import simplified
+from cuspid.reporting.shown_mesh import ShownMesh, simplified
 from cuspid.shape_model import ShapeModel
 from cuspid.storage import ShapeResult
 
@@ -28,17 +28,7 @@ def shape_page(result: ShapeResult, most_faces: int = 120_000) -> str:
     count = min(_MOST_MODES, len(model.modes))
     shares = 100 * model.variance_shares
     range_mm = _fitting_range(model)
-    scene: dict[str, Any] = {
-        "layers": [mesh_layer("mean", "Mean", shown.mesh)],
-        "modes": [_mode(model, k, shown.nearest) for k in range(count)],
-        "colors": color_table(SHIFT_COLORS),
-        "range": range_mm,
-        "unit": "mm",
-        "per_step": _MM_PER_STEP,
-        "views": standard_views(model.mean.arch),
-        "teeth": [],
-        "worst": [],
-    }
+    scene = _scene(model, shown, count, range_mm)
     size = {"name": "mean", "full": shown.full_faces, "shown": len(shown.mesh.faces), "off_um": shown.off_um}
     return render_page(
         "shape.html.j2",
@@ -71,6 +61,21 @@ def shape_page(result: ShapeResult, most_faces: int = 120_000) -> str:
         pictures=[(caption, picture_uri(path)) for caption, path in result.pictures.items()],
         made=provenance(result.run),
     )
+
+
+def _scene(model: ShapeModel, shown: ShownMesh, modes: int, range_mm: float) -> dict[str, Any]:
+    """What the viewer draws: the mean and what moves it."""
+    return {
+        "layers": [mesh_layer("mean", "Mean", shown.mesh)],
+        "modes": [_mode(model, k, shown.nearest) for k in range(modes)],
+        "colors": color_table(SHIFT_COLORS),
+        "range": range_mm,
+        "unit": "mm",
+        "per_step": _MM_PER_STEP,
+        "views": standard_views(model.mean.arch),
+        "teeth": [],
+        "worst": [],
+    }
 
 
 def _mode(model: ShapeModel, k: int, nearest: np.ndarray) -> dict[str, Any]:

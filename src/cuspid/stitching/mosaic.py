@@ -199,8 +199,8 @@ def glance(
     tangent2 = np.sum(towards[..., :2] ** 2, axis=-1) / np.maximum(towards[..., 2], 1e-6) ** 2
     size = np.array([view.camera.width, view.camera.height])
     border = np.minimum(px, size - px).min(axis=-1)
-    unlit = (color.max(axis=-1) < DARK).astype(np.float32)
-    cost = options.seams.cost(tangent2, border - options.border_px, np.maximum(glare, unlit))
+    dark = (color.max(axis=-1) < DARK).astype(np.float32)
+    cost = options.seams.cost(tangent2, border - options.border_px, np.maximum(glare, dark))
     seen = np.isfinite(px).all(axis=-1) & (border >= options.border_px) & (in_cam[..., 2] > 0)
     cost = np.where(seen, cost, np.inf)
     bright = (color.max(axis=-1) < BURNT) & (color.max(axis=-1) > DARK) & (glare < 0.02)
