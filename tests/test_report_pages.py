@@ -32,6 +32,7 @@ ARGUMENTS = (
 )
 LAPTOP, PHONE = {"width": 1366, "height": 768}, {"width": 390, "height": 844}
 READY_MS = 60_000
+IS_WIDE = "width => document.querySelector('.zoomed img').getBoundingClientRect().width > width"
 PICTURE = """async () => {
   for (let k = 0; k < 3; k++) await new Promise((done) => requestAnimationFrame(done));
   return document.querySelector("canvas").toDataURL("image/png").split(",")[1];
@@ -119,6 +120,7 @@ def fresh(scan: Visit) -> Visit:
         if button.get_attribute("aria-pressed") != wanted:
             button.click()
     scan.press("[data-reset]")
+    scan.settle()
     return scan
 
 
@@ -221,6 +223,7 @@ def test_a_frame_shows_where_its_cameras_were(fresh):
 
 def test_tooth_numbers_lie_over_the_teeth(fresh):
     fresh.press("[data-teeth]")
+    fresh.settle()
     label = fresh.page.locator(".teeth span")
     assert label.inner_text() == "46"
     box, canvas = label.bounding_box(), fresh.page.locator("canvas").bounding_box()
@@ -289,12 +292,12 @@ def test_pictures_zoom_together(browser, pages):
     widths = [image.bounding_box()["width"] for image in score.page.locator(".zoomed img").all()]
     score.page.locator(".zoomed").first.hover()
     score.page.mouse.wheel(0, -300)
-    score.page.wait_for_timeout(200)
+    score.page.wait_for_function(IS_WIDE, arg=1.1 * widths[0])
     zoomed = [image.bounding_box()["width"] for image in score.page.locator(".zoomed img").all()]
     assert all(after > 1.1 * before for before, after in zip(widths, zoomed, strict=True))
     assert zoomed[0] == pytest.approx(zoomed[1])
     score.press("[data-zoom=reset]")
-    score.page.wait_for_timeout(200)
+    score.page.wait_for_function(f"width => !({IS_WIDE})(width)", arg=1.01 * widths[0])
     assert score.page.locator(".zoomed img").first.bounding_box()["width"] == pytest.approx(widths[0], rel=0.01)
     assert score.complaints == []
     assert all(url == pages["score"].as_uri() or url.startswith("data:") for url in score.requests)
