@@ -55,7 +55,7 @@ def spheres(result: Result) -> str:
 
 def prepared(results: Sequence[Result]) -> str:
     """The thesis' reference model in the form of its Table 3.2, and the margins."""
-    by_case = {result["case"]: result for result in results}
+    by_case, arch = {result["case"]: result for result in results}, "prepared-arch"
     rows = []
     for row in TABLE_3_2:
         if row.result in by_case:
@@ -68,13 +68,14 @@ def prepared(results: Sequence[Result]) -> str:
         (result["case"], tooth, *_margin(entry))
         for result in results
         for tooth, entry in result.get("margins", {}).items()
-        if result["case"] in (f"prepared-{tooth}", "prepared-arch")
+        if result["case"] in (f"prepared-{tooth}", arch)
     ]
     margin_head = ("scan", "FDI", "judged %", "found %", "mean", "SD", "P95", "max", "outward", "detector's floor")
     return "\n".join(
         [
-            "Absolute deviations in um, all points of the scan on the tooth, 120 images for a tooth (the thesis "
-            "measured lines with few points).",
+            "Absolute deviations in um, all points of the scan on the tooth, 120 images for a tooth"
+            + (f", {by_case[arch]['images']} for the arch" if arch in by_case else "")
+            + " (the thesis measured lines with few points).",
             "",
             markdown_table(head, rows),
             "",

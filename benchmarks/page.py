@@ -96,7 +96,7 @@ def table(results: list[Result]) -> str:
 
 def detail(result: Result) -> str:
     """How one result came about."""
-    trueness, condition = result["trueness"], result["versions"]
+    trueness, condition, took = result["trueness"], result["versions"], result["images_to_mesh"]
     return "\n".join(
         [
             f"### {result['case']}",
@@ -111,7 +111,8 @@ def detail(result: Result) -> str:
             f"RMS {trueness['rms_um']:.1f} um, max {trueness['max_um']:.0f} um; complete within 50/100/200 um: "
             + "/".join(f"{trueness['completeness_pct'][key]:.1f}" for key in ("50", "100", "200"))
             + f" %; scale error {trueness['scale_error_ppm']:.0f} ppm; "
-            f"scannable {trueness['scannable_pct']:.1f} % of the reference.",
+            f"scannable {trueness['scannable_pct']:.1f} % of the reference. Images to mesh: {took['wall_s']:.0f} s "
+            f"({took['cpu_s']:.0f} CPU-s), {took['peak_gib']:.1f} GiB.",
         ]
     )
 
