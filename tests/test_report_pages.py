@@ -184,6 +184,24 @@ def test_layers_are_toggled(fresh, layer):
     assert differing(before, fresh.picture()) == 0
 
 
+@pytest.mark.parametrize("layer", ["reference", "cameras"])
+def test_a_standard_view_fits_what_is_shown_and_a_turned_one_stays(fresh, layer):
+    fresh.press(f"[data-layer={layer}]")
+    fitted = fresh.picture()[..., 3]
+    assert fitted.max() == 255
+    assert max(fitted[0].max(), fitted[-1].max(), fitted[:, 0].max(), fitted[:, -1].max()) == 0
+    fresh.page.locator("canvas").hover()
+    fresh.page.mouse.wheel(0, -400)
+    fresh.settle()
+    length = fresh.page.locator(".length span").bounding_box()["width"], fresh.page.locator(".length b").inner_text()
+    fresh.press(f"[data-layer={layer}]")
+    fresh.settle()
+    assert length == (
+        fresh.page.locator(".length span").bounding_box()["width"],
+        fresh.page.locator(".length b").inner_text(),
+    )
+
+
 @pytest.mark.parametrize("view", ["Front", "Right", "Left", "Behind"])
 def test_standard_views_differ_from_the_occlusal_one(fresh, view):
     before = fresh.picture()
@@ -244,8 +262,12 @@ def test_on_paper_the_view_is_a_picture_and_settings_are_open(fresh):
     assert shown.is_visible()
     assert not fresh.page.locator("canvas").is_visible()
     assert not fresh.page.locator(".toolbar").is_visible()
+    fresh.page.evaluate("dispatchEvent(new Event('beforeprint'))")
     still = decoded(shown.get_attribute("src").split(",")[1])
     assert 0.05 < np.mean(still[..., 3] > 0) < 0.95
+    length_bar = still[-25:-10, 14:30]
+    assert (length_bar.min(axis=2) == 0).any(), "transparent around it"
+    assert ((length_bar[..., 3] == 255) & (length_bar[..., :3].max(axis=2) < 30)).any(), "black"
     document = fresh.page.pdf(format="A4", print_background=True)
     fresh.page.emulate_media(media="screen")
     assert document.startswith(b"%PDF")

@@ -126,8 +126,8 @@
     [picture.width, picture.height] = [canvas.width, canvas.height];
     const pen = picture.getContext("2d");
     pen.drawImage(canvas, 0, 0);
-    const scale = canvas.width / canvas.clientWidth;
-    const bar = find(".length span").offsetWidth * scale;
+    const scale = renderer.getPixelRatio(); // The page may be laid out for paper already, where the view has no size.
+    const bar = parseFloat(find(".length span").style.width) * scale;
     const [left, bottom, size] = [14 * scale, picture.height - 14 * scale, 14 * scale];
     pen.fillRect(left, bottom - 0.3 * size, bar, 0.14 * size);
     pen.font = `600 ${size}px sans-serif`;
@@ -143,6 +143,7 @@
 
   let half = 10;
   let chosen = null;
+  let home = null; // The standard view that is shown, until it is turned, moved or left.
 
   function resize() {
     const { clientWidth: width, clientHeight: height } = canvas.parentElement;
@@ -171,8 +172,9 @@
 
   const vector = (values) => new THREE.Vector3(...values);
 
-  function whole(name) {
-    const view = scene.views.find((each) => each.name === name) ?? scene.views[0];
+  function whole(name = scene.views[0].name) {
+    home = name;
+    const view = scene.views.find((each) => each.name === name);
     const eye = vector(view.eye).normalize();
     const right = vector(view.up).cross(eye).normalize();
     const axes = [right, eye.clone().cross(right), eye];
@@ -185,12 +187,12 @@
     lookAt(target, eye, axes[1], 0.54 * shorter * Math.max(width / clientWidth, height / clientHeight));
   }
 
-  // How far the main surface, and the cameras and paths that are shown, reach along some directions.
+  // How far the main surface, and all that is shown besides, reach along some directions.
   function extents(axes) {
-    const lines = [...layers.values(), chosen].filter((each) => each && !each.isMesh && each.visible);
+    const shown = [...layers.values(), chosen].filter((each) => each && (each.visible || each === main()));
     const lows = axes.map(() => Infinity);
     const highs = axes.map(() => -Infinity);
-    for (const { array } of [main(), ...lines].map((each) => each.geometry.attributes.position)) {
+    for (const { array } of shown.map((each) => each.geometry.attributes.position)) {
       for (let v = 0; v < array.length; v += 3) {
         axes.forEach((axis, k) => {
           const at = array[v] * axis.x + array[v + 1] * axis.y + array[v + 2] * axis.z;
@@ -203,6 +205,7 @@
   }
 
   function goTo(place) {
+    home = null;
     const eye = place.towards ? vector(place.towards) : new THREE.Vector3(0, 0, 1);
     const up = Math.abs(eye.clone().normalize().y) < 0.9 ? vector([0, 1, 0]) : vector([0, 0, 1]);
     lookAt(vector(place.position_mm), eye, up, 1.05 * place.radius_mm);
@@ -303,7 +306,10 @@
 
   function bind() {
     for (const button of root.querySelectorAll("[data-layer]")) {
-      button.addEventListener("click", () => show(button));
+      button.addEventListener("click", () => {
+        show(button);
+        if (home) whole(home);
+      });
     }
     for (const button of root.querySelectorAll("[data-view]")) {
       button.addEventListener("click", () => {
@@ -419,7 +425,8 @@
   showTicks();
   whole();
   controls.addEventListener("change", change);
-  new ResizeObserver(resize).observe(canvas.parentElement);
+  controls.addEventListener("start", () => (home = null));
+  new ResizeObserver(([{ contentRect }]) => (home && contentRect.width ? whole(home) : resize())).observe(canvas.parentElement);
   root.classList.add("live");
   const loop = () => {
     controls.update();
