@@ -286,6 +286,23 @@ def test_on_a_phone(browser, pages):
     phone.page.context.close()
 
 
+def test_the_thesis_beside_ours_is_read_on_a_phone(browser, tmp_path):
+    results = Path(__file__).parent.parent / "benchmarks" / "results"
+    cli.main(
+        ["reproduce", "--no-run", "--only", "fig-4.4", "table-3.2", "--results", str(results), "--out", str(tmp_path)]
+    )
+    phone = visit(browser, tmp_path / "reproduction.html", viewer=False, viewport=PHONE, is_mobile=True)
+    assert phone.page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
+    cells = phone.page.locator(".plain td").all()
+    assert len(cells) > 10
+    for cell in cells:
+        box = cell.bounding_box()
+        assert box["width"] > 0.7 * PHONE["width"], "long names do not squeeze what stands beside them"
+        assert box["height"] < PHONE["height"]
+    assert phone.complaints == []
+    phone.page.context.close()
+
+
 def test_without_webgl_a_picture_is_shown(browser, pages):
     blind = "HTMLCanvasElement.prototype.getContext = () => null;"
     found = visit(browser, pages["scan"], viewer=False, before=blind)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.patheffects import Normal, Stroke
 
 from cuspid.panorama import Panorama
 from cuspid.reconstruction import Reconstruction
@@ -13,6 +14,7 @@ from cuspid.reporting.figures import new_figure, save_figure
 
 _TICK = 10
 """Every so many frames one is named."""
+_WIDTH_IN = 8.0
 
 
 def save_camera_path(path: Path, panorama: Panorama, motion: Reconstruction) -> None:
@@ -23,8 +25,10 @@ def save_camera_path(path: Path, panorama: Panorama, motion: Reconstruction) -> 
     poses = [pose.inverse() for pose in motion.rig_from_world.values()]
     centres = np.array([pose.translation for pose in poses])
     axes = np.array([pose.rotation[:, 2] for pose in poses])
-    figure = new_figure(8.0, 8.5, dpi=110, layout="constrained")
-    above, below = figure.subplots(2, 1, height_ratios=[3.2, 1])
+    height, width = panorama.covered.shape
+    above_in = min(max(0.82 * _WIDTH_IN * height / width, 2.0), 9.0)  # The axis' names and the colours have the rest.
+    figure = new_figure(_WIDTH_IN, above_in + 2.9, dpi=110, layout="constrained")
+    above, below = figure.subplots(2, 1, height_ratios=[above_in, 1.7])
     _draw_above(above, panorama, centres, axes, motion.frames)
     _draw_heights(below, panorama, centres, axes)
     save_figure(figure, path)
@@ -43,8 +47,9 @@ def _draw_above(axis: Axes, panorama: Panorama, centres: np.ndarray, axes: np.nd
         axis.plot(*zip(place, look, strict=True), color="#ffffff60", linewidth=0.5)
     dots = axis.scatter(places[:, 0], places[:, 1], c=np.arange(len(places)), cmap="viridis", s=14, zorder=3)
     for index in range(0, len(names), _TICK):
-        axis.annotate(names[index], places[index], (3, 3), textcoords="offset points", color="white", fontsize=6)
-    axis.figure.colorbar(dots, ax=axis, label="located frame", shrink=0.8)
+        label = axis.annotate(names[index], places[index], (5, 3), textcoords="offset points", fontsize=7)
+        label.set(color="white", path_effects=[Stroke(linewidth=1.8, foreground="black"), Normal()])
+    axis.figure.colorbar(dots, ax=axis, label="located frame", fraction=0.04, pad=0.02, aspect=35)
     unit = "mm" if panorama.mm_per_px else "px"
     axis.set(xlabel=f"x, {unit}", ylabel=f"y, {unit} (front up)", title="Path of the camera over the teeth")
     axis.set_xlim(min(extent[0], places[:, 0].min()), max(extent[1], places[:, 0].max()))

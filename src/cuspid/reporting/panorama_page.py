@@ -29,7 +29,7 @@ def panorama_page(result: PanoramaResult) -> str:
         missing=result.missing,
         tiles=[
             ("frames placed", str(used), f"of {len(first.frames)}"),
-            ("parts", str(len(result.parts)), ""),
+            ("part" if len(result.parts) == 1 else "parts", str(len(result.parts)), ""),
             (
                 "width and height",
                 "–" if size is None else f"{size[0]:.1f} × {size[1]:.1f}",
@@ -53,7 +53,7 @@ def _part(part: Panorama, folder: Path) -> dict[str, Any]:
     return {
         "title": "The arch from above" if part.parts == 1 else f"Part {part.part} of {part.parts}",
         "picture": jpeg_uri(_on_ground(part.image, part.covered), widest_px=_WIDEST_PX),
-        "caption": f"{width} × {height} px; wheel or pinch to zoom, drag to move, double click to see all",
+        "caption": f"{width} × {height} px",
         "strip": photo_uri(strip, widest_px=_WIDEST_PX) if strip.exists() else None,
     }
 
