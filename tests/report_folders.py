@@ -130,6 +130,17 @@ def write_shape(folder: Path, jaw: Jaw) -> None:
     storage.write_shape_model(folder, model)
 
 
+def write_comparison(folder: Path, columns: int = 30) -> None:
+    """A comparison of two designs with so many columns for each case."""
+    figures = [{f"surface{k}_within_50_um_pct": 10.5 * row + k for k in range(columns)} for row in range(2)]
+    designs = [{"design": name, "turns": 1, "jaw": "phantom", "tooth": 46} for name in ("twelve", "six")]
+    storage.claim_folder(folder, "compare", {}, {})
+    rows = [{"case": f"phantom_46_{each['design']}_1_0", **each, **figures[k]} for k, each in enumerate(designs)]
+    storage.write_table(folder / "results.csv", [{**row, "failure": None} for row in rows])
+    needs = [{**each, "cameras": 12.0 - 6 * k, "height_mm": 11.6 - k} for k, each in enumerate(designs)]
+    storage.write_json(folder / "comparison.json", {"rows": needs, "enough_turns": {}})
+
+
 def write_score(folder: Path) -> None:
     """As ``cuspid stitch-eval`` leaves it."""
     scores = dict.fromkeys(("zncc", "ssim_teeth", "ssim_full", "ssim_teeth_fitted", "ssim_full_fitted"), 0.5)

@@ -11,6 +11,7 @@ from cuspid.evaluation.deviation import EvaluationOptions, evaluate
 from cuspid.evaluation.registration import RegistrationOptions
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
+from cuspid.reporting.comparison_figures import Curve, save_comparison_picture
 from cuspid.reporting.figures import (
     NOT_COUNTED,
     OCCLUSAL,
@@ -89,6 +90,17 @@ def test_what_is_nearer_hides_what_is_farther():
     centre = np.array(render(scene, width_px=200).image.shape[:2]) // 2
     assert np.argmax(render(scene, width_px=200).image[tuple(centre)]) == 1
     assert np.argmax(render(scene, look(-90.0, -90.0), width_px=200).image[tuple(centre)]) == 0
+
+
+def test_a_long_title_is_not_cut_off(tmp_path: Path):
+    box = [np.array([[-4.0, 5.0], [4.0, 5.0], [4.0, 9.0], [-4.0, 9.0]])]
+    curve = Curve(turns=(1, 3), images=(40.0, 120.0), complete_pct=(30.0, 60.0), error_um=(5.0, 4.0))
+    long = "Handpieces over a tooth; dashed: room at the second molar that 95 % of women have"
+    save_comparison_picture(tmp_path / "picture.png", {"four": box}, {"jaw": {"four": curve}}, 12.0, title=long)
+    drawn = cv2.imread(str(tmp_path / "picture.png"), cv2.IMREAD_GRAYSCALE)
+    assert drawn is not None
+    assert drawn[:60].min() < 100
+    assert drawn[:, -4:].min() == 255
 
 
 def test_pictures_are_written_whole(tmp_path: Path):

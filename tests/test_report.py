@@ -30,6 +30,7 @@ from report_folders import (
     looking_down,
     scanned_tooth,
     tooth_alone,
+    write_comparison,
     write_evaluation,
     write_scan,
     write_score,
@@ -313,6 +314,14 @@ def test_a_study_that_was_killed_shows_what_is_done(tmp_path):
     assert "sweep.json: 2 cases are done" in page
     assert "too dark" in page
     assert "baseline, mm" in page
+
+
+def test_the_page_of_a_comparison_tells_counts_as_counts(tmp_path):
+    write_comparison(tmp_path)
+    page = report_page(storage.read_result(tmp_path))
+    for cell in ("<td>12</td>", "<td>6</td>", "<td>11.60</td>", "<td>10.60</td>"):
+        assert cell in page
+    assert "12.00" not in page
 
 
 def test_the_page_of_a_sweep(tmp_path):

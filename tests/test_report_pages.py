@@ -15,7 +15,7 @@ import pytest
 
 from cuspid import cli
 from cuspid.jaw import Jaw
-from report_folders import tooth_alone, write_scan, write_score, write_shape
+from report_folders import tooth_alone, write_comparison, write_scan, write_score, write_shape
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed: pip install playwright")
 
@@ -31,6 +31,8 @@ ARGUMENTS = (
     "--enable-unsafe-swiftshader",
 )
 LAPTOP, PHONE = {"width": 1366, "height": 768}, {"width": 390, "height": 844}
+A4 = {"width": 695, "height": 1017}
+"""What the margins of the paper leave, in CSS px."""
 READY_MS = 60_000
 IS_WIDE = "width => document.querySelector('.zoomed img').getBoundingClientRect().width > width"
 PICTURE = """async () => {
@@ -86,9 +88,11 @@ def pages(tmp_path_factory: pytest.TempPathFactory, coarse_phantom: Jaw) -> dict
     write_scan(folder / "scan", coarse_phantom)
     write_shape(folder / "shape", tooth_alone(coarse_phantom))
     write_score(folder / "score")
-    for name in ("scan", "shape", "score"):
+    write_comparison(folder / "comparison")
+    names = ("scan", "shape", "score", "comparison")
+    for name in names:
         cli.main(["report", str(folder / name)])
-    return {name: folder / name / "report.html" for name in ("scan", "shape", "score")}
+    return {name: folder / name / "report.html" for name in names}
 
 
 def visit(browser, path: Path, *, viewer: bool = True, before: str | None = None, **context) -> Visit:
@@ -272,6 +276,20 @@ def test_on_paper_the_view_is_a_picture_and_settings_are_open(fresh):
     fresh.page.emulate_media(media="screen")
     assert document.startswith(b"%PDF")
     assert 1 <= len(re.findall(rb"/Type\s*/Page\b", document)) <= 5
+
+
+def test_a_wide_table_fits_on_paper_and_is_moved_on_a_screen(browser, pages):
+    study = visit(browser, pages["comparison"], viewer=False, viewport=A4)
+    reach = "document.querySelector('.sorted').getBoundingClientRect().right"
+    columns = study.page.locator(".sorted thead th")
+    assert study.page.evaluate(reach) > A4["width"]
+    assert study.page.evaluate("document.documentElement.scrollWidth") <= A4["width"]
+    assert columns.last.is_visible()
+    study.page.emulate_media(media="print")
+    assert study.page.evaluate(reach) <= A4["width"]
+    assert not columns.last.is_visible()
+    assert f"of {columns.count()} columns" in study.page.locator(".sorted caption").inner_text()
+    study.page.context.close()
 
 
 def test_on_a_phone(browser, pages):

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 from jaxtyping import Float
@@ -26,6 +27,8 @@ _SHARES = LinearSegmentedColormap.from_list("shares", ["#f08a6b", "#fbe7a8", "#9
 """From little to all."""
 _TOOTH_MM = (9.0, 7.0)
 """Width and height of the drawn tooth."""
+_LETTERS_PER_IN = 7.5
+"""Of a bold title."""
 _TICKS = (50, 100, 200, 300, 500, 1000, 2000, 3000)
 """Numbers of images that are named on an axis."""
 
@@ -62,7 +65,8 @@ def save_comparison_picture(
     figure = new_figure(max(9.0, 3.3 * len(panels), 1.7 * len(sections)), 9.4, dpi=84, layout="constrained")
     halves: NDArray[np.object_] = np.asarray(figure.subfigures(2, 1, height_ratios=(1.0, 2.6)))
     above, below = halves
-    above.suptitle(f"{title}\n", x=0.01, ha="left", fontsize=14, color=_INK, fontweight="bold")
+    told = fill(title, int(_LETTERS_PER_IN * figure.get_figwidth()))
+    above.suptitle(f"{told}\n", x=0.01, ha="left", fontsize=14, color=_INK, fontweight="bold")
     _draw_sections(above.subplots(1, len(sections), squeeze=False)[0].tolist(), sections, colours, gap_mm)
     places = below.subplots(2, len(panels), squeeze=False)
     for (complete, error), (name, curves) in zip(places.T, panels.items(), strict=True):

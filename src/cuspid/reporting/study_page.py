@@ -199,14 +199,18 @@ def _compare_tables(summary: Mapping[str, Any]) -> list[Table]:
 
     def table(title: str, columns: Sequence[str]) -> Table:
         there = [name for name in columns if any(row.get(name) is not None for row in summary["rows"])]
-        rows = [[str(row[k]) for k in keys] + [_cell(row.get(name)) for name in there] for row in summary["rows"]]
+        names = [[str(row[key]) for key in keys] for row in summary["rows"]]
+        figures = [_column([row.get(name) for row in summary["rows"]]) for name in there]
+        rows = [[*name, *cells] for name, *cells in zip(names, *figures, strict=True)]
         return {"title": title, "caption": None, "heads": [*keys, *map(heading, there)], "rows": rows}
 
     return [table("What each needs", _NEEDS), table("What each gives, means over the seeds", _GIVES)]
 
 
-def _cell(value: float | int | None) -> str:
-    return "–" if value is None else f"{value:g}" if isinstance(value, int) else number(value, 2)
+def _column(values: Sequence[float | int | None]) -> list[str]:
+    """With two decimals, but counts as they are."""
+    whole = all(value is None or value == int(value) for value in values)
+    return [number(value, 0 if whole else 2) for value in values]
 
 
 def _repeat_tables(summary: Mapping[str, Any]) -> list[Table]:
