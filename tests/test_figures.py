@@ -100,7 +100,7 @@ def test_a_long_title_is_not_cut_off(tmp_path: Path):
     drawn = cv2.imread(str(tmp_path / "picture.png"), cv2.IMREAD_GRAYSCALE)
     assert drawn is not None
     assert drawn[:60].min() < 100
-    assert drawn[:, -4:].min() == 255
+    assert drawn[:60, -4:].min() == 255
 
 
 def test_pictures_are_written_whole(tmp_path: Path):
