@@ -80,6 +80,16 @@ def test_preparations_that_cannot_be(tmp_path, capsys, phantom_file, arguments, 
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--seed", -1), ("--edge-mm", 0.0), ("--edge-mm", -1.0), ("--edge-mm", 9.0), ("--edge-mm", "nan")]
+    + [("--variation", -1.0), ("--tooth-size", 0.0)],
+)
+def test_phantoms_that_cannot_be(tmp_path, capsys, option, value):
+    assert option.removeprefix("--") in refused(capsys, "phantom", "--out", tmp_path / "jaw.ply", option, value)
+    assert not any(tmp_path.iterdir())
+
+
 def test_a_jaw_that_is_no_manifold(tmp_path, capsys, coarse_phantom):
     mesh = coarse_phantom.mesh
     faces = np.concatenate([mesh.faces, mesh.faces[:1, ::-1]])

@@ -224,6 +224,11 @@ def test_bad_input_of_repeat(tmp_path, capsys, phantom_file):
     for arguments, message in (
         (["--scans", "1"], "at least two"),
         (["--tooth", "16"], "no tooth 16"),
+        (["--tooth", "46", "--workers", "0"], "--workers is 0"),
+        (["--tooth", "46", "--jitter-mm", "-1"], "--jitter-mm"),
+        (["--tooth", "46", "--supersampling", "0"], "--supersampling is 0"),
+        (["--tooth", "46", "--seed", "-1"], "--seed is -1"),
+        (["--tooth", "46", "--scans", "3", "--farthest-mm", "0"], "--farthest-mm"),
     ):
         with pytest.raises(SystemExit) as caught:
             cli.main(["repeat", str(phantom_file), *arguments, "--out", str(tmp_path / "out")])

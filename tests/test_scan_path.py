@@ -291,6 +291,21 @@ def test_the_hand_drifts_on_turns_too(coarse_phantom: Jaw) -> None:
     assert 0.02 < np.mean(moved) < 1.5
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *({"frames": frames} for frames in (1, 0, -3)),
+        *({"length_mm": length} for length in (0.0, -1.0, np.nan)),
+        *({"minimum_overlap": share} for share in (1.0, -0.1, np.nan)),
+        *({name: -0.1} for name in ("jitter_mm", "jitter_deg", "clearance_mm")),
+        *({"jitter_length_mm": length} for length in (0.0, np.nan)),
+    ],
+)
+def test_impossible_paths_are_refused_before_anything_is_made(wrong: dict[str, float]) -> None:
+    with pytest.raises(InputError, match=f"scan path: .*--{next(iter(wrong)).replace('_', '-')}"):
+        ScanPathOptions(**wrong)
+
+
 @pytest.mark.parametrize("wrong", [{"turns": 2}, {"turns": 0}, {"turn_deg": 90.0}, {"turn_deg": 0.0}])
 def test_impossible_turns_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(InputError, match=r"scan path: .*turn"):

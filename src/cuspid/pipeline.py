@@ -210,6 +210,12 @@ class RenderOptions:
     seed: int = 0
     """Chooses texture, hand jitter and sensor noise."""
 
+    def __post_init__(self) -> None:
+        if self.supersampling < 1:
+            raise InputError(f"simulation: --supersampling is {self.supersampling}; at least 1 is needed")
+        if self.seed < 0:
+            raise InputError(f"simulation: --seed is {self.seed}; it must not be negative")
+
 
 @dataclass(frozen=True, kw_only=True)
 class SimulationOptions(RenderOptions):

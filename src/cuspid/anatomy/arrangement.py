@@ -57,6 +57,10 @@ PapillaOf = Callable[[tuple["PlacedTooth", ...]], Point]
 """Where the papilla lies behind given teeth."""
 
 
+COARSEST_MM = 2.0
+"""A grid that is coarser misses teeth."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class PhantomOptions:
     """What the phantom looks like and how finely it is meshed."""
@@ -91,6 +95,14 @@ class PhantomOptions:
     """Tooth (FDI) and its rotation about the long axis, distal end towards buccal: 33 20 43 -15."""
     displace_mm: dict[int, float] = field(default_factory=dict)
     """Tooth (FDI) and its displacement towards buccal: 32 -1.5 42 -1."""
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise InputError(f"phantom: the seed is {self.seed}; it must not be negative")
+        if not COARSEST_MM >= self.edge_mm > 0:
+            raise InputError(f"phantom: --edge-mm is {self.edge_mm:g}; it must be positive and at most {COARSEST_MM:g}")
+        if self.variation < 0 or (self.tooth_size is not None and not self.tooth_size > 0):
+            raise InputError("phantom: --variation must not be negative, --tooth-size must be positive")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -44,6 +44,8 @@ def repeat(
         cluster: Address of a Dask scheduler, tcp://host:port, whose workers see the folder too.
         retry_failed: Run again what failed before.
     """
+    if workers is not None and workers < 1:
+        raise InputError(f"repeat: --workers is {workers}; at least one is needed")
     trial = TrialOptions(simulation=simulation, reconstruction=reconstruction)
     kept = {
         "new_texture": options.new_texture,

@@ -96,6 +96,17 @@ class ScanPathOptions:
             raise InputError(f"scan path: the number of turns must be odd (1, 3, 5 ...), not {self.turns}")
         if not 0 < self.turn_deg < 90:
             raise InputError(f"scan path: --turn-deg must lie between 0 and 90, not {self.turn_deg:g}")
+        if self.frames is not None and self.frames < 2:
+            raise InputError(f"scan path: --frames is {self.frames}; at least 2 are needed")
+        if self.length_mm is not None and not self.length_mm > 0:
+            raise InputError(f"scan path: --length-mm must be positive, not {self.length_mm:g}")
+        if not 0 <= self.minimum_overlap < 1:
+            raise InputError(f"scan path: --minimum-overlap must lie between 0 and 1, not {self.minimum_overlap:g}")
+        if min(self.jitter_mm, self.jitter_deg, self.clearance_mm) < 0 or not self.jitter_length_mm > 0:
+            raise InputError(
+                "scan path: --jitter-mm, --jitter-deg and --clearance-mm must not be negative, --jitter-length-mm "
+                "must be positive"
+            )
 
     @property
     def rolls_deg(self) -> tuple[float, ...]:
