@@ -262,6 +262,9 @@ def test_a_folder_with_nothing_to_report(tmp_path, capsys, scan_folder):
     assert "goes on where it stopped" in refused(capsys, "report", tmp_path / "killed")
     (scan_folder / "trueness.json").write_text("{")
     assert "not valid JSON" in refused(capsys, "report", scan_folder)
+    for broken in ("[]", '{"reconstruct": 3}'):
+        (tmp_path / "killed" / "run.json").write_text(broken)
+        assert "run.json: not what cuspid writes there" in refused(capsys, "report", tmp_path / "killed")
     assert "--most-faces" in refused(capsys, "report", scan_folder, "--most-faces", 3)
     assert not list(tmp_path.glob("**/report.html"))
 

@@ -117,6 +117,15 @@ def hash_file(path: Path) -> str:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
 
 
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """``run.json`` of a folder, by stage; empty where there is none. Raises InputError where it is broken."""
+    path = folder / "run.json"
+    found = read_json(path) if path.exists() else {}
+    if not isinstance(found, dict) or not all(isinstance(entry, dict) for entry in found.values()):
+        raise InputError(f"{path}: not what cuspid writes there; see docs/formats.md")
+    return found
+
+
 def claim_folder(
     folder: Path, stage: str, settings: Mapping[str, object], inputs: Mapping[str, str], *, replace: bool = False
 ) -> None:
@@ -128,7 +137,7 @@ def claim_folder(
     """
     manifest_path = folder / "run.json"
     entry = to_plain({"cuspid": cuspid.__version__, "settings": settings, "inputs_sha256": inputs})
-    manifest = read_json(manifest_path) if manifest_path.exists() else {}
+    manifest = read_manifest(folder)
     if not manifest and folder.exists() and finished(folder):
         raise OutputError(f"{folder}: holds files that are not from cuspid; give an empty or new folder as --out")
     if stage in manifest and manifest[stage] != entry and not replace:

@@ -24,7 +24,7 @@ from cuspid.panorama import Panorama
 from cuspid.reconstruction import Reconstruction
 from cuspid.shape_model import ShapeModel
 from cuspid.storage.captures import read_capture
-from cuspid.storage.files import hash_file, read_json, reading
+from cuspid.storage.files import hash_file, read_json, read_manifest, reading
 from cuspid.storage.jaws import Unit, is_jaw, read_jaw, read_labelled_mesh, read_mesh, read_vertex_values
 from cuspid.storage.panoramas import read_panorama
 from cuspid.storage.reconstructions import read_reconstruction
@@ -130,7 +130,7 @@ def read_result(folder: Path, reference: Path | None = None, unit: Unit = "mm") 
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give one that a verb of cuspid wrote into")
-    run = read_json(folder / "run.json") if (folder / "run.json").exists() else {}
+    run = read_manifest(folder)
     for is_there, read in _READERS:
         if is_there(folder, run):
             return read(folder, run)
