@@ -182,6 +182,7 @@ def test_the_command_line_has_a_page_for_every_verb(monkeypatch):
         assert all(argument in text.replace("-", "_") for argument in own_options(command)), verb
     assert ".. program:: cuspid prepare crown" in found["prepare.rst"]
     assert ".. option:: --taper-deg FLOAT" in found["prepare.rst"]
+    assert all(command_pages.summary(command).endswith(".") for command in cli.COMMANDS.values())
     assert "*(default: 46 41)*" in found["design.rst"]
     assert "--noise.…" in found["design.rst"]
 

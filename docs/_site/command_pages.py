@@ -44,7 +44,7 @@ def parser(command: Any) -> argparse.ArgumentParser:
 def summary(command: Any) -> str:
     """First sentence of what a verb says of itself."""
     paragraph = inspect.getdoc(command).split("\n\n")[0].replace("\n", " ")
-    return re.split(r"(?<=[.:]) (?=[A-Z])", paragraph)[0]
+    return re.sub(":$", ".", re.split(r"(?<=[.:]) (?=[A-Z])", paragraph)[0])
 
 
 def _index(verbs: Mapping[str, str]) -> str:
