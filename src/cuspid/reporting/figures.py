@@ -253,7 +253,7 @@ def _draw_figures(figure: Figure, trueness: Trueness) -> None:
     accuracy = trueness.accuracy
     rows = [
         ("mean absolute", f"{accuracy.mean_abs_um:.1f} µm"),
-        ("signed mean ± SD", f"{accuracy.signed_mean_um:+.1f} ± {accuracy.std_um:.1f} µm"),
+        ("signed mean ± SD", f"{accuracy.signed_mean_um:+z.1f} ± {accuracy.std_um:.1f} µm"),
         ("95 % within", f"{accuracy.p95_um:.1f} µm"),
         ("complete within 50 µm", f"{trueness.completeness_pct['50']:.1f} %"),
         ("scale error", f"{trueness.scale_error_ppm:+.0f} ppm"),
