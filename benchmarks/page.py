@@ -107,7 +107,7 @@ def detail(result: Result) -> str:
             + ", ".join(f"{name} {number}" for name, number in condition.items())
             + ".",
             "",
-            f"Signed mean {trueness['signed_mean_um']:.1f} um, SD {trueness['std_um']:.1f} um, "
+            f"Signed mean {trueness['signed_mean_um']:z.1f} um, SD {trueness['std_um']:.1f} um, "
             f"RMS {trueness['rms_um']:.1f} um, max {trueness['max_um']:.0f} um; complete within 50/100/200 um: "
             + "/".join(f"{trueness['completeness_pct'][key]:.1f}" for key in ("50", "100", "200"))
             + f" %; scale error {trueness['scale_error_ppm']:.0f} ppm; "
