@@ -16,7 +16,8 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int16, UInt8
+from jaxtyping import Bool, Float, Int, Int16, Shaped, UInt8
+from skimage.morphology import remove_small_objects
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.geometry import Rigid3
@@ -30,13 +31,15 @@ Progress = Callable[[str, int, int], None]
 
 CELL_PX = 6
 """Width in px of the cells on which the frame is chosen."""
-_GRID_PX = 12
+_GRID_PX = 3
 """Spacing in px of the places that are projected exactly; between them the map is bilinear."""
 _MARGIN_MM = 4.0
 """The canvas reaches so far beyond the points of the motion."""
 _UNLIT, _UNLIT_PX = 8, 25
 """What is darker than the first (grey level of the largest channel) over a width of the second, in px of the panorama,
 shows nothing: the depth of the mouth behind the teeth."""
+_SPECK_MM2 = 4.0
+"""Smaller pieces of the panorama are left out."""
 BURNT, DARK = 245, 20
 """Grey levels (largest and smallest channel) beyond which a pixel says nothing of brightness."""
 
@@ -94,6 +97,17 @@ class Mosaic:
     """World Z of each pixel. float32."""
     overlaps: tuple[float | None, ...]
     """For each located frame: share of what it sees that the one before sees too."""
+
+
+def brightest(image: Shaped[np.ndarray, "h w 3"]) -> Shaped[np.ndarray, "h w"]:
+    """Largest of the three channels; many times faster than the maximum along the axis."""
+    return np.asarray(np.maximum(np.maximum(image[..., 0], image[..., 1]), image[..., 2]))
+
+
+def _to_border(px: Float[np.ndarray, "h w 2"], camera: Camera) -> Float[np.ndarray, "h w"]:
+    """Distance of pixels from the border of their frame, negative outside; NaN where there is none."""
+    x, y = px[..., 0], px[..., 1]
+    return np.asarray(np.minimum(np.minimum(x, camera.width - x), np.minimum(y, camera.height - y)))
 
 
 # --- where frames lie --------------------------------------------------------------------------------------------
@@ -190,20 +204,20 @@ def glance(
     world = positions(canvas, view, surface, CELL_PX)
     in_cam = view.cam_from_world.apply(world)
     px = view.camera.project(in_cam).astype(np.float32)
-    burnt = cv2.dilate((image.max(axis=-1) >= BURNT).astype(np.uint8) * 255, np.ones((5, 5), np.uint8))
+    burnt = cv2.dilate((brightest(image) >= BURNT).astype(np.uint8) * 255, np.ones((5, 5), np.uint8))
     blurred = cv2.blur(image, (5, 5))
     where = px - np.float32(OPENCV_PIXEL_OFFSET)
     color = cv2.remap(blurred, where, None, cv2.INTER_LINEAR).astype(np.float32)
     glare = cv2.remap(cv2.blur(burnt, (9, 9)), where, None, cv2.INTER_LINEAR).astype(np.float32) / 255
     towards = view.cam_from_world.inverse().translation - world
     tangent2 = np.sum(towards[..., :2] ** 2, axis=-1) / np.maximum(towards[..., 2], 1e-6) ** 2
-    size = np.array([view.camera.width, view.camera.height])
-    border = np.minimum(px, size - px).min(axis=-1)
-    dark = (color.max(axis=-1) < DARK).astype(np.float32)
+    border, largest = _to_border(px, view.camera), brightest(color)
+    dark = (largest < DARK).astype(np.float32)
     cost = options.seams.cost(tangent2, border - options.border_px, np.maximum(glare, dark))
-    seen = np.isfinite(px).all(axis=-1) & (border >= options.border_px) & (in_cam[..., 2] > 0)
+    seen = (border >= options.border_px) & (in_cam[..., 2] > 0)
+    seen &= surface.known_at(world[..., :2]) & ~surface.hides(world, view.cam_from_world.inverse().translation)
     cost = np.where(seen, cost, np.inf)
-    bright = (color.max(axis=-1) < BURNT) & (color.max(axis=-1) > DARK) & (glare < 0.02)
+    bright = (largest < BURNT) & (largest > DARK) & (glare < 0.02)
     # Lights at the camera: 1 / d^2, and a lobe about the optical axis.
     distance2 = np.sum(in_cam**2, axis=-1)
     falloff = np.log(np.maximum(in_cam[..., 2], 1e-6) / np.sqrt(distance2) / distance2)
@@ -341,7 +355,7 @@ def _survey(
         best.offer(index, cells, seen)
         samples.take(index, cells, best.cost.shape[2], seen.color, seen.light, seen.usable)
         now = np.zeros_like(before)
-        now[cells] = np.isfinite(seen.cost) & (seen.color.max(axis=-1) > DARK)
+        now[cells] = np.isfinite(seen.cost) & (brightest(seen.color) > DARK)
         overlaps.append(float((now & before).sum() / max(now.sum(), 1)) if index else None)
         before = now
         progress("survey", index + 1, len(names))
@@ -378,7 +392,8 @@ def _render(
             frame_pixel[view.window][chosen] = px[chosen]
         progress("mosaic", index + 1, len(names))
     image = np.clip(np.rint(bands.image()), 0, 255).astype(np.uint8)
-    nothing = (frame < 0) | unlit(image)
+    shown = (frame >= 0) & ~unlit(image)
+    nothing = ~remove_small_objects(shown, max_size=round(_SPECK_MM2 / canvas.mm_per_px**2))
     image[nothing], frame[nothing], frame_pixel[nothing] = 0, -1, np.nan
     whole = View(views[0].camera, views[0].cam_from_world, 0, 0, canvas.width, canvas.height)
     heights = cv2.resize(positions(canvas, whole, surface, CELL_PX)[..., 2].astype(np.float32), shape[::-1])
@@ -389,7 +404,7 @@ def _render(
 
 def unlit(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
     """Where no light came back: dark places wider than `_UNLIT_PX`, so not the fissures and the gaps between teeth."""
-    dark = (cv2.blur(image, (5, 5)).max(axis=-1) < _UNLIT).astype(np.uint8)
+    dark = (brightest(cv2.blur(image, (5, 5))) < _UNLIT).astype(np.uint8)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_UNLIT_PX, _UNLIT_PX))
     return np.asarray(cv2.morphologyEx(dark, cv2.MORPH_OPEN, disc) > 0)
 
@@ -409,13 +424,14 @@ def _put(
     """Rectify one frame, even out its light and add it."""
     where = px - np.float32(OPENCV_PIXEL_OFFSET)
     rectified = cv2.remap(image, where, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
-    size = np.array([view.camera.width, view.camera.height], np.float32)
-    inside = (np.minimum(px, size - px).min(axis=-1) >= 1) & np.isfinite(px).all(axis=-1)
-    burnt = cv2.dilate((rectified.max(axis=-1) >= BURNT).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    inside = _to_border(px, view.camera) >= 1
+    burnt = cv2.dilate((brightest(rectified) >= BURNT).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     # A burnt-out pixel counts only where no other frame was to be had.
-    valid = (inside & (~burnt | chosen)).astype(np.float32)
-    valid[burnt & chosen] = 0.05
     world = positions(canvas, view, surface, CELL_PX)
+    hidden = surface.hides(world, view.cam_from_world.inverse().translation).astype(np.uint8)
+    open_ = cv2.resize(hidden, (view.width, view.height), interpolation=cv2.INTER_NEAREST) == 0
+    valid = (inside & ((open_ & ~burnt) | chosen)).astype(np.float32)
+    valid[burnt & chosen] = 0.05
     in_cam = view.cam_from_world.apply(world)
     distance2 = np.sum(in_cam**2, axis=-1)
     falloff = np.log(np.maximum(in_cam[..., 2], 1e-6) / np.sqrt(distance2) / distance2).astype(np.float32)

@@ -7,6 +7,7 @@ from collections.abc import Sequence as List
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from jaxtyping import UInt8
 
 from cuspid.panorama import FrameUse, Panorama, Strip
 from cuspid.reconstruction import Reconstruction
@@ -14,6 +15,7 @@ from cuspid.sequence import Sequence
 from cuspid.stitching.mosaic import Mosaic, MosaicOptions, Progress, compose
 from cuspid.stitching.strip import StripOptions, unroll
 from cuspid.stitching.surface import ScaleOptions, SurfaceOptions, height_map, in_occlusal_frame
+from cuspid.stitching.sweep import SweepOptions, sweep
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +25,9 @@ class OrthoOptions:
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     """How large things are."""
     surface: SurfaceOptions = field(default_factory=SurfaceOptions)
-    """The surface on which frames are rectified."""
+    """The smooth surface through the sparse points of the motion."""
+    sweep: SweepOptions = field(default_factory=SweepOptions)
+    """The dense surface on which frames are rectified."""
     mosaic: MosaicOptions = field(default_factory=MosaicOptions)
     """Choice of frames, exposure, blending."""
     strip: StripOptions = field(default_factory=StripOptions)
@@ -55,9 +59,15 @@ def orthophoto(
     if scale.working_distance_mm is None:
         scale = replace(scale, working_distance_mm=sequence.working_distance_mm)
     motion = in_occlusal_frame(located, scale)
-    surface = height_map(motion, options.surface)
     index = {name: number for number, name in enumerate(sequence.names)}
-    mosaic = compose(motion, surface, lambda name: sequence.image(index[name]), options.mosaic, progress=progress)
+
+    def read(name: str) -> UInt8[np.ndarray, "h w 3"]:
+        return sequence.image(index[name])
+
+    sparse = height_map(motion, options.surface)
+    dense = sweep(motion, sparse, read, options.sweep, progress=progress) if options.sweep.enabled else None
+    surface = sparse if dense is None else dense
+    mosaic = compose(motion, surface, read, options.mosaic, progress=progress)
     metric = scale.working_distance_mm is not None or scale.width_mm is not None
     panorama = _panorama(mosaic, motion, frames, index, metric)
     panorama = replace(panorama, notes=(_scale_note(scale, given=scale == options.scale),))

@@ -8,10 +8,13 @@ such that the camera was `NOMINAL_MM` from the teeth, and are not called millime
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import no_type_check
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from numba import njit
 from scipy.ndimage import gaussian_filter, grey_dilation
 from scipy.spatial import KDTree
 
@@ -40,6 +43,9 @@ _DEEP_MM = 8.0
 _ROUND_MM = 0.8
 """Crowns bulge out below their edges: the surface goes on by one cell, at most so much lower."""
 
+_RIM_MM, _OVER_MM = 0.4, 0.2
+"""The surface hides what it stands over by more than the second, farther away than the first."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ScaleOptions:
@@ -66,9 +72,30 @@ class SurfaceOptions:
     """Standard deviation of the Gaussian filter over the height map."""
 
 
+@njit(cache=True, nogil=True)
+@no_type_check
+def _hide(places, centre, roof, corner, cell, start, over, hidden):
+    """Fill in whether the way from a place to the centre goes under the roof, more than ``start`` cells away."""
+    top, (rows, columns) = roof.max(), roof.shape
+    for r in range(places.shape[0]):
+        for c in range(places.shape[1]):
+            x, y, z = places[r, c]
+            dx, dy, dz = centre[0] - x, centre[1] - y, centre[2] - z
+            length = np.sqrt(dx * dx + dy * dy)
+            if dz <= 0 or length == 0:
+                continue
+            for step in range(start, int(length * min(1.0, max(0.0, top - z) / dz) / cell) + 1):
+                share = step * cell / length
+                i = int(np.rint((x + share * dx - corner[0]) / cell))
+                j = int(np.rint((y + share * dy - corner[1]) / cell))
+                if 0 <= i < columns and 0 <= j < rows and roof[j, i] > z + share * dz + over:
+                    hidden[r, c] = True
+                    break
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HeightMap:
-    """World Z over the occlusal plane, on a regular grid, known everywhere."""
+    """World Z over the occlusal plane, on a regular grid."""
 
     corner: Float[np.ndarray, "2"]
     """World (x, y) of the first cell; rows run along +Y."""
@@ -76,6 +103,28 @@ class HeightMap:
     """Spacing."""
     heights: Float[np.ndarray, "r c"]
     """World Z of each cell. float32."""
+    known: Bool[np.ndarray, "r c"]
+    """Whether there is a surface that was seen."""
+
+    @cached_property
+    def _roof(self) -> Float[np.ndarray, "r c"]:
+        """The highest surface within `_RIM_MM`, for the crowns' rims may lie that far out."""
+        size = 2 * round(_RIM_MM / self.cell_mm) + 1
+        return np.asarray(cv2.dilate(self.heights, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))))
+
+    def hides(self, places: Float[np.ndarray, "h w 3"], centre: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "h w"]:
+        """Whether the surface stands between places on it and a camera's centre."""
+        hidden = np.zeros(places.shape[:2], bool)
+        start = round(_RIM_MM / self.cell_mm) + 1
+        _hide(places, centre, self._roof, self.corner, self.cell_mm, start, _OVER_MM, hidden)
+        return hidden
+
+    def known_at(self, xy: Float[np.ndarray, "h w 2"]) -> Bool[np.ndarray, "h w"]:
+        """Whether the surface was seen at a grid of places; not so beyond the border."""
+        place = np.rint((xy - self.corner) / self.cell_mm).astype(int)
+        rows, columns = np.array(self.known.shape) - 1
+        inside = ((place >= 0) & (place <= [columns, rows])).all(axis=-1)
+        return np.asarray(inside & self.known[place[..., 1].clip(0, rows), place[..., 0].clip(0, columns)])
 
     def at(self, xy: Float[np.ndarray, "h w 2"]) -> Float[np.ndarray, "h w"]:
         """Heights at a grid of places, bilinear; that of the border beyond it."""
@@ -220,7 +269,8 @@ def height_map(model: Reconstruction, options: SurfaceOptions) -> HeightMap:
     upper = np.full(known.shape, np.nan)
     upper[known] = np.nanpercentile(heights[known], _UPPER, axis=-1)
     smooth = _filled(_bulging(upper), options.smoothing_mm / options.cell_mm, float(np.median(points[:, 2])))
-    return HeightMap(corner=low, cell_mm=options.cell_mm, heights=smooth.astype(np.float32))
+    heights = smooth.astype(np.float32)
+    return HeightMap(corner=low, cell_mm=options.cell_mm, heights=heights, known=np.ones(heights.shape, bool))
 
 
 def _bulging(heights: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r c"]:

@@ -1,0 +1,359 @@
+"""A dense surface under the occlusal plane, by a sweep of horizontal planes through the frames of one camera.
+
+On each plane z = const all frames are laid down as if the surface were there (Collins 1996); where it is, frames from
+different places agree. What agrees is the zero-mean normalised cross-correlation (ZNCC) of small windows, averaged over
+all pairs of frames a stereo baseline apart: of their grey levels, which tell the outlines of crowns and the gum, and of
+their fine detail alone, because the broad light and shade of a lamp that goes along with the camera moves over the
+surface and pulls what is matched by it below the crowns. The height of each cell then follows from semi-global
+optimisation (Hirschmueller 2008) over the volume of places and heights.
+
+The volume grows with the arch; of the frames only a few are held at a time.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple, no_type_check
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+from numba import njit
+from skimage.morphology import remove_small_holes, remove_small_objects
+
+from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
+from cuspid.geometry import Rigid3
+from cuspid.reconstruction import Reconstruction
+from cuspid.stitching.mosaic import BURNT, Progress, brightest, footprint
+from cuspid.stitching.surface import HeightMap
+
+_BLOCK, _REACH = 24, 14
+"""Frames that are paired at a time, and how many frames later a partner may be."""
+_NOISE_DN = 1.0
+"""Contrast (standard deviation in grey levels) below which there is nothing to agree on."""
+_DETAIL = 4
+"""Fine detail is held in so many steps to a grey level."""
+_DARKEST = 16
+"""Grey levels below are raised to this one: noise."""
+_SPECK_MM2 = 4.0
+"""Smaller islands of what is known are taken for nothing, and smaller holes for known."""
+_ABOVE_MM = 1.5
+"""The surface is looked for no higher above the smooth one through the points: highlights would have it there."""
+_GLARE_PX = 9
+"""Width of the filter that widens highlights: they go along with the camera, as if they lay off the surface."""
+_GLARE_WEIGHT = 0.1
+"""What a pair of frames counts for where a highlight burns in one of them."""
+_PAIRS = 1.0
+"""So many pairs without any agreement are added, so that what few saw counts little."""
+_POOL = 2
+"""Cells of the sweep to one cell of the height map, in each direction."""
+_DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepOptions:
+    """The dense surface."""
+
+    enabled: bool = True
+    """Whether to look for it; else a smooth surface through the sparse points of the motion serves."""
+    cell_mm: float = 0.1
+    """Spacing of the places at which frames are compared; the height map has half as many."""
+    step_mm: float = 0.2
+    """Distance of the planes."""
+    depth_mm: float = 11.0
+    """The lowest plane lies so far below the occlusal one."""
+    window: int = 5
+    """Side of the window that is compared, in cells."""
+    detail_px: float = 4.0
+    """Fine detail is what a Gaussian filter of this standard deviation takes from a frame, px."""
+    baseline_share: float = 0.2
+    """Frames are compared that lie about this share of the distance to the teeth apart."""
+    small_jump: float = 0.03
+    """Penalty of a height that differs by one plane from its neighbour's; the ZNCC costs 1 to 0."""
+    large_jump: float = 0.5
+    """Penalty of a height that differs by more."""
+    smoothing_mm: float = 0.24
+    """Standard deviation of the Gaussian filter over the heights."""
+    agreement: float = 0.15
+    """Places with a lower mean ZNCC (0 to 1) at their height show nothing that is known."""
+
+
+# --- which frames are compared -----------------------------------------------------------------------------------
+
+
+def partners(motion: Reconstruction, share: float) -> dict[int, int]:
+    """For each frame that has one a later frame beside it, whose baseline is nearest to ``share`` of the distance to
+    the points (within a factor 1.8), mostly sideways, looking in about the same direction."""
+    poses = [pose.inverse() for pose in motion.rig_from_world.values()]
+    centres = np.array([pose.translation for pose in poses])
+    axes = np.array([pose.rotation[:, 2] for pose in poses])
+    wanted = share * float(np.median(motion.depths_in_rig))
+    found: dict[int, int] = {}
+    for one in range(len(poses) - 1):
+        others = np.arange(one + 1, min(one + 1 + _REACH, len(poses)))
+        shift, axis = centres[others] - centres[one], axes[others] + axes[one]
+        axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+        along = np.sum(shift * axis, axis=1)
+        sideways = np.linalg.norm(shift - along[:, None] * axis, axis=1)
+        off = np.abs(np.log(np.maximum(sideways, 1e-9) / wanted))
+        alike = (sideways >= 2 * np.abs(along)) & (axes[others] @ axes[one] > np.cos(np.deg2rad(20)))
+        off[~alike] = np.inf
+        if off.min() < np.log(1.8):
+            found[one] = int(others[off.argmin()])
+    return found
+
+
+# --- one plane ---------------------------------------------------------------------------------------------------
+
+
+class Grid(NamedTuple):
+    """Places in the occlusal plane at which frames are compared."""
+
+    corner: Float[np.ndarray, "2"]
+    cell_mm: float
+    columns: int
+    rows: int
+
+    @staticmethod
+    def over(motion: Reconstruction, cell_mm: float) -> Grid:
+        """About the points of a motion, a whole number of pools wide."""
+        low, high = np.percentile(motion.known_tracks.points[:, :2], [0.2, 99.8], axis=0) + [[-4.0], [4.0]]
+        columns, rows = (_POOL * np.ceil((high - low) / cell_mm / _POOL)).astype(int).tolist()
+        return Grid(low, cell_mm, columns, rows)
+
+
+class _Field(NamedTuple):
+    """Values on a plane, and what they are like around each place."""
+
+    values: np.ndarray
+    mean: np.ndarray
+    variance: np.ndarray
+
+    @staticmethod
+    def of(values: Float32[np.ndarray, "h w"], window: int) -> _Field:
+        mean = _mean(values, window)
+        return _Field(values, mean, _mean(values * values, window) - mean * mean)
+
+    def cut(self, part: tuple[slice, slice]) -> _Field:
+        return _Field(*(each[part] for each in self))
+
+
+class _Laid(NamedTuple):
+    """A frame on a plane, within its window of the grid."""
+
+    low: np.ndarray
+    high: np.ndarray
+    gray: _Field
+    detail: _Field
+    weight: np.ndarray
+
+    def part(self, low: np.ndarray, high: np.ndarray) -> tuple[slice, slice]:
+        """Rows and columns of this window."""
+        (left, top), (right, bottom) = (low - self.low).tolist(), (high - self.low).tolist()
+        return slice(top, bottom), slice(left, right)
+
+
+def _mean(values: Float32[np.ndarray, "h w"], window: int) -> Float32[np.ndarray, "h w"]:
+    return np.asarray(cv2.blur(values, (window, window)))
+
+
+def _window_of(grid: Grid, camera: Camera, pose: Rigid3, z: float) -> tuple[Int[np.ndarray, "2"], Int[np.ndarray, "2"]]:
+    """The part of the grid that a frame sees; to no side farther than it would see if it looked straight down."""
+    centre, corners = pose.inverse().translation, footprint(camera, pose, z)
+    half = (centre[2] - z) * max(camera.width, camera.height) / 2 / float(np.mean(camera.focal_px))
+    limits = np.array([grid.columns, grid.rows])
+    low = np.maximum(corners.min(axis=0), centre[:2] - half)
+    high = np.minimum(corners.max(axis=0), centre[:2] + half)
+    low, high = (np.clip(np.floor((end - grid.corner) / grid.cell_mm), 0, limits).astype(int) for end in (low, high))
+    return low, high
+
+
+def _lay(
+    grid: Grid, camera: Camera, pose: Rigid3, z: float, image: UInt8[np.ndarray, "h w 3"], window: int
+) -> _Laid | None:
+    """A frame on the plane at height z; None where it sees nothing of the grid."""
+    low, high = _window_of(grid, camera, pose, z)
+    if np.any(high - low < window):
+        return None
+    corner = grid.corner + grid.cell_mm * (low + 0.5)
+    place = np.array([[grid.cell_mm, 0, corner[0]], [0, grid.cell_mm, corner[1]], [0, 0, 1]])
+    in_camera = np.column_stack([pose.rotation[:, :2], pose.rotation[:, 2] * z + pose.translation]) @ place
+    to_pixel = camera.matrix @ in_camera - OPENCV_PIXEL_OFFSET * np.outer([1, 1, 0], in_camera[2])
+    size, flags = (high - low).tolist(), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    laid = cv2.warpPerspective(image, to_pixel, size, flags=flags).astype(np.float32)
+    gray, detail, weight = (np.ascontiguousarray(laid[..., channel]) for channel in range(3))
+    weight = cv2.erode(weight, np.ones((window, window), np.uint8), borderValue=0)
+    return _Laid(low, high, _Field.of(gray, window), _Field.of(detail, window), weight / 255)
+
+
+def _zncc(one: _Field, other: _Field, noise: float, window: int) -> Float32[np.ndarray, "h w"]:
+    """What two fields agree, 0 to 1; little where their contrast is not above the noise."""
+    common = _mean(one.values * other.values, window) - one.mean * other.mean
+    power = (np.maximum(one.variance, 0) + noise**2) * (np.maximum(other.variance, 0) + noise**2)
+    return np.clip(common / np.sqrt(power), 0, 1)
+
+
+def _add_agreement(one: _Laid, other: _Laid, window: int, agreement: np.ndarray, pairs: np.ndarray) -> None:
+    """Add what two frames agree on a plane, and where both see it, to the sums over the grid."""
+    low, high = np.maximum(one.low, other.low), np.minimum(one.high, other.high)
+    if np.any(high <= low):
+        return
+    a, b = one.part(low, high), other.part(low, high)
+    weight = np.minimum(one.weight[a], other.weight[b])
+    gray = _zncc(one.gray.cut(a), other.gray.cut(b), _NOISE_DN, window)
+    detail = _zncc(one.detail.cut(a), other.detail.cut(b), _DETAIL * _NOISE_DN, window)
+    here = slice(low[1], high[1]), slice(low[0], high[0])
+    agreement[here] += weight * (gray * gray + detail) / 2
+    pairs[here] += weight
+
+
+# --- all planes --------------------------------------------------------------------------------------------------
+
+
+def _compared(
+    image: UInt8[np.ndarray, "h w 3"], maps: tuple[np.ndarray, np.ndarray] | None, detail_px: float
+) -> UInt8[np.ndarray, "h w 3"]:
+    """What is compared of a frame, as a camera without distortion sees it: its grey levels, their fine detail (times
+    `_DETAIL`, about 128), and what they count for (times 255): in one picture, for that is laid down fastest."""
+    gray = np.maximum(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), _DARKEST)
+    detail = gray - cv2.GaussianBlur(gray.astype(np.float32), (0, 0), detail_px)
+    glare = cv2.dilate((brightest(image) >= BURNT).astype(np.uint8), np.ones((_GLARE_PX, _GLARE_PX), np.uint8))
+    weight = np.where(glare > 0, 255 * _GLARE_WEIGHT, 255)
+    picture = np.dstack([gray, np.clip(128 + _DETAIL * detail, 0, 255), weight]).astype(np.uint8)
+    return picture if maps is None else np.asarray(cv2.remap(picture, *maps, cv2.INTER_LINEAR))
+
+
+def _undistortion(camera: Camera) -> tuple[np.ndarray, np.ndarray] | None:
+    """Maps for ``cv2.remap`` to the same camera without distortion; None where it has none."""
+    if not np.any(camera.distortion):
+        return None
+    ideal = replace(camera, distortion=np.zeros(4), covariance=None)
+    pixels = camera.project(ideal.rays(ideal.pixel_centres())) - OPENCV_PIXEL_OFFSET
+    pixels = np.nan_to_num(pixels, nan=-1e4).astype(np.float32)
+    return np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])
+
+
+def sweep(
+    motion: Reconstruction,
+    sparse: HeightMap,
+    read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
+    options: SweepOptions,
+    *,
+    progress: Progress,
+) -> HeightMap | None:
+    """The surface on which the frames of a motion in the occlusal frame agree; None where no two frames lie apart.
+
+    ``sparse`` is the smooth surface through the points, which tells how high the teeth reach; ``read`` gives the image
+    of a frame by its name.
+    """
+    pairs = partners(motion, options.baseline_share)
+    if not pairs:
+        return None
+    top = float(sparse.heights.max()) + _ABOVE_MM
+    levels = np.arange(-options.depth_mm, top + options.step_mm, options.step_mm)
+    grid = Grid.over(motion, options.cell_mm)
+    volume = _agreement(motion, pairs, grid, levels, read, options, progress)
+    cell_mm = _POOL * options.cell_mm
+    corner, (rows, columns) = grid.corner + cell_mm / 2, volume.shape[1:]
+    places = corner + cell_mm * np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
+    volume[levels[:, None, None] > sparse.at(places) + _ABOVE_MM] = 0
+    plane = semi_global(1 - volume, options.small_jump, options.large_jump)
+    at = np.clip(np.rint(plane), 0, len(levels) - 1).astype(int)
+    certainty = cv2.blur(np.take_along_axis(volume, at[None], axis=0)[0], (5, 5))
+    heights = cv2.medianBlur((levels[0] + options.step_mm * plane).astype(np.float32), 5)
+    return HeightMap(
+        corner=corner,
+        cell_mm=cell_mm,
+        heights=np.asarray(cv2.GaussianBlur(heights, (0, 0), options.smoothing_mm / cell_mm)),
+        known=_without_specks(certainty >= options.agreement, cell_mm),
+    )
+
+
+def _without_specks(known: Bool[np.ndarray, "r c"], cell_mm: float) -> Bool[np.ndarray, "r c"]:
+    """Without small islands and small holes."""
+    size = round(_SPECK_MM2 / cell_mm**2)
+    return np.asarray(remove_small_holes(remove_small_objects(known, max_size=size), max_size=size))
+
+
+def _agreement(
+    motion: Reconstruction,
+    pairs: Mapping[int, int],
+    grid: Grid,
+    levels: Float[np.ndarray, "d"],
+    read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
+    options: SweepOptions,
+    progress: Progress,
+) -> Float32[np.ndarray, "d r c"]:
+    """Mean agreement of the pairs of frames that see a place, at each height; zero where there are too few."""
+    camera, poses, names = motion.rig[motion.rig.names[0]].camera, list(motion.rig_from_world.values()), motion.frames
+    maps, window = _undistortion(camera), options.window
+    sums, counts = np.zeros((2, len(levels), grid.rows // _POOL, grid.columns // _POOL), np.float32)
+
+    def look(block: Mapping[int, int], images: Mapping[int, UInt8[np.ndarray, "h w 3"]], level: int) -> None:
+        agreement, seen = np.zeros((2, grid.rows, grid.columns), np.float32)
+        laid = {
+            frame: _lay(grid, camera, poses[frame], float(levels[level]), each, window)
+            for frame, each in images.items()
+        }
+        for one, other in block.items():
+            first, second = laid[one], laid[other]
+            if first is not None and second is not None:
+                _add_agreement(first, second, window, agreement, seen)
+        size = sums.shape[:0:-1]
+        sums[level] += cv2.resize(agreement, size, interpolation=cv2.INTER_AREA)
+        counts[level] += cv2.resize(seen, size, interpolation=cv2.INTER_AREA)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for start in range(0, len(names), _BLOCK):
+            block = {one: other for one, other in pairs.items() if start <= one < start + _BLOCK}
+            wanted = sorted({*block, *block.values()})
+            images = {frame: _compared(read(names[frame]), maps, options.detail_px) for frame in wanted}
+            list(pool.map(partial(look, block, images), range(len(levels))))
+            progress("surface", min(start + _BLOCK, len(names)), len(names))
+    return sums / (counts + np.float32(_PAIRS))
+
+
+# --- heights -----------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _add_path(cost, total, down, right, small, large):
+    """Add the least costs of paths in one direction to their sum over the directions."""
+    depth, rows, columns = cost.shape
+    path = np.zeros((rows, columns, depth), np.float32)
+    for i in range(rows):
+        y = i if down >= 0 else rows - 1 - i
+        for j in range(columns):
+            x = j if right >= 0 else columns - 1 - j
+            v, u = y - down, x - right
+            if v < 0 or v >= rows or u < 0 or u >= columns:
+                for d in range(depth):
+                    path[y, x, d] = cost[d, y, x]
+            else:
+                before = path[v, u]
+                least = before.min()
+                for d in range(depth):
+                    best = min(before[d], least + large)
+                    if d > 0:
+                        best = min(best, before[d - 1] + small)
+                    if d < depth - 1:
+                        best = min(best, before[d + 1] + small)
+                    path[y, x, d] = cost[d, y, x] + best - least
+            for d in range(depth):
+                total[d, y, x] += path[y, x, d]
+
+
+def semi_global(cost: Float32[np.ndarray, "d r c"], small: float, large: float) -> Float[np.ndarray, "r c"]:
+    """Plane of each cell, with fractions, by semi-global optimisation along eight directions."""
+    total = np.zeros_like(cost)
+    for down, right in _DIRECTIONS:
+        _add_path(cost, total, down, right, np.float32(small), np.float32(large))
+    best = np.clip(total.argmin(axis=0), 1, len(cost) - 2)
+    below, here, above = (np.take_along_axis(total, (best + step)[None], axis=0)[0] for step in (-1, 0, 1))
+    bend = np.maximum(below + above - 2 * here, 1e-6)
+    return np.asarray(best + np.clip((below - above) / (2 * bend), -0.5, 0.5), dtype=np.float64)
