@@ -34,7 +34,9 @@ LAPTOP, PHONE = {"width": 1366, "height": 768}, {"width": 390, "height": 844}
 A4 = {"width": 695, "height": 1017}
 """What the margins of the paper leave, in CSS px."""
 READY_MS = 60_000
-IS_WIDE = "width => document.querySelector('.zoomed img').getBoundingClientRect().width > width"
+ARE_WIDE = """width => [...document.querySelectorAll('.zoomed img')].map((each) =>
+  each.getBoundingClientRect().width > width).reduce((one, other) => one === other ? one : null)"""
+"""Whether all pictures are wider, or none is; null in between, for one follows the other a frame later."""
 PICTURE = """async () => {
   for (let k = 0; k < 3; k++) await new Promise((done) => requestAnimationFrame(done));
   return document.querySelector("canvas").toDataURL("image/png").split(",")[1];
@@ -349,12 +351,12 @@ def test_pictures_zoom_together(browser, pages):
     widths = [image.bounding_box()["width"] for image in score.page.locator(".zoomed img").all()]
     score.page.locator(".zoomed").first.hover()
     score.page.mouse.wheel(0, -300)
-    score.page.wait_for_function(IS_WIDE, arg=1.1 * widths[0])
+    score.page.wait_for_function(ARE_WIDE, arg=1.1 * widths[0])
     zoomed = [image.bounding_box()["width"] for image in score.page.locator(".zoomed img").all()]
     assert all(after > 1.1 * before for before, after in zip(widths, zoomed, strict=True))
     assert zoomed[0] == pytest.approx(zoomed[1])
     score.press("[data-zoom=reset]")
-    score.page.wait_for_function(f"width => !({IS_WIDE})(width)", arg=1.01 * widths[0])
+    score.page.wait_for_function(f"width => ({ARE_WIDE})(width) === false", arg=1.01 * widths[0])
     assert score.page.locator(".zoomed img").first.bounding_box()["width"] == pytest.approx(widths[0], rel=0.01)
     assert score.complaints == []
     assert all(url == pages["score"].as_uri() or url.startswith("data:") for url in score.requests)
