@@ -1,0 +1,213 @@
+"""The dense surface of a panorama, against a step whose heights are known, and its parts against their laws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from cuspid.camera import Camera
+from cuspid.geometry import Rigid3
+from cuspid.reconstruction import Reconstruction, Tracks
+from cuspid.rig import MountedCamera, Rig
+from cuspid.stitching.mosaic import MosaicOptions, compose
+from cuspid.stitching.surface import HeightMap, SurfaceOptions, height_map
+from cuspid.stitching.sweep import SweepOptions, partners, semi_global, sweep
+
+HALF_MM, DEEP_MM, CAMERA_MM = 3.0, 4.0, 14.0
+"""A bar of this half width along Y stands so high over a floor; the camera goes along it so high over its top."""
+CAMERA = Camera(width=240, height=180, focal_px=np.array([200.0, 200.0]), principal_point_px=np.array([120.0, 90.0]))
+
+
+class Scene(NamedTuple):
+    """Frames over the bar, and the motion that took them."""
+
+    motion: Reconstruction
+    images: dict[str, np.ndarray]
+
+    def read(self, name: str) -> np.ndarray:
+        return self.images[name]
+
+    def swept(self, **changes: object) -> HeightMap | None:
+        sparse = height_map(self.motion, SurfaceOptions())
+        return sweep(self.motion, sparse, self.read, SweepOptions(**changes), progress=lambda *_: None)
+
+
+def true_places(pose: Rigid3, pixels: np.ndarray) -> np.ndarray:
+    """What pixels of a frame show: the top of the bar, the floor, NaN for its walls."""
+    rays, centre = pose.inverse().rotate(CAMERA.rays(pixels)), pose.inverse().translation
+    top = centre - rays * (centre[2] / rays[..., 2:])
+    floor = centre - rays * ((centre[2] + DEEP_MM) / rays[..., 2:])
+    on_top, on_floor = np.abs(top[..., 0]) < HALF_MM, np.abs(floor[..., 0]) > HALF_MM
+    return np.where(on_top[..., None], top, np.where(on_floor[..., None], floor, np.nan))
+
+
+def picture(pose: Rigid3, texture: np.ndarray) -> np.ndarray:
+    """A frame over the bar; the texture has ten px to the millimetre. Walls are black, and y > 4 mm is plain."""
+    places = true_places(pose, CAMERA.pixel_centres())
+    where = (10 * np.nan_to_num(places[..., :2], nan=1e3) + 200).astype(np.float32)
+    gray = cv2.remap(texture, where[..., 0], where[..., 1], cv2.INTER_CUBIC, borderValue=0)
+    gray[places[..., 1] > 4] = 120
+    return np.dstack([np.clip(gray, 0, 255).astype(np.uint8)] * 3)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    rng = np.random.default_rng(3)
+    texture = cv2.GaussianBlur(rng.normal(0, 1, (400, 400)).astype(np.float32), (0, 0), 1.5)
+    texture = 120 + 40 * texture / texture.std()
+    poses = {}
+    for index, y in enumerate(np.arange(-9.0, 9.1, 1.0)):
+        tilt = Rigid3.from_rotation_vector(np.deg2rad(rng.normal(0, 4, 3)), np.zeros(3))
+        looking = Rigid3(np.diag([1.0, -1, -1]), np.array([0, 0, CAMERA_MM]))
+        place = Rigid3(np.eye(3), -np.array([rng.normal(0, 1.5), y, rng.normal(0, 0.3)]))
+        poses[f"{index:03d}"] = tilt @ looking @ place
+    points = rng.uniform([-6, -12, 0], [6, 12, 0], (900, 3))
+    points[np.abs(points[:, 0]) > HALF_MM, 2] = -DEEP_MM
+    motion = Reconstruction(
+        rig=Rig({"camera": MountedCamera(CAMERA, Rigid3.identity())}),
+        rig_from_world=poses,
+        tracks=Tracks(
+            points=points,
+            colors=np.zeros((len(points), 3), np.uint8),
+            point_index=np.repeat(np.arange(len(points)), 3),
+            frame_index=np.tile(np.array([8, 9, 10]), len(points)),
+            camera_index=np.zeros(3 * len(points), np.int64),
+            pixels=np.zeros((3 * len(points), 2)),
+        ),
+    )
+    return Scene(motion, {name: picture(pose, texture) for name, pose in poses.items()})
+
+
+@pytest.fixture(scope="module")
+def surface(scene: Scene) -> HeightMap:
+    found = scene.swept()
+    assert found is not None
+    return found
+
+
+def grid(x: tuple[float, float], y: tuple[float, float] = (-7.0, 2.5)) -> np.ndarray:
+    """Places of a rectangle every 0.1 mm."""
+    return np.stack(np.meshgrid(np.arange(*x, 0.1), np.arange(*y, 0.1)), axis=-1)
+
+
+def test_the_step_is_found_where_it_is(surface: HeightMap) -> None:
+    top, floor = surface.at(grid((-2.3, 2.3))), surface.at(grid((4.2, 6.0)))
+    assert np.percentile(np.abs(top), 95) < 0.15
+    assert np.percentile(np.abs(floor + DEEP_MM), 90) < 0.3
+    high = surface.at(grid((-5, 5))) > -DEEP_MM / 2
+    assert np.median(high.sum(axis=1)) * 0.1 == pytest.approx(2 * HALF_MM, abs=0.6)
+
+
+def test_what_is_textured_is_known_and_what_is_plain_or_beyond_is_not(surface: HeightMap) -> None:
+    assert surface.known_at(grid((-2.3, 2.3))).mean() > 0.99
+    assert surface.known_at(grid((-2.3, 2.3), (6.0, 9.0))).mean() < 0.05
+    assert not surface.known_at(grid((50.0, 51.0))).any()
+
+
+def test_highlights_that_go_along_with_the_camera_do_not_raise_the_surface(scene: Scene, surface: HeightMap) -> None:
+    """A spot in the middle of each picture is by itself best explained at the camera's own height."""
+    lit = {name: cv2.circle(image.copy(), (120, 90), 8, (255, 255, 255), -1) for name, image in scene.images.items()}
+    found = scene._replace(images=lit).swept()
+    assert found is not None
+    assert np.percentile(np.abs(found.at(grid((-2.3, 2.3)))), 95) < 0.25
+
+
+def test_distortion_is_taken_out(scene: Scene, surface: HeightMap) -> None:
+    bent = replace(CAMERA, distortion=np.array([-0.2, 0.05, 0.0, 0.0]))
+    where = CAMERA.project(bent.rays(bent.pixel_centres())).astype(np.float32) - np.float32(0.5)
+    images = {name: cv2.remap(image, where, None, cv2.INTER_CUBIC) for name, image in scene.images.items()}
+    rig = Rig({"camera": MountedCamera(bent, Rigid3.identity())})
+    found = Scene(replace(scene.motion, rig=rig), images).swept()
+    assert found is not None
+    middle = grid((-2.3, 2.3))
+    assert np.median(np.abs(found.at(middle) - surface.at(middle))) < 0.05
+
+
+def test_a_camera_that_stands_still_finds_no_surface(scene: Scene) -> None:
+    pose = scene.motion.rig_from_world["009"]
+    still = replace(scene.motion, rig_from_world=dict.fromkeys(scene.motion.rig_from_world, pose))
+    assert Scene(still, scene.images).swept() is None
+
+
+def test_the_mosaic_shows_each_place_once(scene: Scene, surface: HeightMap) -> None:
+    """What lies behind the bar is taken from frames that see it there, and not shown where none does."""
+    mosaic = compose(scene.motion, surface, scene.read, MosaicOptions(), progress=lambda *_: None)
+    rows, columns = np.nonzero(mosaic.frame >= 0)
+    poses = list(scene.motion.rig_from_world.values())
+    shown = np.full((len(rows), 3), np.nan)
+    for index, pose in enumerate(poses):
+        mine = mosaic.frame[rows, columns] == index
+        shown[mine] = true_places(pose, mosaic.frame_pixel[rows, columns][mine].astype(np.float64))
+    off = np.linalg.norm(shown[:, :2] - mosaic.canvas.world(np.stack([columns, rows], axis=-1) + 0.5), axis=1)
+    assert np.isnan(off).mean() < 0.02, "walls are hardly shown"
+    assert np.nanmedian(off) < 0.02
+    assert np.nanpercentile(off, 95) < 0.5
+
+
+@pytest.mark.parametrize("share", [0.1, 0.2, 0.3])
+def test_partners_lie_about_the_wanted_baseline_apart(scene: Scene, share: float) -> None:
+    poses = list(scene.motion.rig_from_world.values())
+    depth = float(np.median(scene.motion.depths_in_rig))
+    found = partners(scene.motion, share)
+    assert len(found) > 8
+    for one, other in found.items():
+        shift = poses[other].inverse().translation - poses[one].inverse().translation
+        assert other > one
+        assert share / 1.9 < np.linalg.norm(shift) / depth < share * 2.1
+
+
+def flat_with(bump_mm: float, inside: Callable[[np.ndarray], np.ndarray]) -> HeightMap:
+    """A floor with a bump on some of its cells."""
+    x = np.stack(np.meshgrid(np.arange(-10, 10.1, 0.2), np.arange(-10, 10.1, 0.2)), axis=-1)
+    heights = np.where(inside(x), bump_mm, 0.0).astype(np.float32)
+    return HeightMap(corner=np.array([-10.0, -10]), cell_mm=0.2, heights=heights, known=np.ones(heights.shape, bool))
+
+
+@given(st.floats(1.0, 5.0), st.floats(-8.0, 8.0))
+def test_a_wall_hides_what_lies_in_its_shadow(height_mm: float, centre_x: float) -> None:
+    """A camera 14 mm over the floor, a wall of 1 mm about x = 0: the shadow is as long as similar triangles say."""
+    wall = flat_with(height_mm, lambda x: np.abs(x[..., 0]) <= 0.5)
+    x = np.arange(0.95, 9.0, 0.1)
+    places = np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=-1)[None]
+    hidden = wall.hides(places, np.array([centre_x, 0, 14.0]))[0]
+    top = 0.5 + (-centre_x + 0.5) * height_mm / (14 - height_mm)
+    assert not hidden[x > top + 0.9].any()
+    assert hidden[(x > 1.6) & (x < top - 0.3)].all()
+
+
+@given(st.floats(-9.0, 9.0), st.floats(-9.0, 9.0))
+def test_a_plane_hides_nothing(x: float, y: float) -> None:
+    plane = flat_with(0.0, lambda x: np.zeros(x.shape[:-1], bool))
+    places = np.concatenate([grid((-8, 8), (-8, 8)), np.zeros((160, 160, 1))], axis=-1)
+    assert not plane.hides(places, np.array([x, y, 10.0])).any()
+
+
+@given(arrays(np.float32, (7, 4, 5), elements=st.floats(0, 1, width=16)))
+def test_without_penalties_each_cell_has_its_own_best_plane(cost: np.ndarray) -> None:
+    found = semi_global(cost, 0.0, 0.0)
+    nearest = np.clip(np.rint(found), 0, 6).astype(int)[None]
+    beside = [np.take_along_axis(cost, np.clip(nearest + step, 0, 6), axis=0) for step in (-1, 0, 1)]
+    assert np.all(np.min(beside, axis=0) <= cost[1:-1].min(axis=0) + 1e-6)
+
+
+@given(st.integers(1, 5), st.integers(1, 5), st.floats(0.05, 1.0))
+def test_a_lone_cell_follows_its_neighbours_if_penalties_outweigh_it(plane: int, own: int, gain: float) -> None:
+    cost = np.ones((7, 9, 9), np.float32)
+    cost[plane] = 0
+    cost[:, 4, 4], cost[own, 4, 4] = gain, 0
+    assert semi_global(cost, 1.1, 1.1)[4, 4] == pytest.approx(plane, abs=0.5)
+    assert semi_global(cost, 0.0, 0.0)[4, 4] == pytest.approx(own, abs=0.5)
+
+
+def test_fractions_of_planes_are_those_of_a_parabola() -> None:
+    true = np.linspace(2.0, 6.0, 12).reshape(3, 4)
+    cost = ((np.arange(9)[:, None, None] - true) ** 2).astype(np.float32)
+    assert semi_global(cost, 0.0, 0.0) == pytest.approx(true, abs=1e-4)
