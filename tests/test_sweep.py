@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from cuspid.camera import Camera
+from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
@@ -150,6 +151,22 @@ def test_the_mosaic_shows_each_place_once(scene: Scene, surface: HeightMap) -> N
     assert np.isnan(off).mean() < 0.02, "walls are hardly shown"
     assert np.nanmedian(off) < 0.02
     assert np.nanpercentile(off, 95) < 0.5
+
+
+def test_a_film_of_another_scale_needs_no_more_cells(scene: Scene, surface: HeightMap) -> None:
+    """A wrong scale makes the arch ten times larger; so are its pixels."""
+    motion = scene.motion.scaled(10.0)
+    found = Scene(motion, scene.images).swept()
+    assert found is not None
+    assert found.heights.size < 2 * surface.heights.size
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"cell_mm": 0.0}, {"window": 4}, {"window": 1}, {"large_jump": 0.01}, {"small_jump": -1.0}]
+)
+def test_options_that_make_no_sense_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(InputError, match="sweep"):
+        SweepOptions(**wrong)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.2, 0.3])

@@ -26,6 +26,7 @@ from numba import njit
 from skimage.morphology import remove_small_holes, remove_small_objects
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
+from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.reconstruction import Reconstruction
 from cuspid.stitching.mosaic import BURNT, Progress, brightest, footprint
@@ -61,9 +62,10 @@ class SweepOptions:
     enabled: bool = True
     """Whether to look for it; else a smooth surface through the sparse points of the motion serves."""
     cell_mm: float = 0.1
-    """Spacing of the places at which frames are compared; the height map has half as many."""
+    """Spacing of the places at which frames are compared, if it is not less than a pixel; the height map has twice as
+    much."""
     step_mm: float = 0.2
-    """Distance of the planes."""
+    """Distance of the planes, if from one to the next what is compared shifts by half a pixel at least."""
     depth_mm: float = 11.0
     """The lowest plane lies so far below the occlusal one."""
     window: int = 5
@@ -80,6 +82,13 @@ class SweepOptions:
     """Standard deviation of the Gaussian filter over the heights."""
     agreement: float = 0.15
     """Places with a lower mean ZNCC (0 to 1) at their height show nothing that is known."""
+
+    def __post_init__(self) -> None:
+        lengths = (self.cell_mm, self.step_mm, self.depth_mm, self.detail_px, self.baseline_share, self.smoothing_mm)
+        if min(lengths) <= 0 or self.window < 3 or self.window % 2 == 0:
+            raise InputError("sweep: lengths and shares must be positive, and the window an odd number from 3")
+        if not 0 <= self.small_jump <= self.large_jump:
+            raise InputError("sweep: a small jump must cost something and a large one no less: 0 <= small <= large")
 
 
 # --- which frames are compared -----------------------------------------------------------------------------------
@@ -253,18 +262,20 @@ def sweep(
     pairs = partners(motion, options.baseline_share)
     if not pairs:
         return None
+    pixel_mm = float(np.median(motion.depths_in_rig) / np.mean(motion.rig[motion.rig.names[0]].camera.focal_px))
+    step_mm = max(options.step_mm, 0.5 * pixel_mm / options.baseline_share)
     top = float(sparse.heights.max()) + _ABOVE_MM
-    levels = np.arange(-options.depth_mm, top + options.step_mm, options.step_mm)
-    grid = Grid.over(motion, options.cell_mm)
+    levels = np.arange(-options.depth_mm, top + step_mm, step_mm)
+    grid = Grid.over(motion, max(options.cell_mm, pixel_mm))
     volume = _agreement(motion, pairs, grid, levels, read, options, progress)
-    cell_mm = _POOL * options.cell_mm
+    cell_mm = _POOL * grid.cell_mm
     corner, (rows, columns) = grid.corner + cell_mm / 2, volume.shape[1:]
     places = corner + cell_mm * np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
     volume[levels[:, None, None] > sparse.at(places) + _ABOVE_MM] = 0
     plane = semi_global(1 - volume, options.small_jump, options.large_jump)
     at = np.clip(np.rint(plane), 0, len(levels) - 1).astype(int)
     certainty = cv2.blur(np.take_along_axis(volume, at[None], axis=0)[0], (5, 5))
-    heights = cv2.medianBlur((levels[0] + options.step_mm * plane).astype(np.float32), 5)
+    heights = cv2.medianBlur((levels[0] + step_mm * plane).astype(np.float32), 5)
     return HeightMap(
         corner=corner,
         cell_mm=cell_mm,
