@@ -140,3 +140,14 @@ class Camera:
         """True where a pixel lies inside the image by at least ``margin_px``; False for NaN."""
         upper = np.array([self.width, self.height]) - margin_px
         return np.all((pixels >= margin_px) & (pixels <= upper), axis=-1)
+
+
+def undistortion_maps(camera: Camera) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]] | None:
+    """Where each pixel of the same camera without distortion lies in the image, as ``cv2.remap`` wants it, float32 (far
+    outside where it saw nothing); None where the camera has none."""
+    if not np.any(camera.distortion):
+        return None
+    ideal = replace(camera, distortion=np.zeros(4), covariance=None)
+    pixels = camera.project(ideal.rays(ideal.pixel_centres())) - OPENCV_PIXEL_OFFSET
+    pixels = np.nan_to_num(pixels, nan=-1e4).astype(np.float32)
+    return np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
+from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera, undistortion_maps
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.rig import MountedCamera
@@ -48,9 +48,7 @@ class IdealView:
     def of(name: str, mounted: MountedCamera) -> IdealView:
         """The ideal view of a mounted camera."""
         ideal = replace(mounted.camera, distortion=np.zeros(4), covariance=None)
-        distorted = bool(np.any(mounted.camera.distortion))
-        maps = resampling_map(mounted, ideal, mounted.cam_from_rig) if distorted else None
-        return IdealView(name, ideal, mounted.cam_from_rig, maps)
+        return IdealView(name, ideal, mounted.cam_from_rig, undistortion_maps(mounted.camera))
 
     def resample(self, image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w *c"]:
         """The image as the ideal camera would have taken it; black where the real one saw nothing."""

@@ -15,7 +15,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple, no_type_check
 
@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numba import njit
 from skimage.morphology import remove_small_holes, remove_small_objects
 
-from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
+from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera, undistortion_maps
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.reconstruction import Reconstruction
@@ -236,16 +236,6 @@ def _compared(
     return picture if maps is None else np.asarray(cv2.remap(picture, *maps, cv2.INTER_LINEAR))
 
 
-def _undistortion(camera: Camera) -> tuple[np.ndarray, np.ndarray] | None:
-    """Maps for ``cv2.remap`` to the same camera without distortion; None where it has none."""
-    if not np.any(camera.distortion):
-        return None
-    ideal = replace(camera, distortion=np.zeros(4), covariance=None)
-    pixels = camera.project(ideal.rays(ideal.pixel_centres())) - OPENCV_PIXEL_OFFSET
-    pixels = np.nan_to_num(pixels, nan=-1e4).astype(np.float32)
-    return np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])
-
-
 def sweep(
     motion: Reconstruction,
     sparse: HeightMap,
@@ -262,11 +252,7 @@ def sweep(
     pairs = partners(motion, options.baseline_share)
     if not pairs:
         return None
-    pixel_mm = float(np.median(motion.depths_in_rig) / np.mean(motion.rig[motion.rig.names[0]].camera.focal_px))
-    step_mm = max(options.step_mm, 0.5 * pixel_mm / options.baseline_share)
-    top = float(sparse.heights.max()) + _ABOVE_MM
-    levels = np.arange(-options.depth_mm, top + step_mm, step_mm)
-    grid = Grid.over(motion, max(options.cell_mm, pixel_mm))
+    grid, levels = _places(motion, float(sparse.heights.max()) + _ABOVE_MM, options)
     volume = _agreement(motion, pairs, grid, levels, read, options, progress)
     cell_mm = _POOL * grid.cell_mm
     corner, (rows, columns) = grid.corner + cell_mm / 2, volume.shape[1:]
@@ -275,13 +261,22 @@ def sweep(
     plane = semi_global(1 - volume, options.small_jump, options.large_jump)
     at = np.clip(np.rint(plane), 0, len(levels) - 1).astype(int)
     certainty = cv2.blur(np.take_along_axis(volume, at[None], axis=0)[0], (5, 5))
-    heights = cv2.medianBlur((levels[0] + step_mm * plane).astype(np.float32), 5)
+    heights = cv2.medianBlur(np.interp(plane, np.arange(len(levels)), levels).astype(np.float32), 5)
     return HeightMap(
         corner=corner,
         cell_mm=cell_mm,
         heights=np.asarray(cv2.GaussianBlur(heights, (0, 0), options.smoothing_mm / cell_mm)),
         known=_without_specks(certainty >= options.agreement, cell_mm),
     )
+
+
+def _places(motion: Reconstruction, top: float, options: SweepOptions) -> tuple[Grid, Float[np.ndarray, "d"]]:
+    """Where frames are compared: the cells, and the heights of the planes; not closer than pixels tell apart."""
+    camera = motion.rig[motion.rig.names[0]].camera
+    pixel_mm = float(np.median(motion.depths_in_rig) / np.mean(camera.focal_px))
+    step_mm = max(options.step_mm, 0.5 * pixel_mm / options.baseline_share)
+    levels = np.arange(-options.depth_mm, top + step_mm, step_mm)
+    return Grid.over(motion, max(options.cell_mm, pixel_mm)), levels
 
 
 def _without_specks(known: Bool[np.ndarray, "r c"], cell_mm: float) -> Bool[np.ndarray, "r c"]:
@@ -301,7 +296,7 @@ def _agreement(
 ) -> Float32[np.ndarray, "d r c"]:
     """Mean agreement of the pairs of frames that see a place, at each height; zero where there are too few."""
     camera, poses, names = motion.rig[motion.rig.names[0]].camera, list(motion.rig_from_world.values()), motion.frames
-    maps, window = _undistortion(camera), options.window
+    maps, window = undistortion_maps(camera), options.window
     sums, counts = np.zeros((2, len(levels), grid.rows // _POOL, grid.columns // _POOL), np.float32)
 
     def look(block: Mapping[int, int], images: Mapping[int, UInt8[np.ndarray, "h w 3"]], level: int) -> None:
