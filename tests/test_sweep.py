@@ -19,7 +19,7 @@ from cuspid.geometry import Rigid3
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
 from cuspid.stitching.mosaic import MosaicOptions, compose
-from cuspid.stitching.surface import HeightMap, SurfaceOptions, height_map
+from cuspid.stitching.surface import HeightMap, SurfaceOptions, height_map, uncovered
 from cuspid.stitching.sweep import SweepOptions, partners, semi_global, sweep
 
 HALF_MM, DEEP_MM, CAMERA_MM = 3.0, 4.0, 14.0
@@ -198,6 +198,23 @@ def test_a_wall_hides_what_lies_in_its_shadow(height_mm: float, centre_x: float)
     top = 0.5 + (-centre_x + 0.5) * height_mm / (14 - height_mm)
     assert not hidden[x > top + 0.9].any()
     assert hidden[(x > 1.6) & (x < top - 0.3)].all()
+
+
+def test_a_false_rise_in_the_middle_of_a_crown_hides_nothing_but_a_crown_hides_gum(
+    scene: Scene, surface: HeightMap
+) -> None:
+    """A ring on the bar is high enough to hide its middle from all frames; no such thing stands on a crown."""
+    rows, columns = surface.known.shape
+    x, y = np.meshgrid(surface.corner[0] + 0.2 * np.arange(columns), surface.corner[1] + 0.2 * np.arange(rows))
+    away = np.hypot(x - 2.0, y - 0.5)
+    ringed = np.where((away > 0.7) & (away < 1.0), 11.0, surface.heights).astype(np.float32)
+    false = replace(surface, heights=ringed)
+    middle, centre = np.array([[[2.0, 0.5, 0.0]]]), np.array([4.0, 2.0, CAMERA_MM])
+    assert false.hides(middle, centre).all()
+    sparse = height_map(scene.motion, SurfaceOptions())
+    assert not uncovered(false, sparse, scene.motion).hides(middle, centre).any()
+    behind = np.array([[[-HALF_MM - 0.7, 0.0, -DEEP_MM]]])
+    assert uncovered(surface, sparse, scene.motion).hides(behind, np.array([3.0, 0, CAMERA_MM])).all()
 
 
 @given(st.floats(-9.0, 9.0), st.floats(-9.0, 9.0))

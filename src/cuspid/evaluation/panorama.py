@@ -33,6 +33,8 @@ from cuspid.trueness import NOTHING, GroundTruth, OcclusalView
 
 FEWEST_TEETH_PX = 200
 """Of the sampled pixels must show teeth, for an alignment by geometry."""
+_LEAST_EXTENT_MM = 5.0
+"""A panorama that covers less of the jaw is none: its alignment rests on one place."""
 FEWEST_MATCHES = 25
 """Image features that must agree, for an alignment by pictures."""
 _MATCH_MM = 0.5
@@ -463,6 +465,8 @@ class _Comparison:
         if failure:
             return self._failed(failure)
         on_shot = None if self.shot is None else align_by_pictures(self.panorama, self.shot)
+        if on_shot is not None and self._collapsed(on_shot.scale, 0.0):
+            on_shot = None
         note = "aligned by image features: without the frames of its pixels, its geometric error is not known"
         made = self._scored(plane_from_panorama, on_shot)
         return replace(made, score=replace(made.score, aligned_by="pictures", notes=(*made.score.notes, note)))
@@ -482,6 +486,9 @@ class _Comparison:
         coarse = scale * (self.panorama.mm_per_px or 1.0)
         if coarse > self.options.coarsest_mm:
             return f"collapsed: one pixel for {coarse:.2g} mm of the teeth"
+        extent = coarse * max(self.panorama.covered.shape)
+        if extent < _LEAST_EXTENT_MM:
+            return f"collapsed: the whole picture lies on {extent:.2g} mm of the jaw"
         return None
 
     def _geometry(self, errors: Float[np.ndarray, "n"], scale: float) -> GeometricError:

@@ -14,7 +14,7 @@ from cuspid.reconstruction import Reconstruction
 from cuspid.sequence import Sequence
 from cuspid.stitching.mosaic import Mosaic, MosaicOptions, Progress, compose
 from cuspid.stitching.strip import StripOptions, unroll
-from cuspid.stitching.surface import ScaleOptions, SurfaceOptions, height_map, in_occlusal_frame
+from cuspid.stitching.surface import ScaleOptions, SurfaceOptions, height_map, in_occlusal_frame, uncovered
 from cuspid.stitching.sweep import SweepOptions, sweep
 
 
@@ -66,7 +66,7 @@ def orthophoto(
 
     sparse = height_map(motion, options.surface)
     dense = sweep(motion, sparse, read, options.sweep, progress=progress) if options.sweep.enabled else None
-    surface = sparse if dense is None else dense
+    surface = sparse if dense is None else uncovered(dense, sparse, motion)
     mosaic = compose(motion, surface, read, options.mosaic, progress=progress)
     metric = scale.working_distance_mm is not None or scale.width_mm is not None
     panorama = _panorama(mosaic, motion, frames, index, metric)

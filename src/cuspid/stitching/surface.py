@@ -13,10 +13,11 @@ from typing import no_type_check
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from numba import njit
 from scipy.ndimage import gaussian_filter, grey_dilation
 from scipy.spatial import KDTree
+from skimage.morphology import remove_small_holes
 
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
@@ -45,6 +46,8 @@ _ROUND_MM = 0.8
 
 _RIM_MM, _OVER_MM = 0.4, 0.2
 """The surface hides what it stands over by more than the second, farther away than the first."""
+_HOLE_MM2, _CROWN_MM = 20.0, 1.5
+"""Holes up to this size in what is seen of the crowns are none; crowns lie no deeper below the smooth surface."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +73,12 @@ class SurfaceOptions:
     """Spacing of the height map."""
     smoothing_mm: float = 0.5
     """Standard deviation of the Gaussian filter over the height map."""
+
+
+def _disc(radius_mm: float, cell_mm: float) -> UInt8[np.ndarray, "k k"]:
+    """A disc for filters of shape."""
+    size = 2 * round(radius_mm / cell_mm) + 1
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
 
 
 @njit(cache=True, nogil=True)
@@ -105,26 +114,30 @@ class HeightMap:
     """World Z of each cell. float32."""
     known: Bool[np.ndarray, "r c"]
     """Whether there is a surface that was seen."""
+    bare: Bool[np.ndarray, "r c"] | None = None
+    """Places that nothing hides, whatever rises beside them."""
 
     @cached_property
     def _roof(self) -> Float[np.ndarray, "r c"]:
         """The highest surface within `_RIM_MM`, for the crowns' rims may lie that far out."""
-        size = 2 * round(_RIM_MM / self.cell_mm) + 1
-        return np.asarray(cv2.dilate(self.heights, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))))
+        return np.asarray(cv2.dilate(self.heights, _disc(_RIM_MM, self.cell_mm)))
 
     def hides(self, places: Float[np.ndarray, "h w 3"], centre: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "h w"]:
         """Whether the surface stands between places on it and a camera's centre."""
         hidden = np.zeros(places.shape[:2], bool)
         start = round(_RIM_MM / self.cell_mm) + 1
         _hide(places, centre, self._roof, self.corner, self.cell_mm, start, _OVER_MM, hidden)
-        return hidden
+        return hidden if self.bare is None else hidden & ~self._marked(self.bare, places[..., :2])
 
     def known_at(self, xy: Float[np.ndarray, "h w 2"]) -> Bool[np.ndarray, "h w"]:
         """Whether the surface was seen at a grid of places; not so beyond the border."""
+        return self._marked(self.known, xy)
+
+    def _marked(self, cells: Bool[np.ndarray, "r c"], xy: Float[np.ndarray, "h w 2"]) -> Bool[np.ndarray, "h w"]:
         place = np.rint((xy - self.corner) / self.cell_mm).astype(int)
-        rows, columns = np.array(self.known.shape) - 1
+        rows, columns = np.array(cells.shape) - 1
         inside = ((place >= 0) & (place <= [columns, rows])).all(axis=-1)
-        return np.asarray(inside & self.known[place[..., 1].clip(0, rows), place[..., 0].clip(0, columns)])
+        return np.asarray(inside & cells[place[..., 1].clip(0, rows), place[..., 0].clip(0, columns)])
 
     def at(self, xy: Float[np.ndarray, "h w 2"]) -> Float[np.ndarray, "h w"]:
         """Heights at a grid of places, bilinear; that of the border beyond it."""
@@ -271,6 +284,27 @@ def height_map(model: Reconstruction, options: SurfaceOptions) -> HeightMap:
     smooth = _filled(_bulging(upper), options.smoothing_mm / options.cell_mm, float(np.median(points[:, 2])))
     heights = smooth.astype(np.float32)
     return HeightMap(corner=low, cell_mm=options.cell_mm, heights=heights, known=np.ones(heights.shape, bool))
+
+
+def uncovered(dense: HeightMap, sparse: HeightMap, motion: Reconstruction) -> HeightMap:
+    """A dense surface whose false rises do not hide what the camera went over.
+
+    Where seen surface lies all around a place of a crown that is hidden from every frame, something rises beside it
+    that cannot be: a highlight in a hollow. Gum far below the smooth surface may well be hidden behind a crown.
+    """
+    camera, cells = motion.rig[motion.rig.names[0]].camera, dense.known.shape
+    x, y = np.meshgrid(*(low + dense.cell_mm * np.arange(n) for low, n in zip(dense.corner, cells[::-1], strict=True)))
+    places = np.stack([x, y, dense.heights], axis=-1)
+    seen = np.zeros(cells, bool)
+    for pose in motion.rig_from_world.values():
+        there = pose.apply(places)
+        inside = camera.contains(camera.project(there)) & (there[..., 2] > 0) & dense.known
+        part = tuple(slice(at.min(initial=0), at.max(initial=-1) + 1) for at in np.nonzero(inside & ~seen))
+        seen[part] |= inside[part] & ~dense.hides(places[part], pose.inverse().translation)
+    holes = remove_small_holes(seen, max_size=round(_HOLE_MM2 / dense.cell_mm**2)) & ~seen
+    crown = dense.heights > sparse.at(places[..., :2]) - _CROWN_MM
+    wide = cv2.dilate(holes.astype(np.uint8), _disc(_RIM_MM, dense.cell_mm)) > 0
+    return replace(dense, bare=wide & crown)
 
 
 def _bulging(heights: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r c"]:
