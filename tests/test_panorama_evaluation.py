@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from cuspid import storage
 from cuspid.cli import main
 from cuspid.errors import InputError
+from cuspid.evaluation import panorama as evaluation
 from cuspid.evaluation.panorama import (
     PanoramaEvaluationOptions,
     Similarity2,
@@ -360,3 +361,17 @@ def test_a_picture_of_another_program_is_laid_over_by_its_features(known: Known,
     assert written["geometry"] is None
     assert written["picture"]["zncc"] > 0.9
     assert written["coverage_pct"] > 95
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-4])
+def test_a_picture_that_lies_on_one_place_failed(
+    known: Known, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scale: float
+) -> None:
+    truth = write_truth(known, tmp_path)
+    storage.write_image(tmp_path / "other.png", known.panorama.image)
+    onto_one_place = Similarity2(scale * np.eye(2), np.zeros(2))
+    monkeypatch.setattr(evaluation, "align_by_pictures", lambda *_: onto_one_place)
+    main(["stitch-eval", str(tmp_path / "other.png"), str(truth), "--out", str(tmp_path / "score")])
+    written = json.loads((tmp_path / "score" / "score.json").read_text())
+    assert "the whole picture lies on" in written["failure"]
+    assert written["picture"] is None
