@@ -429,8 +429,8 @@ def _put(
     # A burnt-out pixel counts only where no other frame was to be had.
     world = positions(canvas, view, surface, CELL_PX)
     hidden = surface.hides(world, view.cam_from_world.inverse().translation).astype(np.uint8)
-    open_ = cv2.resize(hidden, (view.width, view.height), interpolation=cv2.INTER_NEAREST) == 0
-    valid = (inside & ((open_ & ~burnt) | chosen)).astype(np.float32)
+    in_view = cv2.resize(hidden, (view.width, view.height), interpolation=cv2.INTER_NEAREST) == 0
+    valid = (inside & ((in_view & ~burnt) | chosen)).astype(np.float32)
     valid[burnt & chosen] = 0.05
     in_cam = view.cam_from_world.apply(world)
     distance2 = np.sum(in_cam**2, axis=-1)

@@ -299,7 +299,7 @@ def uncovered(dense: HeightMap, sparse: HeightMap, motion: Reconstruction) -> He
     for pose in motion.rig_from_world.values():
         there = pose.apply(places)
         inside = camera.contains(camera.project(there)) & (there[..., 2] > 0) & dense.known
-        part = tuple(slice(at.min(initial=0), at.max(initial=-1) + 1) for at in np.nonzero(inside & ~seen))
+        part = tuple(slice(at.min(initial=max(cells)), at.max(initial=-1) + 1) for at in np.nonzero(inside & ~seen))
         seen[part] |= inside[part] & ~dense.hides(places[part], pose.inverse().translation)
     holes = remove_small_holes(seen, max_size=round(_HOLE_MM2 / dense.cell_mm**2)) & ~seen
     crown = dense.heights > sparse.at(places[..., :2]) - _CROWN_MM

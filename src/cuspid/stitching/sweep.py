@@ -294,7 +294,7 @@ def _agreement(
     options: SweepOptions,
     progress: Progress,
 ) -> Float32[np.ndarray, "d r c"]:
-    """Mean agreement of the pairs of frames that see a place, at each height; zero where there are too few."""
+    """Mean agreement (0 to 1) of the pairs of frames that see a place, at each height; the less, the fewer they are."""
     camera, poses, names = motion.rig[motion.rig.names[0]].camera, list(motion.rig_from_world.values()), motion.frames
     maps, window = undistortion_maps(camera), options.window
     sums, counts = np.zeros((2, len(levels), grid.rows // _POOL, grid.columns // _POOL), np.float32)
