@@ -113,6 +113,21 @@ def test_what_is_textured_is_known_and_what_is_plain_or_beyond_is_not(surface: H
     assert not surface.known_at(grid((50.0, 51.0))).any()
 
 
+def test_a_plain_spot_in_a_crown_is_bridged(scene: Scene) -> None:
+    """Nothing agrees there, as where a highlight goes over a smooth hollow."""
+    spot = np.array([0.0, -3.0])
+
+    def plain(name: str) -> np.ndarray:
+        places = true_places(scene.motion.rig_from_world[name], CAMERA.pixel_centres())
+        return np.where(np.linalg.norm(places[..., :2] - spot, axis=-1)[..., None] < 2.4, 120, scene.images[name])
+
+    found = Scene(scene.motion, {name: plain(name).astype(np.uint8) for name in scene.images}).swept()
+    assert found is not None
+    inside = grid((-1.2, 1.2), (-4.2, -1.8))
+    assert found.known_at(inside).all()
+    assert np.abs(found.at(inside)).max() < 0.2
+
+
 def test_highlights_that_go_along_with_the_camera_do_not_raise_the_surface(scene: Scene, surface: HeightMap) -> None:
     """A spot in the middle of each picture is by itself best explained at the camera's own height."""
     lit = {name: cv2.circle(image.copy(), (120, 90), 8, (255, 255, 255), -1) for name, image in scene.images.items()}

@@ -46,8 +46,10 @@ _ROUND_MM = 0.8
 
 _RIM_MM, _OVER_MM = 0.4, 0.2
 """The surface hides what it stands over by more than the second, farther away than the first."""
-_HOLE_MM2, _CROWN_MM = 20.0, 1.5
-"""Holes up to this size in what is seen of the crowns are none; crowns lie no deeper below the smooth surface."""
+HOLE_MM2 = 20.0
+"""Holes up to this size in what is known or seen of the teeth are none."""
+_CROWN_MM = 1.5
+"""Crowns lie no deeper below the smooth surface."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -301,7 +303,7 @@ def uncovered(dense: HeightMap, sparse: HeightMap, motion: Reconstruction) -> He
         inside = camera.contains(camera.project(there)) & (there[..., 2] > 0) & dense.known
         part = tuple(slice(at.min(initial=max(cells)), at.max(initial=-1) + 1) for at in np.nonzero(inside & ~seen))
         seen[part] |= inside[part] & ~dense.hides(places[part], pose.inverse().translation)
-    holes = remove_small_holes(seen, max_size=round(_HOLE_MM2 / dense.cell_mm**2)) & ~seen
+    holes = remove_small_holes(seen, max_size=round(HOLE_MM2 / dense.cell_mm**2)) & ~seen
     crown = dense.heights > sparse.at(places[..., :2]) - _CROWN_MM
     wide = cv2.dilate(holes.astype(np.uint8), _disc(_RIM_MM, dense.cell_mm)) > 0
     return replace(dense, bare=wide & crown)

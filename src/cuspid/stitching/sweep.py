@@ -24,13 +24,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numba import njit
 from skimage.morphology import remove_small_holes, remove_small_objects
+from skimage.restoration import inpaint_biharmonic
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera, undistortion_maps
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.reconstruction import Reconstruction
 from cuspid.stitching.mosaic import BURNT, Progress, brightest, footprint
-from cuspid.stitching.surface import HeightMap
+from cuspid.stitching.surface import HOLE_MM2, HeightMap
 
 _BLOCK, _REACH = 24, 14
 """Frames that are paired at a time, and how many frames later a partner may be."""
@@ -41,7 +42,9 @@ _DETAIL = 4
 _DARKEST = 16
 """Grey levels below are raised to this one: noise."""
 _SPECK_MM2 = 4.0
-"""Smaller islands of what is known are taken for nothing, and smaller holes for known."""
+"""Smaller islands of what is known are taken for nothing."""
+_RIM_CELLS = 2
+"""So wide is the rim of a hole whose heights are not trusted either."""
 _ABOVE_MM = 1.5
 """The surface is looked for no higher above the smooth one through the points: highlights would have it there."""
 _GLARE_PX = 9
@@ -262,11 +265,14 @@ def sweep(
     at = np.clip(np.rint(plane), 0, len(levels) - 1).astype(int)
     certainty = cv2.blur(np.take_along_axis(volume, at[None], axis=0)[0], (5, 5))
     heights = cv2.medianBlur(np.interp(plane, np.arange(len(levels)), levels).astype(np.float32), 5)
+    sure = remove_small_objects(certainty >= options.agreement, max_size=round(_SPECK_MM2 / cell_mm**2))
+    known = remove_small_holes(sure, max_size=round(HOLE_MM2 / cell_mm**2))
+    heights = _bridged(heights, known & ~sure)
     return HeightMap(
         corner=corner,
         cell_mm=cell_mm,
         heights=np.asarray(cv2.GaussianBlur(heights, (0, 0), options.smoothing_mm / cell_mm)),
-        known=_without_specks(certainty >= options.agreement, cell_mm),
+        known=np.asarray(known),
     )
 
 
@@ -279,10 +285,10 @@ def _places(motion: Reconstruction, top: float, options: SweepOptions) -> tuple[
     return Grid.over(motion, max(options.cell_mm, pixel_mm)), levels
 
 
-def _without_specks(known: Bool[np.ndarray, "r c"], cell_mm: float) -> Bool[np.ndarray, "r c"]:
-    """Without small islands and small holes."""
-    size = round(_SPECK_MM2 / cell_mm**2)
-    return np.asarray(remove_small_holes(remove_small_objects(known, max_size=size), max_size=size))
+def _bridged(heights: Float32[np.ndarray, "r c"], holes: Bool[np.ndarray, "r c"]) -> Float32[np.ndarray, "r c"]:
+    """Heights that span the holes smoothly: where a highlight leaves nothing to agree on, those found are false."""
+    wide = cv2.dilate(holes.astype(np.uint8), np.ones((2 * _RIM_CELLS + 1,) * 2, np.uint8)) > 0
+    return np.asarray(inpaint_biharmonic(heights, wide, split_into_regions=True), dtype=np.float32)
 
 
 def _agreement(
