@@ -143,6 +143,16 @@ def test_the_strip_is_as_long_as_the_way_of_the_camera(stitched: Stitched) -> No
     assert np.all((strip.zone >= 0) == strip.covered)
 
 
+def test_two_runs_on_the_same_frames_are_alike(stitched: Stitched, sequence: Sequence) -> None:
+    (again,) = pipeline.stitch(sequence, StitchOptions())
+    assert stitched.motion is not None
+    assert again.motion is not None
+    for name, pose in stitched.motion.rig_from_world.items():
+        np.testing.assert_array_equal(again.motion.rig_from_world[name].matrix, pose.matrix)
+    np.testing.assert_array_equal(again.panorama.image, stitched.panorama.image)
+    np.testing.assert_array_equal(again.panorama.frame_pixel, stitched.panorama.frame_pixel)
+
+
 def test_one_camera_without_a_calibration_finds_its_focal_length(sequence: Sequence) -> None:
     motion = locate_single(replace(sequence, camera=None, working_distance_mm=None), SingleOptions())
     assert len(motion.parts) == 1

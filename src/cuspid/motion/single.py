@@ -274,7 +274,10 @@ def _fill_database(
 
 def _mapper_options(calibrated: bool, options: SingleOptions) -> pycolmap.IncrementalPipelineOptions:
     """COLMAP's mapper for short steps over a low relief, with few and noisy matches."""
-    how = pycolmap.IncrementalPipelineOptions(random_seed=options.seed, extract_colors=False, min_model_size=3)
+    # Threads would add in another order in each run, and bundle adjustment makes much of that.
+    how = pycolmap.IncrementalPipelineOptions(
+        random_seed=options.seed, num_threads=1, extract_colors=False, min_model_size=3
+    )
     how.ba_refine_focal_length = how.mapper.abs_pose_refine_focal_length = not calibrated
     how.ba_refine_extra_params = how.mapper.abs_pose_refine_extra_params = False
     how.mapper.init_min_num_inliers, how.mapper.init_min_tri_angle = 2 * options.minimum_matches, 5.0
