@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import sys
 from collections.abc import Callable, Mapping
 from itertools import product
@@ -90,7 +91,7 @@ def measure(name: str, method: str, folder: Path, limit_s: int) -> dict[str, obj
     out = folder / method
     command = METHODS[method](folder / "film" / "capture", out, limit_s)
     status, figures = timed(*command)
-    score, failure = None, f"the program ended with status {status}" if status else unmade(out)
+    score, failure = None, given_up(status, limit_s) if status else unmade(out)
     if failure is None:
         made = out if (out / "panorama.json").exists() else first_part(out)
         run_timed("stitch-eval", str(made), str(folder / "film" / "truth"), "--out", str(folder / f"{method}-score"))
@@ -107,6 +108,11 @@ def measure(name: str, method: str, folder: Path, limit_s: int) -> dict[str, obj
         "score": score,
         **conditions(),
     }
+
+
+def given_up(status: int, limit_s: int) -> str:
+    """Why a program ended without a result."""
+    return f"given up after {limit_s} s of CPU" if status == -signal.SIGXCPU else f"ended with status {status}"
 
 
 def unmade(out: Path) -> str | None:
