@@ -15,6 +15,7 @@ from hypothesis.extra.numpy import arrays
 from cuspid import pipeline, storage
 from cuspid.camera import Camera
 from cuspid.capture import Capture
+from cuspid.cli import main
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
@@ -151,6 +152,25 @@ def test_two_runs_on_the_same_frames_are_alike(stitched: Stitched, sequence: Seq
         np.testing.assert_array_equal(again.motion.rig_from_world[name].matrix, pose.matrix)
     np.testing.assert_array_equal(again.panorama.image, stitched.panorama.image)
     np.testing.assert_array_equal(again.panorama.frame_pixel, stitched.panorama.frame_pixel)
+
+
+def test_a_video_is_stitched_from_the_command_line_and_its_folder_takes_no_other(
+    film: tuple[Capture, GroundTruth], sequence: Sequence, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def video(name: str, indices: range) -> Path:
+        stream = cv2.VideoWriter(str(tmp_path / name), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, sequence.size)
+        for index in indices:
+            stream.write(cv2.cvtColor(sequence.image(index), cv2.COLOR_RGB2BGR))
+        stream.release()
+        return tmp_path / name
+
+    command = ["--calibration", str(film[0].folder / "handpiece.json"), "--out", str(tmp_path / "out")]
+    main(["stitch", str(video("whole.avi", range(8))), *command])
+    panorama = storage.read_panorama(tmp_path / "out")
+    assert [frame.name for frame in panorama.frames if frame.used] == [f"{n:05d}" for n in range(8)]
+    with pytest.raises(SystemExit):
+        main(["stitch", str(video("other.avi", range(4, 12))), *command])
+    assert "another run of 'decode'" in capsys.readouterr().err
 
 
 def test_one_camera_without_a_calibration_finds_its_focal_length(sequence: Sequence) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -37,9 +37,7 @@ def stitch(
             one (and without a capture's own) the focal length is found from the images.
     """
     with show_progress() as progress:
-        sequence = storage.read_sequence(
-            frames, out / "frames", calibration=calibration, progress=partial(progress, "decoding")
-        )
+        sequence = _read(frames, out, calibration, partial(progress, "decoding"))
         hashes = _hashes(sequence, calibration)
         with storage.claimed_folder(out, "stitch", {"stitch": options}, hashes, replace=True):
             parts = pipeline.stitch(sequence, options, progress=progress)
@@ -48,6 +46,15 @@ def stitch(
                 _write(folder, part)
     _print(parts, folders)
     report(out)
+
+
+def _read(frames: Path, out: Path, calibration: Path | None, progress: Callable[[int, int], None]) -> Sequence:
+    """The frames; those of a video are decoded into the folder of the results, which is home to this video alone."""
+    read = partial(storage.read_sequence, frames, out / "frames", calibration=calibration, progress=progress)
+    if not frames.is_file():
+        return read()
+    with storage.claimed_folder(out, "decode", {}, {"video": storage.hash_file(frames)}):
+        return read()
 
 
 def _hashes(sequence: Sequence, calibration: Path | None) -> dict[str, str]:
