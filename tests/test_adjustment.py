@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from cuspid.camera import Camera
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
-from cuspid.motion import adjustment, normal_equations
+from cuspid.motion import adjustment, gauge, normal_equations
 from cuspid.motion.adjustment import AdjustmentOptions, adjust, covariance_factor, left_jacobian
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
@@ -181,7 +181,7 @@ def test_jacobian_agrees_with_finite_differences(seed: int) -> None:
         unknowns = np.zeros(6 + whitened.size)
         unknowns[:6] = step[3:9]
         unknowns[6 + 14 * camera : 20 + 14 * camera] = step[9:]
-        moved = adjustment._moved(start, nothing, weighting, prior, 0.0, unknowns)
+        moved = adjustment._moved(start, nothing, weighting, prior, unknowns)
         return linearised(moved._replace(points=start.points + step[:3]), 1, camera, 0)[0]
 
     _, jacobian = linearised(start, 1, camera, 0)
@@ -211,6 +211,72 @@ def test_covariance_factor_squares_to_the_covariance(rank: int, seed: int) -> No
     root = np.random.default_rng(seed).normal(size=(6, rank)) * EXTRINSIC_SIGMA[:, None]
     factor = covariance_factor(root @ root.T, 6)
     np.testing.assert_allclose(factor @ factor.T, root @ root.T, atol=1e-12)
+
+
+# --- the gauge of a free calibration -----------------------------------------------------------------------------
+
+
+def disturbed_state(seed: int, rig: Rig) -> tuple[normal_equations.State, normal_equations.Observations, object]:
+    """A state away from the prior, with its observations."""
+    rng, prior = np.random.default_rng(seed), adjustment._Prior.of(rig)
+    scene = disturbed(make_scene(frames=3, points=40), rng, rig=rig)
+    every = np.ones(len(scene.tracks.point_index), dtype=bool)
+    observations, points = adjustment._sorted_by_point(scene.tracks, every)
+    start = adjustment._initial_state(scene, scene.tracks.points[points], prior)
+    whitened = rng.normal(size=start.whitened.shape)
+    return adjustment._with_calibration(start, prior, whitened), observations, prior
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    step=st.lists(st.floats(-0.3, 0.3), min_size=7, max_size=7),
+)
+def test_no_image_sees_a_gauge(seed: int, step: list[float]) -> None:
+    """Residuals stay, and so does the first pose; what changes is the prior's cost alone."""
+    state, observations, prior = disturbed_state(seed, with_priors(make_rig()))
+    change = gauge.Gauge.of(np.array(step))
+    whitened = state.whitened.copy()
+    whitened[:, : gauge.PLACE] = prior.whitened_places(*gauge.moved_places(state, change))
+    moved = adjustment._with_calibration(gauge.moved_world(state, change), prior, whitened)
+    residuals = normal_equations.residual_vectors(state, observations)
+    np.testing.assert_allclose(normal_equations.residual_vectors(moved, observations), residuals, atol=1e-7)
+    np.testing.assert_allclose(moved.frame_translation[0], state.frame_translation[0], atol=1e-10)
+    np.testing.assert_allclose(moved.frame_rotation[0], state.frame_rotation[0], atol=1e-10)
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_no_small_gauge_lessens_the_cost_of_the_best(seed: int) -> None:
+    """Stationary in all seven directions, and no worse than where it began."""
+    state, _, prior = disturbed_state(seed, with_priors(make_rig()))
+    best = adjustment._at_best_gauge(state, prior)
+
+    def cost(step: np.ndarray) -> float:
+        places = prior.whitened_places(*gauge.moved_places(best, gauge.Gauge.of(step)))
+        return float(np.sum(places**2))
+
+    here = cost(np.zeros(7))
+    assert here < np.sum(state.whitened[:, : gauge.PLACE] ** 2)
+    for step in 1e-3 * np.eye(7):
+        assert min(cost(step), cost(-step)) > here
+
+
+def test_a_gauge_moves_nothing_that_is_held() -> None:
+    """With one camera's place held only the scale about that camera is left; with all, nothing."""
+    rig = with_priors(make_rig())
+    held = Rig({**rig.cameras, "c0": replace(rig["c0"], covariance=None)})
+    state, _, _ = disturbed_state(0, held)
+    change = gauge.best_gauge(state)
+    np.testing.assert_allclose(change.turn, np.eye(3), atol=1e-9)
+    assert abs(change.scale - 1) > 1e-4
+    rotation, translation = gauge.moved_places(state, change)
+    np.testing.assert_allclose(rotation[0], state.camera_rotation[0], atol=1e-9)
+    np.testing.assert_allclose(translation[0], state.camera_translation[0], atol=1e-4)
+    fixed = Rig({name: replace(mounted, covariance=None) for name, mounted in rig.cameras.items()})
+    change = gauge.best_gauge(disturbed_state(0, fixed)[0])
+    assert change.scale == 1.0
+    assert not change.shift.any()
 
 
 # --- closed loops ------------------------------------------------------------------------------------------------
@@ -259,6 +325,43 @@ def test_calibration_is_as_uncertain_as_its_covariance_says() -> None:
     assert 4.8 < np.mean(extrinsics) < 7.4
     assert 6.6 < np.mean(parameters) < 9.6
     assert np.std(after, axis=(0, 1))[4] < 0.5 * np.std(before, axis=(0, 1))[4]
+
+
+@pytest.mark.parametrize("size", [0.97, 1.03])
+def test_the_start_does_not_decide_the_scale(size: float) -> None:
+    """Only the prior knows the scale of a free rig; the size of poses and points at the start is no news."""
+    nominal = with_priors(make_rig())
+    rng = np.random.default_rng(4)
+    start = disturbed(make_scene(rig=drawn_from_priors(nominal, rng), frames=12, points=400), rng, rig=nominal)
+    resized = replace(
+        start,
+        rig_from_world={n: Rigid3(p.rotation, size * p.translation) for n, p in start.rig_from_world.items()},
+        tracks=replace(start.tracks, points=size * start.tracks.points),
+    )
+    options = AdjustmentOptions(start_px=1e6)
+    one, other = adjust(start, options), adjust(resized, options)
+    assert not one.notes
+    for name, pose in one.rig_from_world.items():
+        np.testing.assert_allclose(other.rig_from_world[name].matrix, pose.matrix, atol=2e-5)
+
+
+def test_a_search_that_ends_too_soon_says_so() -> None:
+    nominal = with_priors(make_rig())
+    rng = np.random.default_rng(2)
+    start = disturbed(make_scene(rig=drawn_from_priors(nominal, rng), points=150), rng, rig=nominal)
+    assert any("not converged" in note for note in adjust(start, AdjustmentOptions(rounds=1, iterations=1)).notes)
+    assert not adjust(start).notes
+
+
+def test_a_calibration_of_another_handpiece_is_told() -> None:
+    """The truth lies far from the file for its covariance; the worst camera is named."""
+    nominal = with_priors(make_rig())
+    moved = Rigid3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.6, 0.0])) @ nominal["c4"].cam_from_rig
+    truth = Rig({**nominal.cameras, "c4": replace(nominal["c4"], cam_from_rig=moved)})
+    rng = np.random.default_rng(3)
+    found = adjust(disturbed(make_scene(rig=truth, points=150), rng, rig=nominal), AdjustmentOptions(start_px=200.0))
+    assert len(found.notes) == 1
+    assert "camera c4" in found.notes[0]
 
 
 def test_calibration_without_prior_is_held() -> None:

@@ -89,6 +89,8 @@ class Reconstruction:
     """RMS reprojection error of the sparse model."""
     log: Mapping[str, float | int] = field(default_factory=dict)
     """Counts and seconds of the stages, units in the keys."""
+    notes: tuple[str, ...] = ()
+    """What a user must know of it, one line each; empty where nothing is doubtful."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rig_from_world", MappingProxyType(dict(self.rig_from_world)))

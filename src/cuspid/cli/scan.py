@@ -209,6 +209,8 @@ def _print_located(reconstruction: Reconstruction, capture: Capture) -> None:
     console.print(f"located {len(reconstruction.frames)} of {len(capture.frames)} frames")
     for dropped in reconstruction.dropped:
         console.print(f"  left out {dropped.what}: {dropped.reason}")
+    for note in reconstruction.notes:
+        console.print(f"note: {note}")
 
 
 def _print_trueness(trueness: Trueness) -> None:

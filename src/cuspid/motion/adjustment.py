@@ -9,8 +9,11 @@ Unknowns and how a step changes them:
   parameters = prior + L_i z_i, where L L^T is the covariance of the prior. Without one L = 0: the calibration is held.
 
 Levenberg-Marquardt on the Huber loss of the residuals in units of their standard deviation. The points are eliminated
-(Schur complement); what remains is a dense system of 6 unknowns a frame and 14 a camera. The sums run over a fixed
-number of parts in a fixed order, so the result does not depend on the number of threads.
+(Schur complement); what remains is a dense system of 6 unknowns a frame and 14 a camera. After each step the points
+are put where their rays then meet (variable projection, Golub and Pereyra 1973), for along the bending of an arch they
+move far and not in a straight line; and the similarity of the whole rig, which no image sees, is set by the prior alone
+(:mod:`cuspid.motion.gauge`). The sums run over a fixed number of parts in a fixed order, so the result does not depend
+on the number of threads.
 """
 
 from __future__ import annotations
@@ -22,10 +25,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtri
 
 from cuspid.epipolar import skew
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
+from cuspid.motion.gauge import PLACE, best_gauge, moved_places, moved_world
 from cuspid.motion.normal_equations import (
     CALIBRATION,
     POSE,
@@ -35,12 +40,19 @@ from cuspid.motion.normal_equations import (
     Weighting,
     normal_equations,
     residual_vectors,
+    settle,
     substitute,
 )
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
 
 _LEAST_SIGMA_PX = 1e-6
+_LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
+"""Of a step, as shares of the diagonal of the normal equations. What moves everything at once, as the scale and the
+bending of an arch, stands out so little from that diagonal that 1e-4 of it would freeze it."""
+_GAUGE_STEPS = 5
+_CHANCE = 1e-6
+"""A calibration that would come about with less than this chance is not that of the handpiece."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,8 +71,9 @@ class AdjustmentOptions:
     """Number of times that the minimum is sought, with outliers dropped in between."""
     iterations: int = 30
     """Most steps in a round."""
-    tolerance_sigmas: float = 0.02
-    """A round ends when a step moves the unknowns by less than this share of their standard deviations."""
+    tolerance: float = 0.01
+    """A round ends when the cost, in squared standard deviations, would fall by less than this: all unknowns together
+    are then within the root of it of their best values, measured in their standard deviations."""
     minimum_angle_deg: float = 1.0
     """Points whose rays meet at less than this angle are dropped."""
     covariance: bool = True
@@ -121,6 +134,18 @@ class _Prior:
         camera = mounted.camera.with_parameters(mounted.camera.parameters + shift)
         return replace(mounted, camera=camera, cam_from_rig=moved)
 
+    def whitened_places(
+        self, rotations: Float[np.ndarray, "c 3 3"], translations: Float[np.ndarray, "c 3"]
+    ) -> Float[np.ndarray, "c 6"]:
+        """How many standard deviations places in the rig are from the given ones."""
+        numbers = []
+        for mounted, factor, rotation, translation in zip(
+            self.rig.cameras.values(), self.extrinsic_factor, rotations, translations, strict=True
+        ):
+            motion = Rigid3(rotation, translation) @ mounted.cam_from_rig.inverse()
+            numbers.append(np.linalg.pinv(factor) @ [*motion.rotation_vector, *motion.translation])
+        return np.array(numbers)
+
     def basis_at(self, index: int, whitened: Float[np.ndarray, "14"]) -> Float[np.ndarray, "14 14"]:
         """Derivative of (motion on the left of cam_from_rig, parameters) with respect to ``whitened``."""
         motion = self.extrinsic_factor[index] @ whitened[:6]
@@ -162,21 +187,19 @@ def _initial_state(reconstruction: Reconstruction, points: Float[np.ndarray, "p 
     return _with_calibration(state, prior, np.zeros((cameras, CALIBRATION)))
 
 
-def _moved(
-    state: State, observations: Observations, weighting: Weighting, prior: _Prior, damping: float, step: Any
-) -> State:
-    """The state after a step of the reduced unknowns and the back-substitution of the points."""
+def _moved(state: State, observations: Observations, weighting: Weighting, prior: _Prior, step: Any) -> State:
+    """The state after a step of poses and calibration, with the points where their rays then meet."""
     size = POSE * (len(state.frame_rotation) - 1)
     motions = np.vstack([np.zeros((1, POSE)), step[:size].reshape(-1, POSE)])
     turns = Rotation.from_rotvec(motions[:, :3]).as_matrix()
     moved = state._replace(
         frame_rotation=turns @ state.frame_rotation,
         frame_translation=np.einsum("fij,fj->fi", turns, state.frame_translation) + motions[:, 3:],
-        points=substitute(state, observations, weighting, damping, step),
+        points=substitute(state, observations, weighting, step),
     )
-    if not weighting.calibrated:
-        return moved
-    return _with_calibration(moved, prior, state.whitened + step[size:].reshape(state.whitened.shape))
+    if weighting.calibrated:
+        moved = _with_calibration(moved, prior, state.whitened + step[size:].reshape(state.whitened.shape))
+    return settle(moved, observations, weighting)
 
 
 # --- minimisation ------------------------------------------------------------------------------------------------
@@ -192,7 +215,7 @@ def _cost(state: State, observations: Observations, weighting: Weighting) -> flo
     return float(np.sum(loss) + np.sum(state.whitened**2))
 
 
-def _solve_damped(system: System, damping: float) -> Float[np.ndarray, "n"] | None:
+def _solve(system: System, damping: float) -> Float[np.ndarray, "n"] | None:
     """The damped step, or None where the system is not positive definite."""
     matrix = system.matrix.copy()
     on_diagonal = np.arange(len(matrix))
@@ -203,29 +226,54 @@ def _solve_damped(system: System, damping: float) -> Float[np.ndarray, "n"] | No
         return None
 
 
+def _at_best_gauge(state: State, prior: _Prior) -> State:
+    """The state with the least cost of the prior among those that all images see alike."""
+    for _ in range(_GAUGE_STEPS):
+        gauge = best_gauge(state)
+        whitened = state.whitened.copy()
+        whitened[:, :PLACE] = prior.whitened_places(*moved_places(state, gauge))
+        if not np.sum(whitened**2) < (1 - 1e-9) * np.sum(state.whitened**2):
+            break
+        state = _with_calibration(moved_world(state, gauge), prior, whitened)
+    return state
+
+
+@dataclass(frozen=True, eq=False)
+class _Minimum:
+    """Where the search for the least cost ended."""
+
+    state: State
+    steps: int
+    """Steps that were tried."""
+    decrease: float
+    """By which the cost would still fall, if it were quadratic."""
+
+
 def _minimise(
     state: State,
     observations: Observations,
     weighting: Weighting,
     prior: _Prior,
     options: AdjustmentOptions,
-) -> State:
-    """Levenberg-Marquardt from ``state`` to the minimum of the cost."""
-    damping, cost = 1e-4, _cost(state, observations, weighting)
-    for _ in range(options.iterations):
-        system = normal_equations(state, observations, weighting, damping)
-        step = _solve_damped(system, damping)
-        candidate = state if step is None else _moved(state, observations, weighting, prior, damping, step)
+) -> _Minimum:
+    """Levenberg-Marquardt on poses and calibration, with the points always where their rays meet best."""
+    damping, cost = _LEAST_DAMPING, _cost(state, observations, weighting)
+    steps, settled = 0, False
+    while steps < options.iterations and not settled and damping <= _MOST_DAMPING:
+        steps += 1
+        system = normal_equations(state, observations, weighting)
+        full = _solve(system, _LEAST_DAMPING)
+        step = full if damping == _LEAST_DAMPING else _solve(system, damping)
+        decrease = np.inf if full is None else float(-full @ system.gradient)
+        candidate = state if step is None else _moved(state, observations, weighting, prior, step)
         lower = np.inf if step is None else _cost(candidate, observations, weighting)
+        settled = decrease < options.tolerance and not cost - lower > options.tolerance
         if lower <= cost:
-            state, cost, damping = candidate, lower, max(damping / 10, 1e-9)
-        elif damping > 1e6:
-            break
+            state, damping = _at_best_gauge(candidate, prior), max(damping / 10, _LEAST_DAMPING)
+            cost = _cost(state, observations, weighting) if weighting.calibrated else lower
         else:
             damping *= 10
-        if step is not None and -step @ system.gradient <= len(step) * options.tolerance_sigmas**2:
-            break
-    return state
+    return _Minimum(state, steps, decrease)
 
 
 def _sigma_px(state: State, observations: Observations, weighting: Weighting, unknowns: int) -> float:
@@ -340,7 +388,7 @@ def _posterior(
     state: State, observations: Observations, weighting: Weighting
 ) -> tuple[Float[np.ndarray, "f 6 6"], Float[np.ndarray, "c 14 14"] | None]:
     """Covariance of each pose and of each camera's calibration (motion on the left, parameters)."""
-    system = normal_equations(state, observations, weighting._replace(huber_sigmas=np.inf), 0.0)
+    system = normal_equations(state, observations, weighting._replace(huber_sigmas=np.inf))
     inverse = cho_solve(cho_factor(system.matrix, lower=True), np.eye(len(system.matrix)))
     poses = np.zeros((len(state.frame_rotation), POSE, POSE))
     for frame in range(1, len(poses)):
@@ -388,18 +436,48 @@ def adjust(reconstruction: Reconstruction, options: AdjustmentOptions | None = N
     prior = _Prior.of(reconstruction.rig)
     observations, points = _sorted_by_point(tracks, np.ones(len(tracks.point_index), dtype=bool))
     state, colors = _initial_state(reconstruction, tracks.points[points], prior), tracks.colors[points]
-    sigma_px, limit_px = options.sigma_px, options.start_px
+    sigma_px, limit_px, steps = options.sigma_px, options.start_px, 0
     for _ in range(options.rounds):
         keep = _good(state, observations, limit_px, options.minimum_angle_deg)
         if not keep.any():
             raise ReconstructionError("adjustment: no point is consistent; check the handpiece's calibration")
         state, observations, colors = _select(state, observations, colors, keep)
         weighting = Weighting(sigma_px, options.huber_sigmas, prior.is_free)
-        state = _minimise(state, observations, weighting, prior, options)
+        minimum = _minimise(state, observations, weighting, prior, options)
+        state, steps = minimum.state, steps + minimum.steps
         unknowns = state.points.size + POSE * (len(state.frame_rotation) - 1)
         sigma_px = _sigma_px(state, observations, weighting, unknowns)
         limit_px = options.outlier_sigmas * sigma_px
-    return _result(reconstruction, state, observations, colors, prior, sigma_px, options.covariance)
+    found = _result(reconstruction, state, observations, colors, prior, sigma_px, options.covariance)
+    return replace(
+        found,
+        notes=(*found.notes, *_unsettled(minimum, options), *_implausible(state, prior)),
+        log={**found.log, "adjustment_steps": steps, "calibration_cost": float(np.sum(state.whitened**2))},
+    )
+
+
+def _unsettled(minimum: _Minimum, options: AdjustmentOptions) -> tuple[str, ...]:
+    """Whether the adjustment stopped before it had settled."""
+    if minimum.decrease < options.tolerance:
+        return ()
+    return (
+        f"adjustment: not converged after {minimum.steps} steps; poses and scale may be wrong: check the handpiece's "
+        "calibration",
+    )
+
+
+def _implausible(state: State, prior: _Prior) -> tuple[str, ...]:
+    """Whether the refined calibration lies farther from the given one than its covariance allows."""
+    free = np.array([np.linalg.matrix_rank(factor) for factor in (*prior.extrinsic_factor, *prior.parameter_factor)])
+    cost, numbers = float(np.sum(state.whitened**2)), int(free.sum())
+    if numbers == 0 or cost <= chdtri(numbers, _CHANCE):
+        return ()
+    camera = int(np.argmax(np.sum(state.whitened**2, axis=1)))
+    return (
+        f"calibration: the images want it {np.sqrt(cost / numbers):.1f} standard deviations (root mean square of "
+        f"{numbers} numbers) from the file, camera {prior.rig.names[camera]} farthest; is it the file of this "
+        "handpiece, and are its covariances not too small?",
+    )
 
 
 def _result(

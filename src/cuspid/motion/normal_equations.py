@@ -21,6 +21,8 @@ CALIBRATION = 14
 _COLUMNS = 3 + POSE + CALIBRATION
 _PARTS = 4
 _NEAREST_MM = 1e-3
+_SETTLING = 4
+"""Most steps of a point after the rest has moved."""
 
 
 class State(NamedTuple):
@@ -268,10 +270,10 @@ def _eliminate(system, offsets, widths, coupling, count, inverse, point_gradient
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _point_inverse(hessian, damping, inverse):
-    """Inverse of a point's 3x3 block with damping; zero where the point is not determined."""
-    a, b, c = hessian[0, 0] * (1 + damping), hessian[0, 1], hessian[0, 2]
-    d, e, f = hessian[1, 1] * (1 + damping), hessian[1, 2], hessian[2, 2] * (1 + damping)
+def _point_inverse(hessian, inverse):
+    """Inverse of a point's 3x3 block; zero where the point is not determined."""
+    a, b, c = hessian[0, 0], hessian[0, 1], hessian[0, 2]
+    d, e, f = hessian[1, 1], hessian[1, 2], hessian[2, 2]
     determinant = a * (d * f - e * e) - b * (b * f - e * c) + c * (b * e - d * c)
     inverse[:] = 0
     if determinant <= 1e-12 * a * d * f:
@@ -294,7 +296,7 @@ def _offsets_of(observations, weighting, o, frames):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _accumulate(state, observations, weighting, damping, first, last, system):
+def _accumulate(state, observations, weighting, first, last, system):
     """Add the points ``first`` to ``last`` to the reduced normal equations."""
     frames, longest = state.frame_rotation.shape[0], np.diff(observations.start).max()
     scratch, residual, jacobian = make_scratch(), np.zeros(2), np.zeros((2, _COLUMNS))
@@ -311,13 +313,13 @@ def _accumulate(state, observations, weighting, damping, first, last, system):
                 _add_block(gradient, 0, 0, jacobian[:, :3], residual.reshape(2, 1))
                 blocks = (offsets, widths, coupling, count)
                 count = _add_observation(system, blocks, jacobian, residual, pose_at, camera_at)
-        _point_inverse(hessian, damping, inverse)
+        _point_inverse(hessian, inverse)
         _eliminate(system, offsets, widths, coupling, count, inverse, gradient[:, 0])
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _substitute(state, observations, weighting, damping, step, first, last, moved):
+def _substitute(state, observations, weighting, step, first, last, moved):
     """Back-substitution: the points ``first`` to ``last`` after the reduced unknowns have made their step."""
     frames = state.frame_rotation.shape[0]
     scratch, residual, jacobian = make_scratch(), np.zeros(2), np.zeros((2, _COLUMNS))
@@ -335,11 +337,59 @@ def _substitute(state, observations, weighting, damping, step, first, last, move
                     residual[i] += np.dot(jacobian[i, 3 + POSE :], step[camera_at : camera_at + CALIBRATION])
             _add_block(hessian, 0, 0, jacobian[:, :3], jacobian[:, :3])
             _add_block(gradient, 0, 0, jacobian[:, :3], residual.reshape(2, 1))
-        _point_inverse(hessian, damping, inverse)
+        _point_inverse(hessian, inverse)
         for i in range(3):
             moved[point, i] = state.points[point, i] - (
                 inverse[i, 0] * gradient[0, 0] + inverse[i, 1] * gradient[1, 0] + inverse[i, 2] * gradient[2, 0]
             )
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _loss(state, observations, weighting, point, scratch, residual):
+    """Huber loss of the observations of a point; infinite where it lies behind one of their cameras."""
+    x_in_rig, x_in_cam, by_cam, _, raw = scratch
+    total = 0.0
+    for o in range(observations.start[point], observations.start[point + 1]):
+        frame, camera = observations.frame[o], observations.camera[o]
+        _move(state.frame_rotation[frame], state.frame_translation[frame], state.points[point], x_in_rig)
+        _move(state.camera_rotation[camera], state.camera_translation[camera], x_in_rig, x_in_cam)
+        if x_in_cam[2] < _NEAREST_MM:
+            return np.inf
+        x, y, z = x_in_cam
+        _camera_jacobian(state.intrinsics[camera], x, y, z, residual, by_cam, raw[:, POSE:])
+        residual -= observations.pixels[o]
+        length, knee = np.hypot(residual[0], residual[1]) / weighting.sigma_px, weighting.huber_sigmas
+        total += length * length if length <= knee else 2 * knee * length - knee * knee
+    return total
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _settle(state, observations, weighting, first, last):
+    """Move the points ``first`` to ``last`` to where their rays meet, the rest being held (Gauss-Newton)."""
+    scratch, residual, jacobian = make_scratch(), np.zeros(2), np.zeros((2, _COLUMNS))
+    hessian, gradient, inverse = np.zeros((3, 3)), np.zeros((3, 1)), np.zeros((3, 3))
+    before = np.zeros(3)
+    for point in range(first, last):
+        loss = _loss(state, observations, weighting, point, scratch, residual)
+        for _ in range(_SETTLING):
+            hessian[:], gradient[:], before[:] = 0, 0, state.points[point]
+            for o in range(observations.start[point], observations.start[point + 1]):
+                if _weigh(state, observations, weighting, point, o, scratch, residual, jacobian):
+                    _add_block(hessian, 0, 0, jacobian[:, :3], jacobian[:, :3])
+                    _add_block(gradient, 0, 0, jacobian[:, :3], residual.reshape(2, 1))
+            _point_inverse(hessian, inverse)
+            for i in range(3):
+                for j in range(3):
+                    state.points[point, i] -= inverse[i, j] * gradient[j, 0]
+            lower = _loss(state, observations, weighting, point, scratch, residual)
+            if not lower < loss:
+                state.points[point] = before
+                break
+            gained, loss = loss - lower, lower
+            if gained < 1e-9 * loss:
+                break
 
 
 def _in_parts(work: Callable[[int, int], Any], count: int) -> list[Any]:
@@ -349,14 +399,14 @@ def _in_parts(work: Callable[[int, int], Any], count: int) -> list[Any]:
         return list(pool.map(work, edges[:-1], edges[1:]))
 
 
-def normal_equations(state: State, observations: Observations, weighting: Weighting, damping: float) -> System:
+def normal_equations(state: State, observations: Observations, weighting: Weighting) -> System:
     """Reduced normal equations of all observations and of the prior of the calibration."""
     size = POSE * (len(state.frame_rotation) - 1)
     total = size + (state.whitened.size if weighting.calibrated else 0)
 
     def part(first: int, last: int) -> System:
         system = System(np.zeros((total, total)), np.zeros(total), np.zeros(total))
-        _accumulate(state, observations, weighting, damping, first, last, system)
+        _accumulate(state, observations, weighting, first, last, system)
         return system
 
     parts = _in_parts(part, len(state.points))
@@ -370,16 +420,24 @@ def normal_equations(state: State, observations: Observations, weighting: Weight
 
 
 def substitute(
-    state: State, observations: Observations, weighting: Weighting, damping: float, step: Float[np.ndarray, "n"]
+    state: State, observations: Observations, weighting: Weighting, step: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "p 3"]:
     """The points after the reduced unknowns have made their step."""
     points = np.empty_like(state.points)
 
     def part(first: int, last: int) -> None:
-        _substitute(state, observations, weighting, damping, step, first, last, points)
+        _substitute(state, observations, weighting, step, first, last, points)
 
     _in_parts(part, len(points))
     return points
+
+
+def settle(state: State, observations: Observations, weighting: Weighting) -> State:
+    """The state with each point where its rays meet best, poses and calibration being held."""
+    settled = state._replace(points=state.points.copy())
+    held = weighting._replace(calibrated=False)
+    _in_parts(lambda first, last: _settle(settled, observations, held, first, last), len(state.points))
+    return settled
 
 
 def residual_vectors(state: State, observations: Observations) -> Float[np.ndarray, "o 2"]:

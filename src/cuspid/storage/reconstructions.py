@@ -49,6 +49,7 @@ def write_reconstruction(folder: Path, reconstruction: Reconstruction, handpiece
             "frames_dropped": reconstruction.dropped,
             "points": 0 if reconstruction.tracks is None else len(reconstruction.tracks.points),
             "reprojection_rms_px": reconstruction.reprojection_rms_px,
+            "notes": reconstruction.notes,
             "log": reconstruction.log,
             "pose_covariance_rotation_rad_translation_mm": reconstruction.pose_covariance,
         },
@@ -67,6 +68,7 @@ def read_reconstruction(folder: Path) -> Reconstruction:
             pose_covariance=covariance_from_json(value["pose_covariance_rotation_rad_translation_mm"]),
             reprojection_rms_px=value["reprojection_rms_px"],
             log=value["log"],
+            notes=tuple(value.get("notes", ())),
         )
 
 

@@ -1,0 +1,95 @@
+"""What no image sees of a rig whose calibration is free: its own frame and its scale.
+
+If a similarity is applied to the rig frame, that is to every camera of the rig, every pose and every point, no pixel
+moves: seven directions in which the prior of the calibration alone decides. They move everything at once, so that a
+damped step of the adjustment hardly follows them; here the least of the prior along them is found by itself.
+
+Notation: ``new = scale turn old + shift`` in the rig frame; a small motion (rotation vector, translation) acts on the
+left of ``cam_from_rig``, and z are the whitened numbers of :mod:`cuspid.motion.adjustment`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import null_space
+from scipy.spatial.transform import Rotation
+
+from cuspid.epipolar import skew
+from cuspid.motion.normal_equations import State
+
+PLACE = 6
+"""Numbers of a camera's place in the rig, the first of its whitened ones."""
+_HELD = 1e-6
+"""A direction of a camera's place is held whose standard deviation is less than this share of those of its parts."""
+
+
+class Gauge(NamedTuple):
+    """A similarity of the rig frame."""
+
+    turn: Float[np.ndarray, "3 3"]
+    shift: Float[np.ndarray, "3"]
+    scale: float
+
+    @staticmethod
+    def of(step: Float[np.ndarray, "7"]) -> Gauge:
+        """From a rotation vector (rad), a shift (mm) and the logarithm of the scale."""
+        return Gauge(Rotation.from_rotvec(step[:3]).as_matrix(), step[3:6], float(np.exp(step[6])))
+
+
+def best_gauge(state: State) -> Gauge:
+    """The similarity that lessens the prior's cost of the cameras' places most, to first order; it moves none of the
+    places in a direction in which it is held."""
+    motions = np.stack(
+        [
+            _motion_by_gauge(turn, place)
+            for turn, place in zip(state.camera_rotation, state.camera_translation, strict=True)
+        ]
+    )
+    inverses, held = zip(*(_split(basis[:PLACE, :PLACE]) for basis in state.basis), strict=True)
+    held_rows = np.concatenate([rows @ motion for rows, motion in zip(held, motions, strict=True)])
+    free = null_space(held_rows, rcond=1e-9) if len(held_rows) else np.eye(7)
+    whitened = np.concatenate([inverse @ motion for inverse, motion in zip(inverses, motions, strict=True)])
+    along = np.linalg.lstsq(whitened @ free, -state.whitened[:, :PLACE].ravel(), rcond=None)[0]
+    return Gauge.of(free @ along)
+
+
+def _motion_by_gauge(turn: Float[np.ndarray, "3 3"], place: Float[np.ndarray, "3"]) -> Float[np.ndarray, "6 7"]:
+    """Small motion of ``cam_from_rig`` by a small gauge (rotation vector, shift, logarithm of the scale)."""
+    motion = np.zeros((PLACE, 7))
+    motion[:3, :3], motion[3:, :3] = -turn, -skew(place) @ turn
+    motion[3:, 3:6], motion[3:, 6] = -turn, place
+    return motion
+
+
+def _split(basis: Float[np.ndarray, "6 6"]) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "k 6"]]:
+    """From a small motion to z, and rows that vanish for the motions that the prior allows."""
+    length = np.linalg.norm(basis, axis=1)
+    unit = np.where(length > 0, length, 1.0)
+    left, values, right = np.linalg.svd(basis / unit[:, None])
+    allowed = values > _HELD
+    inverse = right.T @ np.diag(np.where(allowed, 1 / np.where(allowed, values, 1.0), 0.0)) @ left.T
+    return inverse / unit, left.T[~allowed] / unit
+
+
+def moved_world(state: State, gauge: Gauge) -> State:
+    """Poses and points of a state after a gauge, with the first frame where it was; the cameras are the caller's."""
+    rotation = gauge.turn @ state.frame_rotation
+    translation = gauge.scale * state.frame_translation @ gauge.turn.T + gauge.shift
+    # The world is redefined so that the first pose stays: new_from_old = before^-1 after.
+    before, place = state.frame_rotation[0], state.frame_translation[0]
+    world_turn, world_shift = before.T @ rotation[0], before.T @ (translation[0] - place)
+    rotation = rotation @ world_turn.T
+    return state._replace(
+        frame_rotation=rotation,
+        frame_translation=translation - rotation @ world_shift,
+        points=gauge.scale * state.points @ world_turn.T + world_shift,
+    )
+
+
+def moved_places(state: State, gauge: Gauge) -> tuple[Float[np.ndarray, "c 3 3"], Float[np.ndarray, "c 3"]]:
+    """Rotations and translations of ``cam_from_rig`` after a gauge."""
+    rotation = state.camera_rotation @ gauge.turn.T
+    return rotation, gauge.scale * state.camera_translation - rotation @ gauge.shift
