@@ -11,7 +11,7 @@ import numpy as np
 from cuspid import storage
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
-from cuspid.rig import Exposure, Handpiece, Light, MountedCamera, Rig
+from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 
 folder = Path(sys.argv[1])
 camera = Camera.from_field_of_view(640, 480, 70.0)
@@ -25,7 +25,7 @@ led = Light(position_mm=np.array([0.0, 1.5, 6.0]), direction=np.array([0.0, 0.0,
 handpiece = Handpiece(
     rig=Rig(cameras),
     lights={"led": led},
-    exposures=(Exposure(name="all", lights=("led",)),),
+    lightings=(Lighting(name="all", lights=("led",)),),
     working_distance_mm=6.0,
     depth_range_mm=(3.0, 10.0),
     name="two cameras, 2 mm apart",

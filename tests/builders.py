@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,10 @@ import trimesh
 
 from cuspid import storage
 from cuspid.camera import Camera
-from cuspid.capture import Capture, Frame
+from cuspid.capture import Capture, Frame, ImageFolder
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
-from cuspid.rig import Exposure, Handpiece, Light, MountedCamera, Rig
+from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 
 CAMERA = Camera.from_field_of_view(16, 12, 62.0)
 
@@ -27,17 +28,30 @@ def handpiece(*names: str) -> Handpiece:
     return Handpiece(
         rig=rig,
         lights={"led": Light(position_mm=np.array([1.0, 2, 3]), direction=np.array([0, 0, 1.0]), power=2.0)},
-        exposures=(Exposure(name="all", lights=("led",)),),
+        lightings=(Lighting(name="all", lights=("led",)),),
     )
+
+
+def folder_capture(folder: Path, handpiece: Handpiece, stems: Iterable[str]) -> Capture:
+    """A capture whose images are to lie in a folder, every camera with one of every frame."""
+    lighting = handpiece.lightings[0].name if handpiece.lightings else None
+    frames = tuple(Frame(name=stem, cameras=handpiece.rig.names, lighting=lighting) for stem in stems)
+    return Capture(handpiece=handpiece, frames=frames, source=ImageFolder(folder))
+
+
+def image_path(capture: Capture, frame: str, camera: str) -> Path:
+    """Where an image of such a capture lies."""
+    assert isinstance(capture.source, ImageFolder)
+    return capture.source.path(frame, camera)
 
 
 def make_capture(
     folder: Path, names: tuple[str, ...] = ("a", "b"), stems: tuple[str, ...] = ("00000", "00001")
 ) -> Capture:
-    capture = Capture(folder=folder, handpiece=handpiece(*names), frames=tuple(Frame(name=stem) for stem in stems))
+    capture = folder_capture(folder, handpiece(*names), stems)
     rng = np.random.default_rng(0)
     for name in names:
         for stem in stems:
-            storage.write_image(capture.image_path(stem, name), rng.integers(0, 255, (12, 16, 3), dtype=np.uint8))
-    storage.write_capture(capture)
+            storage.write_image(image_path(capture, stem, name), rng.integers(0, 255, (12, 16, 3), dtype=np.uint8))
+    storage.write_capture(folder, capture)
     return capture

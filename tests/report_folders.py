@@ -6,16 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
+from builders import folder_capture, image_path
 from cuspid import storage
 from cuspid.camera import Camera
-from cuspid.capture import Capture, Frame
+from cuspid.capture import Dropped
 from cuspid.evaluation.deviation import statistics
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
-from cuspid.reconstruction import Dropped, Reconstruction
+from cuspid.reconstruction import Reconstruction
 from cuspid.reporting.figures import deviation_colors
-from cuspid.rig import Exposure, Handpiece, MountedCamera, Rig
+from cuspid.rig import Handpiece, Lighting, MountedCamera, Rig
 from cuspid.shape_model import MeanStep, ShapeModel
 from cuspid.trueness import Trueness
 
@@ -86,15 +87,15 @@ def write_scan(folder: Path, jaw: Jaw) -> None:
     rig = Rig(
         {name: MountedCamera(CAMERA, Rigid3(np.eye(3), np.array([-2.0 * k, 0, 0]))) for k, name in enumerate(names)}
     )
-    handpiece = Handpiece(rig=rig, exposures=(Exposure(name="all"),))
-    capture = Capture(folder=folder / "capture", handpiece=handpiece, frames=tuple(Frame(name=name) for name in FRAMES))
+    handpiece = Handpiece(rig=rig, lightings=(Lighting(name="all"),))
+    capture = folder_capture(folder / "capture", handpiece, FRAMES)
     rng = np.random.default_rng(0)
     storage.claim_folder(folder, "simulate", {"simulation": {"seed": 3, "path": {"tooth": TOOTH}}}, {})
     storage.claim_folder(folder, "reconstruct", {"reconstruction": {"motion": "rig"}}, {"images": "b" * 64})
     for frame in FRAMES:
         for name in names:
-            storage.write_image(capture.image_path(frame, name), rng.integers(0, 255, (48, 64, 3), dtype=np.uint8))
-    storage.write_capture(capture)
+            storage.write_image(image_path(capture, frame, name), rng.integers(0, 255, (48, 64, 3), dtype=np.uint8))
+    storage.write_capture(folder / "capture", capture)
     storage.write_jaw(folder / "truth" / "jaw.ply", jaw)
     poses = {name: looking_down(jaw, 4.0 * k - 2.0) @ REFERENCE_FROM_SCAN for k, name in enumerate(FRAMES[:2])}
     lost = (Dropped(what="frame 00002", reason="too few points"),)

@@ -12,11 +12,12 @@ import pytest
 import trimesh
 
 from cuspid.camera import Camera
+from cuspid.capture import Frame
 from cuspid.errors import CuspidError, InputError, MissingDependencyError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
-from cuspid.rig import Exposure, Handpiece, Light, MountedCamera, Rig, Sensor
+from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor
 from cuspid.simulation import blender, raycast
 from cuspid.simulation.appearance import Appearance, Material
 from cuspid.simulation.raycast import Scene, Sink, render_capture
@@ -33,6 +34,7 @@ OFF_CENTRE = Camera(
     focal_px=np.array([170.0, 155.0]),
     principal_point_px=np.array([81.3, 88.7]),
 )
+FRAME = Frame(name="0", cameras=("a",), lighting="all")
 POSE = Rigid3.from_rotation_vector(np.array([0.3, -0.2, 0.5]), np.array([0.4, -0.3, 0.2]))
 """The handpiece somewhere askew in the world."""
 
@@ -48,7 +50,7 @@ def scene_of(meshes: list[tuple[trimesh.Trimesh, int]], camera: Camera = OFF_CEN
         handpiece=Handpiece(
             rig=Rig({"a": MountedCamera(camera, Rigid3.identity())}),
             lights={"led": light},
-            exposures=(Exposure(name="all", lights=("led",)),),
+            lightings=(Lighting(name="all", lights=("led",)),),
             sensor=Sensor(noise_dn=0.0),
         ),
         appearance=Appearance(enamel=WHITE, gum=BLACK),
@@ -67,11 +69,11 @@ def both(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> tuple[np.ndarray, np.
     """The linear light by ray casting and by Blender, at a gain that burns nothing."""
     monkeypatch.setattr(blender, "SAMPLES", 128)
     for module in (blender, raycast):
-        monkeypatch.setattr(module, "metered_gain", lambda scene, poses, exposure: 12.0)
+        monkeypatch.setattr(module, "metered_gains", lambda scene, frames, poses: {"all": 12.0})
     images: list[np.ndarray] = []
     sink: Sink = lambda frame, camera, image: images.append((image.mean(axis=-1) / 255) ** 2.2)  # noqa: E731
-    assert list(render_capture(scene, {"0": POSE}, sink)) == [("0", "a")]
-    assert list(blender.render_with_blender(scene, {"0": POSE}, sink)) == [("0", "a")]
+    assert list(render_capture(scene, [FRAME], {"0": POSE}, sink)) == [("0", "a")]
+    assert list(blender.render_with_blender(scene, [FRAME], {"0": POSE}, sink)) == [("0", "a")]
     return images[0], images[1]
 
 

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from builders import box_mesh, handpiece, make_capture
+from builders import box_mesh, handpiece, image_path, make_capture
 from cuspid import cli, storage
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
@@ -61,34 +61,36 @@ def test_a_tooth_that_is_not_there(tmp_path, capsys, coarse_phantom):
 
 
 def test_broken_captures(tmp_path, capsys):
-    capture = make_capture(tmp_path / "capture")
-    out = tmp_path / "scan"
-    image = capture.image_path("00001", "b")
+    folder, out = tmp_path / "capture", tmp_path / "scan"
+    image = image_path(make_capture(folder), "00001", "b")
     whole = image.read_bytes()
 
     image.write_bytes(whole[: len(whole) // 2])
-    assert "truncated PNG" in refused(capsys, "reconstruct", capture.folder, "--out", out)
+    assert "truncated PNG" in refused(capsys, "reconstruct", folder, "--out", out)
     image.unlink()
-    assert "frames differ between cameras" in refused(capsys, "reconstruct", capture.folder, "--out", out)
-    shutil.rmtree(capture.folder / "images" / "b")
-    assert "no folder for camera b" in refused(capsys, "reconstruct", capture.folder, "--out", out)
+    image_path(make_capture(folder), "00001", "a").unlink()
+    image.unlink()
+    assert "1 of 2 frames have no images" in refused(capsys, "reconstruct", folder, "--out", out)
+    make_capture(folder)
+    shutil.rmtree(folder / "images" / "b")
+    assert "no two cameras see the same surface" in refused(capsys, "reconstruct", folder, "--out", out)
     assert not out.exists()
 
 
 def test_images_of_a_wrong_size(tmp_path, capsys):
     capture = make_capture(tmp_path / "capture")
-    storage.write_image(capture.image_path("00000", "a"), np.zeros((9, 9, 3), dtype=np.uint8))
-    message = refused(capsys, "reconstruct", capture.folder, "--out", tmp_path / "scan")
+    storage.write_image(image_path(capture, "00000", "a"), np.zeros((9, 9, 3), dtype=np.uint8))
+    message = refused(capsys, "reconstruct", tmp_path / "capture", "--out", tmp_path / "scan")
     assert "9 x 9 px, but camera a has 16 x 12 px" in message
 
 
 def test_a_handpiece_with_an_unknown_camera(tmp_path, capsys):
-    capture = make_capture(tmp_path / "capture")
+    make_capture(tmp_path / "capture")
     storage.write_handpiece(tmp_path / "other.json", handpiece("a", "z"))
     message = refused(
-        capsys, "reconstruct", capture.folder, "--handpiece", tmp_path / "other.json", "--out", tmp_path / "scan"
+        capsys, "reconstruct", tmp_path / "capture", "--handpiece", tmp_path / "other.json", "--out", tmp_path / "scan"
     )
-    assert "no folder for camera z" in message
+    assert "the folder b is no camera of the handpiece" in message
 
 
 def test_a_folder_that_holds_another_run(tmp_path, capsys):

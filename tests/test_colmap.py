@@ -10,8 +10,9 @@ import numpy as np
 import pycolmap
 import pytest
 
+from builders import folder_capture, image_path
 from cuspid.camera import Camera
-from cuspid.capture import Capture, Frame
+from cuspid.capture import Capture
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.motion.adjustment import residuals_px
@@ -59,8 +60,7 @@ def make_found(frames: int = 4) -> Reconstruction:
 
 def make_capture(folder: Path, found: Reconstruction) -> Capture:
     """The capture that the reconstruction is of; its images are not needed."""
-    frames = tuple(Frame(name=name) for name in found.frames)
-    return Capture(folder=folder, handpiece=Handpiece(rig=found.rig), frames=frames)
+    return folder_capture(folder, Handpiece(rig=found.rig), found.frames)
 
 
 def assert_same_poses(one: Reconstruction, other: Reconstruction, atol: float = 1e-9) -> None:
@@ -255,7 +255,7 @@ def take_images(folder: Path, found: Reconstruction, texture: np.ndarray) -> Cap
     capture = make_capture(folder, found)
     for frame, pose in found.rig_from_world.items():
         for name, mounted in found.rig.cameras.items():
-            file = capture.image_path(frame, name)
+            file = image_path(capture, frame, name)
             file.parent.mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(file), photograph(mounted.camera, mounted.cam_from_rig @ pose, texture))
     return capture

@@ -90,8 +90,8 @@ def test_side_groups_aim_at_the_crown_from_the_working_distance() -> None:
 
 def test_lights_lie_between_the_cameras_of_their_group_and_are_on_in_the_one_exposure() -> None:
     handpiece = twelve_cameras()
-    assert [exposure.name for exposure in handpiece.exposures] == ["all"]
-    assert set(handpiece.exposures[0].lights) == set(handpiece.lights)
+    assert [lighting.name for lighting in handpiece.lightings] == ["all"]
+    assert set(handpiece.lightings[0].lights) == set(handpiece.lights)
     for name, light in handpiece.lights.items():
         camera = handpiece.rig[f"{name[0]}1"]
         np.testing.assert_allclose(light.direction, camera.axis_in_rig, atol=1e-12)

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from builders import folder_capture, image_path
 from cuspid.camera import Camera
-from cuspid.capture import Capture, Frame
+from cuspid.capture import Capture
 from cuspid.errors import InputError, OutputError
 from cuspid.geometry import Rigid3
 from cuspid.motion.features import DESCRIPTOR_NORM, FeatureOptions, detect, detect_all, spread
@@ -128,12 +129,10 @@ def capture(tmp_path: Path) -> Capture:
     """Two cameras and two frames on disk."""
     camera = Camera.from_field_of_view(SIZE, SIZE, 62.0)
     rig = Rig({name: MountedCamera(camera, Rigid3.identity()) for name in ("a", "b")})
-    made = Capture(
-        folder=tmp_path, handpiece=Handpiece(rig=rig), frames=tuple(Frame(name=f"{k:05d}") for k in range(2))
-    )
+    made = folder_capture(tmp_path, Handpiece(rig=rig), ("00000", "00001"))
     for camera_name in rig.names:
         for k, frame in enumerate(made.frames):
-            path = made.image_path(frame, camera_name)
+            path = image_path(made, frame.name, camera_name)
             path.parent.mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(path), photograph(FIRST + [[0, 0, 9 * k], [0, 0, 0], [0, 0, 0]]))
     return made
@@ -153,9 +152,9 @@ def test_all_images_are_read_once(capture: Capture, tmp_path: Path, monkeypatch:
     assert not reads
     np.testing.assert_array_equal(again["00001", "b"].descriptors, first["00001", "b"].descriptors)
     np.testing.assert_array_equal(again["00001", "b"].pixels, first["00001", "b"].pixels)
-    cv2.imwrite(str(capture.image_path("00001", "b")), photograph(SECOND))
+    cv2.imwrite(str(image_path(capture, "00001", "b")), photograph(SECOND))
     detect_all(capture, cache=cache)
-    assert reads == [("00001", "b")]
+    assert reads == [(capture.frames[1], "b")]
     assert len(detect_all(capture, FeatureOptions(count=10), cache=cache)["00000", "a"]) == 10
 
 
@@ -174,6 +173,6 @@ def test_bad_images_and_caches_are_told(capture: Capture, tmp_path: Path) -> Non
     blocked.write_text("a file, not a folder")
     with pytest.raises(OutputError, match="blocked"):
         detect_all(capture, cache=blocked)
-    capture.image_path("00001", "a").unlink()
+    image_path(capture, "00001", "a").unlink()
     with pytest.raises(InputError, match=r"a/00001\.png"):
         detect_all(capture, cache=tmp_path / "cache")

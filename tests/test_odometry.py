@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
+from builders import folder_capture, image_path
 from cuspid.camera import Camera
-from cuspid.capture import Capture, Frame
+from cuspid.capture import Capture
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.motion import MotionOptions, locate
@@ -137,6 +138,23 @@ def test_result_is_repeatable() -> None:
     one, other = (locate_features(handpiece, seen, list(path), MotionOptions()) for _ in range(2))
     for name, pose in one.rig_from_world.items():
         np.testing.assert_array_equal(pose.matrix, other.rig_from_world[name].matrix)
+
+
+def test_a_camera_without_an_image_is_left_out_of_that_frame_alone() -> None:
+    """The rest of the frame is used, and every frame is placed about as well as with all images."""
+    handpiece, path = make_handpiece(), make_path(6)
+    seen = see(handpiece, path)
+    names = handpiece.rig.names
+    missing = {("00001", names[0]), ("00003", names[0]), ("00003", names[2])}
+    whole = locate_features(handpiece, seen, list(path), MotionOptions())
+    rest = {key: each for key, each in seen.items() if key not in missing}
+    found = locate_features(handpiece, rest, list(path), MotionOptions())
+    assert found.frames == tuple(path)
+    assert 0 < np.abs(errors(found, path)).max() < 3 * np.abs(errors(whole, path)).max()
+    images = set(zip(found.tracks.frame_index.tolist(), found.tracks.camera_index.tolist(), strict=True))
+    frames = list(path)
+    assert not images & {(frames.index(frame), names.index(camera)) for frame, camera in missing}
+    assert len(images) == len(path) * len(names) - len(missing)
 
 
 def test_a_blurred_frame_is_dropped_and_bridged() -> None:
@@ -272,12 +290,12 @@ def make_capture(folder: Path, rig: Rig, path: dict[str, Rigid3]) -> Capture:
     rng = np.random.default_rng(0)
     layers = [cv2.GaussianBlur(rng.normal(size=(1600, 1600)), (0, 0), s) * s for s in (2.0, 5.0, 12.0)]
     texture = cv2.normalize(sum(layers), None, 30, 225, cv2.NORM_MINMAX).astype(np.float32)
-    capture = Capture(folder=folder, handpiece=Handpiece(rig=rig), frames=tuple(Frame(name=name) for name in path))
+    capture = folder_capture(folder, Handpiece(rig=rig), path)
     for frame, pose in path.items():
         for name, mounted in rig.cameras.items():
             gray = photograph(mounted.camera, mounted.cam_from_rig @ pose, texture, 80.0)
             noisy = np.clip(np.rint(gray + rng.normal(0, 1.5, gray.shape)), 0, 255).astype(np.uint8)
-            file = capture.image_path(frame, name)
+            file = image_path(capture, frame, name)
             file.parent.mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(file), cv2.merge([noisy] * 3))
     return capture

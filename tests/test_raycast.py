@@ -9,12 +9,13 @@ import pytest
 import trimesh
 
 from cuspid.camera import Camera
+from cuspid.capture import Frame
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
-from cuspid.rig import Exposure, Handpiece, Light, MountedCamera, Rig, Sensor
+from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor
 from cuspid.simulation.appearance import (
     APPEARANCES,
     GRADIENT_NOISE_SD,
@@ -31,6 +32,7 @@ from cuspid.simulation.raycast import (
     _coat,
     auto_gain,
     lamps,
+    lit_frames,
     radiance,
     render_capture,
     render_depth,
@@ -74,7 +76,7 @@ def probe(*lights: Light, camera: Camera = CAMERA, sensor: Sensor | None = None)
     return Handpiece(
         rig=Rig({"a": MountedCamera(camera, FACING)}),
         lights=named,
-        exposures=(Exposure(name="all", lights=tuple(named)),),
+        lightings=(Lighting(name="all", lights=tuple(named)),),
         sensor=sensor or Sensor(noise_dn=0.0),
     )
 
@@ -169,7 +171,7 @@ def test_lights_add_up_and_only_those_that_are_on_shine() -> None:
     np.testing.assert_allclose(
         light_seen(jaw, both), light_seen(jaw, probe(one)) + light_seen(jaw, probe(other)), rtol=1e-3
     )
-    first_only = replace(both, exposures=(Exposure(name="all", lights=("led0",)),))
+    first_only = replace(both, lightings=(Lighting(name="all", lights=("led0",)),))
     np.testing.assert_array_equal(light_seen(jaw, first_only), light_seen(jaw, probe(one)))
 
 
@@ -283,8 +285,8 @@ def test_exposure_burns_little_and_uses_the_range(coarse_phantom: Jaw) -> None:
     handpiece = twelve_cameras(DesignOptions(width_px=60, height_px=60))
     scene = Scene(jaw=coarse_phantom, handpiece=handpiece, appearance=APPEARANCES["artificial"], supersampling=1)
     pose = Rigid3(np.eye(3), -_over(coarse_phantom, 46))
-    gain = auto_gain(scene, [pose])
-    images = np.concatenate([render_image(scene, "0", name, pose, gain) for name in handpiece.rig.names])
+    gain, frame = auto_gain(scene, [pose]), Frame(name="0", cameras=handpiece.rig.names)
+    images = np.concatenate([render_image(scene, frame, name, pose, gain) for name in frame.cameras])
     assert np.mean(images >= 254) < 0.03
     assert 190 < np.percentile(images, 97) < 255
 
@@ -312,7 +314,8 @@ def poses(scene: Scene) -> dict[str, Rigid3]:
 
 def rendered(scene: Scene, poses: dict[str, Rigid3], **options: object) -> dict[tuple[str, str], np.ndarray]:
     images: dict[tuple[str, str], np.ndarray] = {}
-    done = list(render_capture(scene, poses, lambda f, c, image: images.update({(f, c): image}), **options))  # type: ignore[arg-type]
+    taken = lit_frames(scene.handpiece, poses)
+    done = list(render_capture(scene, *taken, lambda f, c, image: images.update({(f, c): image}), **options))  # type: ignore[arg-type]
     assert sorted(done) == sorted(images)
     return images
 
@@ -330,24 +333,43 @@ def test_a_resumed_capture_equals_an_uninterrupted_one(scene: Scene, poses: dict
 def test_processes_give_the_same_images_as_one(scene: Scene, poses: dict[str, Rigid3], tmp_path) -> None:
     whole = rendered(scene, poses)
     done = list(
-        render_capture(scene, poses, lambda f, c, image: np.save(tmp_path / f"{f}-{c}.npy", image), processes=2)
+        render_capture(
+            scene,
+            *lit_frames(scene.handpiece, poses),
+            lambda f, c, image: np.save(tmp_path / f"{f}-{c}.npy", image),
+            processes=2,
+        )
     )
     assert sorted(done) == sorted(whole)
     for (frame, camera), image in whole.items():
         np.testing.assert_array_equal(np.load(tmp_path / f"{frame}-{camera}.npy"), image)
 
 
+def test_each_lighting_pattern_lights_its_own_frames(scene: Scene, poses: dict[str, Rigid3]) -> None:
+    """Whatever the patterns are called: a frame for each at each pose, exposed alike, each by its own lights."""
+    one, *_, other = scene.handpiece.lights
+    patterns = (Lighting(name="left side", lights=(one,)), Lighting(name="Ü2", lights=(other,)))
+    turns = replace(scene, handpiece=replace(scene.handpiece, lightings=patterns))
+    images = rendered(turns, poses)
+    assert {frame for frame, _ in images} == {f"{name}{letter}" for name in poses for letter in "ab"}
+    for pattern, letter in zip(patterns, "ab", strict=True):
+        alone = replace(scene, handpiece=replace(scene.handpiece, lightings=(pattern,)))
+        for (frame, camera), image in rendered(alone, poses).items():
+            apart = images[f"{frame}{letter}", camera].astype(float) - image
+            assert np.abs(apart).mean() < 3 * turns.handpiece.sensor.noise_dn
+    assert np.abs(images["00000a", "o1"].astype(float) - images["00000b", "o1"]).mean() > 10
+
+
 def test_noise_differs_between_images_and_seeds(scene: Scene, poses: dict[str, Rigid3]) -> None:
     pose = poses["00000"]
-    one = render_image(scene, "a", "o1", pose, 1.0).astype(int)
-    same = render_image(scene, "a", "o1", pose, 1.0).astype(int)
-    other = render_image(scene, "b", "o1", pose, 1.0).astype(int)
+    a, b = (Frame(name=name, cameras=("o1",), lighting="all") for name in "ab")
+    one, same, other = (render_image(scene, frame, "o1", pose, 1.0).astype(int) for frame in (a, a, b))
     np.testing.assert_array_equal(one, same)
     assert (one - other).std() == pytest.approx(1.5 * np.sqrt(2), rel=0.3)
 
 
 def test_what_cannot_be_rendered_is_said(scene: Scene) -> None:
-    with pytest.raises(InputError, match="no exposure named 'left'; it has all"):
+    with pytest.raises(InputError, match="no lighting pattern named 'left'; it has all"):
         lamps(scene.handpiece, "left", Rigid3.identity())
     with pytest.raises(InputError, match="no camera sees the jaw"):
         auto_gain(scene, [Rigid3(np.eye(3), np.array([0, 0, 500.0]))])

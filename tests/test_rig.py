@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.rig import Exposure, Handpiece, Light, MountedCamera, Rig
+from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 from strategies import rigid3s
 
 CAMERA = Camera.from_field_of_view(500, 500, 62.0)
@@ -55,7 +55,7 @@ def test_unknown_names_are_named():
     with pytest.raises(InputError, match="no camera named 'z'; it has a"):
         rig["z"]
     with pytest.raises(InputError, match="unknown lights blue"):
-        Handpiece(rig=rig, exposures=(Exposure(lights=("blue",)),))
+        Handpiece(rig=rig, lightings=(Lighting(lights=("blue",)),))
     with pytest.raises(InputError, match="at least one camera"):
         Rig({})
 

@@ -94,6 +94,16 @@ def test_four_cameras_beat_two() -> None:
         assert 0 < with_four.mean() < with_two.mean() < 0.02
 
 
+def test_a_camera_without_an_image_leaves_the_others_their_depth() -> None:
+    images = {name: image for name, image in hills_images().items() if name != "west"}
+    found = DepthEstimator(diamond(), StereoOptions(spacing_px=2)).measure(images, "00000")
+    assert {depth_map.camera_name for depth_map in found} == set(images)
+    for depth_map in found:
+        error = errors_um(depth_map)
+        assert error.size > 0.3 * depth_map.depth_mm.size
+        assert 0.1 < np.median(np.abs(error)) < 12
+
+
 def test_distorted_and_turned_cameras_measure_as_well() -> None:
     handpiece = diamond(distortion=LENS, turn_rad=0.05)
     for depth_map in DepthEstimator(handpiece).measure(photograph(handpiece), "00000"):

@@ -54,7 +54,7 @@ def film(coarse_phantom: Jaw, tmp_path_factory: pytest.TempPathFactory) -> tuple
 
 @pytest.fixture(scope="module")
 def sequence(film: tuple[Capture, GroundTruth], tmp_path_factory: pytest.TempPathFactory) -> Sequence:
-    return storage.read_sequence(film[0].folder, tmp_path_factory.mktemp("decoded"))
+    return storage.read_sequence(film[0].source.folder, tmp_path_factory.mktemp("decoded"))
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +164,7 @@ def test_a_video_is_stitched_from_the_command_line_and_its_folder_takes_no_other
         stream.release()
         return tmp_path / name
 
-    command = ["--calibration", str(film[0].folder / "handpiece.json"), "--out", str(tmp_path / "out")]
+    command = ["--calibration", str(film[0].source.folder / "handpiece.json"), "--out", str(tmp_path / "out")]
     main(["stitch", str(video("whole.avi", range(8))), *command])
     panorama = storage.read_panorama(tmp_path / "out")
     assert [frame.name for frame in panorama.frames if frame.used] == [f"{n:05d}" for n in range(8)]

@@ -9,12 +9,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from builders import CAMERA, box_mesh, handpiece, make_capture
+from builders import CAMERA, box_mesh, handpiece, image_path, make_capture
 from cuspid import storage
+from cuspid.capture import Dropped
 from cuspid.errors import CuspidError, InputError, OutputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw, Landmark, Sphere
-from cuspid.reconstruction import DepthMap, Dropped, Reconstruction
+from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import MountedCamera, Rig
 from strategies import cameras, rigid3s
 
@@ -115,7 +116,7 @@ def test_handpiece_and_rig_config_return(tmp_path, camera, transform, other):
     np.testing.assert_allclose(again.rig["o1"].covariance, 1e-4 * np.eye(6))
     assert again.rig["o2"].covariance is None
     assert again.depth_range_mm == (2.0, 9.5)
-    assert again.exposures == original.exposures
+    assert again.lightings == original.lightings
     np.testing.assert_allclose(again.lights["led"].position_mm, [1, 2, 3])
     storage.write_rig_config(tmp_path / "rig_config.json", rig)
     colmap = storage.read_rig_config(tmp_path / "rig_config.json")
@@ -164,16 +165,16 @@ def test_a_capture_returns(tmp_path):
     capture = make_capture(tmp_path)
     again = storage.read_capture(tmp_path)
     assert again.frames == capture.frames
-    np.testing.assert_array_equal(again.image("00001", "b"), capture.image("00001", "b"))
-    assert again.gray("00000", "a").shape == (12, 16)
+    second = capture.frames[1]
+    np.testing.assert_array_equal(again.image(second, "b"), capture.image(second, "b"))
     (tmp_path / "capture.json").unlink()
     assert [frame.name for frame in storage.read_capture(tmp_path).frames] == ["00000", "00001"]
 
 
 def test_what_a_killed_run_left_unfinished_is_passed_over(tmp_path):
     capture = make_capture(tmp_path / "capture")
-    (capture.folder / "images" / "b" / f"{storage.PART}x1y2.png").write_bytes(b"half an image")
-    assert storage.read_capture(capture.folder).frames == capture.frames
+    (tmp_path / "capture" / "images" / "b" / f"{storage.PART}x1y2.png").write_bytes(b"half an image")
+    assert storage.read_capture(tmp_path / "capture").frames == capture.frames
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / f"{storage.PART}x1y2.json").write_text("{")
     storage.claim_folder(tmp_path / "out", "simulate", {}, {})
@@ -181,31 +182,55 @@ def test_what_a_killed_run_left_unfinished_is_passed_over(tmp_path):
 
 def test_broken_captures_are_refused(tmp_path):
     capture = make_capture(tmp_path)
-    path = capture.image_path("00001", "b")
+    path = image_path(capture, "00001", "b")
     whole = path.read_bytes()
 
     path.write_bytes(whole[:-20])
     with pytest.raises(InputError, match="truncated PNG"):
-        capture.image("00001", "b")
+        capture.image(capture.frames[1], "b")
     storage.write_image(path, np.zeros((9, 9, 3), dtype=np.uint8))
     with pytest.raises(InputError, match="9 x 9 px, but camera b has 16 x 12 px"):
-        capture.image("00001", "b")
+        capture.image(capture.frames[1], "b")
     path.write_bytes(b"")
     with pytest.raises(InputError, match="truncated"):
-        capture.image("00001", "b")
+        capture.image(capture.frames[1], "b")
     path.unlink()
-    with pytest.raises(InputError, match="frames differ between cameras: 00001"):
-        storage.read_capture(tmp_path)
+    without = storage.read_capture(tmp_path)
+    assert [frame.cameras for frame in without.frames] == [("a", "b"), ("a",)]
+    assert [dropped.what for dropped in without.left_out] == ["camera b of frame 00001"]
+    assert set(without.images(without.frames[1])) == {"a"}
     path.write_bytes(whole)
     (tmp_path / "images" / "zz").mkdir()
     with pytest.raises(InputError, match="folder zz is no camera of the handpiece"):
         storage.read_capture(tmp_path)
     (tmp_path / "images" / "zz").rmdir()
     (tmp_path / "images" / "b").rename(tmp_path / "b")
-    with pytest.raises(InputError, match="no folder for camera b"):
-        storage.read_capture(tmp_path)
+    without = storage.read_capture(tmp_path)
+    assert without.handpiece.rig.names == ("a",)
+    assert [dropped.what for dropped in without.left_out] == ["camera b"]
     with pytest.raises(InputError, match="no folder 'images'"):
         storage.read_capture(tmp_path / "images")
+
+
+def test_what_a_capture_is_made_from_is_told_by_its_contents(tmp_path):
+    """Another image of the same size on disk is another capture; the same image again is the same one."""
+    capture = make_capture(tmp_path)
+    before, path = storage.hash_capture(capture), image_path(capture, "00000", "a")
+    whole = path.read_bytes()
+    path.write_bytes(bytes([*whole[:60], whole[60] ^ 1, *whole[61:]]))
+    after = storage.hash_capture(capture)
+    assert after["handpiece"] == before["handpiece"]
+    assert after["images"] != before["images"]
+    path.write_bytes(whole)
+    assert storage.hash_capture(capture) == before
+
+
+def test_a_handpiece_with_a_field_that_means_nothing_is_refused(tmp_path):
+    storage.write_handpiece(tmp_path / "handpiece.json", handpiece("a", "b"))
+    value = storage.read_json(tmp_path / "handpiece.json")
+    storage.write_json(tmp_path / "handpiece.json", {**value, "exposures": value["lightings"]})
+    with pytest.raises(InputError, match="the field 'exposures' is not known"):
+        storage.read_handpiece(tmp_path / "handpiece.json")
 
 
 def test_depth_maps_return(tmp_path):

@@ -1,9 +1,11 @@
-"""A capture: what the handpiece recorded, images on disk in COLMAP's rig layout ``images/<camera>/<frame>.png``."""
+"""A capture: what the handpiece recorded, frame by frame, read through a source of images."""
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -44,51 +46,122 @@ def image_size(path: Path) -> tuple[int, int]:
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """One position of the handpiece: all cameras exposed together."""
+    """One instant: the images that the cameras of the handpiece took together."""
 
     name: str
     """File stem common to the images of all cameras."""
-    exposure: str = "all"
-    """Name of the exposure in the handpiece."""
+    cameras: tuple[str, ...]
+    """The cameras that have an image of it."""
+    lighting: str | None = None
+    """Name of the lighting pattern of the handpiece, or None where it is not known."""
+    time_s: float | None = None
+    """When it was taken, from any zero, or None where that is not known."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dropped:
+    """A frame, camera, image or point set that was left out, and why."""
+
+    what: str
+    """For example ``frame 00012`` or ``camera b2``."""
+    reason: str
+    """One line for people."""
+
+
+@runtime_checkable
+class ImageSource(Protocol):
+    """Where the images of a capture come from."""
+
+    @property
+    def suffix(self) -> str:
+        """How the names of the images end."""
+        ...
+
+    def read(self, frame: str, camera: str) -> UInt8[np.ndarray, "h w 3"]:
+        """RGB image. Raises InputError where it is missing or cannot be decoded whole."""
+        ...
+
+    def size(self, frame: str, camera: str) -> tuple[int, int]:
+        """Width and height in px, at a glance. Raises InputError where the image is missing or damaged."""
+        ...
+
+    def digest(self, frame: str, camera: str) -> str:
+        """SHA-256 of the image as it is stored. Raises InputError where it is missing."""
+        ...
+
+    def where(self, frame: str, camera: str) -> str:
+        """For messages."""
+        ...
+
+
+def image_name(frame: str, camera: str, suffix: str) -> str:
+    """Name of an image in COLMAP's rig layout: ``<camera>/<frame>.png``."""
+    return f"{camera}/{frame}{suffix}"
+
+
+@dataclass(frozen=True)
+class ImageFolder:
+    """Images on disk in COLMAP's rig layout, ``images/<camera>/<frame>.png``. An :class:`ImageSource`."""
+
+    folder: Path
+    """Holds ``images/``."""
+    suffix: str = ".png"
+    """Image file suffix."""
+
+    def path(self, frame: str, camera: str) -> Path:
+        """Where an image lies."""
+        return self.folder / "images" / image_name(frame, camera, self.suffix)
+
+    def read(self, frame: str, camera: str) -> UInt8[np.ndarray, "h w 3"]:
+        """As :meth:`ImageSource.read`."""
+        return read_image(self.path(frame, camera))
+
+    def size(self, frame: str, camera: str) -> tuple[int, int]:
+        """As :meth:`ImageSource.size`."""
+        return image_size(self.path(frame, camera))
+
+    def digest(self, frame: str, camera: str) -> str:
+        """As :meth:`ImageSource.digest`."""
+        path = self.path(frame, camera)
+        try:
+            with path.open("rb") as stream:
+                return hashlib.file_digest(stream, "sha256").hexdigest()
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror}); put the image back") from error
+
+    def where(self, frame: str, camera: str) -> str:
+        """As :meth:`ImageSource.where`."""
+        return str(self.path(frame, camera))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Capture:
-    """Images and the handpiece that took them. Images are read when asked for."""
+    """What a handpiece recorded. Images are read when asked for."""
 
-    folder: Path
-    """Holds ``handpiece.json`` and ``images/``."""
     handpiece: Handpiece
     """Nominal or calibrated; all that reconstruction knows besides the images."""
     frames: tuple[Frame, ...]
     """In the order of capture."""
-    suffix: str = ".png"
-    """Image file suffix."""
+    source: ImageSource
+    """Where the images come from."""
+    left_out: tuple[Dropped, ...] = ()
+    """Images that are not there, and why."""
 
-    def image_path(self, frame: Frame | str, camera: str) -> Path:
-        """Where the image of a camera at a frame lies."""
-        name = frame if isinstance(frame, str) else frame.name
-        return self.folder / "images" / camera / f"{name}{self.suffix}"
-
-    def image(self, frame: Frame | str, camera: str) -> UInt8[np.ndarray, "h w 3"]:
-        """RGB image. Raises InputError where the file is missing, broken, or of another size than the camera's."""
+    def image(self, frame: Frame, camera: str) -> UInt8[np.ndarray, "h w 3"]:
+        """RGB image. Raises InputError where it is missing, broken, or of another size than the camera's."""
         self.check_image(frame, camera)
-        return read_image(self.image_path(frame, camera))
+        return self.source.read(frame.name, camera)
 
-    def images(self, frame: Frame | str) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
-        """The images of all cameras at a frame, as :meth:`image`."""
-        return {name: self.image(frame, name) for name in self.handpiece.rig.names}
+    def images(self, frame: Frame) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
+        """The images of all cameras that have one of a frame, as :meth:`image`."""
+        return {name: self.image(frame, name) for name in frame.cameras}
 
-    def check_image(self, frame: Frame | str, camera: str) -> None:
-        """Raise what :meth:`image` would, as far as a glance at the file tells."""
-        path, model = self.image_path(frame, camera), self.handpiece.rig[camera].camera
-        width, height = image_size(path)
+    def check_image(self, frame: Frame, camera: str) -> None:
+        """Raise what :meth:`image` would, as far as a glance at the image tells."""
+        model = self.handpiece.rig[camera].camera
+        width, height = self.source.size(frame.name, camera)
         if (width, height) != (model.width, model.height):
             raise InputError(
-                f"{path}: {width} x {height} px, but camera {camera} has {model.width} x {model.height} px; "
-                "give the handpiece file that belongs to these images"
+                f"{self.source.where(frame.name, camera)}: {width} x {height} px, but camera {camera} has "
+                f"{model.width} x {model.height} px; give the handpiece file that belongs to these images"
             )
-
-    def gray(self, frame: Frame | str, camera: str) -> UInt8[np.ndarray, "h w"]:
-        """The image in grey (Rec. 601), as :meth:`image`."""
-        return np.asarray(cv2.cvtColor(self.image(frame, camera), cv2.COLOR_RGB2GRAY), dtype=np.uint8)

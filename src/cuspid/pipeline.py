@@ -30,7 +30,7 @@ from cuspid.anatomy.landmarks import in_frame, missing, validate
 from cuspid.anatomy.mouth import MouthOptions, room_mm, study_mouths
 from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, labels_from_colors
 from cuspid.anatomy.surfaces import named_surfaces
-from cuspid.capture import Capture, Frame
+from cuspid.capture import Capture, Frame, ImageFolder
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.evaluation.deviation import evaluate as compare_with_reference
@@ -52,10 +52,10 @@ from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.blender import render_with_blender
 from cuspid.simulation.free_path import FreePathOptions, plan_free_path
 from cuspid.simulation.occlusal import OcclusalOptions, render_occlusal_view
-from cuspid.simulation.raycast import Scene, render_capture
+from cuspid.simulation.raycast import Scene, lit_frames, render_capture
 from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path, steady_poses
-from cuspid.stereo.between import BetweenOptions, measure_between
 from cuspid.stereo.matching import DepthEstimator, StereoOptions
+from cuspid.stereo.temporal import TemporalOptions, measure_temporal
 from cuspid.stitching.ortho import OrthoOptions, Stitched, orthophoto
 from cuspid.stitching.thesis_method import ThesisOptions, stitch_as_thesis
 from cuspid.surface.cleaning import CleaningOptions, clean
@@ -279,27 +279,29 @@ def take_images(
     progress: Progress = silent,
 ) -> tuple[Capture, GroundTruth]:
     """As :func:`simulate`, from given poses of the handpiece, by the name of the frame."""
-    truth = GroundTruth(jaw=jaw, handpiece=handpiece, rig_from_world=rig_from_world)
+    frames, poses = lit_frames(handpiece, rig_from_world)
+    truth = GroundTruth(jaw=jaw, handpiece=handpiece, rig_from_world=poses)
     storage.write_truth(folder / "truth", truth)
-    capture = Capture(
-        folder=folder / "capture", handpiece=handpiece, frames=tuple(Frame(name=name) for name in rig_from_world)
-    )
-    storage.write_capture(capture)
-    for done, total in _render(capture, truth, options):
+    capture = Capture(handpiece=handpiece, frames=frames, source=ImageFolder(folder / "capture"))
+    storage.write_capture(folder / "capture", capture)
+    for done, total in _render(folder / "capture", frames, truth, options):
         progress("images", done, total)
     return capture, truth
 
 
-def _render(capture: Capture, truth: GroundTruth, options: RenderOptions) -> Iterator[tuple[int, int]]:
-    names = truth.handpiece.rig.names
-    total = len(capture.frames) * len(names)
-    present = sum(capture.image_path(frame, name).exists() for frame in capture.frames for name in names)
+def _render(
+    folder: Path, frames: Sequence[Frame], truth: GroundTruth, options: RenderOptions
+) -> Iterator[tuple[int, int]]:
+    images = ImageFolder(folder)
+    paths = [images.path(frame.name, camera) for frame in frames for camera in frame.cameras]
+    total, present = len(paths), sum(path.exists() for path in paths)
     render = render_with_blender if options.renderer == "blender" else render_capture
     rendered = render(
         _scene(truth, options),
+        frames,
         truth.rig_from_world,
-        lambda frame, camera, image: storage.write_image(capture.image_path(frame, camera), image),
-        skip=lambda frame, camera: capture.image_path(frame, camera).exists(),
+        lambda frame, camera, image: storage.write_image(images.path(frame, camera), image),
+        skip=lambda frame, camera: images.path(frame, camera).exists(),
         processes=usable_cores(),
     )
     for done, _ in enumerate(rendered, start=present + 1):
@@ -317,7 +319,7 @@ def _scene(truth: GroundTruth, options: RenderOptions) -> Scene:
 
 
 def scannable(truth: GroundTruth, options: VisibilityOptions) -> Bool[np.ndarray, "f"]:
-    """The faces of the true jaw that at least two cameras of one exposure could see."""
+    """The faces of the true jaw that at least two cameras of one frame could see."""
     return scannable_faces(truth.jaw.mesh, truth.handpiece, truth.rig_from_world.values(), options)
 
 
@@ -331,9 +333,9 @@ class ReconstructionOptions:
     motion: MotionMethod = "rig"
     """How the frames are located: rig (ours), or COLMAP's own mapper without (colmap) and with the rig (colmap-rig)."""
     stereo: StereoOptions = field(default_factory=StereoOptions)
-    """Depth within an exposure."""
-    between: BetweenOptions = field(default_factory=BetweenOptions)
-    """Depth between consecutive exposures, where one camera of a group alone saw the surface."""
+    """Depth within a frame."""
+    temporal: TemporalOptions = field(default_factory=TemporalOptions)
+    """Depth from consecutive frames, where one camera of a group alone saw the surface."""
     tracking: MotionOptions = field(default_factory=MotionOptions)
     """Features, odometry and adjustment of the method ``rig``."""
     fusion: FusionOptions = field(default_factory=FusionOptions)
@@ -357,7 +359,7 @@ class StoredDepthMaps:
 def measure_depth(
     capture: Capture, folder: Path, options: StereoOptions, *, progress: Progress = silent
 ) -> StoredDepthMaps:
-    """Depth maps of every frame, exposure by exposure, kept in ``folder``."""
+    """Depth maps of every frame, from that frame alone, kept in ``folder``."""
     estimator = DepthEstimator(capture.handpiece, options)
 
     def measure(frame: Frame) -> tuple[DepthMap, ...]:
@@ -366,11 +368,11 @@ def measure_depth(
     return _measure_all(capture.frames, measure, folder, partial(progress, "depth"))
 
 
-def measure_depth_between(
+def measure_temporal_depth(
     capture: Capture,
     reconstruction: Reconstruction,
     folder: Path,
-    options: BetweenOptions,
+    options: TemporalOptions,
     *,
     progress: Progress = silent,
 ) -> StoredDepthMaps:
@@ -382,11 +384,11 @@ def measure_depth_between(
         after = following[frame.name]
         poses = reconstruction.rig_from_world
         after_from_rig = poses[after.name] @ poses[frame.name].inverse()
-        return measure_between(
+        return measure_temporal(
             capture.handpiece, capture.images(frame), capture.images(after), after_from_rig, frame.name, options
         )
 
-    return _measure_all(located[:-1], measure, folder, partial(progress, "depth between"))
+    return _measure_all(located[:-1], measure, folder, partial(progress, "temporal depth"))
 
 
 def _measure_all(
@@ -463,11 +465,11 @@ def reconstruct(
     if _moved(capture.handpiece, reconstruction):
         capture = dataclasses.replace(capture, handpiece=dataclasses.replace(capture.handpiece, rig=reconstruction.rig))
         depths = measure_depth(capture, folder / "depth-refined", options.stereo, progress=progress)
-    if options.between.enabled:
-        between = measure_depth_between(
-            capture, reconstruction, folder / "depth-between", options.between, progress=progress
+    if options.temporal.enabled:
+        temporal = measure_temporal_depth(
+            capture, reconstruction, folder / "depth-temporal", options.temporal, progress=progress
         )
-        depths = StoredDepthMaps([*depths.files, *between.files])
+        depths = StoredDepthMaps([*depths.files, *temporal.files])
     return reconstruction, fuse(depths, reconstruction, folder, options, progress=progress)
 
 

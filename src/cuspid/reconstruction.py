@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from cuspid.camera import Camera
+from cuspid.capture import Dropped
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.rig import Rig
@@ -40,16 +41,6 @@ class DepthMap:
         rays = self.camera.rays(self.camera.pixel_centres().reshape(-1, 2)[known])
         in_cam = rays * self.depth_mm.ravel()[known, None].astype(np.float64)
         return self.cam_from_rig.inverse().apply(in_cam), known
-
-
-@dataclass(frozen=True, kw_only=True)
-class Dropped:
-    """A frame, camera or point set that was left out, and why."""
-
-    what: str
-    """For example ``frame 00012`` or ``camera b2``."""
-    reason: str
-    """One line for people."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -140,8 +140,8 @@ class Sensor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Exposure:
-    """Which lights are on while all cameras expose together."""
+class Lighting:
+    """A lighting pattern: which lights are on while the cameras expose."""
 
     name: str = "all"
     """Name that frames refer to."""
@@ -157,8 +157,8 @@ class Handpiece:
     """The cameras."""
     lights: Mapping[str, Light] = field(default_factory=dict)
     """Lights by name."""
-    exposures: tuple[Exposure, ...] = ()
-    """What is lit in turn at each position; empty means nothing is known of the lights."""
+    lightings: tuple[Lighting, ...] = ()
+    """Lighting patterns, in the order in which they take turns; empty where nothing is known of them."""
     sensor: Sensor = field(default_factory=Sensor)
     """Common to all cameras."""
     working_distance_mm: float = 5.0
@@ -170,11 +170,24 @@ class Handpiece:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lights", MappingProxyType(dict(self.lights)))
-        unknown = {light for exposure in self.exposures for light in exposure.lights} - set(self.lights)
+        unknown = {light for lighting in self.lightings for light in lighting.lights} - set(self.lights)
         if unknown:
-            raise InputError(f"handpiece: exposures name unknown lights {', '.join(sorted(unknown))}")
+            raise InputError(f"handpiece: lighting patterns name unknown lights {', '.join(sorted(unknown))}")
         near, far = self.depth_range_mm
         if not 0 < near < self.working_distance_mm < far:
             raise InputError(
                 f"handpiece: depth range {near}-{far} mm must enclose the working distance {self.working_distance_mm}"
             )
+
+    def lights_on(self, lighting: str | None) -> list[Light]:
+        """The lights of a lighting pattern; all of them where the pattern is not known (None).
+
+        Raises InputError for a pattern that the handpiece does not have.
+        """
+        if lighting is None:
+            return list(self.lights.values())
+        by_name = {each.name: each.lights for each in self.lightings}
+        if lighting not in by_name:
+            known = ", ".join(by_name) or "none"
+            raise InputError(f"handpiece {self.name}: no lighting pattern named {lighting!r}; it has {known}")
+        return [self.lights[name] for name in by_name[lighting]]

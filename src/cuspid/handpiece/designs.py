@@ -24,7 +24,7 @@ from jaxtyping import Float
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.rig import Exposure, Handpiece, Light, MountedCamera, Rig
+from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 
 DEPTH_RANGE_MM = (2.5, 9.0)
 """What a lens of such size keeps usefully sharp. Its blur disc is f A |1/Z - 1/Z0| wide and grows with the aperture A,
@@ -95,7 +95,7 @@ def six_cameras(options: DesignOptions = DesignOptions()) -> Handpiece:
         four,
         rig=Rig({**four.rig.cameras, **cameras}),
         lights={**four.lights, **lights},
-        exposures=(Exposure(name="all", lights=(*four.lights, *lights)),),
+        lightings=(Lighting(name="all", lights=(*four.lights, *lights)),),
         name="six-cameras",
     )
 
@@ -115,7 +115,7 @@ def _handpiece(name: str, views: Mapping[str, Rigid3], options: DesignOptions) -
     return Handpiece(
         rig=Rig(cameras),
         lights=lights,
-        exposures=(Exposure(name="all", lights=tuple(lights)),),
+        lightings=(Lighting(name="all", lights=tuple(lights)),),
         working_distance_mm=options.working_distance_mm,
         depth_range_mm=DEPTH_RANGE_MM,
         name=name,

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import looking_at
 from cuspid.handpiece.optics import Optics
-from cuspid.rig import Exposure, Handpiece, Light, MountedCamera, Rig
+from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +118,7 @@ def build_handpiece(
     return Handpiece(
         rig=Rig(cameras),
         lights=lights,
-        exposures=(Exposure(name="all", lights=tuple(lights)),),
+        lightings=(Lighting(name="all", lights=tuple(lights)),),
         working_distance_mm=shape.distance_mm,
         depth_range_mm=depth_range_mm,
         name=name,

@@ -13,7 +13,7 @@ import numpy as np
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.handpiece.designs import looking_at
-from cuspid.rig import Exposure, Handpiece, Light, MountedCamera, Rig
+from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +61,7 @@ def intra_oral_camera(options: IntraOralOptions = IntraOralOptions()) -> Handpie
     return Handpiece(
         rig=Rig({"camera": MountedCamera(camera, looking_at(np.zeros(3), down, right, options.working_distance_mm))}),
         lights=lights,
-        exposures=(Exposure(name="all", lights=tuple(lights)),),
+        lightings=(Lighting(name="all", lights=tuple(lights)),),
         working_distance_mm=options.working_distance_mm,
         depth_range_mm=(options.working_distance_mm / 3, 2.5 * options.working_distance_mm),
         name="intra-oral-camera",

@@ -92,7 +92,7 @@ def visible_counts(
 ) -> Int[np.ndarray, "f"]:
     """For each face: the largest number of cameras that see it at once."""
     most = np.zeros(len(mesh.faces), dtype=np.int64)
-    for faces, seen, _ in _exposures(mesh, handpiece, rig_from_world, options):
+    for faces, seen, _ in _at_each_pose(mesh, handpiece, rig_from_world, options):
         most[faces] = np.maximum(most[faces], seen.sum(axis=1))
     return most
 
@@ -104,7 +104,7 @@ def survey_visibility(
     count, names = len(mesh.faces), handpiece.rig.names
     most, images = np.zeros((2, count), dtype=np.int64)
     by_camera, angles_deg = np.zeros((count, len(names)), dtype=bool), np.zeros(count)
-    for faces, seen, eyes in _exposures(mesh, handpiece, rig_from_world, options):
+    for faces, seen, eyes in _at_each_pose(mesh, handpiece, rig_from_world, options):
         at_once = seen.sum(axis=1)
         most[faces] = np.maximum(most[faces], at_once)
         images[faces] += at_once
@@ -215,7 +215,7 @@ def _view(camera: Camera, cam_from_rig: Rigid3, depth_range_mm: tuple[float, flo
     )
 
 
-def _exposures(
+def _at_each_pose(
     mesh: Mesh, handpiece: Handpiece, rig_from_world: Iterable[Rigid3], options: VisibilityOptions
 ) -> Iterator[tuple[Int[np.ndarray, "n"], Bool[np.ndarray, "n c"], Float[np.ndarray, "c 3"]]]:
     """For each pose: the faces near it, which camera sees which of them, and where the cameras are."""

@@ -23,11 +23,11 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from cuspid.camera import Camera
-from cuspid.capture import Capture
+from cuspid.capture import Capture, Dropped, Frame, ImageFolder, image_name
 from cuspid.errors import InputError, OutputError, ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.motion.adjustment import residuals_px
-from cuspid.reconstruction import Dropped, Reconstruction, Tracks
+from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import Rig
 
 MODEL_FILES = ("cameras", "images", "points3D")
@@ -75,7 +75,9 @@ def _colmap_rig(rig: Rig) -> pycolmap.Rig:
     return made
 
 
-def _add_images(model: pycolmap.Reconstruction, found: Reconstruction, suffix: str) -> Int[np.ndarray, "o"]:
+def _add_images(
+    model: pycolmap.Reconstruction, found: Reconstruction, taken: Mapping[str, Sequence[str]], suffix: str
+) -> Int[np.ndarray, "o"]:
     """Add frames and images with their keypoints; returns the number of each observation within its image."""
     cameras, tracks = found.rig.names, found.tracks
     reference_from_rig = found.rig.rebased()[1]
@@ -89,16 +91,16 @@ def _add_images(model: pycolmap.Reconstruction, found: Reconstruction, suffix: s
     )
     for f, (name, rig_from_world) in enumerate(found.rig_from_world.items()):
         frame = pycolmap.Frame(frame_id=f + 1, rig_id=1)
-        identifiers = [f * len(cameras) + c + 1 for c in range(len(cameras))]
-        for c, identifier in enumerate(identifiers):
+        images = [(c, f * len(cameras) + c + 1) for c, camera in enumerate(cameras) if camera in taken[name]]
+        for c, identifier in images:
             frame.add_data_id(pycolmap.data_t(_sensor(c), identifier))
         frame.rig_from_world = colmap_rigid(reference_from_rig @ rig_from_world)
         model.add_frame(frame)
-        for c, identifier in enumerate(identifiers):
+        for c, identifier in images:
             seen = by_image[identifier - 1]
             within[seen] = np.arange(len(seen))
             pixels = np.zeros((0, 2)) if tracks is None else tracks.pixels[seen]
-            image = pycolmap.Image(f"{cameras[c]}/{name}{suffix}", pixels, c + 1, identifier)
+            image = pycolmap.Image(image_name(name, cameras[c], suffix), pixels, c + 1, identifier)
             image.frame_id = f + 1
             model.add_image(image)
         model.register_frame(f + 1)
@@ -117,13 +119,20 @@ def _add_points(model: pycolmap.Reconstruction, tracks: Tracks, cameras: int, wi
             model.add_point3D(tracks.points[point], pycolmap.Track(elements), tracks.colors[point])
 
 
-def to_colmap(found: Reconstruction, suffix: str = ".png") -> pycolmap.Reconstruction:
-    """The reconstruction as COLMAP's, with one rig; observations that it knows become the images' keypoints."""
+def to_colmap(
+    found: Reconstruction, frames: Sequence[Frame] | None = None, suffix: str = ".png"
+) -> pycolmap.Reconstruction:
+    """The reconstruction as COLMAP's, with one rig; observations that it knows become the images' keypoints.
+
+    ``frames`` tell which cameras have an image of each located frame; None: all of them.
+    """
+    every = dict.fromkeys(found.frames, found.rig.names)
+    taken = every if frames is None else {frame.name: frame.cameras for frame in frames}
     model = pycolmap.Reconstruction()
     for index, mounted in enumerate(found.rig.cameras.values()):
         model.add_camera(colmap_camera(mounted.camera, index + 1))
     model.add_rig(_colmap_rig(found.rig))
-    within = _add_images(model, found, suffix)
+    within = _add_images(model, found, taken, suffix)
     if found.tracks is not None:
         _add_points(model, found.tracks, len(found.rig.names), within)
     model.update_point_3d_errors()
@@ -132,7 +141,7 @@ def to_colmap(found: Reconstruction, suffix: str = ".png") -> pycolmap.Reconstru
 
 def write_model(folder: Path, found: Reconstruction, capture: Capture) -> None:
     """Write COLMAP's sparse model (binary) to a folder, whole or not at all. Raises OutputError."""
-    model = to_colmap(found, capture.suffix)
+    model = to_colmap(found, capture.frames, capture.source.suffix)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".part-") as part:
@@ -253,7 +262,8 @@ def _match_names(model: pycolmap.Reconstruction, capture: Capture, source: str) 
         else:
             strange.append(image.name)
     if not poses:
-        example = f"{capture.handpiece.rig.names[0]}/{capture.frames[0].name}{capture.suffix}"
+        first = capture.frames[0]
+        example = image_name(first.name, first.cameras[0], capture.source.suffix)
         found = f"named like {strange[0]}" if strange else "none placed"
         raise InputError(f"{source}: its images ({found}) are not those of the capture, which are named like {example}")
     return _PosedImages(poses, identifiers)
@@ -344,10 +354,13 @@ def from_colmap(model: pycolmap.Reconstruction, capture: Capture, source: str) -
         rig=rig,
         rig_from_world={frame: pose @ model_from_world for frame, pose in rig_from_model.items()},
         tracks=tracks if len(tracks.points) else None,
-        dropped=tuple(
-            Dropped(what=f"frame {frame.name}", reason=f"not in {source}")
-            for frame in capture.frames
-            if frame.name not in by_frame
+        dropped=(
+            *capture.left_out,
+            *(
+                Dropped(what=f"frame {frame.name}", reason=f"not in {source}")
+                for frame in capture.frames
+                if frame.name not in by_frame
+            ),
         ),
         log={"mm_per_model_unit": scale, "scale_spread": spread},
     )
@@ -416,8 +429,11 @@ def _map(
     capture: Capture, folder: Path, with_rig: bool, seed: int
 ) -> tuple[list[pycolmap.Reconstruction], list[float]]:
     """COLMAP's models of the capture and the seconds of extraction, matching and mapping."""
-    images, database = capture.folder / "images", folder / "database.db"
-    names = [f"{c}/{f.name}{capture.suffix}" for c in capture.handpiece.rig.names for f in capture.frames]
+    if not isinstance(capture.source, ImageFolder):
+        raise InputError("COLMAP reads images from a folder: write the capture to one, or use --motion rig")
+    images, database = capture.source.folder / "images", folder / "database.db"
+    frames, suffix = capture.frames, capture.source.suffix
+    names = [image_name(f.name, c, suffix) for c in capture.handpiece.rig.names for f in frames if c in f.cameras]
     moments = [time.perf_counter()]
     pycolmap.extract_features(database, images, names, camera_mode=pycolmap.CameraMode.PER_FOLDER)
     moments.append(time.perf_counter())

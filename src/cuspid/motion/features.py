@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET
-from cuspid.capture import Capture
+from cuspid.capture import Capture, Frame
 from cuspid.errors import OutputError
 
 Progress = Callable[[str, int, int], None]
@@ -114,10 +114,9 @@ def detect(image: UInt8[np.ndarray, "h w 3"], options: FeatureOptions | None = N
     return Features(pixels=pixels, descriptors=_root_sift(descriptors), colors=_colors_at(image, pixels))
 
 
-def _key(path: Path, options: FeatureOptions) -> str:
-    """Changes when the image file or the options do."""
-    state = path.stat()
-    return hashlib.sha256(f"{options} {state.st_size} {state.st_mtime_ns}".encode()).hexdigest()
+def _key(digest: str, options: FeatureOptions) -> str:
+    """Changes when the image or the options do."""
+    return hashlib.sha256(f"{options} {digest}".encode()).hexdigest()
 
 
 def _load(path: Path, key: str) -> Features | None:
@@ -151,16 +150,17 @@ def _keep(path: Path, key: str, features: Features) -> None:
         raise OutputError(f"{path}: cannot be written ({error.strerror}); free some space") from error
 
 
-def _detect_kept(capture: Capture, frame: str, camera: str, options: FeatureOptions, cache: Path | None) -> Features:
+def _detect_kept(capture: Capture, frame: Frame, camera: str, options: FeatureOptions, cache: Path | None) -> Features:
     """Features of one image of a capture, from the cache where it has them."""
     if cache is None:
         return detect(capture.image(frame, camera), options)
-    image_path, kept_path = capture.image_path(frame, camera), cache / "features" / camera / f"{frame}.npz"
-    kept = _load(kept_path, _key(image_path, options)) if image_path.exists() else None
+    path = cache / "features" / camera / f"{frame.name}.npz"
+    key = _key(capture.source.digest(frame.name, camera), options)
+    kept = _load(path, key)
     if kept is not None:
         return kept
     features = detect(capture.image(frame, camera), options)
-    _keep(kept_path, _key(image_path, options), features)
+    _keep(path, key, features)
     return features
 
 
@@ -173,13 +173,13 @@ def detect_all(
 ) -> Mapping[tuple[str, str], Features]:
     """Features of every image by (frame, camera). Finished images are kept in ``cache``. Raises InputError."""
     options = options or FeatureOptions()
-    images = [(frame.name, camera) for frame in capture.frames for camera in capture.handpiece.rig.names]
+    images = [(frame, camera) for frame in capture.frames for camera in frame.cameras]
     found: dict[tuple[str, str], Features] = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         jobs = [pool.submit(_detect_kept, capture, *image, options, cache) for image in images]
         try:
-            for image, job in zip(images, jobs, strict=True):
-                found[image] = job.result()
+            for (frame, camera), job in zip(images, jobs, strict=True):
+                found[frame.name, camera] = job.result()
                 if progress is not None:
                     progress("features", len(found), len(images))
         finally:

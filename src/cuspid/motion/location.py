@@ -104,12 +104,12 @@ class _Numbering:
     """Index of the camera of each keypoint."""
 
     @staticmethod
-    def of(frames: Sequence[Views]) -> _Numbering:
+    def of(frames: Sequence[Views], rig: Rig) -> _Numbering:
         """Number the keypoints of frames."""
         sizes = {(f, name): len(view.features) for f, views in enumerate(frames) for name, view in views.items()}
         counts = list(sizes.values())
         starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        cameras = {name: index for index, name in enumerate(frames[0])}
+        cameras = {name: index for index, name in enumerate(rig.names)}
         return _Numbering(
             dict(zip(sizes, starts.tolist(), strict=False)),
             np.repeat([frame for frame, _ in sizes], counts),
@@ -131,6 +131,8 @@ def _match_frames(
     second_from_first = poses[second] @ poses[first].inverse()
     matches = [np.zeros((0, 2), dtype=np.int64)]
     for camera, mounted in handpiece.rig.cameras.items():
+        if camera not in frames[first] or camera not in frames[second]:
+            continue
         motion = mounted.cam_from_rig @ second_from_first @ mounted.cam_from_rig.inverse()
         here, there = (_depth_bounds(clouds[f], handpiece, camera, options.depth_slack_mm) for f in (first, second))
         found = match_guided(frames[first][camera], frames[second][camera], motion, here, there, options.between)
@@ -184,7 +186,7 @@ def _link(
     progress: Progress | None,
 ) -> Tracks:
     """Tracks over the located frames: the matches within frames and, guided by the poses, between them."""
-    numbering = _Numbering.of(frames)
+    numbering = _Numbering.of(frames, handpiece.rig)
     pairs = frame_pairs(len(frames), options.reach)
 
     def work(index: int) -> Int[np.ndarray, "k 2"]:
@@ -234,10 +236,16 @@ def locate_features(
     *,
     progress: Progress | None = None,
 ) -> Reconstruction:
-    """As :func:`locate`, from the keypoints by (frame, camera) of the frames ``names`` in the order of capture."""
+    """As :func:`locate`, from the keypoints by (frame, camera) of the frames ``names`` in the order of capture.
+
+    A camera without keypoints of a frame is left out of that frame.
+    """
     rig, log = handpiece.rig, dict[str, float]()
     options = _loosened(options, 2 * calibration_sigma_px(rig, handpiece.working_distance_mm))
-    frames = [{c: make_view(features[name, c], mounted.camera) for c, mounted in rig.cameras.items()} for name in names]
+    frames = [
+        {c: make_view(features[name, c], mounted.camera) for c, mounted in rig.cameras.items() if (name, c) in features}
+        for name in names
+    ]
     with _timed(log, "triangulation"):
         pairs = rig.stereo_pairs(handpiece.working_distance_mm)
         clouds = _in_threads(
@@ -279,4 +287,4 @@ def locate(
         features = detect_all(capture, options.features, progress=progress, cache=cache)
     names = [frame.name for frame in capture.frames]
     found = locate_features(capture.handpiece, features, names, options, progress=progress)
-    return replace(found, log={**log, **found.log})
+    return replace(found, dropped=(*capture.left_out, *found.dropped), log={**log, **found.log})

@@ -18,12 +18,12 @@ from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
+from cuspid.capture import Dropped
 from cuspid.geometry import Rigid3
 from cuspid.motion.colmap import colmap_camera, colmap_rigid, rigid_from_colmap
 from cuspid.motion.features import Features, spread
 from cuspid.motion.pairs import MatchingOptions, View, match_guided, match_unguided
 from cuspid.motion.tracks import intersect_rays, join
-from cuspid.reconstruction import Dropped
 from cuspid.rig import Handpiece, Rig
 
 Views = Mapping[str, View]
@@ -135,6 +135,8 @@ def triangulate_frame(
     rig, bounds = handpiece.rig, handpiece.depth_range_mm
     matches = []
     for first, second in pairs:
+        if first not in views or second not in views:
+            continue
         a, b = views[first], views[second]
         second_from_first = rig[second].cam_from_rig @ rig[first].cam_from_rig.inverse()
         found = match_guided(a, b, second_from_first, _full_range(a, bounds), _full_range(b, bounds), options)
@@ -174,11 +176,13 @@ def _best_known(cloud: Cloud, view: View, camera: str, count: int) -> Int[np.nda
 
 
 def _sightings(
-    cloud: Cloud, source: Views, target: Views, options: OdometryOptions
+    rig: Rig, cloud: Cloud, source: Views, target: Views, options: OdometryOptions
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 2"], Int[np.ndarray, "k"]]:
-    """Points of a cloud, where the cameras of another frame see them (px), and the index of that camera."""
+    """Points of a cloud, where the cameras of another frame see them (px), and the index of that camera in the rig."""
     points, pixels, cameras = [np.zeros((0, 3))], [np.zeros((0, 2))], [np.zeros(0, np.int64)]
-    for index, camera in enumerate(target):
+    for index, camera in enumerate(rig.names):
+        if camera not in source or camera not in target:
+            continue
         known = _best_known(cloud, source[camera], camera, options.most_per_camera)
         found = match_unguided(_subset(source[camera].features, known), target[camera].features, options.unguided)
         points.append(cloud.points[cloud.point_of[camera][known[found[:, 0]]]])
@@ -224,7 +228,7 @@ def _moved(pose: Rigid3, step: Float[np.ndarray, "6"]) -> Rigid3:
 
 def relative_pose(rig: Rig, cloud: Cloud, source: Views, target: Views, options: OdometryOptions, seed: int) -> Edge:
     """Pose of the target frame relative to the frame of the cloud."""
-    points, pixels, cameras = _sightings(cloud, source, target, options)
+    points, pixels, cameras = _sightings(rig, cloud, source, target, options)
     if len(points) < options.minimum_matches:
         return Edge(target_from_source=None, matches=len(points))
     ransac = pycolmap.RANSACOptions(

@@ -282,16 +282,14 @@ def _frames(capture: Capture | None, count: int, located: bool) -> list[dict[str
     if capture is None or count == 0 or not capture.frames:
         return []
     picks = np.unique(np.linspace(0, len(capture.frames) - 1, min(count, len(capture.frames))).round().astype(int))
-    names = [capture.frames[pick].name for pick in picks]
-    cameras = capture.handpiece.rig.names
     return [
         {
-            "name": name,
-            "picture": jpeg_uri(contact_sheet([capture.image(name, camera) for camera in cameras])),
-            "cameras": len(cameras),
+            "name": frame.name,
+            "picture": jpeg_uri(contact_sheet(list(capture.images(frame).values()))),
+            "cameras": len(frame.cameras),
             "located": located,
         }
-        for name in names
+        for frame in (capture.frames[pick] for pick in picks)
     ]
 
 

@@ -19,11 +19,12 @@ from typing import Any
 
 import numpy as np
 
+from cuspid.capture import Frame
 from cuspid.errors import InputError, MissingDependencyError
 from cuspid.geometry import Rigid3
 from cuspid.rig import Light, MountedCamera
 from cuspid.simulation.appearance import face_materials
-from cuspid.simulation.raycast import Scene, Sink, image_rng, lights_on, metered_gain
+from cuspid.simulation.raycast import Scene, Sink, image_rng, metered_gains
 from cuspid.simulation.sensor import expose
 
 PYTHON_VARIABLE = "CUSPID_BLENDER_PYTHON"
@@ -42,12 +43,12 @@ _HOW_TO = (
 
 def render_with_blender(
     scene: Scene,
+    frames: Sequence[Frame],
     poses: Mapping[str, Rigid3],
     sink: Sink,
     *,
     skip: Callable[[str, str], bool] = lambda frame, camera: False,
     processes: int = 1,
-    exposure: str = "all",
 ) -> Iterator[tuple[str, str]]:
     """As :func:`cuspid.simulation.raycast.render_capture`, by Blender on ``processes`` threads.
 
@@ -55,17 +56,18 @@ def render_with_blender(
     another lobe than Lambert's, which Blender does not offer.
     """
     python = blender_python()
-    tasks = [(frame, camera) for frame in poses for camera in scene.handpiece.rig.names if not skip(frame, camera)]
+    tasks = [(frame, camera) for frame in frames for camera in frame.cameras if not skip(frame.name, camera)]
     if not tasks:
         return
-    gain = metered_gain(scene, poses, exposure)
+    gains = metered_gains(scene, frames, poses)
+    gain_of = {frame.name: gains[frame.lighting] for frame in frames}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        _write_scene(folder, scene, poses, tasks, exposure, processes)
+        _write_scene(folder, scene, poses, tasks, processes)
         for frame, camera in _run(python, folder):
             image = folder / f"{frame}-{camera}.npy"
             rng = image_rng(scene, frame, camera)
-            sink(frame, camera, expose(np.load(image), gain, scene.handpiece.sensor, rng))
+            sink(frame, camera, expose(np.load(image), gain_of[frame], scene.handpiece.sensor, rng))
             image.unlink()
             yield frame, camera
 
@@ -109,24 +111,22 @@ def _write_scene(
     folder: Path,
     scene: Scene,
     poses: Mapping[str, Rigid3],
-    tasks: Sequence[tuple[str, str]],
-    exposure: str,
+    tasks: Sequence[tuple[Frame, str]],
     threads: int,
 ) -> None:
     mesh = scene.jaw.mesh
     np.savez(folder / "mesh.npz", vertices=mesh.vertices, faces=mesh.faces, materials=face_materials(scene.jaw))
-    lights = lights_on(scene.handpiece, exposure)
     description = {
         "samples": SAMPLES,
         "threads": threads,
         "materials": [dataclasses.asdict(each) for each in (scene.appearance.enamel, scene.appearance.gum)],
         "images": [
             {
-                "frame": frame,
+                "frame": frame.name,
                 "name": name,
-                "seed": zlib.crc32(f"{scene.seed}/{frame}/{name}".encode()) & 0x7FFFFFFF,
-                "camera": _camera(name, scene.handpiece.rig[name], poses[frame]),
-                "lights": [_light(light, poses[frame]) for light in lights],
+                "seed": zlib.crc32(f"{scene.seed}/{frame.name}/{name}".encode()) & 0x7FFFFFFF,
+                "camera": _camera(name, scene.handpiece.rig[name], poses[frame.name]),
+                "lights": [_light(light, poses[frame.name]) for light in scene.handpiece.lights_on(frame.lighting)],
             }
             for frame, name in tasks
         ],

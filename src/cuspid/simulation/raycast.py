@@ -10,7 +10,7 @@ share. The world is the frame of the jaw.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,11 +22,12 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numba import njit
 
 from cuspid.camera import Camera
+from cuspid.capture import Frame
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
-from cuspid.rig import Handpiece, Light
+from cuspid.rig import Handpiece
 from cuspid.simulation.appearance import Appearance, Palette, albedo_at, face_materials, palette
 from cuspid.simulation.sensor import expose
 
@@ -94,22 +95,16 @@ class Lamps(NamedTuple):
     exponents: np.ndarray
 
 
-def lights_on(handpiece: Handpiece, exposure: str) -> list[Light]:
-    """The lights that an exposure names."""
-    names = {each.name: each.lights for each in handpiece.exposures}
-    if exposure not in names:
-        raise InputError(f"handpiece: no exposure named {exposure!r}; it has {', '.join(names) or 'none'}")
-    return [handpiece.lights[name] for name in names[exposure]]
-
-
-def lamps(handpiece: Handpiece, exposure: str, rig_from_world: Rigid3) -> Lamps:
-    """The lights that an exposure names, in the world frame."""
-    on = lights_on(handpiece, exposure)
+def lamps(handpiece: Handpiece, lighting: str | None, rig_from_world: Rigid3) -> Lamps:
+    """The lights of a lighting pattern in the world frame. Raises InputError where there are none."""
+    on = handpiece.lights_on(lighting)
+    if not on:
+        raise InputError(f"handpiece {handpiece.name}: no light is on (lighting pattern {lighting or 'not given'})")
     world_from_rig = rig_from_world.inverse()
     return Lamps(
-        world_from_rig.apply(np.array([light.position_mm for light in on]).reshape(-1, 3)),
-        world_from_rig.rotate(np.array([light.direction for light in on]).reshape(-1, 3)),
-        np.array([light.power * light.colour for light in on]).reshape(-1, 3),
+        world_from_rig.apply(np.array([light.position_mm for light in on])),
+        world_from_rig.rotate(np.array([light.direction for light in on])),
+        np.array([light.power * light.colour for light in on]),
         np.array([light.lobe_exponent for light in on]),
     )
 
@@ -329,11 +324,11 @@ def _shade(rays, surface, palette, lights, lit, ambient, row, out):
                     out[pixel, c] += falloff * lights.intensities[k, c] * (albedo[c] * diffuse + glossy) / samples
 
 
-def auto_gain(scene: Scene, poses: Iterable[Rigid3], exposure: str = "all", stride: int = 10) -> float:
-    """The one gain of a capture, metered over all cameras at some poses, on images ``stride`` times coarser."""
+def auto_gain(scene: Scene, poses: Iterable[Rigid3], lighting: str | None = None, stride: int = 10) -> float:
+    """The gain for a lighting pattern, metered over all cameras at some poses, on images ``stride`` times coarser."""
     levels = []
     for rig_from_world in poses:
-        lights = lamps(scene.handpiece, exposure, rig_from_world)
+        lights = lamps(scene.handpiece, lighting, rig_from_world)
         for mounted in scene.handpiece.rig.cameras.values():
             coarse = radiance(scene, _coarser(mounted.camera, stride), mounted.cam_from_rig @ rig_from_world, lights)
             levels.append(coarse.mean(axis=-1).ravel())
@@ -344,11 +339,14 @@ def auto_gain(scene: Scene, poses: Iterable[Rigid3], exposure: str = "all", stri
     return float(BRIGHT_LEVEL / np.percentile(seen, BRIGHT_PERCENTILE))
 
 
-def metered_gain(scene: Scene, poses: Mapping[str, Rigid3], exposure: str) -> float:
-    """The one gain of a capture, metered at a few poses spread over it."""
-    all_poses = list(poses.values())
-    spread = np.unique(np.linspace(0, len(all_poses) - 1, METERED_POSES).astype(int))
-    return auto_gain(scene, [all_poses[index] for index in spread], exposure)
+def metered_gains(scene: Scene, frames: Sequence[Frame], poses: Mapping[str, Rigid3]) -> dict[str | None, float]:
+    """The one gain of each lighting pattern of a capture, metered at a few of its frames spread over it."""
+    gains: dict[str | None, float] = {}
+    for lighting in dict.fromkeys(frame.lighting for frame in frames):
+        lit = [poses[frame.name] for frame in frames if frame.lighting == lighting]
+        spread = np.unique(np.linspace(0, len(lit) - 1, METERED_POSES).astype(int))
+        gains[lighting] = auto_gain(scene, [lit[index] for index in spread], lighting)
+    return gains
 
 
 def _coarser(camera: Camera, stride: int) -> Camera:
@@ -361,15 +359,31 @@ def _coarser(camera: Camera, stride: int) -> Camera:
     )
 
 
+def lit_frames(
+    handpiece: Handpiece, rig_from_world: Mapping[str, Rigid3]
+) -> tuple[tuple[Frame, ...], dict[str, Rigid3]]:
+    """The frames taken at some poses, under each lighting pattern of the handpiece in turn, and the pose of each.
+
+    With one pattern, or none, a frame has the name of its pose; with more a letter follows it.
+    """
+    patterns: list[str | None] = [each.name for each in handpiece.lightings] or [None]
+    letters = [chr(ord("a") + index) for index in range(len(patterns))] if len(patterns) > 1 else [""]
+    cameras, frames, poses = handpiece.rig.names, [], {}
+    for name, pose in rig_from_world.items():
+        for letter, lighting in zip(letters, patterns, strict=True):
+            frames.append(Frame(name=f"{name}{letter}", cameras=cameras, lighting=lighting))
+            poses[f"{name}{letter}"] = pose
+    return tuple(frames), poses
+
+
 def render_image(
-    scene: Scene, frame: str, camera_name: str, rig_from_world: Rigid3, gain: float, exposure: str = "all"
+    scene: Scene, frame: Frame, camera_name: str, rig_from_world: Rigid3, gain: float
 ) -> UInt8[np.ndarray, "h w 3"]:
     """One image. Depends on its arguments alone, so that a resumed capture equals an uninterrupted one."""
     mounted = scene.handpiece.rig[camera_name]
-    light = radiance(
-        scene, mounted.camera, mounted.cam_from_rig @ rig_from_world, lamps(scene.handpiece, exposure, rig_from_world)
-    )
-    return expose(light, gain, scene.handpiece.sensor, image_rng(scene, frame, camera_name))
+    lights = lamps(scene.handpiece, frame.lighting, rig_from_world)
+    light = radiance(scene, mounted.camera, mounted.cam_from_rig @ rig_from_world, lights)
+    return expose(light, gain, scene.handpiece.sensor, image_rng(scene, frame.name, camera_name))
 
 
 def image_rng(scene: Scene, frame: str, camera_name: str) -> np.random.Generator:
@@ -381,14 +395,14 @@ def image_rng(scene: Scene, frame: str, camera_name: str) -> np.random.Generator
 class _Worker:
     scene: Scene
     poses: Mapping[str, Rigid3]
-    gain: float
+    gains: Mapping[str | None, float]
     sink: Sink
-    exposure: str
 
-    def __call__(self, task: tuple[str, str]) -> tuple[str, str]:
+    def __call__(self, task: tuple[Frame, str]) -> tuple[str, str]:
         frame, camera = task
-        self.sink(frame, camera, render_image(self.scene, frame, camera, self.poses[frame], self.gain, self.exposure))
-        return task
+        gain = self.gains[frame.lighting]
+        self.sink(frame.name, camera, render_image(self.scene, frame, camera, self.poses[frame.name], gain))
+        return frame.name, camera
 
 
 _worker: _Worker
@@ -399,29 +413,28 @@ def _adopt(worker: _Worker) -> None:
     _worker = worker
 
 
-def _work(task: tuple[str, str]) -> tuple[str, str]:
+def _work(task: tuple[Frame, str]) -> tuple[str, str]:
     return _worker(task)
 
 
 def render_capture(
     scene: Scene,
+    frames: Sequence[Frame],
     poses: Mapping[str, Rigid3],
     sink: Sink,
     *,
     skip: Callable[[str, str], bool] = lambda frame, camera: False,
     processes: int = 1,
-    exposure: str = "all",
 ) -> Iterator[tuple[str, str]]:
-    """Render every camera at every pose but those that ``skip`` names, and yield (frame, camera) as each is done.
+    """Render the cameras of every frame but those that ``skip`` names, and yield (frame, camera) as each is done.
 
     Embree holds the interpreter lock, so the work is spread over processes. They are forked, and only trace rays in the
     scene that the parent built (a forked child could not build one) and run kernels that the parent compiled.
     """
-    tasks = [(frame, camera) for frame in poses for camera in scene.handpiece.rig.names if not skip(frame, camera)]
+    tasks = [(frame, camera) for frame in frames for camera in frame.cameras if not skip(frame.name, camera)]
     if not tasks:
         return
-    gain = metered_gain(scene, poses, exposure)
-    worker = _Worker(scene=scene, poses=poses, gain=gain, sink=sink, exposure=exposure)
+    worker = _Worker(scene=scene, poses=poses, gains=metered_gains(scene, frames, poses), sink=sink)
     if processes == 1:
         yield from map(worker, tasks)
         return

@@ -1,6 +1,6 @@
-"""Depth within one exposure, which needs the rig alone, and between two, which needs the motion too."""
+"""Depth from one frame, which needs the rig alone, and from two, which needs the motion too."""
 
-from cuspid.stereo.between import BetweenOptions, measure_between
 from cuspid.stereo.matching import DepthEstimator, StereoOptions
+from cuspid.stereo.temporal import TemporalOptions, measure_temporal
 
-__all__ = ["BetweenOptions", "DepthEstimator", "StereoOptions", "measure_between"]
+__all__ = ["DepthEstimator", "StereoOptions", "TemporalOptions", "measure_temporal"]

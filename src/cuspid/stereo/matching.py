@@ -1,4 +1,4 @@
-"""Depth maps of one exposure, group by group: match, refine, check.
+"""Depth maps of one frame, group by group: match, refine, check.
 
 Frames: ``grid`` is the pinhole of a depth map, a coarser version of the camera's ideal pinhole.
 """
@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, UInt8
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.reconstruction import DepthMap
-from cuspid.rig import Handpiece
+from cuspid.rig import Handpiece, Rig
 from cuspid.stereo.confidence import ConfidenceOptions, Measured, agreement, confidence, without_speckle
 from cuspid.stereo.rectification import IdealView, RectifiedPair, rectify
 from cuspid.stereo.refinement import SCORE, VARIANCE, GroupGeometry, Q, RefinementOptions, refine
@@ -24,7 +24,7 @@ from cuspid.stereo.seeds import PairMatcher, seed_pairs, seed_points, semi_globa
 
 @dataclass(frozen=True, kw_only=True)
 class StereoOptions:
-    """Depth within one exposure."""
+    """Depth within one frame."""
 
     spacing_px: int = 3
     """Depth is measured at every so many pixels."""
@@ -102,7 +102,7 @@ def stack_images(
 
 
 class DepthEstimator:
-    """Measures depth in exposures of one handpiece. Holds only what the handpiece fixes; safe to share by threads."""
+    """Measures depth in the frames of one handpiece. Holds only what the handpiece fixes; safe to share by threads."""
 
     def __init__(
         self, handpiece: Handpiece, options: StereoOptions | None = None, matcher: PairMatcher = semi_global
@@ -111,16 +111,25 @@ class DepthEstimator:
         self.handpiece = handpiece
         self.options = options or StereoOptions()
         self.matcher = matcher
-        groups = handpiece.rig.groups(handpiece.working_distance_mm)
-        self.groups = tuple(self._prepare(group) for group in groups if len(group) > 1)
-        if not self.groups:
+        self._prepared: dict[tuple[str, ...], Group] = {}
+        if not self._groups(handpiece.rig.names):
             raise InputError(
                 f"handpiece {handpiece.name}: no two cameras see the same surface at "
                 f"{handpiece.working_distance_mm} mm; check the calibration and the working distance"
             )
 
-    def _prepare(self, names: tuple[str, ...]) -> Group:
-        rig = self.handpiece.rig
+    def _groups(self, cameras: tuple[str, ...]) -> list[Group]:
+        """The groups that some of the cameras make."""
+        rig = Rig({name: self.handpiece.rig[name] for name in cameras})
+        groups = rig.groups(self.handpiece.working_distance_mm)
+        return [self._group(rig, names) for names in groups if len(names) > 1]
+
+    def _group(self, rig: Rig, names: tuple[str, ...]) -> Group:
+        if names not in self._prepared:
+            self._prepared[names] = self._prepare(rig, names)
+        return self._prepared[names]
+
+    def _prepare(self, rig: Rig, names: tuple[str, ...]) -> Group:
         views = tuple(IdealView.of(name, rig[name]) for name in names)
         stereo_pairs = rig.stereo_pairs(self.handpiece.working_distance_mm)
         pairs = seed_pairs(rig, names, stereo_pairs)
@@ -132,8 +141,12 @@ class DepthEstimator:
         )
 
     def measure(self, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], frame: str) -> tuple[DepthMap, ...]:
-        """Depth maps of one exposure, one for each camera that has company, from RGB or grey images by camera name."""
-        return tuple(depth_map for group in self.groups for depth_map in self._measure_group(group, images, frame))
+        """Depth maps of a frame, one for each camera that has company, from RGB or grey images by camera name.
+
+        A camera of the handpiece that is not among them took no image of the frame.
+        """
+        groups = self._groups(tuple(name for name in self.handpiece.rig.names if name in images))
+        return tuple(depth_map for group in groups for depth_map in self._measure_group(group, images, frame))
 
     def _measure_group(
         self, group: Group, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], frame: str

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from cuspid.capture import Capture, Frame
+from cuspid.capture import Capture, Dropped, Frame, ImageFolder
 from cuspid.errors import InputError, OutputError
+from cuspid.rig import Handpiece, Rig
 from cuspid.storage.files import finished, read_json, reading, to_plain, write_bytes, write_json
 from cuspid.storage.handpieces import handpiece_to_json, read_handpiece, write_handpiece, write_rig_config
 from cuspid.storage.jaws import read_jaw, write_jaw
@@ -22,11 +24,11 @@ from cuspid.trueness import GroundTruth
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
-def write_capture(capture: Capture) -> None:
+def write_capture(folder: Path, capture: Capture) -> None:
     """Write what belongs to a capture besides its images: handpiece, rig configuration and list of frames."""
-    write_handpiece(capture.folder / "handpiece.json", capture.handpiece)
-    write_rig_config(capture.folder / "rig_config.json", capture.handpiece.rig)
-    write_json(capture.folder / "capture.json", {"suffix": capture.suffix, "frames": capture.frames})
+    write_handpiece(folder / "handpiece.json", capture.handpiece)
+    write_rig_config(folder / "rig_config.json", capture.handpiece.rig)
+    write_json(folder / "capture.json", {"frames": capture.frames})
 
 
 def write_image(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
@@ -40,67 +42,84 @@ def write_image(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
 def read_capture(folder: Path, handpiece: Path | None = None) -> Capture:
     """A capture folder: ``images/<camera>/<frame>.*`` and a handpiece file (default ``handpiece.json`` in it).
 
-    Without ``capture.json`` the frames are those of the image folders. Raises InputError where a camera's folder is
-    missing, a folder belongs to no camera of the handpiece, the frames differ between cameras, or
-    an image is truncated or of another size than its camera's.
+    Without ``capture.json`` the frames are those of the image folders, in the order of their names. A camera that has
+    no image of a frame is left out of that frame, one that has none at all out of the handpiece (``left_out`` tells).
+    Raises InputError where a folder belongs to no camera of the handpiece, a frame that ``capture.json`` names has no
+    image at all, or an image is truncated or of another size than its camera's.
     """
-    if not (folder / "images").is_dir():
+    images = folder / "images"
+    if not images.is_dir():
         raise InputError(f"{folder}: no folder 'images' in it; give the folder that holds images/<camera>/<frame>.png")
     known = read_handpiece(handpiece or folder / "handpiece.json")
-    present = {path.name for path in (folder / "images").iterdir() if path.is_dir()}
-    missing, unknown = set(known.rig.names) - present, present - set(known.rig.names)
-    if missing:
-        raise InputError(f"{folder / 'images'}: no folder for camera {', '.join(sorted(missing))} of the handpiece")
+    unknown = {path.name for path in images.iterdir() if path.is_dir()} - set(known.rig.names)
     if unknown:
         raise InputError(
-            f"{folder / 'images'}: the folder {', '.join(sorted(unknown))} is no camera of the handpiece, "
-            f"which has {', '.join(known.rig.names)}"
+            f"{images}: the folder {', '.join(sorted(unknown))} is no camera of the handpiece, which has "
+            f"{', '.join(known.rig.names)}"
         )
-    suffix, stems = _image_stems(folder / "images", known.rig.names)
-    manifest = folder / "capture.json"
-    if not manifest.exists():
-        frames = tuple(Frame(name=stem) for stem in stems)
-        return _checked(Capture(folder=folder, handpiece=known, frames=frames, suffix=suffix))
-    value = read_json(manifest)
-    with reading(manifest):
-        frames = tuple(Frame(**frame) for frame in value["frames"])
-        suffix = value["suffix"]
-    absent = sorted({frame.name for frame in frames} - set(stems))
-    if absent:
-        raise InputError(
-            f"{folder}: {len(absent)} of {len(frames)} frames have no images (first: {absent[0]}); "
-            "finish the capture with the command that began it"
-        )
-    return _checked(Capture(folder=folder, handpiece=known, frames=frames, suffix=suffix))
-
-
-def _checked(capture: Capture) -> Capture:
-    for name in capture.handpiece.rig.names:
-        for frame in capture.frames:
+    suffix, stems = _image_stems(images, known.rig.names)
+    frames, left_out = _present(_listed(folder, known, stems), stems, folder)
+    used = Rig({name: mounted for name, mounted in known.rig.cameras.items() if stems[name]})
+    capture = Capture(
+        handpiece=replace(known, rig=used), frames=frames, source=ImageFolder(folder, suffix), left_out=left_out
+    )
+    for frame in frames:
+        for name in frame.cameras:
             capture.check_image(frame, name)
     return capture
 
 
-def _image_stems(images: Path, cameras: Sequence[str]) -> tuple[str, list[str]]:
+def _listed(folder: Path, handpiece: Handpiece, stems: Mapping[str, set[str]]) -> list[Frame]:
+    """The frames that there should be, with all cameras that should have an image."""
+    manifest = folder / "capture.json"
+    if not manifest.exists():
+        lighting = handpiece.lightings[0].name if len(handpiece.lightings) == 1 else None
+        every = sorted(set().union(*stems.values()))
+        return [Frame(name=stem, cameras=handpiece.rig.names, lighting=lighting) for stem in every]
+    value = read_json(manifest)
+    with reading(manifest):
+        listed = [Frame(**{**frame, "cameras": tuple(frame["cameras"])}) for frame in value["frames"]]
+        for frame in listed:
+            for name in frame.cameras:
+                handpiece.rig[name]
+    return listed
+
+
+def _present(
+    listed: Sequence[Frame], stems: Mapping[str, set[str]], folder: Path
+) -> tuple[tuple[Frame, ...], tuple[Dropped, ...]]:
+    """The frames with the cameras that do have an image, and what is missing."""
+    frames = [replace(frame, cameras=tuple(c for c in frame.cameras if frame.name in stems[c])) for frame in listed]
+    empty = [frame.name for frame in frames if not frame.cameras]
+    if empty:
+        raise InputError(
+            f"{folder}: {len(empty)} of {len(frames)} frames have no images (first: {empty[0]}); "
+            "finish the capture with the command that began it"
+        )
+    idle = [name for name, known in stems.items() if not known]
+    left_out = [Dropped(what=f"camera {name}", reason="it has no images") for name in idle]
+    left_out += [
+        Dropped(what=f"camera {name} of frame {frame.name}", reason="it has no image of it")
+        for frame, whole in zip(frames, listed, strict=True)
+        for name in whole.cameras
+        if name not in frame.cameras and name not in idle
+    ]
+    return tuple(frames), tuple(left_out)
+
+
+def _image_stems(images: Path, cameras: Sequence[str]) -> tuple[str, dict[str, set[str]]]:
+    """Image suffix, and the stems of each camera's images."""
     files = {
         camera: [path for path in finished(images / camera) if path.suffix.lower() in IMAGE_SUFFIXES]
         for camera in cameras
+        if (images / camera).is_dir()
     }
-    stems = {camera: {path.stem for path in paths} for camera, paths in files.items()}
-    first = cameras[0]
-    for camera in cameras:
-        odd = sorted(stems[camera] ^ stems[first])
-        if odd:
-            raise InputError(
-                f"{images}: frames differ between cameras: {odd[0]} is in only one of {first} and {camera}; "
-                "each frame needs an image of every camera"
-            )
     suffixes = {path.suffix for paths in files.values() for path in paths}
     if not suffixes:
         raise InputError(f"{images}: no images in it")
     if len(suffixes) > 1:
         raise InputError(f"{images}: mixed image types {', '.join(sorted(suffixes))}; convert them to one")
-    return suffixes.pop(), sorted(stems[first])
+    return suffixes.pop(), {camera: {path.stem for path in files.get(camera, ())} for camera in cameras}
 
 
 def write_truth(folder: Path, truth: GroundTruth) -> None:
@@ -125,15 +144,7 @@ def write_overlap(path: Path, minimum: float, mean: float) -> None:
 
 
 def hash_capture(capture: Capture) -> dict[str, str]:
-    """SHA-256 of a capture's handpiece and of its list of frames with the sizes of their images.
-
-    The contents of the images are not read: that would take longer than finding a broken one when it is used.
-    """
-    listing = [
-        (path.name, path.stat().st_size)
-        for name in capture.handpiece.rig.names
-        for frame in capture.frames
-        if (path := capture.image_path(frame, name)).exists()
-    ]
-    parts = {"handpiece": handpiece_to_json(capture.handpiece), "images": listing}
+    """SHA-256 of a capture's handpiece and of its frames with the contents of their images."""
+    images = [(frame, [capture.source.digest(frame.name, name) for name in frame.cameras]) for frame in capture.frames]
+    parts = {"handpiece": handpiece_to_json(capture.handpiece), "images": images}
     return {name: hashlib.sha256(json.dumps(to_plain(part)).encode()).hexdigest() for name, part in parts.items()}

@@ -11,7 +11,7 @@ import numpy as np
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.rig import Exposure, Handpiece, Light, MountedCamera, Rig, Sensor
+from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor
 from cuspid.storage.files import read_json, reading, write_json
 
 
@@ -76,9 +76,13 @@ def handpiece_to_json(handpiece: Handpiece) -> dict[str, Any]:
         "depth_range_mm": handpiece.depth_range_mm,
         "cameras": cameras,
         "lights": handpiece.lights,
-        "exposures": handpiece.exposures,
+        "lightings": handpiece.lightings,
         "sensor": handpiece.sensor,
     }
+
+
+_FIELDS = {"name", "working_distance_mm", "depth_range_mm", "cameras", "lights", "lightings", "sensor"}
+"""Of ``handpiece.json``."""
 
 
 def write_handpiece(path: Path, handpiece: Handpiece) -> None:
@@ -100,6 +104,9 @@ def read_handpiece(path: Path) -> Handpiece:
     if isinstance(value, list):
         return Handpiece(rig=read_rig_config(path), name=path.stem)
     with reading(path):
+        strange = sorted(set(value) - _FIELDS)
+        if strange:
+            raise InputError(f"{path}: the field {strange[0]!r} is not known; it has {', '.join(sorted(_FIELDS))}")
         cameras = {
             name: MountedCamera(
                 camera_from_json(camera),
@@ -112,9 +119,8 @@ def read_handpiece(path: Path) -> Handpiece:
         return Handpiece(
             rig=Rig(cameras),
             lights={name: _light_from_json(light) for name, light in value.get("lights", {}).items()},
-            exposures=tuple(
-                Exposure(name=exposure["name"], lights=tuple(exposure["lights"]))
-                for exposure in value.get("exposures", [])
+            lightings=tuple(
+                Lighting(name=each["name"], lights=tuple(each["lights"])) for each in value.get("lightings", [])
             ),
             sensor=Sensor(**value.get("sensor", {})),
             working_distance_mm=float(value["working_distance_mm"]),

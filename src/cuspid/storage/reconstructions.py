@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from cuspid.capture import Dropped
 from cuspid.geometry import Rigid3
-from cuspid.reconstruction import DepthMap, Dropped, Reconstruction
+from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece
 from cuspid.storage.files import read_json, reading, to_plain, whole_file, write_json
 from cuspid.storage.handpieces import (

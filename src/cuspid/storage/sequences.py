@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
-from cuspid.capture import image_size
+from cuspid.capture import ImageFolder, image_size
 from cuspid.errors import InputError
 from cuspid.rig import Handpiece
 from cuspid.sequence import Sequence
@@ -59,7 +59,8 @@ def _of_capture(folder: Path) -> Sequence:
         raise InputError(
             f"{folder}: a capture of {len(names)} cameras; give the images of one, {folder / 'images' / names[0]}"
         )
-    paths = [capture.image_path(frame, names[0]) for frame in capture.frames]
+    images = ImageFolder(folder, capture.source.suffix)
+    paths = [images.path(frame.name, names[0]) for frame in capture.frames]
     found = Sequence(source=folder, paths=tuple(paths), size=_common_size(folder, paths))
     return _with_handpiece(found, capture.handpiece, folder / "handpiece.json")
 

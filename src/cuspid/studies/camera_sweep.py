@@ -33,7 +33,7 @@ from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DesignOptions
 from cuspid.jaw import Jaw
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
-from cuspid.rig import Exposure, Handpiece, Light, MountedCamera, Rig
+from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 from cuspid.simulation.appearance import Preset
 from cuspid.simulation.scan_path import (
     ScanPathOptions,
@@ -42,7 +42,7 @@ from cuspid.simulation.scan_path import (
     plan_scan_path,
     steady_poses,
 )
-from cuspid.stereo.between import BetweenOptions
+from cuspid.stereo.temporal import TemporalOptions
 from cuspid.studies.camera_pair import Direction, baseline_axis, camera_pair, facing
 from cuspid.studies.grid import Case, Outcome, Progress, Value, run_grid
 from cuspid.studies.trial import Trial, TrialOptions, run_trial
@@ -100,8 +100,8 @@ class SweepOptions:
     """Positions of the pair on it; consecutive images must overlap by more than 75 %."""
     texture: Preset = "artificial"
     """Surface of the teeth: artificial (the thesis' condition), powder, enamel."""
-    between: bool = False
-    """Also measure depth between consecutive exposures, which shows less of what the pair itself can do."""
+    temporal: bool = False
+    """Also measure depth from consecutive frames, which shows less of what the pair itself can do."""
     contenders: int = 2
     """So many settings that are best by completeness, and as many by accuracy, are repeated, and that of the thesis."""
     repeats: int = 2
@@ -231,7 +231,7 @@ def pair_handpiece(pair_from_rig: Rigid3, setting: Setting, options: SweepOption
     return Handpiece(
         rig=rig,
         lights=lights,
-        exposures=(Exposure(name="all", lights=tuple(lights)),),
+        lightings=(Lighting(name="all", lights=tuple(lights)),),
         working_distance_mm=_pairing_distance_mm(rig, options.distance_mm, far),
         depth_range_mm=(near, far),
         name=f"pair-{setting[0]:g}mm-{setting[1]:g}deg",
@@ -285,7 +285,7 @@ def sweep_case(
     overlap = image_overlap(site.jaw.mesh, handpiece, list(poses.values()))
     how = TrialOptions(
         simulation=SimulationOptions(texture=options.texture, supersampling=options.supersampling, seed=seed),
-        reconstruction=ReconstructionOptions(between=BetweenOptions(enabled=options.between)),
+        reconstruction=ReconstructionOptions(temporal=TemporalOptions(enabled=options.temporal)),
         evaluation=EvaluationOptions(margin_mm=_ANY_DISTANCE_MM, samples=50_000),
     )
     with tempfile.TemporaryDirectory(prefix="cuspid-sweep-") as folder:

@@ -18,12 +18,13 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
+from cuspid.capture import Frame
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.precision import deformation
 from cuspid.handpiece.presets import PRESETS
 from cuspid.jaw import Jaw
-from cuspid.rig import Exposure, Handpiece, Light, MountedCamera
+from cuspid.rig import Handpiece, Light, Lighting, MountedCamera
 from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.raycast import Scene, auto_gain, render_image
 from cuspid.stereo.matching import coarser, group_geometry
@@ -151,7 +152,7 @@ def _handpiece(options: MatchingNoiseOptions, baseline_mm: float) -> Handpiece:
     return Handpiece(
         rig=camera_pair(baseline_mm, angle, PRESETS[options.sensor].camera),
         lights=lights,
-        exposures=(Exposure(lights=tuple(lights)),),
+        lightings=(Lighting(lights=tuple(lights)),),
         working_distance_mm=options.distance_mm,
         depth_range_mm=_DEPTHS_MM,
         name=f"pair-{baseline_mm:g}",
@@ -163,7 +164,8 @@ def _images(
 ) -> tuple[UInt8[np.ndarray, "h w"], ...]:
     scene = Scene(jaw=jaw, handpiece=handpiece, appearance=APPEARANCES[options.texture], seed=options.seed)
     gain = auto_gain(scene, [pose])
-    rendered = [render_image(scene, handpiece.name, name, pose, gain) for name in handpiece.rig.names]
+    frame = Frame(name=handpiece.name, cameras=handpiece.rig.names)
+    rendered = [render_image(scene, frame, name, pose, gain) for name in frame.cameras]
     return tuple(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8) for image in rendered)
 
 

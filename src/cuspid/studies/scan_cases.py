@@ -31,7 +31,7 @@ PREPARED = (46, 45, 42, 36, 35)
 full-contour crown, and two inlays."""
 _LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 _PR_SET_PDEATHSIG = 1
-_STAGES = ("depth", "depth-between", "motion")
+_STAGES = ("depth", "depth-temporal", "motion")
 
 
 def timed(*command: str, log: IO[bytes] | None = None) -> tuple[int, dict[str, float]]:

@@ -27,7 +27,7 @@ from cuspid.motion.pairs import match_unguided
 from cuspid.rig import Handpiece
 from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.free_path import FreePathOptions, plan_free_path
-from cuspid.simulation.raycast import Scene, metered_gain, render_image
+from cuspid.simulation.raycast import Scene, lit_frames, metered_gains, render_image
 from cuspid.simulation.scan_path import ScanPathOptions, steady_poses
 from cuspid.stitching.examination import ExaminationOptions, examine
 from cuspid.stitching.normal_map import LIGHT, grey_normal_map, normal_map, rectify
@@ -144,11 +144,12 @@ def _render(
 ) -> list[UInt8[np.ndarray, "h w 3"]]:
     """Every camera at every pose, poses first."""
     scene = Scene(jaw=jaw, handpiece=handpiece, appearance=APPEARANCES[texture], supersampling=1, seed=0)
-    gain = metered_gain(scene, poses, "all")
+    frames, poses = lit_frames(handpiece, poses)
+    gains = metered_gains(scene, frames, poses)
     return [
-        render_image(scene, frame, camera, pose, gain)
-        for frame, pose in poses.items()
-        for camera in handpiece.rig.names
+        render_image(scene, frame, camera, poses[frame.name], gains[frame.lighting])
+        for frame in frames
+        for camera in frame.cameras
     ]
 
 

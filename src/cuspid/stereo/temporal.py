@@ -1,8 +1,8 @@
-"""Depth between two exposures, once the motion is known: each camera together with itself a moment later.
+"""Temporal stereo: depth from two frames, once the motion is known, each camera together with itself a moment later.
 
-It reaches surface that only one camera of a group sees within an exposure: the strips at the borders of what the
+It reaches surface that only one camera of a group sees within a frame: the strips at the borders of what the
 group sees in common, for example cusps between the occlusal and the buccal view. It leans on the motion, which is less
-sure than the rig, so it gets little weight where depth within an exposure is at hand.
+sure than the rig, so it gets little weight where depth from one frame is at hand.
 """
 
 from __future__ import annotations
@@ -20,49 +20,51 @@ from cuspid.stereo.matching import DepthEstimator, StereoOptions
 
 
 @dataclass(frozen=True, kw_only=True)
-class BetweenOptions:
-    """Depth between consecutive exposures."""
+class TemporalOptions:
+    """Temporal stereo of consecutive frames."""
 
     enabled: bool = True
     """Whether to measure it at all."""
     confidence_share: float = 0.05
-    """Its confidence relative to depth within an exposure."""
+    """Its confidence relative to depth from one frame."""
     least_baseline_share: float = 0.08
     """Smallest movement of a camera relative to the working distance."""
     largest_turn_deg: float = 20.0
-    """Largest turn of the handpiece between the exposures."""
+    """Largest turn of the handpiece between the frames."""
     stereo: StereoOptions = field(default_factory=StereoOptions)
-    """Matching and checks, as within an exposure."""
+    """Matching and checks, as within a frame."""
 
 
-def measure_between(
+def measure_temporal(
     handpiece: Handpiece,
     images: Mapping[str, UInt8[np.ndarray, "h w *c"]],
     next_images: Mapping[str, UInt8[np.ndarray, "h w *c"]],
     next_from_rig: Rigid3,
     frame: str,
-    options: BetweenOptions | None = None,
+    options: TemporalOptions | None = None,
 ) -> tuple[DepthMap, ...]:
     """Depth maps of each camera that moved enough, in its place at ``frame`` and a moment later.
 
-    ``next_from_rig`` moves points of the rig frame at ``frame`` to that at the next exposure. All depth maps are given
+    ``next_from_rig`` moves points of the rig frame at ``frame`` to that at the next frame. All depth maps are given
     in the rig frame at ``frame``; those of the moved cameras have ``+`` after the camera's name.
     """
-    options = options or BetweenOptions()
+    options = options or TemporalOptions()
     found: list[DepthMap] = []
     for name in handpiece.rig.names:
+        if name not in images or name not in next_images:
+            continue
         pair = moving_pair(handpiece, name, next_from_rig, options)
         if pair is not None:
-            exposures = {name: images[name], f"{name}+": next_images[name]}
-            found += DepthEstimator(pair, options.stereo).measure(exposures, frame)
+            both = {name: images[name], f"{name}+": next_images[name]}
+            found += DepthEstimator(pair, options.stereo).measure(both, frame)
     return tuple(
         replace(depth_map, confidence=(options.confidence_share * depth_map.confidence).astype(np.float32))
         for depth_map in found
     )
 
 
-def moving_pair(handpiece: Handpiece, name: str, next_from_rig: Rigid3, options: BetweenOptions) -> Handpiece | None:
-    """A handpiece of one camera and itself at the next exposure; None where that makes no stereo pair."""
+def moving_pair(handpiece: Handpiece, name: str, next_from_rig: Rigid3, options: TemporalOptions) -> Handpiece | None:
+    """A handpiece of one camera and itself at the next frame; None where that makes no stereo pair."""
     mounted = handpiece.rig[name]
     moved = MountedCamera(mounted.camera, mounted.cam_from_rig @ next_from_rig)
     shift = mounted.cam_from_rig.rotate(moved.centre_in_rig - mounted.centre_in_rig)
@@ -74,4 +76,4 @@ def moving_pair(handpiece: Handpiece, name: str, next_from_rig: Rigid3, options:
     rig = Rig({name: mounted, f"{name}+": moved})
     if not rig.stereo_pairs(handpiece.working_distance_mm):
         return None
-    return replace(handpiece, rig=rig, lights={}, exposures=())
+    return replace(handpiece, rig=rig, lights={}, lightings=())
