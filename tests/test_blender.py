@@ -106,7 +106,7 @@ def test_both_renderers_put_a_marker_where_the_camera_projects_it(
 
 
 def render(scene: Scene) -> list[tuple[str, str]]:
-    return list(blender.render_with_blender(scene, {"0": POSE}, lambda frame, camera, image: None))
+    return list(blender.render_with_blender(scene, [FRAME], {"0": POSE}, lambda frame, camera, image: None))
 
 
 def test_without_blender_the_user_is_told_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
