@@ -15,7 +15,6 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
@@ -45,6 +44,7 @@ from cuspid.motion.colmap import locate_with_colmap, read_model, write_model
 from cuspid.motion.location import MotionOptions
 from cuspid.motion.location import locate as locate_with_rig
 from cuspid.motion.single import SingleOptions, locate_single
+from cuspid.progress import Progress, silent
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece
 from cuspid.sequence import Sequence as FrameSequence
@@ -63,14 +63,7 @@ from cuspid.surface.fusion import FusionOptions
 from cuspid.surface.fusion import fuse as fuse_depth_maps
 from cuspid.trueness import GroundTruth, Trueness
 
-Progress = Callable[[str, int, int], None]
-"""Told the stage, how much of it is done and how much there is."""
-
 MotionMethod = Literal["rig", "colmap", "colmap-rig"]
-
-
-def silent(stage: str, done: int, total: int) -> None:
-    """A :data:`Progress` that says nothing."""
 
 
 def usable_cores() -> int:
@@ -363,7 +356,7 @@ def measure_depth(
     def measure(frame: Frame) -> tuple[DepthMap, ...]:
         return estimator.measure(capture.images(frame), frame.name)
 
-    return _measure_all(capture.frames, measure, folder, partial(progress, "depth"))
+    return _measure_all(capture.frames, measure, folder, "depth", progress)
 
 
 def measure_depth_between(
@@ -386,14 +379,15 @@ def measure_depth_between(
             capture.handpiece, capture.images(frame), capture.images(after), after_from_rig, frame.name, options
         )
 
-    return _measure_all(located[:-1], measure, folder, partial(progress, "depth between"))
+    return _measure_all(located[:-1], measure, folder, "depth between", progress)
 
 
 def _measure_all(
     frames: Sequence[Frame],
     measure: Callable[[Frame], tuple[DepthMap, ...]],
     folder: Path,
-    progress: Callable[[int, int], None],
+    stage: str,
+    progress: Progress,
 ) -> StoredDepthMaps:
     files = [folder / f"{frame.name}.npz" for frame in frames]
 
@@ -403,7 +397,7 @@ def _measure_all(
 
     with ThreadPoolExecutor(usable_cores()) as pool:
         for done, _ in enumerate(pool.map(keep, frames, files), start=1):
-            progress(done, len(files))
+            progress(stage, done, len(files))
     return StoredDepthMaps(files)
 
 

@@ -15,7 +15,7 @@ Frame: the mean of the samples' occlusal frames, mm.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -28,10 +28,8 @@ from cuspid.anatomy.procrustes import Superposition, dimension, superpose
 from cuspid.errors import InputError
 from cuspid.jaw import Jaw, Landmark
 from cuspid.mesh import Mesh
+from cuspid.progress import Progress, silent
 from cuspid.shape_model import MeanStep, ShapeModel
-
-Progress = Callable[[str, int, int], None]
-"""Told the stage, how much of it is done and how much there is."""
 
 _NO_VARIANCE = 1e-12
 """Modes with a smaller share of the variance than this are rounding."""
@@ -81,12 +79,8 @@ class _Samples:
         return Target.of(mesh, labels_or_gum(jaw.face_labels if self.by_tooth else None, len(mesh.faces)))
 
 
-def quiet(stage: str, done: int, total: int) -> None:
-    """A :data:`Progress` that says nothing."""
-
-
 def mean_shape(
-    jaws: Mapping[str, Jaw], options: MeanShapeOptions = MeanShapeOptions(), *, progress: Progress = quiet
+    jaws: Mapping[str, Jaw], options: MeanShapeOptions = MeanShapeOptions(), *, progress: Progress = silent
 ) -> ShapeModel:
     """The mean jaw and the principal modes of at least two jaws of one arch that have landmarks.
 

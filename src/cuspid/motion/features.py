@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -23,9 +23,7 @@ from jaxtyping import Float, Int, UInt8
 from cuspid.camera import OPENCV_PIXEL_OFFSET
 from cuspid.capture import Capture
 from cuspid.errors import OutputError
-
-Progress = Callable[[str, int, int], None]
-"""Called with (stage, done, total)."""
+from cuspid.progress import Progress, silent
 
 DESCRIPTOR_NORM = 512.0
 """Euclidean length of a descriptor before rounding."""
@@ -168,7 +166,7 @@ def detect_all(
     capture: Capture,
     options: FeatureOptions | None = None,
     *,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     cache: Path | None = None,
 ) -> Mapping[tuple[str, str], Features]:
     """Features of every image by (frame, camera). Finished images are kept in ``cache``. Raises InputError."""
@@ -180,8 +178,7 @@ def detect_all(
         try:
             for image, job in zip(images, jobs, strict=True):
                 found[image] = job.result()
-                if progress is not None:
-                    progress("features", len(found), len(images))
+                progress("features", len(found), len(images))
         finally:
             pool.shutdown(cancel_futures=True)
     return found

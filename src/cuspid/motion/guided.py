@@ -19,9 +19,10 @@ from scipy.spatial import KDTree
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.motion.adjustment import AdjustmentOptions, adjust
-from cuspid.motion.features import Features, Progress
+from cuspid.motion.features import Features
 from cuspid.motion.pairs import MatchingOptions, View, make_view, match_guided
 from cuspid.motion.tracks import intersect_rays
+from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, Tracks
 
 _DEPTH = 14.0
@@ -114,7 +115,7 @@ def refine(
     features: Sequence[Features],
     options: GuidedOptions,
     *,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Reconstruction:
     """The model of one camera with refined poses and new tracks; ``features`` of its frames, in their order.
 
@@ -128,8 +129,7 @@ def refine(
         limit_px = options.start_px / (1 if number == 0 else 2)
         found = _triangulated(model, features, views, track, image_of, limit_px, options)
         model = _rescaled(adjust(found, replace(options.adjustment, start_px=limit_px)))
-        if progress is not None:
-            progress("refining", number + 1, len(options.tolerances_px))
+        progress("refining", number + 1, len(options.tolerances_px))
     return model
 
 

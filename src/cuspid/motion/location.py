@@ -18,7 +18,7 @@ from cuspid.capture import Capture
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.motion.adjustment import AdjustmentOptions, adjust, calibration_sigma_px
-from cuspid.motion.features import FeatureOptions, Features, Progress, detect_all
+from cuspid.motion.features import FeatureOptions, Features, detect_all
 from cuspid.motion.odometry import (
     Cloud,
     OdometryOptions,
@@ -31,6 +31,7 @@ from cuspid.motion.odometry import (
 )
 from cuspid.motion.pairs import MatchingOptions, frame_pairs, make_view, match_guided
 from cuspid.motion.tracks import intersect_rays, join, thin
+from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import Handpiece, Rig
 
@@ -71,14 +72,13 @@ def _timed(log: dict[str, float], stage: str) -> Iterator[None]:
     log[f"{stage}_s"] = time.perf_counter() - start
 
 
-def _in_threads(work: Callable[[int], _T], count: int, stage: str, progress: Progress | None) -> list[_T]:
+def _in_threads(work: Callable[[int], _T], count: int, stage: str, progress: Progress) -> list[_T]:
     """``work(0)`` to ``work(count - 1)`` in threads, results in order."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         results = []
         for result in pool.map(work, range(count)):
             results.append(result)
-            if progress is not None:
-                progress(stage, len(results), count)
+            progress(stage, len(results), count)
     return results
 
 
@@ -181,7 +181,7 @@ def _link(
     poses: Sequence[Rigid3],
     handpiece: Handpiece,
     options: MotionOptions,
-    progress: Progress | None,
+    progress: Progress,
 ) -> Tracks:
     """Tracks over the located frames: the matches within frames and, guided by the poses, between them."""
     numbering = _Numbering.of(frames)
@@ -232,7 +232,7 @@ def locate_features(
     names: Sequence[str],
     options: MotionOptions,
     *,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Reconstruction:
     """As :func:`locate`, from the keypoints by (frame, camera) of the frames ``names`` in the order of capture."""
     rig, log = handpiece.rig, dict[str, float]()
@@ -267,7 +267,7 @@ def locate(
     capture: Capture,
     options: MotionOptions | None = None,
     *,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     cache: FilePath | None = None,
 ) -> Reconstruction:
     """Metric poses of the frames and a sparse model; finished images are kept in ``cache`` for a later run.

@@ -21,7 +21,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from numba import njit
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET
-from cuspid.motion.features import Progress
+from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, Tracks
 
 _LEAST_CONTRAST = 0.5
@@ -169,7 +169,7 @@ def lengthen(
     read: Callable[[str], UInt8[np.ndarray, "h w"]],
     options: PatchOptions,
     *,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Reconstruction:
     """The model of one camera with a second track for each point whose patch was found in enough frames.
 
@@ -190,8 +190,7 @@ def lengthen(
                 (mine, np.full(len(mine), frame), tracks.pixels[own[mine]]),
                 *pool.map(follow, [other for other in near if other != frame]),
             ]
-            if progress is not None:
-                progress("patches", frame + 1, len(names))
+            progress("patches", frame + 1, len(names))
     point, seen_in, pixels = (np.concatenate(each) for each in zip(*found, strict=True))
     return replace(model, tracks=_with_second(tracks, point, seen_in, pixels, options))
 

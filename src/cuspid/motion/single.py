@@ -25,11 +25,12 @@ from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.motion.adjustment import adjust
 from cuspid.motion.colmap import quiet, rigid_from_colmap
-from cuspid.motion.features import FeatureOptions, Features, Progress, detect
+from cuspid.motion.features import FeatureOptions, Features, detect
 from cuspid.motion.guided import GuidedOptions, refine
 from cuspid.motion.pairs import MatchingOptions, match_unguided
 from cuspid.motion.patches import PatchOptions, lengthen
 from cuspid.panorama import FrameUse
+from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
 from cuspid.sequence import Sequence
@@ -155,13 +156,12 @@ def _look(image: UInt8[np.ndarray, "h w 3"], options: SingleOptions) -> _Look:
     )
 
 
-def _look_at_all(sequence: Sequence, options: SingleOptions, progress: Progress | None) -> list[_Look]:
+def _look_at_all(sequence: Sequence, options: SingleOptions, progress: Progress) -> list[_Look]:
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         looks = []
         for look in pool.map(lambda index: _look(sequence.image(index), options), range(len(sequence))):
             looks.append(look)
-            if progress is not None:
-                progress("features", len(looks), len(sequence))
+            progress("features", len(looks), len(sequence))
     return looks
 
 
@@ -223,7 +223,7 @@ def _tie(
     camera: pycolmap.Camera,
     matching: MatchingOptions,
     options: SingleOptions,
-    progress: Progress | None,
+    progress: Progress,
 ) -> dict[tuple[int, int], pycolmap.TwoViewGeometry]:
     """Verified matches of pairs of frames; pairs that have too few are not in it."""
 
@@ -236,8 +236,7 @@ def _tie(
         for done, (pair, geometry) in enumerate(zip(pairs, pool.map(tie, pairs), strict=True), start=1):
             if geometry is not None:
                 found[pair] = geometry
-            if progress is not None:
-                progress("matching", done, len(pairs))
+            progress("matching", done, len(pairs))
     return found
 
 
@@ -295,7 +294,7 @@ def _map(
     ties: Mapping[tuple[int, int], pycolmap.TwoViewGeometry],
     calibrated: bool,
     options: SingleOptions,
-    progress: Progress | None,
+    progress: Progress,
 ) -> list[pycolmap.Reconstruction]:
     """COLMAP's models, largest first."""
     placed = 0
@@ -303,8 +302,7 @@ def _map(
     def count() -> None:
         nonlocal placed
         placed = min(placed + 1, len(features))
-        if progress is not None:
-            progress("mapping", placed, len(features))
+        progress("mapping", placed, len(features))
 
     with tempfile.TemporaryDirectory() as folder, quiet():
         database = Path(folder) / "database.db"
@@ -316,8 +314,7 @@ def _map(
             _mapper_options(calibrated, options),
             next_image_callback=count,
         )
-    if progress is not None:
-        progress("mapping", len(features), len(features))
+    progress("mapping", len(features), len(features))
     return sorted(models.values(), key=lambda model: -int(model.num_reg_images()))
 
 
@@ -447,7 +444,7 @@ def _camera_of(found: pycolmap.Camera, given: Camera | None, options: SingleOpti
 
 
 def locate_single(
-    sequence: Sequence, options: SingleOptions | None = None, *, progress: Progress | None = None
+    sequence: Sequence, options: SingleOptions | None = None, *, progress: Progress = silent
 ) -> SingleMotion:
     """The way of the one camera that took a sequence.
 
@@ -490,7 +487,7 @@ def _refined(
     sequence: Sequence,
     features: Mapping[int, Features],
     options: SingleOptions,
-    progress: Progress | None,
+    progress: Progress,
 ) -> Reconstruction:
     """A part with its poses made precise: by keypoints, then by patches too."""
     own = [features[index] for index in sorted(part.poses)]

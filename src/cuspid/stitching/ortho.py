@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from cuspid.panorama import FrameUse, Panorama, Strip
+from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
 from cuspid.sequence import Sequence
-from cuspid.stitching.mosaic import Mosaic, MosaicOptions, Progress, compose
+from cuspid.stitching.mosaic import Mosaic, MosaicOptions, compose
 from cuspid.stitching.strip import StripOptions, unroll
 from cuspid.stitching.surface import ScaleOptions, SurfaceOptions, height_map, in_occlusal_frame, uncovered
 from cuspid.stitching.sweep import SweepOptions, sweep
@@ -52,7 +53,7 @@ def orthophoto(
     frames: List[FrameUse],
     options: OrthoOptions,
     *,
-    progress: Progress,
+    progress: Progress = silent,
 ) -> Stitched:
     """The panorama of one model of the motion. Raises ReconstructionError where it has no points."""
     scale = options.scale

@@ -29,8 +29,9 @@ from skimage.restoration import inpaint_biharmonic
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera, undistortion_maps
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
-from cuspid.stitching.mosaic import BURNT, Progress, brightest, footprint
+from cuspid.stitching.mosaic import BURNT, brightest, footprint
 from cuspid.stitching.surface import HOLE_MM2, HeightMap
 
 _BLOCK, _REACH = 24, 14
@@ -245,7 +246,7 @@ def sweep(
     read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
     options: SweepOptions,
     *,
-    progress: Progress,
+    progress: Progress = silent,
 ) -> HeightMap | None:
     """The surface on which the frames of a motion in the occlusal frame agree; None where no two frames lie apart.
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -23,6 +23,7 @@ from jaxtyping import Float, Int16, UInt8
 from cuspid.camera import Camera
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.panorama import FrameUse, Panorama
+from cuspid.progress import Progress, silent
 from cuspid.sequence import Sequence
 from cuspid.stitching.examination import ExaminationOptions, examine, frame_corners, scale_of, warp
 from cuspid.stitching.normal_map import grey_normal_map, normal_map, rectify
@@ -39,9 +40,6 @@ from cuspid.stitching.warps import (
     location_weights,
     weighted_dlt,
 )
-
-Progress = Callable[[str, int, int], None]
-"""Told the stage, how much of it is done and how much there is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,7 +231,7 @@ def build_chains(
 
 
 def stitch_as_thesis(
-    sequence: Sequence, options: ThesisOptions, *, examination: bool, progress: Progress
+    sequence: Sequence, options: ThesisOptions, *, examination: bool, progress: Progress = silent
 ) -> tuple[Panorama, ...]:
     """The panorama of a sequence, in parts where it broke or collapsed, largest first; ``examination`` leaves out the
     frames that fail it.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import numpy as np
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.capture import image_size
 from cuspid.errors import InputError
+from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece
 from cuspid.sequence import Sequence
 from cuspid.storage.captures import IMAGE_SUFFIXES, read_capture, write_image
@@ -24,12 +24,9 @@ VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm")
 MOST_FRAMES = 300
 """A longer video is thinned evenly to about as many frames."""
 
-DecodeProgress = Callable[[int, int], None]
-"""Told how many frames of a video were read and how many there are."""
-
 
 def read_sequence(
-    source: Path, decoded: Path, *, calibration: Path | None = None, progress: DecodeProgress = lambda done, total: None
+    source: Path, decoded: Path, *, calibration: Path | None = None, progress: Progress = silent
 ) -> Sequence:
     """Frames of one camera from a folder of images, a video or a capture.
 
@@ -79,7 +76,7 @@ def _common_size(folder: Path, paths: list[Path]) -> tuple[int, int]:
     return usual
 
 
-def _of_video(video: Path, decoded: Path, progress: DecodeProgress) -> Sequence:
+def _of_video(video: Path, decoded: Path, progress: Progress) -> Sequence:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     stream = cv2.VideoCapture(str(video))
     announced = int(stream.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -95,7 +92,7 @@ def _of_video(video: Path, decoded: Path, progress: DecodeProgress) -> Sequence:
                 write_image(path, cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
             paths.append(path)
         number += 1
-        progress(number, max(announced, number))
+        progress("decoding", number, max(announced, number))
     stream.release()
     if len(paths) < 2:
         raise InputError(f"{video}: {len(paths)} frame(s) could be decoded; not a video, truncated, or of one frame")

@@ -24,6 +24,7 @@ from typing import Any
 
 from cuspid import storage
 from cuspid.errors import CuspidError, InputError, MissingDependencyError
+from cuspid.progress import Progress, silent
 
 Value = float | int | str | bool | None
 """What a cell of the table holds."""
@@ -60,9 +61,6 @@ Work = Callable[..., Mapping[str, Value]]
 """A function of a module that workers can import: takes the parameters of a case by name, returns figures by name, and
 raises where the case fails."""
 
-Progress = Callable[[int, int], None]
-"""Told how many cases are done, and of how many."""
-
 
 def grid(**axes: Sequence[Value]) -> tuple[Case, ...]:
     """All combinations of the values on the axes, the last axis fastest, named after their values."""
@@ -84,14 +82,15 @@ def run_grid(
     workers: int | None = None,
     cluster: str | None = None,
     retry_failed: bool = False,
-    progress: Progress = lambda done, total: None,
+    stage: str = "cases",
+    progress: Progress = silent,
 ) -> tuple[Outcome, ...]:
     """Run the cases that have no result in ``folder`` yet and return all outcomes, in the order of the cases.
 
     ``workers`` local processes (default: one for each core), or the workers of the Dask scheduler at ``cluster``.
-    Writes ``cases/<name>.json`` for each case and the table ``results.csv``. Raises InputError for fewer than one
-    worker, where two cases share a name or the cluster cannot be reached, MissingDependencyError where Dask is not
-    installed.
+    ``stage`` is what ``progress`` calls the cases. Writes ``cases/<name>.json`` for each case and the table
+    ``results.csv``. Raises InputError for fewer than one worker, where two cases share a name or the cluster cannot be
+    reached, MissingDependencyError where Dask is not installed.
     """
     if workers is not None and workers < 1:
         raise InputError(f"study: --workers is {workers}; at least one is needed")
@@ -102,13 +101,13 @@ def run_grid(
     if retry_failed:
         done = {name: outcome for name, outcome in done.items() if outcome.failure is None}
     left = [case for case in cases if case.name not in done]
-    progress(len(done), len(cases))
+    progress(stage, len(done), len(cases))
     if left:
         outcomes = _on_cluster(left, work, cluster) if cluster else _in_processes(left, work, workers or _cores())
         for outcome in outcomes:
             done[outcome.case.name] = outcome
             _write(folder, outcome)
-            progress(len(done), len(cases))
+            progress(stage, len(done), len(cases))
     ordered = tuple(done[case.name] for case in cases)
     storage.write_bytes(folder / "results.csv", table(ordered).encode())
     return ordered
