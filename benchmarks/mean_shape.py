@@ -33,6 +33,7 @@ from cuspid.jaw import GUM, Jaw, Landmark
 from cuspid.mesh import Mesh
 from cuspid.storage import read_shape_model, write_shape_model
 from cuspid.studies.reproduction.samples import MEAN_GROUP, iteration, make_phantom, make_population
+from cuspid.workers import usable_cores
 
 KNOWN = 6
 """Samples with a known mean."""
@@ -203,7 +204,7 @@ def main() -> None:
     result = {
         "population": population(options.work, options.count, options.edge_mm),
         "known_mean": known_mean(options.work, options.edge_mm),
-        "threads": os.cpu_count(),
+        "threads": usable_cores(),
         **conditions(),
     }
     options.out.parent.mkdir(parents=True, exist_ok=True)

@@ -11,9 +11,7 @@ trueness       = evaluate(mesh, truth.jaw, scannable=...)
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -62,13 +60,9 @@ from cuspid.surface.cleaning import CleaningOptions, clean
 from cuspid.surface.fusion import FusionOptions
 from cuspid.surface.fusion import fuse as fuse_depth_maps
 from cuspid.trueness import GroundTruth, Trueness
+from cuspid.workers import map_in_threads, usable_cores
 
 MotionMethod = Literal["rig", "colmap", "colmap-rig"]
-
-
-def usable_cores() -> int:
-    """Cores that this process may run on: a case of a study is pinned to one."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 # --- What is scanned -----------------------------------------------------------------------------------------------
@@ -389,16 +383,13 @@ def _measure_all(
     stage: str,
     progress: Progress,
 ) -> StoredDepthMaps:
-    files = [folder / f"{frame.name}.npz" for frame in frames]
-
-    def keep(frame: Frame, file: Path) -> None:
+    def keep(frame: Frame) -> Path:
+        file = folder / f"{frame.name}.npz"
         if not file.exists():
             storage.write_depth_maps(file, measure(frame))
+        return file
 
-    with ThreadPoolExecutor(usable_cores()) as pool:
-        for done, _ in enumerate(pool.map(keep, frames, files), start=1):
-            progress(stage, done, len(files))
-    return StoredDepthMaps(files)
+    return StoredDepthMaps(map_in_threads(keep, frames, stage=stage, progress=progress))
 
 
 def locate(

@@ -14,9 +14,7 @@ Frame: the mean of the samples' occlusal frames, mm.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -30,6 +28,7 @@ from cuspid.jaw import Jaw, Landmark
 from cuspid.mesh import Mesh
 from cuspid.progress import Progress, silent
 from cuspid.shape_model import MeanStep, ShapeModel
+from cuspid.workers import map_in_threads
 
 _NO_VARIANCE = 1e-12
 """Modes with a smaller share of the variance than this are rounding."""
@@ -170,19 +169,16 @@ def _iterate(
 def _lay_on_all(
     mean: Mesh, template: Template, samples: _Samples, options: MeanShapeOptions, stage: str, progress: Progress
 ) -> list[Fit]:
-    def lay(number: int, jaw: Jaw) -> Fit:
+    jaws = list(samples.jaws.values())
+
+    def lay(number: int) -> Fit:
         start = warp(samples.pose.mean, samples.pose.aligned[number], mean.vertices)
         if options.correspondence == "landmarks":
             return Fit(vertices=start, covered=np.zeros(len(start), dtype=bool))
-        return fit(template, start, samples.target(number, jaw), options.fit)
+        return fit(template, start, samples.target(number, jaws[number]), options.fit)
 
-    progress(stage, 0, len(samples.jaws))
-    fits: list[Fit] = []
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for found in pool.map(lay, range(len(samples.jaws)), samples.jaws.values()):
-            fits.append(found)
-            progress(stage, len(fits), len(samples.jaws))
-    return fits
+    progress(stage, 0, len(jaws))
+    return map_in_threads(lay, range(len(jaws)), stage=stage, progress=progress)
 
 
 def _step(mean: Mesh, moved: Mesh, fits: list[Fit]) -> MeanStep:

@@ -8,9 +8,7 @@ handpiece keep their roll from one frame to the next, so fixing the orientation 
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +22,7 @@ from cuspid.camera import OPENCV_PIXEL_OFFSET
 from cuspid.capture import Capture
 from cuspid.errors import OutputError
 from cuspid.progress import Progress, silent
+from cuspid.workers import map_in_threads
 
 DESCRIPTOR_NORM = 512.0
 """Euclidean length of a descriptor before rounding."""
@@ -172,13 +171,8 @@ def detect_all(
     """Features of every image by (frame, camera). Finished images are kept in ``cache``. Raises InputError."""
     options = options or FeatureOptions()
     images = [(frame.name, camera) for frame in capture.frames for camera in capture.handpiece.rig.names]
-    found: dict[tuple[str, str], Features] = {}
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        jobs = [pool.submit(_detect_kept, capture, *image, options, cache) for image in images]
-        try:
-            for image, job in zip(images, jobs, strict=True):
-                found[image] = job.result()
-                progress("features", len(found), len(images))
-        finally:
-            pool.shutdown(cancel_futures=True)
-    return found
+
+    def kept(image: tuple[str, str]) -> Features:
+        return _detect_kept(capture, *image, options, cache)
+
+    return dict(zip(images, map_in_threads(kept, images, stage="features", progress=progress), strict=True))

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path as FilePath
-from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -34,8 +31,7 @@ from cuspid.motion.tracks import intersect_rays, join, thin
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import Handpiece, Rig
-
-_T = TypeVar("_T")
+from cuspid.workers import map_in_threads
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,16 +66,6 @@ def _timed(log: dict[str, float], stage: str) -> Iterator[None]:
     start = time.perf_counter()
     yield
     log[f"{stage}_s"] = time.perf_counter() - start
-
-
-def _in_threads(work: Callable[[int], _T], count: int, stage: str, progress: Progress) -> list[_T]:
-    """``work(0)`` to ``work(count - 1)`` in threads, results in order."""
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        results = []
-        for result in pool.map(work, range(count)):
-            results.append(result)
-            progress(stage, len(results), count)
-    return results
 
 
 def _depth_bounds(
@@ -187,10 +173,10 @@ def _link(
     numbering = _Numbering.of(frames)
     pairs = frame_pairs(len(frames), options.reach)
 
-    def work(index: int) -> Int[np.ndarray, "k 2"]:
-        return _match_frames(*pairs[index], frames, clouds, poses, handpiece, options, numbering.starts)
+    def match(pair: tuple[int, int]) -> Int[np.ndarray, "k 2"]:
+        return _match_frames(*pair, frames, clouds, poses, handpiece, options, numbering.starts)
 
-    between = _in_threads(work, len(pairs), "matching", progress)
+    between = map_in_threads(match, pairs, stage="matching", progress=progress)
     image = numbering.frame * len(handpiece.rig.names) + numbering.camera
     matches = np.concatenate([*_within_frames(clouds, numbering.starts), *between])
     track = join(matches, image)
@@ -240,11 +226,11 @@ def locate_features(
     frames = [{c: make_view(features[name, c], mounted.camera) for c, mounted in rig.cameras.items()} for name in names]
     with _timed(log, "triangulation"):
         pairs = rig.stereo_pairs(handpiece.working_distance_mm)
-        clouds = _in_threads(
-            lambda f: triangulate_frame(handpiece, pairs, frames[f], options.within),
-            len(frames),
-            "triangulation",
-            progress,
+        clouds = map_in_threads(
+            lambda views: triangulate_frame(handpiece, pairs, views, options.within),
+            frames,
+            stage="triangulation",
+            progress=progress,
         )
     with _timed(log, "odometry"):
         path = chain(find_edges(rig, frames, clouds, options.odometry, options.seed), names, options.odometry)

@@ -7,11 +7,9 @@ not know the scale: lengths are in units of the model, not millimetres.
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Mapping
 from collections.abc import Sequence as List
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -34,6 +32,7 @@ from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
 from cuspid.sequence import Sequence
+from cuspid.workers import map_in_threads
 
 CAMERA = "camera"
 """Name of the one camera in the rig."""
@@ -157,12 +156,9 @@ def _look(image: UInt8[np.ndarray, "h w 3"], options: SingleOptions) -> _Look:
 
 
 def _look_at_all(sequence: Sequence, options: SingleOptions, progress: Progress) -> list[_Look]:
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        looks = []
-        for look in pool.map(lambda index: _look(sequence.image(index), options), range(len(sequence))):
-            looks.append(look)
-            progress("features", len(looks), len(sequence))
-    return looks
+    return map_in_threads(
+        lambda index: _look(sequence.image(index), options), range(len(sequence)), stage="features", progress=progress
+    )
 
 
 def _refusals(looks: List[_Look], names: List[str], options: SingleOptions) -> dict[int, str]:
@@ -231,13 +227,8 @@ def _tie(
         one, other = (features[index] for index in pair)
         return _verify(camera, one, other, match_unguided(one, other, matching), options)
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        found = {}
-        for done, (pair, geometry) in enumerate(zip(pairs, pool.map(tie, pairs), strict=True), start=1):
-            if geometry is not None:
-                found[pair] = geometry
-            progress("matching", done, len(pairs))
-    return found
+    found = map_in_threads(tie, pairs, stage="matching", progress=progress)
+    return {pair: geometry for pair, geometry in zip(pairs, found, strict=True) if geometry is not None}
 
 
 def _pairs_at(kept: List[int], steps: List[int]) -> list[tuple[int, int]]:

@@ -10,10 +10,8 @@ chain stretches a frame beyond a limit it has collapsed, and a new part begins.
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -40,6 +38,7 @@ from cuspid.stitching.warps import (
     location_weights,
     weighted_dlt,
 )
+from cuspid.workers import map_in_threads
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,12 +124,7 @@ def look_at_all(sequence: Sequence, camera: Camera, options: ThesisOptions, prog
     def one(index: int) -> Look:
         return look(without_distortion(sequence.image(index), camera), ideal, options)
 
-    looks: list[Look] = []
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for found in pool.map(one, range(len(sequence))):
-            looks.append(found)
-            progress("normal maps", len(looks), len(sequence))
-    return looks
+    return map_in_threads(one, range(len(sequence)), stage="normal maps", progress=progress)
 
 
 # --- the chain -------------------------------------------------------------------------------------------------------

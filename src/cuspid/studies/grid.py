@@ -25,6 +25,7 @@ from typing import Any
 from cuspid import storage
 from cuspid.errors import CuspidError, InputError, MissingDependencyError
 from cuspid.progress import Progress, silent
+from cuspid.workers import core_numbers, usable_cores
 
 Value = float | int | str | bool | None
 """What a cell of the table holds."""
@@ -103,7 +104,7 @@ def run_grid(
     left = [case for case in cases if case.name not in done]
     progress(stage, len(done), len(cases))
     if left:
-        outcomes = _on_cluster(left, work, cluster) if cluster else _in_processes(left, work, workers or _cores())
+        outcomes = _on_cluster(left, work, cluster) if cluster else _in_processes(left, work, workers or usable_cores())
         for outcome in outcomes:
             done[outcome.case.name] = outcome
             _write(folder, outcome)
@@ -172,14 +173,10 @@ class _Running:
     core: int
 
 
-def _cores() -> int:
-    return len(os.sched_getaffinity(0))
-
-
 def _in_processes(cases: Sequence[Case], work: Work, workers: int) -> Iterator[Outcome]:
     """Outcomes as they come, from at most so many processes at once."""
     waiting = list(reversed(cases))
-    cores = sorted(os.sched_getaffinity(0))
+    cores = core_numbers()
     free = [cores[k % len(cores)] for k in range(workers)]
     running: dict[Connection, _Running] = {}
     try:
@@ -288,7 +285,7 @@ def _attempt_on_worker(work: Work, case: Case, slots: Mapping[str, int]) -> Outc
     """
     import distributed
 
-    cores = sorted(os.sched_getaffinity(os.getpid()))
+    cores = core_numbers(os.getpid())
     number = _threads.setdefault(threading.get_ident(), len(_threads))
     os.sched_setaffinity(0, {cores[(slots.get(distributed.get_worker().address, 0) + number) % len(cores)]})
     return _attempt(work, case)

@@ -23,7 +23,8 @@ from cuspid.progress import Progress, silent
 from cuspid.reconstruction import DepthMap
 from cuspid.surface.evidence import Evidence, colors_of, observe
 from cuspid.surface.meshing import extract
-from cuspid.surface.volume import SparseVolume, in_threads
+from cuspid.surface.volume import SparseVolume
+from cuspid.workers import map_slices
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +117,7 @@ class Votes:
         """Let one depth map vote on the vertices that it sees."""
         chunks = self._in_view(depth_map.camera, cam_from_world)
         colors = colors_of(depth_map)
-        in_threads(
+        map_slices(
             lambda part: _vote(
                 chunks[part],
                 self.rough.vertices,

@@ -30,7 +30,6 @@ from cuspid.anatomy.phantom import PhantomOptions, build_phantom
 from cuspid.anatomy.population import GroupName, draw_population
 from cuspid.errors import CuspidError, InputError
 from cuspid.handpiece.designs import twelve_cameras
-from cuspid.pipeline import usable_cores
 from cuspid.progress import Progress, silent
 from cuspid.reporting.figures import save_picture
 from cuspid.studies.camera_pair import CameraPairOptions
@@ -50,6 +49,7 @@ from cuspid.studies.reproduction.samples import (
     surfaces_seen,
 )
 from cuspid.studies.scan_cases import conditions, measure_scan, prepared_cases, run_timed
+from cuspid.workers import usable_cores
 
 READ_ONLY = ("measure", "design_comparison_full_size")
 """Results that the page shows and no run here makes: they need data that is not public, or hours."""
