@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
@@ -20,8 +19,8 @@ from jaxtyping import Float, Int, UInt8
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET
 from cuspid.capture import Capture
-from cuspid.errors import OutputError
 from cuspid.progress import Progress, silent
+from cuspid.storage.files import write_arrays
 from cuspid.workers import map_in_threads
 
 DESCRIPTOR_NORM = 512.0
@@ -130,22 +129,8 @@ def _load(path: Path, key: str) -> Features | None:
 
 def _keep(path: Path, key: str, features: Features) -> None:
     """Write features whole or not at all. Raises OutputError."""
-    part = path.with_suffix(".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("wb") as file:
-            np.savez(
-                file,
-                key=np.array(key),
-                pixels=features.pixels,
-                descriptors=features.descriptors,
-                colors=features.colors,
-            )
-        part.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            part.unlink()
-        raise OutputError(f"{path}: cannot be written ({error.strerror}); free some space") from error
+    arrays = {"pixels": features.pixels, "descriptors": features.descriptors, "colors": features.colors}
+    write_arrays(path, {"key": np.array(key), **arrays})
 
 
 def _detect_kept(capture: Capture, frame: str, camera: str, options: FeatureOptions, cache: Path | None) -> Features:
