@@ -28,7 +28,7 @@ from scipy.linalg import subspace_angles
 from cuspid import storage
 from cuspid.anatomy.mean_shape import MeanShapeOptions, mean_shape, vertex_areas
 from cuspid.anatomy.phantom import PhantomOptions
-from cuspid.anatomy.procrustes import best_rotation
+from cuspid.geometry import best_similarity
 from cuspid.jaw import GUM, Jaw, Landmark
 from cuspid.mesh import Mesh
 from cuspid.storage import read_shape_model, write_shape_model
@@ -177,7 +177,7 @@ def _onto_landmarks(jaw: Jaw, reference: Jaw) -> Jaw:
     """The jaw, moved rigidly so that its landmarks lie best on the reference's."""
     labels = sorted(jaw.landmarks)
     own, other = (np.stack([one.landmarks[label].position for label in labels]) for one in (jaw, reference))
-    turn = best_rotation(own - own.mean(axis=0), other - other.mean(axis=0))
+    _, turn, _ = best_similarity(own, other)
     vertices = (jaw.mesh.vertices - own.mean(axis=0)) @ turn.T + other.mean(axis=0)
     return replace(jaw, mesh=Mesh(vertices, jaw.mesh.faces))
 

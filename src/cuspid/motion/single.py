@@ -20,7 +20,7 @@ from jaxtyping import Float, Int, UInt8
 
 from cuspid.camera import Camera
 from cuspid.errors import ReconstructionError
-from cuspid.geometry import Rigid3
+from cuspid.geometry import Rigid3, best_similarity
 from cuspid.motion.adjustment import adjust
 from cuspid.motion.colmap import quiet, rigid_from_colmap
 from cuspid.motion.features import FeatureOptions, Features, detect
@@ -335,19 +335,6 @@ def _model_of(found: pycolmap.Reconstruction) -> _Model:
     )
 
 
-def similarity(
-    source: Float[np.ndarray, "n d"], target: Float[np.ndarray, "n d"]
-) -> tuple[float, Float[np.ndarray, "d d"], Float[np.ndarray, "d"]]:
-    """Scale, rotation and shift that bring source to target with the least squares (Umeyama 1991)."""
-    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    u, spread, vt = np.linalg.svd(b.T @ a)
-    signs = np.ones(len(spread))
-    signs[-1] = np.sign(np.linalg.det(u @ vt))
-    rotation = u * signs @ vt
-    scale = float(np.sum(spread * signs) / np.sum(a**2))
-    return scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
-
-
 def _same_points(one: _Model, other: _Model) -> Int[np.ndarray, "k 2"]:
     """Points of two models that were seen as the same keypoint."""
     where = {(frame, keypoint): point for point, frame, keypoint in one.seen.tolist()}
@@ -363,7 +350,7 @@ def _joined(one: _Model, other: _Model, least: int) -> _Model | None:
     for _ in range(3):
         if len(same) < least:
             return None
-        scale, rotation, shift = similarity(other.points[same[:, 1]], one.points[same[:, 0]])
+        scale, rotation, shift = best_similarity(other.points[same[:, 1]], one.points[same[:, 0]])
         errors = np.linalg.norm(scale * other.points[same[:, 1]] @ rotation.T + shift - one.points[same[:, 0]], axis=1)
         same = same[errors <= max(3 * float(np.median(errors)), 1e-9)]
     poses = {
