@@ -19,6 +19,7 @@ from cuspid.cli import main
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3, best_similarity
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
+from cuspid.image_sequence import ImageSequence
 from cuspid.jaw import GUM, Jaw
 from cuspid.motion.guided import join_in_order
 from cuspid.motion.single import SingleOptions, locate_single, mouth_share, normalise_contrast
@@ -26,7 +27,6 @@ from cuspid.panorama import Panorama
 from cuspid.pipeline import RenderOptions, StitchOptions, take_images
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
-from cuspid.sequence import Sequence
 from cuspid.simulation.scan_path import arch_curve
 from cuspid.stitching.exposure import ExposureOptions, Samples, balance
 from cuspid.stitching.mosaic import unlit
@@ -53,12 +53,12 @@ def film(coarse_phantom: Jaw, tmp_path_factory: pytest.TempPathFactory) -> tuple
 
 
 @pytest.fixture(scope="module")
-def sequence(film: tuple[Capture, GroundTruth], tmp_path_factory: pytest.TempPathFactory) -> Sequence:
+def sequence(film: tuple[Capture, GroundTruth], tmp_path_factory: pytest.TempPathFactory) -> ImageSequence:
     return storage.read_sequence(film[0].folder, tmp_path_factory.mktemp("decoded"))
 
 
 @pytest.fixture(scope="module")
-def stitched(sequence: Sequence) -> Stitched:
+def stitched(sequence: ImageSequence) -> Stitched:
     (whole,) = pipeline.stitch(sequence, StitchOptions())
     return whole
 
@@ -85,7 +85,7 @@ def seen_points(panorama: Panorama, truth: GroundTruth, camera: Camera) -> tuple
 
 
 def test_every_frame_is_placed_and_pixels_show_what_lies_there(
-    stitched: Stitched, film: tuple[Capture, GroundTruth], sequence: Sequence
+    stitched: Stitched, film: tuple[Capture, GroundTruth], sequence: ImageSequence
 ) -> None:
     panorama = stitched.panorama
     assert [frame.name for frame in panorama.frames if frame.used] == [f"{n:03d}" for n in range(FRAMES)]
@@ -110,7 +110,7 @@ def test_the_camera_was_where_it_is_found(stitched: Stitched, film: tuple[Captur
 
 
 def test_the_panorama_is_not_mirrored_and_heights_are_those_of_the_jaw(
-    stitched: Stitched, film: tuple[Capture, GroundTruth], sequence: Sequence
+    stitched: Stitched, film: tuple[Capture, GroundTruth], sequence: ImageSequence
 ) -> None:
     panorama = stitched.panorama
     assert sequence.camera is not None
@@ -144,7 +144,7 @@ def test_the_strip_is_as_long_as_the_way_of_the_camera(stitched: Stitched) -> No
     assert np.all((strip.zone >= 0) == strip.covered)
 
 
-def test_two_runs_on_the_same_frames_are_alike(stitched: Stitched, sequence: Sequence) -> None:
+def test_two_runs_on_the_same_frames_are_alike(stitched: Stitched, sequence: ImageSequence) -> None:
     (again,) = pipeline.stitch(sequence, StitchOptions())
     assert stitched.motion is not None
     assert again.motion is not None
@@ -155,7 +155,7 @@ def test_two_runs_on_the_same_frames_are_alike(stitched: Stitched, sequence: Seq
 
 
 def test_a_video_is_stitched_from_the_command_line_and_its_folder_takes_no_other(
-    film: tuple[Capture, GroundTruth], sequence: Sequence, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    film: tuple[Capture, GroundTruth], sequence: ImageSequence, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def video(name: str, indices: range) -> Path:
         stream = cv2.VideoWriter(str(tmp_path / name), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, sequence.size)
@@ -173,7 +173,7 @@ def test_a_video_is_stitched_from_the_command_line_and_its_folder_takes_no_other
     assert "another run of 'decode'" in capsys.readouterr().err
 
 
-def test_one_camera_without_a_calibration_finds_its_focal_length(sequence: Sequence) -> None:
+def test_one_camera_without_a_calibration_finds_its_focal_length(sequence: ImageSequence) -> None:
     motion = locate_single(replace(sequence, camera=None, working_distance_mm=None), SingleOptions())
     assert len(motion.parts) == 1
     assert sequence.camera is not None
@@ -185,14 +185,14 @@ def test_one_camera_without_a_calibration_finds_its_focal_length(sequence: Seque
 # --- bad sequences -----------------------------------------------------------------------------------------------
 
 
-def images_in(folder: Path, images: list[np.ndarray]) -> Sequence:
+def images_in(folder: Path, images: list[np.ndarray]) -> ImageSequence:
     for index, image in enumerate(images):
         storage.write_image(folder / f"{index:03d}.png", image)
     return storage.read_sequence(folder, folder / "decoded")
 
 
 def test_a_black_or_blurred_frame_and_a_repeated_one_are_left_out_with_a_reason(
-    sequence: Sequence, tmp_path: Path
+    sequence: ImageSequence, tmp_path: Path
 ) -> None:
     images = [sequence.image(index) for index in range(8)]
     images[2] = np.zeros_like(images[2])
@@ -220,7 +220,7 @@ def test_frames_that_have_nothing_in_common_are_named(tmp_path: Path) -> None:
         locate_single(images_in(tmp_path, noise), SingleOptions())
 
 
-def test_two_films_are_stitched_as_two_parts(sequence: Sequence, tmp_path: Path) -> None:
+def test_two_films_are_stitched_as_two_parts(sequence: ImageSequence, tmp_path: Path) -> None:
     """The two ends of the film, mirrored and turned for the second: nothing ties them together."""
     first = [sequence.image(index) for index in range(5)]
     second = [np.ascontiguousarray(sequence.image(index)[::-1]) for index in range(7, 12)]
@@ -380,7 +380,7 @@ def test_colours_of_a_mouth_are_told_from_others(color: tuple[int, int, int], al
     assert mouth_share(np.full((20, 20, 3), color, np.uint8)) == alike
 
 
-def test_frames_of_other_colours_are_noted_by_name(sequence: Sequence, tmp_path: Path) -> None:
+def test_frames_of_other_colours_are_noted_by_name(sequence: ImageSequence, tmp_path: Path) -> None:
     blue = np.array([0.3, 0.5, 1.0])
     images = [sequence.image(0), *((sequence.image(index) * blue).astype(np.uint8) for index in range(1, 6))]
     notes = locate_single(images_in(tmp_path, images)).notes

@@ -36,6 +36,7 @@ from cuspid.handpiece.brief import DesignBrief
 from cuspid.handpiece.optimise import Section
 from cuspid.handpiece.precision import NoiseModel, PrecisionMap, at_best, precision_map
 from cuspid.handpiece.visibility import Visibility, VisibilityOptions, scannable_faces, survey_visibility
+from cuspid.image_sequence import ImageSequence
 from cuspid.jaw import ARCHES, Arch, Jaw
 from cuspid.mesh import Mesh
 from cuspid.motion.colmap import locate_with_colmap, read_model, write_model
@@ -45,7 +46,6 @@ from cuspid.motion.single import SingleOptions, locate_single
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece
-from cuspid.sequence import Sequence as FrameSequence
 from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.blender import render_with_blender
 from cuspid.simulation.free_path import FreePathOptions, plan_free_path
@@ -490,7 +490,7 @@ class StitchOptions(OrthoOptions):
     """The method thesis."""
 
 
-def stitch(sequence: FrameSequence, options: StitchOptions, *, progress: Progress = silent) -> tuple[Stitched, ...]:
+def stitch(sequence: ImageSequence, options: StitchOptions, *, progress: Progress = silent) -> tuple[Stitched, ...]:
     """The panorama of an arch from the frames of one camera; several parts where the sequence broke, largest first.
 
     Raises ReconstructionError, naming the frames, where nothing can be placed.

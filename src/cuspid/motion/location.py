@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,7 +19,7 @@ from cuspid.motion.features import FeatureOptions, Features, detect_all
 from cuspid.motion.odometry import (
     Cloud,
     OdometryOptions,
-    Path,
+    Trajectory,
     Views,
     chain,
     find_edges,
@@ -187,13 +187,13 @@ def _link(
     return _triangulated(frames, poses, handpiece.rig, track, numbering)
 
 
-def _require_enough(path: Path, clouds: Sequence[Cloud], options: MotionOptions) -> None:
+def _require_enough(trajectory: Trajectory, clouds: Sequence[Cloud], options: MotionOptions) -> None:
     """Raise ReconstructionError where too few frames are located."""
-    placed, total = len(path.rig_from_world), len(clouds)
+    placed, total = len(trajectory.rig_from_world), len(clouds)
     if placed >= options.minimum_located * total and (placed > 1 or total == 1):
         return
-    shown = "; ".join(f"{d.what}: {d.reason}" for d in path.dropped[:3])
-    more = f"; and {len(path.dropped) - 3} more" if len(path.dropped) > 3 else ""
+    shown = "; ".join(f"{d.what}: {d.reason}" for d in trajectory.dropped[:3])
+    more = f"; and {len(trajectory.dropped) - 3} more" if len(trajectory.dropped) > 3 else ""
     typical = int(np.median([len(cloud.points) for cloud in clouds]))
     raise ReconstructionError(
         f"motion: only {placed} of {total} frames could be placed, with {typical} points in a typical frame ({shown}"
@@ -233,16 +233,16 @@ def locate_features(
             progress=progress,
         )
     with _timed(log, "odometry"):
-        path = chain(find_edges(rig, frames, clouds, options.odometry, options.seed), names, options.odometry)
-    _require_enough(path, clouds, options)
+        trajectory = chain(find_edges(rig, frames, clouds, options.odometry, options.seed), names, options.odometry)
+    _require_enough(trajectory, clouds, options)
     with _timed(log, "matching"):
-        frames, clouds = [frames[f] for f in path.rig_from_world], [clouds[f] for f in path.rig_from_world]
-        tracks = _link(frames, clouds, list(path.rig_from_world.values()), handpiece, options, progress)
+        frames, clouds = [frames[f] for f in trajectory.rig_from_world], [clouds[f] for f in trajectory.rig_from_world]
+        tracks = _link(frames, clouds, list(trajectory.rig_from_world.values()), handpiece, options, progress)
     start = Reconstruction(
         rig=rig,
-        rig_from_world={names[f]: pose for f, pose in path.rig_from_world.items()},
+        rig_from_world={names[f]: pose for f, pose in trajectory.rig_from_world.items()},
         tracks=tracks,
-        dropped=path.dropped,
+        dropped=trajectory.dropped,
     )
     with _timed(log, "adjustment"):
         adjusted = adjust(start, options.adjustment)
@@ -254,7 +254,7 @@ def locate(
     options: MotionOptions | None = None,
     *,
     progress: Progress = silent,
-    cache: FilePath | None = None,
+    cache: Path | None = None,
 ) -> Reconstruction:
     """Metric poses of the frames and a sparse model; finished images are kept in ``cache`` for a later run.
 

@@ -80,7 +80,7 @@ class Edge:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Path:
+class Trajectory:
     """The largest set of frames that are tied to each other."""
 
     rig_from_world: Mapping[int, Rigid3]
@@ -283,7 +283,7 @@ def _reason(
     return f"only {most} matches to its neighbours; {options.minimum_matches} are needed"
 
 
-def chain(edges: Mapping[tuple[int, int], Edge], names: Sequence[str], options: OdometryOptions) -> Path:
+def chain(edges: Mapping[tuple[int, int], Edge], names: Sequence[str], options: OdometryOptions) -> Trajectory:
     """Poses of the largest part by following the edges from its first frame."""
     part = _parts(edges, len(names))
     largest = int(np.argmax(np.bincount(part)))
@@ -297,7 +297,7 @@ def chain(edges: Mapping[tuple[int, int], Edge], names: Sequence[str], options: 
         i = int(before[j])
         forward = tied.get((i, j)) or tied[j, i].inverse()
         poses[j] = forward @ poses[i]
-    return Path(
+    return Trajectory(
         rig_from_world={int(frame): poses[int(frame)] for frame in located},
         dropped=tuple(
             Dropped(what=f"frame {name}", reason=_reason(index, part, edges, options))

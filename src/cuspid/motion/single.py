@@ -8,8 +8,7 @@ not know the scale: lengths are in units of the model, not millimetres.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
-from collections.abc import Sequence as List
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from jaxtyping import Float, Int, UInt8
 from cuspid.camera import Camera
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3, best_similarity
+from cuspid.image_sequence import ImageSequence
 from cuspid.motion.adjustment import adjust
 from cuspid.motion.colmap import quiet, rigid_from_colmap
 from cuspid.motion.features import FeatureOptions, Features, detect
@@ -31,7 +31,6 @@ from cuspid.panorama import FrameUse
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
-from cuspid.sequence import Sequence
 from cuspid.workers import map_in_threads
 
 CAMERA = "camera"
@@ -155,13 +154,13 @@ def _look(image: UInt8[np.ndarray, "h w 3"], options: SingleOptions) -> _Look:
     )
 
 
-def _look_at_all(sequence: Sequence, options: SingleOptions, progress: Progress) -> list[_Look]:
+def _look_at_all(sequence: ImageSequence, options: SingleOptions, progress: Progress) -> list[_Look]:
     return map_in_threads(
         lambda index: _look(sequence.image(index), options), range(len(sequence)), stage="features", progress=progress
     )
 
 
-def _refusals(looks: List[_Look], names: List[str], options: SingleOptions) -> dict[int, str]:
+def _refusals(looks: Sequence[_Look], names: Sequence[str], options: SingleOptions) -> dict[int, str]:
     """Why frames are left out before anything is matched, by index: black, blurred, or the same as another."""
     reasons, last = {}, -1
     sharpness = np.array([look.sharpness for look in looks])
@@ -215,7 +214,7 @@ def _verify(
 
 def _tie(
     features: Mapping[int, Features],
-    pairs: List[tuple[int, int]],
+    pairs: Sequence[tuple[int, int]],
     camera: pycolmap.Camera,
     matching: MatchingOptions,
     options: SingleOptions,
@@ -231,7 +230,7 @@ def _tie(
     return {pair: geometry for pair, geometry in zip(pairs, found, strict=True) if geometry is not None}
 
 
-def _pairs_at(kept: List[int], steps: List[int]) -> list[tuple[int, int]]:
+def _pairs_at(kept: Sequence[int], steps: Sequence[int]) -> list[tuple[int, int]]:
     """Pairs of kept frames so many frames apart."""
     return [(kept[i], kept[i + step]) for i in range(len(kept)) for step in steps if i + step < len(kept)]
 
@@ -363,7 +362,7 @@ def _joined(one: _Model, other: _Model, least: int) -> _Model | None:
     return _Model({**poses, **one.poses}, np.concatenate([one.points, moved]), seen)
 
 
-def _join_all(models: List[_Model], least: int) -> list[_Model]:
+def _join_all(models: Sequence[_Model], least: int) -> list[_Model]:
     """Models joined as long as any two share enough points; frames of a smaller one that a larger one has are its."""
     parts: list[_Model] = []
     for model in models:
@@ -378,7 +377,7 @@ def _join_all(models: List[_Model], least: int) -> list[_Model]:
 
 
 def _reconstruction(
-    model: _Model, camera: Camera, names: List[str], features: Mapping[int, Features]
+    model: _Model, camera: Camera, names: Sequence[str], features: Mapping[int, Features]
 ) -> Reconstruction:
     """A model as the noun; points that fewer than two frames still see are left out."""
     order = sorted(model.poses)
@@ -422,7 +421,7 @@ def _camera_of(found: pycolmap.Camera, given: Camera | None, options: SingleOpti
 
 
 def locate_single(
-    sequence: Sequence, options: SingleOptions | None = None, *, progress: Progress = silent
+    sequence: ImageSequence, options: SingleOptions | None = None, *, progress: Progress = silent
 ) -> SingleMotion:
     """The way of the one camera that took a sequence.
 
@@ -462,7 +461,7 @@ def locate_single(
 def _refined(
     part: _Model,
     camera: Camera,
-    sequence: Sequence,
+    sequence: ImageSequence,
     features: Mapping[int, Features],
     options: SingleOptions,
     progress: Progress,
@@ -480,7 +479,7 @@ def _refined(
     return adjust(longer, options.guided.adjustment)
 
 
-def _strangers(looks: List[_Look], names: List[str]) -> tuple[str, ...]:
+def _strangers(looks: Sequence[_Look], names: Sequence[str]) -> tuple[str, ...]:
     """A note where frames have little of the colours of a mouth."""
     strange = [name for name, look in zip(names, looks, strict=True) if look.mouth_share < 0.5]
     if not strange:
@@ -489,7 +488,7 @@ def _strangers(looks: List[_Look], names: List[str]) -> tuple[str, ...]:
     return (f"{which} show little that has the colour of teeth or gums: is this a film of teeth?",)
 
 
-def _notes(camera: Camera, calibrated: bool, parts: List[Reconstruction]) -> tuple[str, ...]:
+def _notes(camera: Camera, calibrated: bool, parts: Sequence[Reconstruction]) -> tuple[str, ...]:
     notes = []
     if not calibrated:
         notes.append(
@@ -502,7 +501,7 @@ def _notes(camera: Camera, calibrated: bool, parts: List[Reconstruction]) -> tup
     return tuple(notes)
 
 
-def _check_enough(kept: List[int], refused: Mapping[int, str], names: List[str]) -> None:
+def _check_enough(kept: Sequence[int], refused: Mapping[int, str], names: Sequence[str]) -> None:
     """Raises ReconstructionError where fewer than two frames are left."""
     if len(kept) >= 2:
         return
@@ -514,7 +513,10 @@ def _check_enough(kept: List[int], refused: Mapping[int, str], names: List[str])
 
 
 def _why_nothing(
-    sequence: Sequence, kept: List[int], features: Mapping[int, Features], ties: Mapping[tuple[int, int], object]
+    sequence: ImageSequence,
+    kept: Sequence[int],
+    features: Mapping[int, Features],
+    ties: Mapping[tuple[int, int], object],
 ) -> str:
     """What to tell a user whose frames could not be placed."""
     names, counts = sequence.names, [len(features[index]) for index in kept]
@@ -529,9 +531,9 @@ def _why_nothing(
 
 
 def _uses(
-    names: List[str],
+    names: Sequence[str],
     refused: Mapping[int, str],
-    parts: List[Reconstruction],
+    parts: Sequence[Reconstruction],
     ties: Mapping[tuple[int, int], object],
 ) -> tuple[FrameUse, ...]:
     """What became of every frame."""
