@@ -19,7 +19,7 @@ import numpy as np
 from run import conditions
 
 from cuspid import pipeline, storage
-from cuspid.geometry import Rigid3
+from cuspid.geometry import Rigid3, best_similarity
 from cuspid.pipeline import MotionMethod, ReconstructionOptions
 
 
@@ -28,8 +28,7 @@ def position_errors_um(found: Mapping[str, Rigid3], true: Mapping[str, Rigid3]) 
     names = [name for name in true if name in found]
     a = np.stack([found[name].inverse().translation for name in names])
     b = np.stack([true[name].inverse().translation for name in names])
-    u, _, vt = np.linalg.svd((b - b.mean(0)).T @ (a - a.mean(0)))
-    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    _, rotation, _ = best_similarity(a, b)
     return 1000 * np.linalg.norm((a - a.mean(0)) @ rotation.T - (b - b.mean(0)), axis=1)
 
 

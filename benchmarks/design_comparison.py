@@ -124,7 +124,11 @@ def main() -> None:
     cases = [case for case in wanted if not arguments.report or (folder / "cases" / f"{case.name}.json").exists()]
     work = partial(scan_case, folder=folder, options=options, trial=TRIAL)
     outcomes = run_grid(
-        cases, work, folder, workers=arguments.workers, progress=lambda done, total: print(f"{done} of {total} scans")
+        cases,
+        work,
+        folder,
+        workers=arguments.workers,
+        progress=lambda stage, done, total: print(f"{done} of {total} scans"),
     )
     rows = comparison_rows(outcomes, options)
     write_json(arguments.out / f"{name}.json", summary(options, wanted, outcomes, rows))

@@ -43,7 +43,7 @@ def timed(jaw: Jaw, *, workers: int | None = None, cluster: str | None = None) -
             OPTIONS,
             workers=workers,
             cluster=cluster,
-            progress=lambda done, total: begins.append(time.perf_counter()),
+            progress=lambda stage, done, total: begins.append(time.perf_counter()),
         )
     failed = [outcome.failure for outcome in outcomes if outcome.failure]
     if failed:

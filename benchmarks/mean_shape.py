@@ -28,11 +28,12 @@ from scipy.linalg import subspace_angles
 from cuspid import storage
 from cuspid.anatomy.mean_shape import MeanShapeOptions, mean_shape, vertex_areas
 from cuspid.anatomy.phantom import PhantomOptions
-from cuspid.anatomy.procrustes import best_rotation
+from cuspid.geometry import best_similarity
 from cuspid.jaw import GUM, Jaw, Landmark
 from cuspid.mesh import Mesh
 from cuspid.storage import read_shape_model, write_shape_model
 from cuspid.studies.reproduction.samples import MEAN_GROUP, iteration, make_phantom, make_population
+from cuspid.workers import usable_cores
 
 KNOWN = 6
 """Samples with a known mean."""
@@ -176,7 +177,7 @@ def _onto_landmarks(jaw: Jaw, reference: Jaw) -> Jaw:
     """The jaw, moved rigidly so that its landmarks lie best on the reference's."""
     labels = sorted(jaw.landmarks)
     own, other = (np.stack([one.landmarks[label].position for label in labels]) for one in (jaw, reference))
-    turn = best_rotation(own - own.mean(axis=0), other - other.mean(axis=0))
+    _, turn, _ = best_similarity(own, other)
     vertices = (jaw.mesh.vertices - own.mean(axis=0)) @ turn.T + other.mean(axis=0)
     return replace(jaw, mesh=Mesh(vertices, jaw.mesh.faces))
 
@@ -203,7 +204,7 @@ def main() -> None:
     result = {
         "population": population(options.work, options.count, options.edge_mm),
         "known_mean": known_mean(options.work, options.edge_mm),
-        "threads": os.cpu_count(),
+        "threads": usable_cores(),
         **conditions(),
     }
     options.out.parent.mkdir(parents=True, exist_ok=True)

@@ -138,8 +138,8 @@ def test_options_that_make_no_sense(change):
 def test_a_real_sweep_measures_the_surface_alone(swept):
     outcomes, folder, seen = swept
     assert [each.failure for each in outcomes] == [None, None]
-    assert seen[0] == (0, 2)
-    assert seen[-1] == (2, 2)
+    assert seen[0] == ("scans", 0, 2)
+    assert seen[-1] == ("scans", 2, 2)
     for each in outcomes:
         figures = each.figures
         assert 0.1 < figures["mean_abs_um"] < 25

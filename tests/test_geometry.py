@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 from hypothesis import given
+from hypothesis import strategies as st
 
-from cuspid.geometry import Rigid3
+from cuspid.geometry import Rigid3, best_similarity
 from strategies import points, rigid3s
 
 
@@ -35,6 +36,60 @@ def test_known_rotation():
     quarter_turn = Rigid3.from_rotation_vector(np.array([0, 0, np.pi / 2]), np.array([1.0, 0, 0]))
     np.testing.assert_allclose(quarter_turn.apply(np.array([[1.0, 0, 0]])), [[1, 1, 0]], atol=1e-12)
     np.testing.assert_allclose(quarter_turn.rotate(np.array([1.0, 0, 0])), [0, 1, 0], atol=1e-12)
+
+
+def rotated(rng: np.random.Generator, dimensions: int) -> np.ndarray:
+    """A random proper rotation."""
+    turn = np.linalg.qr(rng.normal(size=(dimensions, dimensions)))[0]
+    turn[0] *= np.sign(np.linalg.det(turn))
+    return turn
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([2, 3]))
+def test_a_similarity_is_found_exactly_whatever_the_weights(seed, dimensions):
+    rng = np.random.default_rng(seed)
+    turn, scale, shift = rotated(rng, dimensions), float(rng.uniform(0.2, 5)), rng.normal(size=dimensions)
+    points = rng.normal(size=(6, dimensions))
+    for weights in (None, rng.uniform(0.1, 1, 6)):
+        found = best_similarity(points, scale * points @ turn.T + shift, weights)
+        assert found[0] == pytest.approx(scale)
+        np.testing.assert_allclose(found[1], turn, atol=1e-8)
+        np.testing.assert_allclose(found[2], shift, atol=1e-8)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([2, 3]))
+def test_a_weight_of_two_is_a_point_given_twice(seed, dimensions):
+    source, target = np.random.default_rng(seed).normal(size=(2, 8, dimensions))
+    twice = [*range(8), 0, 5]
+    weighted = best_similarity(source, target, np.bincount(twice).astype(float))
+    for one, other in zip(weighted, best_similarity(source[twice], target[twice]), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([2, 3]))
+def test_no_similarity_nearby_is_nearer(seed, dimensions):
+    rng = np.random.default_rng(seed)
+    source, target, weights = *rng.normal(size=(2, 8, dimensions)), rng.uniform(0.1, 1, 8)
+    scale, rotation, shift = best_similarity(source, target, weights)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+
+    def misfit(scale, rotation, shift):
+        return weights @ np.sum((scale * source @ rotation.T + shift - target) ** 2, axis=1)
+
+    best = misfit(scale, rotation, shift)
+    for _ in range(10):
+        step = rng.normal(scale=0.01, size=(dimensions, dimensions))
+        turn = np.linalg.qr(np.eye(dimensions) + step - step.T)[0]
+        turn *= np.sign(np.diag(turn))
+        assert (
+            misfit(scale * rng.uniform(0.99, 1.01), turn @ rotation, shift + rng.normal(0, 0.01, dimensions))
+            > best - 1e-12
+        )
+
+
+def test_a_mirror_image_is_not_laid_on_by_reflection():
+    source = np.random.default_rng(0).normal(size=(9, 3))
+    assert np.linalg.det(best_similarity(source, source * [-1, 1, 1])[1]) == pytest.approx(1)
 
 
 def test_values_are_frozen():

@@ -58,10 +58,10 @@ def test_what_is_finished_is_not_run_again(tmp_path):
         grid_cases.leaves_a_mark,
         tmp_path / "out",
         workers=1,
-        progress=lambda done, total: seen.append((done, total)),
+        progress=lambda *step: seen.append(step),
     )
     assert (tmp_path / "calls").read_text().split() == ["1", "2", "3"]
-    assert seen == [(2, 3), (3, 3)]
+    assert seen == [("cases", 2, 3), ("cases", 3, 3)]
 
 
 def test_failed_cases_are_run_again_where_asked(tmp_path):

@@ -18,7 +18,6 @@ from cuspid.evaluation import panorama as evaluation
 from cuspid.evaluation.panorama import (
     PanoramaEvaluationOptions,
     Similarity2,
-    best_similarity,
     evaluate_panorama,
     grey,
     image_scores,
@@ -187,7 +186,7 @@ def test_the_best_similarity_is_found(turn: float, scale: float, shift: tuple[fl
     source = np.random.default_rng(seed).normal(0, 20, (30, 2))
     linear = scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     true = Similarity2(linear, np.array(shift))
-    found = best_similarity(source, true.apply(source))
+    found = Similarity2.best(source, true.apply(source))
     np.testing.assert_allclose(found.apply(source), true.apply(source), atol=1e-8)
     np.testing.assert_allclose(found.inverse().apply(true.apply(source)), source, atol=1e-8)
     assert found.scale == pytest.approx(scale)
@@ -197,7 +196,7 @@ def test_the_best_similarity_is_found(turn: float, scale: float, shift: tuple[fl
 def test_a_stretch_leaves_half_of_it_in_each_direction(stretch: float, seed: int) -> None:
     points = np.random.default_rng(seed).normal(0, 20, (4000, 2))
     stretched = points * [1 + stretch, 1]
-    left = best_similarity(stretched, points).apply(stretched) - points
+    left = Similarity2.best(stretched, points).apply(stretched) - points
     expected = stretch / 2 * np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1)))
     assert np.sqrt(np.mean(np.sum(left**2, axis=1))) == pytest.approx(expected, rel=0.12)
 

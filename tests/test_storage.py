@@ -17,6 +17,7 @@ from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw, Landmark, Sphere
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import MountedCamera, Rig
+from cuspid.storage.files import whole_files
 from strategies import cameras, rigid3s
 
 
@@ -305,6 +306,22 @@ def test_files_are_whole_or_absent(tmp_path):
         fill_the_disk()
     assert storage.read_json(path) == {"a": None, "b": 0.5}
     assert [item.name for item in tmp_path.iterdir()] == ["value.json"]
+
+
+def test_files_of_a_folder_are_there_together_or_not_at_all(tmp_path):
+    def write(text: str, *, fails: bool = False) -> None:
+        with whole_files(tmp_path / "model") as part:
+            for name in ("a.txt", "b.txt"):
+                (part / name).write_text(text)
+            if fails:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    write("first")
+    with pytest.raises(OutputError, match="disk is full"):
+        write("second", fails=True)
+    assert {file.name: file.read_text() for file in (tmp_path / "model").iterdir()} == dict.fromkeys(
+        ("a.txt", "b.txt"), "first"
+    )
 
 
 def test_a_film_that_the_disk_cannot_hold_is_no_film(tmp_path, monkeypatch):

@@ -38,7 +38,7 @@ class Scene(NamedTuple):
 
     def swept(self, **changes: object) -> HeightMap | None:
         sparse = height_map(self.motion, SurfaceOptions())
-        return sweep(self.motion, sparse, self.read, SweepOptions(**changes), progress=lambda *_: None)
+        return sweep(self.motion, sparse, self.read, SweepOptions(**changes))
 
 
 def true_places(pose: Rigid3, pixels: np.ndarray) -> np.ndarray:
@@ -155,7 +155,7 @@ def test_a_camera_that_stands_still_finds_no_surface(scene: Scene) -> None:
 
 def test_the_mosaic_shows_each_place_once(scene: Scene, surface: HeightMap) -> None:
     """What lies behind the bar is taken from frames that see it there, and not shown where none does."""
-    mosaic = compose(scene.motion, surface, scene.read, MosaicOptions(), progress=lambda *_: None)
+    mosaic = compose(scene.motion, surface, scene.read, MosaicOptions())
     rows, columns = np.nonzero(mosaic.frame >= 0)
     poses = list(scene.motion.rig_from_world.values())
     shown = np.full((len(rows), 3), np.nan)

@@ -1,7 +1,8 @@
-"""Rigid motions in three dimensions.
+"""Rigid motions in three dimensions, and how points are laid on others.
 
 Notation: a transform is named ``target_from_source``; ``x_in_target = target_from_source @ x_in_source``.
-Lengths are millimetres. There is no similarity transform on purpose: the rig fixes the scale.
+Lengths are millimetres. There is no similarity transform on purpose: the rig fixes the scale. Where nothing does (one
+camera, jaws of different size), :func:`best_similarity` tells the scale apart.
 """
 
 from __future__ import annotations
@@ -94,3 +95,22 @@ class Rigid3:
     def rotate(self, directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Turn directions, without translation."""
         return directions @ self.rotation.T
+
+
+def best_similarity(
+    source: Float[np.ndarray, "n d"], target: Float[np.ndarray, "n d"], weights: Float[np.ndarray, "n"] | None = None
+) -> tuple[float, Float[np.ndarray, "d d"], Float[np.ndarray, "d"]]:
+    """Scale s, proper rotation R and translation t for which ``s R x + t`` is nearest to the target, in any dimension.
+
+    Nearest in the sum of the squares, times ``weights`` where there are any (S. Umeyama, IEEE PAMI 13, 1991). The
+    rotation is also the best one where the scale is kept (W. Kabsch, Acta Cryst. A32, 1976).
+    """
+    shares = np.full(len(source), 1 / len(source)) if weights is None else weights / weights.sum()
+    from_centre, to_centre = shares @ source, shares @ target
+    centred = source - from_centre
+    u, spread, vt = np.linalg.svd((shares[:, None] * (target - to_centre)).T @ centred)
+    signs = np.ones(len(spread))
+    signs[-1] = np.sign(np.linalg.det(u @ vt))
+    rotation = u * signs @ vt
+    scale = float(np.sum(spread * signs) / np.sum(shares @ centred**2))
+    return scale, rotation, to_centre - scale * rotation @ from_centre

@@ -11,11 +11,8 @@ trueness       = evaluate(mesh, truth.jaw, scannable=...)
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
@@ -39,15 +36,16 @@ from cuspid.handpiece.brief import DesignBrief
 from cuspid.handpiece.optimise import Section
 from cuspid.handpiece.precision import NoiseModel, PrecisionMap, at_best, precision_map
 from cuspid.handpiece.visibility import Visibility, VisibilityOptions, scannable_faces, survey_visibility
+from cuspid.image_sequence import ImageSequence
 from cuspid.jaw import ARCHES, Arch, Jaw
 from cuspid.mesh import Mesh
 from cuspid.motion.colmap import locate_with_colmap, read_model, write_model
 from cuspid.motion.location import MotionOptions
 from cuspid.motion.location import locate as locate_with_rig
 from cuspid.motion.single import SingleOptions, locate_single
+from cuspid.progress import Progress, silent
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece
-from cuspid.sequence import Sequence as FrameSequence
 from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.blender import render_with_blender
 from cuspid.simulation.free_path import FreePathOptions, plan_free_path
@@ -62,20 +60,9 @@ from cuspid.surface.cleaning import CleaningOptions, clean
 from cuspid.surface.fusion import FusionOptions
 from cuspid.surface.fusion import fuse as fuse_depth_maps
 from cuspid.trueness import GroundTruth, Trueness
-
-Progress = Callable[[str, int, int], None]
-"""Told the stage, how much of it is done and how much there is."""
+from cuspid.workers import map_in_threads, usable_cores
 
 MotionMethod = Literal["rig", "colmap", "colmap-rig"]
-
-
-def silent(stage: str, done: int, total: int) -> None:
-    """A :data:`Progress` that says nothing."""
-
-
-def usable_cores() -> int:
-    """Cores that this process may run on: a case of a study is pinned to one."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 # --- What is scanned -----------------------------------------------------------------------------------------------
@@ -365,7 +352,7 @@ def measure_depth(
     def measure(frame: Frame) -> tuple[DepthMap, ...]:
         return estimator.measure(capture.images(frame), frame.name)
 
-    return _measure_all(capture.frames, measure, folder, partial(progress, "depth"))
+    return _measure_all(capture.frames, measure, folder, "depth", progress)
 
 
 def measure_temporal_depth(
@@ -388,25 +375,23 @@ def measure_temporal_depth(
             capture.handpiece, capture.images(frame), capture.images(after), after_from_rig, frame.name, options
         )
 
-    return _measure_all(located[:-1], measure, folder, partial(progress, "temporal depth"))
+    return _measure_all(located[:-1], measure, folder, "temporal depth", progress)
 
 
 def _measure_all(
     frames: Sequence[Frame],
     measure: Callable[[Frame], tuple[DepthMap, ...]],
     folder: Path,
-    progress: Callable[[int, int], None],
+    stage: str,
+    progress: Progress,
 ) -> StoredDepthMaps:
-    files = [folder / f"{frame.name}.npz" for frame in frames]
-
-    def keep(frame: Frame, file: Path) -> None:
+    def keep(frame: Frame) -> Path:
+        file = folder / f"{frame.name}.npz"
         if not file.exists():
             storage.write_depth_maps(file, measure(frame))
+        return file
 
-    with ThreadPoolExecutor(usable_cores()) as pool:
-        for done, _ in enumerate(pool.map(keep, frames, files), start=1):
-            progress(done, len(files))
-    return StoredDepthMaps(files)
+    return StoredDepthMaps(map_in_threads(keep, frames, stage=stage, progress=progress))
 
 
 def locate(
@@ -507,7 +492,7 @@ class StitchOptions(OrthoOptions):
     """The method thesis."""
 
 
-def stitch(sequence: FrameSequence, options: StitchOptions, *, progress: Progress = silent) -> tuple[Stitched, ...]:
+def stitch(sequence: ImageSequence, options: StitchOptions, *, progress: Progress = silent) -> tuple[Stitched, ...]:
     """The panorama of an arch from the frames of one camera; several parts where the sequence broke, largest first.
 
     Raises ReconstructionError, naming the frames, where nothing can be placed.

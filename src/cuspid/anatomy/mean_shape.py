@@ -14,9 +14,7 @@ Frame: the mean of the samples' occlusal frames, mm.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -28,10 +26,9 @@ from cuspid.anatomy.procrustes import Superposition, dimension, superpose
 from cuspid.errors import InputError
 from cuspid.jaw import Jaw, Landmark
 from cuspid.mesh import Mesh
+from cuspid.progress import Progress, silent
 from cuspid.shape_model import MeanStep, ShapeModel
-
-Progress = Callable[[str, int, int], None]
-"""Told the stage, how much of it is done and how much there is."""
+from cuspid.workers import map_in_threads
 
 _NO_VARIANCE = 1e-12
 """Modes with a smaller share of the variance than this are rounding."""
@@ -81,12 +78,8 @@ class _Samples:
         return Target.of(mesh, labels_or_gum(jaw.face_labels if self.by_tooth else None, len(mesh.faces)))
 
 
-def quiet(stage: str, done: int, total: int) -> None:
-    """A :data:`Progress` that says nothing."""
-
-
 def mean_shape(
-    jaws: Mapping[str, Jaw], options: MeanShapeOptions = MeanShapeOptions(), *, progress: Progress = quiet
+    jaws: Mapping[str, Jaw], options: MeanShapeOptions = MeanShapeOptions(), *, progress: Progress = silent
 ) -> ShapeModel:
     """The mean jaw and the principal modes of at least two jaws of one arch that have landmarks.
 
@@ -176,19 +169,16 @@ def _iterate(
 def _lay_on_all(
     mean: Mesh, template: Template, samples: _Samples, options: MeanShapeOptions, stage: str, progress: Progress
 ) -> list[Fit]:
-    def lay(number: int, jaw: Jaw) -> Fit:
+    jaws = list(samples.jaws.values())
+
+    def lay(number: int) -> Fit:
         start = warp(samples.pose.mean, samples.pose.aligned[number], mean.vertices)
         if options.correspondence == "landmarks":
             return Fit(vertices=start, covered=np.zeros(len(start), dtype=bool))
-        return fit(template, start, samples.target(number, jaw), options.fit)
+        return fit(template, start, samples.target(number, jaws[number]), options.fit)
 
-    progress(stage, 0, len(samples.jaws))
-    fits: list[Fit] = []
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for found in pool.map(lay, range(len(samples.jaws)), samples.jaws.values()):
-            fits.append(found)
-            progress(stage, len(fits), len(samples.jaws))
-    return fits
+    progress(stage, 0, len(jaws))
+    return map_in_threads(lay, range(len(jaws)), stage=stage, progress=progress)
 
 
 def _step(mean: Mesh, moved: Mesh, fits: list[Fit]) -> MeanStep:

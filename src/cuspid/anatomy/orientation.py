@@ -17,7 +17,7 @@ from scipy.ndimage import maximum_filter
 from scipy.spatial import ConvexHull, cKDTree
 
 from cuspid.errors import InputError
-from cuspid.geometry import Rigid3
+from cuspid.geometry import Rigid3, best_similarity
 from cuspid.jaw import GUM, Arch
 from cuspid.mesh import Mesh
 from cuspid.storage import MM_PER_UNIT, Unit
@@ -223,7 +223,7 @@ def _fit_arch(places: Float[np.ndarray, "n 2"], angle: float) -> tuple[float, Fl
         source = np.concatenate([arch[from_places], arch[near]])
         target = np.concatenate([places, places[to_places[near]]])
         weights = np.concatenate([np.full(len(places), 1 / len(places)), np.full(near.sum(), 1 / len(arch))])
-        laid = _similarity(source, target, weights, arch)
+        laid = _laid(source, target, weights, arch)
     there, _ = cKDTree(laid).query(places)
     back, _ = tree.query(laid)
     front = laid[30] - laid[[0, -1]].mean(axis=0)
@@ -231,20 +231,16 @@ def _fit_arch(places: Float[np.ndarray, "n 2"], angle: float) -> tuple[float, Fl
     return float(misfit / 2), front / np.linalg.norm(front)
 
 
-def _similarity(
+def _laid(
     source: Float[np.ndarray, "n 2"],
     target: Float[np.ndarray, "n 2"],
     weights: Float[np.ndarray, "n"],
     points: Float[np.ndarray, "m 2"],
 ) -> Float[np.ndarray, "m 2"]:
     """``points`` moved by the similarity, of moderate scale, that lays ``source`` best on ``target``."""
-    weights = weights / weights.sum()
-    from_centre, to_centre = weights @ source, weights @ target
-    a, b = (source - from_centre) @ [1, 1j], (target - to_centre) @ [1, 1j]
-    factor = np.sum(weights * a.conj() * b) / np.sum(weights * np.abs(a) ** 2)
-    factor *= np.clip(np.abs(factor), 0.75, 1.3) / max(np.abs(factor), 1e-9)
-    moved = factor * ((points - from_centre) @ [1, 1j])
-    return np.stack([moved.real, moved.imag], axis=1) + to_centre
+    scale, rotation, _ = best_similarity(source, target, weights)
+    from_centre, to_centre = (np.average(each, axis=0, weights=weights) for each in (source, target))
+    return np.asarray(np.clip(scale, 0.75, 1.3) * (points - from_centre) @ rotation.T + to_centre)
 
 
 def check_scale(mesh: Mesh, unit: Unit = "mm") -> tuple[str, ...]:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.errors import InputError
+from cuspid.geometry import best_similarity
 
 _MOST_ROUNDS = 1000
 _STILL = 1e-13
@@ -63,7 +64,7 @@ def superpose(samples: Float[np.ndarray, "n l 3"], *, scale: bool = False) -> Su
     centres = samples.mean(axis=1)
     centred = samples - centres[:, None]
     rotations, scales, mean = _consensus(centred, scale)
-    turn = best_rotation(mean, centred.mean(axis=0))
+    _, turn, _ = best_similarity(mean, centred.mean(axis=0))
     sizes = np.linalg.norm(centred, axis=(1, 2))
     factor = sizes.mean() / np.linalg.norm(mean) if scale else 1.0
     rotations, scales = turn @ rotations, factor * scales
@@ -75,19 +76,13 @@ def superpose(samples: Float[np.ndarray, "n l 3"], *, scale: bool = False) -> Su
     )
 
 
-def best_rotation(source: Float[np.ndarray, "l 3"], target: Float[np.ndarray, "l 3"]) -> Float[np.ndarray, "3 3"]:
-    """The proper rotation that brings centred points nearest to others (W. Kabsch, Acta Cryst. A32, 1976)."""
-    u, _, vt = np.linalg.svd(target.T @ source)
-    return np.asarray(u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt)
-
-
 def _consensus(
     centred: Float[np.ndarray, "n l 3"], scale: bool
 ) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n"], Float[np.ndarray, "l 3"]]:
     """Rotations and scales that lay centred configurations on their mean, and the mean."""
     mean, scales = centred[0], np.ones(len(centred))
     for _ in range(_MOST_ROUNDS):
-        rotations = np.stack([best_rotation(sample, mean) for sample in centred])
+        rotations = np.stack([best_similarity(sample, mean)[1] for sample in centred])
         turned = np.einsum("nij,nlj->nli", rotations, centred)
         if scale:
             scales = _best_scales(turned)

@@ -78,7 +78,7 @@ def compare(
             trial,
             workers=workers,
             cluster=cluster,
-            progress=lambda done, total: progress("scans", done, total),
+            progress=progress,
         )
     _save(out, outcomes, options)
 

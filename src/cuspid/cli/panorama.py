@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -13,10 +13,11 @@ from tyro.conf import Positional
 from cuspid import pipeline, storage
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
+from cuspid.image_sequence import ImageSequence
 from cuspid.panorama import FrameUse
 from cuspid.pipeline import StitchOptions
+from cuspid.progress import Progress
 from cuspid.reporting.panorama_figures import save_camera_path
-from cuspid.sequence import Sequence
 from cuspid.stitching.ortho import Stitched
 
 
@@ -37,7 +38,7 @@ def stitch(
             one (and without a capture's own) the focal length is found from the images.
     """
     with show_progress() as progress:
-        sequence = _read(frames, out, calibration, partial(progress, "decoding"))
+        sequence = _read(frames, out, calibration, progress)
         hashes = _hashes(sequence, calibration)
         with storage.claimed_folder(out, "stitch", {"stitch": options}, hashes, replace=True):
             parts = pipeline.stitch(sequence, options, progress=progress)
@@ -48,7 +49,7 @@ def stitch(
     report(out)
 
 
-def _read(frames: Path, out: Path, calibration: Path | None, progress: Callable[[int, int], None]) -> Sequence:
+def _read(frames: Path, out: Path, calibration: Path | None, progress: Progress) -> ImageSequence:
     """The frames; those of a video are decoded into the folder of the results, which is home to this video alone."""
     read = partial(storage.read_sequence, frames, out / "frames", calibration=calibration, progress=progress)
     if not frames.is_file():
@@ -57,7 +58,7 @@ def _read(frames: Path, out: Path, calibration: Path | None, progress: Callable[
         return read()
 
 
-def _hashes(sequence: Sequence, calibration: Path | None) -> dict[str, str]:
+def _hashes(sequence: ImageSequence, calibration: Path | None) -> dict[str, str]:
     """Of the list of frames with their sizes, and of the calibration."""
     listing = [(path.name, path.stat().st_size) for path in sequence.paths]
     hashes = {"frames": hashlib.sha256(repr(listing).encode()).hexdigest()}

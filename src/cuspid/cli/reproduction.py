@@ -86,9 +86,7 @@ def _run(out: Path, wanted: Mapping[str, tuple[str, ...]], quick: bool, workers:
         return {}
     console.print(f"to run: {', '.join(wanted)}", highlight=False)
     with show_progress() as progress:
-        failures = run_missing(
-            out, wanted, quick=quick, workers=workers, progress=lambda done, total: progress("runs", done, total)
-        )
+        failures = run_missing(out, wanted, quick=quick, workers=workers, progress=progress)
     for name, reason in failures.items():
         console.print(f"failed: {name}: {reason}", highlight=False)
     return failures

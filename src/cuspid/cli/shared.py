@@ -9,13 +9,15 @@ from pathlib import Path
 from typing import Literal
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bars
 from tyro.conf import arg
 
 from cuspid import pipeline, storage
 from cuspid.anatomy.phantom import PhantomOptions, build_phantom
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.jaw import Arch, Jaw
+from cuspid.progress import Progress
 from cuspid.rig import Handpiece
 
 console = Console(stderr=True)
@@ -47,10 +49,10 @@ class Probe:
 
 
 @contextmanager
-def show_progress() -> Iterator[pipeline.Progress]:
+def show_progress() -> Iterator[Progress]:
     """A bar for each stage of long work, with the time left."""
     columns = (TextColumn("{task.description:>12}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console) as bars:
+    with Bars(*columns, console=console) as bars:
         tasks: dict[str, TaskID] = {}
 
         def report(stage: str, done: int, total: int) -> None:

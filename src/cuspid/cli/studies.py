@@ -63,7 +63,7 @@ def sweep(
                 workers=workers,
                 cluster=cluster,
                 retry_failed=retry_failed,
-                progress=lambda done, total: progress("scans", done, total),
+                progress=progress,
             )
         _save(out, outcomes, options)
 

@@ -27,7 +27,7 @@ from skimage.metrics import structural_similarity
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET
 from cuspid.errors import InputError
-from cuspid.geometry import Rigid3
+from cuspid.geometry import Rigid3, best_similarity
 from cuspid.panorama import Panorama
 from cuspid.trueness import NOTHING, GroundTruth, OcclusalView
 
@@ -171,6 +171,12 @@ class Similarity2:
         """Lengths are multiplied by this."""
         return float(np.sqrt(abs(np.linalg.det(self.linear))))
 
+    @staticmethod
+    def best(source: Float[np.ndarray, "n 2"], target: Float[np.ndarray, "n 2"]) -> Similarity2:
+        """That which lays points on others (least squares)."""
+        scale, rotation, shift = best_similarity(source, target)
+        return Similarity2(scale * rotation, shift)
+
     def apply(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
         """Move points."""
         return points @ self.linear.T + self.shift
@@ -179,15 +185,6 @@ class Similarity2:
         """The way back."""
         back = np.linalg.inv(self.linear)
         return Similarity2(back, -back @ self.shift)
-
-
-def best_similarity(source: Float[np.ndarray, "n 2"], target: Float[np.ndarray, "n 2"]) -> Similarity2:
-    """Least squares, without reflection (Umeyama 1991): complex regression in two dimensions."""
-    a, b = (points @ [1, 1j] for points in (source, target))
-    centred = a - a.mean()
-    factor = np.vdot(centred, b - b.mean()) / np.vdot(centred, centred)
-    linear = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
-    return Similarity2(linear, target.mean(axis=0) - linear @ source.mean(axis=0))
 
 
 # --- Where pixels truly are ------------------------------------------------------------------------------------------
@@ -442,7 +439,7 @@ class _Comparison:
         """The alignment from where the pixels truly are."""
         if len(traced.labels) < FEWEST_TEETH_PX:
             return self._failed(f"only {len(traced.labels)} of the sampled pixels show teeth")
-        plane_from_panorama = best_similarity(traced.placed, traced.true_mm[:, :2])
+        plane_from_panorama = Similarity2.best(traced.placed, traced.true_mm[:, :2])
         errors = np.linalg.norm(plane_from_panorama.apply(traced.placed) - traced.true_mm[:, :2], axis=1)
         failure = self._too_few_frames() or self._collapsed(plane_from_panorama.scale, float(np.median(errors)))
         if failure:
@@ -450,7 +447,7 @@ class _Comparison:
         shot_from_panorama = None
         if self.shot is not None:
             on_plane = self.shot.on_plane(traced.true_mm)
-            shot_from_panorama = best_similarity(traced.placed, on_plane)
+            shot_from_panorama = Similarity2.best(traced.placed, on_plane)
         geometry = self._geometry(errors, plane_from_panorama.scale)
         molars = inter_molar_error(traced, 1.0 if self.panorama.mm_per_px else plane_from_panorama.scale)
         made = self._scored(plane_from_panorama, shot_from_panorama, geometry=geometry, inter_molar_error_mm=molars)

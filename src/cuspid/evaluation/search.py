@@ -10,7 +10,6 @@ Frames: ``fixed`` and ``moving``. A batch of poses ``fixed_from_moving`` is an a
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import no_type_check
 
@@ -23,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
+from cuspid.workers import map_in_threads
 
 _MAX_VOXELS = 1e6
 _TESTED = 144
@@ -146,8 +146,7 @@ def _try_all(cloud: _Cloud, table: _Table, cap_mm: float, options: SearchOptions
         turned = np.concatenate([points, normals], axis=2).astype(np.float32)
         return _score_turns(turned, targets, target_frames, fixed, table.nearest, table.origin, table.pitch_mm, cap_mm)
 
-    with ThreadPoolExecutor() as pool:
-        scores = np.stack(list(pool.map(score, range(len(anchors)))))
+    scores = np.stack(map_in_threads(score, range(len(anchors))))
     best = np.argsort(scores, axis=None, kind="stable")[: options.candidates]
     anchor, target, turn = np.unravel_index(best, scores.shape)
     rotation = target_frames[target] @ anchor_turns[anchor, turn]

@@ -13,7 +13,7 @@ always the same ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -30,6 +30,7 @@ from cuspid.handpiece.optics import Optics
 from cuspid.handpiece.precision import NoiseModel, bound_rms_um, noise_px, projection_jacobian
 from cuspid.handpiece.visibility import VisibilityOptions, visible_faces
 from cuspid.mesh import Mesh
+from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, MountedCamera
 
 _REACH_MM = 11.0
@@ -188,7 +189,7 @@ def optimise_handpiece(
     gap_mm: float,
     options: SearchOptions = SearchOptions(),
     *,
-    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+    progress: Progress = silent,
 ) -> Design:
     """The cheapest handpiece of the family by precision, coverage and cameras, conditions first.
 

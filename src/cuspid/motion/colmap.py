@@ -8,7 +8,6 @@ repeatable bit for bit.
 from __future__ import annotations
 
 import shutil
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -29,6 +28,7 @@ from cuspid.geometry import Rigid3
 from cuspid.motion.adjustment import residuals_px
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import Rig
+from cuspid.storage.files import whole_files
 
 MODEL_FILES = ("cameras", "images", "points3D")
 """Files of a sparse model, ``.bin`` or ``.txt``; newer ones also have ``rigs`` and ``frames``."""
@@ -142,17 +142,14 @@ def to_colmap(
 def write_model(folder: Path, found: Reconstruction, capture: Capture) -> None:
     """Write COLMAP's sparse model (binary) to a folder, whole or not at all. Raises OutputError."""
     model = to_colmap(found, capture.frames, capture.source.suffix)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".part-") as part:
+    with whole_files(folder) as part:
+        try:
             model.write(part)
-            written = pycolmap.Reconstruction(part)
-            if (written.num_points3D(), written.num_reg_images()) != (model.num_points3D(), model.num_reg_images()):
-                raise OSError("the disk is full")
-            for file in sorted(Path(part).iterdir()):
-                file.replace(folder / file.name)
-    except (OSError, RuntimeError, ValueError) as error:
-        raise OutputError(f"{folder}: the sparse model cannot be written ({error}); free some space") from error
+            written = _read(part)
+        except (InputError, RuntimeError, ValueError) as error:
+            raise OutputError(f"{folder}: the sparse model cannot be written ({error}); free some space") from error
+        if (written.num_points3D(), written.num_reg_images()) != (model.num_points3D(), model.num_reg_images()):
+            raise OutputError(f"{folder}: the sparse model is not whole; free some space")
 
 
 # --- reading -----------------------------------------------------------------------------------------------------

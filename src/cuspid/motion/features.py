@@ -8,10 +8,7 @@ handpiece keep their roll from one frame to the next, so fixing the orientation 
 from __future__ import annotations
 
 import hashlib
-import os
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
@@ -22,10 +19,9 @@ from jaxtyping import Float, Int, UInt8
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET
 from cuspid.capture import Capture, Frame
-from cuspid.errors import OutputError
-
-Progress = Callable[[str, int, int], None]
-"""Called with (stage, done, total)."""
+from cuspid.progress import Progress, silent
+from cuspid.storage.files import write_arrays
+from cuspid.workers import map_in_threads
 
 DESCRIPTOR_NORM = 512.0
 """Euclidean length of a descriptor before rounding."""
@@ -132,22 +128,8 @@ def _load(path: Path, key: str) -> Features | None:
 
 def _keep(path: Path, key: str, features: Features) -> None:
     """Write features whole or not at all. Raises OutputError."""
-    part = path.with_suffix(".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("wb") as file:
-            np.savez(
-                file,
-                key=np.array(key),
-                pixels=features.pixels,
-                descriptors=features.descriptors,
-                colors=features.colors,
-            )
-        part.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            part.unlink()
-        raise OutputError(f"{path}: cannot be written ({error.strerror}); free some space") from error
+    arrays = {"pixels": features.pixels, "descriptors": features.descriptors, "colors": features.colors}
+    write_arrays(path, {"key": np.array(key), **arrays})
 
 
 def _detect_kept(capture: Capture, frame: Frame, camera: str, options: FeatureOptions, cache: Path | None) -> Features:
@@ -168,20 +150,15 @@ def detect_all(
     capture: Capture,
     options: FeatureOptions | None = None,
     *,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     cache: Path | None = None,
 ) -> Mapping[tuple[str, str], Features]:
     """Features of every image by (frame, camera). Finished images are kept in ``cache``. Raises InputError."""
     options = options or FeatureOptions()
     images = [(frame, camera) for frame in capture.frames for camera in frame.cameras]
-    found: dict[tuple[str, str], Features] = {}
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        jobs = [pool.submit(_detect_kept, capture, *image, options, cache) for image in images]
-        try:
-            for (frame, camera), job in zip(images, jobs, strict=True):
-                found[frame.name, camera] = job.result()
-                if progress is not None:
-                    progress("features", len(found), len(images))
-        finally:
-            pool.shutdown(cancel_futures=True)
-    return found
+
+    def kept(image: tuple[Frame, str]) -> Features:
+        return _detect_kept(capture, *image, options, cache)
+
+    found = map_in_threads(kept, images, stage="features", progress=progress)
+    return {(frame.name, camera): features for (frame, camera), features in zip(images, found, strict=True)}

@@ -5,9 +5,7 @@ The first rounds look far beyond what the poses say, so that their errors are no
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import no_type_check
 
@@ -19,10 +17,12 @@ from scipy.spatial import KDTree
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.motion.adjustment import AdjustmentOptions, adjust
-from cuspid.motion.features import Features, Progress
+from cuspid.motion.features import Features
 from cuspid.motion.pairs import MatchingOptions, View, make_view, match_guided
 from cuspid.motion.tracks import intersect_rays
+from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, Tracks
+from cuspid.workers import map_in_threads
 
 _DEPTH = 14.0
 """Depth to which a model is scaled here: guided matching takes lengths for millimetres."""
@@ -114,7 +114,7 @@ def refine(
     features: Sequence[Features],
     options: GuidedOptions,
     *,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Reconstruction:
     """The model of one camera with refined poses and new tracks; ``features`` of its frames, in their order.
 
@@ -128,8 +128,7 @@ def refine(
         limit_px = options.start_px / (1 if number == 0 else 2)
         found = _triangulated(model, features, views, track, image_of, limit_px, options)
         model = _rescaled(adjust(found, replace(options.adjustment, start_px=limit_px)))
-        if progress is not None:
-            progress("refining", number + 1, len(options.tolerances_px))
+        progress("refining", number + 1, len(options.tolerances_px))
     return model
 
 
@@ -173,8 +172,7 @@ def _tracks(
         found = match_guided(views[one], views[other], motion, bounds[one], bounds[other], matching)
         return found + [starts[one], starts[other]]
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        matches = np.concatenate([np.zeros((0, 2), np.int64), *pool.map(match, pairs)])
+    matches = np.concatenate([np.zeros((0, 2), np.int64), *map_in_threads(match, pairs)])
     image_of = np.repeat(np.arange(len(views)), sizes)
     return join_in_order(matches, image_of), image_of
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from pathlib import Path as FilePath
-from typing import TypeVar
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -18,11 +15,11 @@ from cuspid.capture import Capture
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.motion.adjustment import AdjustmentOptions, adjust, calibration_sigma_px
-from cuspid.motion.features import FeatureOptions, Features, Progress, detect_all
+from cuspid.motion.features import FeatureOptions, Features, detect_all
 from cuspid.motion.odometry import (
     Cloud,
     OdometryOptions,
-    Path,
+    Trajectory,
     Views,
     chain,
     find_edges,
@@ -31,10 +28,10 @@ from cuspid.motion.odometry import (
 )
 from cuspid.motion.pairs import MatchingOptions, frame_pairs, make_view, match_guided
 from cuspid.motion.tracks import intersect_rays, join, thin
+from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import Handpiece, Rig
-
-_T = TypeVar("_T")
+from cuspid.workers import map_in_threads
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,17 +66,6 @@ def _timed(log: dict[str, float], stage: str) -> Iterator[None]:
     start = time.perf_counter()
     yield
     log[f"{stage}_s"] = time.perf_counter() - start
-
-
-def _in_threads(work: Callable[[int], _T], count: int, stage: str, progress: Progress | None) -> list[_T]:
-    """``work(0)`` to ``work(count - 1)`` in threads, results in order."""
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        results = []
-        for result in pool.map(work, range(count)):
-            results.append(result)
-            if progress is not None:
-                progress(stage, len(results), count)
-    return results
 
 
 def _depth_bounds(
@@ -183,16 +169,16 @@ def _link(
     poses: Sequence[Rigid3],
     handpiece: Handpiece,
     options: MotionOptions,
-    progress: Progress | None,
+    progress: Progress,
 ) -> Tracks:
     """Tracks over the located frames: the matches within frames and, guided by the poses, between them."""
     numbering = _Numbering.of(frames, handpiece.rig)
     pairs = frame_pairs(len(frames), options.reach)
 
-    def work(index: int) -> Int[np.ndarray, "k 2"]:
-        return _match_frames(*pairs[index], frames, clouds, poses, handpiece, options, numbering.starts)
+    def match(pair: tuple[int, int]) -> Int[np.ndarray, "k 2"]:
+        return _match_frames(*pair, frames, clouds, poses, handpiece, options, numbering.starts)
 
-    between = _in_threads(work, len(pairs), "matching", progress)
+    between = map_in_threads(match, pairs, stage="matching", progress=progress)
     image = numbering.frame * len(handpiece.rig.names) + numbering.camera
     matches = np.concatenate([*_within_frames(clouds, numbering.starts), *between])
     track = join(matches, image)
@@ -203,13 +189,13 @@ def _link(
     return _triangulated(frames, poses, handpiece.rig, track, numbering)
 
 
-def _require_enough(path: Path, clouds: Sequence[Cloud], options: MotionOptions) -> None:
+def _require_enough(trajectory: Trajectory, clouds: Sequence[Cloud], options: MotionOptions) -> None:
     """Raise ReconstructionError where too few frames are located."""
-    placed, total = len(path.rig_from_world), len(clouds)
+    placed, total = len(trajectory.rig_from_world), len(clouds)
     if placed >= options.minimum_located * total and (placed > 1 or total == 1):
         return
-    shown = "; ".join(f"{d.what}: {d.reason}" for d in path.dropped[:3])
-    more = f"; and {len(path.dropped) - 3} more" if len(path.dropped) > 3 else ""
+    shown = "; ".join(f"{d.what}: {d.reason}" for d in trajectory.dropped[:3])
+    more = f"; and {len(trajectory.dropped) - 3} more" if len(trajectory.dropped) > 3 else ""
     typical = int(np.median([len(cloud.points) for cloud in clouds]))
     raise ReconstructionError(
         f"motion: only {placed} of {total} frames could be placed, with {typical} points in a typical frame ({shown}"
@@ -234,7 +220,7 @@ def locate_features(
     names: Sequence[str],
     options: MotionOptions,
     *,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Reconstruction:
     """As :func:`locate`, from the keypoints by (frame, camera) of the frames ``names`` in the order of capture.
 
@@ -248,23 +234,23 @@ def locate_features(
     ]
     with _timed(log, "triangulation"):
         pairs = rig.stereo_pairs(handpiece.working_distance_mm)
-        clouds = _in_threads(
-            lambda f: triangulate_frame(handpiece, pairs, frames[f], options.within),
-            len(frames),
-            "triangulation",
-            progress,
+        clouds = map_in_threads(
+            lambda views: triangulate_frame(handpiece, pairs, views, options.within),
+            frames,
+            stage="triangulation",
+            progress=progress,
         )
     with _timed(log, "odometry"):
-        path = chain(find_edges(rig, frames, clouds, options.odometry, options.seed), names, options.odometry)
-    _require_enough(path, clouds, options)
+        trajectory = chain(find_edges(rig, frames, clouds, options.odometry, options.seed), names, options.odometry)
+    _require_enough(trajectory, clouds, options)
     with _timed(log, "matching"):
-        frames, clouds = [frames[f] for f in path.rig_from_world], [clouds[f] for f in path.rig_from_world]
-        tracks = _link(frames, clouds, list(path.rig_from_world.values()), handpiece, options, progress)
+        frames, clouds = [frames[f] for f in trajectory.rig_from_world], [clouds[f] for f in trajectory.rig_from_world]
+        tracks = _link(frames, clouds, list(trajectory.rig_from_world.values()), handpiece, options, progress)
     start = Reconstruction(
         rig=rig,
-        rig_from_world={names[f]: pose for f, pose in path.rig_from_world.items()},
+        rig_from_world={names[f]: pose for f, pose in trajectory.rig_from_world.items()},
         tracks=tracks,
-        dropped=path.dropped,
+        dropped=trajectory.dropped,
     )
     with _timed(log, "adjustment"):
         adjusted = adjust(start, options.adjustment)
@@ -275,8 +261,8 @@ def locate(
     capture: Capture,
     options: MotionOptions | None = None,
     *,
-    progress: Progress | None = None,
-    cache: FilePath | None = None,
+    progress: Progress = silent,
+    cache: Path | None = None,
 ) -> Reconstruction:
     """Metric poses of the frames and a sparse model; finished images are kept in ``cache`` for a later run.
 

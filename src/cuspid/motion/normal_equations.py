@@ -6,13 +6,13 @@ and H their direct part, the reduced system is H - W V^-1 W^T.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple, no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float
 from numba import njit
+
+from cuspid.workers import map_slices
 
 POSE = 6
 """Unknowns of a frame."""
@@ -20,6 +20,7 @@ CALIBRATION = 14
 """Unknowns of a camera: 6 of its place in the rig, 8 of its lens."""
 _COLUMNS = 3 + POSE + CALIBRATION
 _PARTS = 4
+"""Fixed, for the order of a sum shows in its last bits: the result must not depend on the number of cores."""
 _NEAREST_MM = 1e-3
 _SETTLING = 4
 """Most steps of a point after the rest has moved."""
@@ -392,24 +393,17 @@ def _settle(state, observations, weighting, first, last):
                 break
 
 
-def _in_parts(work: Callable[[int, int], Any], count: int) -> list[Any]:
-    """``work(first, last)`` on each of a fixed number of ranges, in threads; results in the order of the ranges."""
-    edges = np.linspace(0, count, _PARTS + 1).astype(int).tolist()
-    with ThreadPoolExecutor(_PARTS) as pool:
-        return list(pool.map(work, edges[:-1], edges[1:]))
-
-
 def normal_equations(state: State, observations: Observations, weighting: Weighting) -> System:
     """Reduced normal equations of all observations and of the prior of the calibration."""
     size = POSE * (len(state.frame_rotation) - 1)
     total = size + (state.whitened.size if weighting.calibrated else 0)
 
-    def part(first: int, last: int) -> System:
+    def part(points: slice) -> System:
         system = System(np.zeros((total, total)), np.zeros(total), np.zeros(total))
-        _accumulate(state, observations, weighting, first, last, system)
+        _accumulate(state, observations, weighting, points.start, points.stop, system)
         return system
 
-    parts = _in_parts(part, len(state.points))
+    parts = map_slices(part, len(state.points), _PARTS)
     matrix, gradient, diagonal = (sum(terms[1:], terms[0]) for terms in zip(*parts, strict=True))
     if weighting.calibrated:
         prior = np.arange(size, total)
@@ -423,20 +417,24 @@ def substitute(
     state: State, observations: Observations, weighting: Weighting, step: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "p 3"]:
     """The points after the reduced unknowns have made their step."""
-    points = np.empty_like(state.points)
+    moved = np.empty_like(state.points)
 
-    def part(first: int, last: int) -> None:
-        _substitute(state, observations, weighting, step, first, last, points)
+    def part(points: slice) -> None:
+        _substitute(state, observations, weighting, step, points.start, points.stop, moved)
 
-    _in_parts(part, len(points))
-    return points
+    map_slices(part, len(moved), _PARTS)
+    return moved
 
 
 def settle(state: State, observations: Observations, weighting: Weighting) -> State:
     """The state with each point where its rays meet best, poses and calibration being held."""
     settled = state._replace(points=state.points.copy())
     held = weighting._replace(calibrated=False)
-    _in_parts(lambda first, last: _settle(settled, observations, held, first, last), len(state.points))
+
+    def part(points: slice) -> None:
+        _settle(settled, observations, held, points.start, points.stop)
+
+    map_slices(part, len(state.points), _PARTS)
     return settled
 
 

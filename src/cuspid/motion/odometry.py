@@ -7,9 +7,7 @@ relative to it follows from where all cameras see them there (generalised absolu
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,6 +23,7 @@ from cuspid.motion.features import Features, spread
 from cuspid.motion.pairs import MatchingOptions, View, match_guided, match_unguided
 from cuspid.motion.tracks import intersect_rays, join
 from cuspid.rig import Handpiece, Rig
+from cuspid.workers import map_in_threads
 
 Views = Mapping[str, View]
 """Keypoints of one frame by camera."""
@@ -81,7 +80,7 @@ class Edge:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Path:
+class Trajectory:
     """The largest set of frames that are tied to each other."""
 
     rig_from_world: Mapping[int, Rigid3]
@@ -262,16 +261,16 @@ def find_edges(
     rig: Rig, frames: Sequence[Views], clouds: Sequence[Cloud], options: OdometryOptions, seed: int
 ) -> dict[tuple[int, int], Edge]:
     """Relative poses at +1 and, between parts that are still apart, at +2 and farther."""
+
+    def find(pair: tuple[int, int]) -> Edge:
+        i, j = pair
+        return relative_pose(rig, clouds[i], frames[i], frames[j], options, seed + i)
+
     edges: dict[tuple[int, int], Edge] = {}
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for step in range(1, options.reach + 1):
-            part = _parts(edges, len(frames))
-            open_pairs = [(i, i + step) for i in range(len(frames) - step) if part[i] != part[i + step]]
-            jobs = [
-                pool.submit(relative_pose, rig, clouds[i], frames[i], frames[j], options, seed + i)
-                for i, j in open_pairs
-            ]
-            edges.update(zip(open_pairs, (job.result() for job in jobs), strict=True))
+    for step in range(1, options.reach + 1):
+        part = _parts(edges, len(frames))
+        open_pairs = [(i, i + step) for i in range(len(frames) - step) if part[i] != part[i + step]]
+        edges.update(zip(open_pairs, map_in_threads(find, open_pairs), strict=True))
     return edges
 
 
@@ -288,7 +287,7 @@ def _reason(
     return f"only {most} matches to its neighbours; {options.minimum_matches} are needed"
 
 
-def chain(edges: Mapping[tuple[int, int], Edge], names: Sequence[str], options: OdometryOptions) -> Path:
+def chain(edges: Mapping[tuple[int, int], Edge], names: Sequence[str], options: OdometryOptions) -> Trajectory:
     """Poses of the largest part by following the edges from its first frame."""
     part = _parts(edges, len(names))
     largest = int(np.argmax(np.bincount(part)))
@@ -302,7 +301,7 @@ def chain(edges: Mapping[tuple[int, int], Edge], names: Sequence[str], options: 
         i = int(before[j])
         forward = tied.get((i, j)) or tied[j, i].inverse()
         poses[j] = forward @ poses[i]
-    return Path(
+    return Trajectory(
         rig_from_world={int(frame): poses[int(frame)] for frame in located},
         dropped=tuple(
             Dropped(what=f"frame {name}", reason=_reason(index, part, edges, options))

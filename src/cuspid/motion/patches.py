@@ -8,9 +8,7 @@ with the template's gradients, Baker and Matthews 2004; gain and offset are free
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple, no_type_check
@@ -21,8 +19,9 @@ from jaxtyping import Float, Float32, Int, UInt8
 from numba import njit
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET
-from cuspid.motion.features import Progress
+from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, Tracks
+from cuspid.workers import map_in_threads
 
 _LEAST_CONTRAST = 0.5
 """Standard deviation of the grey levels of a patch, below which it says nothing."""
@@ -169,7 +168,7 @@ def lengthen(
     read: Callable[[str], UInt8[np.ndarray, "h w"]],
     options: PatchOptions,
     *,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Reconstruction:
     """The model of one camera with a second track for each point whose patch was found in enough frames.
 
@@ -179,19 +178,17 @@ def lengthen(
     tracks, names = model.known_tracks, model.frames
     poses, pictures = _Poses.of(model), dict[int, np.ndarray]()
     found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for frame in range(len(names)):
-            near = range(max(0, frame - options.reach), min(len(names), frame + options.reach + 1))
-            kept = {other: pictures[other] for other in near if other in pictures}
-            pictures = kept | {n: _smooth(read(names[n]), options.blur_px) for n in near if n not in kept}
-            mine = np.flatnonzero(tracks.frame_index[own] == frame)
-            follow = partial(_follow, model, poses, pictures, frame, mine, own[mine], options)
-            found += [
-                (mine, np.full(len(mine), frame), tracks.pixels[own[mine]]),
-                *pool.map(follow, [other for other in near if other != frame]),
-            ]
-            if progress is not None:
-                progress("patches", frame + 1, len(names))
+    for frame in range(len(names)):
+        near = range(max(0, frame - options.reach), min(len(names), frame + options.reach + 1))
+        kept = {other: pictures[other] for other in near if other in pictures}
+        pictures = kept | {n: _smooth(read(names[n]), options.blur_px) for n in near if n not in kept}
+        mine = np.flatnonzero(tracks.frame_index[own] == frame)
+        follow = partial(_follow, model, poses, pictures, frame, mine, own[mine], options)
+        found += [
+            (mine, np.full(len(mine), frame), tracks.pixels[own[mine]]),
+            *map_in_threads(follow, [other for other in near if other != frame]),
+        ]
+        progress("patches", frame + 1, len(names))
     point, seen_in, pixels = (np.concatenate(each) for each in zip(*found, strict=True))
     return replace(model, tracks=_with_second(tracks, point, seen_in, pixels, options))
 

@@ -7,11 +7,8 @@ not know the scale: lengths are in units of the model, not millimetres.
 
 from __future__ import annotations
 
-import os
 import tempfile
-from collections.abc import Mapping
-from collections.abc import Sequence as List
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -22,17 +19,19 @@ from jaxtyping import Float, Int, UInt8
 
 from cuspid.camera import Camera
 from cuspid.errors import ReconstructionError
-from cuspid.geometry import Rigid3
+from cuspid.geometry import Rigid3, best_similarity
+from cuspid.image_sequence import ImageSequence
 from cuspid.motion.adjustment import adjust
 from cuspid.motion.colmap import quiet, rigid_from_colmap
-from cuspid.motion.features import FeatureOptions, Features, Progress, detect
+from cuspid.motion.features import FeatureOptions, Features, detect
 from cuspid.motion.guided import GuidedOptions, refine
 from cuspid.motion.pairs import MatchingOptions, match_unguided
 from cuspid.motion.patches import PatchOptions, lengthen
 from cuspid.panorama import FrameUse
+from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
-from cuspid.sequence import Sequence
+from cuspid.workers import map_in_threads
 
 CAMERA = "camera"
 """Name of the one camera in the rig."""
@@ -155,17 +154,13 @@ def _look(image: UInt8[np.ndarray, "h w 3"], options: SingleOptions) -> _Look:
     )
 
 
-def _look_at_all(sequence: Sequence, options: SingleOptions, progress: Progress | None) -> list[_Look]:
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        looks = []
-        for look in pool.map(lambda index: _look(sequence.image(index), options), range(len(sequence))):
-            looks.append(look)
-            if progress is not None:
-                progress("features", len(looks), len(sequence))
-    return looks
+def _look_at_all(sequence: ImageSequence, options: SingleOptions, progress: Progress) -> list[_Look]:
+    return map_in_threads(
+        lambda index: _look(sequence.image(index), options), range(len(sequence)), stage="features", progress=progress
+    )
 
 
-def _refusals(looks: List[_Look], names: List[str], options: SingleOptions) -> dict[int, str]:
+def _refusals(looks: Sequence[_Look], names: Sequence[str], options: SingleOptions) -> dict[int, str]:
     """Why frames are left out before anything is matched, by index: black, blurred, or the same as another."""
     reasons, last = {}, -1
     sharpness = np.array([look.sharpness for look in looks])
@@ -219,11 +214,11 @@ def _verify(
 
 def _tie(
     features: Mapping[int, Features],
-    pairs: List[tuple[int, int]],
+    pairs: Sequence[tuple[int, int]],
     camera: pycolmap.Camera,
     matching: MatchingOptions,
     options: SingleOptions,
-    progress: Progress | None,
+    progress: Progress,
 ) -> dict[tuple[int, int], pycolmap.TwoViewGeometry]:
     """Verified matches of pairs of frames; pairs that have too few are not in it."""
 
@@ -231,17 +226,11 @@ def _tie(
         one, other = (features[index] for index in pair)
         return _verify(camera, one, other, match_unguided(one, other, matching), options)
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        found = {}
-        for done, (pair, geometry) in enumerate(zip(pairs, pool.map(tie, pairs), strict=True), start=1):
-            if geometry is not None:
-                found[pair] = geometry
-            if progress is not None:
-                progress("matching", done, len(pairs))
-    return found
+    found = map_in_threads(tie, pairs, stage="matching", progress=progress)
+    return {pair: geometry for pair, geometry in zip(pairs, found, strict=True) if geometry is not None}
 
 
-def _pairs_at(kept: List[int], steps: List[int]) -> list[tuple[int, int]]:
+def _pairs_at(kept: Sequence[int], steps: Sequence[int]) -> list[tuple[int, int]]:
     """Pairs of kept frames so many frames apart."""
     return [(kept[i], kept[i + step]) for i in range(len(kept)) for step in steps if i + step < len(kept)]
 
@@ -295,7 +284,7 @@ def _map(
     ties: Mapping[tuple[int, int], pycolmap.TwoViewGeometry],
     calibrated: bool,
     options: SingleOptions,
-    progress: Progress | None,
+    progress: Progress,
 ) -> list[pycolmap.Reconstruction]:
     """COLMAP's models, largest first."""
     placed = 0
@@ -303,8 +292,7 @@ def _map(
     def count() -> None:
         nonlocal placed
         placed = min(placed + 1, len(features))
-        if progress is not None:
-            progress("mapping", placed, len(features))
+        progress("mapping", placed, len(features))
 
     with tempfile.TemporaryDirectory() as folder, quiet():
         database = Path(folder) / "database.db"
@@ -316,8 +304,7 @@ def _map(
             _mapper_options(calibrated, options),
             next_image_callback=count,
         )
-    if progress is not None:
-        progress("mapping", len(features), len(features))
+    progress("mapping", len(features), len(features))
     return sorted(models.values(), key=lambda model: -int(model.num_reg_images()))
 
 
@@ -347,19 +334,6 @@ def _model_of(found: pycolmap.Reconstruction) -> _Model:
     )
 
 
-def similarity(
-    source: Float[np.ndarray, "n d"], target: Float[np.ndarray, "n d"]
-) -> tuple[float, Float[np.ndarray, "d d"], Float[np.ndarray, "d"]]:
-    """Scale, rotation and shift that bring source to target with the least squares (Umeyama 1991)."""
-    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    u, spread, vt = np.linalg.svd(b.T @ a)
-    signs = np.ones(len(spread))
-    signs[-1] = np.sign(np.linalg.det(u @ vt))
-    rotation = u * signs @ vt
-    scale = float(np.sum(spread * signs) / np.sum(a**2))
-    return scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
-
-
 def _same_points(one: _Model, other: _Model) -> Int[np.ndarray, "k 2"]:
     """Points of two models that were seen as the same keypoint."""
     where = {(frame, keypoint): point for point, frame, keypoint in one.seen.tolist()}
@@ -375,7 +349,7 @@ def _joined(one: _Model, other: _Model, least: int) -> _Model | None:
     for _ in range(3):
         if len(same) < least:
             return None
-        scale, rotation, shift = similarity(other.points[same[:, 1]], one.points[same[:, 0]])
+        scale, rotation, shift = best_similarity(other.points[same[:, 1]], one.points[same[:, 0]])
         errors = np.linalg.norm(scale * other.points[same[:, 1]] @ rotation.T + shift - one.points[same[:, 0]], axis=1)
         same = same[errors <= max(3 * float(np.median(errors)), 1e-9)]
     poses = {
@@ -388,7 +362,7 @@ def _joined(one: _Model, other: _Model, least: int) -> _Model | None:
     return _Model({**poses, **one.poses}, np.concatenate([one.points, moved]), seen)
 
 
-def _join_all(models: List[_Model], least: int) -> list[_Model]:
+def _join_all(models: Sequence[_Model], least: int) -> list[_Model]:
     """Models joined as long as any two share enough points; frames of a smaller one that a larger one has are its."""
     parts: list[_Model] = []
     for model in models:
@@ -403,7 +377,7 @@ def _join_all(models: List[_Model], least: int) -> list[_Model]:
 
 
 def _reconstruction(
-    model: _Model, camera: Camera, names: List[str], features: Mapping[int, Features]
+    model: _Model, camera: Camera, names: Sequence[str], features: Mapping[int, Features]
 ) -> Reconstruction:
     """A model as the noun; points that fewer than two frames still see are left out."""
     order = sorted(model.poses)
@@ -447,7 +421,7 @@ def _camera_of(found: pycolmap.Camera, given: Camera | None, options: SingleOpti
 
 
 def locate_single(
-    sequence: Sequence, options: SingleOptions | None = None, *, progress: Progress | None = None
+    sequence: ImageSequence, options: SingleOptions | None = None, *, progress: Progress = silent
 ) -> SingleMotion:
     """The way of the one camera that took a sequence.
 
@@ -487,10 +461,10 @@ def locate_single(
 def _refined(
     part: _Model,
     camera: Camera,
-    sequence: Sequence,
+    sequence: ImageSequence,
     features: Mapping[int, Features],
     options: SingleOptions,
-    progress: Progress | None,
+    progress: Progress,
 ) -> Reconstruction:
     """A part with its poses made precise: by keypoints, then by patches too."""
     own = [features[index] for index in sorted(part.poses)]
@@ -505,7 +479,7 @@ def _refined(
     return adjust(longer, options.guided.adjustment)
 
 
-def _strangers(looks: List[_Look], names: List[str]) -> tuple[str, ...]:
+def _strangers(looks: Sequence[_Look], names: Sequence[str]) -> tuple[str, ...]:
     """A note where frames have little of the colours of a mouth."""
     strange = [name for name, look in zip(names, looks, strict=True) if look.mouth_share < 0.5]
     if not strange:
@@ -514,7 +488,7 @@ def _strangers(looks: List[_Look], names: List[str]) -> tuple[str, ...]:
     return (f"{which} show little that has the colour of teeth or gums: is this a film of teeth?",)
 
 
-def _notes(camera: Camera, calibrated: bool, parts: List[Reconstruction]) -> tuple[str, ...]:
+def _notes(camera: Camera, calibrated: bool, parts: Sequence[Reconstruction]) -> tuple[str, ...]:
     notes = []
     if not calibrated:
         notes.append(
@@ -527,7 +501,7 @@ def _notes(camera: Camera, calibrated: bool, parts: List[Reconstruction]) -> tup
     return tuple(notes)
 
 
-def _check_enough(kept: List[int], refused: Mapping[int, str], names: List[str]) -> None:
+def _check_enough(kept: Sequence[int], refused: Mapping[int, str], names: Sequence[str]) -> None:
     """Raises ReconstructionError where fewer than two frames are left."""
     if len(kept) >= 2:
         return
@@ -539,7 +513,10 @@ def _check_enough(kept: List[int], refused: Mapping[int, str], names: List[str])
 
 
 def _why_nothing(
-    sequence: Sequence, kept: List[int], features: Mapping[int, Features], ties: Mapping[tuple[int, int], object]
+    sequence: ImageSequence,
+    kept: Sequence[int],
+    features: Mapping[int, Features],
+    ties: Mapping[tuple[int, int], object],
 ) -> str:
     """What to tell a user whose frames could not be placed."""
     names, counts = sequence.names, [len(features[index]) for index in kept]
@@ -554,9 +531,9 @@ def _why_nothing(
 
 
 def _uses(
-    names: List[str],
+    names: Sequence[str],
     refused: Mapping[int, str],
-    parts: List[Reconstruction],
+    parts: Sequence[Reconstruction],
     ties: Mapping[tuple[int, int], object],
 ) -> tuple[FrameUse, ...]:
     """What became of every frame."""

@@ -21,13 +21,11 @@ from skimage.morphology import remove_small_objects
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.geometry import Rigid3
+from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
 from cuspid.stitching.exposure import ExposureOptions, Light, Samples, balance
 from cuspid.stitching.seams import SeamOptions, choose
 from cuspid.stitching.surface import HeightMap
-
-Progress = Callable[[str, int, int], None]
-"""Told the stage, how much of it is done and how much there is."""
 
 CELL_PX = 6
 """Width in px of the cells on which the frame is chosen."""
@@ -323,7 +321,7 @@ def compose(
     read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
     options: MosaicOptions,
     *,
-    progress: Progress,
+    progress: Progress = silent,
 ) -> Mosaic:
     """The orthophoto of all located frames; ``read`` gives the image of a frame by its name."""
     camera = motion.rig[motion.rig.names[0]].camera

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from collections.abc import Sequence as List
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import UInt8
 
+from cuspid.image_sequence import ImageSequence
 from cuspid.panorama import FrameUse, Panorama, Strip
+from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
-from cuspid.sequence import Sequence
-from cuspid.stitching.mosaic import Mosaic, MosaicOptions, Progress, compose
+from cuspid.stitching.mosaic import Mosaic, MosaicOptions, compose
 from cuspid.stitching.strip import StripOptions, unroll
 from cuspid.stitching.surface import ScaleOptions, SurfaceOptions, height_map, in_occlusal_frame, uncovered
 from cuspid.stitching.sweep import SweepOptions, sweep
@@ -47,12 +47,12 @@ class Stitched:
 
 
 def orthophoto(
-    sequence: Sequence,
+    sequence: ImageSequence,
     located: Reconstruction,
-    frames: List[FrameUse],
+    frames: Sequence[FrameUse],
     options: OrthoOptions,
     *,
-    progress: Progress,
+    progress: Progress = silent,
 ) -> Stitched:
     """The panorama of one model of the motion. Raises ReconstructionError where it has no points."""
     scale = options.scale
@@ -86,7 +86,7 @@ def _scale_note(scale: ScaleOptions, *, given: bool) -> str:
 
 
 def _panorama(
-    mosaic: Mosaic, motion: Reconstruction, frames: List[FrameUse], index: Mapping[str, int], metric: bool
+    mosaic: Mosaic, motion: Reconstruction, frames: Sequence[FrameUse], index: Mapping[str, int], metric: bool
 ) -> Panorama:
     """The mosaic as the noun; its frames are numbered as in the sequence."""
     canvas = mosaic.canvas

@@ -12,9 +12,7 @@ The volume grows with the arch; of the frames only a few are held at a time.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple, no_type_check
@@ -29,9 +27,11 @@ from skimage.restoration import inpaint_biharmonic
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera, undistortion_maps
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
-from cuspid.stitching.mosaic import BURNT, Progress, brightest, footprint
+from cuspid.stitching.mosaic import BURNT, brightest, footprint
 from cuspid.stitching.surface import HOLE_MM2, HeightMap
+from cuspid.workers import map_in_threads
 
 _BLOCK, _REACH = 24, 14
 """Frames that are paired at a time, and how many frames later a partner may be."""
@@ -245,7 +245,7 @@ def sweep(
     read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
     options: SweepOptions,
     *,
-    progress: Progress,
+    progress: Progress = silent,
 ) -> HeightMap | None:
     """The surface on which the frames of a motion in the occlusal frame agree; None where no two frames lie apart.
 
@@ -319,13 +319,12 @@ def _agreement(
         sums[level] += cv2.resize(agreement, size, interpolation=cv2.INTER_AREA)
         counts[level] += cv2.resize(seen, size, interpolation=cv2.INTER_AREA)
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for start in range(0, len(names), _BLOCK):
-            block = {one: other for one, other in pairs.items() if start <= one < start + _BLOCK}
-            wanted = sorted({*block, *block.values()})
-            images = {frame: _compared(read(names[frame]), maps, options.detail_px) for frame in wanted}
-            list(pool.map(partial(look, block, images), range(len(levels))))
-            progress("surface", min(start + _BLOCK, len(names)), len(names))
+    for start in range(0, len(names), _BLOCK):
+        block = {one: other for one, other in pairs.items() if start <= one < start + _BLOCK}
+        wanted = sorted({*block, *block.values()})
+        images = {frame: _compared(read(names[frame]), maps, options.detail_px) for frame in wanted}
+        map_in_threads(partial(look, block, images), range(len(levels)))
+        progress("surface", min(start + _BLOCK, len(names)), len(names))
     return sums / (counts + np.float32(_PAIRS))
 
 

@@ -10,10 +10,8 @@ chain stretches a frame beyond a limit it has collapsed, and a new part begins.
 
 from __future__ import annotations
 
-import os
 from collections import Counter
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -22,8 +20,9 @@ from jaxtyping import Float, Int16, UInt8
 
 from cuspid.camera import Camera
 from cuspid.errors import InputError, ReconstructionError
+from cuspid.image_sequence import ImageSequence
 from cuspid.panorama import FrameUse, Panorama
-from cuspid.sequence import Sequence
+from cuspid.progress import Progress, silent
 from cuspid.stitching.examination import ExaminationOptions, examine, frame_corners, scale_of, warp
 from cuspid.stitching.normal_map import grey_normal_map, normal_map, rectify
 from cuspid.stitching.placing import Blend, Canvas, Placed
@@ -39,9 +38,7 @@ from cuspid.stitching.warps import (
     location_weights,
     weighted_dlt,
 )
-
-Progress = Callable[[str, int, int], None]
-"""Told the stage, how much of it is done and how much there is."""
+from cuspid.workers import map_in_threads
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +94,7 @@ class Chain:
 # --- frames ----------------------------------------------------------------------------------------------------------
 
 
-def calibration(sequence: Sequence, options: ThesisOptions) -> tuple[Camera, tuple[str, ...]]:
+def calibration(sequence: ImageSequence, options: ThesisOptions) -> tuple[Camera, tuple[str, ...]]:
     """The camera, calibrated or with an assumed angle of view (which is noted)."""
     if sequence.camera is not None:
         return sequence.camera, ()
@@ -120,19 +117,14 @@ def look(image: UInt8[np.ndarray, "h w 3"], camera: Camera, options: ThesisOptio
     return Look(find_points(grey_normal_map(picture), options.warps), find_segments(picture, options.warps))
 
 
-def look_at_all(sequence: Sequence, camera: Camera, options: ThesisOptions, progress: Progress) -> list[Look]:
+def look_at_all(sequence: ImageSequence, camera: Camera, options: ThesisOptions, progress: Progress) -> list[Look]:
     """Every frame; the images are read one by one."""
     ideal = replace(camera, distortion=np.zeros(4))
 
     def one(index: int) -> Look:
         return look(without_distortion(sequence.image(index), camera), ideal, options)
 
-    looks: list[Look] = []
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for found in pool.map(one, range(len(sequence))):
-            looks.append(found)
-            progress("normal maps", len(looks), len(sequence))
-    return looks
+    return map_in_threads(one, range(len(sequence)), stage="normal maps", progress=progress)
 
 
 # --- the chain -------------------------------------------------------------------------------------------------------
@@ -233,7 +225,7 @@ def build_chains(
 
 
 def stitch_as_thesis(
-    sequence: Sequence, options: ThesisOptions, *, examination: bool, progress: Progress
+    sequence: ImageSequence, options: ThesisOptions, *, examination: bool, progress: Progress = silent
 ) -> tuple[Panorama, ...]:
     """The panorama of a sequence, in parts where it broke or collapsed, largest first; ``examination`` leaves out the
     frames that fail it.
@@ -262,7 +254,7 @@ _PLANE_NOTE = (
 )
 
 
-def _lay(sequence: Sequence, camera: Camera, chain: Chain, part: int, progress: Progress) -> Blend:
+def _lay(sequence: ImageSequence, camera: Camera, chain: Chain, part: int, progress: Progress) -> Blend:
     """All frames of a part on its canvas; the pixels of frames as the lens distorts them."""
     blend = Blend(Canvas.around(chain.placed))
     for done, placed in enumerate(chain.placed, start=1):
@@ -291,7 +283,9 @@ def _panorama(blend: Blend, frames: tuple[FrameUse, ...], part: int, parts: int,
     )
 
 
-def _frame_uses(sequence: Sequence, parts: list[Chain], mine: int, reasons: Mapping[int, str]) -> tuple[FrameUse, ...]:
+def _frame_uses(
+    sequence: ImageSequence, parts: list[Chain], mine: int, reasons: Mapping[int, str]
+) -> tuple[FrameUse, ...]:
     """Every frame of the sequence as one part sees it."""
     placed = {placed.index: (number, placed) for number, chain in enumerate(parts) for placed in chain.placed}
 
@@ -309,7 +303,7 @@ def _frame_uses(sequence: Sequence, parts: list[Chain], mine: int, reasons: Mapp
     return tuple(use(index, name) for index, name in enumerate(sequence.names))
 
 
-def _break_notes(sequence: Sequence, parts: list[Chain]) -> tuple[str, ...]:
+def _break_notes(sequence: ImageSequence, parts: list[Chain]) -> tuple[str, ...]:
     """Where and why parts ended before the sequence did."""
     notes = []
     for chain in sorted(parts, key=lambda chain: chain.placed[0].index):
@@ -322,7 +316,7 @@ def _break_notes(sequence: Sequence, parts: list[Chain]) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _nothing(sequence: Sequence, reasons: Mapping[int, str]) -> str:
+def _nothing(sequence: ImageSequence, reasons: Mapping[int, str]) -> str:
     common, count = Counter(reason.split(":")[0] for reason in reasons.values()).most_common(1)[0]
     return (
         f"{sequence.source}: no two of {len(sequence)} frames hang together ({count} fail by {common}); they need more "

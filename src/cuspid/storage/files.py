@@ -35,18 +35,37 @@ def whole_file(path: Path) -> Iterator[Path]:
     """
     temporary: Path | None = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=PART, suffix=path.suffix)
-        os.close(handle)
-        temporary = Path(name)
-        temporary.chmod(0o644)
-        yield temporary
-        temporary.replace(path)
-    except OSError as error:
-        raise OutputError(_describe(path, error)) from error
+        with _writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            handle, name = tempfile.mkstemp(dir=path.parent, prefix=PART, suffix=path.suffix)
+            os.close(handle)
+            temporary = Path(name)
+            temporary.chmod(0o644)
+            yield temporary
+            temporary.replace(path)
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_files(folder: Path) -> Iterator[Path]:
+    """As :func:`whole_file`, for several files: a temporary folder whose files move into ``folder``."""
+    with _writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=PART) as temporary:
+            yield Path(temporary)
+            for file in sorted(Path(temporary).iterdir()):
+                file.replace(folder / file.name)
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Turn what the system says against a file or folder into one clear line."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(_describe(path, error)) from error
 
 
 def _describe(path: Path, error: OSError) -> str:
@@ -64,6 +83,13 @@ def write_bytes(path: Path, data: bytes) -> None:
 def write_json(path: Path, value: object) -> None:
     """Write JSON whole or not at all; dataclasses, arrays and paths are converted."""
     write_bytes(path, (json.dumps(to_plain(value), indent=2, allow_nan=False) + "\n").encode())
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], *, compressed: bool = False) -> None:
+    """Write arrays by name as NumPy's ``.npz``, whole or not at all."""
+    save = np.savez_compressed if compressed else np.savez
+    with whole_file(path) as temporary, temporary.open("wb") as stream:
+        save(stream, allow_pickle=False, **arrays)
 
 
 def to_plain(value: Any) -> Any:

@@ -10,15 +10,14 @@ import numpy as np
 from cuspid.capture import read_image
 from cuspid.errors import InputError
 from cuspid.storage.captures import write_image
-from cuspid.storage.files import read_json, reading, whole_file, write_json
+from cuspid.storage.files import read_json, reading, write_arrays, write_json
 from cuspid.trueness import OcclusalView
 
 
 def write_occlusal_view(folder: Path, view: OcclusalView) -> None:
     """Write a single shot; ``view.json`` comes last, so that what has one is whole."""
     write_image(folder / "picture.png", view.image)
-    with whole_file(folder / "surface.npz") as temporary, temporary.open("wb") as stream:
-        np.savez_compressed(stream, allow_pickle=False, labels=view.labels, height_mm=view.height_mm)
+    write_arrays(folder / "surface.npz", {"labels": view.labels, "height_mm": view.height_mm}, compressed=True)
     numbers = {name: getattr(view, name) for name in ("mm_per_px", "origin_px", "camera_height_mm")}
     write_json(folder / "view.json", numbers)
 

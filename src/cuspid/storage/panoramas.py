@@ -18,7 +18,7 @@ from jaxtyping import UInt8
 
 from cuspid.errors import InputError, OutputError
 from cuspid.panorama import ZONES, FrameUse, Panorama, Strip
-from cuspid.storage.files import read_json, reading, whole_file, write_bytes, write_json
+from cuspid.storage.files import read_json, reading, write_arrays, write_bytes, write_json
 from cuspid.storage.tables import write_table
 
 _HEADER = ("method", "mm_per_px", "origin_px", "part", "parts", "notes")
@@ -29,8 +29,7 @@ def write_panorama(folder: Path, panorama: Panorama) -> None:
     rgba = np.dstack([panorama.image, np.where(panorama.covered, 255, 0).astype(np.uint8)])
     write_table(folder / "frames.csv", [dataclasses.asdict(frame) for frame in panorama.frames])
     write_bytes(folder / "panorama.pgw", world_file(panorama).encode())
-    with whole_file(folder / "source.npz") as temporary, temporary.open("wb") as stream:
-        np.savez_compressed(stream, allow_pickle=False, **_source(panorama))
+    write_arrays(folder / "source.npz", _source(panorama), compressed=True)
     write_bytes(folder / "panorama.png", _png(folder / "panorama.png", rgba))
     write_json(folder / "panorama.json", _header(panorama))
 

@@ -14,7 +14,7 @@ from cuspid.capture import Dropped
 from cuspid.geometry import Rigid3
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece
-from cuspid.storage.files import read_json, reading, to_plain, whole_file, write_json
+from cuspid.storage.files import read_json, reading, to_plain, write_arrays, write_json
 from cuspid.storage.handpieces import (
     camera_from_json,
     camera_to_json,
@@ -91,8 +91,7 @@ def write_depth_maps(path: Path, depth_maps: Sequence[DepthMap]) -> None:
         for depth in depth_maps
     ]
     arrays["header"] = np.frombuffer(json.dumps(to_plain(header)).encode(), dtype=np.uint8)
-    with whole_file(path) as temporary, temporary.open("wb") as stream:
-        np.savez(stream, allow_pickle=False, **arrays)
+    write_arrays(path, arrays)
 
 
 def read_depth_maps(path: Path) -> tuple[DepthMap, ...]:

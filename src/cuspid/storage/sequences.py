@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,8 +13,9 @@ import numpy as np
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.capture import ImageFolder, image_size
 from cuspid.errors import InputError
+from cuspid.image_sequence import ImageSequence
+from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece
-from cuspid.sequence import Sequence
 from cuspid.storage.captures import IMAGE_SUFFIXES, read_capture, write_image
 from cuspid.storage.files import finished, read_json, reading
 from cuspid.storage.handpieces import camera_from_colmap, camera_from_json, read_handpiece
@@ -24,13 +24,10 @@ VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm")
 MOST_FRAMES = 300
 """A longer video is thinned evenly to about as many frames."""
 
-DecodeProgress = Callable[[int, int], None]
-"""Told how many frames of a video were read and how many there are."""
-
 
 def read_sequence(
-    source: Path, decoded: Path, *, calibration: Path | None = None, progress: DecodeProgress = lambda done, total: None
-) -> Sequence:
+    source: Path, decoded: Path, *, calibration: Path | None = None, progress: Progress = silent
+) -> ImageSequence:
     """Frames of one camera from a folder of images, a video or a capture.
 
     A video is decoded into the folder ``decoded``. Raises InputError where there are fewer than two frames, a frame is
@@ -47,12 +44,12 @@ def read_sequence(
     return found if calibration is None else _calibrated(found, calibration)
 
 
-def _of_folder(folder: Path) -> Sequence:
+def _of_folder(folder: Path) -> ImageSequence:
     paths = sorted(path for path in finished(folder) if path.suffix.lower() in IMAGE_SUFFIXES)
-    return Sequence(source=folder, paths=tuple(paths), size=_common_size(folder, paths))
+    return ImageSequence(source=folder, paths=tuple(paths), size=_common_size(folder, paths))
 
 
-def _of_capture(folder: Path) -> Sequence:
+def _of_capture(folder: Path) -> ImageSequence:
     capture = read_capture(folder)
     names = capture.handpiece.rig.names
     if len(names) > 1:
@@ -61,7 +58,7 @@ def _of_capture(folder: Path) -> Sequence:
         )
     images = ImageFolder(folder, capture.source.suffix)
     paths = [images.path(frame.name, names[0]) for frame in capture.frames]
-    found = Sequence(source=folder, paths=tuple(paths), size=_common_size(folder, paths))
+    found = ImageSequence(source=folder, paths=tuple(paths), size=_common_size(folder, paths))
     return _with_handpiece(found, capture.handpiece, folder / "handpiece.json")
 
 
@@ -80,7 +77,7 @@ def _common_size(folder: Path, paths: list[Path]) -> tuple[int, int]:
     return usual
 
 
-def _of_video(video: Path, decoded: Path, progress: DecodeProgress) -> Sequence:
+def _of_video(video: Path, decoded: Path, progress: Progress) -> ImageSequence:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     stream = cv2.VideoCapture(str(video))
     announced = int(stream.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -96,7 +93,7 @@ def _of_video(video: Path, decoded: Path, progress: DecodeProgress) -> Sequence:
                 write_image(path, cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
             paths.append(path)
         number += 1
-        progress(number, max(announced, number))
+        progress("decoding", number, max(announced, number))
     stream.release()
     if len(paths) < 2:
         raise InputError(f"{video}: {len(paths)} frame(s) could be decoded; not a video, truncated, or of one frame")
@@ -105,13 +102,13 @@ def _of_video(video: Path, decoded: Path, progress: DecodeProgress) -> Sequence:
         notes.append(f"{video.name}: truncated, {number} of {announced} frames could be decoded; the rest is missing")
     if step > 1:
         notes.append(f"{video.name}: {number} frames; every {step}th is used")
-    return Sequence(source=video, paths=tuple(paths), size=_common_size(decoded, paths), notes=tuple(notes))
+    return ImageSequence(source=video, paths=tuple(paths), size=_common_size(decoded, paths), notes=tuple(notes))
 
 
 # --- calibration ---------------------------------------------------------------------------------------------------
 
 
-def _calibrated(sequence: Sequence, path: Path) -> Sequence:
+def _calibrated(sequence: ImageSequence, path: Path) -> ImageSequence:
     """With the calibration of a file: handpiece.json or rig_config.json of one camera, a camera alone as JSON, COLMAP's
     cameras.txt, or OpenCV's YAML."""
     if path.suffix.lower() in (".yml", ".yaml", ".xml"):
@@ -125,7 +122,7 @@ def _calibrated(sequence: Sequence, path: Path) -> Sequence:
     return _with_handpiece(sequence, read_handpiece(path), path)
 
 
-def _with_handpiece(sequence: Sequence, handpiece: Handpiece, path: Path) -> Sequence:
+def _with_handpiece(sequence: ImageSequence, handpiece: Handpiece, path: Path) -> ImageSequence:
     cameras = list(handpiece.rig.cameras.values())
     if len(cameras) > 1:
         raise InputError(f"{path}: {len(cameras)} cameras; the calibration of one is needed")
@@ -133,7 +130,7 @@ def _with_handpiece(sequence: Sequence, handpiece: Handpiece, path: Path) -> Seq
     return replace(found, working_distance_mm=handpiece.working_distance_mm)
 
 
-def _with_camera(sequence: Sequence, camera: Camera, path: Path) -> Sequence:
+def _with_camera(sequence: ImageSequence, camera: Camera, path: Path) -> ImageSequence:
     if (camera.width, camera.height) != sequence.size:
         raise InputError(
             f"{path}: calibration of {camera.width} x {camera.height} px, but the frames have {sequence.size[0]} x "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from io import BytesIO
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -13,7 +12,7 @@ from jaxtyping import Float
 from cuspid.errors import InputError
 from cuspid.mesh import Mesh
 from cuspid.shape_model import MeanStep, ShapeModel
-from cuspid.storage.files import read_json, reading, write_bytes, write_json
+from cuspid.storage.files import read_json, reading, write_arrays, write_json
 from cuspid.storage.jaws import read_jaw, write_jaw
 
 
@@ -21,16 +20,14 @@ def write_shape_model(folder: Path, model: ShapeModel) -> None:
     """Write ``mean.ply`` (with ``mean.json``), ``modes.npz`` and, last, ``shape.json``, which completes them."""
     (folder / "shape.json").unlink(missing_ok=True)
     write_jaw(folder / "mean.ply", model.mean)
-    buffer = BytesIO()
-    # A mesh file does not keep the order of the vertices.
-    np.savez(
-        buffer,
-        vertices=model.mean.mesh.vertices,
-        faces=model.mean.mesh.faces,
-        modes=model.modes.astype(np.float32),
-        landmark_modes=model.landmark_modes,
-    )
-    write_bytes(folder / "modes.npz", buffer.getvalue())
+    arrays = {
+        # A mesh file does not keep the order of the vertices.
+        "vertices": model.mean.mesh.vertices,
+        "faces": model.mean.mesh.faces,
+        "modes": model.modes.astype(np.float32),
+        "landmark_modes": model.landmark_modes,
+    }
+    write_arrays(folder / "modes.npz", arrays)
     summary = {
         "samples": model.names,
         "first": model.first,

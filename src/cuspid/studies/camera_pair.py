@@ -14,7 +14,7 @@ turned inwards by half the *axis angle*; the *convergence* is the angle between 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from types import MappingProxyType
@@ -38,13 +38,12 @@ from cuspid.handpiece.presets import PRESETS
 from cuspid.handpiece.visibility import VisibilityOptions, visible_faces
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
+from cuspid.progress import Progress, silent
 from cuspid.rig import MountedCamera, Rig
 
 Direction = Literal["across", "along"]
 """How the baseline lies: across the arch (for a side of a tooth: up and down), or along it."""
 Row = dict[str, str | float | bool | None]
-Progress = Callable[[str, int, int], None]
-"""Told the stage, how much of it is done and how much there is."""
 
 Matcher = Literal["slanted", "upright"]
 """Whose noise counts: the refinement of this program, whose window turns with the surface, or a window that is only
@@ -164,7 +163,7 @@ def baseline_axis(jaw: Jaw, tooth: int, surface: str, direction: Direction) -> F
 def study_camera_pair(
     jaw: Jaw,
     options: CameraPairOptions = CameraPairOptions(),
-    progress: Progress = lambda stage, done, total: None,
+    progress: Progress = silent,
 ) -> tuple[Row, ...]:
     """One row for each surface faced, baseline, angle and distance, and for each named surface of the tooth.
 

@@ -33,6 +33,7 @@ from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DesignOptions
 from cuspid.jaw import Jaw
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
+from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 from cuspid.simulation.appearance import Preset
 from cuspid.simulation.scan_path import (
@@ -44,7 +45,7 @@ from cuspid.simulation.scan_path import (
 )
 from cuspid.stereo.temporal import TemporalOptions
 from cuspid.studies.camera_pair import Direction, baseline_axis, camera_pair, facing
-from cuspid.studies.grid import Case, Outcome, Progress, Value, run_grid
+from cuspid.studies.grid import Case, Outcome, Value, run_grid
 from cuspid.studies.trial import Trial, TrialOptions, run_trial
 
 Setting = tuple[float, float]
@@ -341,7 +342,7 @@ def sweep(
     workers: int | None = None,
     cluster: str | None = None,
     retry_failed: bool = False,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = silent,
 ) -> tuple[Outcome, ...]:
     """Run the grid once, then the contenders again with other seeds; what is in the folder already is not run again.
 
@@ -355,10 +356,11 @@ def sweep(
         workers=workers,
         cluster=cluster,
         retry_failed=retry_failed,
+        stage="scans",
     )
     cases = [_case(options, setting, 0) for setting in options.settings]
     repeated = options.repeats * min(len(cases), 2 * options.contenders + (options.thesis is not None))
-    first = run(cases, progress=lambda done, total: progress(done, total + repeated))
+    first = run(cases, progress=lambda stage, done, total: progress(stage, done, total + repeated))
     again = [
         _case(options, each, seed) for seed in range(1, options.repeats + 1) for each in contenders(first, options)
     ]

@@ -42,6 +42,7 @@ from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.handpiece.optimise import handpiece_outline
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
+from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, Rig
 from cuspid.simulation.scan_path import ScanPathOptions, steady_poses
 from cuspid.studies.grid import Case, Outcome, Value, run_grid
@@ -364,13 +365,13 @@ def compare_designs(
     *,
     workers: int | None = None,
     cluster: str | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
 ) -> tuple[Outcome, ...]:
     """Scan everything that has no result in ``folder`` yet; all outcomes. See :func:`cuspid.studies.grid.run_grid`."""
     handpieces = prepare_comparison(folder, options)
     work = partial(scan_case, folder=folder.resolve(), options=options, trial=trial)
     cases = comparison_cases(options, handpieces)
-    return run_grid(cases, work, folder, workers=workers, cluster=cluster, progress=progress)
+    return run_grid(cases, work, folder, workers=workers, cluster=cluster, stage="scans", progress=progress)
 
 
 def comparison_rows(

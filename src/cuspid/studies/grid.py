@@ -24,6 +24,8 @@ from typing import Any
 
 from cuspid import storage
 from cuspid.errors import CuspidError, InputError, MissingDependencyError
+from cuspid.progress import Progress, silent
+from cuspid.workers import core_numbers, usable_cores
 
 Value = float | int | str | bool | None
 """What a cell of the table holds."""
@@ -60,9 +62,6 @@ Work = Callable[..., Mapping[str, Value]]
 """A function of a module that workers can import: takes the parameters of a case by name, returns figures by name, and
 raises where the case fails."""
 
-Progress = Callable[[int, int], None]
-"""Told how many cases are done, and of how many."""
-
 
 def grid(**axes: Sequence[Value]) -> tuple[Case, ...]:
     """All combinations of the values on the axes, the last axis fastest, named after their values."""
@@ -84,14 +83,15 @@ def run_grid(
     workers: int | None = None,
     cluster: str | None = None,
     retry_failed: bool = False,
-    progress: Progress = lambda done, total: None,
+    stage: str = "cases",
+    progress: Progress = silent,
 ) -> tuple[Outcome, ...]:
     """Run the cases that have no result in ``folder`` yet and return all outcomes, in the order of the cases.
 
     ``workers`` local processes (default: one for each core), or the workers of the Dask scheduler at ``cluster``.
-    Writes ``cases/<name>.json`` for each case and the table ``results.csv``. Raises InputError for fewer than one
-    worker, where two cases share a name or the cluster cannot be reached, MissingDependencyError where Dask is not
-    installed.
+    ``stage`` is what ``progress`` calls the cases. Writes ``cases/<name>.json`` for each case and the table
+    ``results.csv``. Raises InputError for fewer than one worker, where two cases share a name or the cluster cannot be
+    reached, MissingDependencyError where Dask is not installed.
     """
     if workers is not None and workers < 1:
         raise InputError(f"study: --workers is {workers}; at least one is needed")
@@ -102,13 +102,13 @@ def run_grid(
     if retry_failed:
         done = {name: outcome for name, outcome in done.items() if outcome.failure is None}
     left = [case for case in cases if case.name not in done]
-    progress(len(done), len(cases))
+    progress(stage, len(done), len(cases))
     if left:
-        outcomes = _on_cluster(left, work, cluster) if cluster else _in_processes(left, work, workers or _cores())
+        outcomes = _on_cluster(left, work, cluster) if cluster else _in_processes(left, work, workers or usable_cores())
         for outcome in outcomes:
             done[outcome.case.name] = outcome
             _write(folder, outcome)
-            progress(len(done), len(cases))
+            progress(stage, len(done), len(cases))
     ordered = tuple(done[case.name] for case in cases)
     storage.write_bytes(folder / "results.csv", table(ordered).encode())
     return ordered
@@ -173,14 +173,10 @@ class _Running:
     core: int
 
 
-def _cores() -> int:
-    return len(os.sched_getaffinity(0))
-
-
 def _in_processes(cases: Sequence[Case], work: Work, workers: int) -> Iterator[Outcome]:
     """Outcomes as they come, from at most so many processes at once."""
     waiting = list(reversed(cases))
-    cores = sorted(os.sched_getaffinity(0))
+    cores = core_numbers()
     free = [cores[k % len(cores)] for k in range(workers)]
     running: dict[Connection, _Running] = {}
     try:
@@ -289,7 +285,7 @@ def _attempt_on_worker(work: Work, case: Case, slots: Mapping[str, int]) -> Outc
     """
     import distributed
 
-    cores = sorted(os.sched_getaffinity(os.getpid()))
+    cores = core_numbers(os.getpid())
     number = _threads.setdefault(threading.get_ident(), len(_threads))
     os.sched_setaffinity(0, {cores[(slots.get(distributed.get_worker().address, 0) + number) % len(cores)]})
     return _attempt(work, case)

@@ -26,6 +26,7 @@ from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.pipeline import SimulationOptions
+from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece
 from cuspid.simulation.scan_path import plan_scan_path
 from cuspid.studies.grid import Case, Outcome, Value, run_grid
@@ -131,7 +132,7 @@ def repeat_scans(
     workers: int | None = None,
     cluster: str | None = None,
     retry_failed: bool = False,
-    progress: pipeline.Progress = pipeline.silent,
+    progress: Progress = silent,
 ) -> Repetition:
     """Scan a jaw several times and compare the scans with it and with each other; goes on where it stopped.
 
@@ -141,12 +142,12 @@ def repeat_scans(
     if not (folder / "reference.json").exists():
         storage.write_handpiece(folder / "handpiece.json", handpiece)
         storage.write_jaw(folder / "reference.ply", jaw)
-    run = partial(run_grid, workers=workers, cluster=cluster, retry_failed=retry_failed)
+    run = partial(run_grid, workers=workers, cluster=cluster, retry_failed=retry_failed, progress=progress)
     work = partial(scan_again, folder=folder.resolve(), options=options, trial=trial)
-    scans = run(scan_cases(options, trial), work, folder, progress=partial(progress, "scans"))
+    scans = run(scan_cases(options, trial), work, folder, stage="scans")
     names = [outcome.case.name for outcome in scans if outcome.failure is None]
     compare = partial(compare_scans, folder=folder.resolve(), options=options)
-    pairs = run(pair_cases(names), compare, folder / "pairs", progress=partial(progress, "pairs"))
+    pairs = run(pair_cases(names), compare, folder / "pairs", stage="pairs")
     found = _spread_of(folder, names, options) if len(names) > 1 else None
     return Repetition(scans=scans, pairs=pairs, spread=found)
 

@@ -22,7 +22,7 @@ from typing import IO
 
 import cuspid
 from cuspid.errors import CuspidError
-from cuspid.pipeline import usable_cores
+from cuspid.workers import usable_cores
 
 PACKAGES = ("cuspid", "numpy", "numba", "opencv-contrib-python-headless", "pycolmap", "embreex", "libigl")
 """Whose versions are kept with every result."""

@@ -8,7 +8,7 @@ too few maps confirm from its outer side is not kept: that takes away ghosts and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import no_type_check
 
@@ -19,10 +19,12 @@ from numba import njit
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
+from cuspid.progress import Progress, silent
 from cuspid.reconstruction import DepthMap
 from cuspid.surface.evidence import Evidence, colors_of, observe
 from cuspid.surface.meshing import extract
-from cuspid.surface.volume import SparseVolume, in_threads
+from cuspid.surface.volume import SparseVolume
+from cuspid.workers import map_slices
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,20 +45,12 @@ class FusionOptions:
     """Number of depth maps that must confirm a vertex."""
 
 
-Progress = Callable[[str, int, int], None]
-"""Told the stage, how much of it is done and how much there is."""
-
-
-def _silent(stage: str, done: int, total: int) -> None:
-    """A :data:`Progress` that says nothing."""
-
-
 def fuse(
     depth_maps: Iterable[DepthMap],
     rig_from_world: Mapping[str, Rigid3],
     options: FusionOptions | None = None,
     *,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> Mesh:
     """One coloured mesh in the world frame from the depth maps whose frame was located; no faces if they hold nothing.
 
@@ -123,7 +117,7 @@ class Votes:
         """Let one depth map vote on the vertices that it sees."""
         chunks = self._in_view(depth_map.camera, cam_from_world)
         colors = colors_of(depth_map)
-        in_threads(
+        map_slices(
             lambda part: _vote(
                 chunks[part],
                 self.rough.vertices,

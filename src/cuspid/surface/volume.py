@@ -7,11 +7,7 @@ key in a sorted array; ``neighbours`` holds the slot of each of the 27 blocks ar
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import no_type_check
 
 import numpy as np
@@ -20,6 +16,7 @@ from numba import njit
 
 from cuspid.geometry import Rigid3
 from cuspid.surface.evidence import Evidence, observe
+from cuspid.workers import map_slices
 
 BLOCK = 8
 """Voxels along the side of a block."""
@@ -38,14 +35,6 @@ def unpack(keys: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n 3"]:
     """Inverse of :func:`pack`."""
     mask = (1 << 21) - 1
     return np.stack([keys >> 42, (keys >> 21) & mask, keys & mask], axis=-1) - _OFFSET
-
-
-def in_threads(work: Callable[[slice], None], count: int) -> None:
-    """Call ``work``, which must release the GIL, on a slice of ``count`` items for each processor."""
-    threads = os.cpu_count() or 1
-    bounds = np.linspace(0, count, threads + 1).astype(int)
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(work, (slice(start, stop) for start, stop in pairwise(bounds.tolist()))))
 
 
 @dataclass
@@ -72,7 +61,7 @@ class SparseVolume:
         keys = self._keys_around(points)
         slots = self._allocate(keys)
         origins = unpack(keys).astype(np.float64) * BLOCK
-        in_threads(
+        map_slices(
             lambda part: _integrate(
                 self.distance,
                 self.weight,

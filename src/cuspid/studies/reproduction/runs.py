@@ -30,11 +30,11 @@ from cuspid.anatomy.phantom import PhantomOptions, build_phantom
 from cuspid.anatomy.population import GroupName, draw_population
 from cuspid.errors import CuspidError, InputError
 from cuspid.handpiece.designs import twelve_cameras
-from cuspid.pipeline import usable_cores
+from cuspid.progress import Progress, silent
 from cuspid.reporting.figures import save_picture
 from cuspid.studies.camera_pair import CameraPairOptions
 from cuspid.studies.camera_sweep import SweepOptions
-from cuspid.studies.grid import Case, Progress, Value, run_grid
+from cuspid.studies.grid import Case, Value, run_grid
 from cuspid.studies.reproduction.catalogue import Item
 from cuspid.studies.reproduction.checks import CHECKS
 from cuspid.studies.reproduction.findings import CHECKED, PANORAMA, Result, Results
@@ -49,6 +49,7 @@ from cuspid.studies.reproduction.samples import (
     surfaces_seen,
 )
 from cuspid.studies.scan_cases import conditions, measure_scan, prepared_cases, run_timed
+from cuspid.workers import usable_cores
 
 READ_ONLY = ("measure", "design_comparison_full_size")
 """Results that the page shows and no run here makes: they need data that is not public, or hours."""
@@ -375,7 +376,7 @@ def run_missing(
     *,
     quick: bool,
     workers: int | None = None,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = silent,
 ) -> dict[str, str]:
     """Run what is missing; for each run that failed the reason, in one line. See :func:`run_grid`."""
     records = folder / "work" / "runs"
@@ -386,6 +387,7 @@ def run_missing(
         partial(run_one, folder=folder.resolve(), wanted=dict(wanted), quick=quick),
         records,
         workers=workers,
+        stage="runs",
         progress=progress,
     )
     return {outcome.case.name: outcome.failure for outcome in outcomes if outcome.failure is not None}

@@ -1,4 +1,4 @@
-"""A sequence: the frames of one hand-held camera, images on disk that are read when asked for."""
+"""The frames of one hand-held camera in their order: images on disk that are read when asked for."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cuspid.errors import InputError
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Sequence:
+class ImageSequence:
     """Images of one camera in the order in which they were taken."""
 
     source: Path

@@ -1,0 +1,60 @@
+"""How many cores this process may use, and work that is spread over them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from typing import TypeVar
+
+import numpy as np
+
+from cuspid.progress import Progress, silent
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+
+def core_numbers(thread: int = 0) -> list[int]:
+    """The cores that a thread may run on, by their numbers: the calling one's, or those of a process by its id.
+
+    All cores where the system does not tell.
+    """
+    if hasattr(os, "sched_getaffinity"):
+        return sorted(os.sched_getaffinity(thread))
+    return list(range(os.cpu_count() or 1))
+
+
+def usable_cores() -> int:
+    """Number of cores that the calling thread, and those that it starts, may run on: a case of a study has one."""
+    return len(core_numbers())
+
+
+def map_in_threads(
+    work: Callable[[_Item], _Result], items: Iterable[_Item], *, stage: str = "", progress: Progress = silent
+) -> list[_Result]:
+    """``work`` on each item, in a thread for each usable core; results in the order of the items.
+
+    Of errors the first in that order is raised, and items that were not begun are left. ``progress`` is told of
+    ``stage``.
+    """
+    results: list[_Result] = []
+    with ThreadPoolExecutor(usable_cores()) as pool:
+        jobs = [pool.submit(work, item) for item in items]
+        try:
+            for job in jobs:
+                results.append(job.result())
+                progress(stage, len(results), len(jobs))
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return results
+
+
+def map_slices(work: Callable[[slice], _Result], count: int, parts: int | None = None) -> list[_Result]:
+    """``work``, which must release the GIL, on consecutive slices of ``count`` items, in threads; results in order.
+
+    One slice for each usable core, or so many ``parts`` where the result depends on where they are cut.
+    """
+    bounds = np.linspace(0, count, (parts or usable_cores()) + 1).astype(int)
+    return map_in_threads(work, [slice(*ends) for ends in pairwise(bounds.tolist())])

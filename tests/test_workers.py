@@ -1,0 +1,79 @@
+"""Work in threads: in order, no more of it than may be, none after an error."""
+
+import os
+import threading
+import time
+
+import pytest
+
+from cuspid.workers import core_numbers, map_in_threads, map_slices, usable_cores
+
+
+def pinned(work):
+    """What ``work`` returns in a thread that may run on one core alone."""
+    found = []
+
+    def alone():
+        os.sched_setaffinity(0, {min(core_numbers())})
+        found.append(work())
+
+    thread = threading.Thread(target=alone)
+    thread.start()
+    thread.join()
+    return found[0]
+
+
+def test_results_come_in_the_order_of_the_items_and_each_is_told():
+    told = []
+
+    def late(item):
+        time.sleep(0.01 * (3 - item))
+        return 10 * item
+
+    assert map_in_threads(late, range(4), stage="tens", progress=lambda *step: told.append(step)) == [0, 10, 20, 30]
+    assert told == [("tens", done, 4) for done in (1, 2, 3, 4)]
+    assert map_in_threads(late, []) == []
+
+
+def test_the_first_error_is_raised_and_what_was_not_begun_is_left():
+    begun = []
+
+    def refuse(item):
+        begun.append(item)
+        time.sleep(0.01)
+        raise ValueError(item)
+
+    with pytest.raises(ValueError, match=r"^0$"):
+        map_in_threads(refuse, range(1000))
+    assert len(begun) < 1000
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 7, 1000])
+@pytest.mark.parametrize("parts", [None, 1, 4])
+def test_slices_follow_each_other_and_leave_nothing_out(count, parts):
+    slices = map_slices(lambda part: part, count, parts)
+    assert len(slices) == (parts or usable_cores())
+    assert [item for part in slices for item in range(count)[part]] == list(range(count))
+    sizes = [part.stop - part.start for part in slices]
+    assert max(sizes) - min(sizes) <= 1
+
+
+def test_where_slices_are_cut_does_not_depend_on_the_cores():
+    assert map_slices(lambda part: part, 1000, 4) == pinned(lambda: map_slices(lambda part: part, 1000, 4))
+
+
+def test_a_thread_that_is_pinned_to_one_core_starts_one_thread_at_a_time():
+    def which(_):
+        time.sleep(0.01)
+        return threading.get_ident(), tuple(core_numbers())
+
+    assert pinned(usable_cores) == 1
+    threads, cores = zip(*pinned(lambda: map_in_threads(which, range(8))), strict=True)
+    assert len(set(threads)) == 1
+    assert set(cores) == {(min(core_numbers()),)}
+    assert core_numbers() == core_numbers(os.getpid()), "and the others keep their cores"
+
+
+def test_a_system_without_affinity_lends_all_cores(monkeypatch):
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert usable_cores() == os.cpu_count()
