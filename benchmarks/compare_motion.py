@@ -18,9 +18,10 @@ from pathlib import Path
 import numpy as np
 from run import conditions
 
-from cuspid import pipeline, storage
+from cuspid import storage
 from cuspid.geometry import Rigid3, best_similarity
-from cuspid.pipeline import MotionMethod, ReconstructionOptions
+from cuspid.motion.location import MotionOptions
+from cuspid.motion.stage import MotionMethod, locate
 
 
 def position_errors_um(found: Mapping[str, Rigid3], true: Mapping[str, Rigid3]) -> np.ndarray:
@@ -37,7 +38,7 @@ def compare(scan: Path, method: MotionMethod) -> dict[str, object]:
     capture, truth = storage.read_capture(scan / "capture"), storage.read_truth(scan / "truth")
     with tempfile.TemporaryDirectory() as folder:
         begin = time.perf_counter()
-        found = pipeline.locate(capture, Path(folder), ReconstructionOptions(motion=method))
+        found = locate(capture, Path(folder), MotionOptions(), method)
         seconds = time.perf_counter() - begin
     return {
         "capture": scan.name,

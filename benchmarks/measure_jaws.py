@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from run import conditions
 
-from cuspid import pipeline
 from cuspid.anatomy.arch import DIMENSIONS, ArchDimensions, arch_dimensions, group_rows, implausible, jaw_rows, survey
 from cuspid.anatomy.dentition import ARCH_FORMS
+from cuspid.anatomy.jaw_files import load_jaw
 from cuspid.anatomy.landmarking import with_estimates
 from cuspid.anatomy.phantom import PhantomOptions, build_phantom
 from cuspid.jaw import Arch, Jaw
@@ -86,7 +86,7 @@ def summary(phantoms: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
 def load(path: Path) -> tuple[Jaw, tuple[str, ...]]:
     """A real jaw with estimated landmarks."""
     arch: Arch = "upper" if path.stem.endswith("upper") else "lower"
-    jaw, notes = pipeline.load_jaw(path, arch=arch)
+    jaw, notes = load_jaw(path, arch=arch)
     return with_estimates(jaw), notes
 
 

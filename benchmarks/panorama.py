@@ -26,7 +26,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from run import conditions, run_timed, timed
 
-from cuspid import pipeline, storage
+from cuspid import storage
+from cuspid.anatomy.jaw_files import jaw_files, load_jaw
 from cuspid.anatomy.phantom import PhantomOptions, build_phantom
 from cuspid.anatomy.population import GroupName, draw_population
 from cuspid.evaluation.panorama import PanoramaEvaluationOptions
@@ -53,7 +54,7 @@ def phantoms() -> dict[str, PhantomOptions]:
 
 def real_jaw(path: Path) -> Jaw:
     """A user's jaw with smooth faces, labelled where its file tells the teeth."""
-    jaw, _ = pipeline.load_jaw(path, arch="lower" if "lower" in path.stem else "upper")
+    jaw, _ = load_jaw(path, arch="lower" if "lower" in path.stem else "upper")
     smooth, labels = subdivided(jaw.mesh), jaw.face_labels
     if labels is not None:
         labels = labels[jaw.mesh.closest(smooth.face_centres)[1]]
@@ -154,9 +155,9 @@ METHODS: Mapping[str, Callable[[Path, Path, int], list[str]]] = {
 }
 
 
-def jaw_files(given: list[Path]) -> dict[str, Path]:
+def named_jaws(given: list[Path]) -> dict[str, Path]:
     """The jaws of files and folders by name."""
-    return {path.stem: path for each in given for path in pipeline.jaw_files(each)}
+    return {path.stem: path for each in given for path in jaw_files(each)}
 
 
 def main() -> None:
@@ -171,7 +172,7 @@ def main() -> None:
     parser.add_argument("--cpu-s", type=int, default=180, help="after which OpenCV's Stitcher is given up")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    subjects: Mapping[str, PhantomOptions | Path] = {**phantoms(), **jaw_files(options.jaws)}
+    subjects: Mapping[str, PhantomOptions | Path] = {**phantoms(), **named_jaws(options.jaws)}
     wanted = [name for name in subjects if not options.subject or name in options.subject]
     for name in wanted:
         film(name, subjects[name], options.work / name, list(subjects).index(name))

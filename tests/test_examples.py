@@ -4,6 +4,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from cuspid import pipeline, storage
@@ -34,6 +35,7 @@ def test_scan_one_tooth(tmp_path):
     assert 90 < float(re.search(r"([\d.]+) % of what", printed).group(1)) <= 100
     assert (tmp_path / "motion" / "sparse").is_dir()
     assert goes_on_where_it_stopped(tmp_path)
+    results_belong_to_what_made_them(tmp_path)
 
 
 def goes_on_where_it_stopped(folder: Path) -> bool:
@@ -45,3 +47,19 @@ def goes_on_where_it_stopped(folder: Path) -> bool:
     kept = (folder / "depth" / "00004.npz").stat().st_mtime_ns
     pipeline.reconstruct(storage.read_capture(folder / "capture"), folder, pipeline.ReconstructionOptions())
     return (folder / "mesh.stl").read_bytes() == whole and (folder / "depth" / "00004.npz").stat().st_mtime_ns == kept
+
+
+def results_belong_to_what_made_them(folder: Path) -> None:
+    """Poses that are read again have their tracks; another voxel gives another mesh; another image gives another
+    depth of its frame, and of no other."""
+    capture, options = storage.read_capture(folder / "capture"), pipeline.ReconstructionOptions()
+    found = pipeline.locate(capture, folder / "motion", options.tracking)
+    assert len(found.tracks.point_index) == found.log["observations"]
+    coarse = replace(options, fusion=replace(options.fusion, voxel_mm=2 * options.fusion.voxel_mm))
+    fine = storage.read_mesh(folder / "mesh.ply")
+    assert len(pipeline.reconstruct(capture, folder, coarse)[1].faces) < 0.5 * len(fine.faces)
+    shutil.copy(capture.source.path("00005", "o1"), capture.source.path("00004", "o1"))
+    before = {path.name: path.stat().st_mtime_ns for path in (folder / "depth").glob("*.npz")}
+    pipeline.measure_depth(capture, folder / "depth", options.stereo)
+    after = {path.name: path.stat().st_mtime_ns for path in (folder / "depth").glob("*.npz")}
+    assert [name for name in before if after[name] != before[name]] == ["00004.npz"]

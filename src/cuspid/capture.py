@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -99,6 +100,13 @@ def image_name(frame: str, camera: str, suffix: str) -> str:
     return f"{camera}/{frame}{suffix}"
 
 
+@cache
+def _file_digest(path: Path, size: int, modified_ns: int) -> str:
+    """SHA-256 of a file, read once for each of its states."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
 @dataclass(frozen=True)
 class ImageFolder:
     """Images on disk in COLMAP's rig layout, ``images/<camera>/<frame>.png``. An :class:`ImageSource`."""
@@ -124,8 +132,8 @@ class ImageFolder:
         """As :meth:`ImageSource.digest`."""
         path = self.path(frame, camera)
         try:
-            with path.open("rb") as stream:
-                return hashlib.file_digest(stream, "sha256").hexdigest()
+            state = path.stat()
+            return _file_digest(path, state.st_size, state.st_mtime_ns)
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror}); put the image back") from error
 

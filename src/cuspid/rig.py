@@ -74,6 +74,18 @@ class Rig:
         }
         return Rig(moved), reference_from_rig
 
+    def largest_shift_px(self, other: Rig, distance_mm: float) -> float:
+        """How far at most points at a distance lie from each other in the images of this calibration and of another one
+        of the same cameras."""
+        shares = np.array([[0.1, 0.1], [0.9, 0.1], [0.1, 0.9], [0.9, 0.9], [0.5, 0.5]])
+        largest = 0.0
+        for name, mounted in self.cameras.items():
+            pixels = shares * [mounted.camera.width, mounted.camera.height]
+            in_rig = mounted.cam_from_rig.inverse().apply(mounted.camera.rays(pixels) * distance_mm)
+            there = other[name].camera.project(other[name].cam_from_rig.apply(in_rig))
+            largest = max(largest, float(np.abs(there - pixels).max()))
+        return largest
+
     def overlap(self, first: str, second: str, distance_mm: float) -> float:
         """Share (0 to 1) of a plane across the first camera's axis, filling its image, that the second sees too."""
         one, other = self[first], self[second]

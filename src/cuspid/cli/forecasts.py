@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional, arg
 
-from cuspid import pipeline, storage
+from cuspid import storage
 from cuspid.anatomy.surfaces import named_surfaces, tooth_axes
 from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source
 from cuspid.errors import InputError
@@ -25,6 +25,7 @@ from cuspid.jaw import Jaw
 from cuspid.reporting.precision_figures import save_precision_picture
 from cuspid.reporting.visibility_figures import save_counts_picture, save_surfaces_picture
 from cuspid.simulation.scan_path import ScanPathOptions
+from cuspid.studies.forecast import bound_over, foresee
 
 VIEWS = {"occlusal": (0.0, 90.0), "from the cheek": (0.0, 15.0), "from the tongue": (180.0, 15.0)}
 """Azimuth from the buccal side of a tooth, and elevation, in degrees."""
@@ -94,7 +95,7 @@ def visibility(
     settings = {"source": source, "probe": probe, "path": path, "seed": seed, "visibility": options}
     with storage.claimed_folder(out, "visibility", settings, _hashes(jaw, probe), replace=True):
         scanned, device = load_source(jaw, source), load_probe(probe)
-        seen = pipeline.foresee(scanned, device, path, options, seed=seed)
+        seen = foresee(scanned, device, path, options, seed=seed)
         surfaces = _surfaces(scanned, path.tooth)
         rows = surface_rows(seen, scanned.mesh.face_areas, surfaces)
         storage.write_table(out / "surfaces.csv", rows, digits=2)
@@ -129,7 +130,7 @@ def precision(
     settings = {"source": source, "probe": probe, "tooth": tooth, "turns": turns, "noise": noise, "rule": visibility}
     with storage.claimed_folder(out, "precision", settings, _hashes(jaw, probe), replace=True):
         scanned, device = load_source(jaw, source), load_probe(probe)
-        found = pipeline.bound_over(scanned, device, ScanPathOptions(tooth=tooth, turns=turns), noise, visibility)
+        found = bound_over(scanned, device, ScanPathOptions(tooth=tooth, turns=turns), noise, visibility)
         faces = scanned.tooth_faces(tooth)
         rows = _precision_rows(scanned, found, _surfaces(scanned, tooth))
         storage.write_table(out / "surfaces.csv", rows, digits=2)

@@ -7,13 +7,14 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional
 
-from cuspid import pipeline, storage
+from cuspid import storage
 from cuspid.anatomy.mouth import MouthOptions
 from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
 from cuspid.handpiece.brief import read_brief
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.handpiece.optimise import SearchOptions, handpiece_outline, optimise_handpiece
 from cuspid.reporting.design_figures import save_design_picture
+from cuspid.studies.forecast import room_for, sections_of
 
 
 def handpiece(
@@ -57,9 +58,9 @@ def design(
     settings = {"search": search, "mouth": mouth, "teeth": teeth, "source": source}
     inputs = {"brief": storage.hash_file(brief)} | ({} if jaw is None else {"jaw": storage.hash_file(jaw)})
     with storage.claimed_folder(out, "design", settings, inputs, replace=True), show_progress() as progress:
-        gap_mm = pipeline.room_for(wanted, mouth)
+        gap_mm = room_for(wanted, mouth)
         wanted.check_gap(gap_mm)
-        sections = pipeline.sections_of(load_source(jaw, source), teeth, wanted)
+        sections = sections_of(load_source(jaw, source), teeth, wanted)
         found = optimise_handpiece(wanted, sections, gap_mm, search, progress=progress)
         storage.write_handpiece(out / "handpiece.json", found.handpiece)
         storage.write_rig_config(out / "rig_config.json", found.handpiece.rig)

@@ -13,7 +13,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, Tim
 from rich.progress import Progress as Bars
 from tyro.conf import arg
 
-from cuspid import pipeline, storage
+from cuspid import storage
+from cuspid.anatomy.jaw_files import load_jaw
 from cuspid.anatomy.phantom import PhantomOptions, build_phantom
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.jaw import Arch, Jaw
@@ -67,7 +68,7 @@ def load_source(mesh: Path | None, source: Source) -> Jaw:
     """The jaw of a file in the occlusal frame, or the phantom; prints what was found or is unsure."""
     if mesh is None:
         return build_phantom(PhantomOptions(arch=source.arch or "lower", seed=source.jaw_seed))
-    jaw, notes = pipeline.load_jaw(mesh, unit=source.unit, arch=source.arch)
+    jaw, notes = load_jaw(mesh, unit=source.unit, arch=source.arch)
     for note in notes:
         console.print(f"note: {note}")
     return jaw

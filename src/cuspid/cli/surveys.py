@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional
 
-from cuspid import pipeline, storage
+from cuspid import storage
 from cuspid.anatomy.arch import (
     DIMENSIONS,
     Dimension,
@@ -24,6 +24,7 @@ from cuspid.anatomy.arch import (
     needed_landmarks,
     survey,
 )
+from cuspid.anatomy.jaw_files import jaw_files, load_landmarked_jaw
 from cuspid.anatomy.mean_shape import MeanShapeOptions, mean_shape
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
@@ -54,14 +55,14 @@ def measure(
         unit: Length unit of the mesh files.
         arch: Which jaws they are, where neither the files nor their names say.
     """
-    files = pipeline.jaw_files(jaws)
+    files = jaw_files(jaws)
     if landmarks is not None and len(files) > 1:
         raise InputError(f"{landmarks}: one file of landmarks for {len(files)} jaws; put one beside each mesh instead")
     hashes = {path.name: storage.hash_file(path) for path in files}
     with storage.claimed_folder(out, "measure", {"arch": arch}, hashes, replace=True), show_progress() as progress:
 
         def load(number: int, path: Path) -> tuple[Jaw, tuple[str, ...]]:
-            jaw, notes = pipeline.load_landmarked_jaw(path, unit=unit, arch=arch, landmarks=landmarks)
+            jaw, notes = load_landmarked_jaw(path, unit=unit, arch=arch, landmarks=landmarks)
             storage.write_landmarks(out / f"{path.stem}.landmarks.json", jaw.landmarks, "occlusal")
             _save_pictures(out, path.stem, jaw)
             progress("jaws", number, len(files))
@@ -131,10 +132,10 @@ def shape(
         unit: Length unit of the mesh files.
         arch: Which jaws they are, where the files do not say.
     """
-    files = pipeline.jaw_files(jaws)
+    files = jaw_files(jaws)
     hashes = {path.name: storage.hash_file(path) for path in files}
     with storage.claimed_folder(out, "shape", {"shape": options}, hashes, replace=True), show_progress() as progress:
-        samples = {path.stem: pipeline.load_landmarked_jaw(path, unit=unit, arch=arch)[0] for path in files}
+        samples = {path.stem: load_landmarked_jaw(path, unit=unit, arch=arch)[0] for path in files}
         model = mean_shape(samples, options, progress=progress)
         storage.write_shape_model(out, model)
         save_picture(out / "mean.png", model.mean.mesh, title=f"Mean of {len(samples)} jaws")

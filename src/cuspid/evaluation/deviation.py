@@ -105,12 +105,14 @@ def evaluate(
     options: EvaluationOptions,
     *,
     scannable: Bool[np.ndarray, "f"] | None = None,
-    rng: np.random.Generator,
+    rng: np.random.Generator | None = None,
 ) -> Trueness:
     """Compare a scan in any pose with a reference of which the faces in ``scannable`` count (None: see the module).
 
-    Raises InputError where the two do not belong together or nothing is left to compare.
+    ``rng`` draws the samples; the same ones each time where there is none. Raises InputError where the two do not
+    belong together or nothing is left to compare.
     """
+    rng = rng or np.random.default_rng(0)
     surface = Surface(reference.mesh)
     rules = _rules(reference.mesh, scannable, options)
     alignment = _align(scan, surface, options, rng)

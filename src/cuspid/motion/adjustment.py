@@ -267,7 +267,7 @@ def _minimise(
         decrease = np.inf if full is None else float(-full @ system.gradient)
         candidate = state if step is None else _moved(state, observations, weighting, prior, step)
         lower = np.inf if step is None else _cost(candidate, observations, weighting)
-        settled = decrease < options.tolerance and not cost - lower > options.tolerance
+        settled = decrease < options.tolerance
         if lower <= cost:
             state, damping = _at_best_gauge(candidate, prior), max(damping / 10, _LEAST_DAMPING)
             cost = _cost(state, observations, weighting) if weighting.calibrated else lower

@@ -28,7 +28,7 @@ from cuspid.geometry import Rigid3
 from cuspid.motion.adjustment import residuals_px
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import Rig
-from cuspid.storage.files import whole_files
+from cuspid.storage.files import digest_of, hash_file, whole_files
 
 MODEL_FILES = ("cameras", "images", "points3D")
 """Files of a sparse model, ``.bin`` or ``.txt``; newer ones also have ``rigs`` and ``frames``."""
@@ -172,6 +172,12 @@ def _model_folder(folder: Path) -> Path:
             if all((candidate / f"{name}{suffix}").is_file() for name in MODEL_FILES):
                 return candidate
     raise InputError(f"{folder}: no COLMAP model; a folder with cameras, images and points3D (.bin or .txt) is needed")
+
+
+def hash_model(folder: Path) -> str:
+    """SHA-256 of a sparse model. Raises InputError where the folder holds none."""
+    files = sorted(path for path in _model_folder(folder).iterdir() if path.stem in (*MODEL_FILES, "rigs", "frames"))
+    return digest_of({path.name: hash_file(path) for path in files})
 
 
 def _integer(data: bytes, at: int, size: int) -> int:

@@ -7,11 +7,9 @@ handpiece keep their roll from one frame to the next, so fixing the orientation 
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import cv2
 import numpy as np
@@ -21,6 +19,7 @@ from cuspid.camera import OPENCV_PIXEL_OFFSET
 from cuspid.capture import Capture, Frame
 from cuspid.progress import Progress, silent
 from cuspid.storage.files import write_arrays
+from cuspid.storage.stages import Stage
 from cuspid.workers import map_in_threads
 
 DESCRIPTOR_NORM = 512.0
@@ -110,39 +109,23 @@ def detect(image: UInt8[np.ndarray, "h w 3"], options: FeatureOptions | None = N
     return Features(pixels=pixels, descriptors=_root_sift(descriptors), colors=_colors_at(image, pixels))
 
 
-def _key(digest: str, options: FeatureOptions) -> str:
-    """Changes when the image or the options do."""
-    return hashlib.sha256(f"{options} {digest}".encode()).hexdigest()
+def _load(path: Path) -> Features:
+    """Features that an earlier run has kept."""
+    with np.load(path) as kept:
+        return Features(pixels=kept["pixels"], descriptors=kept["descriptors"], colors=kept["colors"])
 
 
-def _load(path: Path, key: str) -> Features | None:
-    """Features kept by an earlier run, or None where there are none for this key."""
-    try:
-        with np.load(path) as kept:
-            if str(kept["key"]) != key:
-                return None
-            return Features(pixels=kept["pixels"], descriptors=kept["descriptors"], colors=kept["colors"])
-    except (OSError, ValueError, KeyError, BadZipFile):
-        return None
-
-
-def _keep(path: Path, key: str, features: Features) -> None:
-    """Write features whole or not at all. Raises OutputError."""
-    arrays = {"pixels": features.pixels, "descriptors": features.descriptors, "colors": features.colors}
-    write_arrays(path, {"key": np.array(key), **arrays})
-
-
-def _detect_kept(capture: Capture, frame: Frame, camera: str, options: FeatureOptions, cache: Path | None) -> Features:
-    """Features of one image of a capture, from the cache where it has them."""
-    if cache is None:
+def _detect_kept(capture: Capture, frame: Frame, camera: str, options: FeatureOptions, stage: Stage | None) -> Features:
+    """Features of one image of a capture, from the results of an earlier run where they are there."""
+    if stage is None:
         return detect(capture.image(frame, camera), options)
-    path = cache / "features" / camera / f"{frame.name}.npz"
-    key = _key(capture.source.digest(frame.name, camera), options)
-    kept = _load(path, key)
-    if kept is not None:
-        return kept
+    path = stage.folder / camera / f"{frame.name}.npz"
+    key = stage.key({"image": capture.source.digest(frame.name, camera)})
+    if stage.has(key, [path]):
+        return _load(path)
     features = detect(capture.image(frame, camera), options)
-    _keep(path, key, features)
+    write_arrays(path, {name: getattr(features, name) for name in ("pixels", "descriptors", "colors")})
+    stage.record(key, [path])
     return features
 
 
@@ -155,10 +138,11 @@ def detect_all(
 ) -> Mapping[tuple[str, str], Features]:
     """Features of every image by (frame, camera). Finished images are kept in ``cache``. Raises InputError."""
     options = options or FeatureOptions()
+    stage = None if cache is None else Stage("features", cache / "features", options, ("motion/features.py",))
     images = [(frame, camera) for frame in capture.frames for camera in frame.cameras]
 
     def kept(image: tuple[Frame, str]) -> Features:
-        return _detect_kept(capture, *image, options, cache)
+        return _detect_kept(capture, *image, options, stage)
 
     found = map_in_threads(kept, images, stage="features", progress=progress)
     return {(frame.name, camera): features for (frame, camera), features in zip(images, found, strict=True)}

@@ -8,11 +8,8 @@ from cuspid.storage.captures import (
     IMAGE_SUFFIXES,
     hash_capture,
     read_capture,
-    read_truth,
     write_capture,
     write_image,
-    write_overlap,
-    write_truth,
 )
 from cuspid.storage.files import (
     PART,
@@ -26,30 +23,18 @@ from cuspid.storage.files import (
     write_json,
 )
 from cuspid.storage.handpieces import read_handpiece, read_rig_config, write_handpiece, write_rig_config
-from cuspid.storage.jaws import (
-    MESH_SUFFIXES,
-    MM_PER_UNIT,
-    Unit,
-    is_jaw,
-    read_jaw,
-    read_labelled_mesh,
-    read_mesh,
-    read_vertex_values,
-    write_jaw,
-    write_mesh,
-)
+from cuspid.storage.jaws import is_jaw, read_jaw, read_labelled_mesh, write_jaw
 from cuspid.storage.landmarks import MARKUPS_SUFFIX, LandmarkFile, LandmarkFrame, read_landmarks, write_landmarks
+from cuspid.storage.meshes import MESH_SUFFIXES, MM_PER_UNIT, Unit, read_mesh, read_vertex_values, write_mesh
 from cuspid.storage.occlusal_views import read_occlusal_view, write_occlusal_view
 from cuspid.storage.panoramas import read_panorama, write_panorama, write_strip
 from cuspid.storage.reconstructions import (
     read_depth_maps,
     read_poses,
     read_reconstruction,
-    trueness_summary,
     write_depth_maps,
     write_poses,
     write_reconstruction,
-    write_trueness,
 )
 from cuspid.storage.results import (
     PanoramaResult,
@@ -63,6 +48,8 @@ from cuspid.storage.results import (
 from cuspid.storage.sequences import read_sequence
 from cuspid.storage.shapes import read_shape_model, write_shape_model
 from cuspid.storage.tables import csv_table, write_table
+from cuspid.storage.trueness import trueness_summary, write_trueness
+from cuspid.storage.truths import read_truth, write_overlap, write_truth
 from cuspid.storage.videos import write_video
 
 __all__ = [

@@ -1,9 +1,7 @@
-"""Captures, and what only the simulator knows of them."""
+"""Captures: images, calibration, and the list of frames."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +13,9 @@ from jaxtyping import UInt8
 from cuspid.capture import Capture, Dropped, Frame, ImageFolder
 from cuspid.errors import InputError, OutputError
 from cuspid.rig import Handpiece, Rig
-from cuspid.storage.files import finished, read_json, reading, to_plain, write_bytes, write_json
-from cuspid.storage.handpieces import handpiece_to_json, read_handpiece, write_handpiece, write_rig_config
-from cuspid.storage.jaws import read_jaw, write_jaw
-from cuspid.storage.reconstructions import read_poses, write_poses
-from cuspid.trueness import GroundTruth
+from cuspid.storage.files import digest_of, finished, read_json, reading, write_bytes, write_json
+from cuspid.storage.handpieces import hash_handpiece, read_handpiece, write_handpiece, write_rig_config
+from cuspid.workers import map_in_threads
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
@@ -122,29 +118,12 @@ def _image_stems(images: Path, cameras: Sequence[str]) -> tuple[str, dict[str, s
     return suffixes.pop(), {camera: {path.stem for path in files.get(camera, ())} for camera in cameras}
 
 
-def write_truth(folder: Path, truth: GroundTruth) -> None:
-    """Write what only the simulator knows: ``jaw.ply``, ``handpiece.json``, ``poses.json``."""
-    write_jaw(folder / "jaw.ply", truth.jaw)
-    write_handpiece(folder / "handpiece.json", truth.handpiece)
-    write_poses(folder / "poses.json", truth.rig_from_world)
-
-
-def read_truth(folder: Path) -> GroundTruth:
-    """Read what :func:`write_truth` wrote."""
-    return GroundTruth(
-        jaw=read_jaw(folder / "jaw.ply"),
-        handpiece=read_handpiece(folder / "handpiece.json"),
-        rig_from_world=read_poses(folder / "poses.json"),
-    )
-
-
-def write_overlap(path: Path, minimum: float, mean: float) -> None:
-    """Write the share of the surface in an image that the same camera's next image also sees."""
-    write_json(path, {"minimum_overlap": minimum, "mean_overlap": mean})
+def hash_frame(capture: Capture, frame: Frame) -> str:
+    """SHA-256 of a frame of a capture with the contents of its images."""
+    return digest_of([frame, [capture.source.digest(frame.name, name) for name in frame.cameras]])
 
 
 def hash_capture(capture: Capture) -> dict[str, str]:
     """SHA-256 of a capture's handpiece and of its frames with the contents of their images."""
-    images = [(frame, [capture.source.digest(frame.name, name) for name in frame.cameras]) for frame in capture.frames]
-    parts = {"handpiece": handpiece_to_json(capture.handpiece), "images": images}
-    return {name: hashlib.sha256(json.dumps(to_plain(part)).encode()).hexdigest() for name, part in parts.items()}
+    frames = map_in_threads(lambda frame: hash_frame(capture, frame), capture.frames)
+    return {"handpiece": hash_handpiece(capture.handpiece), "images": digest_of(frames)}

@@ -132,6 +132,11 @@ def reading(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: a value cannot be used ({error}); see docs/formats.md") from error
 
 
+def digest_of(value: object) -> str:
+    """SHA-256 of a value as JSON: options, arrays and mappings alike."""
+    return hashlib.sha256(json.dumps(to_plain(value), sort_keys=True).encode()).hexdigest()
+
+
 def hash_file(path: Path) -> str:
     """SHA-256 of a file's contents."""
     if not path.is_file():

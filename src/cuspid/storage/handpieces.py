@@ -12,7 +12,7 @@ from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor
-from cuspid.storage.files import read_json, reading, write_json
+from cuspid.storage.files import digest_of, read_json, reading, write_json
 
 
 def rigid_to_json(target_from_source: Rigid3) -> dict[str, Any]:
@@ -127,6 +127,11 @@ def read_handpiece(path: Path) -> Handpiece:
             depth_range_mm=(float(near), float(far)),
             name=str(value.get("name", path.stem)),
         )
+
+
+def hash_handpiece(handpiece: Handpiece) -> str:
+    """SHA-256 of all of a handpiece."""
+    return digest_of(handpiece_to_json(handpiece))
 
 
 def write_rig_config(path: Path, rig: Rig) -> None:

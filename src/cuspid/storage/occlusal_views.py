@@ -13,6 +13,9 @@ from cuspid.storage.captures import write_image
 from cuspid.storage.files import read_json, reading, write_arrays, write_json
 from cuspid.trueness import OcclusalView
 
+OCCLUSAL_VIEW_FILES = ("picture.png", "surface.npz", "view.json")
+"""What :func:`write_occlusal_view` writes."""
+
 
 def write_occlusal_view(folder: Path, view: OcclusalView) -> None:
     """Write a single shot; ``view.json`` comes last, so that what has one is whole."""

@@ -1,4 +1,4 @@
-"""Reconstructions, depth maps and trueness."""
+"""Reconstructions and depth maps."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
 from cuspid.capture import Dropped
+from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.reconstruction import DepthMap, Reconstruction
+from cuspid.reconstruction import DepthMap, Reconstruction, Tracks
 from cuspid.rig import Handpiece
 from cuspid.storage.files import read_json, reading, to_plain, write_arrays, write_json
 from cuspid.storage.handpieces import (
@@ -24,7 +25,6 @@ from cuspid.storage.handpieces import (
     rigid_to_json,
     write_handpiece,
 )
-from cuspid.trueness import Trueness
 
 
 def write_poses(path: Path, rig_from_world: Mapping[str, Rigid3]) -> None:
@@ -39,9 +39,15 @@ def read_poses(path: Path) -> dict[str, Rigid3]:
         return {name: rigid_from_json(pose) for name, pose in value.items()}
 
 
+RECONSTRUCTION_FILES = ("poses.json", "handpiece.json", "tracks.npz", "reconstruction.json")
+"""What :func:`write_reconstruction` writes."""
+
+
 def write_reconstruction(folder: Path, reconstruction: Reconstruction, handpiece: Handpiece) -> None:
-    """Write poses, refined handpiece and the list of what was dropped; last of all ``reconstruction.json``."""
+    """Write poses, refined handpiece, tracks and what was dropped; last of all ``reconstruction.json``."""
     write_poses(folder / "poses.json", reconstruction.rig_from_world)
+    if reconstruction.tracks is not None:
+        write_arrays(folder / "tracks.npz", {name: getattr(reconstruction.tracks, name) for name in _TRACKS})
     write_handpiece(folder / "handpiece.json", dataclasses.replace(handpiece, rig=reconstruction.rig))
     write_json(
         folder / "reconstruction.json",
@@ -58,19 +64,31 @@ def write_reconstruction(folder: Path, reconstruction: Reconstruction, handpiece
 
 
 def read_reconstruction(folder: Path) -> Reconstruction:
-    """Read what :func:`write_reconstruction` wrote; the sparse tracks stay in COLMAP's model beside it."""
-    path = folder / "reconstruction.json"
+    """Read what :func:`write_reconstruction` wrote. Raises InputError where it is missing or broken."""
+    path, tracks = folder / "reconstruction.json", folder / "tracks.npz"
     value = read_json(path)
     with reading(path):
         return Reconstruction(
             rig=read_handpiece(folder / "handpiece.json").rig,
             rig_from_world=read_poses(folder / "poses.json"),
+            tracks=_read_tracks(tracks) if value["points"] else None,
             dropped=tuple(Dropped(**entry) for entry in value["frames_dropped"]),
             pose_covariance=covariance_from_json(value["pose_covariance_rotation_rad_translation_mm"]),
             reprojection_rms_px=value["reprojection_rms_px"],
             log=value["log"],
             notes=tuple(value.get("notes", ())),
         )
+
+
+_TRACKS = [field.name for field in dataclasses.fields(Tracks)]
+
+
+def _read_tracks(path: Path) -> Tracks:
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return Tracks(**{name: arrays[name] for name in _TRACKS})
+    except (OSError, ValueError, KeyError, BadZipFile) as error:
+        raise InputError(f"{path}: missing or damaged; delete the folder and locate the frames again") from error
 
 
 def write_depth_maps(path: Path, depth_maps: Sequence[DepthMap]) -> None:
@@ -110,28 +128,3 @@ def read_depth_maps(path: Path) -> tuple[DepthMap, ...]:
             )
             for index, entry in enumerate(header)
         )
-
-
-def trueness_summary(trueness: Trueness) -> dict[str, Any]:
-    """``trueness.json``: the headline at the top level, everything else below it. Unknown numbers are null."""
-    accuracy = trueness.accuracy
-    details = {
-        field.name: getattr(trueness, field.name)
-        for field in dataclasses.fields(trueness)
-        if field.name not in {"deviation_um", "reference_from_scan"}
-    }
-    return {
-        "mean_abs_um": accuracy.mean_abs_um,
-        "signed_mean_um": accuracy.signed_mean_um,
-        "std_um": accuracy.std_um,
-        "rms_um": accuracy.rms_um,
-        "p95_um": accuracy.p95_um,
-        "max_um": accuracy.max_um,
-        **details,
-        "reference_from_scan": trueness.reference_from_scan.matrix,
-    }
-
-
-def write_trueness(path: Path, trueness: Trueness) -> None:
-    """Write ``trueness.json``."""
-    write_json(path, trueness_summary(trueness))

@@ -25,7 +25,8 @@ from cuspid.reconstruction import Reconstruction
 from cuspid.shape_model import ShapeModel
 from cuspid.storage.captures import read_capture
 from cuspid.storage.files import hash_file, read_json, read_manifest, reading
-from cuspid.storage.jaws import Unit, is_jaw, read_jaw, read_labelled_mesh, read_mesh, read_vertex_values
+from cuspid.storage.jaws import is_jaw, read_jaw, read_labelled_mesh
+from cuspid.storage.meshes import Unit, read_mesh, read_vertex_values
 from cuspid.storage.panoramas import read_panorama
 from cuspid.storage.reconstructions import read_reconstruction
 from cuspid.storage.shapes import read_shape_model

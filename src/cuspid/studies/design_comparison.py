@@ -28,6 +28,7 @@ from jaxtyping import Bool, Float
 
 from cuspid import pipeline, storage
 from cuspid.anatomy.boxed import boxed
+from cuspid.anatomy.jaw_files import load_jaw
 from cuspid.anatomy.mean_shape import mean_shape
 from cuspid.anatomy.mouth import MouthOptions, fit_pct, room_mm, study_mouths
 from cuspid.anatomy.phantom import PhantomOptions, build_phantom
@@ -150,7 +151,7 @@ def make_jaw(name: str, edge_mm: float) -> Jaw:
     if name in _JAWS:
         return _JAWS[name](edge_mm)
     _jaw_name(name)
-    return pipeline.load_jaw(Path(name))[0]
+    return load_jaw(Path(name))[0]
 
 
 def _jaw_name(given: str) -> str:

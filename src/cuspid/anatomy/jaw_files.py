@@ -1,0 +1,75 @@
+"""Jaws that a user brings: mesh files in any frame, with labels and landmarks where there are any."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from cuspid.anatomy.landmarking import with_estimates
+from cuspid.anatomy.landmarks import in_frame, missing, validate
+from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, labels_from_colors
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
+from cuspid.jaw import ARCHES, Arch, Jaw
+from cuspid.storage.jaws import is_jaw, read_jaw, read_labelled_mesh
+from cuspid.storage.landmarks import MARKUPS_SUFFIX, read_landmarks
+from cuspid.storage.meshes import MESH_SUFFIXES, Unit
+
+
+def load_jaw(path: Path, *, unit: Unit = "mm", arch: Arch | None = None) -> tuple[Jaw, tuple[str, ...]]:
+    """A user's jaw mesh, brought into the occlusal frame, and notes on what was found or is unsure; a jaw that cuspid
+    wrote, as it is.
+
+    Raises InputError where the file is no mesh, or its width is not that of a jaw in the given unit.
+    """
+    jaw, notes, _ = _load_oriented(path, unit, arch)
+    return jaw, notes
+
+
+def _load_oriented(path: Path, unit: Unit, arch: Arch | None) -> tuple[Jaw, tuple[str, ...], Rigid3]:
+    """As :func:`load_jaw`, with ``occlusal_from_mesh``."""
+    if is_jaw(path):
+        return read_jaw(path), (), Rigid3.identity()
+    mesh, labels, colors = read_labelled_mesh(path, unit)
+    notes = check_scale(mesh, unit)
+    occlusal = find_occlusal_frame(mesh)
+    moved = mesh.transformed(occlusal.occlusal_from_mesh)
+    if labels is None and colors is not None:
+        labels = labels_from_colors(colors, moved, arch)
+    return Jaw(mesh=moved, face_labels=labels, arch=arch), (*notes, *occlusal.notes), occlusal.occlusal_from_mesh
+
+
+def jaw_files(folder: Path) -> list[Path]:
+    """The mesh files of a folder, or the one file that is given. Raises InputError where there is none."""
+    if folder.is_file():
+        return [folder]
+    found = sorted(path for path in folder.glob("*") if path.suffix.lower() in MESH_SUFFIXES)
+    if not found:
+        raise InputError(f"{folder}: no jaw meshes in it; give a folder with STL, PLY or OBJ files")
+    return found
+
+
+def load_landmarked_jaw(
+    path: Path, *, unit: Unit = "mm", arch: Arch | None = None, landmarks: Path | None = None
+) -> tuple[Jaw, tuple[str, ...]]:
+    """As :func:`load_jaw`, with landmarks: from a file, or those that the jaw came with; the rest is estimated from its
+    labels, where it has any.
+
+    A file ``<name>.landmarks.json`` or ``<name>.mrk.json`` beside the mesh is found by itself. ``lower`` or ``upper``
+    in the name of the mesh tells the arch where nothing else does. Raises InputError for a landmark that the scheme or
+    the jaw does not know, and where there are neither landmarks nor labels.
+    """
+    named: Arch | None = next((each for each in ARCHES if each in path.stem.lower()), None)
+    jaw, notes, occlusal_from_mesh = _load_oriented(path, unit, arch or named)
+    beside = (path.with_suffix(suffix) for suffix in (".landmarks.json", MARKUPS_SUFFIX))
+    file = landmarks or next((each for each in beside if each.exists()), None)
+    if file is not None:
+        given = read_landmarks(file)
+        validate(given.landmarks, jaw.teeth, source=str(file))
+        placed = in_frame(given.landmarks, occlusal_from_mesh) if given.frame == "mesh" else given.landmarks
+        jaw, notes = replace(jaw, landmarks=placed), (*notes, *given.notes)
+    if jaw.face_labels is not None and missing(jaw.landmarks, jaw.teeth):
+        jaw = with_estimates(jaw)
+    if not jaw.landmarks:
+        raise InputError(f"{path}: neither landmarks nor tooth labels; give a landmark file or a labelled mesh")
+    return jaw, notes

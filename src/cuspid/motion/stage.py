@@ -1,0 +1,56 @@
+"""Where the handpiece was, found once and kept on disk, or taken from a COLMAP model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Literal
+
+from cuspid.capture import Capture
+from cuspid.motion.colmap import hash_model, locate_with_colmap, read_model, write_model
+from cuspid.motion.location import MotionOptions
+from cuspid.motion.location import locate as locate_with_rig
+from cuspid.progress import Progress, silent
+from cuspid.reconstruction import Reconstruction
+from cuspid.storage.captures import hash_capture
+from cuspid.storage.reconstructions import RECONSTRUCTION_FILES, read_reconstruction, write_reconstruction
+from cuspid.storage.stages import Stage
+
+MotionMethod = Literal["rig", "colmap", "colmap-rig"]
+
+
+def locate(
+    capture: Capture, folder: Path, options: MotionOptions, method: MotionMethod = "rig", *, progress: Progress = silent
+) -> Reconstruction:
+    """Metric poses of the frames, kept in ``folder`` together with a COLMAP model.
+
+    ``method``: ``rig`` is ours; COLMAP's own mapper without (``colmap``) or with the rig (``colmap-rig``).
+    """
+
+    def find() -> Reconstruction:
+        if method == "rig":
+            return locate_with_rig(capture, options, progress=progress, cache=folder / "cache")
+        return locate_with_colmap(capture, folder / "colmap", with_rig=method == "colmap-rig")
+
+    stage = Stage("motion", folder, {"method": method, "options": options if method == "rig" else None}, ("motion",))
+    return _kept(stage, capture, hash_capture(capture), find)
+
+
+def take_poses(capture: Capture, model: Path, folder: Path) -> Reconstruction:
+    """The poses of a COLMAP model of the capture, made metric by the rig and kept in ``folder``."""
+    inputs = {**hash_capture(capture), "model": hash_model(model)}
+    return _kept(
+        Stage("motion", folder, "from poses", ("motion",)), capture, inputs, lambda: read_model(model, capture)
+    )
+
+
+def _kept(
+    stage: Stage, capture: Capture, inputs: Mapping[str, str], find: Callable[[], Reconstruction]
+) -> Reconstruction:
+    def write() -> None:
+        found = find()
+        write_model(stage.folder / "sparse", found, capture)
+        write_reconstruction(stage.folder, found, capture.handpiece)
+
+    stage.make(inputs, [stage.folder / name for name in RECONSTRUCTION_FILES], write)
+    return read_reconstruction(stage.folder)

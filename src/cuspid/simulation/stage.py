@@ -1,0 +1,174 @@
+"""What a handpiece records of a jaw, in simulation: images on disk, and beside them what only the simulator knows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+
+from cuspid.capture import Capture, ImageFolder
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
+from cuspid.jaw import Jaw
+from cuspid.progress import Progress, silent
+from cuspid.rig import Handpiece
+from cuspid.simulation.appearance import APPEARANCES, Preset
+from cuspid.simulation.blender import render_with_blender
+from cuspid.simulation.free_path import FreePathOptions, plan_free_path
+from cuspid.simulation.occlusal import OcclusalOptions, render_occlusal_view
+from cuspid.simulation.raycast import Scene, lit_frames, render_capture
+from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path
+from cuspid.storage.captures import write_capture, write_image
+from cuspid.storage.files import digest_of, hash_file
+from cuspid.storage.occlusal_views import OCCLUSAL_VIEW_FILES, write_occlusal_view
+from cuspid.storage.stages import Stage
+from cuspid.storage.truths import write_overlap, write_truth
+from cuspid.trueness import GroundTruth
+from cuspid.workers import usable_cores
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderOptions:
+    """What the images of a simulation look like."""
+
+    texture: Preset = "artificial"
+    """Surface: artificial (strong matte texture, the thesis' condition), powder (weak speckle), enamel (plain, wet)."""
+    renderer: Literal["embree", "blender"] = "embree"
+    """Embree rays (default), or Blender Cycles with subsurface scattering (needs an environment of its own)."""
+    supersampling: int = 2
+    """Rays through a pixel along each side."""
+    seed: int = 0
+    """Chooses texture, hand jitter and sensor noise."""
+
+    def __post_init__(self) -> None:
+        if self.supersampling < 1:
+            raise InputError(f"simulation: --supersampling is {self.supersampling}; at least 1 is needed")
+        if self.seed < 0:
+            raise InputError(f"simulation: --seed is {self.seed}; it must not be negative")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationOptions(RenderOptions):
+    """How a jaw is scanned in simulation."""
+
+    path: ScanPathOptions = field(default_factory=ScanPathOptions)
+    """How the handpiece moves."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmOptions(RenderOptions):
+    """How a jaw is filmed by hand in simulation."""
+
+    texture: Preset = "enamel"
+    """Surface: artificial (strong matte texture, the thesis' condition), powder (weak speckle), enamel (plain, wet)."""
+    path: FreePathOptions = field(default_factory=FreePathOptions)
+    """How the hand moves the camera."""
+
+
+SINGLE_SHOTS: Mapping[str, float | None] = MappingProxyType({"occlusal": None, "shot": 300.0})
+"""Height in mm of the camera of each picture of the true jaw; None for an orthographic view."""
+
+
+def simulate(
+    jaw: Jaw, handpiece: Handpiece, folder: Path, options: SimulationOptions, *, progress: Progress = silent
+) -> tuple[Capture, GroundTruth]:
+    """Scan a jaw: images to ``folder/capture``, what only the simulator knows to ``folder/truth``.
+
+    Images that are there already are kept; a run that goes on gives the same bits as one that was not interrupted.
+    """
+    path = plan_scan_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
+    write_overlap(folder / "truth" / "path.json", path.minimum_overlap, path.mean_overlap)
+    return take_images(jaw, handpiece, path.rig_from_world, folder, options, progress=progress)
+
+
+def film(
+    jaw: Jaw, handpiece: Handpiece, folder: Path, options: FilmOptions, *, progress: Progress = silent
+) -> tuple[Capture, GroundTruth]:
+    """As :func:`simulate`, with a camera that a shaky hand moves freely over the arch.
+
+    Also the arch in a single shot from above: ``truth/occlusal``, orthographic, and ``truth/shot``, from far above.
+    """
+    poses = plan_free_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
+    capture, truth = take_images(jaw, handpiece, poses, folder, options, progress=progress)
+    for done, (name, height_mm) in enumerate(SINGLE_SHOTS.items(), start=1):
+        _shoot(truth, folder / "truth", name, OcclusalOptions(camera_height_mm=height_mm), options)
+        progress("single shots", done, len(SINGLE_SHOTS))
+    return capture, truth
+
+
+def _shoot(truth: GroundTruth, folder: Path, name: str, view: OcclusalOptions, options: FilmOptions) -> None:
+    stage = Stage("single shot", folder, [view, _look(options)], _CODE)
+    scene = _scene(truth, replace(options, supersampling=max(2, options.supersampling)))
+    files = [folder / name / file for file in OCCLUSAL_VIEW_FILES]
+    stage.make(_jaw_files(folder), files, lambda: write_occlusal_view(folder / name, render_occlusal_view(scene, view)))
+
+
+def take_images(
+    jaw: Jaw,
+    handpiece: Handpiece,
+    rig_from_world: Mapping[str, Rigid3],
+    folder: Path,
+    options: RenderOptions,
+    *,
+    progress: Progress = silent,
+) -> tuple[Capture, GroundTruth]:
+    """As :func:`simulate`, from given poses of the handpiece, by the name of the frame."""
+    frames, poses = lit_frames(handpiece, rig_from_world)
+    truth = GroundTruth(jaw=jaw, handpiece=handpiece, rig_from_world=poses)
+    write_truth(folder / "truth", truth)
+    capture = Capture(handpiece=handpiece, frames=frames, source=ImageFolder(folder / "capture"))
+    write_capture(folder / "capture", capture)
+    for done, total in _render(folder, capture, truth, options):
+        progress("images", done, total)
+    return capture, truth
+
+
+def _render(folder: Path, capture: Capture, truth: GroundTruth, options: RenderOptions) -> Iterator[tuple[int, int]]:
+    """Render what is not there yet; yields how many images are there, and how many there will be."""
+    images = ImageFolder(folder / "capture")
+    stage = Stage("images", folder / "truth", _look(options), _CODE)
+    # The gain is metered over the whole path, so each image depends on all of the truth.
+    key = stage.key({**_jaw_files(folder / "truth"), "poses": digest_of(dict(truth.rig_from_world))})
+    there = {
+        (frame.name, camera): stage.has(key, [images.path(frame.name, camera)])
+        for frame in capture.frames
+        for camera in frame.cameras
+    }
+    rendered = _RENDERERS[options.renderer](
+        _scene(truth, options),
+        capture.frames,
+        truth.rig_from_world,
+        lambda frame, camera, image: write_image(images.path(frame, camera), image),
+        skip=lambda frame, camera: there[frame, camera],
+        processes=usable_cores(),
+    )
+    for done, image in enumerate(rendered, start=sum(there.values()) + 1):
+        stage.record(key, [images.path(*image)])
+        yield done, len(there)
+
+
+_CODE = ("simulation",)
+_RENDERERS = {"embree": render_capture, "blender": render_with_blender}
+
+
+def _look(options: RenderOptions) -> dict[str, object]:
+    """Of the options those that the images depend on besides the poses."""
+    return {each.name: getattr(options, each.name) for each in fields(RenderOptions)}
+
+
+def _jaw_files(truth: Path) -> dict[str, str]:
+    return {name: hash_file(truth / name) for name in ("jaw.ply", "jaw.json", "handpiece.json")}
+
+
+def _scene(truth: GroundTruth, options: RenderOptions) -> Scene:
+    return Scene(
+        jaw=truth.jaw,
+        handpiece=truth.handpiece,
+        appearance=APPEARANCES[options.texture],
+        supersampling=options.supersampling,
+        seed=options.seed,
+    )

@@ -1,0 +1,123 @@
+"""Stages: results on disk that are used again only where they are still those of what made them.
+
+What makes a result has a key: SHA-256 over the name of the stage, its options, the contents of its inputs and the code.
+A folder of results keeps ``made.jsonl``, a line for each file with the key that it was made under and the SHA-256 of
+its contents. A file with another key, or with other contents, is made again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.resources import files as package_files
+from pathlib import Path
+from threading import Lock
+
+import cuspid
+from cuspid.errors import InputError, OutputError
+from cuspid.storage.files import digest_of, hash_file
+
+RECORD = "made.jsonl"
+"""Name of the file that tells what a folder's results were made from."""
+
+_log = logging.getLogger("cuspid")
+
+
+@cache
+def code_version(*parts: str) -> str:
+    """Version of cuspid, and SHA-256 of the modules of its ground floor and of some packages or modules, given as
+    ``stereo`` or ``motion/features.py``."""
+    root = Path(str(package_files("cuspid")))
+    modules = [*root.glob("*.py")]
+    for part in parts:
+        modules += [root / part] if part.endswith(".py") else (root / part).rglob("*.py")
+    digest = hashlib.sha256()
+    for path in sorted(modules):
+        digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
+    return f"{cuspid.__version__} {digest.hexdigest()}"
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One kind of results, and the folder that they are kept in."""
+
+    name: str
+    """What is made, for people: ``depth``."""
+    folder: Path
+    """Where ``made.jsonl`` lies."""
+    options: object
+    """How it is made."""
+    code: tuple[str, ...] = ()
+    """What of cuspid makes it, as :func:`code_version` takes it."""
+    _made: dict[str, tuple[str, str]] = field(init=False, repr=False)
+    _lock: Lock = field(init=False, repr=False, default_factory=Lock)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_made", _read_record(self.folder / RECORD))
+
+    def key(self, inputs: Mapping[str, str]) -> str:
+        """What identifies a result that is made from inputs, given by their digests."""
+        return digest_of([self.name, self.options, inputs, code_version(*self.code)])
+
+    def has(self, key: str, files: Sequence[Path]) -> bool:
+        """Whether all of the files are there as they were made under a key."""
+        return all(self._made.get(self._name(file)) == (key, _digest(file)) for file in files)
+
+    def make(self, inputs: Mapping[str, str], files: Sequence[Path], write: Callable[[], None]) -> str:
+        """Call ``write``, which writes the files, unless they are there already from the same inputs; their key.
+
+        Raises OutputError where they cannot be recorded.
+        """
+        key = self.key(inputs)
+        if not self.has(key, files):
+            stale = [file for file in files if file.exists() and self._name(file) in self._made]
+            if stale:
+                _log.info(f"{stale[0]}: {self._why(stale[0], key)}; it is made again")
+            write()
+            self.record(key, files)
+        return key
+
+    def record(self, key: str, files: Sequence[Path]) -> None:
+        """Keep that files, which are there, were made under a key. Raises OutputError."""
+        entries = {self._name(file): (key, _digest(file)) for file in files}
+        lines = "".join(json.dumps([name, *entry]) + "\n" for name, entry in entries.items())
+        try:
+            with self._lock, (self.folder / RECORD).open("a") as stream:
+                stream.write(lines)
+        except OSError as error:
+            raise OutputError(f"{self.folder / RECORD}: cannot be written ({error.strerror})") from error
+        self._made.update(entries)
+
+    def _name(self, file: Path) -> str:
+        return os.path.relpath(file, self.folder)
+
+    def _why(self, file: Path, key: str) -> str:
+        made_under, contents = self._made[self._name(file)]
+        return "made from something else" if made_under != key or contents == _digest(file) else "damaged"
+
+
+def _digest(file: Path) -> str:
+    """SHA-256 of a file, empty where there is none."""
+    try:
+        return hash_file(file)
+    except InputError:
+        return ""
+
+
+def _read_record(path: Path) -> dict[str, tuple[str, str]]:
+    """Key and contents by file; what a killed run left unfinished does not count, later lines go before earlier."""
+    made: dict[str, tuple[str, str]] = {}
+    if not path.is_file():
+        return made
+    for line in path.read_text(errors="replace").splitlines():
+        try:
+            name, key, contents = json.loads(line)
+        except (ValueError, TypeError):
+            continue
+        made[str(name)] = (str(key), str(contents))
+    return made

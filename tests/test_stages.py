@@ -1,0 +1,102 @@
+"""Stored results are used again under the key of what made them, and under no other."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from cuspid.errors import OutputError
+from cuspid.storage.stages import RECORD, Stage, code_version
+
+
+@dataclass(frozen=True)
+class Options:
+    """Of a stage."""
+
+    size: float = 1.0
+
+
+class Maker:
+    """Writes a file, and counts how often."""
+
+    def __init__(self, file: Path) -> None:
+        self.file, self.calls = file, 0
+
+    def __call__(self) -> None:
+        self.calls += 1
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        self.file.write_text(f"result {self.calls}")
+
+
+@pytest.fixture
+def maker(tmp_path: Path) -> Maker:
+    return Maker(tmp_path / "made" / "result.txt")
+
+
+def made_again(maker: Maker, stage: Stage, **inputs: str) -> bool:
+    """Whether the stage makes its result anew."""
+    before = maker.calls
+    stage.make(inputs, [maker.file], maker)
+    return maker.calls > before
+
+
+def test_a_result_is_made_once_and_again_only_when_something_changed(maker: Maker) -> None:
+    folder = maker.file.parent
+    assert made_again(maker, Stage("cut", folder, Options()), images="a")
+    assert not made_again(maker, Stage("cut", folder, Options()), images="a")
+    assert made_again(maker, Stage("cut", folder, Options(size=1.5)), images="a")
+    assert made_again(maker, Stage("cut", folder, Options(size=1.5)), images="b")
+    assert made_again(maker, Stage("cut", folder, Options(size=1.5)), images="b", more="c")
+    assert made_again(maker, Stage("paste", folder, Options(size=1.5)), images="b", more="c")
+    assert made_again(maker, Stage("paste", folder, Options(size=1.5), ("stereo",)), images="b", more="c")
+    assert not made_again(maker, Stage("paste", folder, Options(size=1.5), ("stereo",)), images="b", more="c")
+
+
+@pytest.mark.parametrize("damage", [b"", b"result 2", b"resul"])
+def test_a_damaged_result_is_made_again_and_told(maker: Maker, caplog: pytest.LogCaptureFixture, damage: bytes) -> None:
+    stage = Stage("cut", maker.file.parent, Options())
+    made_again(maker, stage)
+    maker.file.write_bytes(damage)
+    with caplog.at_level(logging.INFO, logger="cuspid"):
+        assert made_again(maker, stage)
+    assert "result.txt: damaged; it is made again" in caplog.text
+    assert not made_again(maker, stage)
+
+
+def test_a_lost_result_is_made_again(maker: Maker) -> None:
+    stage = Stage("cut", maker.file.parent, Options())
+    made_again(maker, stage)
+    maker.file.unlink()
+    assert made_again(maker, stage)
+
+
+def test_a_file_that_no_stage_has_made_is_not_taken_for_a_result(maker: Maker) -> None:
+    """As one that was written by a run that was killed before it could record it."""
+    maker()
+    assert made_again(maker, Stage("cut", maker.file.parent, Options()))
+
+
+def test_a_record_that_was_cut_short_costs_its_last_line_alone(tmp_path: Path) -> None:
+    stage = Stage("cut", tmp_path, Options())
+    makers = [Maker(tmp_path / f"{number}.txt") for number in range(3)]
+    for each in makers:
+        stage.make({}, [each.file], each)
+    record = tmp_path / RECORD
+    record.write_text(record.read_text()[:-40] + "\n[1, 2]\nnonsense\n{}\n")
+    again = Stage("cut", tmp_path, Options())
+    assert [made_again(each, again) for each in makers] == [False, False, True]
+
+
+def test_a_record_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    (tmp_path / RECORD).mkdir()
+    with pytest.raises(OutputError, match=RECORD):
+        Stage("cut", tmp_path, Options()).record("key", [])
+
+
+def test_the_version_of_the_code_tells_its_parts_apart() -> None:
+    parts = [(), ("stereo",), ("motion",), ("motion/features.py",), ("stereo", "motion")]
+    assert len({code_version(*each) for each in parts}) == len(parts)
+    assert code_version("stereo") == code_version("stereo")
