@@ -26,9 +26,9 @@ from run import conditions
 from scipy.linalg import subspace_angles
 
 from cuspid import storage
-from cuspid.anatomy.mean_shape import MeanShapeOptions, mean_shape, vertex_areas
-from cuspid.anatomy.phantom import PhantomOptions
-from cuspid.anatomy.procrustes import best_rotation
+from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.anatomy.shape.mean import MeanShapeOptions, mean_shape, vertex_areas
+from cuspid.anatomy.shape.procrustes import best_rotation
 from cuspid.jaw import GUM, Jaw, Landmark
 from cuspid.mesh import Mesh
 from cuspid.storage import read_shape_model, write_shape_model

@@ -15,7 +15,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from run import conditions
 
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.studies.reproduction.samples import measure_populations
 
 EDGE_MM = 0.28

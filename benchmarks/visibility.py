@@ -18,7 +18,8 @@ from pathlib import Path
 
 from run import conditions
 
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.surfaces import named_surfaces
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import twelve_cameras

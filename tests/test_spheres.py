@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from cuspid.anatomy.dentition import ARCH_FORMS
-from cuspid.anatomy.sphere_arch import SphereArchOptions, build_sphere_arch
+from cuspid.anatomy.phantom.sphere_arch import SphereArchOptions, build_sphere_arch
+from cuspid.anatomy.teeth.dentition import ARCH_FORMS
 from cuspid.errors import InputError
 from cuspid.evaluation.distance import Surface
 from cuspid.evaluation.registration import RegistrationOptions, fit

@@ -25,8 +25,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from cuspid import storage
-from cuspid.anatomy.landmarking import with_estimates
-from cuspid.anatomy.landmarks import in_frame, missing, validate
+from cuspid.anatomy.landmarks.estimation import with_estimates
+from cuspid.anatomy.landmarks.scheme import in_frame, missing, validate
 from cuspid.anatomy.mouth import MouthOptions, room_mm, study_mouths
 from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, labels_from_colors
 from cuspid.anatomy.surfaces import named_surfaces

@@ -13,7 +13,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from tyro.conf import arg
 
 from cuspid import pipeline, storage
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.jaw import Arch, Jaw
 from cuspid.rig import Handpiece

@@ -11,7 +11,7 @@ from rich.table import Table
 from tyro.conf import Positional
 
 from cuspid import pipeline, storage
-from cuspid.anatomy.arch import (
+from cuspid.anatomy.landmarks.dimensions import (
     DIMENSIONS,
     Dimension,
     GroupStatistics,
@@ -24,7 +24,7 @@ from cuspid.anatomy.arch import (
     needed_landmarks,
     survey,
 )
-from cuspid.anatomy.mean_shape import MeanShapeOptions, mean_shape
+from cuspid.anatomy.shape.mean import MeanShapeOptions, mean_shape
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
 from cuspid.errors import InputError

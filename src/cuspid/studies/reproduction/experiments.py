@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from cuspid.anatomy.boxed import boxed, crown_boxes
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
-from cuspid.anatomy.preparation import preset
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.anatomy.preparation.prepare import preset
+from cuspid.anatomy.shape.boxed import boxed, crown_boxes
 from cuspid.anatomy.surfaces import SURFACES
 from cuspid.camera import Camera
 from cuspid.epipolar import epipolar_residuals, fundamental_matrix, projection_matrix

@@ -7,8 +7,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from cuspid.anatomy.arch import PRINTED_TABLE
-from cuspid.anatomy.landmarks import labels_of
+from cuspid.anatomy.landmarks.dimensions import PRINTED_TABLE
+from cuspid.anatomy.landmarks.scheme import labels_of
 from cuspid.anatomy.mouth import Anatomy, Mouth, MouthOptions, study_mouths, tooth_ends_mm
 from cuspid.studies.reproduction.findings import Check, Figures
 

@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from cuspid.anatomy.arch import PRINTED_TABLE
+from cuspid.anatomy.landmarks.dimensions import PRINTED_TABLE
 from cuspid.studies.reproduction.catalogue import Item
 from cuspid.studies.reproduction.findings import (
     CHECKED,

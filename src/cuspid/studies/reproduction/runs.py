@@ -25,9 +25,10 @@ from typing import Literal
 import numpy as np
 
 from cuspid import storage
-from cuspid.anatomy.boxed import boxed
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
-from cuspid.anatomy.population import GroupName, draw_population
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.anatomy.phantom.population import GroupName, draw_population
+from cuspid.anatomy.shape.boxed import boxed
 from cuspid.errors import CuspidError, InputError
 from cuspid.handpiece.designs import twelve_cameras
 from cuspid.pipeline import usable_cores

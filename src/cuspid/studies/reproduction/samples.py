@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from cuspid import storage
-from cuspid.anatomy.mean_shape import MeanShapeOptions, mean_shape
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom, phantom_landmarks
-from cuspid.anatomy.population import GROUPS, Group, GroupName, draw_and_count, draw_population
+from cuspid.anatomy.phantom.build import build_phantom, phantom_landmarks
+from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.anatomy.phantom.population import GROUPS, Group, GroupName, draw_and_count, draw_population
+from cuspid.anatomy.shape.mean import MeanShapeOptions, mean_shape
 from cuspid.anatomy.surfaces import named_surfaces
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3

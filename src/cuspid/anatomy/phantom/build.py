@@ -9,10 +9,9 @@ from jaxtyping import Float, Int
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from cuspid.anatomy.arrangement import PhantomOptions, PlacedTooth, place_teeth, vary_teeth
-from cuspid.anatomy.crowns import Points
-from cuspid.anatomy.gum import Gum
-from cuspid.anatomy.isosurface import (
+from cuspid.anatomy.phantom.arrangement import PlacedTooth, place_teeth, vary_teeth
+from cuspid.anatomy.phantom.gum import Gum
+from cuspid.anatomy.phantom.isosurface import (
     edges_of,
     evaluate,
     graph_of,
@@ -23,12 +22,12 @@ from cuspid.anatomy.isosurface import (
     value_and_gradient,
     without_folds,
 )
-from cuspid.anatomy.solid import Solid
-from cuspid.anatomy.surface_points import landmarks_of, papilla
+from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.anatomy.phantom.solid import Solid
+from cuspid.anatomy.phantom.surface_points import landmarks_of, papilla
+from cuspid.anatomy.teeth.crowns import Points
 from cuspid.jaw import Jaw, Landmark
 from cuspid.mesh import Mesh
-
-__all__ = ["PhantomOptions", "PlacedTooth", "build_phantom", "phantom_landmarks", "phantom_teeth"]
 
 
 def build_phantom(options: PhantomOptions = PhantomOptions()) -> Jaw:

@@ -2,8 +2,8 @@
 
 Landmarks, paired by label, lay the jaws on each other (generalised Procrustes). The first jaw, warped to the mean
 landmarks, is the first guess of the mean. Then, until the mean stands still: lay the current mean on every jaw (a
-thin-plate spline through the landmarks, then the surface, see `cuspid.anatomy.correspondence`), and take the mean of
-where each vertex comes to lie.
+thin-plate spline through the landmarks, then the surface, see `cuspid.anatomy.shape.correspondence`), and take the mean
+of where each vertex comes to lie.
 
 The splines alone cannot leave the first jaw. A spline is linear in the landmarks that it leads to, and those have the
 current landmarks as their mean; so the mean of the splines is the identity and the mean keeps every detail of the first
@@ -23,8 +23,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.anatomy.correspondence import Fit, FitOptions, Target, Template, fit, labels_or_gum, warp
-from cuspid.anatomy.procrustes import Superposition, dimension, superpose
+from cuspid.anatomy.shape.correspondence import Fit, FitOptions, Target, Template, fit, labels_or_gum, warp
+from cuspid.anatomy.shape.procrustes import Superposition, dimension, superpose
 from cuspid.errors import InputError
 from cuspid.jaw import Jaw, Landmark
 from cuspid.mesh import Mesh

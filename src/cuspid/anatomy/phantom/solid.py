@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from cuspid.anatomy.arrangement import PlacedTooth
-from cuspid.anatomy.crowns import Points, Values, crown_distance, smooth_min
-from cuspid.anatomy.gum import Gum, above_root_end, collar
+from cuspid.anatomy.phantom.arrangement import PlacedTooth
+from cuspid.anatomy.phantom.gum import Gum, above_root_end, collar
+from cuspid.anatomy.teeth.crowns import Points, Values, crown_distance, smooth_min
 from cuspid.jaw import GUM
 
 FAR_MM = 3.0

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
-from cuspid.anatomy.arrangement import PlacedTooth
-from cuspid.anatomy.crowns import Crown, Points, Values, silhouettes, smooth_max, smooth_min
+from cuspid.anatomy.phantom.arrangement import PlacedTooth
+from cuspid.anatomy.teeth.crowns import Crown, Points, Values, silhouettes, smooth_max, smooth_min
 
 ROOT = 0.7
 """Length of the root that is modelled, as a fraction of the crown height; it ends inside the gum."""

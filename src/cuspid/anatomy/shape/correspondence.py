@@ -19,7 +19,7 @@ from scipy.sparse import csr_array, diags_array
 from scipy.spatial import cKDTree
 from scipy.stats import binom
 
-from cuspid.anatomy.procrustes import dimension
+from cuspid.anatomy.shape.procrustes import dimension
 from cuspid.jaw import GUM
 from cuspid.mesh import Mesh
 

@@ -2,7 +2,8 @@
 
 Frames. *Jaw*: the occlusal frame of `cuspid.jaw`. Seen along -Z with +Y up, +X points right; that is the patient's
 right in a lower jaw (teeth 41-47) and the patient's left in an upper one (teeth 21-27). *Tooth*: see
-`cuspid.anatomy.crowns`; the frame of a tooth with X < 0 is left-handed, for it is the mirror image of its counterpart.
+`cuspid.anatomy.teeth.crowns`; the frame of a tooth with X < 0 is left-handed, for it is the mirror image of its
+counterpart.
 
 The teeth of a quadrant are a chain of segments, each as long as its tooth is wide, that touch at the contact points.
 Their headings are those nearest to a natural arch that give it its dimensions (`arch_form`). Rotated or displaced teeth
@@ -10,17 +11,18 @@ touch elsewhere than at their widest, and the row closes up behind them: that is
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.anatomy.arch_form import Aim, Chain, Seen, Shape, dimensions, segments, solve_shape
-from cuspid.anatomy.crown_points import Point, crown_point
-from cuspid.anatomy.crowns import Crown, Points, crown_distance, silhouettes, top_of
-from cuspid.anatomy.dentition import ARCH_FORMS, QUADRANTS, Tooth
-from cuspid.anatomy.landmarks import kind_of
+from cuspid.anatomy.landmarks.scheme import kind_of
+from cuspid.anatomy.phantom.arch_form import Aim, Chain, Seen, Shape, dimensions, segments, solve_shape
+from cuspid.anatomy.phantom.crown_points import Point, crown_point
+from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.anatomy.teeth.crowns import Crown, Points, crown_distance, silhouettes, top_of
+from cuspid.anatomy.teeth.dentition import ARCH_FORMS, QUADRANTS, Tooth
 from cuspid.errors import InputError
 from cuspid.jaw import Arch
 
@@ -55,54 +57,6 @@ KINK_MARGIN_DEG = 8.0
 
 PapillaOf = Callable[[tuple["PlacedTooth", ...]], Point]
 """Where the papilla lies behind given teeth."""
-
-
-COARSEST_MM = 2.0
-"""A grid that is coarser misses teeth."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PhantomOptions:
-    """What the phantom looks like and how finely it is meshed."""
-
-    arch: Arch = "lower"
-    """Which jaw."""
-    seed: int = 0
-    """Individual variation of size, shape, rotation and height of the teeth, and of the gum."""
-    edge_mm: float = 0.2
-    """Spacing of the sampling grid, about the edge length of the faces; 0.2 gives some 400 000 faces."""
-    spee_mm: float = 1.5
-    """Depth of the curve of Spee between the incisors and the second molar."""
-    variation: float = 1.0
-    """Strength of the individual variation: 0 = the textbook arch, 1 = natural."""
-    inter_canine_mm: float | None = None
-    """Distance a between the cusp tips of the canines; the mean of adults unless said otherwise."""
-    inter_first_molar_mm: float | None = None
-    """Distance b between the buccal grooves of the first molars; the mean unless said otherwise, or, where a premolar
-    is missing, what the row of teeth makes of it."""
-    inter_second_molar_mm: float | None = None
-    """Distance c between the buccal grooves of the second molars; as for b."""
-    arch_length_mm: float | None = None
-    """Distance f from the papilla to the middle between the buccal grooves of the second molars; what the teeth make of
-    the widths unless said otherwise."""
-    tooth_size: float | None = None
-    """Size of all teeth relative to the textbook's; 1, or what fits dimensions or crowding that are asked for."""
-    missing: tuple[int, ...] = ()
-    """Teeth (FDI) that are missing; their space is closed. 34 44: extracted premolars. 37 47: no second molars."""
-    crowding_mm: float = 0.0
-    """By how much the front is too short for its six teeth: they stand rotated and overlapping."""
-    rotate_deg: dict[int, float] = field(default_factory=dict)
-    """Tooth (FDI) and its rotation about the long axis, distal end towards buccal: 33 20 43 -15."""
-    displace_mm: dict[int, float] = field(default_factory=dict)
-    """Tooth (FDI) and its displacement towards buccal: 32 -1.5 42 -1."""
-
-    def __post_init__(self) -> None:
-        if self.seed < 0:
-            raise InputError(f"phantom: the seed is {self.seed}; it must not be negative")
-        if not COARSEST_MM >= self.edge_mm > 0:
-            raise InputError(f"phantom: --edge-mm is {self.edge_mm:g}; it must be positive and at most {COARSEST_MM:g}")
-        if self.variation < 0 or (self.tooth_size is not None and not self.tooth_size > 0):
-            raise InputError("phantom: --variation must not be negative, --tooth-size must be positive")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,11 +1,11 @@
 """Landmarks of a jaw whose teeth are labelled, estimated from its surface.
 
-Each tooth is looked at in its own view (`cuspid.anatomy.tooth_view`: u distal, v buccal, z occlusal). What is looked
-for, by the definitions of `cuspid.anatomy.landmarks`:
+Each tooth is looked at in its own view (`cuspid.anatomy.landmarks.tooth_view`: u distal, v buccal, z occlusal). What is
+looked for, by the definitions of `cuspid.anatomy.landmarks.scheme`:
 
 - the angle of an incisal edge is the point farthest half-way between up and sideways (on a canine, whose edge slopes,
   60 degrees from up); the middle of the edge lies half-way between its angles;
-- cusps are summits, told apart by where the cusps of that tooth normally lie (`cuspid.anatomy.dentition`);
+- cusps are summits, told apart by where the cusps of that tooth normally lie (`cuspid.anatomy.teeth.dentition`);
 - the buccal groove is where the rim is deepest below the line through the tips of the two buccal cusps; the rim bows
   out from that line a little (`RIM_BOW`);
 - the central groove is the lowest point between buccal and lingual cusps, half-way between mesial and distal;
@@ -23,10 +23,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
 
-from cuspid.anatomy.arch import arch_of
-from cuspid.anatomy.dentition import QUADRANTS
-from cuspid.anatomy.landmarks import TOOTH_LANDMARKS, ToothKind, kind_of, labels_of
-from cuspid.anatomy.tooth_view import Place, ToothView, view_teeth
+from cuspid.anatomy.landmarks.dimensions import arch_of
+from cuspid.anatomy.landmarks.scheme import TOOTH_LANDMARKS, ToothKind, kind_of, labels_of
+from cuspid.anatomy.landmarks.tooth_view import Place, ToothView, view_teeth
+from cuspid.anatomy.teeth.dentition import QUADRANTS
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Arch, Jaw, Landmark
 from cuspid.mesh import Mesh

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from manifold3d import Error, Manifold, Mesh64, OpType
 from scipy.interpolate import CubicSpline
 
-from cuspid.anatomy.dentition import ARCH_FORMS, ArchForm
+from cuspid.anatomy.teeth.dentition import ARCH_FORMS, ArchForm
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Arch, Jaw, Sphere
 from cuspid.mesh import Mesh

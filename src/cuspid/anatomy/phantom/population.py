@@ -23,7 +23,8 @@ from typing import Literal
 
 import numpy as np
 
-from cuspid.anatomy.arrangement import PhantomOptions, can_stand
+from cuspid.anatomy.phantom.arrangement import can_stand
+from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.errors import InputError
 from cuspid.jaw import Arch
 

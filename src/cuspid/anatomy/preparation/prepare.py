@@ -1,9 +1,9 @@
 """Prepared teeth: cracks, crown preparations and inlays cut into a labelled jaw by exact booleans.
 
 Frame: the occlusal frame of `cuspid.jaw`, mm. Each preparation is a tool in the frame of its tooth
-(`cuspid.anatomy.tooth_site`), whose axis is the long axis of the crown and the path of insertion. All tools are taken
-away from the jaw; the result is closed (an open scan stays open at its own borders), its new faces carry labels, and
-the edge of each preparation is kept as a line on the surface: ``45.margin``, ``46.crack``.
+(`cuspid.anatomy.preparation.tooth_site`), whose axis is the long axis of the crown and the path of insertion. All tools
+are taken away from the jaw; the result is closed (an open scan stays open at its own borders), its new faces carry
+labels, and the edge of each preparation is kept as a line on the surface: ``45.margin``, ``46.crack``.
 
 Sources of the defaults:
 
@@ -28,11 +28,11 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from cuspid.anatomy.booleans import CAVITY, TROUGH, Cut, Tool, closed, rim_of, subtract
-from cuspid.anatomy.crack_tool import CrackShape, crack_tool
-from cuspid.anatomy.crown_tool import CrownShape, crown_tool
-from cuspid.anatomy.inlay_tool import InlayShape, inlay_tool
-from cuspid.anatomy.isosurface import graph_of, neighbours_of
-from cuspid.anatomy.tooth_site import ToothSite, site_of
+from cuspid.anatomy.phantom.isosurface import graph_of, neighbours_of
+from cuspid.anatomy.preparation.crack_tool import CrackShape, crack_tool
+from cuspid.anatomy.preparation.crown_tool import CrownShape, crown_tool
+from cuspid.anatomy.preparation.inlay_tool import InlayShape, inlay_tool
+from cuspid.anatomy.preparation.tooth_site import ToothSite, site_of
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, gaussian_filter, gaussian_filter1d, map_coordinates
 from scipy.spatial import cKDTree
 
-from cuspid.anatomy.landmarks import ToothKind, kind_of
+from cuspid.anatomy.landmarks.scheme import ToothKind, kind_of
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw

@@ -1,4 +1,4 @@
-"""The landmarks of a phantom, exact points of its implicit surface (scheme: `cuspid.anatomy.landmarks`).
+"""The landmarks of a phantom, exact points of its implicit surface (scheme: `cuspid.anatomy.landmarks.scheme`).
 
 A *cervix* is the lowest point of the gum's margin on that side of a tooth, along its long axis. The papilla of a lower
 jaw is the tip of the gum that shows lingually between the central incisors: of what is seen from above, the point
@@ -11,13 +11,13 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.anatomy.arrangement import PlacedTooth
-from cuspid.anatomy.crown_points import Point, crown_points
-from cuspid.anatomy.crowns import Points, Values, crown_distance, silhouettes
-from cuspid.anatomy.gum import margin_height
-from cuspid.anatomy.isosurface import newton_step, value_and_gradient
-from cuspid.anatomy.landmarks import TOOTH_LANDMARKS, kind_of, labels_of
-from cuspid.anatomy.solid import CREASE_MM, Solid
+from cuspid.anatomy.landmarks.scheme import TOOTH_LANDMARKS, kind_of, labels_of
+from cuspid.anatomy.phantom.arrangement import PlacedTooth
+from cuspid.anatomy.phantom.crown_points import Point, crown_points
+from cuspid.anatomy.phantom.gum import margin_height
+from cuspid.anatomy.phantom.isosurface import newton_step, value_and_gradient
+from cuspid.anatomy.phantom.solid import CREASE_MM, Solid
+from cuspid.anatomy.teeth.crowns import Points, Values, crown_distance, silhouettes
 from cuspid.jaw import Arch, Landmark
 
 PAPILLA_ABOVE_MM = 0.35

@@ -1,9 +1,9 @@
 """The tool that prepares a tooth for a crown: everything above the finish line but a tapered stump.
 
-Frame: that of the tooth's site (`cuspid.anatomy.tooth_site`). The tool's inner surface is a grid of profiles, one for
-each direction round the axis. A profile runs from the sulcus over the finish line, the shoulder or chamfer and the
-axial wall to the reduced occlusal surface and on to the axis. One row of the grid is the finish line, and so it is
-crisp.
+Frame: that of the tooth's site (`cuspid.anatomy.preparation.tooth_site`). The tool's inner surface is a grid of
+profiles, one for each direction round the axis. A profile runs from the sulcus over the finish line, the shoulder or
+chamfer and the axial wall to the reduced occlusal surface and on to the axis. One row of the grid is the finish line,
+and so it is crisp.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from cuspid.anatomy.booleans import CAVITY, OUTSIDE, ROOT, TROUGH, Tool
-from cuspid.anatomy.crowns import smooth_max, smooth_min, smooth_step
-from cuspid.anatomy.tooth_site import TURNS, Heights, ToothSite, round_means
+from cuspid.anatomy.preparation.tooth_site import TURNS, Heights, ToothSite, round_means
+from cuspid.anatomy.teeth.crowns import smooth_max, smooth_min, smooth_step
 from cuspid.errors import InputError
 from cuspid.mesh import Mesh
 

@@ -1,8 +1,8 @@
 """The tool that cracks a tooth: a wedge-shaped slit that wanders mesiodistally over the occlusal surface.
 
-Frame: that of the tooth's site (`cuspid.anatomy.tooth_site`). The slit is V-shaped: as wide as asked at the surface and
-closed at its depth, which is measured along the axis. It begins in the fossa at the far end, crosses a marginal ridge
-and runs out on the proximal side; at its ends width and depth fade together.
+Frame: that of the tooth's site (`cuspid.anatomy.preparation.tooth_site`). The slit is V-shaped: as wide as asked at the
+surface and closed at its depth, which is measured along the axis. It begins in the fossa at the far end, crosses a
+marginal ridge and runs out on the proximal side; at its ends width and depth fade together.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.anatomy.booleans import CAVITY, OUTSIDE, Tool
-from cuspid.anatomy.tooth_site import ToothSite, outward
+from cuspid.anatomy.preparation.tooth_site import ToothSite, outward
 from cuspid.errors import InputError
 
 WANDER_MM = 0.18

@@ -12,7 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
-from cuspid.anatomy.crowns import Points, Values
+from cuspid.anatomy.teeth.crowns import Points, Values
 
 Field = Callable[[Points], Values]
 """Signed distance in mm, shape (n,), of points (n, 3); negative inside."""

@@ -1,4 +1,4 @@
-"""The anatomical points of a crown, in the frame of the tooth (see `cuspid.anatomy.crowns`).
+"""The anatomical points of a crown, in the frame of the tooth (see `cuspid.anatomy.teeth.crowns`).
 
 A cusp tip is the point farthest along the long axis; the angle of an incisal edge, the point farthest in a direction
 half-way between edge and side. The rim of a molar is taken at `RIM`, where its profile turns from the occlusal
@@ -13,8 +13,8 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.anatomy.crowns import Crown, Lobe, Values, crown_distance
-from cuspid.anatomy.landmarks import TOOTH_LANDMARKS, ToothKind
+from cuspid.anatomy.landmarks.scheme import TOOTH_LANDMARKS, ToothKind
+from cuspid.anatomy.teeth.crowns import Crown, Lobe, Values, crown_distance
 
 Point = Float[np.ndarray, "3"]
 

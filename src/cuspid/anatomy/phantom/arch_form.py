@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from cuspid.anatomy.crown_points import Point
+from cuspid.anatomy.phantom.crown_points import Point
 
 TOOTH_SIZES = (0.8, 1.2)
 """Sizes of the teeth, relative to the textbook's, among which one is chosen that fits an asked length of the arch."""

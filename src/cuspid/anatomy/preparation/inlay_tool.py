@@ -1,8 +1,8 @@
 """The tool that prepares a tooth for a mesio-occluso-distal inlay: an occlusal slot between two proximal boxes.
 
-Frame: that of the tooth's site (`cuspid.anatomy.tooth_site`). Slot and boxes are convex: flat floors, plane walls that
-diverge towards occlusal, and internal edges rounded as by a bur. Where the gum covers the rim of a box, a second body
-clears it, with a sulcus below the gingival floor.
+Frame: that of the tooth's site (`cuspid.anatomy.preparation.tooth_site`). Slot and boxes are convex: flat floors, plane
+walls that diverge towards occlusal, and internal edges rounded as by a bur. Where the gum covers the rim of a box, a
+second body clears it, with a sulcus below the gingival floor.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.anatomy.booleans import CAVITY, TROUGH, Tool, run_lengths
-from cuspid.anatomy.crown_tool import EMERGENCE, SULCUS_MM
-from cuspid.anatomy.tooth_site import ToothSite
+from cuspid.anatomy.preparation.crown_tool import EMERGENCE, SULCUS_MM
+from cuspid.anatomy.preparation.tooth_site import ToothSite
 from cuspid.errors import InputError
 from cuspid.mesh import Mesh
 

@@ -9,7 +9,7 @@ silhouettes, cusp positions and grooves are drawn after Wheeler's plates of each
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from cuspid.anatomy.crowns import AxialGroove, Crown, Edge, Lobe
+from cuspid.anatomy.teeth.crowns import AxialGroove, Crown, Edge, Lobe
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from cuspid.anatomy.landmarks import teeth_named
+from cuspid.anatomy.landmarks.scheme import teeth_named
 from cuspid.errors import CuspidError, InputError
 from cuspid.jaw import Arch, Jaw, Landmark
 
