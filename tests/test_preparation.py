@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from cuspid.anatomy.booleans import open_edges
+from cuspid.anatomy.edges import open_edges
 from cuspid.anatomy.preparation.prepare import (
     KINDS,
     CrackOptions,

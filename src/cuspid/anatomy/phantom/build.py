@@ -9,14 +9,12 @@ from jaxtyping import Float, Int
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from cuspid.anatomy.edges import edges_of, graph_of, neighbours_of
 from cuspid.anatomy.phantom.arrangement import PlacedTooth, place_teeth, vary_teeth
 from cuspid.anatomy.phantom.gum import Gum
 from cuspid.anatomy.phantom.isosurface import (
-    edges_of,
     evaluate,
-    graph_of,
     mesh_of,
-    neighbours_of,
     newton_step,
     onto_surface,
     value_and_gradient,

@@ -8,10 +8,10 @@ from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
+from cuspid.anatomy.edges import edges_of, graph_of
 from cuspid.anatomy.teeth.crowns import Points, Values
 
 Field = Callable[[Points], Values]
@@ -79,11 +79,6 @@ def _largest_part(
     return vertices[keep], renumbered[faces[keep[faces[:, 0]]]]
 
 
-def edges_of(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
-    """Edges (e, 2) of the faces; each edge of a closed mesh appears once in either direction."""
-    return np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
-
-
 def _relax(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v 3"]:
     """Vertices moved half-way to the mean of their neighbours, which evens out the faces."""
     adjacency = graph_of(edges_of(faces), len(vertices)).tocsr()
@@ -128,16 +123,3 @@ def _face_cross(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"
     """Cross products (f, 3) of two edges of each face, mm^2."""
     a, b, c = vertices[faces].transpose(1, 0, 2)
     return np.cross(b - a, c - a)
-
-
-def neighbours_of(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "p 2"]:
-    """Pairs (p, 2) of faces that share an edge, in both orders, for a closed mesh."""
-    edges = np.sort(edges_of(faces), axis=1)
-    order = np.lexsort((edges[:, 1], edges[:, 0]))
-    pairs = (order // 3).reshape(-1, 2)
-    return np.concatenate([pairs, pairs[:, ::-1]])
-
-
-def graph_of(pairs: Int[np.ndarray, "p 2"], count: int) -> coo_array:
-    """Adjacency matrix (count, count) of the given pairs."""
-    return coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))

@@ -19,6 +19,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from cuspid.anatomy.booleans import CAVITY, OUTSIDE, ROOT, TROUGH, Tool
+from cuspid.anatomy.edges import edges_of
 from cuspid.anatomy.preparation.tooth_site import TURNS, Heights, ToothSite, round_means
 from cuspid.anatomy.teeth.crowns import smooth_max, smooth_min, smooth_step
 from cuspid.errors import InputError
@@ -117,7 +118,7 @@ def _crossings(site: ToothSite, height: Float[np.ndarray, "TURNS"]) -> Float[np.
     vertices = site.surface.vertices
     turn = site.polar(vertices)[0] / (2 * np.pi) * TURNS - 0.5
     above = vertices[:, 2] - np.interp(turn, np.arange(TURNS), height, period=TURNS)
-    edges = np.stack([site.surface.faces, np.roll(site.surface.faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+    edges = edges_of(site.surface.faces)
     edges = edges[above[edges[:, 0]] * above[edges[:, 1]] < 0]
     share = (above[edges[:, 0]] / (above[edges[:, 0]] - above[edges[:, 1]]))[:, None]
     return (1 - share) * vertices[edges[:, 0]] + share * vertices[edges[:, 1]]

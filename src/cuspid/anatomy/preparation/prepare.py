@@ -28,7 +28,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from cuspid.anatomy.booleans import CAVITY, TROUGH, Cut, Tool, closed, rim_of, subtract
-from cuspid.anatomy.phantom.isosurface import graph_of, neighbours_of
+from cuspid.anatomy.edges import graph_of, neighbours_of
 from cuspid.anatomy.preparation.crack_tool import CrackShape, crack_tool
 from cuspid.anatomy.preparation.crown_tool import CrownShape, crown_tool
 from cuspid.anatomy.preparation.inlay_tool import InlayShape, inlay_tool

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, gaussian_filter, gaussian_filter1d, map_coordinates
 from scipy.spatial import cKDTree
 
+from cuspid.anatomy.edges import edges_of
 from cuspid.anatomy.landmarks.scheme import ToothKind, kind_of
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
@@ -223,7 +224,7 @@ def site_of(jaw: Jaw, fdi: int) -> ToothSite:
 
 def _seams(mesh: Mesh, labels: Int[np.ndarray, "f"]) -> tuple[Int[np.ndarray, "s 2"], Float[np.ndarray, "s 3"]]:
     """Edges between faces of different labels: the two labels in ascending order, and the middle of each edge."""
-    edges = np.sort(np.stack([mesh.faces, np.roll(mesh.faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+    edges = np.sort(edges_of(mesh.faces), axis=1)
     order = np.lexsort((edges[:, 1], edges[:, 0]))
     same = (edges[order[1:]] == edges[order[:-1]]).all(axis=1)
     one, two = labels[order[:-1][same] // 3], labels[order[1:][same] // 3]
