@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cuspid.reporting.reproduction_page import markdown
+from cuspid.reporting.pages.reproduction import markdown
 from cuspid.studies.reproduction.judging import judge
 from cuspid.studies.reproduction.page import GENERATED, make_page
 from cuspid.studies.reproduction.pictures import LIKENESS, TRUENESS, draw_likeness, draw_trueness

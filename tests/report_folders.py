@@ -14,7 +14,7 @@ from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.reconstruction import Dropped, Reconstruction
-from cuspid.reporting.figures import deviation_colors
+from cuspid.reporting.figures.drawing import deviation_colors
 from cuspid.rig import Exposure, Handpiece, MountedCamera, Rig
 from cuspid.shape_model import MeanStep, ShapeModel
 from cuspid.trueness import Trueness

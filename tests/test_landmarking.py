@@ -15,7 +15,7 @@ from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw, Landmark
-from cuspid.reporting.landmark_figures import save_landmark_picture, save_measure_picture
+from cuspid.reporting.figures.landmark import save_landmark_picture, save_measure_picture
 
 # The uncertainties are from the phantoms of seeds 100 to 103, which no test uses.
 

@@ -22,7 +22,7 @@ from cuspid.anatomy.shape.procrustes import superpose
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Jaw, Landmark
 from cuspid.mesh import Mesh
-from cuspid.reporting.shape_figures import save_modes_picture, save_variance_picture
+from cuspid.reporting.figures.shape import save_modes_picture, save_variance_picture
 from cuspid.shape_model import ShapeModel
 from cuspid.storage import read_shape_model, write_shape_model
 

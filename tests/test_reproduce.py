@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from cuspid import storage
 from cuspid.cli import main
 from cuspid.errors import CuspidError, InputError
-from cuspid.reporting.reproduction_page import html, markdown
+from cuspid.reporting.pages.reproduction import html, markdown
 from cuspid.studies.reproduction import camera_checks, camera_findings, mouth_checks, runs
 from cuspid.studies.reproduction.catalogue import BY_ID, ITEMS, TABLE_3_2
 from cuspid.studies.reproduction.judging import judge

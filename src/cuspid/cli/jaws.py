@@ -27,8 +27,8 @@ from cuspid.anatomy.shape.boxed import boxed
 from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
 from cuspid.errors import InputError
 from cuspid.jaw import Jaw
-from cuspid.reporting.figures import save_picture
-from cuspid.reporting.preparation_figures import save_preparation_picture
+from cuspid.reporting.figures.drawing import save_picture
+from cuspid.reporting.figures.preparation import save_preparation_picture
 
 
 def phantom(

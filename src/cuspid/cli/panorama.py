@@ -15,7 +15,7 @@ from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
 from cuspid.panorama import FrameUse
 from cuspid.pipeline import StitchOptions
-from cuspid.reporting.panorama_figures import save_camera_path
+from cuspid.reporting.figures.panorama import save_camera_path
 from cuspid.sequence import Sequence
 from cuspid.stitching.ortho import Stitched
 

@@ -13,8 +13,8 @@ from rich.table import Table
 from cuspid import storage
 from cuspid.cli.shared import console, show_progress
 from cuspid.errors import CuspidError, InputError
-from cuspid.reporting.page import photo_uri
-from cuspid.reporting.reproduction_page import Page, html, markdown
+from cuspid.reporting.pages.page import photo_uri
+from cuspid.reporting.pages.reproduction import Page, html, markdown
 from cuspid.studies.reproduction.catalogue import BY_ID, ITEMS, Item
 from cuspid.studies.reproduction.judging import judge
 from cuspid.studies.reproduction.page import make_page

@@ -29,9 +29,9 @@ from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
 from cuspid.errors import InputError
 from cuspid.jaw import Arch, Jaw
-from cuspid.reporting.figures import save_picture
-from cuspid.reporting.landmark_figures import save_landmark_picture, save_measure_picture
-from cuspid.reporting.shape_figures import save_modes_picture, save_variance_picture
+from cuspid.reporting.figures.drawing import save_picture
+from cuspid.reporting.figures.landmark import save_landmark_picture, save_measure_picture
+from cuspid.reporting.figures.shape import save_modes_picture, save_variance_picture
 from cuspid.shape_model import ShapeModel
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Container, Sequence
 
-from cuspid.reporting.reproduction_page import Entry, FigureRow, Page
+from cuspid.reporting.pages.reproduction import Entry, FigureRow, Page
 from cuspid.studies.reproduction.findings import PANORAMA, Finding, Result, Results
 from cuspid.studies.reproduction.rules import FAVOUR, Comparison, Figure, Verdict
 

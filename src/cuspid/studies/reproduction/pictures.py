@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from cuspid.anatomy.mouth import OPENINGS, MouthOptions, sagittal_view
-from cuspid.reporting.mouth_figures import save_sagittal_picture
-from cuspid.reporting.reproduction_figures import save_ssim_picture, save_trueness_picture
+from cuspid.reporting.figures.mouth import save_sagittal_picture
+from cuspid.reporting.figures.reproduction import save_ssim_picture, save_trueness_picture
 from cuspid.studies.reproduction.catalogue import TABLE_3_2
 from cuspid.studies.reproduction.findings import Result, Results
 from cuspid.studies.reproduction.panorama_findings import canvas_ssim, panoramas

@@ -32,7 +32,7 @@ from cuspid.anatomy.shape.boxed import boxed
 from cuspid.errors import CuspidError, InputError
 from cuspid.handpiece.designs import twelve_cameras
 from cuspid.pipeline import usable_cores
-from cuspid.reporting.figures import save_picture
+from cuspid.reporting.figures.drawing import save_picture
 from cuspid.studies.camera_pair import CameraPairOptions
 from cuspid.studies.camera_sweep import SweepOptions
 from cuspid.studies.grid import Case, Progress, Value, run_grid

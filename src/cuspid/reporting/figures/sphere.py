@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from cuspid.jaw import Jaw
-from cuspid.reporting.figures import new_figure, save_figure
+from cuspid.reporting.figures.drawing import new_figure, save_figure
 
 _INK, _FAINT, _LINE = "#333333", "#9a9a9a", "#1f5fd6"
 _COLOURS = "YlOrRd"

@@ -17,14 +17,12 @@ from cuspid.geometry import Rigid3
 from cuspid.jaw import Arch
 from cuspid.mesh import Mesh
 from cuspid.reconstruction import Reconstruction
-from cuspid.reporting.figures import FigureOptions, deviation_map
-from cuspid.reporting.page import packed
-from cuspid.reporting.shown_mesh import pack_deviation, pack_mesh
+from cuspid.reporting.figures.drawing import FigureOptions, deviation_map
+from cuspid.reporting.pages.page import packed
+from cuspid.reporting.pages.shown_mesh import pack_deviation, pack_mesh
 from cuspid.rig import Rig
 from cuspid.storage import ScanResult
 
-RANGES_UM = (5.0, 10.0, 25.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
-"""Ends of the colour bar from which the reader chooses."""
 PLASTER_COLOR = (222, 214, 200)
 """sRGB of a surface without deviations."""
 REFERENCE_COLOR = (196, 205, 214)
@@ -45,11 +43,6 @@ class Place:
     """How much of its surroundings is to be seen."""
     towards: tuple[float, float, float] | None = None
     """From where it is best seen, a direction; None to keep the present one."""
-
-
-def fitting_range_um(p95_um: float) -> float:
-    """The smallest range of the colour bar that is at least two and a half times the 95th percentile."""
-    return next((each for each in RANGES_UM if each >= 2.5 * p95_um), RANGES_UM[-1])
 
 
 def shown_frame(result: ScanResult) -> Rigid3:

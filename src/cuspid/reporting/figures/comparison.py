@@ -19,7 +19,7 @@ from matplotlib.patches import Polygon
 from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
-from cuspid.reporting.figures import new_figure, save_figure
+from cuspid.reporting.figures.drawing import new_figure, save_figure
 
 _INK, _GAP, _TOOTH = "#333333", "#c8501e", "#f3ead9"
 _COLOURS = ("#3b7dd8", "#c8860a", "#3fa66b", "#8e5bb5", "#b8405e", "#5a6872", "#2a9d9d", "#8a6d3b")

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from cuspid.panorama import FrameUse, Panorama
-from cuspid.reporting.page import jpeg_uri, number, photo_uri, picture_uri, provenance, render_page, signed
+from cuspid.reporting.pages.page import jpeg_uri, number, photo_uri, picture_uri, provenance, render_page, signed
 from cuspid.storage import PanoramaResult, ScoreResult
 
 _WIDEST_PX = 2600

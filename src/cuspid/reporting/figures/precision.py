@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures import NOT_COUNTED, look, new_figure, render, save_figure
+from cuspid.reporting.figures.drawing import NOT_COUNTED, look, new_figure, render, save_figure
 
 _INK = "#333333"
 _ERRORS = colormaps["viridis_r"]

@@ -17,7 +17,7 @@ from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from cuspid.reporting.figures import new_figure, save_figure
+from cuspid.reporting.figures.drawing import new_figure, save_figure
 
 _INK = "#333333"
 _MARKS = {"best": "#d12a1e", "thesis": "#111111"}

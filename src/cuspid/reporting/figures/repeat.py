@@ -13,16 +13,16 @@ from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures import (
+from cuspid.reporting.figures.drawing import (
     NOT_COUNTED,
     OCCLUSAL,
     FigureOptions,
     deviation_map,
+    fitting_range_um,
     new_figure,
     render,
     save_figure,
 )
-from cuspid.reporting.scene import fitting_range_um
 
 _INK = "#333333"
 _MOST_NAMED = 12

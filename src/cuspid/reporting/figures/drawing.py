@@ -26,6 +26,8 @@ PLASTER = np.array([222, 214, 200], dtype=np.uint8)
 """Colour of a mesh that has none."""
 NOT_COUNTED = np.array([168, 168, 168], dtype=np.uint8)
 """Colour of a vertex without a deviation."""
+RANGES_UM = (5.0, 10.0, 25.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
+"""Ends of the colour bar from which the reader chooses."""
 _BACK = 0.78
 """Grey of a surface seen from behind."""
 _INK = "#333333"
@@ -74,6 +76,11 @@ def deviation_map(options: FigureOptions) -> LinearSegmentedColormap:
         (1.0, "#a50f15"),
     ]
     return LinearSegmentedColormap.from_list("deviation", [((1 + x) / 2, color) for x, color in stops], N=1024)
+
+
+def fitting_range_um(p95_um: float) -> float:
+    """The smallest range of the colour bar that is at least two and a half times the 95th percentile."""
+    return next((each for each in RANGES_UM if each >= 2.5 * p95_um), RANGES_UM[-1])
 
 
 def deviation_colors(

@@ -11,11 +11,11 @@ from jaxtyping import Float
 from cuspid.errors import InputError
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures import FigureOptions, deviation_colors, render
-from cuspid.reporting.page import jpeg_uri, number, picture_uri, provenance, render_page, script_json, signed
-from cuspid.reporting.repeat_figures import faces_around
-from cuspid.reporting.scene import RANGES_UM, color_table, css_gradient, fitting_range_um, mesh_layer, standard_views
-from cuspid.reporting.shown_mesh import UM_PER_STEP, simplified
+from cuspid.reporting.figures.drawing import RANGES_UM, FigureOptions, deviation_colors, fitting_range_um, render
+from cuspid.reporting.figures.repeat import faces_around
+from cuspid.reporting.pages.page import jpeg_uri, number, picture_uri, provenance, render_page, script_json, signed
+from cuspid.reporting.pages.scene import color_table, css_gradient, mesh_layer, standard_views
+from cuspid.reporting.pages.shown_mesh import UM_PER_STEP, simplified
 from cuspid.storage import StudyResult
 
 _MOST_FACES = 120_000

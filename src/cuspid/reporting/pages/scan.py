@@ -19,24 +19,29 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures import FigureOptions, deviation_colors, deviation_map, render
-from cuspid.reporting.page import jpeg_uri, picture_uri, provenance, render_page, script_json
-from cuspid.reporting.scene import (
+from cuspid.reporting.figures.drawing import (
     RANGES_UM,
+    FigureOptions,
+    deviation_colors,
+    deviation_map,
+    fitting_range_um,
+    render,
+)
+from cuspid.reporting.pages.page import jpeg_uri, picture_uri, provenance, render_page, script_json
+from cuspid.reporting.pages.scene import (
     REFERENCE_COLOR,
     Place,
     camera_layer,
     color_table,
     css_color,
     css_gradient,
-    fitting_range_um,
     mesh_layer,
     path_layer,
     poses_from,
     shown_frame,
     standard_views,
 )
-from cuspid.reporting.shown_mesh import UM_PER_STEP, ShownMesh, simplified
+from cuspid.reporting.pages.shown_mesh import UM_PER_STEP, ShownMesh, simplified
 from cuspid.storage import ScanResult
 
 _BINS = 80

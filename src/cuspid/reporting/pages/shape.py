@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures import render
-from cuspid.reporting.page import jpeg_uri, packed, picture_uri, provenance, render_page, script_json
-from cuspid.reporting.scene import color_table, css_gradient, mesh_layer, standard_views
-from cuspid.reporting.shape_figures import SHIFT_COLORS
-from cuspid.reporting.shown_mesh import ShownMesh, simplified
+from cuspid.reporting.figures.drawing import render
+from cuspid.reporting.figures.shape import SHIFT_COLORS
+from cuspid.reporting.pages.page import jpeg_uri, packed, picture_uri, provenance, render_page, script_json
+from cuspid.reporting.pages.scene import color_table, css_gradient, mesh_layer, standard_views
+from cuspid.reporting.pages.shown_mesh import ShownMesh, simplified
 from cuspid.shape_model import ShapeModel
 from cuspid.storage import ShapeResult
 

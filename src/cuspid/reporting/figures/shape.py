@@ -15,7 +15,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures import OCCLUSAL, new_figure, render, save_figure
+from cuspid.reporting.figures.drawing import OCCLUSAL, new_figure, render, save_figure
 from cuspid.shape_model import ShapeModel
 
 _INK = "#333333"

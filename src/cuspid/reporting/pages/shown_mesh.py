@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from cuspid.mesh import Mesh
-from cuspid.reporting.page import packed
+from cuspid.reporting.pages.page import packed
 
 _MOST = 65535
 _PROBES = 50_000

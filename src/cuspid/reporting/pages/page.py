@@ -37,7 +37,7 @@ def render_page(template: str, **values: Any) -> str:
 @cache
 def _environment() -> Environment:
     environment = Environment(
-        loader=PackageLoader("cuspid.reporting"),
+        loader=PackageLoader("cuspid.reporting.pages"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -50,7 +50,7 @@ def _environment() -> Environment:
 
 def asset(name: str) -> Markup:
     """A script or a style of the package, as it is."""
-    return Markup((resources.files("cuspid.reporting") / "assets" / name).read_text())
+    return Markup((resources.files("cuspid.reporting.pages") / "assets" / name).read_text())
 
 
 def script_json(value: object) -> Markup:

@@ -15,7 +15,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.lines import Line2D
 
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures import look, new_figure, render, save_figure
+from cuspid.reporting.figures.drawing import look, new_figure, render, save_figure
 from cuspid.rig import Handpiece, MountedCamera
 
 GROUP_COLOURS: Mapping[str, str] = {"o": "#c8860a", "b": "#3b7dd8", "l": "#8e5bb5"}

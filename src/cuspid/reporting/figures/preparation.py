@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures import OCCLUSAL, look, new_figure, render, save_figure
+from cuspid.reporting.figures.drawing import OCCLUSAL, look, new_figure, render, save_figure
 
 _INK = "#333333"
 _LINE = "#c1121f"

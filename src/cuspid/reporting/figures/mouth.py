@@ -14,7 +14,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon
 
-from cuspid.reporting.figures import new_figure, save_figure
+from cuspid.reporting.figures.drawing import new_figure, save_figure
 
 TOOTH_NAMES = (
     "central incisor",

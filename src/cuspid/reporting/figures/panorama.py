@@ -10,7 +10,7 @@ from matplotlib.patheffects import Normal, Stroke
 
 from cuspid.panorama import Panorama
 from cuspid.reconstruction import Reconstruction
-from cuspid.reporting.figures import new_figure, save_figure
+from cuspid.reporting.figures.drawing import new_figure, save_figure
 
 _TICK = 10
 """Every so many frames one is named."""

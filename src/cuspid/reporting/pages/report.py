@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import assert_never
 
-from cuspid.reporting.panorama_page import panorama_page, score_page
-from cuspid.reporting.scan_page import ReportOptions, scan_page
-from cuspid.reporting.shape_page import shape_page
-from cuspid.reporting.study_page import study_page
+from cuspid.reporting.pages.panorama import panorama_page, score_page
+from cuspid.reporting.pages.scan import ReportOptions, scan_page
+from cuspid.reporting.pages.shape import shape_page
+from cuspid.reporting.pages.study import study_page
 from cuspid.storage import PanoramaResult, Result, ScanResult, ScoreResult, ShapeResult, StudyResult
 
 

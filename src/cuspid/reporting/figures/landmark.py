@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Jaw, Landmark
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures import OCCLUSAL, new_figure, render, save_figure
+from cuspid.reporting.figures.drawing import OCCLUSAL, new_figure, render, save_figure
 
 _INK = "#333333"
 _COLORS = {"cusp": "#c4262e", "groove": "#1f5fd6", "angle": "#8a3ab9", "edge": "#8a3ab9", "cervix": "#1d7d4f"}

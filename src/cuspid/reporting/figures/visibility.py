@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures import OCCLUSAL, PLASTER, View, look, new_figure, render, save_figure
+from cuspid.reporting.figures.drawing import OCCLUSAL, PLASTER, View, look, new_figure, render, save_figure
 
 SURFACE_COLOURS: Mapping[str, str] = {
     "occlusal": "#f2c14e",
