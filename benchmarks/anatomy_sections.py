@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from cuspid.studies.reproduction.catalogue import TABLE_3_2
-from cuspid.studies.reproduction.trueness_findings import trueness_of
+from cuspid.thesis.catalogue import TABLE_3_2
+from cuspid.thesis.trueness_findings import trueness_of
 
 Result = Mapping[str, Any]
 

@@ -32,7 +32,7 @@ from cuspid.anatomy.shape.procrustes import best_rotation
 from cuspid.jaw import GUM, Jaw, Landmark
 from cuspid.mesh import Mesh
 from cuspid.storage import read_shape_model, write_shape_model
-from cuspid.studies.reproduction.samples import MEAN_GROUP, iteration, make_phantom, make_population
+from cuspid.thesis.samples import MEAN_GROUP, iteration, make_phantom, make_population
 
 KNOWN = 6
 """Samples with a known mean."""

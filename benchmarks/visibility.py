@@ -33,7 +33,7 @@ from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
 from cuspid.storage import write_json
-from cuspid.studies.reproduction.samples import path_over, surfaces_seen
+from cuspid.thesis.samples import path_over, surfaces_seen
 
 EDGE_MM = 0.29
 """Edges that give the phantom about 200 000 faces."""

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
-
 import numpy as np
 
 from cuspid.anatomy.landmarks.dimensions import PRINTED_TABLE
 from cuspid.anatomy.landmarks.scheme import labels_of
 from cuspid.anatomy.mouth import Anatomy, Mouth, MouthOptions, study_mouths, tooth_ends_mm
-from cuspid.studies.reproduction.findings import Check, Figures
+from cuspid.thesis.findings import Figures
 
 OPENINGS_MM = (35.0, 60.0)
 """Mouth openings that the thesis starts from."""
@@ -125,17 +122,3 @@ def landmarks() -> Figures:
 def copied_column() -> Figures:
     """Table 2.1: how far its column f is from its column b."""
     return {"largest_difference_mm": max(abs(row["f"][0] - row["b"][0]) for row in PRINTED_TABLE.values())}
-
-
-CHECKS: Mapping[str, Check] = MappingProxyType(
-    {
-        "radius": radius,
-        "sagittal_model": sagittal_model,
-        "ramus_angle": ramus_angle,
-        "hinge_distance": hinge_distance,
-        "gap": gap,
-        "landmarks": landmarks,
-        "copied_column": copied_column,
-    }
-)
-"""By name."""

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from cuspid.studies.reproduction.catalogue import TABLE_3_2, Item
-from cuspid.studies.reproduction.findings import (
+from cuspid.thesis.catalogue import TABLE_3_2, Item
+from cuspid.thesis.findings import (
     EXACT,
     Finder,
     Finding,
@@ -22,7 +22,7 @@ from cuspid.studies.reproduction.findings import (
     only,
     vanishing,
 )
-from cuspid.studies.reproduction.rules import AtLeast, AtMost, Comparison, Equals, Holds
+from cuspid.thesis.rules import AtLeast, AtMost, Comparison, Equals, Holds
 
 _TERMS = {"complete_50_um_pct": ("completeness within 50 µm", "%", 1), "mean_abs_um": ("mean deviation", "µm", -1)}
 

@@ -7,8 +7,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from cuspid.studies.reproduction.catalogue import TABLE_3_2, Item, TruenessRow
-from cuspid.studies.reproduction.findings import (
+from cuspid.thesis.catalogue import TABLE_3_2, Item, TruenessRow
+from cuspid.thesis.findings import (
     Finder,
     Finding,
     Result,
@@ -18,7 +18,7 @@ from cuspid.studies.reproduction.findings import (
     of_check,
     only,
 )
-from cuspid.studies.reproduction.rules import Comparison, Equals, Holds, LessIsBetter
+from cuspid.thesis.rules import Comparison, Equals, Holds, LessIsBetter
 
 
 def trueness_of(result: Result, row: TruenessRow) -> Result:

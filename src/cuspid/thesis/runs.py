@@ -36,12 +36,13 @@ from cuspid.reporting.figures.drawing import save_picture
 from cuspid.studies.camera_pair import CameraPairOptions
 from cuspid.studies.camera_sweep import SweepOptions
 from cuspid.studies.grid import Case, Progress, Value, run_grid
-from cuspid.studies.reproduction.catalogue import Item
-from cuspid.studies.reproduction.checks import CHECKS
-from cuspid.studies.reproduction.findings import CHECKED, PANORAMA, Result, Results
-from cuspid.studies.reproduction.judging import judge
-from cuspid.studies.reproduction.panorama_findings import SUBJECTS, WITHOUT, panoramas
-from cuspid.studies.reproduction.samples import (
+from cuspid.studies.scan_cases import conditions, measure_scan, prepared_cases, run_timed
+from cuspid.thesis.catalogue import Item
+from cuspid.thesis.checks import CHECKS
+from cuspid.thesis.findings import CHECKED, PANORAMA, Result, Results
+from cuspid.thesis.judging import judge
+from cuspid.thesis.panorama_findings import SUBJECTS, WITHOUT, panoramas
+from cuspid.thesis.samples import (
     MEAN_EDGE_MM,
     best_camera_pairs,
     find_mean_shape,
@@ -49,7 +50,6 @@ from cuspid.studies.reproduction.samples import (
     path_over,
     surfaces_seen,
 )
-from cuspid.studies.scan_cases import conditions, measure_scan, prepared_cases, run_timed
 
 READ_ONLY = ("measure", "design_comparison_full_size")
 """Results that the page shows and no run here makes: they need data that is not public, or hours."""

@@ -1,7 +1,7 @@
 """From results to verdicts: for every item of the catalogue what we find beside what the thesis states.
 
 Nothing is computed here but what follows from the results, and no verdict is given but by a rule of
-:mod:`cuspid.studies.reproduction.rules`.
+:mod:`cuspid.thesis.rules`.
 """
 
 from __future__ import annotations
@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
-from cuspid.studies.reproduction import (
+from cuspid.thesis import (
     camera_findings,
     design_findings,
     mouth_findings,
     panorama_findings,
     trueness_findings,
 )
-from cuspid.studies.reproduction.catalogue import ITEMS, Item
-from cuspid.studies.reproduction.findings import Finder, Finding, Results
+from cuspid.thesis.catalogue import ITEMS, Item
+from cuspid.thesis.findings import Finder, Finding, Results
 
 FINDERS: Mapping[str, Finder] = MappingProxyType(
     {

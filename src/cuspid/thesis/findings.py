@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from cuspid.errors import InputError
-from cuspid.studies.reproduction.catalogue import Item
-from cuspid.studies.reproduction.rules import AtMost, Comparison, Equals, Figure, Rule, Verdict, least_favourable
+from cuspid.thesis.catalogue import Item
+from cuspid.thesis.rules import AtMost, Comparison, Equals, Figure, Rule, Verdict, least_favourable
 
 Result = Mapping[str, Any]
 Results = Mapping[str, Result]

@@ -8,8 +8,8 @@ from types import MappingProxyType
 import numpy as np
 
 from cuspid.anatomy.landmarks.dimensions import PRINTED_TABLE
-from cuspid.studies.reproduction.catalogue import Item
-from cuspid.studies.reproduction.findings import (
+from cuspid.thesis.catalogue import Item
+from cuspid.thesis.findings import (
     CHECKED,
     Finder,
     Finding,
@@ -19,7 +19,7 @@ from cuspid.studies.reproduction.findings import (
     of_check,
     vanishes,
 )
-from cuspid.studies.reproduction.rules import AtLeast, AtMost, Comparison, Equals
+from cuspid.thesis.rules import AtLeast, AtMost, Comparison, Equals
 
 _RIEDER = "the model solves the angle from the opening, of which the thesis takes Rieder's; its 26 deg are of 93 others"
 

@@ -7,8 +7,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from cuspid.studies.reproduction.catalogue import Item
-from cuspid.studies.reproduction.findings import (
+from cuspid.thesis.catalogue import Item
+from cuspid.thesis.findings import (
     CHECKED,
     PANORAMA,
     Finder,
@@ -19,7 +19,7 @@ from cuspid.studies.reproduction.findings import (
     compare,
     vanishes,
 )
-from cuspid.studies.reproduction.rules import AtLeast, Comparison, Exceeds, Holds
+from cuspid.thesis.rules import AtLeast, Comparison, Exceeds, Holds
 
 SUBJECTS = 10
 """Of Fig 4.4."""

@@ -8,8 +8,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from cuspid.studies.reproduction.catalogue import Item
-from cuspid.studies.reproduction.findings import (
+from cuspid.thesis.catalogue import Item
+from cuspid.thesis.findings import (
     CHECKED,
     EXACT,
     Finder,
@@ -22,7 +22,7 @@ from cuspid.studies.reproduction.findings import (
     vanishes,
     vanishing,
 )
-from cuspid.studies.reproduction.rules import AtLeast, AtMost, Comparison, Equals, Holds
+from cuspid.thesis.rules import AtLeast, AtMost, Comparison, Equals, Holds
 
 
 def _fig_1_3(item: Item, results: Results) -> Finding:

@@ -6,8 +6,8 @@ from collections import Counter
 from collections.abc import Container, Sequence
 
 from cuspid.reporting.pages.reproduction import Entry, FigureRow, Page
-from cuspid.studies.reproduction.findings import PANORAMA, Finding, Result, Results
-from cuspid.studies.reproduction.rules import FAVOUR, Comparison, Figure, Verdict
+from cuspid.thesis.findings import PANORAMA, Finding, Result, Results
+from cuspid.thesis.rules import FAVOUR, Comparison, Figure, Verdict
 
 TITLE = "The thesis, reproduced"
 WORDS: dict[Verdict, str] = {

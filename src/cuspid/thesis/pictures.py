@@ -7,10 +7,10 @@ from pathlib import Path
 from cuspid.anatomy.mouth import OPENINGS, MouthOptions, sagittal_view
 from cuspid.reporting.figures.mouth import save_sagittal_picture
 from cuspid.reporting.figures.reproduction import save_ssim_picture, save_trueness_picture
-from cuspid.studies.reproduction.catalogue import TABLE_3_2
-from cuspid.studies.reproduction.findings import Result, Results
-from cuspid.studies.reproduction.panorama_findings import canvas_ssim, panoramas
-from cuspid.studies.reproduction.trueness_findings import trueness_of
+from cuspid.thesis.catalogue import TABLE_3_2
+from cuspid.thesis.findings import Result, Results
+from cuspid.thesis.panorama_findings import canvas_ssim, panoramas
+from cuspid.thesis.trueness_findings import trueness_of
 
 TRUENESS, LIKENESS, SAGITTAL = "reproduction-table-3.2.png", "reproduction-fig-4.4.png", "mouth-sagittal.png"
 METHODS = {"ortho": "cuspid, default", "thesis": "the thesis' method"}

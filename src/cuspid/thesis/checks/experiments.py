@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from itertools import product
-from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -35,8 +34,8 @@ from cuspid.stitching.normal_map import LIGHT, grey_normal_map, normal_map, rect
 from cuspid.stitching.shading import ShadingOptions, shape_from_shading
 from cuspid.stitching.warps import Points, WarpOptions, find_points, link
 from cuspid.studies.camera_pair import MATCHING, CameraPairOptions, Matcher, study_camera_pair
-from cuspid.studies.reproduction.camera_checks import BASELINES_MM
-from cuspid.studies.reproduction.findings import Check, Figures
+from cuspid.thesis.checks.cameras import BASELINES_MM
+from cuspid.thesis.findings import Figures
 
 EDGE_MM = 0.4
 """Of the phantom that experiments are made on."""
@@ -232,21 +231,3 @@ def normals() -> Figures:
         "residual": float(np.abs(picture[..., :2] - (crossed[..., :2] + 1) / 2).max()),
         "least_blue": float(picture[..., 2].min()),
     }
-
-
-CHECKS: Mapping[str, Check] = MappingProxyType(
-    {
-        "occlusion": occlusion,
-        "baseline_terms": baseline_terms,
-        "surfaces": surfaces,
-        "designs": designs,
-        "box_sizes": box_sizes,
-        "preparations": preparations,
-        "stereo_matches": stereo_matches,
-        "free_path": free_path,
-        "rejections": rejections,
-        "normals": normals,
-        "normal_map_features": normal_map_features,
-    }
-)
-"""By name."""

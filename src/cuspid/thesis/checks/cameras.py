@@ -24,7 +24,7 @@ from cuspid.handpiece.precision import (
 )
 from cuspid.rig import MountedCamera
 from cuspid.studies.camera_pair import CameraPairOptions, camera_pair
-from cuspid.studies.reproduction.findings import Check, Figures
+from cuspid.thesis.findings import Figures
 
 _ENDS: Mapping[str, Callable[[tuple[float, ...]], float]] = MappingProxyType({"least": min, "largest": max})
 BASELINES_MM = (1.0, 1.5, 2.5, 4.0)
@@ -208,18 +208,3 @@ def pair_grid() -> Figures:
         "distance_mm": options.distances_mm,
     }
     return {f"{end}_{name}": pick(values) for name, values in axes.items() for end, pick in _ENDS.items()}
-
-
-CHECKS: Mapping[str, Check] = MappingProxyType(
-    {
-        "projections": projections,
-        "projection_matrices": projection_matrices,
-        "epipolar": epipolar,
-        "pair_parameters": pair_parameters,
-        "likelihood": likelihood,
-        "closed_form": closed_form,
-        "baseline_bound": baseline_bound,
-        "pair_grid": pair_grid,
-    }
-)
-"""By name."""
