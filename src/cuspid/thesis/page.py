@@ -6,7 +6,8 @@ from collections import Counter
 from collections.abc import Container, Sequence
 
 from cuspid.reporting.pages.reproduction import Entry, FigureRow, Page
-from cuspid.thesis.findings import PANORAMA, Finding, Result, Results
+from cuspid.thesis.judging import Finding
+from cuspid.thesis.results import PANORAMA, Result, Results
 from cuspid.thesis.rules import FAVOUR, Comparison, Figure, Verdict
 
 TITLE = "The thesis, reproduced"

@@ -8,9 +8,8 @@ from cuspid.anatomy.mouth import OPENINGS, MouthOptions, sagittal_view
 from cuspid.reporting.figures.mouth import save_sagittal_picture
 from cuspid.reporting.figures.reproduction import save_ssim_picture, save_trueness_picture
 from cuspid.thesis.catalogue import TABLE_3_2
-from cuspid.thesis.findings import Result, Results
-from cuspid.thesis.panorama_findings import canvas_ssim, panoramas
-from cuspid.thesis.trueness_findings import trueness_of
+from cuspid.thesis.computed.panoramas import canvas_ssim, panoramas
+from cuspid.thesis.results import Result, Results, at
 
 TRUENESS, LIKENESS, SAGITTAL = "reproduction-table-3.2.png", "reproduction-fig-4.4.png", "mouth-sagittal.png"
 METHODS = {"ortho": "cuspid, default", "thesis": "the thesis' method"}
@@ -33,7 +32,7 @@ def draw_trueness(path: Path, results: Results) -> None:
         [f"{row.part}: {row.what}" + (f" ({row.tooth})" if row.tooth else "") for row in TABLE_3_2],
         [row.mean_um for row in TABLE_3_2],
         [
-            float(trueness_of(results[row.result], row)["mean_abs_um"]) if row.result in results else None
+            float(at(results[row.result], row.path)["mean_abs_um"]) if row.result in results else None
             for row in TABLE_3_2
         ],
         title="Table 3.2: the thesis and cuspid",

@@ -6,8 +6,9 @@ figures that have a good side (errors, shares); of the others there is *reproduc
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Literal
 
 from cuspid.errors import InputError
@@ -128,8 +129,13 @@ class AtLeast:
 class Holds:
     """For a statement that is true or false."""
 
-    text: str
+    condition: str
     """When it counts as true."""
+
+    @property
+    def text(self) -> str:
+        """How it decides."""
+        return f"reproduced: {self.condition}; else it differs"
 
     def verdict(self, ours: bool) -> Verdict:
         """Of the statement."""
@@ -137,6 +143,17 @@ class Holds:
 
 
 Rule = LessIsBetter | Exceeds | Equals | AtMost | AtLeast | Holds
+RULES: Mapping[str, tuple[type[Rule], str]] = MappingProxyType(
+    {
+        "less_is_better": (LessIsBetter, "thesis"),
+        "exceeds": (Exceeds, "thesis"),
+        "equals": (Equals, "thesis"),
+        "at_most": (AtMost, "limit"),
+        "at_least": (AtLeast, "limit"),
+        "holds": (Holds, "condition"),
+    }
+)
+"""By the keys of the catalogue; and the field that the value of the key is for."""
 
 
 def _parts(figure: float | tuple[float, ...]) -> tuple[float, ...]:

@@ -39,9 +39,9 @@ from cuspid.studies.grid import Case, Progress, Value, run_grid
 from cuspid.studies.scan_cases import conditions, measure_scan, prepared_cases, run_timed
 from cuspid.thesis.catalogue import Item
 from cuspid.thesis.checks import CHECKS
-from cuspid.thesis.findings import CHECKED, PANORAMA, Result, Results
+from cuspid.thesis.computed.panoramas import EXAMINED, SUBJECTS, UNEXAMINED, panoramas
 from cuspid.thesis.judging import judge
-from cuspid.thesis.panorama_findings import SUBJECTS, WITHOUT, panoramas
+from cuspid.thesis.results import CHECKED, PANORAMA, Result, Results
 from cuspid.thesis.samples import (
     MEAN_EDGE_MM,
     best_camera_pairs,
@@ -232,8 +232,8 @@ SUBJECT_NUMBERS: tuple[tuple[GroupName, int], ...] = (
 METHODS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "ortho": ("--method", "ortho"),
-        "thesis": ("--method", "thesis"),
-        WITHOUT: ("--method", "thesis", "--no-examination"),
+        EXAMINED: ("--method", "thesis"),
+        UNEXAMINED: ("--method", "thesis", "--no-examination"),
     }
 )
 """Arguments of ``cuspid stitch`` by the names of the methods."""

@@ -5,13 +5,13 @@ Each check is a function without arguments that returns figures with units in th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 from cuspid.thesis.checks import cameras, experiments, mouth
-from cuspid.thesis.findings import Check
+from cuspid.thesis.results import Figures
 
-CHECKS: Mapping[str, Check] = MappingProxyType(
+CHECKS: Mapping[str, Callable[[], Figures]] = MappingProxyType(
     {
         check.__name__: check
         for check in (

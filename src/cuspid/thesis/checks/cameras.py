@@ -24,7 +24,7 @@ from cuspid.handpiece.precision import (
 )
 from cuspid.rig import MountedCamera
 from cuspid.studies.camera_pair import CameraPairOptions, camera_pair
-from cuspid.thesis.findings import Figures
+from cuspid.thesis.results import Figures
 
 _ENDS: Mapping[str, Callable[[tuple[float, ...]], float]] = MappingProxyType({"least": min, "largest": max})
 BASELINES_MM = (1.0, 1.5, 2.5, 4.0)

@@ -35,7 +35,7 @@ from cuspid.stitching.shading import ShadingOptions, shape_from_shading
 from cuspid.stitching.warps import Points, WarpOptions, find_points, link
 from cuspid.studies.camera_pair import MATCHING, CameraPairOptions, Matcher, study_camera_pair
 from cuspid.thesis.checks.cameras import BASELINES_MM
-from cuspid.thesis.findings import Figures
+from cuspid.thesis.results import Figures
 
 EDGE_MM = 0.4
 """Of the phantom that experiments are made on."""

@@ -7,7 +7,7 @@ import numpy as np
 from cuspid.anatomy.landmarks.dimensions import PRINTED_TABLE
 from cuspid.anatomy.landmarks.scheme import labels_of
 from cuspid.anatomy.mouth import Anatomy, Mouth, MouthOptions, study_mouths, tooth_ends_mm
-from cuspid.thesis.findings import Figures
+from cuspid.thesis.results import Figures
 
 OPENINGS_MM = (35.0, 60.0)
 """Mouth openings that the thesis starts from."""
