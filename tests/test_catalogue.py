@@ -38,6 +38,11 @@ def test_a_row_is_read_into_a_rule_and_a_path():
     assert row == Row(quantity="length", thesis="12", ours=("lengths.first_mm",), rule=Equals(thesis=12.0, within=1.0))
 
 
+def test_what_equals_a_number_equals_it_to_rounding():
+    (row,) = only_item(ITEM + ROW + 'ours = "a"\nequals = 12\n').rows
+    assert [row.rule.verdict(ours) for ours in (12.0, 12.0 + 1e-10, 12.0 + 1e-8)] == ["reproduced"] * 2 + ["differs"]
+
+
 def test_rows_have_what_the_item_says_for_each_unless_they_say_otherwise():
     each = '[item.each]\nunit = "mm"\nequals = [12, 13]\nwithin = 1\n'
     own = ROW + 'unit = "um"\nours = "a"\nat_most = 0.5\n'
@@ -58,7 +63,7 @@ def test_rows_have_what_the_item_says_for_each_unless_they_say_otherwise():
         (ITEM + ROW + JUDGED.replace("equals", "equal"), "fig-9.1: unknown key 'equal'"),
         (ITEM + ROW + 'ours = "a"', "fig-9.1: length: no rule; give one of"),
         (ITEM + ROW + JUDGED + "at_most = 3", "fig-9.1: length: equals and at_most; give one of"),
-        (ITEM + ROW + 'ours = "a"\nequals = 12', "fig-9.1: length: equals needs within"),
+        (ITEM + ROW + 'ours = "a"\nat_most = 12\nwithin = 1', "fig-9.1: length: within goes with equals"),
         (ITEM + ROW + 'ours = "a"\nequals = ["twelve"]\nwithin = 1', "fig-9.1: length: "),
         (ITEM + ROW + 'ours = "a"\nless_is_better = 0', "fig-9.1: length: rule: only a positive figure"),
         (ITEM + ROW + "at_most = 3", "fig-9.1: length: give ours, a path, or computed"),

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from cuspid.errors import InputError
 from cuspid.thesis.results import CHECKED
-from cuspid.thesis.rules import RULES, Rule
+from cuspid.thesis.rules import RULES, Equals, Rule
 
 Kind = Literal["figure", "table", "equation"]
 _KINDS: Mapping[str, tuple[Kind, str]] = {
@@ -140,6 +140,8 @@ class Item:
 
 # --- Reading ----------------------------------------------------------------------------------------------------------
 
+ROUNDING = 1e-9
+"""What differs by no more is equal."""
 Keys = Mapping[str, type | tuple[type, ...]]
 _NUMBER = (int, float)
 _ITEM: Keys = {
@@ -224,12 +226,12 @@ def _rule(row: Mapping[str, Any], where: str) -> Rule:
     named = [name for name in RULES if name in row]
     if len(named) != 1:
         raise InputError(f"{where}: {' and '.join(named) or 'no rule'}; give one of {', '.join(RULES)}")
-    if ("within" in row) != (named == ["equals"]):
-        raise InputError(f"{where}: equals needs within, and no other rule takes it")
+    if "within" in row and named != ["equals"]:
+        raise InputError(f"{where}: within goes with equals alone")
     kind, name = RULES[named[0]]
     try:
-        values = {name: _as_floats(row[named[0]])} | ({"within": float(row["within"])} if "within" in row else {})
-        return kind(**values)
+        values: dict[str, Any] = {name: _as_floats(row[named[0]])}
+        return kind(**values | ({"within": float(row.get("within", ROUNDING))} if kind is Equals else {}))
     except (InputError, TypeError, ValueError) as error:
         raise InputError(f"{where}: {error}") from error
 
