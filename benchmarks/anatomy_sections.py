@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from cuspid.studies.reproduction.catalogue import TABLE_3_2
-from cuspid.studies.reproduction.trueness_findings import trueness_of
+from cuspid.thesis.catalogue import TABLE_3_2
+from cuspid.thesis.results import at
 
 Result = Mapping[str, Any]
 
@@ -59,7 +59,7 @@ def prepared(results: Sequence[Result]) -> str:
     rows = []
     for row in TABLE_3_2:
         if row.result in by_case:
-            found = trueness_of(by_case[row.result], row)
+            found = at(by_case[row.result], row.path)
             ours = (found["min_um"], found["max_um"], found["mean_abs_um"], found["std_abs_um"], found["p95_um"])
             printed = "/".join(f"{value:g}" for value in (row.min_um, row.max_um, row.mean_um, row.std_um))
             rows.append((f"{row.part}, {row.what}", row.tooth or "all", printed, *(f"{figure:.1f}" for figure in ours)))

@@ -19,9 +19,10 @@ from pathlib import Path
 import numpy as np
 from run import conditions
 
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.jaw import Jaw
-from cuspid.reporting.precision_figures import Panel, save_best_picture, save_maps_picture, save_noise_picture
+from cuspid.reporting.figures.precision import Panel, save_best_picture, save_maps_picture, save_noise_picture
 from cuspid.storage import write_json
 from cuspid.studies.camera_pair import (
     MATCHING,

@@ -16,12 +16,13 @@ from pathlib import Path
 
 from run import conditions, run_timed
 
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.jaw import Jaw
 from cuspid.storage import read_json, write_json
 from cuspid.studies.camera_pair import CameraPairOptions, Row, Term, best_pairs, study_camera_pair
 from cuspid.studies.camera_sweep import SweepOptions
-from cuspid.studies.reproduction.runs import SWEPT, sweep_arguments, sweep_result
+from cuspid.thesis.runs import SWEPT, sweep_arguments, sweep_result
 
 SURFACES = ("occlusal", "incisal", "buccal", "lingual", "labial")
 IN_THEORY = ("occlusal", "buccal", "lingual")

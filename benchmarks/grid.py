@@ -20,7 +20,8 @@ import distributed
 import numpy as np
 from run import conditions
 
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.jaw import Jaw
 from cuspid.storage import write_json
 from cuspid.studies.camera_sweep import SweepOptions, sweep

@@ -26,13 +26,13 @@ from run import conditions
 from scipy.linalg import subspace_angles
 
 from cuspid import storage
-from cuspid.anatomy.mean_shape import MeanShapeOptions, mean_shape, vertex_areas
-from cuspid.anatomy.phantom import PhantomOptions
+from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.anatomy.shape.mean import MeanShapeOptions, mean_shape, vertex_areas
 from cuspid.geometry import best_similarity
 from cuspid.jaw import GUM, Jaw, Landmark
 from cuspid.mesh import Mesh
 from cuspid.storage import read_shape_model, write_shape_model
-from cuspid.studies.reproduction.samples import MEAN_GROUP, iteration, make_phantom, make_population
+from cuspid.thesis.samples import MEAN_GROUP, iteration, make_phantom, make_population
 from cuspid.workers import usable_cores
 
 KNOWN = 6

@@ -19,11 +19,20 @@ from typing import Any
 import numpy as np
 from run import conditions
 
-from cuspid.anatomy.arch import DIMENSIONS, ArchDimensions, arch_dimensions, group_rows, implausible, jaw_rows, survey
-from cuspid.anatomy.dentition import ARCH_FORMS
 from cuspid.anatomy.jaw_files import load_jaw
-from cuspid.anatomy.landmarking import with_estimates
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
+from cuspid.anatomy.landmarks.dimensions import (
+    DIMENSIONS,
+    ArchDimensions,
+    arch_dimensions,
+    group_rows,
+    implausible,
+    jaw_rows,
+    survey,
+)
+from cuspid.anatomy.landmarks.estimation import with_estimates
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.anatomy.teeth.dentition import ARCH_FORMS
 from cuspid.jaw import Arch, Jaw
 
 SEEDS = range(6)

@@ -28,8 +28,9 @@ from run import conditions, run_timed, timed
 
 from cuspid import storage
 from cuspid.anatomy.jaw_files import jaw_files, load_jaw
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
-from cuspid.anatomy.population import GroupName, draw_population
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.anatomy.phantom.population import GroupName, draw_population
 from cuspid.evaluation.panorama import PanoramaEvaluationOptions
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh

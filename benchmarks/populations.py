@@ -15,8 +15,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from run import conditions
 
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
-from cuspid.studies.reproduction.samples import measure_populations
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.thesis.samples import measure_populations
 
 EDGE_MM = 0.28
 """Edge of the faces for the timing: about 200 000 faces."""

@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 from run import conditions
 
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.surfaces import named_surfaces
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
@@ -35,7 +36,7 @@ from cuspid.handpiece.precision import (
 )
 from cuspid.handpiece.presets import PRESETS
 from cuspid.jaw import Jaw
-from cuspid.reporting.precision_figures import save_ellipsoids_picture, save_precision_picture
+from cuspid.reporting.figures.precision import save_ellipsoids_picture, save_precision_picture
 from cuspid.rig import Handpiece, MountedCamera
 from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path
 from cuspid.storage import write_json

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cuspid.reporting.reproduction_page import markdown
-from cuspid.studies.reproduction.judging import judge
-from cuspid.studies.reproduction.page import GENERATED, make_page
-from cuspid.studies.reproduction.pictures import LIKENESS, TRUENESS, draw_likeness, draw_trueness
-from cuspid.studies.reproduction.runs import read_results
+from cuspid.reporting.pages.reproduction import markdown
+from cuspid.thesis.judging import judge
+from cuspid.thesis.page import GENERATED, make_page
+from cuspid.thesis.pictures import LIKENESS, TRUENESS, draw_likeness, draw_trueness
+from cuspid.thesis.runs import read_results
 
 HERE = Path(__file__).parent
 

@@ -18,7 +18,8 @@ from pathlib import Path
 
 from run import conditions
 
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.surfaces import named_surfaces
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import twelve_cameras
@@ -32,7 +33,7 @@ from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
 from cuspid.storage import write_json
-from cuspid.studies.reproduction.samples import path_over, surfaces_seen
+from cuspid.thesis.samples import path_over, surfaces_seen
 
 EDGE_MM = 0.29
 """Edges that give the phantom about 200 000 faces."""

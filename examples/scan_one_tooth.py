@@ -7,7 +7,8 @@ import sys
 from pathlib import Path
 
 from cuspid import pipeline
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.handpiece.visibility import VisibilityOptions

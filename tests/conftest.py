@@ -8,7 +8,8 @@ import pytest
 from hypothesis import settings
 
 from cuspid import storage
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 

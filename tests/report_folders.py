@@ -15,7 +15,7 @@ from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.reconstruction import Reconstruction
-from cuspid.reporting.figures import deviation_colors
+from cuspid.reporting.figures.drawing import deviation_colors
 from cuspid.rig import Handpiece, Lighting, MountedCamera, Rig
 from cuspid.shape_model import MeanStep, ShapeModel
 from cuspid.trueness import Trueness

@@ -3,10 +3,10 @@
 import sys
 from pathlib import Path
 
-from cuspid.studies.reproduction import runs
-from cuspid.studies.reproduction.catalogue import BY_ID
-from cuspid.studies.reproduction.runs import Run, gather, missing, run_missing
 from cuspid.studies.scan_cases import timed
+from cuspid.thesis import runs
+from cuspid.thesis.catalogue import BY_ID
+from cuspid.thesis.runs import Run, gather, missing, run_missing
 
 ITEMS = (BY_ID["fig-2.2"], BY_ID["fig-3.15"])
 POPULATIONS = {"groups": {"lower-14": {"max_abs_asked_minus_measured_mm": 0.001}}}

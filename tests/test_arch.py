@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid.anatomy.arch import (
+from cuspid.anatomy.landmarks.dimensions import (
     PRINTED_TABLE,
     Survey,
     arch_dimensions,
@@ -18,7 +18,7 @@ from cuspid.anatomy.arch import (
     needed_landmarks,
     survey,
 )
-from cuspid.anatomy.landmarks import in_frame, labels_of
+from cuspid.anatomy.landmarks.scheme import in_frame, labels_of
 from cuspid.errors import InputError
 from cuspid.jaw import Arch, Jaw, Landmark
 from cuspid.mesh import Mesh

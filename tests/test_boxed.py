@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from cuspid.anatomy.boxed import BoxOptions, boxed, crown_boxes
+from cuspid.anatomy.shape.boxed import BoxOptions, boxed, crown_boxes
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh

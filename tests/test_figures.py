@@ -11,8 +11,8 @@ from cuspid.evaluation.deviation import EvaluationOptions, evaluate
 from cuspid.evaluation.registration import RegistrationOptions
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
-from cuspid.reporting.comparison_figures import Curve, save_comparison_picture
-from cuspid.reporting.figures import (
+from cuspid.reporting.figures.comparison import Curve, save_comparison_picture
+from cuspid.reporting.figures.drawing import (
     NOT_COUNTED,
     OCCLUSAL,
     FigureOptions,

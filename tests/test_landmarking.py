@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cuspid.anatomy.arch import arch_dimensions, needed_landmarks
-from cuspid.anatomy.landmarking import SIGMA_MM, estimate_landmarks, with_estimates
-from cuspid.anatomy.landmarks import TOOTH_LANDMARKS, labels_of, missing
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
+from cuspid.anatomy.landmarks.dimensions import arch_dimensions, needed_landmarks
+from cuspid.anatomy.landmarks.estimation import SIGMA_MM, estimate_landmarks, with_estimates
+from cuspid.anatomy.landmarks.scheme import TOOTH_LANDMARKS, labels_of, missing
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw, Landmark
-from cuspid.reporting.landmark_figures import save_landmark_picture, save_measure_picture
+from cuspid.reporting.figures.landmark import save_landmark_picture, save_measure_picture
 
 # The uncertainties are from the phantoms of seeds 100 to 103, which no test uses.
 

@@ -16,13 +16,13 @@ from scipy.linalg import subspace_angles
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
-from cuspid.anatomy.correspondence import Target, Template, fit, warp
-from cuspid.anatomy.mean_shape import MeanShapeOptions, mean_shape, principal_modes, vertex_areas
-from cuspid.anatomy.procrustes import superpose
+from cuspid.anatomy.shape.correspondence import Target, Template, fit, warp
+from cuspid.anatomy.shape.mean import MeanShapeOptions, mean_shape, principal_modes, vertex_areas
+from cuspid.anatomy.shape.procrustes import superpose
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Jaw, Landmark
 from cuspid.mesh import Mesh
-from cuspid.reporting.shape_figures import save_modes_picture, save_variance_picture
+from cuspid.reporting.figures.shape import save_modes_picture, save_variance_picture
 from cuspid.shape_model import ShapeModel
 from cuspid.storage import read_shape_model, write_shape_model
 

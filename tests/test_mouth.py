@@ -30,7 +30,7 @@ from cuspid.anatomy.mouth import (
     typical_mouth,
 )
 from cuspid.errors import InputError
-from cuspid.reporting.mouth_figures import save_fit_picture, save_gap_picture, save_sagittal_picture
+from cuspid.reporting.figures.mouth import save_fit_picture, save_gap_picture, save_sagittal_picture
 
 R, H = 90.0, 90.0 * np.sin(np.deg2rad(22.5))
 

@@ -27,7 +27,7 @@ from cuspid.handpiece.optimise import (
 from cuspid.handpiece.precision import bound_rms_um, fisher_information
 from cuspid.handpiece.presets import PRESETS
 from cuspid.mesh import Mesh
-from cuspid.reporting.design_figures import save_design_picture
+from cuspid.reporting.figures.design import save_design_picture
 from cuspid.rig import Handpiece
 
 SMALL = """

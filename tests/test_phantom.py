@@ -10,10 +10,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from cuspid.anatomy.crowns import Points
-from cuspid.anatomy.dentition import ARCH_FORMS
-from cuspid.anatomy.landmarks import labels_of
-from cuspid.anatomy.phantom import PhantomOptions, PlacedTooth, build_phantom, phantom_landmarks, phantom_teeth
+from cuspid.anatomy.landmarks.scheme import labels_of
+from cuspid.anatomy.phantom.arrangement import PlacedTooth
+from cuspid.anatomy.phantom.build import build_phantom, phantom_landmarks, phantom_teeth
+from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.anatomy.teeth.crowns import Points
+from cuspid.anatomy.teeth.dentition import ARCH_FORMS
 from cuspid.jaw import GUM, Jaw
 
 COARSE_MM = 0.4

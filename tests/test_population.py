@@ -10,9 +10,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.stats import chi2
 
-from cuspid.anatomy.landmarks import labels_of
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom, phantom_landmarks, phantom_teeth
-from cuspid.anatomy.population import GROUPS, LENGTHS, GroupName, Normal, draw_and_count, draw_population
+from cuspid.anatomy.landmarks.scheme import labels_of
+from cuspid.anatomy.phantom.build import build_phantom, phantom_landmarks, phantom_teeth
+from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.anatomy.phantom.population import GROUPS, LENGTHS, GroupName, Normal, draw_and_count, draw_population
 from cuspid.errors import InputError
 from cuspid.jaw import Arch, Jaw, Landmark
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from cuspid.reporting.precision_figures import (
+from cuspid.reporting.figures.precision import (
     Panel,
     save_best_picture,
     save_ellipsoids_picture,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from cuspid.anatomy.booleans import open_edges
-from cuspid.anatomy.preparation import (
+from cuspid.anatomy.edges import open_edges
+from cuspid.anatomy.preparation.prepare import (
     KINDS,
     CrackOptions,
     CrownOptions,
@@ -19,7 +19,7 @@ from cuspid.anatomy.preparation import (
     prepare,
     preset,
 )
-from cuspid.anatomy.tooth_site import ToothSite, site_of
+from cuspid.anatomy.preparation.tooth_site import ToothSite, site_of
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Jaw, Landmark
 from cuspid.mesh import Mesh

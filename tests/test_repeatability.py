@@ -14,8 +14,8 @@ from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.mesh import Mesh
 from cuspid.pipeline import SimulationOptions
-from cuspid.reporting.repeat_figures import save_repeat_picture
-from cuspid.reporting.report import report_page
+from cuspid.reporting.figures.repeat import save_repeat_picture
+from cuspid.reporting.pages.report import report_page
 from cuspid.simulation.scan_path import ScanPathOptions
 from cuspid.studies.design_comparison import with_smaller_images
 from cuspid.studies.grid import Outcome

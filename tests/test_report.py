@@ -17,12 +17,13 @@ from cuspid.errors import InputError, MissingDependencyError
 from cuspid.mesh import Mesh
 from cuspid.panorama import FrameUse, Panorama
 from cuspid.reporting import live_view
-from cuspid.reporting.page import LARGEST_PAGE_BYTES, flat_settings, number, packed, script_json, signed
-from cuspid.reporting.report import report_page
-from cuspid.reporting.scan_page import ReportOptions, histogram, worst_places
-from cuspid.reporting.scene import RANGES_UM, camera_lines, fitting_range_um
-from cuspid.reporting.shown_mesh import UM_PER_STEP, UNKNOWN, pack_deviation, pack_mesh, simplified
-from cuspid.reporting.study_page import heading
+from cuspid.reporting.figures.drawing import RANGES_UM, fitting_range_um
+from cuspid.reporting.pages.page import LARGEST_PAGE_BYTES, flat_settings, number, packed, script_json, signed
+from cuspid.reporting.pages.report import report_page
+from cuspid.reporting.pages.scan import ReportOptions, histogram, worst_places
+from cuspid.reporting.pages.scene import camera_lines
+from cuspid.reporting.pages.shown_mesh import UM_PER_STEP, UNKNOWN, pack_deviation, pack_mesh, simplified
+from cuspid.reporting.pages.study import heading
 from report_folders import (
     BUMP_UM,
     FRAMES,

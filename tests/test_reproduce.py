@@ -17,12 +17,14 @@ from hypothesis import strategies as st
 from cuspid import storage
 from cuspid.cli import main
 from cuspid.errors import CuspidError, InputError
-from cuspid.reporting.reproduction_page import html, markdown
-from cuspid.studies.reproduction import camera_checks, camera_findings, mouth_checks, runs
-from cuspid.studies.reproduction.catalogue import BY_ID, ITEMS, TABLE_3_2
-from cuspid.studies.reproduction.judging import judge
-from cuspid.studies.reproduction.page import GENERATED, conditions, figure_text, make_page
-from cuspid.studies.reproduction.rules import (
+from cuspid.reporting.pages.reproduction import html, markdown
+from cuspid.studies.scan_cases import run_timed
+from cuspid.thesis import runs
+from cuspid.thesis.catalogue import BY_ID, ITEMS, TABLE_3_2
+from cuspid.thesis.checks import cameras, mouth
+from cuspid.thesis.judging import judge
+from cuspid.thesis.page import GENERATED, conditions, figure_text, make_page
+from cuspid.thesis.rules import (
     FAVOUR,
     AtLeast,
     AtMost,
@@ -32,8 +34,7 @@ from cuspid.studies.reproduction.rules import (
     LessIsBetter,
     least_favourable,
 )
-from cuspid.studies.reproduction.runs import ALL_RESULTS, RUNS, SUBJECT_NAMES, gather, missing, needed, read_results
-from cuspid.studies.scan_cases import run_timed
+from cuspid.thesis.runs import ALL_RESULTS, RUNS, SUBJECT_NAMES, gather, missing, needed, read_results
 
 ROOT = Path(__file__).parent.parent
 CASES = Path(__file__).parent / "reproduction_cases.py"
@@ -109,7 +110,7 @@ def test_limits_from_above_and_below_are_mirrored(limit, ours):
 
 
 def test_a_statement_holds_or_not():
-    assert [Holds(text="").verdict(value) for value in (True, False)] == ["reproduced", "differs"]
+    assert [Holds(condition="").verdict(value) for value in (True, False)] == ["reproduced", "differs"]
 
 
 @given(st.lists(st.sampled_from([*FAVOUR, "not run"]), max_size=8), st.sampled_from(FAVOUR))
@@ -218,29 +219,29 @@ def test_a_result_that_lacks_a_field_is_named():
 
 
 def test_closed_forms_agree_with_another_way_and_could_disagree():
-    assert 0 < mouth_checks.sagittal_model()["residual_mm"] < 1e-9
-    assert 0 < camera_checks.closed_form()["relative_residual"] < 1e-9
-    assert 0.1 < camera_checks.closed_form()["printed_ratio_1_mm"] < 0.5
-    assert 0 < camera_checks.likelihood()["relative_difference"] < 0.01
-    assert all(0 < value < 1e-9 for value in camera_checks.epipolar().values())
-    assert camera_checks.projection_matrices()["parameters"] == 11
+    assert 0 < mouth.sagittal_model()["residual_mm"] < 1e-9
+    assert 0 < cameras.closed_form()["relative_residual"] < 1e-9
+    assert 0.1 < cameras.closed_form()["printed_ratio_1_mm"] < 0.5
+    assert 0 < cameras.likelihood()["relative_difference"] < 0.01
+    assert all(0 < value < 1e-9 for value in cameras.epipolar().values())
+    assert cameras.projection_matrices()["parameters"] == 11
 
 
 def test_the_printed_numbers_of_chapter_2_come_out_as_the_errata_say():
-    assert mouth_checks.radius()["largest_mm"] == pytest.approx(133.33, abs=0.01)
-    gap = mouth_checks.gap()
+    assert mouth.radius()["largest_mm"] == pytest.approx(133.33, abs=0.01)
+    gap = mouth.gap()
     assert (gap["least_mm"], gap["largest_mm"]) == pytest.approx((15.7, 41.3), abs=0.05)
     assert gap["without_cosine_mm"] == pytest.approx(11.95, abs=0.01)
 
 
 def test_a_smaller_baseline_is_less_precise_by_the_bound():
-    found = camera_checks.baseline_bound()
+    found = cameras.baseline_bound()
     assert found["rms_1_mm_um"] > 2 * found["rms_2.5_mm_um"] > found["rms_4_mm_um"] > 0
-    results = {"thesis_checks": {"baseline_bound": found}}
-    rows = camera_findings._BASELINE_ROWS
-    assert rows[0](results).verdict == "differs"
     turned = dict(zip(found, reversed(found.values()), strict=True))
-    assert rows[0]({"thesis_checks": {"baseline_bound": turned}}).verdict == "reproduced"
+    checks = read_results(ROOT / "benchmarks" / "results")["thesis_checks"]
+    for bound, expected in ((found, "differs"), (turned, "reproduced")):
+        rows = finding("fig-3.10", {"thesis_checks": {**checks, "baseline_bound": bound}}).comparisons
+        assert rows[0].verdict == expected
 
 
 # --- The page ---------------------------------------------------------------------------------------------------------

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from cuspid.anatomy.dentition import ARCH_FORMS
-from cuspid.anatomy.sphere_arch import SphereArchOptions, build_sphere_arch
+from cuspid.anatomy.phantom.sphere_arch import SphereArchOptions, build_sphere_arch
+from cuspid.anatomy.teeth.dentition import ARCH_FORMS
 from cuspid.errors import InputError
 from cuspid.evaluation.distance import Surface
 from cuspid.evaluation.registration import RegistrationOptions, fit
@@ -23,7 +23,7 @@ from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import twelve_cameras
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
-from cuspid.reporting.sphere_figures import save_sphere_picture
+from cuspid.reporting.figures.sphere import save_sphere_picture
 from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path
 
 COARSE = SphereArchOptions(edge_mm=0.45)

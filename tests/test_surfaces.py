@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from cuspid.anatomy.landmarks import kind_of
+from cuspid.anatomy.landmarks.scheme import kind_of
 from cuspid.anatomy.surfaces import SURFACES, SurfaceOptions, named_surfaces, tooth_axes
 from cuspid.errors import InputError
 from cuspid.jaw import Jaw

@@ -10,7 +10,7 @@ import trimesh
 from matplotlib.colors import to_rgb
 
 from cuspid.mesh import Mesh
-from cuspid.reporting.visibility_figures import (
+from cuspid.reporting.figures.visibility import (
     COUNT_COLOURS,
     SURFACE_COLOURS,
     save_counts_picture,

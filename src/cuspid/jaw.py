@@ -71,7 +71,7 @@ class Jaw:
     arch: Arch | None = None
     """Which jaw, where it is known."""
     landmarks: Mapping[str, Landmark] = field(default_factory=dict)
-    """By label, ``<FDI>.<point>`` or ``<point>`` (scheme: `cuspid.anatomy.landmarks`)."""
+    """By label, ``<FDI>.<point>`` or ``<point>`` (scheme: `cuspid.anatomy.landmarks.scheme`)."""
     lines: Mapping[str, Float[np.ndarray, "_ 3"]] = field(default_factory=dict)
     """Polylines on the surface, mm, by label: ``45.margin`` is the margin line of the preparation of tooth 45; a closed
     one ends where it begins."""

@@ -11,6 +11,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from cuspid.anatomy.edges import describe_edges, loops_of, open_edges
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
@@ -110,29 +111,6 @@ def run_lengths(mesh: manifold3d.Mesh64) -> Int[np.ndarray, "r"]:
     return np.asarray(np.diff(np.asarray(mesh.run_index, dtype=np.int64)) // 3)
 
 
-def describe_edges(faces: Int[np.ndarray, "f 3"]) -> str:
-    """How many edges are open, shared by more than two faces, or run twice in one direction."""
-    directed = _edges(faces)
-    _, counts = np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)
-    _, twice = np.unique(directed, axis=0, return_counts=True)
-    return (
-        f"{(counts == 1).sum()} open edges, {(counts > 2).sum()} shared by more than two faces, "
-        f"{(twice > 1).sum()} doubled"
-    )
-
-
-def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
-    return np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
-
-
-def open_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
-    """Directed edges without their opposite."""
-    directed = _edges(faces)
-    size = int(faces.max()) + 1
-    keys, opposite = directed[:, 0] * size + directed[:, 1], directed[:, 1] * size + directed[:, 0]
-    return directed[~np.isin(keys, opposite)]
-
-
 def closed(mesh: Mesh) -> Mesh:
     """The mesh with its holes closed; the faces that close them come last.
 
@@ -153,41 +131,9 @@ def closed(mesh: Mesh) -> Mesh:
     return Mesh(np.concatenate(vertices), np.concatenate(faces))
 
 
-def loops_of(edges: Int[np.ndarray, "e 2"]) -> list[Int[np.ndarray, "_"]]:
-    """Closed walks along directed edges, each edge once; a walk that comes back to one of its points closes there."""
-    following: dict[int, list[int]] = {}
-    for start, end in edges.tolist():
-        following.setdefault(start, []).append(end)
-    loops = []
-    for first in list(following):
-        while following[first]:
-            walk, place = [first], {first: 0}
-            while True:
-                ends = following.get(walk[-1])
-                if not ends:
-                    break
-                node = ends.pop()
-                if node in place:
-                    loops.append(np.array(walk[place[node] :]))
-                    for left in walk[place[node] + 1 :]:
-                        del place[left]
-                    walk = walk[: place[node] + 1]
-                    if not following[walk[-1]] and node == first:
-                        break
-                else:
-                    place[node] = len(walk)
-                    walk.append(node)
-            if len(walk) > 1 or not following[first]:
-                break
-    return loops
-
-
 def rim_of(cut: Cut, inside: Bool[np.ndarray, "f"]) -> Float[np.ndarray, "n 3"]:
     """The longest closed line between the faces inside and all others; its last point is its first."""
-    edges = _edges(cut.mesh.faces[inside])
-    size = len(cut.mesh.vertices)
-    keys, opposite = edges[:, 0] * size + edges[:, 1], edges[:, 1] * size + edges[:, 0]
-    loops = loops_of(edges[~np.isin(keys, opposite)])
+    loops = loops_of(open_edges(cut.mesh.faces[inside]))
     if not loops:
         return np.empty((0, 3))
     lines = [cut.mesh.vertices[np.append(loop, loop[0])] for loop in loops]

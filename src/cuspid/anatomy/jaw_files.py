@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from cuspid.anatomy.landmarking import with_estimates
-from cuspid.anatomy.landmarks import in_frame, missing, validate
+from cuspid.anatomy.landmarks.estimation import with_estimates
+from cuspid.anatomy.landmarks.scheme import in_frame, missing, validate
 from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, labels_from_colors
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3

@@ -28,7 +28,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from cuspid.anatomy.dentition import ARCH_FORMS, QUADRANTS
+from cuspid.anatomy.teeth.dentition import ARCH_FORMS, QUADRANTS
 from cuspid.errors import InputError
 
 Sizes = float | Float[np.ndarray, "*n"]

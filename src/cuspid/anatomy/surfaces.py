@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import median_filter, uniform_filter1d
 
-from cuspid.anatomy.landmarks import kind_of
+from cuspid.anatomy.landmarks.scheme import kind_of
 from cuspid.errors import InputError
 from cuspid.jaw import Jaw
 

@@ -17,7 +17,7 @@ from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
 from cuspid.errors import InputError
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
-from cuspid.reporting.comparison_figures import Curve, save_comparison_picture, save_surface_shares_picture
+from cuspid.reporting.figures.comparison import Curve, save_comparison_picture, save_surface_shares_picture
 from cuspid.simulation.appearance import Preset
 from cuspid.simulation.scan_path import ScanPathOptions
 from cuspid.studies.design_comparison import (

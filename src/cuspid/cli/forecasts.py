@@ -22,8 +22,8 @@ from cuspid.handpiece.precision import NoiseModel, PrecisionMap
 from cuspid.handpiece.presets import PRESETS
 from cuspid.handpiece.visibility import VisibilityOptions, camera_rows, surface_rows
 from cuspid.jaw import Jaw
-from cuspid.reporting.precision_figures import save_precision_picture
-from cuspid.reporting.visibility_figures import save_counts_picture, save_surfaces_picture
+from cuspid.reporting.figures.precision import save_precision_picture
+from cuspid.reporting.figures.visibility import save_counts_picture, save_surfaces_picture
 from cuspid.simulation.scan_path import ScanPathOptions
 from cuspid.studies.forecast import bound_over, foresee
 

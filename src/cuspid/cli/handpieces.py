@@ -13,7 +13,7 @@ from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
 from cuspid.handpiece.brief import read_brief
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.handpiece.optimise import SearchOptions, handpiece_outline, optimise_handpiece
-from cuspid.reporting.design_figures import save_design_picture
+from cuspid.reporting.figures.design import save_design_picture
 from cuspid.studies.forecast import room_for, sections_of
 
 

@@ -10,10 +10,11 @@ import numpy as np
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
 from cuspid import storage
-from cuspid.anatomy.boxed import boxed
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
-from cuspid.anatomy.population import GroupName, draw_population
-from cuspid.anatomy.preparation import (
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.anatomy.phantom.population import GroupName, draw_population
+from cuspid.anatomy.phantom.sphere_arch import SphereArchOptions, build_sphere_arch
+from cuspid.anatomy.preparation.prepare import (
     CrackOptions,
     CrownOptions,
     FullContourCrownOptions,
@@ -21,13 +22,13 @@ from cuspid.anatomy.preparation import (
     PreparationOptions,
     preset,
 )
-from cuspid.anatomy.preparation import prepare as prepare_teeth
-from cuspid.anatomy.sphere_arch import SphereArchOptions, build_sphere_arch
+from cuspid.anatomy.preparation.prepare import prepare as prepare_teeth
+from cuspid.anatomy.shape.boxed import boxed
 from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
 from cuspid.errors import InputError
 from cuspid.jaw import Jaw
-from cuspid.reporting.figures import save_picture
-from cuspid.reporting.preparation_figures import save_preparation_picture
+from cuspid.reporting.figures.drawing import save_picture
+from cuspid.reporting.figures.preparation import save_preparation_picture
 
 
 def phantom(

@@ -21,7 +21,7 @@ from cuspid.anatomy.mouth import (
     study_mouths,
 )
 from cuspid.cli.shared import Flat, console
-from cuspid.reporting.mouth_figures import TOOTH_NAMES, save_fit_picture, save_gap_picture, save_sagittal_picture
+from cuspid.reporting.figures.mouth import TOOTH_NAMES, save_fit_picture, save_gap_picture, save_sagittal_picture
 
 
 def mouth(*, out: Path, options: Annotated[MouthOptions, Flat] = MouthOptions()) -> None:

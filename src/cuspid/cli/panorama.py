@@ -17,7 +17,7 @@ from cuspid.image_sequence import ImageSequence
 from cuspid.panorama import FrameUse
 from cuspid.pipeline import StitchOptions
 from cuspid.progress import Progress
-from cuspid.reporting.panorama_figures import save_camera_path
+from cuspid.reporting.figures.panorama import save_camera_path
 from cuspid.stitching.ortho import Stitched
 
 

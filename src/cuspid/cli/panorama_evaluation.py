@@ -23,7 +23,7 @@ from cuspid.evaluation.panorama import (
     evaluate_panorama,
 )
 from cuspid.panorama import FrameUse, Panorama
-from cuspid.reporting.panorama_evaluation_figures import save_panorama_evaluation
+from cuspid.reporting.figures.panorama_evaluation import save_panorama_evaluation
 from cuspid.trueness import OcclusalView
 
 

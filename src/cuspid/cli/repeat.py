@@ -15,7 +15,7 @@ from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress
 from cuspid.errors import InputError
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
-from cuspid.reporting.repeat_figures import save_repeat_picture
+from cuspid.reporting.figures.repeat import save_repeat_picture
 from cuspid.studies.repetition import RepeatOptions, Repetition, repeat_scans
 from cuspid.studies.trial import TrialOptions
 

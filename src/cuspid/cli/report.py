@@ -9,8 +9,8 @@ from tyro.conf import Positional
 
 from cuspid import storage
 from cuspid.cli.shared import Flat, console
-from cuspid.reporting.report import report_page
-from cuspid.reporting.scan_page import ReportOptions
+from cuspid.reporting.pages.report import report_page
+from cuspid.reporting.pages.scan import ReportOptions
 
 
 def report(

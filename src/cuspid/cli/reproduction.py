@@ -13,13 +13,13 @@ from rich.table import Table
 from cuspid import storage
 from cuspid.cli.shared import console, show_progress
 from cuspid.errors import CuspidError, InputError
-from cuspid.reporting.page import photo_uri
-from cuspid.reporting.reproduction_page import Page, html, markdown
-from cuspid.studies.reproduction.catalogue import BY_ID, ITEMS, Item
-from cuspid.studies.reproduction.judging import judge
-from cuspid.studies.reproduction.page import make_page
-from cuspid.studies.reproduction.pictures import draw_pictures
-from cuspid.studies.reproduction.runs import gather, missing, run_missing
+from cuspid.reporting.pages.page import photo_uri
+from cuspid.reporting.pages.reproduction import Page, html, markdown
+from cuspid.thesis.catalogue import BY_ID, ITEMS, Item
+from cuspid.thesis.judging import judge
+from cuspid.thesis.page import make_page
+from cuspid.thesis.pictures import draw_pictures
+from cuspid.thesis.runs import gather, missing, run_missing
 
 
 def reproduce(

@@ -24,8 +24,8 @@ from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.reconstruction import Reconstruction
-from cuspid.reporting.figures import deviation_colors, save_deviation_picture
-from cuspid.reporting.sphere_figures import save_sphere_picture
+from cuspid.reporting.figures.drawing import deviation_colors, save_deviation_picture
+from cuspid.reporting.figures.sphere import save_sphere_picture
 from cuspid.trueness import Trueness
 
 

@@ -15,7 +15,8 @@ from tyro.conf import arg
 
 from cuspid import storage
 from cuspid.anatomy.jaw_files import load_jaw
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.jaw import Arch, Jaw
 from cuspid.progress import Progress

@@ -15,7 +15,7 @@ from cuspid import storage
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
 from cuspid.errors import InputError
-from cuspid.reporting.sweep_figures import SweepMap, save_sweep_picture
+from cuspid.reporting.figures.sweep import SweepMap, save_sweep_picture
 from cuspid.studies.camera_sweep import TERMS, Best, Setting, SweepOptions, Term, best_setting, values_of
 from cuspid.studies.camera_sweep import sweep as run_sweep
 from cuspid.studies.grid import Outcome

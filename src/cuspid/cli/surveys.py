@@ -11,7 +11,8 @@ from rich.table import Table
 from tyro.conf import Positional
 
 from cuspid import storage
-from cuspid.anatomy.arch import (
+from cuspid.anatomy.jaw_files import jaw_files, load_landmarked_jaw
+from cuspid.anatomy.landmarks.dimensions import (
     DIMENSIONS,
     Dimension,
     GroupStatistics,
@@ -24,15 +25,14 @@ from cuspid.anatomy.arch import (
     needed_landmarks,
     survey,
 )
-from cuspid.anatomy.jaw_files import jaw_files, load_landmarked_jaw
-from cuspid.anatomy.mean_shape import MeanShapeOptions, mean_shape
+from cuspid.anatomy.shape.mean import MeanShapeOptions, mean_shape
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
 from cuspid.errors import InputError
 from cuspid.jaw import Arch, Jaw
-from cuspid.reporting.figures import save_picture
-from cuspid.reporting.landmark_figures import save_landmark_picture, save_measure_picture
-from cuspid.reporting.shape_figures import save_modes_picture, save_variance_picture
+from cuspid.reporting.figures.drawing import save_picture
+from cuspid.reporting.figures.landmark import save_landmark_picture, save_measure_picture
+from cuspid.reporting.figures.shape import save_modes_picture, save_variance_picture
 from cuspid.shape_model import ShapeModel
 
 

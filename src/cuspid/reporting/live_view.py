@@ -14,14 +14,12 @@ from jaxtyping import Float, UInt8
 
 from cuspid.errors import InputError, MissingDependencyError
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures import FigureOptions, deviation_colors
-from cuspid.reporting.scene import (
+from cuspid.reporting.figures.drawing import RANGES_UM, FigureOptions, deviation_colors, fitting_range_um
+from cuspid.reporting.pages.scene import (
     PLASTER_COLOR,
-    RANGES_UM,
     REFERENCE_COLOR,
     camera_lines,
     camera_path,
-    fitting_range_um,
     poses_from,
     shown_frame,
 )

@@ -6,8 +6,8 @@ anterior, superior), and reads a mesh file as LPS unless the file says otherwise
 mesh file, and RAS has the signs of x and y turned.
 
 Points are told apart by their label alone; the order of a file means nothing. Labels are checked against the scheme of
-names by `cuspid.anatomy.landmarks.validate`, which knows it. Markups follow Slicer's schema, ``markups-schema-v1.0.3``
-(github.com/Slicer/Slicer, Modules/Loadable/Markups/Resources/Schema).
+names by `cuspid.anatomy.landmarks.scheme.validate`, which knows it. Markups follow Slicer's schema,
+``markups-schema-v1.0.3`` (github.com/Slicer/Slicer, Modules/Loadable/Markups/Resources/Schema).
 """
 
 from __future__ import annotations

@@ -27,13 +27,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from cuspid import pipeline, storage
-from cuspid.anatomy.boxed import boxed
 from cuspid.anatomy.jaw_files import load_jaw
-from cuspid.anatomy.mean_shape import mean_shape
 from cuspid.anatomy.mouth import MouthOptions, fit_pct, room_mm, study_mouths
-from cuspid.anatomy.phantom import PhantomOptions, build_phantom
-from cuspid.anatomy.population import draw_population
-from cuspid.anatomy.preparation import prepare, preset
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.anatomy.phantom.population import draw_population
+from cuspid.anatomy.preparation.prepare import prepare, preset
+from cuspid.anatomy.shape.boxed import boxed
+from cuspid.anatomy.shape.mean import mean_shape
 from cuspid.anatomy.surfaces import named_surfaces
 from cuspid.camera import Camera
 from cuspid.errors import CuspidError, InputError

@@ -1,0 +1,347 @@
+"""Landmarks of a jaw whose teeth are labelled, estimated from its surface.
+
+Each tooth is looked at in its own view (`cuspid.anatomy.landmarks.tooth_view`: u distal, v buccal, z occlusal). What is
+looked for, by the definitions of `cuspid.anatomy.landmarks.scheme`:
+
+- the angle of an incisal edge is the point farthest half-way between up and sideways (on a canine, whose edge slopes,
+  60 degrees from up); the middle of the edge lies half-way between its angles;
+- cusps are summits, told apart by where the cusps of that tooth normally lie (`cuspid.anatomy.teeth.dentition`);
+- the buccal groove is where the rim is deepest below the line through the tips of the two buccal cusps; the rim bows
+  out from that line a little (`RIM_BOW`);
+- the central groove is the lowest point between buccal and lingual cusps, half-way between mesial and distal;
+- a cervix is the bottom of a parabola laid through the margin of the gum.
+
+The uncertainty of a point joins three parts: what phantoms with known landmarks show for that kind of point, a share of
+the edge length of the mesh, and how far the point moves when the jaw is tilted a little or smoothed more.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.optimize import linear_sum_assignment
+
+from cuspid.anatomy.landmarks.dimensions import arch_of
+from cuspid.anatomy.landmarks.scheme import TOOTH_LANDMARKS, ToothKind, kind_of, labels_of
+from cuspid.anatomy.landmarks.tooth_view import Place, ToothView, view_teeth
+from cuspid.anatomy.teeth.dentition import QUADRANTS
+from cuspid.errors import InputError
+from cuspid.jaw import GUM, Arch, Jaw, Landmark
+from cuspid.mesh import Mesh
+
+Point = Float[np.ndarray, "3"]
+Points = Float[np.ndarray, "n 3"]
+
+_NO_POINTS = np.zeros((0, 3))
+_UP = np.array([0.0, 0.0, 1.0])
+_ANGLE_DEG: Mapping[ToothKind, float] = MappingProxyType({"incisor": 45.0, "canine": 60.0})
+"""Direction in which the angle of an edge is the farthest point, from up to sideways."""
+_CUSPS_APART_MM = 0.8
+"""No two cusps of a tooth are nearer."""
+_CUSP_SPREAD_MM = 1.5
+"""How far a cusp usually lies from where it is expected."""
+_FARTHEST_CUSP_MM = 3.0
+"""No cusp is this far from where it is expected."""
+_RELIEF_MM = 0.8
+"""A cusp without a summit is what stands out most from the surface smoothed by this."""
+RIM_BOW: Mapping[Arch, tuple[float, float]] = MappingProxyType({"lower": (0.122, 0.145), "upper": (0.081, 0.095)})
+"""How far buccally of the line through the tips of the buccal cusps the rim of first and of other molars is crossed, as
+a fraction of half the depth of the tooth, seen from above; from the phantoms that `SIGMA_MM` is from."""
+_GROOVE_CAP_MM = 0.02
+"""The groove is the middle of what lies about this far above the lowest place of the rim."""
+_PAPILLA_LEAN_DEG = 35.0
+"""Direction in which the tip of a lingual papilla is the farthest point, from up to lingual."""
+_PAPILLA_CAP_MM = 0.05
+"""The tip of a papilla is the middle of what falls about this far short of its farthest point."""
+_PAPILLA_BELOW_MM = 1.0
+"""The incisive papilla is taken this far apical of the palatal margin of the gum at the central incisors."""
+
+
+SIGMA_MM: Mapping[str, tuple[float, float]] = MappingProxyType(
+    {
+        "canine.cusp_tip": (0.03, 0.03),
+        "canine.distal_angle": (0.03, 0.93),
+        "canine.labial_cervix": (0.05, 0.05),
+        "canine.lingual_cervix": (0.18, 0.00),
+        "canine.mesial_angle": (0.12, 0.39),
+        "incisor.distal_angle": (0.08, 0.31),
+        "incisor.incisal_edge": (0.07, 0.12),
+        "incisor.labial_cervix": (0.07, 0.08),
+        "incisor.lingual_cervix": (0.13, 0.05),
+        "incisor.mesial_angle": (0.04, 0.27),
+        "midline": (0.03, 0.34),
+        "molar.buccal_groove": (0.01, 0.08),
+        "molar.central_groove": (0.26, 0.23),
+        "molar.distobuccal_cusp": (0.10, 0.04),
+        "molar.mesiobuccal_cusp": (0.10, 0.08),
+        "molar.mesiolingual_cusp": (0.13, 0.05),
+        "papilla": (0.00, 0.37),
+        "premolar.buccal_cervix": (0.06, 0.04),
+        "premolar.buccal_cusp": (0.03, 0.06),
+        "premolar.central_groove": (0.29, 0.00),
+        "premolar.lingual_cervix": (0.07, 0.08),
+        "premolar.lingual_cusp": (0.13, 0.05),
+    }
+)
+"""Standard uncertainty (one axis) of each kind of point: a constant in mm, and a share of the edge length of the mesh.
+
+From the errors on phantoms of seeds 100 to 103, both arches, with edges of 0.47 and 0.84 mm: what the spread under
+tilts and smoothing does not explain. They hold for teeth formed like the phantom's; worn or restored ones are worse,
+and that shows in the spread alone."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LandmarkingOptions:
+    """How landmarks are estimated from a labelled surface."""
+
+    grid_mm: float = 0.1
+    """Spacing of the height field of a tooth."""
+    smoothing_mm: float = 0.2
+    """Standard deviation of the smoothing of the height field before cusps are looked for."""
+    tilt_deg: float = 4.0
+    """Tilt of the jaw by which the uncertainty is tried."""
+
+
+def estimate_landmarks(jaw: Jaw, options: LandmarkingOptions = LandmarkingOptions()) -> dict[str, Landmark]:
+    """Landmarks of a labelled jaw in the occlusal frame, each with its uncertainty; those not to be found are absent.
+
+    Raises InputError where the jaw has no labels.
+    """
+    if not jaw.teeth:
+        raise InputError("landmarks: the jaw has no tooth labels to find them by; give labels or a landmark file")
+    arch = arch_of(jaw)
+    views = view_teeth(jaw, options.grid_mm)
+    margins = _margins(jaw)
+    tries = [_all_points(jaw, arch, tried, margins) for tried in _tries(views, options)]
+    edge_mm = float(np.sqrt(np.median(jaw.mesh.face_areas) * 4 / np.sqrt(3)))
+    return {
+        label: Landmark(point, _sigma(label, point, [t[label] for t in tries if label in t], edge_mm))
+        for label, point in tries[0].items()
+    }
+
+
+def with_estimates(jaw: Jaw, options: LandmarkingOptions = LandmarkingOptions()) -> Jaw:
+    """The jaw with the landmarks that it lacks estimated from its surface; those that it has stay as they are."""
+    estimated = estimate_landmarks(jaw, options)
+    return replace(jaw, landmarks={**estimated, **jaw.landmarks})
+
+
+def _tries(views: Mapping[int, ToothView], options: LandmarkingOptions) -> list[dict[int, ToothView]]:
+    """The views as they are, tilted four ways, and smoothed more."""
+    slope = np.tan(np.radians(options.tilt_deg))
+    smooth = {fdi: view.smoothed(options.smoothing_mm) for fdi, view in views.items()}
+    leans = slope * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    tilted = [{fdi: view.tilted(lean) for fdi, view in smooth.items()} for lean in leans]
+    return [smooth, *tilted, {fdi: view.smoothed(2 * options.smoothing_mm) for fdi, view in views.items()}]
+
+
+def _sigma(label: str, point: Point, tries: Sequence[Point], edge_mm: float) -> float:
+    """Standard uncertainty (one axis) of a point that several tries found at other places."""
+    fdi, _, name = label.rpartition(".")
+    constant, share = SIGMA_MM[f"{kind_of(int(fdi))}.{name}" if fdi else name]
+    spread = np.sqrt(np.mean((np.array(tries) - point) ** 2))
+    return float(np.linalg.norm([constant, share * edge_mm, spread]))
+
+
+def _all_points(
+    jaw: Jaw, arch: Arch, views: Mapping[int, ToothView], margins: Mapping[int, Points]
+) -> dict[str, Point]:
+    """Every landmark that can be found, by label, in the jaw."""
+    points: dict[str, Point] = {}
+    for fdi, view in views.items():
+        found = _tooth_points(view, arch) | _cervices(view, margins.get(fdi, _NO_POINTS))
+        points |= {f"{fdi}.{name}": found[name] for name in TOOTH_LANDMARKS[kind_of(fdi)] if name in found}
+    points |= _midline_points(jaw, arch, views, margins, points)
+    return {label: points[label] for label in labels_of(views) if label in points}
+
+
+def _tooth_points(view: ToothView, arch: Arch) -> dict[str, Point]:
+    """The landmarks on a crown, in the jaw."""
+    kind = kind_of(view.fdi)
+    if kind in ("incisor", "canine"):
+        places = _edge_places(view, kind)
+    else:
+        places = _cusp_places(view, arch)
+        places["central_groove"] = _central_groove(view, places, 0.15 if kind == "molar" else 0.0)
+        if kind == "molar":
+            places["buccal_groove"] = _buccal_groove(view, RIM_BOW[arch][view.fdi % 10 > 6], places)
+    return {name: view.lift(place) for name, place in places.items()}
+
+
+# Edges
+
+
+def _edge_places(view: ToothView, kind: ToothKind) -> dict[str, Place]:
+    """Corners and middle of an incisal edge, or corners and tip of a canine."""
+    lean = np.radians(_ANGLE_DEG[kind])
+    mesial, distal = (view.farthest(np.array([side * np.sin(lean), 0.0, np.cos(lean)])) for side in (-1, 1))
+    if kind == "canine":
+        return {"mesial_angle": mesial, "cusp_tip": view.farthest(_UP), "distal_angle": distal}
+    middle = (mesial[0] + distal[0]) / 2
+    strip = np.abs(view.places[..., 0] - middle) < 0.6 * view.grid_mm
+    return {"mesial_angle": mesial, "incisal_edge": view.farthest(_UP, strip), "distal_angle": distal}
+
+
+# Cusps and grooves
+
+
+def _expected_cusps(fdi: int, arch: Arch) -> dict[str, tuple[float, float]]:
+    """Where the cusps of a tooth normally lie, as fractions of half its width and depth; a third molar as a second."""
+    cusps = sorted(QUADRANTS[arch][min(fdi % 10, 7) - 1].crown.cusps, key=lambda cusp: cusp.x)
+    before = ("mesio", "disto", "distal_") if kind_of(fdi) == "molar" else ("", "second_")
+    return {
+        f"{prefix}{side}_cusp": (cusp.x, cusp.y)
+        for side, sign in (("buccal", 1), ("lingual", -1))
+        for prefix, cusp in zip(before, (cusp for cusp in cusps if cusp.y * sign > 0), strict=False)
+    }
+
+
+def _cusp_places(view: ToothView, arch: Arch) -> dict[str, Place]:
+    """The summits that suit the cusps of the tooth best; where none does, the highest place near the expected one."""
+    expected = _expected_cusps(view.fdi, arch)
+    places = np.array(list(expected.values())) * [view.half_width_mm, view.half_depth_mm]
+    summits = view.summits(_CUSPS_APART_MM)
+    apart = np.linalg.norm(places[:, None] - summits[None], axis=-1)
+    heights = view.surface(summits)
+    lower = heights.max(initial=-np.inf) - heights
+    suits = np.where(apart < _FARTHEST_CUSP_MM, (apart / _CUSP_SPREAD_MM) ** 2 + lower, 1e3)
+    # A cusp may go without a summit; one that is no landmark does so first.
+    named = np.isin(list(expected), TOOTH_LANDMARKS[kind_of(view.fdi)])
+    without = np.broadcast_to(np.where(named, 20.0, 8.0)[:, None], (len(expected), len(expected)))
+    _, chosen = linear_sum_assignment(np.hstack([suits, without]))
+    inside = np.isfinite(view.heights)
+    relief = np.subtract(view.heights, view.smoothed(_RELIEF_MM).heights, out=view.heights.copy(), where=inside)
+    found = {}
+    for k, name in enumerate(expected):
+        if chosen[k] < len(summits):
+            centre = summits[chosen[k]]
+            found[name] = view.farthest(_UP, view.within(centre - 0.5, centre + 0.5))
+        else:
+            found[name] = view.top(relief, view.within(places[k] - 1.0, places[k] + 1.0))
+    return found
+
+
+def _buccal_groove(view: ToothView, bow: float, cusps: Mapping[str, Place]) -> Place:
+    """The place of the rim that is deepest below the straight line between the tips of the two buccal cusps."""
+    mesial, distal = cusps["mesiobuccal_cusp"], cusps["distobuccal_cusp"]
+    run = np.linspace(0.15, 0.85, 71)
+    line = mesial + run[:, None] * (distal - mesial) + [0.0, bow * view.half_depth_mm]
+    heights = view.sampled(line)
+    tips = np.interp(run, [0.0, 1.0], view.surface(np.stack([mesial, distal])))
+    depth = np.where(np.isfinite(heights), tips - heights, -_FARTHEST_CUSP_MM)
+    weights = np.exp((depth - depth.max()) / _GROOVE_CAP_MM)
+    return np.asarray(weights @ line / weights.sum())
+
+
+def _central_groove(view: ToothView, cusps: Mapping[str, Place], wide: float) -> Place:
+    """The lowest place between buccal and lingual cusps, within a fraction of half the width about the middle."""
+    low = max(place[1] for name, place in cusps.items() if "lingual" in name)
+    high = min(place[1] for name, place in cusps.items() if "buccal" in name)
+    reach, middle, half = max(wide * view.half_width_mm, 0.6 * view.grid_mm), (low + high) / 2, 0.4 * abs(high - low)
+    among = view.within(np.array([-reach, middle - half]), np.array([reach, middle + half]))
+    return view.farthest(-_UP, among)
+
+
+# The gum
+
+
+def _margins(jaw: Jaw) -> dict[int, Points]:
+    """Middles of the edges between each tooth and the gum, mm."""
+    if jaw.face_labels is None:
+        return {}
+    faces = jaw.mesh.faces
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    owner = np.tile(jaw.face_labels, 3)
+    order = np.lexsort((owner, edges[:, 1], edges[:, 0]))
+    edges, owner = edges[order], owner[order]
+    # Labels are sorted within equal edges, and that of the gum is the lowest.
+    border = np.all(edges[1:] == edges[:-1], axis=1) & (owner[:-1] == GUM) & (owner[1:] != GUM)
+    middles = jaw.mesh.vertices[edges[1:][border]].mean(axis=1)
+    teeth = owner[1:][border]
+    return {int(fdi): middles[teeth == fdi] for fdi in np.unique(teeth)}
+
+
+def _cervices(view: ToothView, margin: Points) -> dict[str, Point]:
+    """The lowest point of the margin on either side."""
+    local = view.to_view(margin)
+    outer = "labial" if kind_of(view.fdi) in ("incisor", "canine") else "buccal"
+    found = {}
+    for name, side in ((f"{outer}_cervix", 1), ("lingual_cervix", -1)):
+        near = local[(side * local[:, 1] > 0) & (np.abs(local[:, 0]) < 0.6 * view.half_width_mm)]
+        if len(near) > 4:
+            found[name] = view.to_jaw(_bottom(near, 0.5 * view.half_width_mm))
+    return found
+
+
+def _bottom(points: Points, reach_mm: float) -> Point:
+    """The lowest point of a parabola z(u) through points (u, v, z), within `reach_mm` of u = 0."""
+    across = np.polyfit(points[:, 0], points[:, 1:], 2)
+    a, b, _ = across[:, 1]
+    u = float(np.clip(-b / (2 * a), -reach_mm, reach_mm)) if a > 0 else reach_mm * -np.sign(b)
+    v, z = np.array([u * u, u, 1.0]) @ across
+    return np.array([u, v, z])
+
+
+def _midline_points(
+    jaw: Jaw,
+    arch: Arch,
+    views: Mapping[int, ToothView],
+    margins: Mapping[int, Points],
+    points: Mapping[str, Point],
+) -> dict[str, Point]:
+    """Papilla and midline, where both central incisors are there."""
+    right, left = (41, 31) if arch == "lower" else (11, 21)
+    labels = (f"{right}.mesial_angle", f"{left}.mesial_angle")
+    if jaw.face_labels is None or not all(label in points for label in labels):
+        return {}
+    middle = (points[labels[0]] + points[labels[1]]) / 2
+    between = (views[right].origin + views[left].origin) / 2
+    inwards = -(views[right].axes[1] + views[left].axes[1])
+    inwards /= np.linalg.norm(inwards)
+    found = {"midline": _surface_below(jaw, middle)}
+    if arch == "lower":
+        papilla = _lingual_papilla(jaw.mesh, jaw.face_labels, middle, inwards)
+    else:
+        cervices = [points[f"{fdi}.lingual_cervix"] for fdi in (right, left) if f"{fdi}.lingual_cervix" in points]
+        papilla = _incisive_papilla(jaw, between, inwards, cervices)
+    return found if papilla is None else {**found, "papilla": papilla}
+
+
+def _surface_below(jaw: Jaw, point: Point) -> Point:
+    """Where the surface is below a point, as far as that is a contact of teeth and not a gap between them."""
+    hit = jaw.mesh.cast((point + 2 * _UP)[None], -_UP[None])
+    height = point[2] + 2 - hit.distances[0]
+    return np.array([*point[:2], height]) if point[2] - height < 1.5 else point
+
+
+def _lingual_papilla(mesh: Mesh, labels: Int[np.ndarray, "f"], contact: Point, inwards: Point) -> Point | None:
+    """The tip of the gum that is seen from above lingual of the contact of the central incisors."""
+    lean = np.radians(_PAPILLA_LEAN_DEG)
+    aside = np.array([-inwards[1], inwards[0], 0.0])
+    depth, across = np.meshgrid(np.arange(-0.5, 5.0, 0.05), np.linspace(-0.45, 0.45, 7))
+    over = contact + depth.reshape(-1, 1) * inwards + across.reshape(-1, 1) * aside + 5.0 * _UP
+    hits = mesh.cast(over, np.broadcast_to(-_UP, over.shape))
+    gum = (hits.faces >= 0) & (labels[hits.faces] == GUM)
+    if not gum.any():
+        return None
+    seen = over[gum] - hits.distances[gum, None] * _UP
+    score = seen @ (np.sin(lean) * inwards + np.cos(lean) * _UP)
+    weights = np.exp((score - score.max()) / _PAPILLA_CAP_MM)
+    return weights @ seen / weights.sum()
+
+
+def _incisive_papilla(jaw: Jaw, between: Point, inwards: Point, cervices: Sequence[Point]) -> Point | None:
+    """The palatal gum behind the central incisors, `_PAPILLA_BELOW_MM` apical of their palatal margin."""
+    if not cervices:
+        return None
+    depth = np.arange(0.0, 10.0, 0.05)
+    over = between * [1, 1, 0] + depth[:, None] * inwards + 20.0 * _UP
+    hits = jaw.mesh.cast(over, np.broadcast_to(-_UP, over.shape))
+    heights = 20.0 - hits.distances
+    below = heights < np.mean([cervix[2] for cervix in cervices]) - _PAPILLA_BELOW_MM
+    if not below.any():
+        return None
+    first = int(below.argmax())
+    return np.array([*over[first, :2], heights[first]])

@@ -1,0 +1,1 @@
+"""Jaws that are built: phantoms of teeth and gum, populations of them, and an arch of spheres."""

@@ -1,0 +1,1 @@
+"""Pictures of what the others find, a module for each."""

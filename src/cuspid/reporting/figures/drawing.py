@@ -1,0 +1,273 @@
+"""Pictures of meshes and of their deviations, rendered by Embree rays and framed by matplotlib.
+
+Meshes lie in the occlusal frame (mm). A view is orthographic; its axes are (right, up, towards the eye).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+
+from cuspid.errors import InputError
+from cuspid.mesh import Mesh, RayHits
+from cuspid.storage import whole_file
+from cuspid.trueness import Trueness
+
+PLASTER = np.array([222, 214, 200], dtype=np.uint8)
+"""Colour of a mesh that has none."""
+NOT_COUNTED = np.array([168, 168, 168], dtype=np.uint8)
+"""Colour of a vertex without a deviation."""
+RANGES_UM = (5.0, 10.0, 25.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
+"""Ends of the colour bar from which the reader chooses."""
+_BACK = 0.78
+"""Grey of a surface seen from behind."""
+_INK = "#333333"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FigureOptions:
+    """How deviations are drawn."""
+
+    range_um: float = 100.0
+    """Ends of the colour bar; the range is fixed and symmetric so that pictures can be compared."""
+    tolerance_um: float = 25.0
+    """Green within this deviation to either side."""
+    width_px: int = 1000
+    """Width of the main view."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.tolerance_um < self.range_um:
+            raise InputError(
+                f"figure: the tolerance ({self.tolerance_um:g} um) must be positive and below the range "
+                f"({self.range_um:g} um)"
+            )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class View:
+    """An orthographic picture."""
+
+    image: UInt8[np.ndarray, "h w 3"]
+    """sRGB, white where nothing is."""
+    mm_per_px: float
+    """Size of a pixel."""
+
+
+def deviation_map(options: FigureOptions) -> LinearSegmentedColormap:
+    """Colours from -range to +range: blue inside, green within the tolerance, yellow to red outside."""
+    t = options.tolerance_um / options.range_um
+    stops = [
+        (-1.0, "#1b1464"),
+        (-(1 + t) / 2, "#1f5fd6"),
+        (-t - 0.02 * (1 - t), "#8fdcf2"),
+        (-t, "#58b368"),
+        (t, "#58b368"),
+        (t + 0.02 * (1 - t), "#fff07a"),
+        ((1 + t) / 2, "#f58b1f"),
+        (1.0, "#a50f15"),
+    ]
+    return LinearSegmentedColormap.from_list("deviation", [((1 + x) / 2, color) for x, color in stops], N=1024)
+
+
+def fitting_range_um(p95_um: float) -> float:
+    """The smallest range of the colour bar that is at least two and a half times the 95th percentile."""
+    return next((each for each in RANGES_UM if each >= 2.5 * p95_um), RANGES_UM[-1])
+
+
+def deviation_colors(
+    deviation_um: Float[np.ndarray, "v"], options: FigureOptions = FigureOptions()
+) -> UInt8[np.ndarray, "v 3"]:
+    """sRGB for each signed deviation; grey for NaN."""
+    scaled = 0.5 + 0.5 * np.nan_to_num(deviation_um) / options.range_um
+    colors = deviation_map(options)(scaled, bytes=True)[:, :3]
+    return np.where(np.isnan(deviation_um)[:, None], NOT_COUNTED, colors)
+
+
+def look(azimuth_deg: float, elevation_deg: float) -> Float[np.ndarray, "3 3"]:
+    """Rows (right, up, towards the eye) for an eye at an azimuth from +X towards +Y and an elevation above XY."""
+    azimuth, elevation = np.deg2rad([azimuth_deg, elevation_deg])
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    towards = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    return np.stack([right, np.cross(towards, right), towards])
+
+
+OCCLUSAL = look(-90.0, 90.0)
+"""From the occlusal side, anterior upwards."""
+
+
+def render(
+    mesh: Mesh, axes: Float[np.ndarray, "3 3"] = OCCLUSAL, *, width_px: int = 1000, supersampling: int = 2
+) -> View:
+    """A shaded picture of a mesh in its own colours, cropped to it."""
+    seen = mesh.vertices @ axes.T
+    lower, upper = seen.min(axis=0), seen.max(axis=0)
+    margin = 0.02 * (upper - lower)[:2].max()
+    width_mm, height_mm = (upper - lower)[:2] + 2 * margin
+    step = width_mm / (width_px * supersampling)
+    columns, rows = width_px * supersampling, supersampling * int(np.ceil(height_mm / width_mm * width_px))
+    x = lower[0] - margin + (np.arange(columns) + 0.5) * step
+    y = upper[1] + margin - (np.arange(rows) + 0.5) * step
+    eye = np.stack(np.broadcast_arrays(x[None], y[:, None], upper[2] + 1.0), axis=-1).reshape(-1, 3)
+    hits = mesh.cast(eye @ axes, np.broadcast_to(-axes[2], eye.shape))
+    depth = hits.distances.reshape(rows, columns)
+    canvas = np.ones((rows * columns, 3), dtype=np.float32)
+    canvas[hits.faces >= 0] = _lit(mesh, hits, axes) * (1 - _crevices(depth, step).reshape(-1, 1)[hits.faces >= 0])
+    pixels = canvas.reshape(rows // supersampling, supersampling, width_px, supersampling, 3).mean(axis=(1, 3))
+    return View(image=np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8), mm_per_px=float(step * supersampling))
+
+
+def _lit(mesh: Mesh, hits: RayHits, axes: Float[np.ndarray, "3 3"]) -> Float32[np.ndarray, "n 3"]:
+    """Colour of each hit under a soft light from the upper left, mild enough to be read off a colour bar."""
+    hit = hits.faces >= 0
+    corners = mesh.faces[hits.faces[hit]]
+    weights = hits.barycentric[hit]
+    normals = np.einsum("nk,nkd->nd", weights, mesh.vertex_normals[corners]) @ axes.T
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    back = mesh.face_normals[hits.faces[hit]] @ axes[2] < 0
+    normals[back] *= -1
+    key = np.clip(normals @ (np.array([-0.45, 0.60, 0.66])), 0, 1)
+    shade = 0.46 + 0.38 * key + 0.22 * np.clip(normals[:, 2], 0, 1)
+    colors = np.broadcast_to(PLASTER, mesh.vertices.shape) if mesh.colors is None else mesh.colors
+    albedo = np.einsum("nk,nkd->nd", weights, colors[corners] / 255)
+    albedo[back] = _BACK
+    return (albedo * shade[:, None]).astype(np.float32)
+
+
+def _crevices(depth_mm: Float[np.ndarray, "h w"], step_mm: float) -> Float[np.ndarray, "h w"]:
+    """Darkening where the surface lies deeper than its surroundings (unsharp masking of depth, Luft et al. 2006)."""
+    known = np.isfinite(depth_mm)
+    depth = np.where(known, depth_mm, 0).astype(np.float32)
+    size = (1 + 2 * int(0.8 / step_mm),) * 2
+    share, summed = known.astype(np.float32), depth
+    for _ in range(2):
+        share, summed = cv2.blur(share, size), cv2.blur(summed, size)
+    deeper = depth - summed / np.maximum(share, 1e-3)
+    return np.asarray(np.where(known, np.clip(0.3 * deeper, 0, 0.35), 0))
+
+
+def save_picture(path: Path, mesh: Mesh, *, title: str = "", width_px: int = 1000) -> None:
+    """PNG of a mesh in its own colours: occlusal, and two oblique views."""
+    figure = new_figure(12.0, 6.6, dpi=130)
+    _draw_views(figure, mesh, 0.04, width_px=width_px)
+    _draw_title(figure, title)
+    save_figure(figure, path)
+
+
+def save_deviation_picture(
+    path: Path, scan: Mesh, trueness: Trueness, options: FigureOptions = FigureOptions(), *, title: str = ""
+) -> None:
+    """PNG of a scan (in its own frame) coloured by its deviation, with the colour bar, histogram and key figures."""
+    colors = deviation_colors(trueness.deviation_um, options)
+    colored = replace(scan.transformed(trueness.reference_from_scan), colors=colors)
+    figure = new_figure(12.0, 8.4, dpi=130)
+    _draw_views(figure, colored, 0.30, width_px=options.width_px)
+    _draw_histogram(figure, colored, trueness.deviation_um, options)
+    _draw_figures(figure, trueness)
+    _draw_title(figure, title)
+    save_figure(figure, path)
+
+
+def new_figure(width_in: float, height_in: float, *, dpi: int, layout: Literal["constrained"] | None = None) -> Figure:
+    """A white page of a size in inches, without a screen."""
+    figure = Figure(figsize=(width_in, height_in), dpi=dpi, facecolor="white", layout=layout)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure, whole or not at all. Raises OutputError."""
+    with whole_file(path) as temporary:
+        figure.savefig(temporary)
+
+
+def _draw_title(figure: Figure, title: str) -> None:
+    figure.text(0.03, 0.965, title, fontsize=16, color=_INK, va="center", fontweight="bold")
+
+
+def _draw_views(figure: Figure, mesh: Mesh, bottom: float, *, width_px: int) -> None:
+    """The occlusal view large, and one from each side of the arch at its right."""
+    middle, top = 0.5 * (bottom + 0.91), 0.91
+    azimuth, names = _outward(mesh)
+    _draw_view(figure, (0.02, bottom, 0.55, top - bottom), render(mesh, OCCLUSAL, width_px=width_px), "occlusal")
+    for name, turn, low in ((names[0], 0.0, middle), (names[1], 180.0, bottom)):
+        view = render(mesh, look(azimuth + turn, 30.0), width_px=width_px // 2)
+        _draw_view(figure, (0.60, low + 0.01, 0.38, middle - bottom - 0.05), view, name)
+
+
+def _outward(mesh: Mesh) -> tuple[float, tuple[str, str]]:
+    """Azimuth from which to look at the outer side, and what the two sides are called."""
+    x, y, _ = np.average(mesh.face_centres, axis=0, weights=mesh.face_areas)
+    if np.hypot(x, y) > 0.35 * np.ptp(mesh.vertices[:, :2], axis=0).max():
+        return float(np.rad2deg(np.arctan2(y, x))), ("from outside", "from inside")
+    return 90.0, ("from the front", "from behind")
+
+
+def _draw_view(figure: Figure, place: tuple[float, float, float, float], view: View, name: str) -> None:
+    axes = figure.add_axes(place)
+    height, width = view.image.shape[:2]
+    axes.imshow(view.image, extent=(0, width * view.mm_per_px, 0, height * view.mm_per_px), interpolation="antialiased")
+    axes.set_axis_off()
+    axes.set_anchor("C")
+    axes.set_title(name, loc="left", fontsize=12, color=_INK, pad=3)
+    length = _round_length(0.2 * width * view.mm_per_px)
+    axes.plot([0, length], [0, 0], color=_INK, linewidth=3, solid_capstyle="butt", clip_on=False)
+    axes.annotate(f"{length:g} mm", (length, 0), (5, -3), textcoords="offset points", fontsize=11, color=_INK)
+
+
+def _round_length(upper: float) -> float:
+    """The largest of 1, 2, 5, 10, 20 .. times a power of ten that is not above ``upper``."""
+    power = 10.0 ** np.floor(np.log10(upper))
+    return float(power * max(factor for factor in (1, 2, 5) if factor * power <= upper))
+
+
+def _draw_histogram(figure: Figure, mesh: Mesh, deviation_um: Float[np.ndarray, "v"], options: FigureOptions) -> None:
+    """Surface over deviation, standing on the colour bar that it shares its axis with."""
+    limit = options.range_um
+    shares = np.bincount(mesh.faces.ravel(), np.repeat(mesh.face_areas, 3), minlength=len(mesh.vertices))
+    known = np.isfinite(deviation_um)
+    clipped = np.clip(deviation_um[known], -limit, limit)
+    counts, edges = np.histogram(clipped, bins=100, range=(-limit, limit), weights=shares[known])
+    centres = (edges[1:] + edges[:-1]) / 2
+    bars = figure.add_axes((0.06, 0.135, 0.50, 0.13))
+    bars.bar(centres, counts, width=np.diff(edges), color=deviation_map(options)(0.5 + 0.5 * centres / limit))
+    bars.set_axis_off()
+    bars.set_xlim(-limit, limit)
+    scale = figure.add_axes((0.06, 0.105, 0.50, 0.028))
+    bar = figure.colorbar(
+        ScalarMappable(Normalize(-limit, limit), deviation_map(options)), cax=scale, orientation="horizontal"
+    )
+    bar.set_ticks([-limit, -limit / 2, -options.tolerance_um, 0, options.tolerance_um, limit / 2, limit])
+    bar.ax.tick_params(labelsize=11, color=_INK, labelcolor=_INK)
+    bar.ax.xaxis.set_major_formatter(lambda um, _: f"{um:+g}" if um else "0")
+    bar.outline.set_visible(False)
+    bar.set_label(
+        "deviation from the reference / µm (positive: outside)\ngrey: not counted, or seen from behind",
+        fontsize=12,
+        color=_INK,
+    )
+
+
+def _draw_figures(figure: Figure, trueness: Trueness) -> None:
+    accuracy = trueness.accuracy
+    rows = [
+        ("mean absolute", f"{accuracy.mean_abs_um:.1f} µm"),
+        ("signed mean ± SD", f"{accuracy.signed_mean_um:+z.1f} ± {accuracy.std_um:.1f} µm"),
+        ("95 % within", f"{accuracy.p95_um:.1f} µm"),
+        ("complete within 50 µm", f"{trueness.completeness_pct['50']:.1f} %"),
+        ("scale error", f"{trueness.scale_error_ppm:+.0f} ppm"),
+    ]
+    if trueness.inter_molar_error_um is not None:
+        rows.append(("inter-molar error", f"{trueness.inter_molar_error_um:+.1f} µm"))
+    for line, (name, value) in enumerate(rows):
+        height = 0.245 - 0.034 * line
+        figure.text(0.66, height, name, fontsize=13, color=_INK)
+        figure.text(0.97, height, value, fontsize=13, color=_INK, ha="right", fontweight="bold")

@@ -1,0 +1,72 @@
+"""Pictures of panoramas: the camera's path over the arch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patheffects import Normal, Stroke
+
+from cuspid.panorama import Panorama
+from cuspid.reconstruction import Reconstruction
+from cuspid.reporting.figures.drawing import new_figure, save_figure
+
+_TICK = 10
+"""Every so many frames one is named."""
+_WIDTH_IN = 8.0
+
+
+def save_camera_path(path: Path, panorama: Panorama, motion: Reconstruction) -> None:
+    """The panorama with the place of the camera at each frame, and below it height and tilt over the frames.
+
+    ``motion`` is in the world of the panorama.
+    """
+    poses = [pose.inverse() for pose in motion.rig_from_world.values()]
+    centres = np.array([pose.translation for pose in poses])
+    axes = np.array([pose.rotation[:, 2] for pose in poses])
+    height, width = panorama.covered.shape
+    above_in = min(max(0.82 * _WIDTH_IN * height / width, 2.0), 9.0)  # The axis' names and the colours have the rest.
+    figure = new_figure(_WIDTH_IN, above_in + 2.9, dpi=110, layout="constrained")
+    above, below = figure.subplots(2, 1, height_ratios=[above_in, 1.7])
+    _draw_above(above, panorama, centres, axes, motion.frames)
+    _draw_heights(below, panorama, centres, axes)
+    save_figure(figure, path)
+
+
+def _draw_above(axis: Axes, panorama: Panorama, centres: np.ndarray, axes: np.ndarray, names: tuple[str, ...]) -> None:
+    """The panorama seen from above with the camera's centres, coloured by time, and where it looked."""
+    height, width = panorama.covered.shape
+    corners = panorama.world_from_pixels(np.array([[0.0, height], [width, 0.0]]))
+    extent = (corners[0, 0], corners[1, 0], corners[0, 1], corners[1, 1])
+    axis.imshow(panorama.image, extent=extent, interpolation="antialiased")
+    places = centres[:, :2]
+    looks = places - axes[:, :2] / axes[:, 2:] * centres[:, 2:]
+    axis.plot(*places.T, color="white", linewidth=0.7)
+    for place, look in zip(places, looks, strict=True):
+        axis.plot(*zip(place, look, strict=True), color="#ffffff60", linewidth=0.5)
+    dots = axis.scatter(places[:, 0], places[:, 1], c=np.arange(len(places)), cmap="viridis", s=14, zorder=3)
+    for index in range(0, len(names), _TICK):
+        label = axis.annotate(names[index], places[index], (5, 3), textcoords="offset points", fontsize=7)
+        label.set(color="white", path_effects=[Stroke(linewidth=1.8, foreground="black"), Normal()])
+    axis.figure.colorbar(dots, ax=axis, label="located frame", fraction=0.04, pad=0.02, aspect=35)
+    unit = "mm" if panorama.mm_per_px else "px"
+    axis.set(xlabel=f"x, {unit}", ylabel=f"y, {unit} (front up)", title="Path of the camera over the teeth")
+    axis.set_xlim(min(extent[0], places[:, 0].min()), max(extent[1], places[:, 0].max()))
+    axis.set_ylim(min(extent[2], places[:, 1].min()), max(extent[3], places[:, 1].max()))
+    axis.set_facecolor("black")
+
+
+def _draw_heights(axis: Axes, panorama: Panorama, centres: np.ndarray, axes: np.ndarray) -> None:
+    """Height over the occlusal plane and tilt of every frame."""
+    tilt = np.rad2deg(np.arccos(np.clip(-axes[:, 2], -1, 1)))
+    if panorama.mm_per_px:
+        axis.plot(centres[:, 2], color="C0")
+        axis.set_ylabel("height over the cusps, mm", color="C0")
+    else:
+        axis.plot(centres[:, 2] / np.median(centres[:, 2]), color="C0")
+        axis.set_ylabel("height over the cusps / median", color="C0")
+    other = axis.twinx()
+    other.plot(tilt, color="C1")
+    other.set_ylabel("tilt, deg", color="C1")
+    axis.set_xlabel("located frame")

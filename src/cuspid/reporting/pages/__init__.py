@@ -1,0 +1,1 @@
+"""Pages of one file, which open from a disk without a network."""

@@ -1,0 +1,28 @@
+"""The report of a folder: one HTML page for whatever lies in it."""
+
+from __future__ import annotations
+
+from typing import assert_never
+
+from cuspid.reporting.pages.panorama import panorama_page, score_page
+from cuspid.reporting.pages.scan import ReportOptions, scan_page
+from cuspid.reporting.pages.shape import shape_page
+from cuspid.reporting.pages.study import study_page
+from cuspid.storage import PanoramaResult, Result, ScanResult, ScoreResult, ShapeResult, StudyResult
+
+
+def report_page(result: Result, options: ReportOptions = ReportOptions()) -> str:
+    """The HTML of a result, one file with everything in it. Raises InputError where there is nothing to show."""
+    match result:
+        case ScanResult():
+            return scan_page(result, options)
+        case ShapeResult():
+            return shape_page(result)
+        case StudyResult():
+            return study_page(result)
+        case PanoramaResult():
+            return panorama_page(result)
+        case ScoreResult():
+            return score_page(result)
+        case _:
+            assert_never(result)

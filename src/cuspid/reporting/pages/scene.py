@@ -1,0 +1,168 @@
+"""What the viewer of a page draws: layers, colours, standard views and places, as plain values for JSON.
+
+The frame is the occlusal one (mm); a view names where the eye is and what is up, as directions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib.colors import Colormap
+
+from cuspid.geometry import Rigid3
+from cuspid.jaw import Arch
+from cuspid.mesh import Mesh
+from cuspid.reconstruction import Reconstruction
+from cuspid.reporting.figures.drawing import FigureOptions, deviation_map
+from cuspid.reporting.pages.page import packed
+from cuspid.reporting.pages.shown_mesh import pack_deviation, pack_mesh
+from cuspid.rig import Rig
+from cuspid.storage import ScanResult
+
+PLASTER_COLOR = (222, 214, 200)
+"""sRGB of a surface without deviations."""
+REFERENCE_COLOR = (196, 205, 214)
+"""sRGB of the reference."""
+_FRUSTUM_MM = 1.2
+_COLORS = 257
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """Where the view can go."""
+
+    name: str
+    """For people."""
+    position_mm: tuple[float, float, float]
+    """The middle of it."""
+    radius_mm: float
+    """How much of its surroundings is to be seen."""
+    towards: tuple[float, float, float] | None = None
+    """From where it is best seen, a direction; None to keep the present one."""
+
+
+def shown_frame(result: ScanResult) -> Rigid3:
+    """``shown_from_scan``: the frame of the reference; without one the cameras look down on average."""
+    if result.reference_from_scan is not None:
+        return result.reference_from_scan
+    if result.reconstruction is None:
+        return Rigid3.identity()
+    axes = [
+        pose.inverse().rotate(mounted.axis_in_rig)
+        for pose in result.reconstruction.rig_from_world.values()
+        for mounted in result.reconstruction.rig.cameras.values()
+    ]
+    up = -np.mean(axes, axis=0)
+    up /= np.linalg.norm(up)
+    turn = np.cross(up, [0.0, 0.0, 1.0])
+    sine = float(np.linalg.norm(turn))
+    if sine < 1e-9:
+        return Rigid3(np.diag([1.0, np.sign(up[2]), np.sign(up[2])]), np.zeros(3))
+    return Rigid3.from_rotation_vector(turn / sine * np.arctan2(sine, up[2]), np.zeros(3))
+
+
+def poses_from(reconstruction: Reconstruction, shown_from_scan: Rigid3) -> dict[str, Rigid3]:
+    """``rig_from_shown`` of each frame."""
+    scan_from_shown = shown_from_scan.inverse()
+    return {name: pose @ scan_from_shown for name, pose in reconstruction.rig_from_world.items()}
+
+
+def standard_views(arch: Arch | None) -> list[dict[str, Any]]:
+    """Occlusal, front, the patient's right and left (+X and -X where the arch is not known), and from behind."""
+    names = {"lower": ("Right", "Left"), "upper": ("Left", "Right"), None: ("+X", "−X")}[arch]
+    up = (0.0, 0.0, 1.0)
+    views = {
+        "Occlusal": ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
+        "Front": ((0.0, 1.0, 0.25), up),
+        names[0]: ((1.0, 0.0, 0.25), up),
+        names[1]: ((-1.0, 0.0, 0.25), up),
+        "Behind": ((0.0, -1.0, 0.6), up),
+    }
+    return [{"name": name, "eye": eye, "up": above} for name, (eye, above) in views.items()]
+
+
+def mesh_layer(
+    name: str,
+    label: str,
+    mesh: Mesh,
+    *,
+    visible: bool = True,
+    deviation_um: Float[np.ndarray, "v"] | None = None,
+    color: Sequence[int] = PLASTER_COLOR,
+    behind: bool = False,
+) -> dict[str, Any]:
+    """A surface. ``behind``: where it coincides with another one, the other is seen."""
+    values = None if deviation_um is None else pack_deviation(deviation_um)
+    look = {"visible": visible, "color": list(color), "behind": behind, "values": values}
+    return {"kind": "mesh", "name": name, "label": label, **pack_mesh(mesh), **look}
+
+
+def camera_layer(rig: Rig, rig_from_shown: Mapping[str, Rigid3]) -> dict[str, Any]:
+    """Every camera at every frame as a small pyramid of lines."""
+    points = camera_lines(rig, rig_from_shown)
+    return {
+        "kind": "segments",
+        "name": "cameras",
+        "label": "Cameras",
+        "visible": False,
+        "points": packed(points.astype(np.float32)),
+        "frames": list(rig_from_shown),
+        "points_per_frame": len(points) // max(1, len(rig_from_shown)),
+    }
+
+
+def camera_lines(rig: Rig, rig_from_shown: Mapping[str, Rigid3]) -> Float[np.ndarray, "n 3"]:
+    """Ends of lines, two by two, frame by frame: what each camera sees, as a pyramid of eight edges."""
+    in_rig = np.concatenate([_frustum(rig, name) for name in rig.names])
+    points = [pose.inverse().apply(in_rig) for pose in rig_from_shown.values()]
+    return np.concatenate(points) if points else np.empty((0, 3))
+
+
+def _frustum(rig: Rig, name: str) -> Float[np.ndarray, "16 3"]:
+    """The eight edges of the pyramid that a camera sees, as pairs of points in the rig frame."""
+    mounted = rig[name]
+    size = np.array([mounted.camera.width, mounted.camera.height], dtype=np.float64)
+    corners = mounted.camera.rays(np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size)
+    ends = _FRUSTUM_MM * corners / corners[:, 2:]
+    apex = np.zeros((4, 3))
+    edges = np.concatenate([np.stack([apex, ends], axis=1), np.stack([ends, np.roll(ends, -1, axis=0)], axis=1)])
+    return np.asarray(mounted.cam_from_rig.inverse().apply(edges.reshape(-1, 3)))
+
+
+def path_layer(rig: Rig, rig_from_shown: Mapping[str, Rigid3]) -> dict[str, Any]:
+    """The way of the middle of the cameras."""
+    points = camera_path(rig, rig_from_shown)
+    return {
+        "kind": "line",
+        "name": "path",
+        "label": "Path",
+        "visible": False,
+        "points": packed(points.astype(np.float32)),
+    }
+
+
+def camera_path(rig: Rig, rig_from_shown: Mapping[str, Rigid3]) -> Float[np.ndarray, "n 3"]:
+    """Where the middle of the cameras was at each frame."""
+    middle = np.mean([mounted.centre_in_rig for mounted in rig.cameras.values()], axis=0)
+    return np.array([pose.inverse().apply(middle) for pose in rig_from_shown.values()]).reshape(-1, 3)
+
+
+def color_table(colors: Colormap | None = None) -> dict[str, str]:
+    """The colour bar from one end to the other (default: of deviations, green within a quarter of the range), sRGB."""
+    table = (colors or deviation_map(FigureOptions()))(np.linspace(0, 1, _COLORS), bytes=True)[:, :3]
+    return packed(np.asarray(table, dtype=np.uint8))
+
+
+def css_color(rgb: UInt8[np.ndarray, "3"]) -> str:
+    """An sRGB colour as CSS knows it."""
+    return f"#{bytes(rgb).hex()}"
+
+
+def css_gradient(colors: Colormap | None = None) -> str:
+    """The same as a CSS gradient from left to right."""
+    table = (colors or deviation_map(FigureOptions()))(np.linspace(0, 1, 65), bytes=True)[:, :3]
+    return f"linear-gradient(to right, {', '.join(map(css_color, table))})"
