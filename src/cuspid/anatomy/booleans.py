@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
+from cuspid.mesh import Mesh, edges_of
 
 CAVITY = 1
 """Mark of the faces of a tool that leave prepared tooth."""
@@ -112,7 +112,7 @@ def run_lengths(mesh: manifold3d.Mesh64) -> Int[np.ndarray, "r"]:
 
 def describe_edges(faces: Int[np.ndarray, "f 3"]) -> str:
     """How many edges are open, shared by more than two faces, or run twice in one direction."""
-    directed = _edges(faces)
+    directed = edges_of(faces)
     _, counts = np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)
     _, twice = np.unique(directed, axis=0, return_counts=True)
     return (
@@ -121,14 +121,10 @@ def describe_edges(faces: Int[np.ndarray, "f 3"]) -> str:
     )
 
 
-def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
-    return np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
-
-
 def open_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
     """Directed edges without their opposite."""
-    directed = _edges(faces)
-    size = int(faces.max()) + 1
+    directed = edges_of(faces)
+    size = int(faces.max(initial=-1)) + 1
     keys, opposite = directed[:, 0] * size + directed[:, 1], directed[:, 1] * size + directed[:, 0]
     return directed[~np.isin(keys, opposite)]
 
@@ -184,10 +180,7 @@ def loops_of(edges: Int[np.ndarray, "e 2"]) -> list[Int[np.ndarray, "_"]]:
 
 def rim_of(cut: Cut, inside: Bool[np.ndarray, "f"]) -> Float[np.ndarray, "n 3"]:
     """The longest closed line between the faces inside and all others; its last point is its first."""
-    edges = _edges(cut.mesh.faces[inside])
-    size = len(cut.mesh.vertices)
-    keys, opposite = edges[:, 0] * size + edges[:, 1], edges[:, 1] * size + edges[:, 0]
-    loops = loops_of(edges[~np.isin(keys, opposite)])
+    loops = loops_of(open_edges(cut.mesh.faces[inside]))
     if not loops:
         return np.empty((0, 3))
     lines = [cut.mesh.vertices[np.append(loop, loop[0])] for loop in loops]

@@ -22,6 +22,7 @@ from cuspid.anatomy.booleans import CAVITY, OUTSIDE, ROOT, TROUGH, Tool
 from cuspid.anatomy.crowns import smooth_max, smooth_min, smooth_step
 from cuspid.anatomy.tooth_site import TURNS, Heights, ToothSite, round_means
 from cuspid.errors import InputError
+from cuspid.geometry import lengths_along
 from cuspid.mesh import Mesh
 
 EMERGENCE = 0.09
@@ -193,7 +194,7 @@ def _profile(
 
 def _rounded(shape: CrownShape, corners: Float[np.ndarray, "c 2"]) -> Float[np.ndarray, "rows 2"]:
     """A profile resampled evenly, the inner corner rounded by the chamfer, the outer one by the edge radius."""
-    run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    run = lengths_along(corners)
     even = np.linspace(0.0, run[-1], _ROWS)
     points = np.column_stack([np.interp(even, run, corners[:, k]) for k in range(2)])
     step = even[1]

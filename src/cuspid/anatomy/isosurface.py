@@ -8,11 +8,11 @@ from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
 from cuspid.anatomy.crowns import Points, Values
+from cuspid.graph import graph_of, parts_of
+from cuspid.mesh import edges_of
 
 Field = Callable[[Points], Values]
 """Signed distance in mm, shape (n,), of points (n, 3); negative inside."""
@@ -73,15 +73,10 @@ def _largest_part(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
     """The connected part with the most vertices: the outer surface, without enclosed voids."""
-    _, part = connected_components(graph_of(edges_of(faces), len(vertices)), directed=False)
+    part = parts_of(edges_of(faces), len(vertices))
     keep = part == np.bincount(part).argmax()
     renumbered = np.cumsum(keep) - 1
     return vertices[keep], renumbered[faces[keep[faces[:, 0]]]]
-
-
-def edges_of(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
-    """Edges (e, 2) of the faces; each edge of a closed mesh appears once in either direction."""
-    return np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
 
 
 def _relax(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v 3"]:
@@ -136,8 +131,3 @@ def neighbours_of(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "p 2"]:
     order = np.lexsort((edges[:, 1], edges[:, 0]))
     pairs = (order // 3).reshape(-1, 2)
     return np.concatenate([pairs, pairs[:, ::-1]])
-
-
-def graph_of(pairs: Int[np.ndarray, "p 2"], count: int) -> coo_array:
-    """Adjacency matrix (count, count) of the given pairs."""
-    return coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))

@@ -6,16 +6,13 @@ they stand in; the `solid` is their union. Frames: see `arrangement`.
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from cuspid.anatomy.arrangement import PhantomOptions, PlacedTooth, place_teeth, vary_teeth
 from cuspid.anatomy.crowns import Points
 from cuspid.anatomy.gum import Gum
 from cuspid.anatomy.isosurface import (
-    edges_of,
     evaluate,
-    graph_of,
     mesh_of,
     neighbours_of,
     newton_step,
@@ -25,8 +22,9 @@ from cuspid.anatomy.isosurface import (
 )
 from cuspid.anatomy.solid import Solid
 from cuspid.anatomy.surface_points import landmarks_of, papilla
+from cuspid.graph import parts_of
 from cuspid.jaw import Jaw, Landmark
-from cuspid.mesh import Mesh
+from cuspid.mesh import Mesh, edges_of
 
 __all__ = ["PhantomOptions", "PlacedTooth", "build_phantom", "phantom_landmarks", "phantom_teeth"]
 
@@ -117,7 +115,7 @@ def _one_patch_each(faces: Int[np.ndarray, "f 3"], labels: Int[np.ndarray, "f"])
     pairs = neighbours_of(faces)
     for _ in range(3):
         same = pairs[labels[pairs[:, 0]] == labels[pairs[:, 1]]]
-        _, patch = connected_components(graph_of(same, len(faces)), directed=False)
+        patch = parts_of(same, len(faces))
         size = np.bincount(patch)
         largest = np.zeros(labels.max() + 1, dtype=np.int64)
         np.maximum.at(largest, labels, size[patch])

@@ -7,15 +7,13 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numba import njit
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+
+from cuspid.graph import parts_of
 
 
 def join(matches: Int[np.ndarray, "m 2"], image_of: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
     """Track of each of n keypoints; -1 for one that is unmatched or whose track has two keypoints in one image."""
-    count = len(image_of)
-    graph = coo_array((np.ones(len(matches), bool), (matches[:, 0], matches[:, 1])), shape=(count, count))
-    label = connected_components(graph, directed=False)[1].astype(np.int64)
+    label = parts_of(matches, len(image_of))
     sizes = np.bincount(label, minlength=1)
     images = image_of.max(initial=0) + 1
     distinct = np.unique(label * images + image_of) // images
