@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from builders import mottled
 from cuspid.camera import Camera
 from cuspid.capture import Capture, Frame
 from cuspid.errors import ReconstructionError
@@ -270,8 +271,7 @@ def photograph(camera: Camera, cam_from_world: Rigid3, texture: np.ndarray, px_p
 def make_capture(folder: Path, rig: Rig, path: dict[str, Rigid3]) -> Capture:
     """Images of a speckled plane on disk."""
     rng = np.random.default_rng(0)
-    layers = [cv2.GaussianBlur(rng.normal(size=(1600, 1600)), (0, 0), s) * s for s in (2.0, 5.0, 12.0)]
-    texture = cv2.normalize(sum(layers), None, 30, 225, cv2.NORM_MINMAX).astype(np.float32)
+    texture = mottled(rng, 1600)
     capture = Capture(folder=folder, handpiece=Handpiece(rig=rig), frames=tuple(Frame(name=name) for name in path))
     for frame, pose in path.items():
         for name, mounted in rig.cameras.items():
