@@ -8,9 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
 from cuspid import pipeline, storage
 from cuspid.camera import Camera
@@ -21,7 +18,6 @@ from cuspid.geometry import Rigid3, best_similarity
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
 from cuspid.image_sequence import ImageSequence
 from cuspid.jaw import GUM, Jaw
-from cuspid.motion.guided import join_in_order
 from cuspid.motion.single import SingleOptions, locate_single, mouth_share, normalise_contrast
 from cuspid.panorama import Panorama
 from cuspid.pipeline import RenderOptions, StitchOptions, take_images
@@ -233,21 +229,6 @@ def test_two_films_are_stitched_as_two_parts(sequence: ImageSequence, tmp_path: 
 
 
 # --- parts -------------------------------------------------------------------------------------------------------
-
-
-@given(arrays(np.int64, (12, 2), elements=st.integers(0, 8)))
-def test_tracks_never_hold_two_keypoints_of_an_image(matches: np.ndarray) -> None:
-    image_of = np.repeat(np.arange(3), 3)
-    track = join_in_order(matches, image_of)
-    for number in range(track.max() + 1):
-        members = image_of[track == number]
-        assert len(members) >= 2
-        assert len(set(members.tolist())) == len(members)
-
-
-def test_a_clash_keeps_the_earlier_matches() -> None:
-    track = join_in_order(np.array([[0, 2], [1, 2], [2, 4]]), np.array([0, 0, 1, 1, 2, 2]))
-    assert track.tolist() == [0, -1, 0, -1, 0, -1]
 
 
 def test_contrast_is_evened_but_neither_noise_in_the_dark_nor_a_highlight_is_raised() -> None:
