@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from cuspid import storage
 from cuspid.camera import Camera
@@ -21,6 +24,48 @@ CAMERA = Camera.from_field_of_view(16, 12, 62.0)
 def box_mesh() -> Mesh:
     box = trimesh.creation.box((60, 40, 10))
     return Mesh(np.asarray(box.vertices), np.asarray(box.faces))
+
+
+def sphere(radius_mm: float, subdivisions: int = 4) -> Mesh:
+    ball = trimesh.creation.icosphere(subdivisions, radius_mm)
+    return Mesh(np.asarray(ball.vertices), np.asarray(ball.faces))
+
+
+def plate(z_mm: float, half_width_mm: float, cells: int = 20) -> Mesh:
+    """A square plate of small triangles that faces -Z, towards a camera at the origin."""
+    ticks = np.linspace(-half_width_mm, half_width_mm, cells + 1)
+    x, y = np.meshgrid(ticks, ticks)
+    index = np.arange((cells + 1) ** 2).reshape(cells + 1, -1)
+    a, b, c, d = index[:-1, :-1].ravel(), index[:-1, 1:].ravel(), index[1:, 1:].ravel(), index[1:, :-1].ravel()
+    vertices = np.stack([x.ravel(), y.ravel(), np.full(x.size, z_mm)], axis=1)
+    return Mesh(vertices, np.concatenate([np.stack([a, c, b], 1), np.stack([a, d, c], 1)]))
+
+
+def moved(mesh: Mesh, shift_mm: tuple[float, float, float]) -> Mesh:
+    return replace(mesh, vertices=mesh.vertices + shift_mm)
+
+
+def joined(*meshes: Mesh) -> Mesh:
+    """As one mesh, with colours where all have them."""
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    colors = [mesh.colors for mesh in meshes if mesh.colors is not None]
+    return Mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]),
+        np.concatenate(colors) if len(colors) == len(meshes) else None,
+    )
+
+
+def any_pose(seed: int, reach_mm: float) -> Rigid3:
+    rng = np.random.default_rng(seed)
+    return Rigid3(Rotation.random(rng=rng).as_matrix(), reach_mm * rng.normal(size=3))
+
+
+def mottled(rng: np.random.Generator, size_px: int, scales_px: tuple[float, ...] = (2.0, 5.0, 12.0)) -> np.ndarray:
+    """A square picture of speckle of several sizes, grey levels 30 to 225."""
+    noise = (rng.normal(size=(size_px, size_px)) for _ in scales_px)
+    layers = [cv2.GaussianBlur(each, (0, 0), scale) * scale for each, scale in zip(noise, scales_px, strict=True)]
+    return cv2.normalize(sum(layers), None, 30, 225, cv2.NORM_MINMAX).astype(np.float32)
 
 
 def handpiece(*names: str) -> Handpiece:
@@ -43,6 +88,12 @@ def image_path(capture: Capture, frame: str, camera: str) -> Path:
     """Where an image of such a capture lies."""
     assert isinstance(capture.source, ImageFolder)
     return capture.source.path(frame, camera)
+
+
+def write_frames(folder: Path, frames: Iterable[np.ndarray]) -> Path:
+    for number, frame in enumerate(frames):
+        storage.write_image(folder / f"{number:03d}.png", np.ascontiguousarray(frame))
+    return folder
 
 
 def make_capture(

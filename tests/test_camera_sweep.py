@@ -23,6 +23,7 @@ from cuspid.studies.camera_sweep import (
     values_of,
 )
 from cuspid.studies.grid import Case, Outcome
+from verbs import refused
 
 SMALL = SweepOptions(
     baseline_mm=(1.0, 2.0), angle_deg=(0.0,), image_px=160, path_mm=1.2, frames=2, repeats=0, contenders=1
@@ -257,24 +258,17 @@ def jaw_file(tmp_path, coarse_phantom):
     return tmp_path / "jaw.ply"
 
 
-def refused(capsys, *arguments):
-    with pytest.raises(SystemExit) as caught:
-        cli.main(["sweep", *map(str, arguments)])
-    assert caught.value.code == 1
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("cuspid: ")]
-    assert len(lines) == 1, lines
-    return lines[0]
-
-
 def test_bad_input_is_one_line_and_leaves_nothing(jaw_file, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
-    assert "no incisal surface" in refused(capsys, jaw_file, "--surface", "incisal", "--tooth", 47, "--out", out)
-    close = refused(capsys, jaw_file, "--distance-mm", 0.6, "--depth-of-field-mm", 1, "--out", out)
+    absent = refused(capsys, "sweep", jaw_file, "--surface", "incisal", "--tooth", 47, "--out", out)
+    assert "no incisal surface" in absent
+    close = refused(capsys, "sweep", jaw_file, "--distance-mm", 0.6, "--depth-of-field-mm", 1, "--out", out)
     assert "larger working distance" in close
-    assert "--workers is 0" in refused(capsys, jaw_file, "--workers", 0, "--out", out)
+    assert "--workers is 0" in refused(capsys, "sweep", jaw_file, "--workers", 0, "--out", out)
     pytest.importorskip("distributed")
     monkeypatch.setattr("cuspid.studies.grid.CLUSTER_TIMEOUT_S", 1)
-    assert "no Dask scheduler answers" in refused(capsys, jaw_file, "--cluster", "tcp://127.0.0.1:9", "--out", out)
+    alone = refused(capsys, "sweep", jaw_file, "--cluster", "tcp://127.0.0.1:9", "--out", out)
+    assert "no Dask scheduler answers" in alone
     assert not out.exists()
 
 
@@ -303,5 +297,5 @@ def test_the_verb_writes_its_results_and_does_not_mix_them(jaw_file, tmp_path, c
     assert summary["best"]["complete_50_um_pct"]["setting"] == [1.0, 0.0]
     assert summary["failures"] == {outcomes[1].case.name: "no surface: dark"}
     assert (out / "sweep.png").stat().st_size > 10_000
-    other = refused(capsys, *arguments[:-2], "--angle-deg", 0, 3, "--out", out)
+    other = refused(capsys, "sweep", *arguments[:-2], "--angle-deg", 0, 3, "--out", out)
     assert "holds another run of 'sweep' (settings.options.angle_deg differs)" in other

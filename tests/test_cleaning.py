@@ -6,28 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from builders import joined, moved, sphere
 from cuspid.mesh import Mesh
 from cuspid.surface.cleaning import CleaningOptions, boundaries, clean, face_pieces, non_manifold_faces
 from synthetic_scene import height_field
 
 SHEET = height_field(lambda x, y: 5 + 0.2 * np.sin(x), half_width_mm=2.0, count=41)
-
-
-def joined(*meshes: Mesh) -> Mesh:
-    offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
-    return Mesh(
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]),
-    )
-
-
-def shifted(mesh: Mesh, shift: tuple[float, float, float]) -> Mesh:
-    return Mesh(mesh.vertices + shift, mesh.faces)
-
-
-def sphere(radius: float) -> Mesh:
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)
-    return Mesh(np.asarray(ball.vertices), np.asarray(ball.faces))
 
 
 def test_a_good_surface_is_left_alone() -> None:
@@ -41,7 +25,7 @@ def test_a_good_surface_is_left_alone() -> None:
 
 
 def test_floating_pieces_go() -> None:
-    crumb = shifted(sphere(0.2), (0, 0, -3))
+    crumb = moved(sphere(0.2, 3), (0, 0, -3))
     cleaned, report = clean(joined(SHEET, crumb))
     assert report.removed_pieces == 1
     assert report.removed_piece_faces == len(crumb.faces)
@@ -50,7 +34,7 @@ def test_floating_pieces_go() -> None:
 
 def test_a_wall_behind_the_surface_goes() -> None:
     # The outside looks at -Z: what lies at a larger z is below the surface.
-    ghost = shifted(SHEET, (0, 0, 0.2))
+    ghost = moved(SHEET, (0, 0, 0.2))
     cleaned, report = clean(joined(SHEET, ghost))
     assert report.removed_ghost_faces > 0.9 * len(ghost.faces)
     assert len(SHEET.faces) <= len(cleaned.faces) < 1.02 * len(SHEET.faces)
@@ -70,7 +54,7 @@ def test_holes_are_measured() -> None:
 
 
 def test_a_closed_surface_has_no_boundary() -> None:
-    assert boundaries(sphere(2.0)) == (0.0, ())
+    assert boundaries(sphere(2.0, 3)) == (0.0, ())
 
 
 def test_fins_are_cut_off() -> None:
@@ -84,7 +68,7 @@ def test_fins_are_cut_off() -> None:
 
 
 def test_surfaces_that_touch_in_a_point_are_parted() -> None:
-    other = shifted(SHEET, (4.0, 4.0, 5.0))
+    other = moved(SHEET, (4.0, 4.0, 5.0))
     touching = joined(SHEET, other)
     last, first = len(SHEET.vertices) - 1, len(SHEET.vertices)
     faces = np.where(touching.faces == first, last, touching.faces)
@@ -95,12 +79,12 @@ def test_surfaces_that_touch_in_a_point_are_parted() -> None:
 
 
 def test_pieces_are_counted_by_shared_edges() -> None:
-    assert face_pieces(joined(SHEET, shifted(SHEET, (0, 0, 2)), sphere(1.0))).max() == 2
+    assert face_pieces(joined(SHEET, moved(SHEET, (0, 0, 2)), sphere(1.0, 3))).max() == 2
 
 
 def test_colours_stay_with_their_vertices() -> None:
     colors = np.tile((SHEET.vertices[:, :1] * 50 + 120).astype(np.uint8), 3)
-    half = joined(shifted(sphere(0.1), (0, 0, -3)), SHEET)
+    half = joined(moved(sphere(0.1, 3), (0, 0, -3)), SHEET)
     black = np.zeros((len(half.vertices) - len(colors), 3), dtype=np.uint8)
     painted = Mesh(half.vertices, half.faces, np.vstack([black, colors]))
     cleaned, _ = clean(painted)
@@ -113,4 +97,4 @@ def test_nothing_stays_nothing() -> None:
     cleaned, report = clean(empty)
     assert len(cleaned.faces) == 0
     assert report.holes == ()
-    assert len(clean(sphere(0.1), CleaningOptions())[0].faces) == 0
+    assert len(clean(sphere(0.1, 3), CleaningOptions())[0].faces) == 0

@@ -11,16 +11,7 @@ from builders import box_mesh, handpiece, image_path, make_capture
 from cuspid import cli, storage
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
-
-
-def refused(capsys, *arguments: object) -> str:
-    """The one line that a refused command prints; its exit status must be 1."""
-    with pytest.raises(SystemExit) as caught:
-        cli.main([str(argument) for argument in arguments])
-    assert caught.value.code == 1
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("cuspid: ")]
-    assert len(lines) == 1, lines
-    return lines[0]
+from verbs import refused
 
 
 @pytest.mark.parametrize("verb", sorted(cli.COMMANDS))

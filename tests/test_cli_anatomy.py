@@ -6,14 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cuspid import cli, storage
+from cuspid import storage
 from cuspid.jaw import Jaw, Landmark
 from cuspid.mesh import Mesh
-from test_cli import refused
-
-
-def run(*arguments: object) -> None:
-    cli.main([str(argument) for argument in arguments])
+from verbs import refused, run
 
 
 def test_a_jaw_and_a_broken_one_are_measured(tmp_path, capsys, phantom_file, coarse_phantom):

@@ -4,9 +4,9 @@ import csv
 
 import pytest
 
-from cuspid import cli, storage
+from cuspid import storage
 from cuspid.handpiece.presets import PRESETS
-from test_cli import refused
+from verbs import refused, run
 
 BRIEF = """
 name = "probe"
@@ -18,10 +18,6 @@ occlusal = 0.9
 [cameras]
 most = 4
 """
-
-
-def run(*arguments: object) -> None:
-    cli.main([str(argument) for argument in arguments])
 
 
 def rows_of(path) -> dict[str, dict[str, str]]:

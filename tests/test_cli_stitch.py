@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
+from builders import write_frames
 from cuspid import storage
 from cuspid.camera import Camera
-from cuspid.cli import main
 from cuspid.storage.handpieces import camera_to_json
+from verbs import refused
 
 
 def picture(seed: int, size: tuple[int, int] = (160, 120)) -> np.ndarray:
@@ -20,56 +21,40 @@ def picture(seed: int, size: tuple[int, int] = (160, 120)) -> np.ndarray:
     return np.asarray(cv2.resize(small, size, interpolation=cv2.INTER_CUBIC))
 
 
-def write_frames(folder: Path, count: int) -> Path:
-    for index in range(count):
-        storage.write_image(folder / f"{index:03d}.png", picture(index))
-    return folder
-
-
-def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line that a refused command prints."""
-    with pytest.raises(SystemExit) as stopped:
-        main(arguments)
-    assert stopped.value.code == 1
-    printed = capsys.readouterr().err
-    assert "Traceback" not in printed
-    return next(line for line in printed.splitlines() if line.startswith("cuspid:"))
-
-
 def test_no_such_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    line = refused(["stitch", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out")], capsys)
+    line = refused(capsys, "stitch", tmp_path / "nowhere", "--out", tmp_path / "out")
     assert "no such folder or video" in line
     assert not (tmp_path / "out").exists()
 
 
 def test_one_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = write_frames(tmp_path / "frames", 1)
-    assert "1 image(s)" in refused(["stitch", str(folder), "--out", str(tmp_path / "out")], capsys)
+    folder = write_frames(tmp_path / "frames", map(picture, range(1)))
+    assert "1 image(s)" in refused(capsys, "stitch", folder, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_two_sizes_name_the_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = write_frames(tmp_path / "frames", 3)
+    folder = write_frames(tmp_path / "frames", map(picture, range(3)))
     storage.write_image(folder / "001.png", picture(1, (80, 120)))
-    line = refused(["stitch", str(folder), "--out", str(tmp_path / "out")], capsys)
+    line = refused(capsys, "stitch", folder, "--out", tmp_path / "out")
     assert "001.png: 80 x 120 px, but most frames have 160 x 120 px" in line
 
 
 def test_a_truncated_frame_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = write_frames(tmp_path / "frames", 3)
+    folder = write_frames(tmp_path / "frames", map(picture, range(3)))
     (folder / "002.png").write_bytes((folder / "002.png").read_bytes()[:-40])
-    assert "002.png: truncated" in refused(["stitch", str(folder), "--out", str(tmp_path / "out")], capsys)
+    assert "002.png: truncated" in refused(capsys, "stitch", folder, "--out", tmp_path / "out")
 
 
 def test_something_that_is_no_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "film.mp4").write_bytes(b"not a film")
-    line = refused(["stitch", str(tmp_path / "film.mp4"), "--out", str(tmp_path / "out")], capsys)
+    line = refused(capsys, "stitch", tmp_path / "film.mp4", "--out", tmp_path / "out")
     assert "0 frame(s) could be decoded" in line
 
 
 def test_frames_without_overlap_leave_nothing_half_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = write_frames(tmp_path / "frames", 4)
-    line = refused(["stitch", str(folder), "--out", str(tmp_path / "out")], capsys)
+    folder = write_frames(tmp_path / "frames", map(picture, range(4)))
+    line = refused(capsys, "stitch", folder, "--out", tmp_path / "out")
     assert "000 to 003" in line
     assert not (tmp_path / "out").exists()
 
@@ -126,7 +111,7 @@ def write_calibration(folder: Path, kind: str) -> Path:
 
 @pytest.mark.parametrize("kind", ["json", "colmap", "opencv"])
 def test_calibrations_are_read_alike(tmp_path: Path, kind: str) -> None:
-    folder = write_frames(tmp_path / "frames", 2)
+    folder = write_frames(tmp_path / "frames", map(picture, range(2)))
     sequence = storage.read_sequence(folder, tmp_path / "d", calibration=write_calibration(tmp_path, kind))
     assert sequence.camera is not None
     np.testing.assert_allclose(sequence.camera.parameters, CAMERA.parameters, atol=1e-9)
@@ -137,4 +122,4 @@ def test_a_calibration_of_another_size_is_refused(tmp_path: Path, capsys: pytest
         storage.write_image(tmp_path / "frames" / f"{index}.png", picture(index, (320, 240)))
     calibration = write_calibration(tmp_path, "json")
     arguments = ["stitch", str(tmp_path / "frames"), "--out", str(tmp_path / "out"), "--calibration", str(calibration)]
-    assert "calibration of 160 x 120 px, but the frames have 320 x 240 px" in refused(arguments, capsys)
+    assert "calibration of 160 x 120 px, but the frames have 320 x 240 px" in refused(capsys, *arguments)

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from builders import folder_capture, image_path
+from builders import folder_capture, image_path, mottled
 from cuspid.camera import Camera
 from cuspid.capture import Capture
 from cuspid.errors import InputError, ReconstructionError
@@ -263,10 +263,8 @@ def take_images(folder: Path, found: Reconstruction, texture: np.ndarray) -> Cap
 
 def test_colmap_maps_with_the_rig(tmp_path: Path) -> None:
     """One metric model, poses to some micrometres, and the seconds that it took."""
-    found, rng = make_found(frames=3), np.random.default_rng(0)
-    layers = [cv2.GaussianBlur(rng.normal(size=(1600, 1600)), (0, 0), s) * s for s in (3.0, 6.0, 12.0)]
-    texture = cv2.normalize(sum(layers), None, 30, 225, cv2.NORM_MINMAX).astype(np.float32)
-    capture = take_images(tmp_path, found, texture)
+    found = make_found(frames=3)
+    capture = take_images(tmp_path, found, mottled(np.random.default_rng(0), 1600, (3.0, 6.0, 12.0)))
     mapped = locate_with_colmap(capture, tmp_path / "colmap", with_rig=True)
     assert_same_poses(replace(found, tracks=None), mapped, atol=0.02)
     assert mapped.log["models"] == 1

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from builders import folder_capture, image_path
+from builders import folder_capture, image_path, mottled
 from cuspid.camera import Camera
 from cuspid.capture import Capture
 from cuspid.errors import InputError, OutputError
@@ -23,10 +23,8 @@ SIZE = 240
 
 
 def texture(seed: int = 0) -> np.ndarray:
-    """Speckle of several sizes, twice as large as an image."""
-    rng = np.random.default_rng(seed)
-    layers = [cv2.GaussianBlur(rng.normal(size=(900, 900)), (0, 0), s) * s for s in (2.0, 5.0, 12.0)]
-    return cv2.normalize(sum(layers), None, 30, 225, cv2.NORM_MINMAX).astype(np.float32)
+    """Much larger than an image."""
+    return mottled(np.random.default_rng(seed), 900)
 
 
 def photograph(texture_px_from_px: np.ndarray, seed: int = 0, noise: float = 1.5) -> np.ndarray:

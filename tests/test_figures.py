@@ -4,8 +4,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import trimesh
 
+from builders import joined, moved, sphere
 from cuspid.errors import InputError, OutputError
 from cuspid.evaluation.deviation import EvaluationOptions, evaluate
 from cuspid.evaluation.registration import RegistrationOptions
@@ -26,18 +26,8 @@ from horseshoe import horseshoe
 
 
 def ball(radius_mm: float, centre: tuple[float, float, float], color: tuple[int, int, int]) -> Mesh:
-    shape = trimesh.creation.icosphere(4, radius_mm)
-    colors = np.tile(np.array(color, dtype=np.uint8), (len(shape.vertices), 1))
-    return Mesh(np.asarray(shape.vertices) + centre, np.asarray(shape.faces), colors)
-
-
-def together(*meshes: Mesh) -> Mesh:
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    return Mesh(
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]),
-        np.concatenate([mesh.colors for mesh in meshes if mesh.colors is not None]),
-    )
+    mesh = moved(sphere(radius_mm), centre)
+    return replace(mesh, colors=np.tile(np.array(color, dtype=np.uint8), (len(mesh.vertices), 1)))
 
 
 def place_of(image: np.ndarray, channel: int) -> np.ndarray:
@@ -78,7 +68,7 @@ def test_views_are_rotations_and_look_where_they_say():
 
 def test_a_picture_is_to_scale_and_the_right_way_round():
     red, green = ball(3.0, (-10, 0, 0), (200, 30, 30)), ball(3.0, (0, 8, 0), (30, 200, 30))
-    view = render(together(red, green), width_px=300)
+    view = render(joined(red, green), width_px=300)
     covered = np.sum(view.image.min(axis=2) < 240) * view.mm_per_px**2
     assert covered == pytest.approx(2 * np.pi * 9, rel=0.02)
     apart = (place_of(view.image, 1) - place_of(view.image, 0)) * view.mm_per_px
@@ -86,7 +76,7 @@ def test_a_picture_is_to_scale_and_the_right_way_round():
 
 
 def test_what_is_nearer_hides_what_is_farther():
-    scene = together(ball(3.0, (0, 0, 0), (200, 30, 30)), ball(2.0, (0, 0, 10), (30, 200, 30)))
+    scene = joined(ball(3.0, (0, 0, 0), (200, 30, 30)), ball(2.0, (0, 0, 10), (30, 200, 30)))
     centre = np.array(render(scene, width_px=200).image.shape[:2]) // 2
     assert np.argmax(render(scene, width_px=200).image[tuple(centre)]) == 1
     assert np.argmax(render(scene, look(-90.0, -90.0), width_px=200).image[tuple(centre)]) == 0

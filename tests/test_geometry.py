@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid.geometry import Rigid3, best_similarity
-from strategies import points, rigid3s
+from cuspid.geometry import Rigid3, axes_about, best_similarity, lengths_along, unit
+from strategies import points, rigid3s, vectors
 
 
 @given(rigid3s(), rigid3s(), rigid3s(), points())
@@ -36,6 +36,29 @@ def test_known_rotation():
     quarter_turn = Rigid3.from_rotation_vector(np.array([0, 0, np.pi / 2]), np.array([1.0, 0, 0]))
     np.testing.assert_allclose(quarter_turn.apply(np.array([[1.0, 0, 0]])), [[1, 1, 0]], atol=1e-12)
     np.testing.assert_allclose(quarter_turn.rotate(np.array([1.0, 0, 0])), [0, 1, 0], atol=1e-12)
+
+
+@given(vectors(), vectors())
+def test_axes_about_directions_are_right_handed_frames(one, other):
+    directions = unit(np.stack([one + [20, 0, 0], other - [0, 0, 20]]))
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
+    for axes, direction in zip(axes_about(directions), directions, strict=True):
+        np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(axes) == pytest.approx(1)
+        np.testing.assert_array_equal(axes[2], direction)
+        np.testing.assert_array_equal(axes, axes_about(direction))
+
+
+def test_what_has_no_length_gets_none():
+    np.testing.assert_array_equal(unit(np.zeros((2, 3))), np.zeros((2, 3)))
+
+
+@given(rigid3s(), points())
+def test_the_length_of_a_line_adds_up_and_no_motion_changes_it(motion, line):
+    lengths = lengths_along(line)
+    assert lengths[0] == 0
+    np.testing.assert_allclose(np.diff(lengths), np.linalg.norm(line[1:] - line[:-1], axis=1), atol=1e-12)
+    np.testing.assert_allclose(lengths_along(motion.apply(line)), lengths, atol=1e-9)
 
 
 def rotated(rng: np.random.Generator, dimensions: int) -> np.ndarray:

@@ -1,29 +1,24 @@
 import numpy as np
 import pytest
-import trimesh
 from hypothesis import given
 
+from builders import sphere
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import FDI_FROM_UNIVERSAL, UNIVERSAL_FROM_FDI, Jaw
-from cuspid.mesh import Mesh
+from cuspid.mesh import Mesh, edges_of
 from strategies import rigid3s
 
 
-def sphere(radius: float = 10.0, subdivisions: int = 4) -> Mesh:
-    shape = trimesh.creation.icosphere(subdivisions, radius)
-    return Mesh(np.asarray(shape.vertices), np.asarray(shape.faces))
-
-
 def test_areas_and_normals_of_a_sphere():
-    mesh = sphere()
+    mesh = sphere(10.0)
     assert 0.995 < mesh.face_areas.sum() / (4 * np.pi * 100) < 1
     np.testing.assert_allclose(mesh.vertex_normals, mesh.vertices / 10, atol=1e-2)
     assert np.all(np.sum(mesh.face_normals * mesh.face_centres, axis=1) > 9.9)
 
 
 def test_rays_hit_where_they_should():
-    mesh = sphere()
+    mesh = sphere(10.0)
     rng = np.random.default_rng(0)
     origins, directions = rng.normal(size=(500, 3)), rng.normal(size=(500, 3))
     hits = mesh.cast(origins, directions)
@@ -35,15 +30,27 @@ def test_rays_hit_where_they_should():
 
 
 def test_occlusion_is_of_the_open_segment():
-    mesh = sphere()
+    mesh = sphere(10.0)
     near, far = mesh.face_centres[:50], -mesh.face_centres[:50]
     eye = near * 2
     assert not mesh.occluded(near, eye).any()
     assert mesh.occluded(far, eye).all()
 
 
+def test_each_edge_of_a_closed_surface_is_there_once_in_either_direction():
+    edges = edges_of(sphere(10.0, 2).faces)
+    assert len(np.unique(edges, axis=0)) == len(edges)
+    assert set(map(tuple, edges.tolist())) == set(map(tuple, edges[:, ::-1].tolist()))
+
+
+def test_the_centroid_of_a_cap_lies_above_its_middle():
+    """Half-way between the rim and the top of a sphere (Archimedes)."""
+    mesh = sphere(10.0, 6)
+    np.testing.assert_allclose(mesh.centroid(mesh.face_centres[:, 2] > 6), [0, 0, 8], atol=0.05)
+
+
 def test_closest_points_on_a_sphere():
-    mesh = sphere(subdivisions=6)
+    mesh = sphere(10.0, subdivisions=6)
     points = np.random.default_rng(0).normal(size=(200, 3)) * 20
     distances, faces, positions = mesh.closest(points)
     np.testing.assert_allclose(distances, np.abs(np.linalg.norm(points, axis=1) - 10), atol=2e-3)
@@ -62,14 +69,14 @@ def test_samples_are_even_by_area():
 
 @given(rigid3s())
 def test_moving_a_mesh_moves_its_normals(target_from_source: Rigid3):
-    mesh = sphere(subdivisions=1)
+    mesh = sphere(10.0, subdivisions=1)
     moved = mesh.transformed(target_from_source)
     np.testing.assert_allclose(moved.face_normals, target_from_source.rotate(mesh.face_normals), atol=1e-9)
     np.testing.assert_allclose(moved.face_areas, mesh.face_areas, rtol=1e-9)
 
 
 def test_submesh_keeps_only_what_it_uses():
-    mesh = sphere(subdivisions=2)
+    mesh = sphere(10.0, subdivisions=2)
     upper = mesh.face_centres[:, 2] > 0
     part = mesh.submesh(upper)
     np.testing.assert_allclose(part.face_centres, mesh.face_centres[upper])
@@ -87,7 +94,7 @@ def test_tooth_numbers_of_the_thesis():
 
 
 def test_a_jaw_knows_its_teeth():
-    mesh = sphere(subdivisions=1)
+    mesh = sphere(10.0, subdivisions=1)
     labels = np.zeros(len(mesh.faces), dtype=int)
     labels[:5], labels[5:9] = 46, 45
     jaw = Jaw(mesh=mesh, face_labels=labels)

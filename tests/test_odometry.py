@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from builders import folder_capture, image_path
+from builders import folder_capture, image_path, mottled
 from cuspid.camera import Camera
 from cuspid.capture import Capture
 from cuspid.errors import ReconstructionError
@@ -288,8 +288,7 @@ def photograph(camera: Camera, cam_from_world: Rigid3, texture: np.ndarray, px_p
 def make_capture(folder: Path, rig: Rig, path: dict[str, Rigid3]) -> Capture:
     """Images of a speckled plane on disk."""
     rng = np.random.default_rng(0)
-    layers = [cv2.GaussianBlur(rng.normal(size=(1600, 1600)), (0, 0), s) * s for s in (2.0, 5.0, 12.0)]
-    texture = cv2.normalize(sum(layers), None, 30, 225, cv2.NORM_MINMAX).astype(np.float32)
+    texture = mottled(rng, 1600)
     capture = folder_capture(folder, Handpiece(rig=rig), path)
     for frame, pose in path.items():
         for name, mounted in rig.cameras.items():

@@ -2,12 +2,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-import trimesh
-from scipy.spatial.transform import Rotation
 
+from builders import any_pose, sphere
 from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, labels_from_colors
 from cuspid.errors import InputError
-from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
 from cuspid.storage import Unit
@@ -19,17 +17,12 @@ def jaw() -> Jaw:
     return horseshoe()
 
 
-def any_pose(seed: int) -> Rigid3:
-    rng = np.random.default_rng(seed)
-    return Rigid3(Rotation.random(rng=rng).as_matrix(), 300 * rng.normal(size=3))
-
-
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("closed", [True, False])
 def test_the_frame_is_found_from_any_orientation(seed: int, closed: bool):
     mesh = jaw().mesh if closed else without_base(jaw().mesh)
-    found = find_occlusal_frame(mesh.transformed(any_pose(seed)))
-    to_truth = found.occlusal_from_mesh @ any_pose(seed)
+    found = find_occlusal_frame(mesh.transformed(any_pose(seed, 300)))
+    to_truth = found.occlusal_from_mesh @ any_pose(seed, 300)
     assert to_truth.angle_deg < 6
     assert found.notes == ()
     crowns = to_truth.apply(jaw().mesh.vertices)
@@ -38,15 +31,14 @@ def test_the_frame_is_found_from_any_orientation(seed: int, closed: bool):
 
 
 def test_where_there_is_no_arch_the_frame_is_unsure():
-    ball = trimesh.creation.icosphere(4, 25.0)
-    notes = find_occlusal_frame(Mesh(np.asarray(ball.vertices), np.asarray(ball.faces))).notes
+    notes = find_occlusal_frame(sphere(25.0)).notes
     assert any("unsure" in note for note in notes)
     quadrant = jaw().mesh.submesh(jaw().mesh.face_centres[:, 0] > 8)
     assert any("anterior" in note for note in find_occlusal_frame(quadrant).notes)
 
 
 def in_unit(mm_per_unit_read: float) -> Mesh:
-    mesh = jaw().mesh.transformed(any_pose(0))
+    mesh = jaw().mesh.transformed(any_pose(0, 300))
     return Mesh(mesh.vertices * mm_per_unit_read, mesh.faces)
 
 

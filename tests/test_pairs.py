@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
@@ -113,12 +114,28 @@ def test_frame_pairs_are_lean() -> None:
     assert frame_pairs(1, 3) == ()
 
 
-def test_tracks_with_two_keypoints_in_an_image_are_dropped() -> None:
-    """0-3-5 is a track; 1-4-2 has two keypoints in image 0; 6 is alone."""
+def test_a_match_that_brings_two_keypoints_of_an_image_together_is_left_out() -> None:
+    """0-3-5 is a track; 1-4-2 would have two keypoints in image 0; 6 is alone."""
     image = np.array([0, 0, 0, 1, 1, 2, 2])
     track = join(np.array([[0, 3], [3, 5], [1, 4], [4, 2]]), image)
-    np.testing.assert_array_equal(track, [0, -1, -1, 0, -1, 0, -1])
+    np.testing.assert_array_equal(track, [0, 1, -1, 0, 1, 0, -1])
+    assert len(join(np.zeros((0, 2), np.int64), np.zeros(0, np.int64))) == 0
     np.testing.assert_array_equal(join(np.zeros((0, 2), np.int64), image), np.full(7, -1))
+
+
+@given(arrays(np.int64, (12, 2), elements=st.integers(0, 8)))
+def test_tracks_never_hold_two_keypoints_of_an_image(matches: np.ndarray) -> None:
+    image_of = np.repeat(np.arange(3), 3)
+    track = join(matches, image_of)
+    for number in range(track.max() + 1):
+        members = image_of[track == number]
+        assert len(members) >= 2
+        assert len(set(members.tolist())) == len(members)
+
+
+def test_a_clash_keeps_the_earlier_matches() -> None:
+    track = join(np.array([[0, 2], [1, 2], [2, 4]]), np.array([0, 0, 1, 1, 2, 2]))
+    assert track.tolist() == [0, -1, 0, -1, 0, -1]
 
 
 @given(seed=st.integers(0, 1000))

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from builders import plate
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
@@ -24,7 +25,6 @@ from cuspid.handpiece.precision import (
     triangulate,
 )
 from cuspid.handpiece.presets import PRESETS
-from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece, MountedCamera, Rig
 
 CAMERA = Camera.from_field_of_view(512, 512, 62.0)
@@ -180,19 +180,10 @@ def test_the_ellipsoid_of_a_pair_is_longest_in_depth():
     np.testing.assert_allclose(rebuilt, covariance[0], rtol=1e-9, atol=1e-15)
 
 
-def wall(z_mm: float) -> Mesh:
-    """A square of 4 mm across the axis that faces the cameras, in 200 faces."""
-    x, y = (each.ravel() for each in np.meshgrid(np.linspace(-2, 2, 11), np.linspace(-2, 2, 11)))
-    corners = np.arange(121).reshape(11, 11)
-    a, b, c, d = (each.ravel() for each in (corners[:-1, :-1], corners[:-1, 1:], corners[1:, 1:], corners[1:, :-1]))
-    faces = np.concatenate([np.stack([a, c, b], axis=1), np.stack([a, d, c], axis=1)])
-    return Mesh(np.stack([x, y, np.full(121, z_mm)], axis=1), faces)
-
-
 def test_the_map_of_a_wall_is_the_bound_of_its_points_in_the_world():
     """Whichever way the world is turned, and only where both cameras see it."""
     handpiece = Handpiece(rig=Rig(dict(zip("ab", pair(3.0), strict=True))))
-    flat = wall(3.5)
+    flat = plate(3.5, 2.0, 10)
     here = precision_map(flat, handpiece, Rigid3.identity())
     expected = bound_rms_um(fisher_information(pair(3.0), flat.face_centres))
     both = np.all([CAMERA.contains(CAMERA.project(m.cam_from_rig.apply(flat.face_centres))) for m in pair(3.0)], axis=0)

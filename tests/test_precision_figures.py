@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from builders import plate
 from cuspid.reporting.figures.precision import (
     Panel,
     save_best_picture,
@@ -12,7 +13,6 @@ from cuspid.reporting.figures.precision import (
     save_noise_picture,
     save_precision_picture,
 )
-from test_precision import wall
 
 RED = np.array([0xD1, 0x2A, 0x1E]) / 255
 
@@ -25,7 +25,7 @@ def colourful(path) -> int:
 
 def test_what_fewer_than_two_see_is_grey(tmp_path):
     """The wall faces down, so it is looked at from below."""
-    mesh = wall(0.0)
+    mesh = plate(0.0, 2.0, 10)
     few = np.where(mesh.face_centres[:, 0] < 0, 20.0, np.nan)
     views, counts = {"below": (0.0, -90.0)}, []
     for name, values in (("none", np.full(200, np.nan)), ("half", few), ("all", np.full(200, 20.0))):
@@ -41,7 +41,7 @@ def test_larger_ellipsoids_are_drawn_larger(tmp_path):
     for deviation_mm in (0.01, 0.02):
         covariance = np.tile(deviation_mm**2 * np.eye(3), (200, 1, 1))
         path = tmp_path / "e.png"
-        save_ellipsoids_picture(path, wall(0.0), covariance, picked=np.array([55]), angles_deg=(0.0, -90.0))
+        save_ellipsoids_picture(path, plate(0.0, 2.0, 10), covariance, picked=np.array([55]), angles_deg=(0.0, -90.0))
         image = imread(path)[..., :3]
         rows, columns = np.nonzero(image[..., 0] - image[..., 1] > 0.4)
         sizes.append(np.ptp(rows) * np.ptp(columns))

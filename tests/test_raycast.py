@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import trimesh
 
+from builders import sphere
 from cuspid.camera import Camera
 from cuspid.capture import Frame
 from cuspid.errors import InputError
@@ -122,10 +122,7 @@ def test_depth_of_a_plane_is_exact_also_through_a_distorting_lens() -> None:
 
 
 def test_depth_of_a_sphere_and_nothing_beside_it() -> None:
-    ball = trimesh.creation.icosphere(6, 2.0)
-    depth = render_depth(
-        Mesh(np.asarray(ball.vertices), np.asarray(ball.faces)), CAMERA, Rigid3(np.eye(3), np.array([0, 0, 7.0]))
-    )
+    depth = render_depth(sphere(2.0, 6), CAMERA, Rigid3(np.eye(3), np.array([0, 0, 7.0])))
     rays = CAMERA.rays(CAMERA.pixel_centres())
     squared = np.sum(rays**2, axis=-1)
     discriminant = (7 * rays[..., 2]) ** 2 - squared * (49 - 4)

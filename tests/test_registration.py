@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 from hypothesis import given, settings
-from scipy.spatial.transform import Rotation
 
+from builders import any_pose, joined, moved, sphere
 from cuspid.errors import InputError
 from cuspid.evaluation.distance import Surface
 from cuspid.evaluation.registration import RegistrationOptions, fit, refine, register
@@ -29,11 +29,6 @@ def surface() -> Surface:
     return Surface(jaw().mesh)
 
 
-def any_pose(seed: int) -> Rigid3:
-    rng = np.random.default_rng(seed)
-    return Rigid3(Rotation.random(rng=rng).as_matrix(), 200 * rng.normal(size=3))
-
-
 def error_um(found: Rigid3, true: Rigid3, points: np.ndarray) -> float:
     return 1000 * float(np.linalg.norm(found.apply(points) - true.apply(points), axis=1).max())
 
@@ -51,7 +46,7 @@ def noisy(mesh: Mesh, sd_mm: float) -> Mesh:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_an_identical_surface_is_laid_exactly_from_any_pose(seed: int):
-    scan_from_reference = any_pose(seed)
+    scan_from_reference = any_pose(seed, 200)
     scan = jaw().mesh.transformed(scan_from_reference)
     found = register(scan, surface(), FAST, rng=np.random.default_rng(0))
     assert error_um(found.reference_from_scan, scan_from_reference.inverse(), scan.vertices) < 0.1
@@ -62,7 +57,7 @@ def test_an_identical_surface_is_laid_exactly_from_any_pose(seed: int):
 
 @pytest.mark.parametrize(("fdi", "seed"), [(46, 3), (31, 4), (35, 5)])
 def test_a_noisy_tooth_finds_its_place_in_the_arch(fdi: int, seed: int):
-    scan_from_reference = any_pose(seed)
+    scan_from_reference = any_pose(seed, 200)
     scan = noisy(around_tooth(fdi, 8.0), 0.01).transformed(scan_from_reference)
     found = register(scan, surface(), FAST, rng=np.random.default_rng(0))
     assert 0.01 < error_um(found.reference_from_scan, scan_from_reference.inverse(), scan.vertices) < 5
@@ -71,7 +66,7 @@ def test_a_noisy_tooth_finds_its_place_in_the_arch(fdi: int, seed: int):
 
 
 def test_a_scan_larger_than_its_reference_is_laid_too():
-    scan_from_reference = any_pose(6)
+    scan_from_reference = any_pose(6, 200)
     scan = jaw().mesh.transformed(scan_from_reference)
     found = register(scan, Surface(around_tooth(44, 10.0)), FAST, rng=np.random.default_rng(0))
     assert error_um(found.reference_from_scan, scan_from_reference.inverse(), scan.vertices) < 1
@@ -98,12 +93,7 @@ def test_scale_is_measured_but_never_applied(scale: float):
 
 
 def test_floating_pieces_do_not_move_the_alignment():
-    blob = trimesh.creation.icosphere(3, 3.0)
-    mesh = jaw().mesh
-    scan = Mesh(
-        np.concatenate([mesh.vertices, blob.vertices + [0, 0, 15.0]]),
-        np.concatenate([mesh.faces, blob.faces + len(mesh.vertices)]),
-    )
+    scan = joined(jaw().mesh, moved(sphere(3.0, 3), (0, 0, 15.0)))
     points = scan.sample(20_000, np.random.default_rng(0))[0]
     start = Rigid3.from_rotation_vector(np.array([0.0, 0.02, 0.01]), np.array([0.2, -0.2, 0.1]))
     found = fit(points, surface(), start, RegistrationOptions())
@@ -114,7 +104,7 @@ def test_floating_pieces_do_not_move_the_alignment():
 def test_two_poses_that_fit_alike_are_told_and_chosen_from_alike():
     box = trimesh.creation.box((10.0, 6.0, 4.0)).subdivide_to_size(0.5)
     mesh = Mesh(np.asarray(box.vertices), np.asarray(box.faces))
-    scan = mesh.transformed(any_pose(1))
+    scan = mesh.transformed(any_pose(1, 200))
     found, again = (register(scan, Surface(mesh), FAST, rng=np.random.default_rng(0)) for _ in range(2))
     np.testing.assert_array_equal(found.reference_from_scan.matrix, again.reference_from_scan.matrix)
     assert any("another pose" in note for note in found.notes)
@@ -122,6 +112,5 @@ def test_two_poses_that_fit_alike_are_told_and_chosen_from_alike():
 
 
 def test_surfaces_that_do_not_belong_together_are_refused():
-    ball = trimesh.creation.icosphere(4, 25.0)
     with pytest.raises(InputError, match="same teeth, in the same unit"):
-        register(Mesh(np.asarray(ball.vertices), np.asarray(ball.faces)), surface(), FAST, rng=np.random.default_rng(0))
+        register(sphere(25.0), surface(), FAST, rng=np.random.default_rng(0))

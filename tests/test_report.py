@@ -37,6 +37,7 @@ from report_folders import (
     write_score,
     write_shape,
 )
+from verbs import refused
 
 
 def unpacked(value: dict[str, str]) -> np.ndarray:
@@ -53,14 +54,6 @@ def scene_of(page: str) -> dict:
 def scan_folder(tmp_path, coarse_phantom):
     write_scan(tmp_path / "scan", coarse_phantom)
     return tmp_path / "scan"
-
-
-def refused(capsys, *arguments: object) -> str:
-    with pytest.raises(SystemExit) as caught:
-        cli.main([str(argument) for argument in arguments])
-    assert caught.value.code == 1
-    [line] = [line for line in capsys.readouterr().err.splitlines() if line.startswith("cuspid: ")]
-    return line
 
 
 # --- packing ----------------------------------------------------------------------------------------------------------

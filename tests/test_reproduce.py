@@ -35,6 +35,7 @@ from cuspid.thesis.rules import (
     least_favourable,
 )
 from cuspid.thesis.runs import ALL_RESULTS, RUNS, SUBJECT_NAMES, gather, missing, needed, read_results
+from verbs import refused
 
 ROOT = Path(__file__).parent.parent
 CASES = Path(__file__).parent / "reproduction_cases.py"
@@ -412,16 +413,6 @@ def test_a_command_that_fails_is_told_with_its_last_words(tmp_path):
 # --- The command line -------------------------------------------------------------------------------------------------
 
 
-def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line that a refused command prints."""
-    with pytest.raises(SystemExit) as stopped:
-        main(["reproduce", *arguments])
-    assert stopped.value.code == 1
-    printed = [line for line in capsys.readouterr().err.splitlines() if line]
-    assert len(printed) == 1
-    return printed[0]
-
-
 def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capsys):
     out = ["--out", str(tmp_path / "out")]
     broken, empty = tmp_path / "broken", tmp_path / "empty"
@@ -437,14 +428,14 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capsys):
         "at least one": ["--workers", "0"],
     }
     for expected, arguments in cases.items():
-        assert expected in refused([*out, "--no-run", *arguments], capsys)
+        assert expected in refused(capsys, "reproduce", *out, "--no-run", *arguments, alone=True)
         assert not (tmp_path / "out").exists()
 
 
 def test_results_of_another_form_are_one_line_and_leave_nothing(tmp_path, capsys):
     storage.write_json(tmp_path / "given" / "populations.json", {"groups": {"lower-14": 3}})
     arguments = ["--out", str(tmp_path / "out"), "--results", str(tmp_path / "given"), "--no-run"]
-    assert "populations.json" in refused(arguments, capsys)
+    assert "populations.json" in refused(capsys, "reproduce", *arguments, alone=True)
     assert not (tmp_path / "out").exists()
 
 

@@ -17,7 +17,7 @@ from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw, Landmark, Sphere
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import MountedCamera, Rig
-from cuspid.storage.files import whole_files
+from cuspid.storage.files import read_arrays, whole_files, write_arrays
 from strategies import cameras, rigid3s
 
 
@@ -306,6 +306,18 @@ def test_files_are_whole_or_absent(tmp_path):
         fill_the_disk()
     assert storage.read_json(path) == {"a": None, "b": 0.5}
     assert [item.name for item in tmp_path.iterdir()] == ["value.json"]
+
+
+def test_arrays_return_and_damaged_ones_are_told_with_what_to_do(tmp_path):
+    path = tmp_path / "arrays.npz"
+    write_arrays(path, {"one": np.arange(3), "other": np.eye(2)}, compressed=True)
+    np.testing.assert_array_equal(read_arrays(path, remedy="make it again")["other"], np.eye(2))
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(InputError, match=r"arrays\.npz: damaged .*; make it again"):
+        read_arrays(path, remedy="make it again")
+    path.unlink()
+    with pytest.raises(InputError, match=r"arrays\.npz: cannot be read .*; make it again"):
+        read_arrays(path, remedy="make it again")
 
 
 def test_files_of_a_folder_are_there_together_or_not_at_all(tmp_path):

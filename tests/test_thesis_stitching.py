@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from builders import write_frames
 from cuspid import cli, pipeline, storage
 from cuspid.camera import Camera
 from cuspid.errors import InputError, ReconstructionError
@@ -22,6 +23,7 @@ from cuspid.stitching.placing import Canvas, Placed, frame_pixels, stretch
 from cuspid.stitching.shading import Shape, shape_of_light
 from cuspid.stitching.thesis_method import ThesisOptions
 from cuspid.stitching.warps import SEGMENT_PX, WarpOptions, centroids, location_weights, weighted_dlt
+from verbs import refused
 
 CAMERA = Camera.from_field_of_view(160, 120, 62.0)
 SIZE = (640, 480)
@@ -264,12 +266,6 @@ def cut(wall: np.ndarray, shift: np.ndarray) -> np.ndarray:
     return np.asarray(wall[y : y + FRAME[1], x : x + FRAME[0]])
 
 
-def write_frames(folder: Path, frames: list[np.ndarray]) -> Path:
-    for number, frame in enumerate(frames):
-        storage.write_image(folder / f"{number:03d}.png", np.ascontiguousarray(frame))
-    return folder
-
-
 def stitched(folder: Path, examination: bool = True, **options: object) -> tuple[Panorama, ...]:
     sequence = storage.read_sequence(folder, folder / "decoded")
     chosen = StitchOptions(method="thesis", examination=examination, thesis=ThesisOptions(**options))
@@ -372,8 +368,5 @@ def test_the_verb_writes_a_panorama_and_its_help_holds_the_patent_notice(
 
 def test_the_verb_refuses_black_frames_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_frames(tmp_path / "frames", [np.zeros((180, 240, 3), np.uint8)] * 2)
-    with pytest.raises(SystemExit) as caught:
-        cli.main(["stitch", str(folder), "--method", "thesis", "--out", str(tmp_path / "pano")])
-    assert caught.value.code == 1
-    assert len([line for line in capsys.readouterr().err.splitlines() if line.startswith("cuspid: ")]) == 1
+    refused(capsys, "stitch", folder, "--method", "thesis", "--out", tmp_path / "pano")
     assert not (tmp_path / "pano" / "panorama.png").exists()

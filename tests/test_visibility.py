@@ -7,10 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from builders import joined, moved, plate, sphere
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
@@ -32,28 +32,6 @@ from cuspid.rig import Handpiece, MountedCamera, Rig
 
 CAMERA = Camera.from_field_of_view(500, 500, 62.0)
 DEPTHS = (2.5, 9.0)
-
-
-def sphere(radius_mm: float) -> Mesh:
-    ball = trimesh.creation.icosphere(4, radius_mm)
-    return Mesh(np.asarray(ball.vertices), np.asarray(ball.faces))
-
-
-def plate(z: float, half_width: float, cells: int = 20) -> Mesh:
-    """A square plate of small triangles that faces -Z, towards a camera at the origin."""
-    ticks = np.linspace(-half_width, half_width, cells + 1)
-    x, y = np.meshgrid(ticks, ticks)
-    index = np.arange((cells + 1) ** 2).reshape(cells + 1, -1)
-    a, b, c, d = index[:-1, :-1].ravel(), index[:-1, 1:].ravel(), index[1:, 1:].ravel(), index[1:, :-1].ravel()
-    vertices = np.stack([x.ravel(), y.ravel(), np.full(x.size, z)], axis=1)
-    return Mesh(vertices, np.concatenate([np.stack([a, c, b], 1), np.stack([a, d, c], 1)]))
-
-
-def joined(first: Mesh, second: Mesh) -> Mesh:
-    return Mesh(
-        np.concatenate([first.vertices, second.vertices]),
-        np.concatenate([first.faces, second.faces + len(first.vertices)]),
-    )
 
 
 def looking_along(axes: dict[str, Rigid3]) -> Handpiece:
@@ -161,10 +139,7 @@ def seen_by_brute_force(mesh: Mesh, hand: Handpiece, pose: Rigid3, options: Visi
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_survey_equals_brute_force_over_the_faces(seed: int) -> None:
-    small = trimesh.creation.icosphere(1, 0.6)
-    ball = trimesh.creation.icosphere(2, 3.0)
-    moons = [Mesh(np.asarray(small.vertices) + [x, 0, 4.2], np.asarray(small.faces)) for x in (-1.5, 1.5)]
-    mesh = joined(joined(Mesh(np.asarray(ball.vertices), np.asarray(ball.faces)), moons[0]), moons[1])
+    mesh = joined(sphere(3.0, 2), *(moved(sphere(0.6, 1), (x, 0, 4.2)) for x in (-1.5, 1.5)))
     apart = {name: Rigid3(np.eye(3), np.array([x, 0.0, 0.0])) for name, x in (("a", -1.2), ("b", 0.0), ("c", 1.2))}
     hand, options, poses = looking_along(apart), VisibilityOptions(), [Rigid3.identity(), *wanderings(seed, 3)]
     poses[0] = Rigid3(np.diag([1.0, -1.0, -1.0]), np.array([0, 0, 9.0]))
@@ -263,7 +238,7 @@ def test_options_that_see_nothing_or_backs_are_refused(change: dict[str, float],
 def test_the_tables_weigh_by_area() -> None:
     """Two plates, one large and seen by both cameras, one small and out of sight."""
     wall, aside = plate(5.0, 1.0), plate(5.0, 0.5)
-    both = joined(wall, Mesh(aside.vertices + [50.0, 0, 0], aside.faces))
+    both = joined(wall, moved(aside, (50.0, 0, 0)))
     large = np.arange(len(both.faces)) < len(wall.faces)
     hand = looking_along({"a": Rigid3.identity(), "b": Rigid3(np.eye(3), np.array([-1.0, 0, 0]))})
     found = survey_visibility(both, hand, [Rigid3.identity()], VisibilityOptions())

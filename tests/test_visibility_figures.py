@@ -6,10 +6,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import trimesh
 from matplotlib.colors import to_rgb
 
-from cuspid.mesh import Mesh
+from builders import sphere
 from cuspid.reporting.figures.visibility import (
     COUNT_COLOURS,
     SURFACE_COLOURS,
@@ -18,8 +17,7 @@ from cuspid.reporting.figures.visibility import (
     save_surfaces_picture,
 )
 
-BALL = trimesh.creation.icosphere(3, 10.0)
-MESH = Mesh(np.asarray(BALL.vertices), np.asarray(BALL.faces))
+MESH = sphere(10.0, 3)
 RIGHT = MESH.face_centres[:, 0] > 0
 
 

@@ -25,6 +25,22 @@ def read_only(array: _Array) -> _Array:
     return array
 
 
+def unit(vectors: Float[np.ndarray, "*n d"]) -> Float[np.ndarray, "*n d"]:
+    """Vectors of length one; those of length zero stay."""
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12))
+
+
+def lengths_along(line: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n"]:
+    """Length of a line from its start to each of its points."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+
+
+def axes_about(directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """Right-handed axes, as rows, whose last one is a given unit vector; the turn about it is whatever comes."""
+    first = unit(np.cross(np.eye(3)[np.argmin(np.abs(directions), axis=-1)], directions))
+    return np.stack([first, np.cross(directions, first), directions], axis=-2)
+
+
 @dataclass(frozen=True, eq=False)
 class Rigid3:
     """A rotation followed by a translation."""

@@ -30,6 +30,11 @@ class RayHits:
     """Weights of the face's three vertices at the hit."""
 
 
+def edges_of(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
+    """Edges of the faces, face by face; each edge of a closed mesh appears once in either direction."""
+    return np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+
+
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """Vertices and triangles."""
@@ -87,6 +92,10 @@ class Mesh:
     def bounds(self) -> Float[np.ndarray, "2 3"]:
         """Lower and upper corner of the box around the vertices, mm."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    def centroid(self, faces: Bool[np.ndarray, "f"]) -> Float[np.ndarray, "3"]:
+        """Of the surface of some faces, mm."""
+        return np.asarray(np.average(self.face_centres[faces], axis=0, weights=self.face_areas[faces]))
 
     def transformed(self, target_from_source: Rigid3) -> Mesh:
         """The same mesh in another frame."""

@@ -2,18 +2,14 @@
 
 import numpy as np
 from jaxtyping import Int
-from scipy.sparse import coo_array
 
-
-def edges_of(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
-    """Edges (e, 2) of the faces; each edge of a closed mesh appears once in either direction."""
-    return np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+from cuspid.mesh import edges_of
 
 
 def open_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
     """Directed edges without their opposite."""
     directed = edges_of(faces)
-    size = int(faces.max(initial=0)) + 1
+    size = int(faces.max(initial=-1)) + 1
     keys, opposite = directed[:, 0] * size + directed[:, 1], directed[:, 1] * size + directed[:, 0]
     return directed[~np.isin(keys, opposite)]
 
@@ -64,8 +60,3 @@ def neighbours_of(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "p 2"]:
     order = np.lexsort((edges[:, 1], edges[:, 0]))
     pairs = (order // 3).reshape(-1, 2)
     return np.concatenate([pairs, pairs[:, ::-1]])
-
-
-def graph_of(pairs: Int[np.ndarray, "p 2"], count: int) -> coo_array:
-    """Adjacency matrix (count, count) of the given pairs."""
-    return coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))

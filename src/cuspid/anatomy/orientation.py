@@ -17,7 +17,7 @@ from scipy.ndimage import maximum_filter
 from scipy.spatial import ConvexHull, cKDTree
 
 from cuspid.errors import InputError
-from cuspid.geometry import Rigid3, best_similarity
+from cuspid.geometry import Rigid3, axes_about, best_similarity
 from cuspid.jaw import GUM, Arch
 from cuspid.mesh import Mesh
 from cuspid.storage import MM_PER_UNIT, Unit
@@ -92,9 +92,7 @@ def find_occlusal_frame(mesh: Mesh) -> OcclusalFrame:
 
 def _frame(up: Float[np.ndarray, "3"], centre: Float[np.ndarray, "3"]) -> Rigid3:
     """A frame at ``centre`` with +Z along ``up``."""
-    first = np.cross(np.eye(3)[np.argmin(np.abs(up))], up)
-    first /= np.linalg.norm(first)
-    axes = np.stack([first, np.cross(up, first), up])
+    axes = axes_about(up)
     return Rigid3(axes, -axes @ centre)
 
 

@@ -25,6 +25,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 
 from cuspid.anatomy.landmarks.scheme import kind_of
 from cuspid.errors import InputError
+from cuspid.geometry import unit
 from cuspid.jaw import Jaw
 
 SURFACES = ("occlusal", "incisal", "buccal", "labial", "lingual", "mesial", "distal", "gingival")
@@ -83,13 +84,8 @@ def tooth_axes(jaw: Jaw) -> dict[int, Float[np.ndarray, "3 3"]]:
             f"surfaces: the jaw has {len(order)} labelled teeth; two at least are needed to know how the arch runs "
             "(an FDI number for each face, 0 for gum)"
         )
-    tangents = np.gradient([_centroid(jaw, fdi) for fdi in order], axis=0)
+    tangents = np.gradient([jaw.mesh.centroid(jaw.tooth_faces(fdi))[:2] for fdi in order], axis=0)
     return {fdi: _axes(fdi, along / np.linalg.norm(along)) for fdi, along in zip(order, tangents, strict=True)}
-
-
-def _centroid(jaw: Jaw, fdi: int) -> Float[np.ndarray, "2"]:
-    faces = jaw.tooth_faces(fdi)
-    return np.asarray(np.average(jaw.mesh.face_centres[faces, :2], axis=0, weights=jaw.mesh.face_areas[faces]))
 
 
 def _axes(fdi: int, along: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3 3"]:
@@ -120,7 +116,7 @@ def _places(jaw: Jaw, faces: Int[np.ndarray, "n"], axes: Float[np.ndarray, "3 3"
 
 
 def _codes(fdi: int, places: _Places, normals: Local, options: SurfaceOptions) -> Int[np.ndarray, "n"]:
-    towards = _unit(normals[:, :2]) + 0.5 * _unit(places.relative[:, :2])
+    towards = unit(normals[:, :2]) + 0.5 * unit(places.relative[:, :2])
     if kind_of(fdi) in ("incisor", "canine"):
         names, upwards = ("incisal", "labial"), normals[:, 2] > _UPWARDS
         from_edge = places.mm - _edge(places)
@@ -132,10 +128,6 @@ def _codes(fdi: int, places: _Places, normals: Local, options: SurfaceOptions) -
     proximal = np.abs(towards[:, 0]) > np.abs(towards[:, 1])
     sides = np.where(proximal, np.where(towards[:, 0] > 0, distal, mesial), np.where(towards[:, 1] > 0, outer, lingual))
     return np.asarray(np.where(is_top, top, sides))
-
-
-def _unit(vectors: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
 
 
 def _edge(places: _Places) -> Local:
@@ -151,7 +143,7 @@ def _is_occlusal(places: _Places, normals: Local) -> Bool[np.ndarray, "n"]:
     """Within the rim of the crown."""
     radius = np.linalg.norm(places.relative[:, :2], axis=1)
     turns = np.arctan2(places.relative[:, 1], places.relative[:, 0]) / (2 * np.pi)
-    sloping = np.einsum("nk,nk->n", normals[:, :2], _unit(places.mm[:, :2]))
+    sloping = np.einsum("nk,nk->n", normals[:, :2], unit(places.mm[:, :2]))
     table = (normals[:, 2] > _UPWARDS) & (sloping < _OUTWARDS) & (places.relative[:, 2] > 0)
     rim = _rim(turns[table], radius[table], turns)
     return np.asarray(table | (radius <= rim) & (normals[:, 2] > 0) & (places.relative[:, 2] > -0.5))

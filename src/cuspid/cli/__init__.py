@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -54,8 +55,19 @@ COMMANDS: Mapping[str, Callable[..., Any]] = {
 }
 
 
+class _Notes(logging.Handler):
+    """What the code has to say while it runs, a line each."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print it."""
+        console.print(f"note: {record.getMessage()}", soft_wrap=True, markup=False, highlight=False)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run a verb; a known error is one line on stderr and exit status 1."""
+    log = logging.getLogger("cuspid")
+    log.setLevel(logging.INFO)
+    log.handlers = [_Notes()]
     try:
         tyro.extras.subcommand_cli_from_dict(
             dict(COMMANDS),

@@ -35,7 +35,7 @@ from cuspid.studies.design_comparison import (
     surface_shares,
     table_cells,
 )
-from cuspid.studies.grid import Outcome
+from cuspid.studies.grid import Outcome, check_workers
 from cuspid.studies.trial import TrialOptions
 
 CASE_OPTIONS = ("edge_mm", "image_scale", "minimum_openness", "samples", "thickness_mm")
@@ -63,8 +63,7 @@ def compare(
         workers: Processes on this machine, one core each (default: one for each core).
         cluster: Address of a Dask scheduler, whose workers see the folder too.
     """
-    if workers is not None and workers < 1:
-        raise InputError(f"compare: --workers is {workers}; at least one is needed")
+    check_workers(workers, "compare")
     simulation = SimulationOptions(texture=texture, supersampling=supersampling)
     trial = TrialOptions(simulation=simulation, reconstruction=reconstruction)
     settings = {

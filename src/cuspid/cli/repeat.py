@@ -16,6 +16,7 @@ from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_sou
 from cuspid.errors import InputError
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.reporting.figures.repeat import save_repeat_picture
+from cuspid.studies.grid import check_workers
 from cuspid.studies.repetition import RepeatOptions, Repetition, repeat_scans
 from cuspid.studies.trial import TrialOptions
 
@@ -44,8 +45,7 @@ def repeat(
         cluster: Address of a Dask scheduler, tcp://host:port, whose workers see the folder too.
         retry_failed: Run again what failed before.
     """
-    if workers is not None and workers < 1:
-        raise InputError(f"repeat: --workers is {workers}; at least one is needed")
+    check_workers(workers, "repeat")
     trial = TrialOptions(simulation=simulation, reconstruction=reconstruction)
     kept = {
         "new_texture": options.new_texture,

@@ -15,6 +15,7 @@ from cuspid.cli.shared import console, show_progress
 from cuspid.errors import CuspidError, InputError
 from cuspid.reporting.pages.page import photo_uri
 from cuspid.reporting.pages.reproduction import Page, html, markdown
+from cuspid.studies.grid import check_workers
 from cuspid.thesis.catalogue import BY_ID, ITEMS, Item
 from cuspid.thesis.judging import judge
 from cuspid.thesis.page import make_page
@@ -47,8 +48,7 @@ def reproduce(
         workers: Runs at once, one core each (default: one for each core).
     """
     items = asked_items(only)
-    if workers is not None and workers < 1:
-        raise InputError(f"reproduce: --workers is {workers}; at least one is needed")
+    check_workers(workers, "reproduce")
     if images is not None and not images.is_dir():
         raise InputError(f"--images {images}: no such folder")
     found = gather(out, results)

@@ -126,7 +126,7 @@ def evaluate(
         if np.any(from_reference.labels == fdi)
     }
     centroids = {
-        fdi: _centroid(reference.mesh, (labels == fdi) & rules.faces)
+        fdi: reference.mesh.centroid((labels == fdi) & rules.faces)
         for fdi, within in completeness_by_tooth.items()
         if within["200"] >= _LEAST_TOOTH_PCT
     }
@@ -271,7 +271,3 @@ def _samples_of_reference(
 
 def _within_pct(signed_mm: Float[np.ndarray, "n"]) -> dict[str, float]:
     return {str(um): float(100 * np.mean(np.abs(signed_mm) <= um / 1000)) for um in _WITHIN_UM}
-
-
-def _centroid(mesh: Mesh, faces: Bool[np.ndarray, "f"]) -> Float[np.ndarray, "3"]:
-    return np.asarray(np.average(mesh.face_centres[faces], axis=0, weights=mesh.face_areas[faces]))

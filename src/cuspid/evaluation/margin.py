@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from cuspid.errors import InputError
-from cuspid.geometry import Rigid3
+from cuspid.geometry import Rigid3, axes_about, lengths_along
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 
@@ -158,7 +158,7 @@ def _stations(
     line: Float[np.ndarray, "n 3"], step_mm: float
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"], int]:
     """Points even along a closed line where it is straight enough, its unit direction there, and their number."""
-    run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    run = lengths_along(line)
     length = run[-1]
     if length < 20 * step_mm or length < 8 * _TANGENT_MM:
         raise InputError(f"margin: a line of {length:.2f} mm is too short for sections every {step_mm:g} mm")
@@ -175,9 +175,7 @@ def _stations(
 
 def _axes(tangent: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2 3"]:
     """Two unit vectors that make a right-handed frame with the direction of a line: u x v = tangent."""
-    u = np.cross(np.eye(3)[int(np.argmin(np.abs(tangent)))], tangent)
-    u /= np.linalg.norm(u)
-    return np.stack([u, np.cross(tangent, u)])
+    return axes_about(tangent)[:2]
 
 
 def _lateral(
@@ -262,7 +260,7 @@ def _edge(section: Float[np.ndarray, "m 2"] | None, options: MarginOptions) -> _
     """The convex edge of a section nearest to the origin, weighted by how sharp it is."""
     if section is None or len(section) < 3:
         return None
-    run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(section, axis=0), axis=1))])
+    run = lengths_along(section)
     count = int(run[-1] / _FINE_MM)
     arm = int(options.flank_to_mm / _FINE_MM)
     if count < 2 * arm + 3:

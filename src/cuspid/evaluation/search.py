@@ -20,7 +20,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from cuspid.geometry import Rigid3
+from cuspid.geometry import Rigid3, axes_about, unit
 from cuspid.mesh import Mesh
 from cuspid.workers import map_in_threads
 
@@ -97,11 +97,7 @@ def _cloud(mesh: Mesh, count: int, smoothing_mm: float, rng: np.random.Generator
     alike = np.sum(normals[a] * normals[b], axis=1) > 0
     a, b = np.concatenate([a[alike], b[alike]]), np.concatenate([b[alike], a[alike]])
     summed = normals + np.stack([np.bincount(a, normals[b, axis], minlength=count) for axis in range(3)], axis=1)
-    return _Cloud(points=points, normals=normals, smooth_normals=_unit(summed))
-
-
-def _unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+    return _Cloud(points=points, normals=normals, smooth_normals=unit(summed))
 
 
 def _table(cloud: _Cloud, margin_mm: float) -> _Table:
@@ -115,9 +111,7 @@ def _table(cloud: _Cloud, margin_mm: float) -> _Table:
 
 def _frames(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
     """A rotation for each normal whose third column it is."""
-    least = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
-    first = _unit(np.cross(least, normals))
-    return np.stack([first, np.cross(normals, first), normals], axis=2)
+    return np.ascontiguousarray(np.swapaxes(axes_about(normals), 1, 2))
 
 
 def _spread(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, "k"]:

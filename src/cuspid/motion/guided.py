@@ -7,11 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit
 from scipy.spatial import KDTree
 
 from cuspid.camera import Camera
@@ -19,7 +17,7 @@ from cuspid.errors import InputError
 from cuspid.motion.adjustment import AdjustmentOptions, adjust
 from cuspid.motion.features import Features
 from cuspid.motion.pairs import MatchingOptions, View, make_view, match_guided
-from cuspid.motion.tracks import intersect_rays
+from cuspid.motion.tracks import intersect_rays, join
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.workers import map_in_threads
@@ -60,53 +58,6 @@ class GuidedOptions:
                 f"guided matching: {len(self.tolerances_px)} tolerances and {len(self.depth_shares)} depth shares; "
                 "give one of each for every round, at least one"
             )
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _root(parent, node):
-    while parent[node] != node:
-        node = parent[node]
-    return node
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _join(matches, image_of):
-    """Union of matches in order; one that would bring two keypoints of an image together is left out."""
-    count = len(image_of)
-    parent, tail, size = np.arange(count), np.arange(count), np.ones(count, np.int64)
-    following, mark = np.full(count, -1), np.full(image_of.max() + 1, -1)
-    for m in range(len(matches)):
-        a, b = _root(parent, matches[m, 0]), _root(parent, matches[m, 1])
-        if a == b:
-            continue
-        if size[a] < size[b]:
-            a, b = b, a
-        member = a
-        while member >= 0:
-            mark[image_of[member]] = m
-            member = following[member]
-        member, clash = b, False
-        while member >= 0 and not clash:
-            clash = mark[image_of[member]] == m
-            member = following[member]
-        if not clash:
-            parent[b] = a
-            following[tail[a]] = b
-            tail[a] = tail[b]
-            size[a] += size[b]
-    return parent, size
-
-
-def join_in_order(matches: Int[np.ndarray, "m 2"], image_of: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
-    """Track of each of n keypoints, -1 for none: matches are joined in their order, and one that would give a track two
-    keypoints of an image is left out (where :func:`cuspid.motion.tracks.join` gives up the track)."""
-    parent, _ = _join(matches, image_of)
-    roots = np.array([_root(parent, node) for node in range(len(image_of))])
-    _, label, counts = np.unique(roots, return_inverse=True, return_counts=True)
-    kept = counts >= 2
-    return np.where(kept, np.cumsum(kept) - 1, -1)[label]
 
 
 def refine(
@@ -174,7 +125,7 @@ def _tracks(
 
     matches = np.concatenate([np.zeros((0, 2), np.int64), *map_in_threads(match, pairs)])
     image_of = np.repeat(np.arange(len(views)), sizes)
-    return join_in_order(matches, image_of), image_of
+    return join(matches, image_of), image_of
 
 
 def _triangulated(

@@ -13,11 +13,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import pycolmap
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.csgraph import breadth_first_order
 
 from cuspid.capture import Dropped
 from cuspid.geometry import Rigid3
+from cuspid.graph import graph_of, parts_of
 from cuspid.motion.colmap import colmap_camera, colmap_rigid, rigid_from_colmap
 from cuspid.motion.features import Features, spread
 from cuspid.motion.pairs import MatchingOptions, View, match_guided, match_unguided
@@ -252,9 +252,8 @@ def relative_pose(rig: Rig, cloud: Cloud, source: Views, target: Views, options:
 
 def _parts(edges: Mapping[tuple[int, int], Edge], count: int) -> Int[np.ndarray, "f"]:
     """For each frame the number of the connected part it belongs to."""
-    tied = np.array([pair for pair, edge in edges.items() if edge.target_from_source is not None]).reshape(-1, 2)
-    graph = coo_array((np.ones(len(tied)), (tied[:, 0], tied[:, 1])), shape=(count, count))
-    return np.asarray(connected_components(graph, directed=False)[1])
+    tied = [pair for pair, edge in edges.items() if edge.target_from_source is not None]
+    return parts_of(np.array(tied, dtype=np.int64).reshape(-1, 2), count)
 
 
 def find_edges(
@@ -293,9 +292,8 @@ def chain(edges: Mapping[tuple[int, int], Edge], names: Sequence[str], options: 
     largest = int(np.argmax(np.bincount(part)))
     located = np.flatnonzero(part == largest)
     tied = {pair: edge.target_from_source for pair, edge in edges.items() if edge.target_from_source is not None}
-    rows = np.array([*tied, *((j, i) for i, j in tied)]).reshape(-1, 2)
-    graph = coo_array((np.ones(len(rows)), (rows[:, 0], rows[:, 1])), shape=(len(names), len(names)))
-    order, before = breadth_first_order(graph.tocsr(), int(located[0]))
+    rows = np.array([*tied, *((j, i) for i, j in tied)], dtype=np.int64).reshape(-1, 2)
+    order, before = breadth_first_order(graph_of(rows, len(names)).tocsr(), int(located[0]))
     poses = {int(located[0]): Rigid3.identity()}
     for j in order[1:].tolist():
         i = int(before[j])

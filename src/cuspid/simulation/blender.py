@@ -21,7 +21,7 @@ import numpy as np
 
 from cuspid.capture import Frame
 from cuspid.errors import InputError, MissingDependencyError
-from cuspid.geometry import Rigid3
+from cuspid.geometry import Rigid3, axes_about
 from cuspid.rig import Light, MountedCamera
 from cuspid.simulation.appearance import face_materials
 from cuspid.simulation.raycast import Scene, Sink, image_rng, metered_gains
@@ -153,9 +153,7 @@ def _light(light: Light, rig_from_world: Rigid3) -> dict[str, Any]:
     world_from_rig = rig_from_world.inverse()
     # Blender's area lights shine along -Z; about that axis any turn will do.
     axis = -world_from_rig.rotate(light.direction)
-    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    across /= np.linalg.norm(across)
-    rotation = np.stack([across, np.cross(axis, across), axis], axis=1)
+    rotation = axes_about(axis).T
     return {
         "world_from_light": Rigid3(rotation, world_from_rig.apply(light.position_mm)).matrix.tolist(),
         "power": light.power,

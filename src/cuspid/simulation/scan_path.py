@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter
 from scipy.spatial import KDTree
 
 from cuspid.errors import InputError
-from cuspid.geometry import Rigid3, read_only
+from cuspid.geometry import Rigid3, lengths_along, read_only
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
@@ -129,7 +129,7 @@ class ArchCurve:
     @property
     def lengths_mm(self) -> Float[np.ndarray, "n"]:
         """Length of the curve up to each sample."""
-        return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(self.points, axis=0), axis=1))])
+        return lengths_along(self.points)
 
     def span_of(self, points: Float[np.ndarray, "m 3"]) -> tuple[float, float]:
         """The stretch of the curve (mm from its start) beside which most of the points lie."""
@@ -370,8 +370,7 @@ def _rough_curve(crowns: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
 def _centred_curve(points: Float[np.ndarray, "m 3"], crowns: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
     """A curve moved sideways to the middle of the crowns and lengthened or shortened to where they end."""
     line = _lengthened(points, _NEAR_MM)
-    steps = np.diff(line[:, :2], axis=0)
-    lengths = np.concatenate([[0], np.cumsum(np.linalg.norm(steps, axis=1))])
+    lengths = lengths_along(line[:, :2])
     tangents = np.gradient(line[:, :2], lengths, axis=0)
     normals = np.stack([-tangents[:, 1], tangents[:, 0]], axis=1)
     _, nearest = KDTree(line[:, :2]).query(crowns[:, :2])

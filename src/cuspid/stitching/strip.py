@@ -15,6 +15,7 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET
+from cuspid.geometry import lengths_along, unit
 from cuspid.panorama import ZONES, Panorama, Strip
 from cuspid.reconstruction import Reconstruction
 from cuspid.stitching.surface import HeightMap
@@ -60,12 +61,8 @@ def arch_curve(motion: Reconstruction, surface: HeightMap, options: StripOptions
 def _longer(curve: Float[np.ndarray, "n 2"], by_mm: float) -> Float[np.ndarray, "m 2"]:
     """The curve, straight on beyond its ends: the camera sees farther than it goes."""
     steps = _STEP_MM * np.arange(1, round(by_mm / _STEP_MM) + 1)[:, None]
-    head, tail = (_unit(curve[a] - curve[b]) for a, b in ((0, min(8, len(curve) - 1)), (-1, max(-9, -len(curve)))))
+    head, tail = (unit(curve[a] - curve[b]) for a, b in ((0, min(8, len(curve) - 1)), (-1, max(-9, -len(curve)))))
     return np.concatenate([curve[0] + steps[::-1] * head, curve, curve[-1] + steps * tail])
-
-
-def _unit(vector: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-    return vector / max(float(np.linalg.norm(vector)), 1e-9)
 
 
 def _forward(path: Float[np.ndarray, "f 2"]) -> Float[np.ndarray, "n 2"]:
@@ -82,7 +79,7 @@ def _forward(path: Float[np.ndarray, "f 2"]) -> Float[np.ndarray, "n 2"]:
 
 def _even(curve: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
     """The same curve, sampled every `_STEP_MM`."""
-    lengths = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+    lengths = lengths_along(curve)
     at = np.arange(0, lengths[-1] + _STEP_MM / 2, _STEP_MM)
     return np.stack([np.interp(at, lengths, curve[:, axis]) for axis in range(2)], axis=1)
 

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -90,6 +91,17 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], *, compressed: bo
     save = np.savez_compressed if compressed else np.savez
     with whole_file(path) as temporary, temporary.open("wb") as stream:
         save(stream, allow_pickle=False, **arrays)
+
+
+def read_arrays(path: Path, *, remedy: str) -> dict[str, np.ndarray]:
+    """The arrays of an ``.npz`` by name. Raises InputError, which names the remedy, where it is missing or damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored}
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); {remedy}") from error
+    except (ValueError, EOFError, BadZipFile) as error:
+        raise InputError(f"{path}: damaged ({error}); {remedy}") from error
 
 
 def to_plain(value: Any) -> Any:

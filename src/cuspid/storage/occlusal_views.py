@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
 from cuspid.capture import read_image
 from cuspid.errors import InputError
 from cuspid.storage.captures import write_image
-from cuspid.storage.files import read_json, reading, write_arrays, write_json
+from cuspid.storage.files import read_arrays, read_json, reading, write_arrays, write_json
 from cuspid.trueness import OcclusalView
 
 OCCLUSAL_VIEW_FILES = ("picture.png", "surface.npz", "view.json")
@@ -31,16 +30,13 @@ def read_occlusal_view(folder: Path) -> OcclusalView:
     if not path.exists():
         raise InputError(f"{folder}: no single shot of the jaw in it; make the truth with cuspid film")
     value = read_json(path)
-    try:
-        with np.load(folder / "surface.npz", allow_pickle=False) as arrays:
-            surface = {name: arrays[name] for name in ("labels", "height_mm")}
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-        raise InputError(f"{folder / 'surface.npz'}: missing or damaged; run cuspid film again") from error
+    surface = read_arrays(folder / "surface.npz", remedy="run cuspid film again")
     with reading(path):
         return OcclusalView(
             image=read_image(folder / "picture.png"),
             mm_per_px=value["mm_per_px"],
             origin_px=np.array(value["origin_px"], dtype=np.float64),
             camera_height_mm=value["camera_height_mm"],
-            **surface,
+            labels=surface["labels"],
+            height_mm=surface["height_mm"],
         )

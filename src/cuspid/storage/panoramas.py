@@ -10,7 +10,6 @@ import csv
 import dataclasses
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import cv2
 import numpy as np
@@ -18,10 +17,11 @@ from jaxtyping import UInt8
 
 from cuspid.errors import InputError, OutputError
 from cuspid.panorama import ZONES, FrameUse, Panorama, Strip
-from cuspid.storage.files import read_json, reading, write_arrays, write_bytes, write_json
+from cuspid.storage.files import read_arrays, read_json, reading, write_arrays, write_bytes, write_json
 from cuspid.storage.tables import write_table
 
 _HEADER = ("method", "mm_per_px", "origin_px", "part", "parts", "notes")
+_SOURCE = ("frame_index", "frame_pixel", "height_mm")
 
 
 def write_panorama(folder: Path, panorama: Panorama) -> None:
@@ -57,10 +57,7 @@ def _header(panorama: Panorama) -> dict[str, Any]:
 
 
 def _source(panorama: Panorama) -> dict[str, np.ndarray]:
-    arrays: dict[str, np.ndarray] = {"frame_index": panorama.frame_index, "frame_pixel": panorama.frame_pixel}
-    if panorama.height_mm is not None:
-        arrays["height_mm"] = panorama.height_mm
-    return arrays
+    return {name: array for name in _SOURCE if (array := getattr(panorama, name)) is not None}
 
 
 def read_panorama(folder: Path) -> Panorama:
@@ -70,22 +67,16 @@ def read_panorama(folder: Path) -> Panorama:
     rgba = cv2.imread(str(folder / "panorama.png"), cv2.IMREAD_UNCHANGED)
     if rgba is None or rgba.ndim != 3 or rgba.shape[2] != 4:
         raise InputError(f"{folder / 'panorama.png'}: missing, or not a panorama's image; run cuspid stitch again")
-    frames, source = _read_frames(folder / "frames.csv"), _read_source(folder / "source.npz")
+    frames = _read_frames(folder / "frames.csv")
+    arrays = read_arrays(folder / "source.npz", remedy="run cuspid stitch again")
     with reading(path):
         if len(frames) != value["frames"]:
             raise InputError(f"{folder / 'frames.csv'}: truncated; run cuspid stitch again")
         header: dict[str, Any] = {name: value[name] for name in _HEADER}
         header |= {"origin_px": np.array(value["origin_px"], dtype=np.float64), "notes": tuple(value["notes"])}
+        source: dict[str, Any] = {name: arrays[name] for name in _SOURCE if name in arrays}
         image = np.asarray(cv2.cvtColor(rgba, cv2.COLOR_BGRA2RGB), dtype=np.uint8)
         return Panorama(image=image, covered=rgba[..., 3] > 0, frames=frames, **header, **source)
-
-
-def _read_source(path: Path) -> dict[str, Any]:
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in ("frame_index", "frame_pixel", "height_mm") if name in arrays}
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
-        raise InputError(f"{path}: missing or damaged; run cuspid stitch again") from error
 
 
 def _read_frames(path: Path) -> tuple[FrameUse, ...]:

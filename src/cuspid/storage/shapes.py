@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float
@@ -12,7 +11,7 @@ from jaxtyping import Float
 from cuspid.errors import InputError
 from cuspid.mesh import Mesh
 from cuspid.shape_model import MeanStep, ShapeModel
-from cuspid.storage.files import read_json, reading, write_arrays, write_json
+from cuspid.storage.files import read_arrays, read_json, reading, write_arrays, write_json
 from cuspid.storage.jaws import read_jaw, write_jaw
 
 
@@ -73,10 +72,6 @@ def read_shape_model(folder: Path) -> ShapeModel:
 
 
 def _read_modes(path: Path) -> tuple[Mesh, Float[np.ndarray, "k v 3"], Float[np.ndarray, "k l 3"]]:
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            return Mesh(stored["vertices"], stored["faces"]), stored["modes"], stored["landmark_modes"]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); make the shape model again") from error
-    except (KeyError, ValueError, BadZipFile) as error:
-        raise InputError(f"{path}: not the modes of a shape model ({error}); make the shape model again") from error
+    stored = read_arrays(path, remedy="make the shape model again")
+    with reading(path):
+        return Mesh(stored["vertices"], stored["faces"]), stored["modes"], stored["landmark_modes"]

@@ -136,7 +136,7 @@ def facing(
     mesh: Mesh, surface: Bool[np.ndarray, "f"], baseline_along: Float[np.ndarray, "3"], distance_mm: float
 ) -> Rigid3:
     """``pair_from_world`` of a pair that looks squarely at the middle of a surface, along its mean normal."""
-    target = np.average(mesh.face_centres[surface], axis=0, weights=mesh.face_areas[surface])
+    target = mesh.centroid(surface)
     axis = -mesh.face_cross[surface].sum(axis=0)
     axis /= np.linalg.norm(axis)
     right = baseline_along - (baseline_along @ axis) * axis

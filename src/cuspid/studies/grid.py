@@ -93,8 +93,7 @@ def run_grid(
     ``results.csv``. Raises InputError for fewer than one worker, where two cases share a name or the cluster cannot be
     reached, MissingDependencyError where Dask is not installed.
     """
-    if workers is not None and workers < 1:
-        raise InputError(f"study: --workers is {workers}; at least one is needed")
+    check_workers(workers)
     names = [case.name for case in cases]
     if len(set(names)) < len(names):
         raise InputError(f"study: two cases are called {next(name for name in names if names.count(name) > 1)}")
@@ -112,6 +111,12 @@ def run_grid(
     ordered = tuple(done[case.name] for case in cases)
     storage.write_bytes(folder / "results.csv", table(ordered).encode())
     return ordered
+
+
+def check_workers(workers: int | None, verb: str = "study") -> None:
+    """Raise InputError where a number of workers is given that is less than one."""
+    if workers is not None and workers < 1:
+        raise InputError(f"{verb}: --workers is {workers}; at least one is needed")
 
 
 def table(outcomes: Sequence[Outcome]) -> str:

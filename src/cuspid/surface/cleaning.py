@@ -9,9 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from cuspid.graph import parts_of
 from cuspid.mesh import Mesh
 
 
@@ -113,9 +112,7 @@ def face_pieces(mesh: Mesh) -> Int[np.ndarray, "f"]:
     face = np.tile(np.arange(len(mesh.faces)), 3)
     order = np.argsort(edge, kind="stable")
     pair = np.flatnonzero(edge[order][1:] == edge[order][:-1])
-    one, other = face[order][pair], face[order][pair + 1]
-    graph = coo_array((np.ones(len(one)), (one, other)), shape=(len(mesh.faces),) * 2)
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+    return parts_of(np.stack([face[order][pair], face[order][pair + 1]], axis=1), len(mesh.faces))
 
 
 def floating_faces(mesh: Mesh, options: CleaningOptions) -> tuple[Bool[np.ndarray, "f"], int]:
@@ -142,9 +139,8 @@ def with_split_fans(mesh: Mesh) -> tuple[Mesh, int]:
     start = [side % count * 3 + side // count for side in (one, other)]
     end = [side % count * 3 + (side // count + 1) % 3 for side in (one, other)]
     # The two faces run along the edge in opposite directions.
-    rows, columns = np.concatenate([start[0], end[0]]), np.concatenate([end[1], start[1]])
-    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(corners, corners))
-    _, fan = connected_components(graph, directed=False)
+    same = np.stack([np.concatenate([start[0], end[0]]), np.concatenate([end[1], start[1]])], axis=1)
+    fan = parts_of(same, corners)
     _, first = np.unique(fan, return_index=True)
     source = mesh.faces.ravel()[first]
     colors = None if mesh.colors is None else mesh.colors[source]
@@ -160,8 +156,7 @@ def boundaries(mesh: Mesh) -> tuple[float, tuple[Hole, ...]]:
     if len(open_sides) == 0:
         return 0.0, ()
     face = np.tile(np.arange(len(mesh.faces)), 3)[alone]
-    graph = coo_array((np.ones(len(open_sides)), tuple(open_sides.T)), shape=(len(mesh.vertices),) * 2)
-    loop = connected_components(graph, directed=False)[1][open_sides[:, 0]]
+    loop = parts_of(open_sides, len(mesh.vertices))[open_sides[:, 0]]
     _, loop = np.unique(loop, return_inverse=True)
     perimeter, area = _loop_measures(mesh.vertices[open_sides], loop)
     piece_of_loop = np.zeros(len(perimeter), dtype=np.int64)

@@ -29,7 +29,7 @@ from cuspid.anatomy.landmarks.tooth_view import Place, ToothView, view_teeth
 from cuspid.anatomy.teeth.dentition import QUADRANTS
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Arch, Jaw, Landmark
-from cuspid.mesh import Mesh
+from cuspid.mesh import Mesh, edges_of
 
 Point = Float[np.ndarray, "3"]
 Points = Float[np.ndarray, "n 3"]
@@ -251,9 +251,8 @@ def _margins(jaw: Jaw) -> dict[int, Points]:
     """Middles of the edges between each tooth and the gum, mm."""
     if jaw.face_labels is None:
         return {}
-    faces = jaw.mesh.faces
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    owner = np.tile(jaw.face_labels, 3)
+    edges = np.sort(edges_of(jaw.mesh.faces), axis=1)
+    owner = np.repeat(jaw.face_labels, 3)
     order = np.lexsort((owner, edges[:, 1], edges[:, 0]))
     edges, owner = edges[order], owner[order]
     # Labels are sorted within equal edges, and that of the gum is the lowest.

@@ -127,7 +127,7 @@ class ToothView:
 def view_teeth(jaw: Jaw, grid_mm: float) -> Mapping[int, ToothView]:
     """Each tooth that has enough surface, in the order along the arch."""
     order = [fdi for fdi in _ARCH_ORDER if fdi in jaw.teeth]
-    centroids = np.array([_centroid(jaw, fdi) for fdi in order])
+    centroids = np.array([jaw.mesh.centroid(jaw.tooth_faces(fdi))[:2] for fdi in order])
     directions = _along(centroids)
     views = {}
     for fdi, direction in zip(order, directions, strict=True):
@@ -135,11 +135,6 @@ def view_teeth(jaw: Jaw, grid_mm: float) -> Mapping[int, ToothView]:
         if view is not None:
             views[fdi] = view
     return views
-
-
-def _centroid(jaw: Jaw, fdi: int) -> Float[np.ndarray, "2"]:
-    faces = jaw.tooth_faces(fdi)
-    return np.average(jaw.mesh.face_centres[faces, :2], axis=0, weights=jaw.mesh.face_areas[faces])
 
 
 def _along(centroids: Float[np.ndarray, "t 2"]) -> Float[np.ndarray, "t 2"]:
@@ -162,7 +157,7 @@ def _axes(fdi: int, direction: Float[np.ndarray, "2"], centroid: Float[np.ndarra
 def _view(jaw: Jaw, fdi: int, direction: Float[np.ndarray, "2"], grid_mm: float) -> ToothView | None:
     faces = jaw.mesh.faces[jaw.tooth_faces(fdi)]
     vertices: Int[np.ndarray, "k"] = np.unique(faces)
-    axes = _axes(fdi, direction, _centroid(jaw, fdi))
+    axes = _axes(fdi, direction, jaw.mesh.centroid(jaw.tooth_faces(fdi))[:2])
     local = jaw.mesh.vertices[vertices] @ axes.T
     low, high = local[:, :2].min(axis=0), local[:, :2].max(axis=0)
     middle = np.array([*(low + high) / 2, 0.0])

@@ -6,10 +6,9 @@ they stand in; the `solid` is their union. Frames: see `arrangement`.
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from cuspid.anatomy.edges import edges_of, graph_of, neighbours_of
+from cuspid.anatomy.edges import neighbours_of
 from cuspid.anatomy.phantom.arrangement import PlacedTooth, place_teeth, vary_teeth
 from cuspid.anatomy.phantom.gum import Gum
 from cuspid.anatomy.phantom.isosurface import (
@@ -24,8 +23,9 @@ from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.phantom.solid import Solid
 from cuspid.anatomy.phantom.surface_points import landmarks_of, papilla
 from cuspid.anatomy.teeth.crowns import Points
+from cuspid.graph import parts_of
 from cuspid.jaw import Jaw, Landmark
-from cuspid.mesh import Mesh
+from cuspid.mesh import Mesh, edges_of
 
 
 def build_phantom(options: PhantomOptions = PhantomOptions()) -> Jaw:
@@ -114,7 +114,7 @@ def _one_patch_each(faces: Int[np.ndarray, "f 3"], labels: Int[np.ndarray, "f"])
     pairs = neighbours_of(faces)
     for _ in range(3):
         same = pairs[labels[pairs[:, 0]] == labels[pairs[:, 1]]]
-        _, patch = connected_components(graph_of(same, len(faces)), directed=False)
+        patch = parts_of(same, len(faces))
         size = np.bincount(patch)
         largest = np.zeros(labels.max() + 1, dtype=np.int64)
         np.maximum.at(largest, labels, size[patch])

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from cuspid.anatomy.phantom.arrangement import PlacedTooth
 from cuspid.anatomy.teeth.crowns import Crown, Points, Values, silhouettes, smooth_max, smooth_min
+from cuspid.geometry import lengths_along
 
 ROOT = 0.7
 """Length of the root that is modelled, as a fraction of the crown height; it ends inside the gum."""
@@ -40,7 +41,7 @@ class Gum:
         knots = np.vstack([first, cervices, last])
         widths = np.array([placed.tooth.crown.half_depth_mm for placed in teeth])
         table = np.column_stack([knots, np.pad(widths, 1, mode="edge")])
-        run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots[:, :2], axis=0), axis=1))])
+        run = lengths_along(knots[:, :2])
         samples = CubicSpline(run, table)(np.linspace(0.0, run[-1], 1200))
         return Gum(
             path=samples[:, :2],

@@ -8,11 +8,11 @@ from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
-from cuspid.anatomy.edges import edges_of, graph_of
 from cuspid.anatomy.teeth.crowns import Points, Values
+from cuspid.graph import graph_of, parts_of
+from cuspid.mesh import edges_of
 
 Field = Callable[[Points], Values]
 """Signed distance in mm, shape (n,), of points (n, 3); negative inside."""
@@ -73,7 +73,7 @@ def _largest_part(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
     """The connected part with the most vertices: the outer surface, without enclosed voids."""
-    _, part = connected_components(graph_of(edges_of(faces), len(vertices)), directed=False)
+    part = parts_of(edges_of(faces), len(vertices))
     keep = part == np.bincount(part).argmax()
     renumbered = np.cumsum(keep) - 1
     return vertices[keep], renumbered[faces[keep[faces[:, 0]]]]

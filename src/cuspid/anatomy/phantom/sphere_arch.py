@@ -23,6 +23,7 @@ from scipy.interpolate import CubicSpline
 
 from cuspid.anatomy.teeth.dentition import ARCH_FORMS, ArchForm
 from cuspid.errors import InputError
+from cuspid.geometry import lengths_along
 from cuspid.jaw import GUM, Arch, Jaw, Sphere
 from cuspid.mesh import Mesh
 
@@ -116,7 +117,7 @@ def _quadrant(form: ArchForm, depth_mm: float) -> Float[np.ndarray, "7 2"]:
     """Places of one side from the midline backwards: canine and molars by their widths, the others evenly between."""
     width = form.inter_second_molar_mm
     line = _beta_form(width, depth_mm)
-    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    length = lengths_along(line)
     canine, first, second = np.interp(
         [form.inter_canine_mm / 2, form.inter_first_molar_mm / 2, width / 2], line[:, 0], length
     )
@@ -165,7 +166,7 @@ def _ridge(options: SphereArchOptions, centres: Float[np.ndarray, "n 3"]) -> Man
 
 def _through(centres: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
     """A smooth line through the centres, finely sampled."""
-    run = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1))])
+    run = lengths_along(centres)
     return np.asarray(CubicSpline(run, centres)(np.linspace(0, run[-1], round(run[-1] / _RIDGE_STEP_MM))))
 
 

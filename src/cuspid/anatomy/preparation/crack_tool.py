@@ -16,6 +16,7 @@ from jaxtyping import Float
 from cuspid.anatomy.booleans import CAVITY, OUTSIDE, Tool
 from cuspid.anatomy.preparation.tooth_site import ToothSite, outward
 from cuspid.errors import InputError
+from cuspid.geometry import lengths_along
 
 WANDER_MM = 0.18
 """How far the slit strays to either side."""
@@ -44,7 +45,7 @@ def crack_tool(site: ToothSite, shape: CrackShape) -> Tool:
         raise InputError(
             f"tooth {site.fdi}: a crack {1000 * shape.depth_mm:g} um deep reaches below the gum; make it shallower"
         )
-    run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1))])
+    run = lengths_along(path[:, :2])
     fade = np.clip(np.minimum(run, run[-1] - run) / FADE_MM, 0.12, 1.0)
     return _wedge(path, fade * shape.depth_mm, fade * shape.width_mm / 2)
 

@@ -19,11 +19,11 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from cuspid.anatomy.booleans import CAVITY, OUTSIDE, ROOT, TROUGH, Tool
-from cuspid.anatomy.edges import edges_of
 from cuspid.anatomy.preparation.tooth_site import TURNS, Heights, ToothSite, round_means
 from cuspid.anatomy.teeth.crowns import smooth_max, smooth_min, smooth_step
 from cuspid.errors import InputError
-from cuspid.mesh import Mesh
+from cuspid.geometry import lengths_along
+from cuspid.mesh import Mesh, edges_of
 
 EMERGENCE = 0.09
 """How far the proximal side at the finish line stands back from the contact, as a share of the crown's width: two
@@ -194,7 +194,7 @@ def _profile(
 
 def _rounded(shape: CrownShape, corners: Float[np.ndarray, "c 2"]) -> Float[np.ndarray, "rows 2"]:
     """A profile resampled evenly, the inner corner rounded by the chamfer, the outer one by the edge radius."""
-    run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    run = lengths_along(corners)
     even = np.linspace(0.0, run[-1], _ROWS)
     points = np.column_stack([np.interp(even, run, corners[:, k]) for k in range(2)])
     step = even[1]

@@ -24,16 +24,16 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from cuspid.anatomy.booleans import CAVITY, TROUGH, Cut, Tool, closed, rim_of, subtract
-from cuspid.anatomy.edges import graph_of, neighbours_of
+from cuspid.anatomy.edges import neighbours_of
 from cuspid.anatomy.preparation.crack_tool import CrackShape, crack_tool
 from cuspid.anatomy.preparation.crown_tool import CrownShape, crown_tool
 from cuspid.anatomy.preparation.inlay_tool import InlayShape, inlay_tool
 from cuspid.anatomy.preparation.tooth_site import ToothSite, site_of
 from cuspid.errors import InputError
+from cuspid.graph import parts_of
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
 
@@ -294,7 +294,7 @@ def _assembled(jaw: Jaw, preparations: Mapping[int, PreparationOptions], tools: 
 def _apart(mesh: Mesh, mine: Bool[np.ndarray, "f"]) -> Bool[np.ndarray, "f"]:
     """Faces of a tooth that no longer hang together with most of it: what is left of its side of a contact."""
     pairs = neighbours_of(mesh.faces)
-    _, patch = connected_components(graph_of(pairs[mine[pairs].all(axis=1)], len(mine)), directed=False)
+    patch = parts_of(pairs[mine[pairs].all(axis=1)], len(mine))
     return mine & (patch != np.bincount(patch[mine]).argmax())
 
 

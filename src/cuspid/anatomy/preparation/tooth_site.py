@@ -16,12 +16,11 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, gaussian_filter, gaussian_filter1d, map_coordinates
 from scipy.spatial import cKDTree
 
-from cuspid.anatomy.edges import edges_of
 from cuspid.anatomy.landmarks.scheme import ToothKind, kind_of
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw
-from cuspid.mesh import Mesh
+from cuspid.mesh import Mesh, edges_of
 
 TURNS = 240
 """Directions round the axis in which a tooth is described."""
@@ -243,15 +242,11 @@ def _neighbours(jaw: Jaw, fdi: int) -> list[int]:
     return before + [tooth for tooth in arch[at + 1 :] if tooth in there][:1]
 
 
-def _centroid(mesh: Mesh, faces: Bool[np.ndarray, "f"]) -> Float[np.ndarray, "3"]:
-    return np.average(mesh.face_centres[faces], axis=0, weights=mesh.face_areas[faces])
-
-
 def _frame(jaw: Jaw, fdi: int, mine: Bool[np.ndarray, "f"], gum: Float[np.ndarray, "g 3"]) -> tuple[Rigid3, float]:
     """The frame of a site, and the sign of x that is distal."""
-    centre = _centroid(jaw.mesh, mine)
+    centre = jaw.mesh.centroid(mine)
     z = _long_axis(jaw.mesh.face_normals[mine], jaw.mesh.face_areas[mine])
-    others = [_centroid(jaw.mesh, jaw.tooth_faces(other)) for other in _neighbours(jaw, fdi)]
+    others = [jaw.mesh.centroid(jaw.tooth_faces(other)) for other in _neighbours(jaw, fdi)]
     outwards = centre * [1.0, 1.0, 0.0] if np.hypot(*centre[:2]) > 1 else np.array([0.0, 1.0, 0.0])
     along = {0: np.cross(outwards, z), 1: others[0] - centre if others else z}.get(
         len(others), others[-1] - others[0] if others else z

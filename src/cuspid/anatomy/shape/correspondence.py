@@ -21,7 +21,7 @@ from scipy.stats import binom
 
 from cuspid.anatomy.shape.procrustes import dimension
 from cuspid.jaw import GUM
-from cuspid.mesh import Mesh
+from cuspid.mesh import Mesh, edges_of
 
 _ON_BORDER = 0.7
 """A partner on the rim of a patch counts only if the way to it leaves the patch at least this steeply (sine)."""
@@ -124,7 +124,7 @@ class Template:
 
 
 def _averaging(faces: Int[np.ndarray, "f 3"], count: int) -> csr_array:
-    sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    sides = edges_of(faces)
     both = np.concatenate([sides, sides[:, ::-1]])
     adjacency = csr_array((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count))
     adjacency.data[:] = 1.0
@@ -162,7 +162,7 @@ class Target:
 
 
 def _patch(mesh: Mesh) -> Patch:
-    sides = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
+    sides = np.sort(edges_of(mesh.faces), axis=1)
     _, first, count = np.unique(sides[:, 0] * len(mesh.vertices) + sides[:, 1], return_index=True, return_counts=True)
     rim = np.zeros(len(mesh.vertices), dtype=bool)
     rim[sides[first[count == 1]]] = True
@@ -171,12 +171,12 @@ def _patch(mesh: Mesh) -> Patch:
 
 def _border_points(mesh: Mesh, labels: Int[np.ndarray, "f"]) -> dict[Border, cKDTree]:
     """Points along the edges whose two faces have different labels, by the two labels."""
-    sides = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
+    sides = np.sort(edges_of(mesh.faces), axis=1)
     key = sides[:, 0] * len(mesh.vertices) + sides[:, 1]
     order = np.argsort(key, kind="stable")
     twins = np.flatnonzero(key[order][1:] == key[order][:-1])
     one, other = order[twins], order[twins + 1]
-    pairs = np.sort(np.stack([labels[one % len(labels)], labels[other % len(labels)]], axis=1), axis=1)
+    pairs = np.sort(np.stack([labels[one // 3], labels[other // 3]], axis=1), axis=1)
     share = (np.arange(_PER_EDGE) + 0.5)[:, None] / _PER_EDGE
     trees = {}
     for a, b in np.unique(pairs[pairs[:, 0] < pairs[:, 1]], axis=0):

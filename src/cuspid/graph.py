@@ -1,0 +1,18 @@
+"""Things, by number, that are tied in pairs: which of them hang together."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+
+def graph_of(pairs: Int[np.ndarray, "p 2"], count: int) -> coo_array:
+    """Adjacency matrix (count, count) of the given pairs."""
+    return coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+
+
+def parts_of(pairs: Int[np.ndarray, "p 2"], count: int) -> Int[np.ndarray, "n"]:
+    """For each of ``count`` things the number of the part that it belongs to; parts are what no pair ties."""
+    return np.asarray(connected_components(graph_of(pairs, count), directed=False)[1], dtype=np.int64)
