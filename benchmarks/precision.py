@@ -38,7 +38,7 @@ from cuspid.handpiece.presets import PRESETS
 from cuspid.jaw import Jaw
 from cuspid.reporting.figures.precision import save_ellipsoids_picture, save_precision_picture
 from cuspid.rig import Handpiece, MountedCamera
-from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path
+from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 from cuspid.storage import write_json
 from cuspid.studies.camera_pair import camera_pair
 

@@ -23,17 +23,17 @@ from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.surfaces import named_surfaces
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import twelve_cameras
-from cuspid.handpiece.visibility import (
-    VisibilityOptions,
-    scannable_faces,
-    survey_visibility,
-    visible_counts,
-)
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
 from cuspid.storage import write_json
 from cuspid.thesis.samples import path_over, surfaces_seen
+from cuspid.visibility import (
+    VisibilityOptions,
+    scannable_faces,
+    survey_visibility,
+    visible_counts,
+)
 
 EDGE_MM = 0.29
 """Edges that give the phantom about 200 000 faces."""

@@ -11,8 +11,8 @@ from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
-from cuspid.handpiece.visibility import VisibilityOptions
-from cuspid.simulation.scan_path import ScanPathOptions
+from cuspid.simulation.path.scan import ScanPathOptions
+from cuspid.visibility import VisibilityOptions
 
 folder = Path(sys.argv[1])
 

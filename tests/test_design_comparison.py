@@ -16,7 +16,7 @@ from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DesignOptions, essential_four, six_cameras, twelve_cameras
 from cuspid.mesh import Mesh
 from cuspid.pipeline import SimulationOptions
-from cuspid.simulation.scan_path import ScanPathOptions
+from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.studies.design_comparison import (
     ComparisonOptions,
     compare_designs,

@@ -12,8 +12,8 @@ from cuspid.cli import main
 from cuspid.errors import InputError
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
 from cuspid.jaw import Jaw
-from cuspid.simulation.free_path import REACH, FreePathOptions, hand_noise, plan_free_path
-from cuspid.simulation.scan_path import arch_curve
+from cuspid.simulation.path.free import REACH, FreePathOptions, hand_noise, plan_free_path
+from cuspid.simulation.path.scan import arch_curve
 from verbs import refused
 
 CAMERA = intra_oral_camera()

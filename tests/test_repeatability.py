@@ -16,7 +16,7 @@ from cuspid.mesh import Mesh
 from cuspid.pipeline import SimulationOptions
 from cuspid.reporting.figures.repeat import save_repeat_picture
 from cuspid.reporting.pages.report import report_page
-from cuspid.simulation.scan_path import ScanPathOptions
+from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.studies.design_comparison import with_smaller_images
 from cuspid.studies.grid import Outcome
 from cuspid.studies.repetition import (

@@ -11,26 +11,25 @@ import pytest
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DesignOptions, essential_four, six_cameras, twelve_cameras
-from cuspid.handpiece.visibility import VisibilityOptions, scannable_faces
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece, Rig
-from cuspid.simulation.scan_path import (
-    ArchCurve,
-    ScanPath,
-    ScanPathOptions,
-    _hand_motion,
-    arch_curve,
-    image_overlap,
-    plan_scan_path,
-    steady_poses,
-)
+from cuspid.simulation.path.arch import ArchCurve, arch_curve
+from cuspid.simulation.path.hand import HandMotion, hand_motion
+from cuspid.simulation.path.overlap import image_overlap
+from cuspid.simulation.path.scan import ScanPath, ScanPathOptions, plan_scan_path, steady_poses
+from cuspid.visibility import VisibilityOptions, scannable_faces
 
 STILL = ScanPathOptions(tooth=46, jitter_mm=0.0, jitter_deg=0.0)
 
 
 def plan(jaw: Jaw, options: ScanPathOptions, handpiece: Handpiece | None = None, seed: int = 0) -> ScanPath:
     return plan_scan_path(jaw, handpiece or twelve_cameras(), options, np.random.default_rng(seed))
+
+
+def hand_of(options: ScanPathOptions, span_mm: tuple[float, float]) -> HandMotion:
+    jitter = {name: getattr(options, name) for name in ("jitter_mm", "jitter_deg", "jitter_length_mm")}
+    return hand_motion(span_mm, np.random.default_rng(0), **jitter)
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +174,7 @@ def test_without_jitter_the_handpiece_rides_on_the_curve(coarse_phantom: Jaw, cu
 
 def test_jitter_has_the_asked_deviation_and_is_smooth() -> None:
     options = ScanPathOptions(jitter_mm=0.2, jitter_deg=1.0, jitter_length_mm=5.0)
-    hand = _hand_motion((0.0, 5000.0), options, np.random.default_rng(0))
+    hand = hand_of(options, (0.0, 5000.0))
     np.testing.assert_allclose(hand.drift[:, 3:].std(axis=0), 0.2, rtol=0.1)
     np.testing.assert_allclose(np.rad2deg(hand.drift[:, :3].std(axis=0)), 1.0, rtol=0.1)
     step = 1.0
@@ -221,7 +220,7 @@ def test_one_turn_is_the_path_along_the_curve_to_the_last_bit(coarse_phantom: Ja
     curve, path = arch_curve(coarse_phantom), plan(coarse_phantom, options)
     start, end = curve.span_of(coarse_phantom.mesh.face_centres[coarse_phantom.tooth_faces(46)])
     stretch = (start + end) / 2 - 4.5, (start + end) / 2 + 4.5
-    hand = _hand_motion(stretch, options, np.random.default_rng(0))
+    hand = hand_of(options, stretch)
     for name, at in (("00000", stretch[0]), ("00009", stretch[1])):
         expected = hand.at(at) @ curve.rig_from_world(at)
         np.testing.assert_array_equal(path.rig_from_world[name].matrix, expected.matrix)

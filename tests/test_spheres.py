@@ -24,7 +24,7 @@ from cuspid.handpiece.designs import twelve_cameras
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.reporting.figures.sphere import save_sphere_picture
-from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path
+from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 
 COARSE = SphereArchOptions(edge_mm=0.45)
 

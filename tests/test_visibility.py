@@ -15,20 +15,20 @@ from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import essential_four, twelve_cameras
+from cuspid.handpiece.optics import in_focus
 from cuspid.handpiece.presets import PRESETS
-from cuspid.handpiece.visibility import (
+from cuspid.jaw import Jaw
+from cuspid.mesh import Mesh
+from cuspid.rig import Handpiece, MountedCamera, Rig
+from cuspid.visibility import (
     VisibilityOptions,
     camera_rows,
-    in_focus,
     scannable_faces,
     surface_rows,
     survey_visibility,
     visible_counts,
     visible_faces,
 )
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
-from cuspid.rig import Handpiece, MountedCamera, Rig
 
 CAMERA = Camera.from_field_of_view(500, 500, 62.0)
 DEPTHS = (2.5, 9.0)

@@ -24,7 +24,6 @@ from jaxtyping import Bool
 from cuspid import storage
 from cuspid.capture import Capture
 from cuspid.evaluation.deviation import EvaluationOptions, evaluate
-from cuspid.handpiece.visibility import VisibilityOptions, scannable_faces
 from cuspid.image_sequence import ImageSequence
 from cuspid.jaw import Arch, Jaw
 from cuspid.mesh import Mesh
@@ -43,6 +42,7 @@ from cuspid.surface.cleaning import CleaningOptions
 from cuspid.surface.fusion import FusionOptions
 from cuspid.surface.stage import fuse
 from cuspid.trueness import GroundTruth
+from cuspid.visibility import VisibilityOptions, scannable_faces
 
 __all__ = [
     "EvaluationOptions",

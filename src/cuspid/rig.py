@@ -8,15 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import combinations
 from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float
 
+from cuspid.body import CAMERA_MM, LED_MM, Body, module
 from cuspid.camera import Camera
 from cuspid.errors import InputError
-from cuspid.geometry import Rigid3, read_only
+from cuspid.geometry import Rigid3, axes_about, read_only
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +140,12 @@ class Light:
         object.__setattr__(self, "position_mm", read_only(np.asarray(self.position_mm, dtype=np.float64)))
         object.__setattr__(self, "colour", read_only(np.asarray(self.colour, dtype=np.float64)))
 
+    @property
+    def light_from_rig(self) -> Rigid3:
+        """A frame at the light whose +Z is its axis."""
+        turn = axes_about(self.direction)
+        return Rigid3(turn, -turn @ self.position_mm)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
@@ -177,6 +185,8 @@ class Handpiece:
     """Nominal distance from a camera to the surface that it looks at."""
     depth_range_mm: tuple[float, float] = (2.5, 9.0)
     """Nearest and farthest depth in a camera that is in focus."""
+    body: Body | None = None
+    """What takes up room; None where that is not known."""
     name: str = "handpiece"
     """For people."""
 
@@ -190,6 +200,15 @@ class Handpiece:
             raise InputError(
                 f"handpiece: depth range {near}-{far} mm must enclose the working distance {self.working_distance_mm}"
             )
+
+    @cached_property
+    def solid(self) -> Body:
+        """The body; where it is not known, a box behind each lens and each LED, of the size of miniature ones."""
+        if self.body is not None:
+            return self.body
+        cameras = {f"camera {name}": module(each.cam_from_rig, CAMERA_MM) for name, each in self.rig.cameras.items()}
+        leds = {f"light {name}": module(light.light_from_rig, LED_MM) for name, light in self.lights.items()}
+        return Body({**cameras, **leds})
 
     def lights_on(self, lighting: str | None) -> list[Light]:
         """The lights of a lighting pattern; all of them where the pattern is not known (None).

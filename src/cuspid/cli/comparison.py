@@ -19,7 +19,7 @@ from cuspid.errors import InputError
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.reporting.figures.comparison import Curve, save_comparison_picture, save_surface_shares_picture
 from cuspid.simulation.appearance import Preset
-from cuspid.simulation.scan_path import ScanPathOptions
+from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.studies.design_comparison import (
     GIVES,
     NEEDS,

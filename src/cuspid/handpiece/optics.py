@@ -8,7 +8,7 @@ what says otherwise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from cuspid.camera import Camera
 from cuspid.errors import InputError
+from cuspid.rig import Handpiece
 
 GREEN_UM = 0.55
 """Wavelength for which diffraction is given."""
@@ -131,3 +132,11 @@ class Optics:
     def parallel_overlap(self, baseline_mm: float, distance_mm: float) -> float:
         """Share (0 to 1) of the footprint at a distance that two parallel cameras share, along their baseline."""
         return max(0.0, 1 - baseline_mm / self.footprint_mm(distance_mm)[0])
+
+
+def in_focus(handpiece: Handpiece, optics: Optics, blur_px: float) -> Handpiece:
+    """The handpiece with the depth range in which its lenses draw a point no wider than ``blur_px``.
+
+    Raises InputError where the working distance lies outside that range.
+    """
+    return replace(handpiece, depth_range_mm=optics.depth_of_field_mm(blur_px))

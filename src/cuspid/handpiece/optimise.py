@@ -28,10 +28,10 @@ from cuspid.handpiece.brief import DesignBrief
 from cuspid.handpiece.family import BOUNDS, LAYOUTS, Layout, Shape, build_handpiece
 from cuspid.handpiece.optics import Optics
 from cuspid.handpiece.precision import NoiseModel, bound_rms_um, noise_px, projection_jacobian
-from cuspid.handpiece.visibility import VisibilityOptions, visible_faces
 from cuspid.mesh import Mesh
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, MountedCamera
+from cuspid.visibility import VisibilityOptions, visible_faces
 
 _REACH_MM = 11.0
 """Of the mesh around the middle of a tooth, so much is kept on all sides."""

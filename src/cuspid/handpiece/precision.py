@@ -25,9 +25,9 @@ from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, read_only
 from cuspid.handpiece.optics import Optics
-from cuspid.handpiece.visibility import VisibilityOptions, survey_visibility
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece, MountedCamera
+from cuspid.visibility import VisibilityOptions, survey_visibility
 
 
 @dataclass(frozen=True, kw_only=True)

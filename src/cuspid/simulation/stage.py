@@ -18,15 +18,15 @@ from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece
 from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.blender import render_with_blender
-from cuspid.simulation.free_path import FreePathOptions, plan_free_path
 from cuspid.simulation.occlusal import OcclusalOptions, render_occlusal_view
+from cuspid.simulation.path.free import FreePathOptions, plan_free_path
+from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 from cuspid.simulation.raycast import Scene, lit_frames, render_capture
-from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path
 from cuspid.storage.captures import write_capture, write_image
 from cuspid.storage.files import digest_of, hash_file
 from cuspid.storage.occlusal_views import OCCLUSAL_VIEW_FILES, write_occlusal_view
 from cuspid.storage.stages import Stage
-from cuspid.storage.truths import write_overlap, write_truth
+from cuspid.storage.truths import write_path, write_truth
 from cuspid.trueness import GroundTruth
 from cuspid.workers import usable_cores
 
@@ -81,7 +81,7 @@ def simulate(
     Images that are there already are kept; a run that goes on gives the same bits as one that was not interrupted.
     """
     path = plan_scan_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
-    write_overlap(folder / "truth" / "path.json", path.minimum_overlap, path.mean_overlap)
+    write_path(folder / "truth" / "path.json", path.minimum_overlap, path.mean_overlap, path.seen)
     return take_images(jaw, handpiece, path.rig_from_world, folder, options, progress=progress)
 
 

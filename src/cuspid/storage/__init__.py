@@ -49,7 +49,7 @@ from cuspid.storage.sequences import read_sequence
 from cuspid.storage.shapes import read_shape_model, write_shape_model
 from cuspid.storage.tables import csv_table, write_table
 from cuspid.storage.trueness import trueness_summary, write_trueness
-from cuspid.storage.truths import read_truth, write_overlap, write_truth
+from cuspid.storage.truths import read_truth, write_path, write_truth
 from cuspid.storage.videos import write_video
 
 __all__ = [
@@ -104,8 +104,8 @@ __all__ = [
     "write_landmarks",
     "write_mesh",
     "write_occlusal_view",
-    "write_overlap",
     "write_panorama",
+    "write_path",
     "write_poses",
     "write_reconstruction",
     "write_rig_config",

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
+from cuspid.jaw import GUM
 from cuspid.storage.files import write_json
 from cuspid.storage.handpieces import read_handpiece, write_handpiece
 from cuspid.storage.jaws import read_jaw, write_jaw
@@ -27,6 +29,10 @@ def read_truth(folder: Path) -> GroundTruth:
     )
 
 
-def write_overlap(path: Path, minimum: float, mean: float) -> None:
-    """Write the share of the surface in an image that the same camera's next image also sees."""
-    write_json(path, {"minimum_overlap": minimum, "mean_overlap": mean})
+def write_path(path: Path, minimum_overlap: float, mean_overlap: float, seen: Mapping[int, float]) -> None:
+    """Write what is known of a path before anything is rendered.
+
+    ``seen`` is about the share of each crown that two cameras see at once, by FDI number; 0 stands for all crowns.
+    """
+    shares = {"all" if tooth == GUM else str(tooth): share for tooth, share in seen.items()}
+    write_json(path, {"minimum_overlap": minimum_overlap, "mean_overlap": mean_overlap, "crowns_seen": shares})

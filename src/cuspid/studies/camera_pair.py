@@ -35,11 +35,11 @@ from cuspid.handpiece.precision import (
     noise_px,
 )
 from cuspid.handpiece.presets import PRESETS
-from cuspid.handpiece.visibility import VisibilityOptions, visible_faces
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.progress import Progress, silent
 from cuspid.rig import MountedCamera, Rig
+from cuspid.visibility import VisibilityOptions, visible_faces
 
 Direction = Literal["across", "along"]
 """How the baseline lies: across the arch (for a side of a tooth: up and down), or along it."""

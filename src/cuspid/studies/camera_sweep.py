@@ -5,7 +5,7 @@ the mesh is judged on the faces of the named surface alone. What one pass of the
 :mod:`cuspid.studies.camera_pair` is the theory of the same.
 
 Frames: ``pair`` as there: origin midway between the projection centres, +X along the baseline, +Z where the pair looks.
-``rig`` as in :mod:`cuspid.simulation.scan_path`: it rides along the arch. The pair is mounted so that in the middle of
+``rig`` as in :mod:`cuspid.simulation.path.scan`: it rides along the arch. The pair is mounted so that in the middle of
 the path it looks squarely at the middle of the surface.
 """
 
@@ -36,13 +36,9 @@ from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 from cuspid.simulation.appearance import Preset
-from cuspid.simulation.scan_path import (
-    ScanPathOptions,
-    check_clearance,
-    image_overlap,
-    plan_scan_path,
-    steady_poses,
-)
+from cuspid.simulation.path.overlap import image_overlap
+from cuspid.simulation.path.room import Room, check_clearance
+from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path, steady_poses
 from cuspid.stereo.temporal import TemporalOptions
 from cuspid.studies.camera_pair import Direction, baseline_axis, camera_pair, facing
 from cuspid.studies.grid import Case, Outcome, Value, run_grid
@@ -282,7 +278,7 @@ def sweep_case(
     begin = time.process_time()
     handpiece = pair_handpiece(site.pair_from_rig, (baseline_mm, angle_deg), options)
     poses = site.rig_from_world[seed]
-    check_clearance(site.jaw.mesh, handpiece, poses, options.path.clearance_mm)
+    check_clearance(Room(site.jaw.mesh, handpiece.solid), poses, options.path.clearance_mm)
     overlap = image_overlap(site.jaw.mesh, handpiece, list(poses.values()))
     how = TrialOptions(
         simulation=SimulationOptions(texture=options.texture, supersampling=options.supersampling, seed=seed),

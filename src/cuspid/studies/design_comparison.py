@@ -46,7 +46,7 @@ from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, Rig
-from cuspid.simulation.scan_path import ScanPathOptions, steady_poses
+from cuspid.simulation.path.scan import ScanPathOptions, steady_poses
 from cuspid.studies.grid import Case, Outcome, Value, run_grid
 from cuspid.studies.trial import TrialOptions, run_trial
 

@@ -11,10 +11,10 @@ from cuspid.anatomy.surfaces import named_surfaces
 from cuspid.handpiece.brief import DesignBrief
 from cuspid.handpiece.optimise import Section
 from cuspid.handpiece.precision import NoiseModel, PrecisionMap, at_best, precision_map
-from cuspid.handpiece.visibility import Visibility, VisibilityOptions, survey_visibility
 from cuspid.jaw import Jaw
 from cuspid.rig import Handpiece
-from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path, steady_poses
+from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path, steady_poses
+from cuspid.visibility import Visibility, VisibilityOptions, survey_visibility
 
 
 def room_for(brief: DesignBrief, mouth: MouthOptions) -> float:

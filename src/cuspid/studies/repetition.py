@@ -28,7 +28,7 @@ from cuspid.mesh import Mesh
 from cuspid.pipeline import SimulationOptions
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece
-from cuspid.simulation.scan_path import plan_scan_path
+from cuspid.simulation.path.scan import plan_scan_path
 from cuspid.studies.grid import Case, Outcome, Value, run_grid
 from cuspid.studies.trial import TrialOptions, run_trial
 from cuspid.trueness import GroundTruth

@@ -17,13 +17,13 @@ from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.evaluation.distance import Surface
 from cuspid.evaluation.registration import fit
 from cuspid.geometry import Rigid3
-from cuspid.handpiece.visibility import VisibilityOptions
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.reconstruction import Reconstruction
 from cuspid.rig import Handpiece
 from cuspid.trueness import GroundTruth, Trueness
+from cuspid.visibility import VisibilityOptions
 
 Shoot = Callable[[Path], tuple[Capture, GroundTruth]]
 """Writes images to a folder."""

@@ -19,12 +19,12 @@ from cuspid.anatomy.surfaces import named_surfaces
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import essential_four, twelve_cameras
-from cuspid.handpiece.visibility import VisibilityOptions, surface_rows, survey_visibility
 from cuspid.jaw import Jaw, Landmark
 from cuspid.rig import Handpiece
 from cuspid.shape_model import ShapeModel
-from cuspid.simulation.scan_path import ScanPathOptions, plan_scan_path
+from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 from cuspid.studies.camera_pair import CameraPairOptions, best_pairs, study_camera_pair
+from cuspid.visibility import VisibilityOptions, surface_rows, survey_visibility
 
 MEAN_GROUP: GroupName = "lower-14"
 """Whose mean shape is found."""

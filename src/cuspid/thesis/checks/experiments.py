@@ -26,9 +26,9 @@ from cuspid.motion.features import detect
 from cuspid.motion.pairs import match_unguided
 from cuspid.rig import Handpiece
 from cuspid.simulation.appearance import APPEARANCES, Preset
-from cuspid.simulation.free_path import FreePathOptions, plan_free_path
+from cuspid.simulation.path.free import FreePathOptions, plan_free_path
+from cuspid.simulation.path.scan import ScanPathOptions, steady_poses
 from cuspid.simulation.raycast import Scene, lit_frames, metered_gains, render_image
-from cuspid.simulation.scan_path import ScanPathOptions, steady_poses
 from cuspid.stitching.examination import ExaminationOptions, examine
 from cuspid.stitching.normal_map import LIGHT, grey_normal_map, normal_map, rectify
 from cuspid.stitching.shading import ShadingOptions, shape_from_shading

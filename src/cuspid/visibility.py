@@ -9,7 +9,7 @@ mesh.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import no_type_check
 
 import numpy as np
@@ -19,7 +19,6 @@ from numba import njit
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, read_only
-from cuspid.handpiece.optics import Optics
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
 
@@ -65,14 +64,6 @@ class Visibility:
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
 
-def in_focus(handpiece: Handpiece, optics: Optics, blur_px: float) -> Handpiece:
-    """The handpiece with the depth range in which its lenses draw a point no wider than ``blur_px``.
-
-    Raises InputError where the working distance lies outside that range.
-    """
-    return replace(handpiece, depth_range_mm=optics.depth_of_field_mm(blur_px))
-
-
 def scannable_faces(
     mesh: Mesh, handpiece: Handpiece, rig_from_world: Iterable[Rigid3], options: VisibilityOptions
 ) -> Bool[np.ndarray, "f"]:
@@ -88,12 +79,19 @@ def scannable_faces(
 
 
 def visible_counts(
-    mesh: Mesh, handpiece: Handpiece, rig_from_world: Iterable[Rigid3], options: VisibilityOptions
+    mesh: Mesh,
+    handpiece: Handpiece,
+    rig_from_world: Iterable[Rigid3],
+    options: VisibilityOptions,
+    among: Bool[np.ndarray, "f"] | None = None,
 ) -> Int[np.ndarray, "f"]:
-    """For each face: the largest number of cameras that see it at once."""
+    """For each face: the largest number of cameras that see it at once; 0 for those that are not ``among`` them."""
     most = np.zeros(len(mesh.faces), dtype=np.int64)
-    for faces, seen, _ in _at_each_pose(mesh, handpiece, rig_from_world, options):
-        most[faces] = np.maximum(most[faces], seen.sum(axis=1))
+    views = _views(handpiece)
+    for pose in rig_from_world:
+        near = _within_reach(mesh, views, pose)
+        faces = near if among is None else near[among[near]]
+        most[faces] = np.maximum(most[faces], _seen(mesh, views, pose, options, faces).sum(axis=1))
     return most
 
 
@@ -202,17 +200,16 @@ def _views(handpiece: Handpiece) -> tuple[_View, ...]:
 
 
 def _view(camera: Camera, cam_from_rig: Rigid3, depth_range_mm: tuple[float, float]) -> _View:
-    """Bounds from rays through the border of the image."""
+    low, high = slope_bounds(camera)
+    return _View(camera=camera, cam_from_rig=cam_from_rig, depth_range_mm=depth_range_mm, low=low, high=high)
+
+
+def slope_bounds(camera: Camera) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """Least and greatest x/z and y/z of the rays through the border of the image."""
     ticks = np.linspace(0, 1, 20)
     border = np.array([[t, s] for t in ticks for s in ticks if t in (0, 1) or s in (0, 1)])
     rays = camera.rays(border * [camera.width, camera.height])[:, :2]
-    return _View(
-        camera=camera,
-        cam_from_rig=cam_from_rig,
-        depth_range_mm=depth_range_mm,
-        low=rays.min(axis=0),
-        high=rays.max(axis=0),
-    )
+    return rays.min(axis=0), rays.max(axis=0)
 
 
 def _at_each_pose(

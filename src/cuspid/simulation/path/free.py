@@ -1,6 +1,6 @@
 """Where a camera goes that a shaky hand moves over the teeth, unrestricted (thesis chapter 4, Fig. 4.2).
 
-The steady way is the arch curve of :mod:`cuspid.simulation.scan_path`, from the first crown to the last. To it the hand
+The steady way is the arch curve of :mod:`cuspid.simulation.path.arch`, from the first crown to the last. To it the hand
 adds a random shift, tilt and turn, and it goes at a random speed. Each of these is smooth noise over the frames: a slow
 drift and a quick tremor, both Gaussian and of the asked standard deviation together, and none beyond `REACH` of it, for
 who holds the camera watches the picture. The camera is shifted and turned about the place on the teeth that it looks
@@ -20,7 +20,9 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
 from cuspid.rig import Handpiece
-from cuspid.simulation.scan_path import arch_curve, check_clearance
+from cuspid.simulation.path.arch import arch_curve
+from cuspid.simulation.path.detour import lifts_needed, up
+from cuspid.simulation.path.room import Room
 
 REACH = 2.5
 """The hand never goes farther than this many standard deviations from where it should be."""
@@ -51,7 +53,7 @@ class FreePathOptions:
     tremor: float = 0.15
     """Share of the standard deviation that is tremor."""
     clearance_mm: float = 2.0
-    """Camera and lights keep this distance from the jaw."""
+    """Camera and lights keep this distance from the jaw; the hand lifts them where they would not."""
 
     def __post_init__(self) -> None:
         if self.frames < 2:
@@ -68,7 +70,10 @@ class FreePathOptions:
 def plan_free_path(
     jaw: Jaw, handpiece: Handpiece, options: FreePathOptions, rng: np.random.Generator
 ) -> Mapping[str, Rigid3]:
-    """``rig_from_world`` by frame name. Raises InputError where the camera would come too near to the jaw."""
+    """``rig_from_world`` by frame name. Where the camera would come too near to the jaw, the hand lifts it.
+
+    Raises InputError where that does not help.
+    """
     curve = arch_curve(jaw)
     noise = hand_noise(options, 7, rng)
     speeds = np.exp(options.shake * options.speed * noise[:, 6])
@@ -79,12 +84,15 @@ def plan_free_path(
         options.distance_mm,
     ]
     motions = options.shake * np.array(spreads) * noise[:, :6]
-    poses = {
-        f"{index:05d}": Rigid3.from_rotation_vector(motion[:3], motion[3:]) @ curve.rig_from_world(float(length))
-        for index, (motion, length) in enumerate(zip(motions, along / along[-1] * curve.lengths_mm[-1], strict=True))
+    poses = [
+        Rigid3.from_rotation_vector(motion[:3], motion[3:]) @ curve.rig_from_world(float(length))
+        for motion, length in zip(motions, along / along[-1] * curve.lengths_mm[-1], strict=True)
+    ]
+    room, reach = Room(jaw.mesh, handpiece.solid), round(options.drift_frames)
+    lifts = lifts_needed(room, poses, reach, options.clearance_mm)
+    return {
+        f"{index:05d}": up(lift) @ pose for index, (lift, pose) in enumerate(zip(lifts.tolist(), poses, strict=True))
     }
-    check_clearance(jaw.mesh, handpiece, poses, options.clearance_mm)
-    return poses
 
 
 def hand_noise(options: FreePathOptions, channels: int, rng: np.random.Generator) -> Float[np.ndarray, "f c"]:

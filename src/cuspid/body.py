@@ -1,0 +1,119 @@
+"""The body of a handpiece: what takes up room, as boxes.
+
+Frames: ``rig`` is the frame of the handpiece; ``box`` that of a box, its origin in the middle, its axes along the
+edges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float, Int
+from numba import njit
+
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3, read_only
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """A solid block."""
+
+    box_from_rig: Rigid3
+    """Where it is."""
+    half_mm: Float[np.ndarray, "3"]
+    """Half its lengths along its axes."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "half_mm", read_only(np.asarray(self.half_mm, dtype=np.float64)))
+        if not (np.isfinite(self.half_mm).all() and (self.half_mm > 0).all()):
+            raise InputError(f"body: the sides of a box must be positive, not {2 * self.half_mm} mm")
+
+    @property
+    def corners(self) -> Float[np.ndarray, "8 3"]:
+        """In the rig frame, mm."""
+        return self.box_from_rig.inverse().apply((np.array(list(np.ndindex(2, 2, 2))) * 2 - 1.0) * self.half_mm)
+
+    def surface_points(self, spacing_mm: float) -> Float[np.ndarray, "n 3"]:
+        """Points on its faces, edges and corners, no farther apart than the spacing along an edge; rig frame, mm."""
+        counts = np.maximum(np.ceil(2 * self.half_mm / spacing_mm).astype(int), 1)
+        ticks = [np.linspace(-half, half, count + 1) for half, count in zip(self.half_mm, counts, strict=True)]
+        grid = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+        on_surface = (np.abs(grid) >= self.half_mm * (1 - 1e-9)).any(axis=1)
+        return self.box_from_rig.inverse().apply(grid[on_surface])
+
+
+CAMERA_MM, LED_MM = (1.0, 1.0, 1.6), (0.5, 0.5, 0.6)
+"""Width, height and depth of a miniature camera module (with a sensor of 1/14 inch or less) and of an LED."""
+
+
+def module(front_from_rig: Rigid3, size_mm: tuple[float, float, float]) -> Box:
+    """The box of a part whose front is the plane XY of a frame; it lies behind it, towards -Z."""
+    half = np.array(size_mm) / 2
+    return Box(Rigid3(np.eye(3), np.array([0, 0, half[2]])) @ front_from_rig, half)
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """Boxes that together are the handpiece."""
+
+    parts: Mapping[str, Box]
+    """By name."""
+
+    def __post_init__(self) -> None:
+        if not self.parts:
+            raise InputError("body: at least one box is needed")
+        object.__setattr__(self, "parts", MappingProxyType(dict(self.parts)))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parts in order."""
+        return tuple(self.parts)
+
+    @property
+    def bounds(self) -> Float[np.ndarray, "2 3"]:
+        """Lower and upper corner of the box around it all, in the rig frame, mm."""
+        corners = np.concatenate([box.corners for box in self.parts.values()])
+        return np.stack([corners.min(axis=0), corners.max(axis=0)])
+
+    def surface_points(self, spacing_mm: float) -> Float[np.ndarray, "n 3"]:
+        """As :meth:`Box.surface_points`, of all parts."""
+        return np.concatenate([box.surface_points(spacing_mm) for box in self.parts.values()])
+
+    def distances(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+        """Signed distance in mm of points of the rig frame to the nearest part, negative inside, and which part."""
+        boxes = self.parts.values()
+        distance, part = np.empty(len(points)), np.empty(len(points), dtype=np.int64)
+        _distances(
+            np.ascontiguousarray(points, dtype=np.float64),
+            np.stack([box.box_from_rig.rotation for box in boxes]),
+            np.stack([box.box_from_rig.translation for box in boxes]),
+            np.stack([box.half_mm for box in boxes]),
+            distance,
+            part,
+        )
+        return distance, part
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _distances(points, rotations, translations, halves, distance, part):
+    for n in range(len(points)):
+        distance[n], part[n] = np.inf, -1
+        for b in range(len(halves)):
+            outside, inside = 0.0, -np.inf
+            for i in range(3):
+                x = translations[b, i]
+                for j in range(3):
+                    x += rotations[b, i, j] * points[n, j]
+                over = abs(x) - halves[b, i]
+                inside = max(inside, over)
+                if over > 0:
+                    outside += over * over
+            signed = np.sqrt(outside) if inside > 0 else inside
+            if signed < distance[n]:
+                distance[n], part[n] = signed, b

@@ -1,0 +1,132 @@
+"""Further passes over what the first ones leave unseen of the crowns.
+
+For each roll, a pass along the whole path is tried; of what it would add, the stretch is kept on which it adds most
+beyond what its frames cost (the subarray of largest sum). The best of all is added, and so on until none pays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from cuspid.geometry import Rigid3
+from cuspid.mesh import Mesh
+from cuspid.rig import Handpiece
+from cuspid.simulation.path.coverage import CrownPoints
+from cuspid.simulation.path.detour import up
+from cuspid.simulation.path.legs import Leg, SteadyPath, steady_path
+from cuspid.simulation.path.room import Room
+
+_ROLLS_DEG = (-60.0, -45.0, -30.0, 30.0, 45.0, 60.0)
+_STATION_MM = 1.5
+_WORTH = 2e-4
+"""A millimetre of path must add this share of the crown surface."""
+_OVERHEAD_MM = 10.0
+"""A pass more costs as much as this length: the turn and the way to its start."""
+_ROUND_MM = 2.0
+"""A pass begins and ends so much before and after where it is wanted."""
+_MOST = 6
+_LIFTS_MM = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A pass along the whole path and what two cameras see from its places."""
+
+    roll_deg: float
+    lengths_mm: Float[np.ndarray, "s"]
+    seen: Bool[np.ndarray, "s n"]
+
+    def best_stretch(self, unseen: Bool[np.ndarray, "n"]) -> tuple[float, float, float]:
+        """First and last place of the stretch that pays most, and what it adds beyond its cost, as a share of all."""
+        new = self.seen & unseen
+        added = np.flatnonzero(new.any(axis=0))
+        # A point counts at the middle of the places that see it.
+        at = np.array([np.median(np.flatnonzero(new[:, point])) for point in added], dtype=int)
+        gain = np.bincount(at, minlength=len(self.lengths_mm)) / len(unseen) - _WORTH * _STATION_MM
+        first, last = _largest_sum(gain)
+        net = float(gain[first : last + 1].sum()) - _WORTH * _OVERHEAD_MM
+        return float(self.lengths_mm[first]), float(self.lengths_mm[last]), net
+
+
+def _largest_sum(values: Float[np.ndarray, "n"]) -> tuple[int, int]:
+    """First and last index of the contiguous values with the largest sum (Kadane)."""
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    lowest = np.minimum.accumulate(sums[:-1])
+    last = int(np.argmax(sums[1:] - lowest))
+    return int(np.argmin(sums[: last + 1])), last
+
+
+def further_legs(
+    mesh: Mesh, room: Room, crowns: CrownPoints, handpiece: Handpiece, steady: SteadyPath, clearance_mm: float
+) -> SteadyPath:
+    """The path with the further passes that pay."""
+    unseen = np.asarray(~seen_from(crowns, handpiece, list(_stations(steady))).any(axis=0))
+    trials = [_trial(mesh, room, crowns, handpiece, steady, roll, clearance_mm) for roll in _ROLLS_DEG]
+    legs = list[Leg]()
+    while len(legs) < _MOST:
+        stretches = [trial.best_stretch(unseen) for trial in trials]
+        best = int(np.argmax([net for *_, net in stretches]))
+        start, end, net = stretches[best]
+        if net <= 0:
+            break
+        low, high = (start - _ROUND_MM, end + _ROUND_MM)
+        legs.append(Leg(roll_deg=trials[best].roll_deg, start_mm=low, end_mm=high))
+        within = (trials[best].lengths_mm >= low) & (trials[best].lengths_mm <= high)
+        unseen &= ~trials[best].seen[within].any(axis=0)
+    return steady_path(mesh, steady.curve, (*steady.legs, *_ordered(steady.legs[-1], legs))) if legs else steady
+
+
+def _ordered(last: Leg, legs: Sequence[Leg]) -> Iterator[Leg]:
+    """From the end of each pass to the nearest end of one that is left."""
+    left = list(legs)
+    while left:
+        ways = [leg for each in left for leg in (each, _reversed(each))]
+        following = min(ways, key=lambda leg: abs(leg.start_mm - last.end_mm) + abs(leg.roll_deg - last.roll_deg) / 10)
+        left = [each for each in left if each not in (following, _reversed(following))]
+        yield following
+        last = following
+
+
+def _reversed(leg: Leg) -> Leg:
+    return Leg(roll_deg=leg.roll_deg, start_mm=leg.end_mm, end_mm=leg.start_mm)
+
+
+def _trial(
+    mesh: Mesh,
+    room: Room,
+    crowns: CrownPoints,
+    handpiece: Handpiece,
+    steady: SteadyPath,
+    roll_deg: float,
+    clearance_mm: float,
+) -> _Trial:
+    first = steady.legs[0]
+    low, high = sorted((first.start_mm, first.end_mm))
+    path = steady_path(mesh, steady.curve, (Leg(roll_deg=roll_deg, start_mm=low, end_mm=high),))
+    poses = [_least_lifted(room, pose, clearance_mm) for pose in _stations(path)]
+    seen = seen_from(crowns, handpiece, [pose or Rigid3.identity() for pose in poses])
+    seen[[pose is None for pose in poses]] = False
+    return _Trial(roll_deg, np.linspace(low, high, len(poses)), seen)
+
+
+def _stations(path: SteadyPath) -> Iterator[Rigid3]:
+    low, high = path.span_mm
+    for at in np.linspace(low, high, max(2, 1 + round((high - low) / _STATION_MM))):
+        yield path.rig_from_world(float(at))
+
+
+def _least_lifted(room: Room, pose: Rigid3, clearance_mm: float) -> Rigid3 | None:
+    """The pose, lifted by as little as is needed to fit; None where none of the lifts does."""
+    lifts = [up(lift) for lift in _LIFTS_MM]
+    fits = room.fits(pose, lifts, clearance_mm)
+    return lifts[int(np.argmax(fits))] @ pose if fits.any() else None
+
+
+def seen_from(crowns: CrownPoints, handpiece: Handpiece, poses: Sequence[Rigid3]) -> Bool[np.ndarray, "p n"]:
+    """Whether two cameras see each point of the crowns from each pose."""
+    every = np.arange(len(crowns.points))
+    return np.asarray(crowns.cameras_at(every, handpiece, poses) >= 2)

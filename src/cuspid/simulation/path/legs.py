@@ -1,0 +1,157 @@
+"""The way of a steady hand: passes along the arch, each with its roll, and the turns between them.
+
+A handpiece with few cameras is also rolled about the tangent of the arch (thesis 3.5.3), to scan a cross-section from
+several sides. ``hold`` is the rig frame of a handpiece held upright; a roll is positive when the cameras turn to the
+cheek. The *travel* is the way on all passes and turns, in mm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d, maximum_filter
+
+from cuspid.geometry import Rigid3
+from cuspid.mesh import Mesh
+from cuspid.simulation.path.arch import NEAR_MM, ArchCurve
+
+_SIDE_DEG, _SIDE_MM = 60.0, (4.5, 2.5)
+"""A handpiece rolled so far looks at this place: across from the middle of the crown, and down from the cusp tips."""
+_TURN_RADIUS_MM = 8.0
+"""A turn by an angle counts as the way on a circle of this radius: about that of the cameras around the crown."""
+_STATION_MM = 1.0
+"""Spacing of the places at which the room beside the teeth is measured."""
+_PATCH_MM = 1.5
+"""Half the side of the patch of rays that measures it."""
+_FAR_MM = 8.0
+"""Whence these rays come, from the place that the handpiece looks at; they end as far behind it."""
+_LIFT_MM = 3.0
+"""The nominal crown is corrected by this much at most."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Leg:
+    """One pass along the arch or a stretch of it."""
+
+    roll_deg: float
+    """Positive to the cheek."""
+    start_mm: float
+    """Where it begins on the arch curve."""
+    end_mm: float
+    """Where it ends; before the start where it goes back."""
+
+    @property
+    def length_mm(self) -> float:
+        """Of the stretch."""
+        return abs(self.end_mm - self.start_mm)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SteadyPath:
+    """The passes of a steady hand and the turns between them."""
+
+    curve: ArchCurve
+    legs: tuple[Leg, ...]
+    """In order; from the end of each the handpiece goes straight to the start of the next."""
+    travel_mm: Float[np.ndarray, "k"]
+    """At the start and the end of each leg."""
+    stations_mm: Float[np.ndarray, "s"]
+    """Places on the curve at which the room was measured."""
+    rolls_deg: Float[np.ndarray, "r"]
+    """The rolls, ascending, for which it was."""
+    lifts_mm: Float[np.ndarray, "r s"]
+    """How far the surface there lies outside of the nominal crown."""
+
+    @property
+    def span_mm(self) -> tuple[float, float]:
+        """First and last travel."""
+        return float(self.travel_mm[0]), float(self.travel_mm[-1])
+
+    def place(self, travel_mm: float) -> tuple[float, float]:
+        """Place on the curve in mm and roll in degrees."""
+        lengths = [at for leg in self.legs for at in (leg.start_mm, leg.end_mm)]
+        rolls = [leg.roll_deg for leg in self.legs for _ in range(2)]
+        return float(np.interp(travel_mm, self.travel_mm, lengths)), float(np.interp(travel_mm, self.travel_mm, rolls))
+
+    def rig_from_world(self, travel_mm: float) -> Rigid3:
+        """The handpiece without the drift of a hand."""
+        length, roll = self.place(travel_mm)
+        hold_from_world = self.curve.rig_from_world(length)
+        if self.legs == (Leg(roll_deg=0.0, start_mm=self.legs[0].start_mm, end_mm=self.legs[0].end_mm),):
+            return hold_from_world
+        at_rolls = [np.interp(length, self.stations_mm, lifts) for lifts in self.lifts_mm]
+        return _rig_from_hold(roll, float(np.interp(roll, self.rolls_deg, at_rolls))) @ hold_from_world
+
+
+def there_and_back(rolls_deg: Sequence[float], start_mm: float, end_mm: float) -> tuple[Leg, ...]:
+    """A leg for each roll over the same stretch, there and back in turn."""
+    ends = [(start_mm, end_mm) if number % 2 == 0 else (end_mm, start_mm) for number in range(len(rolls_deg))]
+    return tuple(
+        Leg(roll_deg=roll, start_mm=start, end_mm=end) for roll, (start, end) in zip(rolls_deg, ends, strict=True)
+    )
+
+
+def steady_path(mesh: Mesh, curve: ArchCurve, legs: tuple[Leg, ...]) -> SteadyPath:
+    """The way along all legs; where the surface stands out or falls back, a rolled handpiece follows it."""
+    low, high = (pick(at for leg in legs for at in (leg.start_mm, leg.end_mm)) for pick in (min, max))
+    stations = np.linspace(low, high, max(2, round((high - low) / _STATION_MM)))
+    rolls = np.unique([leg.roll_deg for leg in legs])
+    return SteadyPath(
+        curve=curve,
+        legs=legs,
+        travel_mm=_travel(legs),
+        stations_mm=stations,
+        rolls_deg=rolls,
+        lifts_mm=np.array([_lifts(mesh, curve, stations, float(roll)) for roll in rolls]),
+    )
+
+
+def _travel(legs: tuple[Leg, ...]) -> Float[np.ndarray, "k"]:
+    """Begins where the first leg does on the curve."""
+    at = [legs[0].start_mm, legs[0].end_mm]
+    for before, leg in pairwise(legs):
+        turn = np.deg2rad(abs(leg.roll_deg - before.roll_deg)) * _TURN_RADIUS_MM
+        at.append(at[-1] + float(np.hypot(turn, leg.start_mm - before.end_mm)))
+        at.append(at[-1] + leg.length_mm)
+    return np.array(at)
+
+
+def _rig_from_hold(roll_deg: float, lift_mm: float) -> Rigid3:
+    """A handpiece that looks square at the place of a rounded crown whose normal is rolled by an angle.
+
+    The crown is an ellipse across the arch; at `_SIDE_DEG` its place is that of `_SIDE_MM`, where the side groups of
+    the twelve cameras look.
+    """
+    roll, side = np.deg2rad([roll_deg, _SIDE_DEG])
+    outward = np.array([0, np.sin(roll), np.cos(roll)])
+    across = _SIDE_MM[0] * np.sin(roll) / np.sin(side)
+    down = _SIDE_MM[1] * (1 - np.cos(roll)) / (1 - np.cos(side))
+    rotation = np.stack([[1.0, 0, 0], np.cross(outward, [1.0, 0, 0]), outward])
+    return Rigid3(rotation, -rotation @ (np.array([0, across, -down]) + lift_mm * outward))
+
+
+def _lifts(
+    mesh: Mesh, curve: ArchCurve, stations_mm: Float[np.ndarray, "s"], roll_deg: float
+) -> Float[np.ndarray, "s"]:
+    """How far a rolled handpiece must move out, or in (negative), for its working distance to be kept.
+
+    Rays on a patch square before it find the surface. What stands out most nearby counts, so that the handpiece does
+    not dive behind the last crown; then smoothed along the arch, for a hand does not follow each crown.
+    """
+    if roll_deg == 0:
+        return np.zeros(len(stations_mm))
+    ticks = np.linspace(-_PATCH_MM, _PATCH_MM, 5)
+    patch = np.stack(np.meshgrid(ticks, ticks, _FAR_MM), axis=-1).reshape(-1, 3)
+    lifts = np.zeros(len(stations_mm))
+    for index, length in enumerate(stations_mm):
+        world_from_rig = (_rig_from_hold(roll_deg, 0.0) @ curve.rig_from_world(float(length))).inverse()
+        hits = mesh.cast(world_from_rig.apply(patch), np.broadcast_to(-world_from_rig.rotation[:, 2], patch.shape))
+        heights = _FAR_MM - hits.distances[hits.distances < 2 * _FAR_MM]
+        lifts[index] = np.median(heights) if len(heights) else 0.0
+    highest = maximum_filter(lifts, size=round(NEAR_MM / _STATION_MM), mode="nearest")
+    smooth = gaussian_filter1d(highest, NEAR_MM / 2 / _STATION_MM, mode="nearest")
+    return np.asarray(np.clip(smooth, -_LIFT_MM, _LIFT_MM))

@@ -1,0 +1,179 @@
+"""The room that a jaw leaves for the body of a handpiece.
+
+A pose *fits* where no part of the body comes nearer to the surface than the clearance and no part lies inside the jaw.
+Inside is where the generalised winding number (Jacobson et al., SIGGRAPH 2013) exceeds one half, which open sheets such
+as scans answer as well as closed models: faces far away subtend little, whether they are there or not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import no_type_check
+
+import igl
+import numpy as np
+from jaxtyping import Bool, Float
+from numba import njit
+from scipy.ndimage import map_coordinates
+from scipy.spatial import KDTree
+
+from cuspid.body import Body
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
+from cuspid.mesh import Mesh
+
+_APART_MM = 0.3
+"""Points on the surface lie no farther apart along an edge."""
+_PITCH_MM = 0.15
+"""Of the grid of distances to the body: their errors stay below a hundredth of a millimetre off its edges."""
+_INSIDE_PITCH_MM = 1.0
+"""Of the grid of winding numbers; nearer to the surface than this the distance decides."""
+_INSIDE = 0.5
+_FAR_MM = 3.0
+"""The grids reach so far beyond the body and the jaw."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Values at the nodes of a regular grid."""
+
+    values: Float[np.ndarray, "x y z"]
+    origin: Float[np.ndarray, "3"]
+    pitch_mm: float
+
+    @staticmethod
+    def places(
+        lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"], pitch_mm: float
+    ) -> Float[np.ndarray, "x y z 3"]:
+        ticks = [np.arange(low, high + pitch_mm, pitch_mm) for low, high in zip(lower, upper, strict=True)]
+        return np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """A jaw and the body of a handpiece that moves about it."""
+
+    mesh: Mesh
+    """In the occlusal frame."""
+    body: Body
+    """In the rig frame."""
+
+    def fits(self, rig_from_world: Rigid3, rig_from_pose: list[Rigid3], clearance_mm: float) -> Bool[np.ndarray, "n"]:
+        """Whether the body fits at each of several poses, given relative to one that is not far from them."""
+        near = self._near(rig_from_world, max(float(np.linalg.norm(each.translation)) for each in rig_from_pose))
+        rotations = np.stack([each.rotation for each in rig_from_pose])
+        translations = np.stack([each.translation for each in rig_from_pose])
+        grid = self._distances
+        free = _clear(
+            rig_from_world.apply(near), rotations, translations, grid.values, grid.origin, grid.pitch_mm, clearance_mm
+        )
+        for index in np.flatnonzero(free):
+            free[index] = not self._inside(rig_from_pose[index] @ rig_from_world).any()
+        return free
+
+    def clearance(self, rig_from_world: Rigid3) -> tuple[float, str]:
+        """Distance in mm between body and surface, minus infinity where a part lies inside the jaw, and which part.
+
+        Infinite where they are farther apart than the body is large.
+        """
+        inside = self._inside(rig_from_world)
+        if inside.any():
+            return -np.inf, self.body.names[int(np.argmax(inside))]
+        near = self._near(rig_from_world, 0.0)
+        if len(near) == 0:
+            return np.inf, self.body.names[0]
+        distances, parts = self.body.distances(rig_from_world.apply(near))
+        least = int(np.argmin(distances))
+        return float(distances[least]), self.body.names[parts[least]]
+
+    def _near(self, rig_from_world: Rigid3, farther_mm: float) -> Float[np.ndarray, "n 3"]:
+        """Points of the surface that the body may come near to, if it moves by no more than so much."""
+        low, high = self.body.bounds
+        middle = rig_from_world.inverse().apply(((low + high) / 2)[None])[0]
+        radius = float(np.linalg.norm(high - low)) / 2 + farther_mm + _FAR_MM
+        return self._tree.data[self._tree.query_ball_point(middle, radius)]
+
+    @cached_property
+    def _tree(self) -> KDTree:
+        return KDTree(surface_points(self.mesh, _APART_MM))
+
+    @cached_property
+    def _distances(self) -> _Grid:
+        """Signed distance to the body, in the rig frame."""
+        low, high = self.body.bounds + [[-_FAR_MM], [_FAR_MM]]
+        places = _Grid.places(low, high, _PITCH_MM)
+        return _Grid(self.body.distances(places.reshape(-1, 3))[0].reshape(places.shape[:3]), low, _PITCH_MM)
+
+    @cached_property
+    def _winding(self) -> _Grid:
+        """Winding number of the jaw, in the world."""
+        low, high = self.mesh.bounds + [[-_FAR_MM], [_FAR_MM]]
+        places = _Grid.places(low, high, _INSIDE_PITCH_MM)
+        vertices, faces = (np.ascontiguousarray(each) for each in (self.mesh.vertices, self.mesh.faces))
+        numbers = igl.fast_winding_number(vertices, faces, np.ascontiguousarray(places.reshape(-1, 3)))
+        return _Grid(np.asarray(numbers).reshape(places.shape[:3]), low, _INSIDE_PITCH_MM)
+
+    def _inside(self, rig_from_world: Rigid3) -> Bool[np.ndarray, "p"]:
+        """Which parts have their middle inside the jaw."""
+        middles = rig_from_world.inverse().apply(self._middles)
+        at = ((middles - self._winding.origin) / self._winding.pitch_mm).T
+        return np.asarray(map_coordinates(self._winding.values, at, order=1, cval=0.0) > _INSIDE)
+
+    @cached_property
+    def _middles(self) -> Float[np.ndarray, "p 3"]:
+        return np.array([box.box_from_rig.inverse().translation for box in self.body.parts.values()])
+
+
+def surface_points(mesh: Mesh, apart_mm: float) -> Float[np.ndarray, "n 3"]:
+    """The vertices of a mesh, and on faces with longer edges a lattice of points no farther apart than asked."""
+    corners = mesh.vertices[mesh.faces]
+    longest = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).max(axis=1)
+    steps = np.ceil(longest / apart_mm).astype(int)
+    points = [mesh.vertices]
+    for count in np.unique(steps[steps > 1]):
+        i, j = np.array([(i, j) for i in range(count + 1) for j in range(count + 1 - i)]).T
+        weights = np.stack([i, j, count - i - j], axis=1) / count
+        points.append(np.einsum("kc,fcd->fkd", weights, corners[steps == count]).reshape(-1, 3))
+    return np.concatenate(points)
+
+
+def check_clearance(room: Room, poses: Mapping[str, Rigid3], clearance_mm: float) -> None:
+    """Raise InputError where a part of the handpiece comes too near to the jaw or lies inside it."""
+    for frame, rig_from_world in poses.items():
+        distance, part = room.clearance(rig_from_world)
+        if distance < clearance_mm:
+            where = "lies inside the jaw" if distance == -np.inf else f"comes as near to the jaw as {distance:.2f} mm"
+            raise InputError(
+                f"scan path: at frame {frame} the {part} of the handpiece {where}, and is to keep {clearance_mm:g} mm"
+            )
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _clear(points, rotations, translations, grid, origin, pitch, limit):
+    """For each pose, whether the distances that the grid has at all points, moved by the pose, reach the limit."""
+    free = np.ones(len(rotations), dtype=np.bool_)
+    nx, ny, nz = grid.shape
+    for k in range(len(rotations)):
+        r, t = rotations[k], translations[k]
+        for n in range(len(points)):
+            x, y, z = points[n, 0], points[n, 1], points[n, 2]
+            u = (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0] - origin[0]) / pitch
+            v = (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1] - origin[1]) / pitch
+            w = (r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2] - origin[2]) / pitch
+            if not (0 <= u < nx - 1 and 0 <= v < ny - 1 and 0 <= w < nz - 1):
+                continue
+            i, j, l = int(u), int(v), int(w)
+            a, b, c = u - i, v - j, w - l
+            low = (grid[i, j, l] * (1 - a) + grid[i + 1, j, l] * a) * (1 - b) + (
+                grid[i, j + 1, l] * (1 - a) + grid[i + 1, j + 1, l] * a
+            ) * b
+            high = (grid[i, j, l + 1] * (1 - a) + grid[i + 1, j, l + 1] * a) * (1 - b) + (
+                grid[i, j + 1, l + 1] * (1 - a) + grid[i + 1, j + 1, l + 1] * a
+            ) * b
+            if low * (1 - c) + high * c < limit:
+                free[k] = False
+                break
+    return free

@@ -1,0 +1,314 @@
+"""The path of a scan: over the arch of a jaw or one tooth, following the curve of Spee, held by a human hand.
+
+Frames: the world is the jaw's occlusal frame. Rig frame as in :mod:`cuspid.handpiece.designs`: the origin rides on the
+arch curve, +X along it, +Y towards the cheek, +Z out of the gum. Seen from above (+Z), the path runs clockwise.
+
+A path is made in layers, each a function of the travel: a steady hand on its passes
+(:mod:`~cuspid.simulation.path.legs`), changed where the body of the handpiece does not fit
+(:mod:`~cuspid.simulation.path.detour`), the drift of the hand (:mod:`~cuspid.simulation.path.hand`), and a lift where
+that would touch. Frames are then taken so that they overlap about evenly.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
+from cuspid.jaw import GUM, Jaw
+from cuspid.mesh import Mesh
+from cuspid.rig import Handpiece
+from cuspid.simulation.path.arch import ArchCurve, arch_curve
+from cuspid.simulation.path.coverage import CrownPoints, crown_points
+from cuspid.simulation.path.detour import Detour, PoseAt, lifted, plan_detour
+from cuspid.simulation.path.further import further_legs, seen_from
+from cuspid.simulation.path.hand import HandMotion, hand_motion
+from cuspid.simulation.path.legs import Leg, SteadyPath, steady_path, there_and_back
+from cuspid.simulation.path.overlap import frame_overlap, image_overlap
+from cuspid.simulation.path.room import Room, check_clearance
+
+TOOTH_FRAMES, ARCH_FRAMES = 10, 100
+"""Positions of the handpiece in the thesis: 120 images of a tooth and 1200 of an arch with twelve cameras."""
+
+TOOTH_PATH_MM = 9.0
+"""Length of the path over a tooth: ten positions 1 mm apart, which overlap by some 80 %."""
+
+_ARCH_MM = 80.0
+"""What is longer is a whole arch."""
+_GROWTH = 1.15
+"""By so much at most the number of frames is raised at once, where there are turns."""
+_MOST = 3
+"""So many times the usual number of frames are taken at most for the overlap's sake."""
+_COARSE = 12
+"""Rays along each side of an image that tell how fast it changes."""
+_LOW_SHARE = 0.9
+"""Teeth of which less can be seen are told of."""
+
+_LOG = logging.getLogger("cuspid")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanPathOptions:
+    """How the jaw is scanned."""
+
+    tooth: int | None = None
+    """FDI number of the one tooth to scan; None for the whole arch."""
+    frames: int | None = None
+    """Positions of the handpiece; None for 10 over a tooth, 100 over an arch and one per millimetre over a part of one,
+    or more where the overlap needs it."""
+    length_mm: float | None = None
+    """Length of the path over the middle of the tooth or arch; None for 9 mm over a tooth (the images see 3 mm farther
+    on both sides) and from the first crown to the last over an arch."""
+    jitter_mm: float = 0.15
+    """Standard deviation of the hand's drift along each axis."""
+    jitter_deg: float = 1.5
+    """Standard deviation of the hand's turning about each axis."""
+    jitter_length_mm: float = 6.0
+    """Length of path over which the hand's drift changes."""
+    minimum_overlap: float = 0.75
+    """Share (0 to 1) of the surface in the images of a frame that the next frame must see, by the same cameras."""
+    clearance_mm: float = 0.5
+    """The body of the handpiece keeps this distance from the jaw; where it does not fit, it is lifted, shifted and
+    tilted."""
+    turns: int = 1
+    """Passes over the teeth, an odd number: 1 looks down only, 3 look from the cheek, down and from the tongue, more
+    look in finer steps between."""
+    turn_deg: float = 60.0
+    """How far the handpiece is rolled to either side in the first and the last pass."""
+
+    passes: Literal["turns", "auto"] = "turns"
+    """turns: those that --turns says; auto: also others, rolled differently, over what two cameras did not see."""
+
+    def __post_init__(self) -> None:
+        if self.turns < 1 or self.turns % 2 == 0:
+            raise InputError(f"scan path: the number of turns must be odd (1, 3, 5 ...), not {self.turns}")
+        if not 0 < self.turn_deg < 90:
+            raise InputError(f"scan path: --turn-deg must lie between 0 and 90, not {self.turn_deg:g}")
+        if self.frames is not None and self.frames < 2:
+            raise InputError(f"scan path: --frames is {self.frames}; at least 2 are needed")
+        if self.length_mm is not None and not self.length_mm > 0:
+            raise InputError(f"scan path: --length-mm must be positive, not {self.length_mm:g}")
+        if not 0 <= self.minimum_overlap < 1:
+            raise InputError(f"scan path: --minimum-overlap must lie between 0 and 1, not {self.minimum_overlap:g}")
+        if min(self.jitter_mm, self.jitter_deg, self.clearance_mm) < 0 or not self.jitter_length_mm > 0:
+            raise InputError(
+                "scan path: --jitter-mm, --jitter-deg and --clearance-mm must not be negative, --jitter-length-mm "
+                "must be positive"
+            )
+
+    @property
+    def rolls_deg(self) -> tuple[float, ...]:
+        """Roll of each pass, in order."""
+        if self.turns == 1:
+            return (0.0,)
+        return tuple(map(float, np.linspace(self.turn_deg, -self.turn_deg, self.turns)))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScanPath:
+    """Poses of the handpiece and the overlap that they give."""
+
+    rig_from_world: Mapping[str, Rigid3]
+    """Pose by frame name, in order."""
+    overlap: Float[np.ndarray, "n c"]
+    """For each frame but the last, and each camera: share of the surface in its image that the next image also sees;
+    NaN where the image shows no surface."""
+    steady: SteadyPath = field(repr=False)
+    """The way of a steady hand."""
+    seen: Mapping[int, float] = field(default_factory=dict)
+    """About which share (0 to 1) of the open surface of each crown that the path passes two cameras see at once, by FDI
+    number; by 0 of all crowns together."""
+
+    @property
+    def curve(self) -> ArchCurve:
+        """The curve that the path follows."""
+        return self.steady.curve
+
+    @property
+    def minimum_overlap(self) -> float:
+        """Mean over the cameras of the frame that overlaps least with the next."""
+        return float(frame_overlap(self.overlap).min())
+
+    @property
+    def mean_overlap(self) -> float:
+        """The mean over all images."""
+        return float(np.nanmean(self.overlap))
+
+
+def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng: np.random.Generator) -> ScanPath:
+    """A path over the arch or one tooth on which the handpiece fits and consecutive images overlap enough.
+
+    What a user should know of it goes to the log. Raises InputError where the jaw has no such tooth, the handpiece does
+    not fit even when lifted, or the asked number of frames is too small for the overlap.
+    """
+    curve, room = arch_curve(jaw), Room(jaw.mesh, handpiece.solid)
+    crowns = crown_points(jaw, curve, _reach_mm(handpiece))
+    steady = first = steady_path(jaw.mesh, curve, _legs(jaw, curve, options))
+    if options.passes == "auto":
+        steady = further_legs(jaw.mesh, room, crowns, handpiece, first, options.clearance_mm)
+    detour = plan_detour(room, crowns, handpiece, steady.rig_from_world, steady.span_mm, options.clearance_mm)
+    hand = hand_motion(
+        steady.span_mm,
+        rng,
+        jitter_mm=options.jitter_mm,
+        jitter_deg=options.jitter_deg,
+        jitter_length_mm=options.jitter_length_mm,
+    )
+    pose_at = lifted(room, _held(steady, detour, hand), steady.span_mm, options.clearance_mm)
+    path = _with_frames(jaw.mesh, handpiece, steady, pose_at, options)
+    check_clearance(room, path.rig_from_world, options.clearance_mm)
+    path = replace(path, seen=_seen(crowns, handpiece, path, options.tooth))
+    for note in (*_told_detour(jaw, steady, detour), *_told_passes(steady, first, path), *_told_unseen(path)):
+        _LOG.info(note)
+    return path
+
+
+def _seen(crowns: CrownPoints, handpiece: Handpiece, path: ScanPath, tooth: int | None) -> dict[int, float]:
+    """As :attr:`ScanPath.seen`."""
+    found = np.asarray(seen_from(crowns, handpiece, list(path.rig_from_world.values())).any(axis=0))
+    if tooth is not None:
+        return {tooth: float(found[crowns.teeth == tooth].mean())}
+    teeth = np.unique(crowns.teeth[crowns.teeth != GUM])
+    return {GUM: float(found.mean()), **{int(each): float(found[crowns.teeth == each].mean()) for each in teeth}}
+
+
+def steady_poses(jaw: Jaw, options: ScanPathOptions, per_pass: int) -> tuple[Rigid3, ...]:
+    """``rig_from_world`` at so many places on each pass, evenly spaced, without the drift of a hand or the turns."""
+    curve = arch_curve(jaw)
+    steady = steady_path(jaw.mesh, curve, _legs(jaw, curve, options))
+    ends = steady.travel_mm.reshape(-1, 2)
+    return tuple(steady.rig_from_world(float(at)) for first, last in ends for at in np.linspace(first, last, per_pass))
+
+
+def _legs(jaw: Jaw, curve: ArchCurve, options: ScanPathOptions) -> tuple[Leg, ...]:
+    return there_and_back(options.rolls_deg, *_stretch(jaw, curve, options))
+
+
+def _stretch(jaw: Jaw, curve: ArchCurve, options: ScanPathOptions) -> tuple[float, float]:
+    """Start and end of the path, in mm along the curve."""
+    if options.tooth is None:
+        first, last = 0.0, float(curve.lengths_mm[-1])
+        length = max(last, TOOTH_PATH_MM)
+    else:
+        first, last = curve.span_of(jaw.mesh.face_centres[jaw.tooth_faces(options.tooth)])
+        length = TOOTH_PATH_MM
+    middle, half = (first + last) / 2, (options.length_mm or length) / 2
+    return middle - half, middle + half
+
+
+def _reach_mm(handpiece: Handpiece) -> float:
+    """How far from a point of the surface something may hide it."""
+    return handpiece.depth_range_mm[1]
+
+
+def _held(steady: SteadyPath, detour: Detour, hand: HandMotion) -> PoseAt:
+    """The way of a hand that drifts."""
+    if not detour.changes.any():
+        return lambda at: hand.at(at) @ steady.rig_from_world(at)
+    return lambda at: hand.at(at) @ detour.at(at) @ steady.rig_from_world(at)
+
+
+# --- frames -----------------------------------------------------------------------------------------------------------
+
+
+def _with_frames(
+    mesh: Mesh, handpiece: Handpiece, steady: SteadyPath, pose_at: PoseAt, options: ScanPathOptions
+) -> ScanPath:
+    """As many frames as asked for, or as many as the overlap needs."""
+    usual = options.frames or _usual_frames(steady, options)
+    frames = usual
+    while True:
+        path = _even_path(mesh, handpiece, steady, pose_at, frames)
+        if path.minimum_overlap > options.minimum_overlap:
+            return path
+        needed = _needed(frames, path.minimum_overlap, options)
+        shortfall = (
+            f"with {frames} frames consecutive images overlap by only {path.minimum_overlap:.0%}, less than "
+            f"{options.minimum_overlap:.0%}"
+        )
+        if options.frames:
+            raise InputError(f"scan path: {shortfall}; about {needed} would be needed: give --frames or a shorter path")
+        if needed > _MOST * usual:
+            _LOG.info(f"scan path: {shortfall} somewhere; that may break the scan there")
+            return path
+        frames = needed
+
+
+def _usual_frames(steady: SteadyPath, options: ScanPathOptions) -> int:
+    """Of the thesis for a tooth and a whole arch, in proportion for further passes; one per millimetre for parts."""
+    first = steady.legs[0].length_mm
+    per_pass = TOOTH_FRAMES if options.tooth is not None else ARCH_FRAMES if first > _ARCH_MM else 1 + round(first)
+    return round(per_pass * sum(leg.length_mm for leg in steady.legs) / first)
+
+
+def _needed(frames: int, overlap: float, options: ScanPathOptions) -> int:
+    """Frames that are about enough: the surface that an image loses is in proportion to the step."""
+    growth = (1 - overlap) / (1 - options.minimum_overlap)
+    if options.turns > 1 or options.passes == "auto":
+        # A single image on a turn is no reason for as many more everywhere.
+        growth = min(growth, _GROWTH)
+    return max(frames + 1, int(np.ceil(1 + (frames - 1) * growth)))
+
+
+def _even_path(mesh: Mesh, handpiece: Handpiece, steady: SteadyPath, pose_at: PoseAt, frames: int) -> ScanPath:
+    """The path on which the hand goes slower where the images change faster, so that the overlap is about even."""
+    travel = np.linspace(*steady.span_mm, frames)
+    for _ in range(2):
+        lost = 1 - frame_overlap(image_overlap(mesh, handpiece, [pose_at(float(at)) for at in travel], _COARSE))
+        change = np.concatenate([[0], np.cumsum(np.maximum(lost, 0.25 * lost.max()))])
+        travel = np.interp(np.linspace(0, change[-1], frames), change, travel)
+    poses = [pose_at(float(at)) for at in travel]
+    return ScanPath(
+        rig_from_world={f"{index:05d}": pose for index, pose in enumerate(poses)},
+        overlap=image_overlap(mesh, handpiece, poses),
+        steady=steady,
+    )
+
+
+# --- what a user should know ------------------------------------------------------------------------------------------
+
+
+def _told_detour(jaw: Jaw, steady: SteadyPath, detour: Detour) -> tuple[str, ...]:
+    """Where the handpiece leaves the way of a steady hand."""
+    changed = np.any(detour.changes != 0, axis=1)
+    if not changed.any():
+        return ()
+    shift, lift, *turns = detour.largest
+    places = np.array([steady.curve.place(steady.place(float(at))[0]) for at in detour.travel_mm[changed]])
+    return (
+        f"scan path: the handpiece does not fit everywhere{_near_teeth(jaw, places)}; there it is lifted by up to "
+        f"{lift:.1f} mm, shifted by {shift:.1f} mm and tilted by {np.rad2deg(max(turns)):.0f} deg",
+    )
+
+
+def _near_teeth(jaw: Jaw, places: Float[np.ndarray, "n 3"]) -> str:
+    if not jaw.teeth:
+        return ""
+    centres = np.array([jaw.mesh.centroid(jaw.tooth_faces(tooth))[:2] for tooth in jaw.teeth])
+    nearest = np.argmin(np.linalg.norm(places[:, None, :2] - centres[None], axis=2), axis=1)
+    return " (near " + ", ".join(str(jaw.teeth[index]) for index in np.unique(nearest)) + ")"
+
+
+def _told_passes(steady: SteadyPath, before: SteadyPath, path: ScanPath) -> tuple[str, ...]:
+    """What further passes cost."""
+    more = len(steady.legs) - len(before.legs)
+    if not more:
+        return ()
+    share = 1 - (before.span_mm[1] - before.span_mm[0]) / (steady.span_mm[1] - steady.span_mm[0])
+    rolls = ", ".join(f"{leg.roll_deg:+.0f} deg over {leg.length_mm:.0f} mm" for leg in steady.legs[len(before.legs) :])
+    frames = round(share * len(path.rig_from_world))
+    return (f"scan path: {more} further passes, rolled by {rolls}, take {frames} of {len(path.rig_from_world)} frames",)
+
+
+def _told_unseen(path: ScanPath) -> tuple[str, ...]:
+    """Teeth of which two cameras see little."""
+    low = [f"{tooth} {100 * share:.0f} %" for tooth, share in path.seen.items() if share < _LOW_SHARE and tooth != GUM]
+    if not low:
+        return ()
+    return (f"scan path: two cameras see little of some crowns, of what is open to any direction: {', '.join(low)}",)
