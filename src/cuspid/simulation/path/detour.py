@@ -27,8 +27,10 @@ from cuspid.simulation.path.room import Room
 PoseAt = Callable[[float], Rigid3]
 """``rig_from_world`` at a travel."""
 
-_SHIFTS_MM, _LIFTS_MM = (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0), (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0, 13.0)
-_ROLLS_DEG, _TILTS_DEG = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0), (-12.0, 0.0, 12.0)
+_SHIFTS_MM, _LIFTS_MM = (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0), (0.0, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 13.0)
+_ROLLS_DEG = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0)
+_TILTS_DEG = ((0.0, 0.0), (12.0, 0.0), (-12.0, 0.0), (0.0, 12.0), (0.0, -12.0))
+"""Pitch and yaw."""
 _UNITS = np.array([1.0, 1.0, *np.deg2rad([12.0, 12.0, 12.0])])
 """A shift, a lift and a turn that cost alike."""
 _OFF, _MISSED, _APART = 0.05, 10.0, 0.5
@@ -72,7 +74,7 @@ def _changed(change: Float[np.ndarray, "5"]) -> Rigid3:
 _CANDIDATES = np.array(
     [
         (shift, lift, *np.deg2rad([roll, pitch, yaw]))
-        for shift, lift, roll, pitch, yaw in product(_SHIFTS_MM, _LIFTS_MM, _ROLLS_DEG, _TILTS_DEG, _TILTS_DEG)
+        for shift, lift, roll, (pitch, yaw) in product(_SHIFTS_MM, _LIFTS_MM, _ROLLS_DEG, _TILTS_DEG)
     ]
 )
 

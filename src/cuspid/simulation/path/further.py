@@ -7,7 +7,7 @@ beyond what its frames cost (the subarray of largest sum). The best of all is ad
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -24,8 +24,8 @@ _ROLLS_DEG = (-60.0, -45.0, -30.0, 30.0, 45.0, 60.0)
 _STATION_MM = 1.5
 _WORTH = 2e-4
 """A millimetre of path must add this share of the crown surface."""
-_OVERHEAD_MM = 10.0
-"""A pass more costs as much as this length: the turn and the way to its start."""
+_ARM_MM = 16.0
+"""A pass more costs as much as this length for each radian of its roll: the turns to it and back."""
 _ROUND_MM = 2.0
 """A pass begins and ends so much before and after where it is wanted."""
 _MOST = 6
@@ -48,7 +48,7 @@ class _Trial:
         at = np.array([np.median(np.flatnonzero(new[:, point])) for point in added], dtype=int)
         gain = np.bincount(at, minlength=len(self.lengths_mm)) / len(unseen) - _WORTH * _STATION_MM
         first, last = _largest_sum(gain)
-        net = float(gain[first : last + 1].sum()) - _WORTH * _OVERHEAD_MM
+        net = float(gain[first : last + 1].sum()) - _WORTH * _ARM_MM * abs(np.deg2rad(self.roll_deg))
         return float(self.lengths_mm[first]), float(self.lengths_mm[last]), net
 
 
@@ -77,7 +77,41 @@ def further_legs(
         legs.append(Leg(roll_deg=trials[best].roll_deg, start_mm=low, end_mm=high))
         within = (trials[best].lengths_mm >= low) & (trials[best].lengths_mm <= high)
         unseen &= ~trials[best].seen[within].any(axis=0)
-    return steady_path(mesh, steady.curve, (*steady.legs, *_ordered(steady.legs[-1], legs))) if legs else steady
+    return steady_path(mesh, steady.curve, tuple(_woven(steady.legs, legs))) if legs else steady
+
+
+def _woven(first: Sequence[Leg], further: Sequence[Leg]) -> Iterator[Leg]:
+    """All legs in order: further ones over a stretch are gone through on the way, or at the end where that is shorter.
+
+    On the way means when the last of the first legs has come to the end of the stretch; it goes on from there.
+    """
+    *before, base = first
+    yield from before
+    at, left = base.start_mm, list(further)
+    for stretch in _stretches(further) if base.end_mm > base.start_mm else ():
+        high = max(_ends(leg)[1] for leg in stretch)
+        back = high - min(_ends(leg)[0] for leg in stretch) if len(stretch) % 2 else 0.0
+        if at < high < base.end_mm - back:
+            coming = replace(base, start_mm=at, end_mm=high)
+            yield from (coming, *_ordered(coming, stretch))
+            at, left = high, [leg for leg in left if leg not in stretch]
+    last = replace(base, start_mm=at)
+    yield from (last, *_ordered(last, left))
+
+
+def _ends(leg: Leg) -> tuple[float, float]:
+    return min(leg.start_mm, leg.end_mm), max(leg.start_mm, leg.end_mm)
+
+
+def _stretches(legs: Sequence[Leg]) -> list[list[Leg]]:
+    """Legs that overlap together, in the order of the arch."""
+    found = list[list[Leg]]()
+    for leg in sorted(legs, key=_ends):
+        if found and _ends(leg)[0] < max(_ends(each)[1] for each in found[-1]):
+            found[-1].append(leg)
+        else:
+            found.append([leg])
+    return found
 
 
 def _ordered(last: Leg, legs: Sequence[Leg]) -> Iterator[Leg]:
@@ -92,7 +126,7 @@ def _ordered(last: Leg, legs: Sequence[Leg]) -> Iterator[Leg]:
 
 
 def _reversed(leg: Leg) -> Leg:
-    return Leg(roll_deg=leg.roll_deg, start_mm=leg.end_mm, end_mm=leg.start_mm)
+    return replace(leg, start_mm=leg.end_mm, end_mm=leg.start_mm)
 
 
 def _trial(

@@ -7,9 +7,10 @@ as scans answer as well as closed models: faces far away subtend little, whether
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import no_type_check
 
 import igl
@@ -17,7 +18,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numba import njit
 from scipy.ndimage import map_coordinates
-from scipy.spatial import KDTree
 
 from cuspid.body import Body
 from cuspid.errors import InputError
@@ -60,44 +60,51 @@ class Room:
     body: Body
     """In the rig frame."""
 
-    def fits(self, rig_from_world: Rigid3, rig_from_pose: list[Rigid3], clearance_mm: float) -> Bool[np.ndarray, "n"]:
-        """Whether the body fits at each of several poses, given relative to one that is not far from them."""
-        near = self._near(rig_from_world, max(float(np.linalg.norm(each.translation)) for each in rig_from_pose))
-        rotations = np.stack([each.rotation for each in rig_from_pose])
-        translations = np.stack([each.translation for each in rig_from_pose])
+    def fits(
+        self, rig_from_world: Rigid3, pose_from_rig: Sequence[Rigid3], clearance_mm: float
+    ) -> Bool[np.ndarray, "n"]:
+        """Whether the body fits at each of several poses, given relative to one."""
+        rotations = np.stack([each.rotation for each in pose_from_rig])
+        translations = np.stack([each.translation for each in pose_from_rig])
+        swept = np.einsum("nji,nkj->nki", rotations, self._corners - translations[:, None]).reshape(-1, 3)
+        points = self._within(rig_from_world, swept.min(axis=0) - clearance_mm, swept.max(axis=0) + clearance_mm)
+        # What is nearest to the body meets most poses first.
+        points = points[np.argsort(np.sum((points - self._corners.mean(axis=0)) ** 2, axis=1))]
         grid = self._distances
-        free = _clear(
-            rig_from_world.apply(near), rotations, translations, grid.values, grid.origin, grid.pitch_mm, clearance_mm
-        )
-        for index in np.flatnonzero(free):
-            free[index] = not self._inside(rig_from_pose[index] @ rig_from_world).any()
+        free = _clear(points, rotations, translations, grid.values, grid.origin, grid.pitch_mm, clearance_mm)
+        which = np.flatnonzero(free)
+        free[which] = ~self._inside([pose_from_rig[index] @ rig_from_world for index in which.tolist()]).any(axis=1)
         return free
 
     def clearance(self, rig_from_world: Rigid3) -> tuple[float, str]:
         """Distance in mm between body and surface, minus infinity where a part lies inside the jaw, and which part.
 
-        Infinite where they are farther apart than the body is large.
+        Infinite where they are some millimetres apart.
         """
-        inside = self._inside(rig_from_world)
+        inside = self._inside([rig_from_world])[0]
         if inside.any():
             return -np.inf, self.body.names[int(np.argmax(inside))]
-        near = self._near(rig_from_world, 0.0)
-        if len(near) == 0:
+        low, high = self._corners[0] - _FAR_MM, self._corners[-1] + _FAR_MM
+        distances, parts = self.body.distances(self._within(rig_from_world, low, high))
+        if len(distances) == 0:
             return np.inf, self.body.names[0]
-        distances, parts = self.body.distances(rig_from_world.apply(near))
         least = int(np.argmin(distances))
         return float(distances[least]), self.body.names[parts[least]]
 
-    def _near(self, rig_from_world: Rigid3, farther_mm: float) -> Float[np.ndarray, "n 3"]:
-        """Points of the surface that the body may come near to, if it moves by no more than so much."""
-        low, high = self.body.bounds
-        middle = rig_from_world.inverse().apply(((low + high) / 2)[None])[0]
-        radius = float(np.linalg.norm(high - low)) / 2 + farther_mm + _FAR_MM
-        return self._tree.data[self._tree.query_ball_point(middle, radius)]
+    def _within(
+        self, rig_from_world: Rigid3, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
+    ) -> Float[np.ndarray, "n 3"]:
+        """Points of the surface in a box of the rig frame."""
+        return np.asarray(_in_box(self._points, rig_from_world.rotation, rig_from_world.translation, low, high))
 
     @cached_property
-    def _tree(self) -> KDTree:
-        return KDTree(surface_points(self.mesh, _APART_MM))
+    def _points(self) -> Float[np.ndarray, "n 3"]:
+        return surface_points(self.mesh, _APART_MM)
+
+    @cached_property
+    def _corners(self) -> Float[np.ndarray, "8 3"]:
+        """Of the box around the body, the lower one first and the upper one last."""
+        return np.array(list(product(*self.body.bounds.T)))
 
     @cached_property
     def _distances(self) -> _Grid:
@@ -115,11 +122,12 @@ class Room:
         numbers = igl.fast_winding_number(vertices, faces, np.ascontiguousarray(places.reshape(-1, 3)))
         return _Grid(np.asarray(numbers).reshape(places.shape[:3]), low, _INSIDE_PITCH_MM)
 
-    def _inside(self, rig_from_world: Rigid3) -> Bool[np.ndarray, "p"]:
-        """Which parts have their middle inside the jaw."""
-        middles = rig_from_world.inverse().apply(self._middles)
+    def _inside(self, rig_from_world: Sequence[Rigid3]) -> Bool[np.ndarray, "n p"]:
+        """At each pose, which parts have their middle inside the jaw."""
+        middles = np.array([pose.inverse().apply(self._middles) for pose in rig_from_world]).reshape(-1, 3)
         at = ((middles - self._winding.origin) / self._winding.pitch_mm).T
-        return np.asarray(map_coordinates(self._winding.values, at, order=1, cval=0.0) > _INSIDE)
+        numbers = map_coordinates(self._winding.values, at, order=1, cval=0.0)
+        return np.asarray(numbers.reshape(len(rig_from_world), len(self._middles)) > _INSIDE)
 
     @cached_property
     def _middles(self) -> Float[np.ndarray, "p 3"]:
@@ -148,6 +156,27 @@ def check_clearance(room: Room, poses: Mapping[str, Rigid3], clearance_mm: float
             raise InputError(
                 f"scan path: at frame {frame} the {part} of the handpiece {where}, and is to keep {clearance_mm:g} mm"
             )
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _in_box(points, r, t, low, high):
+    """The points, moved, that then lie in a box."""
+    found = np.empty((len(points), 3))
+    count = 0
+    for n in range(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        u = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0]
+        if not low[0] <= u <= high[0]:
+            continue
+        v = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]
+        if not low[1] <= v <= high[1]:
+            continue
+        w = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]
+        if low[2] <= w <= high[2]:
+            found[count, 0], found[count, 1], found[count, 2] = u, v, w
+            count += 1
+    return found[:count].copy()
 
 
 @njit(cache=True, nogil=True)

@@ -161,7 +161,7 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
         jitter_length_mm=options.jitter_length_mm,
     )
     pose_at = lifted(room, _held(steady, detour, hand), steady.span_mm, options.clearance_mm)
-    path = _with_frames(jaw.mesh, handpiece, steady, pose_at, options)
+    path = _with_frames(jaw.mesh, handpiece, first, steady, pose_at, options)
     check_clearance(room, path.rig_from_world, options.clearance_mm)
     path = replace(path, seen=_seen(crowns, handpiece, path, options.tooth))
     for note in (*_told_detour(jaw, steady, detour), *_told_passes(steady, first, path), *_told_unseen(path)):
@@ -218,10 +218,15 @@ def _held(steady: SteadyPath, detour: Detour, hand: HandMotion) -> PoseAt:
 
 
 def _with_frames(
-    mesh: Mesh, handpiece: Handpiece, steady: SteadyPath, pose_at: PoseAt, options: ScanPathOptions
+    mesh: Mesh,
+    handpiece: Handpiece,
+    first: SteadyPath,
+    steady: SteadyPath,
+    pose_at: PoseAt,
+    options: ScanPathOptions,
 ) -> ScanPath:
-    """As many frames as asked for, or as many as the overlap needs."""
-    usual = options.frames or _usual_frames(steady, options)
+    """As many frames as asked for, or as many as the overlap needs; ``first`` is the path without further passes."""
+    usual = options.frames or _usual_frames(steady, first, options)
     frames = usual
     while True:
         path = _even_path(mesh, handpiece, steady, pose_at, frames)
@@ -240,11 +245,11 @@ def _with_frames(
         frames = needed
 
 
-def _usual_frames(steady: SteadyPath, options: ScanPathOptions) -> int:
-    """Of the thesis for a tooth and a whole arch, in proportion for further passes; one per millimetre for parts."""
-    first = steady.legs[0].length_mm
-    per_pass = TOOTH_FRAMES if options.tooth is not None else ARCH_FRAMES if first > _ARCH_MM else 1 + round(first)
-    return round(per_pass * sum(leg.length_mm for leg in steady.legs) / first)
+def _usual_frames(steady: SteadyPath, first: SteadyPath, options: ScanPathOptions) -> int:
+    """Of the thesis for a tooth and a whole arch, one per millimetre for parts; for further passes in proportion."""
+    length = first.legs[0].length_mm
+    per_pass = TOOTH_FRAMES if options.tooth is not None else ARCH_FRAMES if length > _ARCH_MM else 1 + round(length)
+    return round(per_pass * len(first.legs) * np.ptp(steady.span_mm) / np.ptp(first.span_mm))
 
 
 def _needed(frames: int, overlap: float, options: ScanPathOptions) -> int:
@@ -295,15 +300,16 @@ def _near_teeth(jaw: Jaw, places: Float[np.ndarray, "n 3"]) -> str:
     return " (near " + ", ".join(str(jaw.teeth[index]) for index in np.unique(nearest)) + ")"
 
 
-def _told_passes(steady: SteadyPath, before: SteadyPath, path: ScanPath) -> tuple[str, ...]:
+def _told_passes(steady: SteadyPath, first: SteadyPath, path: ScanPath) -> tuple[str, ...]:
     """What further passes cost."""
-    more = len(steady.legs) - len(before.legs)
-    if not more:
+    rolls = {leg.roll_deg for leg in first.legs}
+    further = [leg for leg in steady.legs if leg.roll_deg not in rolls]
+    if not further:
         return ()
-    share = 1 - (before.span_mm[1] - before.span_mm[0]) / (steady.span_mm[1] - steady.span_mm[0])
-    rolls = ", ".join(f"{leg.roll_deg:+.0f} deg over {leg.length_mm:.0f} mm" for leg in steady.legs[len(before.legs) :])
-    frames = round(share * len(path.rig_from_world))
-    return (f"scan path: {more} further passes, rolled by {rolls}, take {frames} of {len(path.rig_from_world)} frames",)
+    frames = len(path.rig_from_world)
+    more = round(frames * (1 - np.ptp(first.span_mm) / np.ptp(steady.span_mm)))
+    what = ", ".join(f"{leg.roll_deg:+.0f} deg over {leg.length_mm:.0f} mm" for leg in further)
+    return (f"scan path: further passes, rolled to the cheek by {what}, take about {more} of {frames} frames",)
 
 
 def _told_unseen(path: ScanPath) -> tuple[str, ...]:
