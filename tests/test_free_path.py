@@ -12,8 +12,9 @@ from cuspid.cli import main
 from cuspid.errors import InputError
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
 from cuspid.jaw import Jaw
+from cuspid.simulation.path.arch import arch_curve
 from cuspid.simulation.path.free import REACH, FreePathOptions, hand_noise, plan_free_path
-from cuspid.simulation.path.scan import arch_curve
+from cuspid.simulation.path.room import Room
 from verbs import refused
 
 CAMERA = intra_oral_camera()
@@ -111,10 +112,20 @@ def test_the_hand_goes_at_a_changing_speed_but_never_back(coarse_phantom: Jaw) -
     assert 0.2 < np.mean(spreads) < 0.45
 
 
-def test_a_camera_that_would_touch_the_teeth_is_refused(coarse_phantom: Jaw) -> None:
+def test_a_camera_that_would_touch_the_teeth_is_lifted(coarse_phantom: Jaw) -> None:
     near = intra_oral_camera(IntraOralOptions(working_distance_mm=3.0))
-    with pytest.raises(InputError, match="nearer to the jaw than 2"):
-        plan_free_path(coarse_phantom, near, FreePathOptions(), np.random.default_rng(0))
+    room = Room(coarse_phantom.mesh, near.solid, 2.0)
+    free, kept = (
+        plan_free_path(coarse_phantom, near, FreePathOptions(clearance_mm=mm), np.random.default_rng(0))
+        for mm in (0.0, 2.0)
+    )
+    assert min(room.clearance(pose)[0] for pose in free.values()) < 2
+    assert 1.98 < min(room.clearance(pose)[0] for pose in kept.values()) < 2.5
+    for name, pose in kept.items():
+        lift = pose @ free[name].inverse()
+        np.testing.assert_allclose(lift.rotation, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(lift.translation[:2], 0, atol=1e-9)
+        assert lift.translation[2] <= 1e-9
 
 
 @pytest.mark.parametrize(
@@ -140,6 +151,6 @@ def test_film_writes_what_stitch_and_its_evaluation_read(coarse_phantom: Jaw, tm
 
 def test_a_refused_film_leaves_nothing(coarse_phantom: Jaw, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     storage.write_jaw(tmp_path / "jaw.ply", coarse_phantom)
-    near = ("--clearance-mm", "20")
+    near = ("--clearance-mm", "60")
     refused(capsys, "film", tmp_path / "jaw.ply", "--out", tmp_path / "film", *SMALL, *near)
     assert not (tmp_path / "film").exists()

@@ -23,7 +23,7 @@ from cuspid.panorama import Panorama
 from cuspid.pipeline import RenderOptions, StitchOptions, take_images
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
-from cuspid.simulation.path.scan import arch_curve
+from cuspid.simulation.path.arch import arch_curve
 from cuspid.stitching.exposure import ExposureOptions, Samples, balance
 from cuspid.stitching.mosaic import unlit
 from cuspid.stitching.ortho import Stitched

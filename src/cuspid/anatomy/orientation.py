@@ -36,6 +36,12 @@ _ARCH_MISFIT_MM = 2.0
 """A whole arch lies closer than this to the mean arch, as crowns are up to 11 mm wide."""
 _JAW_MM = (40.0, 90.0)
 """Usual width of a jaw."""
+_PART_MM = 9.0
+"""What is smaller is not a tooth, but may be a jaw in cm."""
+_NARROW_MM = 32.0
+"""What is narrower across is part of an arch."""
+_TILT_MM = 6.0
+"""Tips that spread less than this say little of a tilt."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -107,7 +113,8 @@ def _upright(mesh: Mesh) -> tuple[Rigid3, tuple[str, ...]]:
     if openness > 0.15:
         outwards = mean_normal / openness
         along = float(across @ outwards)
-        up = np.sign(along) * across if abs(along) > 0.8 else outwards
+        whole = abs(along) > 0.8 and not _is_part(mesh, across)
+        up = np.sign(along) * across if whole else outwards
         return _frame(up, centre), ()
     sides = [_frame(sign * across, centre) for sign in (1.0, -1.0)]
     rough = [_roughness(_relief(mesh, side)) for side in sides]
@@ -115,6 +122,13 @@ def _upright(mesh: Mesh) -> tuple[Rigid3, tuple[str, ...]]:
     sure = rough[best] > 1.3 * rough[1 - best]
     notes = () if sure else ("occlusal frame: unsure which side the crowns are on, both are rough; check the picture",)
     return sides[best], notes
+
+
+def _is_part(mesh: Mesh, up: Float[np.ndarray, "3"]) -> bool:
+    """Whether this is a quadrant or less, seen from above."""
+    seen = mesh.vertices @ axes_about(up)[:2].T
+    axes = np.linalg.svd(seen - seen.mean(axis=0), full_matrices=False)[2]
+    return bool(np.ptp(seen @ axes.T, axis=0).min() < _NARROW_MM)
 
 
 def _relief(mesh: Mesh, frame: Rigid3) -> _Relief:
@@ -141,15 +155,19 @@ def _roughness(relief: _Relief) -> float:
 
 
 def _level(mesh: Mesh, upright: Rigid3) -> Rigid3:
-    """Turn a frame so that the tips of the crowns lie in the plane XY on average."""
-    frame = _resting(_relief(mesh, upright), upright)
+    """Turn a frame so that the tips of the crowns lie in the plane XY on average.
+
+    About an axis along which the tips hardly spread it is turned the less, the less they do.
+    """
+    frame = upright if _is_part(mesh, upright.rotation[2]) else _resting(_relief(mesh, upright), upright)
     for _ in range(4):
         relief = _relief(mesh, frame)
         tips = relief.points[relief.tips()]
         if len(tips) < 3:
             return frame
-        design = np.column_stack([tips[:, :2], np.ones(len(tips))])
-        a, b, _ = np.linalg.lstsq(design, tips[:, 2], rcond=1e-6)[0]
+        centred = tips - tips.mean(axis=0)
+        spread = centred[:, :2].T @ centred[:, :2] + len(tips) * _TILT_MM**2 * np.eye(2)
+        a, b = np.linalg.solve(spread, centred[:, :2].T @ centred[:, 2])
         frame = _tilted(np.array([-a, -b, 1.0]), frame)
     return frame
 
@@ -251,8 +269,8 @@ def check_scale(mesh: Mesh, unit: Unit = "mm") -> tuple[str, ...]:
     width_mm = float(np.ptp(centred @ axes[:, 1:], axis=0).max())
     lower, upper = _JAW_MM
     measured = f"the mesh is {width_mm:.3g} mm wide (--unit {unit}); a jaw is {lower:g}-{upper:g} mm wide"
-    if lower / 4 < width_mm < 1.5 * upper:
-        return () if lower < width_mm < upper else (f"scale: {measured}",)
+    if _PART_MM < width_mm < 1.5 * upper:
+        return () if lower < width_mm < upper else (f"scale: {measured}, if this is not a part of one",)
     raw = width_mm / MM_PER_UNIT[unit]
     likely = [other for other, factor in MM_PER_UNIT.items() if lower <= raw * factor <= upper]
     advice = f"give --unit {likely[0]}" if likely else "rescale it, or give the --unit that it is in"

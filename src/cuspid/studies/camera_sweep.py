@@ -278,7 +278,7 @@ def sweep_case(
     begin = time.process_time()
     handpiece = pair_handpiece(site.pair_from_rig, (baseline_mm, angle_deg), options)
     poses = site.rig_from_world[seed]
-    check_clearance(Room(site.jaw.mesh, handpiece.solid), poses, options.path.clearance_mm)
+    check_clearance(Room(site.jaw.mesh, handpiece.solid, options.path.clearance_mm), poses)
     overlap = image_overlap(site.jaw.mesh, handpiece, list(poses.values()))
     how = TrialOptions(
         simulation=SimulationOptions(texture=options.texture, supersampling=options.supersampling, seed=seed),

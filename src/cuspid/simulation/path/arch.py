@@ -126,10 +126,13 @@ def _centred_curve(points: Float[np.ndarray, "m 3"], crowns: Float[np.ndarray, "
     _, nearest = KDTree(line[:, :2]).query(crowns[:, :2])
     sideways = np.sum((crowns[:, :2] - line[nearest, :2]) * normals[nearest], axis=1)
     at, middles = _middles(lengths[nearest], sideways, crowns[:, 2])
+    short = _inner(at).sum() < _LEAST_CUTS
+    if short:
+        at, middles = _smooth(at, middles)
     base = np.column_stack([np.interp(at, lengths, line[:, axis]) for axis in (0, 1)])
     normal = np.column_stack([np.interp(at, lengths, normals[:, axis]) for axis in (0, 1)])
-    _, smooth = _smooth(at, np.column_stack([base + middles[:, :1] * normal, middles[:, 1]]))
-    return smooth
+    centred = np.column_stack([base + middles[:, :1] * normal, middles[:, 1]])
+    return centred if short else _smooth(at, centred)[1]
 
 
 def _lengthened(points: Float[np.ndarray, "m 3"], by_mm: float) -> Float[np.ndarray, "k 3"]:
@@ -191,6 +194,11 @@ def _middles(
     return at, np.column_stack([cuts[counted, :2].mean(axis=1), cuts[counted, 2]])
 
 
+def _inner(at: Float[np.ndarray, "m"]) -> Bool[np.ndarray, "m"]:
+    """Which cuts do not lie in the rounded ends."""
+    return (at >= at[0] + _ROUND_MM) & (at <= at[-1] - _ROUND_MM)
+
+
 def _smooth(
     at: Float[np.ndarray, "m"], values: Float[np.ndarray, "m d"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n d"]]:
@@ -199,7 +207,7 @@ def _smooth(
     The rounded ends of the last crowns say nothing of the middle: they are left out and the spline goes on straight.
     What is hardly longer than they are has one middle.
     """
-    inner = (at >= at[0] + _ROUND_MM) & (at <= at[-1] - _ROUND_MM)
+    inner = _inner(at)
     fine = np.linspace(at[0], at[-1], max(50, round(np.ptp(at) / _SAMPLE_MM)))
     if inner.sum() < _LEAST_CUTS:
         return fine, np.tile(np.median(values, axis=0), (len(fine), 1))

@@ -85,27 +85,26 @@ def plan_detour(
     handpiece: Handpiece,
     steady: PoseAt,
     span_mm: tuple[float, float],
-    clearance_mm: float,
 ) -> Detour:
     """The changes with which a steady handpiece fits everywhere."""
     travel = np.linspace(*span_mm, max(2, 1 + round((span_mm[1] - span_mm[0]) / _STATION_MM)))
     poses = [steady(float(at)) for at in travel]
-    blocked = np.array([not room.fits(pose, [Rigid3.identity()], clearance_mm)[0] for pose in poses])
+    blocked = np.array([not room.fits(pose, [Rigid3.identity()])[0] for pose in poses])
     changes = np.zeros((len(travel), 5))
     stretches, count = label(binary_dilation(blocked, iterations=_EASE))
     for number in range(1, count + 1):
         inside = np.flatnonzero(stretches == number)
-        fitting = [_fitting(room, crowns, handpiece, poses[index], clearance_mm) for index in inside]
+        fitting = [_fitting(room, crowns, handpiece, poses[index]) for index in inside]
         tied = bool(inside[0] > 0), bool(inside[-1] < len(travel) - 1)
         changes[inside] = _shortest(fitting, tied)
     return Detour(travel_mm=travel, changes=changes)
 
 
 def _fitting(
-    room: Room, crowns: CrownPoints, handpiece: Handpiece, pose: Rigid3, clearance_mm: float
+    room: Room, crowns: CrownPoints, handpiece: Handpiece, pose: Rigid3
 ) -> tuple[Float[np.ndarray, "k 5"], Float[np.ndarray, "k"]]:
     """The best candidates at a station that fit, and what each costs by itself."""
-    fits = room.fits(pose, _MOTIONS, clearance_mm)
+    fits = room.fits(pose, _MOTIONS)
     if not fits.any():
         raise InputError(
             "scan path: the handpiece does not fit over the jaw even when it is lifted by "
@@ -151,11 +150,11 @@ def _shortest(
     return np.array(chosen[tied[0] : len(chosen) - tied[1]])
 
 
-def lifted(room: Room, pose_at: PoseAt, span_mm: tuple[float, float], clearance_mm: float) -> PoseAt:
+def lifted(room: Room, pose_at: PoseAt, span_mm: tuple[float, float]) -> PoseAt:
     """The path of a hand that lifts the handpiece where it would touch. Raises InputError where that does not help."""
     travel = np.linspace(*span_mm, max(2, 1 + round(2 * (span_mm[1] - span_mm[0]) / _STATION_MM)))
     reach = round(_SLOPE_MM / (travel[1] - travel[0]))
-    lifts = lifts_needed(room, [pose_at(float(at)) for at in travel], reach, clearance_mm)
+    lifts = lifts_needed(room, [pose_at(float(at)) for at in travel], reach)
     if not lifts.any():
         return pose_at
     return lambda at: up(float(np.interp(at, travel, lifts))) @ pose_at(at)
@@ -166,25 +165,23 @@ def up(lift_mm: float) -> Rigid3:
     return Rigid3(np.eye(3), np.array([0, 0, -lift_mm]))
 
 
-def lifts_needed(
-    room: Room, rig_from_world: Sequence[Rigid3], reach: int, clearance_mm: float
-) -> Float[np.ndarray, "n"]:
+def lifts_needed(room: Room, rig_from_world: Sequence[Rigid3], reach: int) -> Float[np.ndarray, "n"]:
     """By how much each of consecutive poses must be lifted to fit, mm, rising and falling over ``reach`` poses.
 
     Raises InputError where lifting does not help.
     """
-    needed = np.array([_lift(room, pose, clearance_mm) for pose in rig_from_world])
+    needed = np.array([_lift(room, pose) for pose in rig_from_world])
     if not needed.any():
         return needed
     return np.asarray(gaussian_filter1d(maximum_filter1d(needed, 2 * reach + 1), reach / 3, mode="nearest"))
 
 
-def _lift(room: Room, pose: Rigid3, clearance_mm: float) -> float:
+def _lift(room: Room, pose: Rigid3) -> float:
     """By how much a handpiece must be lifted to fit, mm."""
-    if room.fits(pose, [Rigid3.identity()], clearance_mm)[0]:
+    if room.fits(pose, [Rigid3.identity()])[0]:
         return 0.0
     heights = np.arange(_RISE_MM, _HIGHEST_MM, _RISE_MM)
-    fits = room.fits(pose, [up(float(height)) for height in heights], clearance_mm)
+    fits = room.fits(pose, [up(float(height)) for height in heights])
     if not fits.any():
         raise InputError(f"scan path: the handpiece does not fit over the jaw even when lifted by {_HIGHEST_MM:g} mm")
     return float(heights[np.argmax(fits)]) + _SPARE_MM

@@ -9,6 +9,7 @@ at, in the rig frame: X along the arch, Y to the cheek, Z out of the gum.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -23,6 +24,8 @@ from cuspid.rig import Handpiece
 from cuspid.simulation.path.arch import arch_curve
 from cuspid.simulation.path.detour import lifts_needed, up
 from cuspid.simulation.path.room import Room
+
+_LOG = logging.getLogger("cuspid")
 
 REACH = 2.5
 """The hand never goes farther than this many standard deviations from where it should be."""
@@ -88,8 +91,15 @@ def plan_free_path(
         Rigid3.from_rotation_vector(motion[:3], motion[3:]) @ curve.rig_from_world(float(length))
         for motion, length in zip(motions, along / along[-1] * curve.lengths_mm[-1], strict=True)
     ]
-    room, reach = Room(jaw.mesh, handpiece.solid), round(options.drift_frames)
-    lifts = lifts_needed(room, poses, reach, options.clearance_mm)
+    if options.clearance_mm >= handpiece.depth_range_mm[1]:
+        raise InputError(
+            f"free path: at --clearance-mm {options.clearance_mm:g} nothing is in focus; the camera sees sharply up to "
+            f"{handpiece.depth_range_mm[1]:g} mm"
+        )
+    room, reach = Room(jaw.mesh, handpiece.solid, options.clearance_mm), round(options.drift_frames)
+    lifts = lifts_needed(room, poses, reach)
+    if lifts.any():
+        _LOG.info(f"free path: the hand lifts the camera by up to {lifts.max():.1f} mm where it would come too near")
     return {
         f"{index:05d}": up(lift) @ pose for index, (lift, pose) in enumerate(zip(lifts.tolist(), poses, strict=True))
     }

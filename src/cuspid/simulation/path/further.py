@@ -60,12 +60,10 @@ def _largest_sum(values: Float[np.ndarray, "n"]) -> tuple[int, int]:
     return int(np.argmin(sums[: last + 1])), last
 
 
-def further_legs(
-    mesh: Mesh, room: Room, crowns: CrownPoints, handpiece: Handpiece, steady: SteadyPath, clearance_mm: float
-) -> SteadyPath:
+def further_legs(mesh: Mesh, room: Room, crowns: CrownPoints, handpiece: Handpiece, steady: SteadyPath) -> SteadyPath:
     """The path with the further passes that pay."""
     unseen = np.asarray(~seen_from(crowns, handpiece, list(_stations(steady))).any(axis=0))
-    trials = [_trial(mesh, room, crowns, handpiece, steady, roll, clearance_mm) for roll in _ROLLS_DEG]
+    trials = [_trial(mesh, room, crowns, handpiece, steady, roll) for roll in _ROLLS_DEG]
     legs = list[Leg]()
     while len(legs) < _MOST:
         stretches = [trial.best_stretch(unseen) for trial in trials]
@@ -136,12 +134,11 @@ def _trial(
     handpiece: Handpiece,
     steady: SteadyPath,
     roll_deg: float,
-    clearance_mm: float,
 ) -> _Trial:
     first = steady.legs[0]
     low, high = sorted((first.start_mm, first.end_mm))
     path = steady_path(mesh, steady.curve, (Leg(roll_deg=roll_deg, start_mm=low, end_mm=high),))
-    poses = [_least_lifted(room, pose, clearance_mm) for pose in _stations(path)]
+    poses = [_least_lifted(room, pose) for pose in _stations(path)]
     seen = seen_from(crowns, handpiece, [pose or Rigid3.identity() for pose in poses])
     seen[[pose is None for pose in poses]] = False
     return _Trial(roll_deg, np.linspace(low, high, len(poses)), seen)
@@ -153,10 +150,10 @@ def _stations(path: SteadyPath) -> Iterator[Rigid3]:
         yield path.rig_from_world(float(at))
 
 
-def _least_lifted(room: Room, pose: Rigid3, clearance_mm: float) -> Rigid3 | None:
+def _least_lifted(room: Room, pose: Rigid3) -> Rigid3 | None:
     """The pose, lifted by as little as is needed to fit; None where none of the lifts does."""
     lifts = [up(lift) for lift in _LIFTS_MM]
-    fits = room.fits(pose, lifts, clearance_mm)
+    fits = room.fits(pose, lifts)
     return lifts[int(np.argmax(fits))] @ pose if fits.any() else None
 
 

@@ -32,7 +32,7 @@ _INSIDE_PITCH_MM = 1.0
 """Of the grid of winding numbers; nearer to the surface than this the distance decides."""
 _INSIDE = 0.5
 _FAR_MM = 3.0
-"""The grids reach so far beyond the body and the jaw."""
+"""Distances are told so far beyond the clearance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,19 +59,21 @@ class Room:
     """In the occlusal frame."""
     body: Body
     """In the rig frame."""
+    clearance_mm: float
+    """That they are to keep from each other."""
 
-    def fits(
-        self, rig_from_world: Rigid3, pose_from_rig: Sequence[Rigid3], clearance_mm: float
-    ) -> Bool[np.ndarray, "n"]:
+    def fits(self, rig_from_world: Rigid3, pose_from_rig: Sequence[Rigid3]) -> Bool[np.ndarray, "n"]:
         """Whether the body fits at each of several poses, given relative to one."""
         rotations = np.stack([each.rotation for each in pose_from_rig])
         translations = np.stack([each.translation for each in pose_from_rig])
         swept = np.einsum("nji,nkj->nki", rotations, self._corners - translations[:, None]).reshape(-1, 3)
-        points = self._within(rig_from_world, swept.min(axis=0) - clearance_mm, swept.max(axis=0) + clearance_mm)
+        points = self._within(
+            rig_from_world, swept.min(axis=0) - self.clearance_mm, swept.max(axis=0) + self.clearance_mm
+        )
         # What is nearest to the body meets most poses first.
         points = points[np.argsort(np.sum((points - self._corners.mean(axis=0)) ** 2, axis=1))]
         grid = self._distances
-        free = _clear(points, rotations, translations, grid.values, grid.origin, grid.pitch_mm, clearance_mm)
+        free = _clear(points, rotations, translations, grid.values, grid.origin, grid.pitch_mm, self.clearance_mm)
         which = np.flatnonzero(free)
         free[which] = ~self._inside([pose_from_rig[index] @ rig_from_world for index in which.tolist()]).any(axis=1)
         return free
@@ -84,7 +86,8 @@ class Room:
         inside = self._inside([rig_from_world])[0]
         if inside.any():
             return -np.inf, self.body.names[int(np.argmax(inside))]
-        low, high = self._corners[0] - _FAR_MM, self._corners[-1] + _FAR_MM
+        reach = self.clearance_mm + _FAR_MM
+        low, high = self._corners[0] - reach, self._corners[-1] + reach
         distances, parts = self.body.distances(self._within(rig_from_world, low, high))
         if len(distances) == 0:
             return np.inf, self.body.names[0]
@@ -109,7 +112,8 @@ class Room:
     @cached_property
     def _distances(self) -> _Grid:
         """Signed distance to the body, in the rig frame."""
-        low, high = self.body.bounds + [[-_FAR_MM], [_FAR_MM]]
+        reach = self.clearance_mm + 2 * _PITCH_MM
+        low, high = self.body.bounds + [[-reach], [reach]]
         places = _Grid.places(low, high, _PITCH_MM)
         return _Grid(self.body.distances(places.reshape(-1, 3))[0].reshape(places.shape[:3]), low, _PITCH_MM)
 
@@ -147,14 +151,15 @@ def surface_points(mesh: Mesh, apart_mm: float) -> Float[np.ndarray, "n 3"]:
     return np.concatenate(points)
 
 
-def check_clearance(room: Room, poses: Mapping[str, Rigid3], clearance_mm: float) -> None:
+def check_clearance(room: Room, poses: Mapping[str, Rigid3]) -> None:
     """Raise InputError where a part of the handpiece comes too near to the jaw or lies inside it."""
     for frame, rig_from_world in poses.items():
         distance, part = room.clearance(rig_from_world)
-        if distance < clearance_mm:
+        if distance < room.clearance_mm:
             where = "lies inside the jaw" if distance == -np.inf else f"comes as near to the jaw as {distance:.2f} mm"
             raise InputError(
-                f"scan path: at frame {frame} the {part} of the handpiece {where}, and is to keep {clearance_mm:g} mm"
+                f"scan path: at frame {frame} the {part} of the handpiece {where}, "
+                f"and is to keep {room.clearance_mm:g} mm"
             )
 
 

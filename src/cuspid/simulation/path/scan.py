@@ -43,7 +43,7 @@ _ARCH_MM = 80.0
 """What is longer is a whole arch."""
 _GROWTH = 1.15
 """By so much at most the number of frames is raised at once, where there are turns."""
-_MOST = 3
+_MOST = 2
 """So many times the usual number of frames are taken at most for the overlap's sake."""
 _COARSE = 12
 """Rays along each side of an image that tell how fast it changes."""
@@ -147,12 +147,12 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
     What a user should know of it goes to the log. Raises InputError where the jaw has no such tooth, the handpiece does
     not fit even when lifted, or the asked number of frames is too small for the overlap.
     """
-    curve, room = arch_curve(jaw), Room(jaw.mesh, handpiece.solid)
+    curve, room = arch_curve(jaw), Room(jaw.mesh, handpiece.solid, options.clearance_mm)
     crowns = crown_points(jaw, curve, _reach_mm(handpiece))
     steady = first = steady_path(jaw.mesh, curve, _legs(jaw, curve, options))
     if options.passes == "auto":
-        steady = further_legs(jaw.mesh, room, crowns, handpiece, first, options.clearance_mm)
-    detour = plan_detour(room, crowns, handpiece, steady.rig_from_world, steady.span_mm, options.clearance_mm)
+        steady = further_legs(jaw.mesh, room, crowns, handpiece, first)
+    detour = plan_detour(room, crowns, handpiece, steady.rig_from_world, steady.span_mm)
     hand = hand_motion(
         steady.span_mm,
         rng,
@@ -160,9 +160,14 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
         jitter_deg=options.jitter_deg,
         jitter_length_mm=options.jitter_length_mm,
     )
-    pose_at = lifted(room, _held(steady, detour, hand), steady.span_mm, options.clearance_mm)
+    pose_at = lifted(room, _held(steady, detour, hand), steady.span_mm)
     path = _with_frames(jaw.mesh, handpiece, first, steady, pose_at, options)
-    check_clearance(room, path.rig_from_world, options.clearance_mm)
+    check_clearance(room, path.rig_from_world)
+    if not np.isfinite(path.overlap).any():
+        raise InputError(
+            f"scan path: no camera sees the jaw in focus where the handpiece keeps {options.clearance_mm:g} mm from "
+            "it; use a narrower one, a larger depth of field or a smaller --clearance-mm"
+        )
     path = replace(path, seen=_seen(crowns, handpiece, path, options.tooth))
     for note in (*_told_detour(jaw, steady, detour), *_told_passes(steady, first, path), *_told_unseen(path)):
         _LOG.info(note)
