@@ -105,3 +105,12 @@ def test_without_labels_open_crown_is_an_estimate_and_nothing_is_said_tooth_by_t
         assert found.open_mm2 == pytest.approx(0.5 * jaw.mesh.face_areas[named.parts > 0].sum(), rel=0.15)
         assert (found.teeth == ()) == crown.estimated
         assert ("an estimate" in found.note) == crown.estimated
+
+
+def test_teeth_of_which_nothing_was_seen_are_left_out():
+    jaw = phantom()
+    seen = jaw.tooth_faces(46) & (jaw.mesh.face_centres[:, 2] > -2)
+    whole, part = pipeline.crown_surface(jaw), pipeline.crown_surface(jaw, seen=seen)
+    assert whole is not None
+    assert part is not None
+    np.testing.assert_array_equal(part.parts, np.where(whole.parts == 46, 46, 0))

@@ -30,7 +30,7 @@ from cuspid.evaluation.deviation import EvaluationOptions, evaluate
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.visibility import VisibilityOptions, scannable_faces
 from cuspid.image_sequence import ImageSequence
-from cuspid.jaw import Arch, Jaw
+from cuspid.jaw import GUM, Arch, Jaw
 from cuspid.mesh import Mesh
 from cuspid.motion.location import MotionOptions
 from cuspid.motion.single import SingleOptions, locate_single
@@ -180,10 +180,11 @@ def load_reference(path: Path, *, unit: storage.Unit = "mm", arch: Arch | None =
     if not path.is_dir():
         return _loaded_reference(path, unit, arch)
     truth = storage.read_truth(path)
+    seen = scannable(truth, VisibilityOptions())
     return Reference(
         jaw=truth.jaw,
-        scannable=scannable(truth, VisibilityOptions()),
-        crown=crown_surface(truth.jaw),
+        scannable=seen,
+        crown=crown_surface(truth.jaw, seen=seen),
         hashes={name: storage.hash_file(path / name) for name in ("jaw.ply", "poses.json", "handpiece.json")},
     )
 
@@ -199,15 +200,20 @@ def _loaded_reference(path: Path, unit: storage.Unit, arch: Arch | None) -> Refe
     return Reference(jaw=jaw, scannable=None, crown=crown, hashes=hashes)
 
 
-def crown_surface(jaw: Jaw, occlusal_from_jaw: Rigid3 = Rigid3.identity()) -> OpenCrown | None:
+def crown_surface(
+    jaw: Jaw, occlusal_from_jaw: Rigid3 = Rigid3.identity(), *, seen: Bool[np.ndarray, "f"] | None = None
+) -> OpenCrown | None:
     """The open crown surface of a jaw: of each tooth, or of what looks like crown where it has no tooth labels; None
     where there is nothing of the kind.
 
-    ``occlusal_from_jaw``: for a mesh that is not in its occlusal frame.
+    ``occlusal_from_jaw``: for a mesh that is not in its occlusal frame. ``seen``: teeth of which none of these faces is
+    a part are left out, which saves time.
     """
     upright = replace(jaw, mesh=jaw.mesh.transformed(occlusal_from_jaw), landmarks={}, lines={}, spheres={})
     crowns = crowns_of(upright)
     if not crowns.faces.any():
         return None
     parts = pieces(upright.mesh, crowns.faces) if jaw.face_labels is None else jaw.face_labels
+    if seen is not None:
+        parts = np.where(np.isin(parts, parts[seen]), parts, GUM)
     return OpenCrown(mesh=jaw.mesh, parts=open_parts(upright.mesh, parts), estimated=crowns.estimated)
