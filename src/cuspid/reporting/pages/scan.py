@@ -233,7 +233,7 @@ def _table(trueness: Mapping[str, Any] | None) -> list[dict[str, Any]]:
     return [
         _table_row("all", trueness, trueness["completeness_pct"], crown["completeness_pct"]),
         *teeth,
-        *(_table_row("everything scanned", trueness[each], None, None) for each in ("everything",) if each in trueness),
+        *(_table_row("everything", trueness[each], None, None) for each in ("everything",) if each in trueness),
     ]
 
 
