@@ -18,13 +18,14 @@ from cuspid.reconstruction import Reconstruction
 from cuspid.reporting.figures.drawing import deviation_colors
 from cuspid.rig import Handpiece, Lighting, MountedCamera, Rig
 from cuspid.shape_model import MeanStep, ShapeModel
-from cuspid.trueness import Trueness
+from cuspid.trueness import CrownCompleteness, Trueness
 
 TOOTH = 46
 BUMP_UM = 80.0
 """Of the one place where the scan is wrong."""
 CAMERA = Camera.from_field_of_view(64, 48, 60.0)
 REFERENCE_FROM_SCAN = Rigid3.from_rotation_vector(np.array([0.3, -0.2, 1.0]), np.array([4.0, -9.0, 2.0]))
+CROWN_WITHIN = {"50": 91.5, "100": 92.5, "200": 93.5}
 FRAMES = ("00000", "00001", "00002")
 
 
@@ -48,11 +49,20 @@ def known_trueness(deviation_um: np.ndarray) -> Trueness:
     within = {"50": 98.0, "100": 99.0, "200": 100.0}
     return Trueness(
         accuracy=found,
+        everything=found,
         completeness=found,
         completeness_pct=within,
         scannable_pct=7.0,
         per_tooth={TOOTH: found},
         per_tooth_completeness_pct={TOOTH: within},
+        crown=CrownCompleteness(
+            completeness_pct=CROWN_WITHIN,
+            open_mm2=200.0,
+            teeth=(TOOTH,),
+            per_tooth_pct={TOOTH: CROWN_WITHIN},
+            estimated=False,
+            note="what counts of the open crown",
+        ),
         scale_error_ppm=-24.0,
         inter_molar_error_um=None,
         inter_canine_error_um=None,

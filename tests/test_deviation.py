@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cuspid.errors import InputError
-from cuspid.evaluation.deviation import EvaluationOptions, evaluate, openness, statistics
+from cuspid.evaluation.crown import OpenCrown, open_parts, openness
+from cuspid.evaluation.deviation import EvaluationOptions, evaluate, statistics
 from cuspid.evaluation.distance import Surface
 from cuspid.evaluation.registration import RegistrationOptions
 from cuspid.evaluation.search import SearchOptions
@@ -268,6 +269,80 @@ def test_insides_and_base_can_be_left_out():
     assert (
         found.completeness_pct["50"] > trueness(mesh.submesh(mesh.face_centres[:, 2] > -2)).completeness_pct["50"] + 3
     )
+
+
+# The whole crown
+
+
+@cache
+def open_crown_of_jaw() -> OpenCrown:
+    labels = jaw().face_labels
+    assert labels is not None
+    return OpenCrown(mesh=jaw().mesh, parts=open_parts(jaw().mesh, labels))
+
+
+def crowned(scan: Mesh, scannable: np.ndarray | None = None) -> Trueness:
+    crown = open_crown_of_jaw()
+    return evaluate(scan, jaw(), IN_PLACE, scannable=scannable, crown=crown, rng=np.random.default_rng(0))
+
+
+def test_the_open_crown_is_tooth_by_tooth_what_the_sky_sees():
+    mesh, parts = jaw().mesh, open_crown_of_jaw().parts
+    assert np.all((parts == 0) | (parts == jaw().face_labels))
+    faces = np.flatnonzero(jaw().tooth_faces(46))
+    assert np.mean((parts[faces] == 46) == (openness(mesh, faces) >= 0.05)) > 0.95
+
+
+def test_what_no_camera_could_see_of_a_crown_is_missed_beside_what_could_be_seen():
+    mesh, tooth = jaw().mesh, jaw().tooth_faces(46)
+    upper = tooth & (mesh.face_centres[:, 2] > 3.5)
+    found = crowned(mesh.submesh(upper), scannable=upper)
+    assert found.completeness_pct["50"] > 99.5
+    assert found.crown is not None
+    assert found.crown.teeth == (46,)
+    share = 100 * mesh.face_areas[upper & (open_crown_of_jaw().parts == 46)].sum() / found.crown.open_mm2
+    assert 20 < share < 95
+    assert found.crown.completeness_pct["50"] == pytest.approx(share, abs=2)
+    assert found.crown.per_tooth_pct[46] == found.crown.completeness_pct
+
+
+def test_teeth_that_the_scan_was_not_meant_for_do_not_count_over_all():
+    mesh = jaw().mesh
+    whole, half = jaw().tooth_faces(46), jaw().tooth_faces(47) & (mesh.face_centres[:, 2] > 5)
+    for scannable in (whole | half, None):
+        crown = crowned(mesh.submesh(whole | half), scannable).crown
+        assert crown is not None
+        assert crown.teeth == (46,)
+        assert crown.completeness_pct["200"] > 99
+        assert 0 < crown.per_tooth_pct[47]["200"] < 75
+        assert 31 not in crown.per_tooth_pct
+
+
+def test_a_tooth_that_could_be_seen_but_was_lost_counts():
+    mesh = jaw().mesh
+    both = jaw().tooth_faces(46) | jaw().tooth_faces(36)
+    crown = crowned(mesh.submesh(jaw().tooth_faces(46)), both).crown
+    assert crown is not None
+    assert crown.teeth == (36, 46)
+    assert crown.per_tooth_pct[36]["200"] < 5
+    assert 30 < crown.completeness_pct["200"] < 70
+
+
+def test_without_crowns_in_reach_nothing_is_said_of_them():
+    mesh = jaw().mesh
+    below = mesh.face_centres[:, 2] < -2
+    assert crowned(mesh.submesh(below), below).crown is None
+    assert trueness(mesh).crown is None
+
+
+def test_in_everything_counts_also_what_was_scanned_where_nothing_could_be_seen():
+    mesh = jaw().mesh
+    raised = displaced(mesh, 0.1 * (mesh.vertices[:, 2:] < 0.5) * mesh.vertex_normals)
+    found = trueness(raised, scannable=crown_side())
+    assert found.accuracy.mean_abs_um < 5
+    assert found.everything.mean_abs_um > 20
+    assert found.everything.count > found.accuracy.count
+    assert trueness(raised).everything == trueness(raised).accuracy
 
 
 def test_a_mask_of_another_reference_is_refused():

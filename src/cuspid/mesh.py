@@ -72,6 +72,12 @@ class Mesh:
         return read_only(0.5 * np.linalg.norm(self.face_cross, axis=1))
 
     @cached_property
+    def vertex_areas(self) -> Float[np.ndarray, "v"]:
+        """A third of the area of the faces around each vertex, mm^2."""
+        shares = np.repeat(self.face_areas / 3, 3)
+        return read_only(np.bincount(self.faces.ravel(), shares, minlength=len(self.vertices)))
+
+    @cached_property
     def face_centres(self) -> Float[np.ndarray, "f 3"]:
         """Centroids in mm."""
         return read_only(self.vertices[self.faces].mean(axis=1))

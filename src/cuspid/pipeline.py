@@ -13,8 +13,8 @@ panorama             = stitch(frames, ...)
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -22,10 +22,14 @@ import numpy as np
 from jaxtyping import Bool
 
 from cuspid import storage
+from cuspid.anatomy.crowns import crowns_of
+from cuspid.anatomy.orientation import find_occlusal_frame
 from cuspid.capture import Capture
+from cuspid.evaluation.crown import OpenCrown, open_parts, pieces
 from cuspid.evaluation.deviation import EvaluationOptions, evaluate
+from cuspid.geometry import Rigid3
 from cuspid.image_sequence import ImageSequence
-from cuspid.jaw import Arch, Jaw
+from cuspid.jaw import GUM, Arch, Jaw
 from cuspid.mesh import Mesh
 from cuspid.motion.location import MotionOptions
 from cuspid.motion.single import SingleOptions, locate_single
@@ -48,9 +52,11 @@ __all__ = [
     "EvaluationOptions",
     "FilmOptions",
     "ReconstructionOptions",
+    "Reference",
     "RenderOptions",
     "SimulationOptions",
     "StitchOptions",
+    "crown_surface",
     "evaluate",
     "film",
     "fuse",
@@ -103,7 +109,7 @@ def reconstruct(
         found = take_poses(capture, colmap_model, folder / "motion")
     handpiece, poses = capture.handpiece, found.rig_from_world
     if handpiece.rig.largest_shift_px(found.rig, handpiece.working_distance_mm) > _MOVED_PX:
-        capture = dataclasses.replace(capture, handpiece=dataclasses.replace(handpiece, rig=found.rig))
+        capture = replace(capture, handpiece=replace(handpiece, rig=found.rig))
         depths = measure_depth(capture, folder / "depth-refined", options.stereo, progress=progress)
     if options.temporal.enabled:
         depths |= measure_temporal_depth(capture, poses, folder / "depth-temporal", options.temporal, progress=progress)
@@ -141,10 +147,8 @@ def stitch(sequence: ImageSequence, options: StitchOptions, *, progress: Progres
     for number, located in enumerate(motion.parts, start=1):
         frames = motion.frames_of(number - 1)
         part = orthophoto(sequence, located, frames, options, progress=progress)
-        numbered = dataclasses.replace(
-            part.panorama, part=number, parts=len(motion.parts), notes=(*notes, *part.panorama.notes)
-        )
-        parts.append(dataclasses.replace(part, panorama=numbered))
+        numbered = replace(part.panorama, part=number, parts=len(motion.parts), notes=(*notes, *part.panorama.notes))
+        parts.append(replace(part, panorama=numbered))
     return tuple(parts)
 
 
@@ -156,16 +160,60 @@ def scannable(truth: GroundTruth, options: VisibilityOptions) -> Bool[np.ndarray
     return scannable_faces(truth.jaw.mesh, truth.handpiece, truth.rig_from_world.values(), options)
 
 
-def load_reference(
-    path: Path, *, unit: storage.Unit = "mm", arch: Arch | None = None
-) -> tuple[Jaw, Bool[np.ndarray, "f"] | None, dict[str, str]]:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Reference:
+    """What a scan is compared with."""
+
+    jaw: Jaw
+    """The surface, and tooth labels where there are any."""
+    scannable: Bool[np.ndarray, "f"] | None
+    """The faces that at least two cameras of one frame could see; None where that is not known."""
+    crown: OpenCrown | None
+    """The open crown surface; None where nothing is crown or looks like it."""
+    hashes: Mapping[str, str]
+    """SHA-256 of the files, by what they are."""
+
+
+def load_reference(path: Path, *, unit: storage.Unit = "mm", arch: Arch | None = None) -> Reference:
     """What a scan is compared with: a mesh file, or the ``truth`` folder of a simulation, which also knows which faces
-    could be seen (None for a mesh file). Also the hashes of the files."""
+    could be seen."""
     if not path.is_dir():
-        if storage.is_jaw(path):
-            return storage.read_jaw(path), None, {"reference": storage.hash_file(path)}
-        mesh, labels, _ = storage.read_labelled_mesh(path, unit)
-        return Jaw(mesh=mesh, face_labels=labels, arch=arch), None, {"reference": storage.hash_file(path)}
+        return _loaded_reference(path, unit, arch)
     truth = storage.read_truth(path)
-    hashes = {name: storage.hash_file(path / name) for name in ("jaw.ply", "poses.json", "handpiece.json")}
-    return truth.jaw, scannable(truth, VisibilityOptions()), hashes
+    seen = scannable(truth, VisibilityOptions())
+    return Reference(
+        jaw=truth.jaw,
+        scannable=seen,
+        crown=crown_surface(truth.jaw, seen=seen),
+        hashes={name: storage.hash_file(path / name) for name in ("jaw.ply", "poses.json", "handpiece.json")},
+    )
+
+
+def _loaded_reference(path: Path, unit: storage.Unit, arch: Arch | None) -> Reference:
+    hashes = {"reference": storage.hash_file(path)}
+    if storage.is_jaw(path):
+        jaw = storage.read_jaw(path)
+        return Reference(jaw=jaw, scannable=None, crown=crown_surface(jaw), hashes=hashes)
+    mesh, labels, _ = storage.read_labelled_mesh(path, unit)
+    jaw = Jaw(mesh=mesh, face_labels=labels, arch=arch)
+    crown = crown_surface(jaw, find_occlusal_frame(mesh).occlusal_from_mesh)
+    return Reference(jaw=jaw, scannable=None, crown=crown, hashes=hashes)
+
+
+def crown_surface(
+    jaw: Jaw, occlusal_from_jaw: Rigid3 = Rigid3.identity(), *, seen: Bool[np.ndarray, "f"] | None = None
+) -> OpenCrown | None:
+    """The open crown surface of a jaw: of each tooth, or of what looks like crown where it has no tooth labels; None
+    where there is nothing of the kind.
+
+    ``occlusal_from_jaw``: for a mesh that is not in its occlusal frame. ``seen``: teeth of which none of these faces is
+    a part are left out, which saves time.
+    """
+    upright = replace(jaw, mesh=jaw.mesh.transformed(occlusal_from_jaw), landmarks={}, lines={}, spheres={})
+    crowns = crowns_of(upright)
+    if not crowns.faces.any():
+        return None
+    parts = pieces(upright.mesh, crowns.faces) if jaw.face_labels is None else jaw.face_labels
+    if seen is not None:
+        parts = np.where(np.isin(parts, parts[seen]), parts, GUM)
+    return OpenCrown(mesh=jaw.mesh, parts=open_parts(upright.mesh, parts), estimated=crowns.estimated)

@@ -106,12 +106,32 @@ class DeviationStatistics:
     """Largest absolute deviation."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class CrownCompleteness:
+    """How much of the crown surface that is open to some direction a scan has, whether or not a camera could see it."""
+
+    completeness_pct: Mapping[str, float]
+    """Share of the open crown surface of the teeth that count within 50, 100, 200 um of the scan, keys "50", ..."""
+    open_mm2: float
+    """Area of that surface."""
+    teeth: tuple[int, ...]
+    """FDI numbers of the teeth that count in ``completeness_pct``: those that the scan was meant for."""
+    per_tooth_pct: Mapping[int, Mapping[str, float]]
+    """As ``completeness_pct``, by FDI number, of each tooth of which anything was in reach."""
+    estimated: bool
+    """Whether crowns were told from gum by shape, for want of tooth labels; then nothing is said tooth by tooth."""
+    note: str
+    """What counts, for people."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Trueness:
     """Result of an evaluation."""
 
     accuracy: DeviationStatistics
-    """Scan to reference."""
+    """Scan to reference, where the reference counts (what two cameras could see, where that is known)."""
+    everything: DeviationStatistics
+    """Scan to reference, with everything that was scanned but what lies past an open border of the reference."""
     completeness: DeviationStatistics
     """Reference to scan."""
     completeness_pct: Mapping[str, float]
@@ -122,6 +142,8 @@ class Trueness:
     """Scan to reference, by FDI number."""
     per_tooth_completeness_pct: Mapping[int, Mapping[str, float]]
     """As ``completeness_pct``, by FDI number."""
+    crown: CrownCompleteness | None
+    """Of all open crown surface; None where nothing of a crown was in reach or none is known."""
     scale_error_ppm: float
     """Best similarity's scale minus one, reported apart and never applied."""
     inter_molar_error_um: float | None

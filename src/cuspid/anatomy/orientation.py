@@ -175,6 +175,8 @@ def _level(mesh: Mesh, upright: Rigid3) -> Rigid3:
 def _resting(relief: _Relief, frame: Rigid3) -> Rigid3:
     """Turn a frame so that +Z is normal to the plane on which the jaw would rest, crowns down."""
     points = relief.points[np.isfinite(relief.points[..., 2])]
+    if np.linalg.matrix_rank(points - points.mean(axis=0), tol=1e-6) < 3:
+        return frame
     hull = ConvexHull(points)
     up = hull.equations[:, 2] > 0.5
     centre = points.mean(axis=0)

@@ -26,7 +26,7 @@ from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.reconstruction import Reconstruction
 from cuspid.reporting.figures.drawing import deviation_colors, save_deviation_picture
 from cuspid.reporting.figures.sphere import save_sphere_picture
-from cuspid.trueness import Trueness
+from cuspid.trueness import DeviationStatistics, Trueness
 
 
 def run(
@@ -131,10 +131,10 @@ def _reconstruct(capture: Capture, out: Path, options: ReconstructionOptions, mo
 
 def _evaluate(mesh: Path, reference: Path, out: Path, source: Source, options: EvaluationOptions) -> None:
     scan = storage.read_mesh(mesh, source.unit)
-    known, scannable, hashes = pipeline.load_reference(reference, unit=source.unit, arch=source.arch)
-    hashes |= {"mesh": storage.hash_file(mesh)}
+    against = pipeline.load_reference(reference, unit=source.unit, arch=source.arch)
+    known, hashes = against.jaw, {**against.hashes, "mesh": storage.hash_file(mesh)}
     with storage.claimed_folder(out, "evaluate", {"evaluation": options}, hashes, replace=True):
-        trueness = pipeline.evaluate(scan, known, options, scannable=scannable)
+        trueness = pipeline.evaluate(scan, known, options, scannable=against.scannable, crown=against.crown)
         coloured = replace(scan, colors=deviation_colors(trueness.deviation_um))
         storage.write_mesh(out / "deviation.ply", coloured, values={"deviation_um": trueness.deviation_um})
         save_deviation_picture(out / "deviation.png", scan, trueness)
@@ -213,18 +213,30 @@ def _print_located(reconstruction: Reconstruction, capture: Capture) -> None:
         console.print(f"note: {note}")
 
 
+_COLUMNS = ("region", "mean |d|", "signed mean", "SD", "RMS", "P95", "max", "within 50 µm, %", "of open crown, %")
+
+
 def _print_trueness(trueness: Trueness) -> None:
     table = Table(title="Trueness in µm, scan to reference", title_justify="left")
-    for column in ("region", "mean |d|", "signed mean", "SD", "RMS", "P95", "max", "within 50 µm, %"):
+    for column in _COLUMNS:
         table.add_column(column, justify="left" if column == "region" else "right")
-    rows = [("all", trueness.accuracy, trueness.completeness_pct)]
-    rows += [
-        (str(fdi), statistics, trueness.per_tooth_completeness_pct[fdi])
-        for fdi, statistics in sorted(trueness.per_tooth.items())
-    ]
-    for region, d, complete in rows:
-        figures = (d.mean_abs_um, d.signed_mean_um, d.std_um, d.rms_um, d.p95_um, d.max_um, complete["50"])
-        table.add_row(region, *(f"{figure:.1f}" for figure in figures))
+    for region, d, shares in _regions(trueness):
+        figures = (d.mean_abs_um, d.signed_mean_um, d.std_um, d.rms_um, d.p95_um, d.max_um)
+        cells = ("-" if share is None else f"{share['50']:.1f}" for share in shares)
+        table.add_row(region, *(f"{figure:.1f}" for figure in figures), *cells)
     Console().print(table)
-    for note in trueness.notes:
+    for note in trueness.notes if trueness.crown is None else (*trueness.notes, trueness.crown.note):
         console.print(f"note: {note}")
+
+
+_Shares = tuple[Mapping[str, float] | None, Mapping[str, float] | None]
+"""Within some um, of what could be seen and of the open crown."""
+
+
+def _regions(trueness: Trueness) -> list[tuple[str, DeviationStatistics, _Shares]]:
+    """Rows of the table: all that could be seen, each tooth, and everything that was scanned."""
+    seen, crown = trueness.per_tooth_completeness_pct, trueness.crown
+    by_tooth = {} if crown is None else crown.per_tooth_pct
+    whole: _Shares = (trueness.completeness_pct, None if crown is None else crown.completeness_pct)
+    teeth = [(str(fdi), d, (seen[fdi], by_tooth.get(fdi))) for fdi, d in sorted(trueness.per_tooth.items())]
+    return [("all", trueness.accuracy, whole), *teeth, ("everything", trueness.everything, (None, None))]

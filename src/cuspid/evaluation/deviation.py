@@ -12,6 +12,9 @@ on the reference to the scan. What counts:
       more. With a mask the reference is all there was to see, and a point is left out only if it lies past the border,
       farther sideways than up or down, and within ``margin_mm``, as where a scan frays at its rim.
 
+Beside this stand a figure in which everything scanned counts (all points but those of (b)), and the completeness of all
+crown surface that is open to some direction (:mod:`cuspid.evaluation.crown`).
+
 A point is always measured to the closest surface, whether that counts or not. ``Trueness.notes`` says how much was left
 out by each rule.
 """
@@ -24,6 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cuspid.errors import InputError
+from cuspid.evaluation.crown import OpenCrown, crown_completeness, openness, within_pct
 from cuspid.evaluation.distance import Feet, Surface
 from cuspid.evaluation.registration import Alignment, RegistrationOptions, best_scale, register
 from cuspid.evaluation.teeth import CANINES, LEAST_SAMPLES, MOLARS, distance_error_um, drift_um, find_teeth
@@ -32,10 +36,8 @@ from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
 from cuspid.trueness import DeviationStatistics, Trueness
 
-_WITHIN_UM = (50, 100, 200)
 _LEAST_TOOTH_PCT = 30.0
 """Share of a tooth's surface that must lie within 200 um of the scan for its place to be judged."""
-_OPENNESS_RAYS = 64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +100,11 @@ class _Samples:
     left_out: str
     """What does not count, for people."""
 
+    def within_pct_by_tooth(self) -> dict[int, dict[str, float]]:
+        """Shares within some um, of each tooth that has samples."""
+        teeth = (int(label) for label in np.unique(self.labels) if label != GUM)
+        return {fdi: within_pct(self.signed_mm[self.labels == fdi]) for fdi in teeth}
+
 
 def evaluate(
     scan: Mesh,
@@ -105,12 +112,14 @@ def evaluate(
     options: EvaluationOptions,
     *,
     scannable: Bool[np.ndarray, "f"] | None = None,
+    crown: OpenCrown | None = None,
     rng: np.random.Generator | None = None,
 ) -> Trueness:
     """Compare a scan in any pose with a reference of which the faces in ``scannable`` count (None: see the module).
 
-    ``rng`` draws the samples; the same ones each time where there is none. Raises InputError where the two do not
-    belong together or nothing is left to compare.
+    ``crown``: the open crown surface of the reference, whose completeness is asked, too. ``rng`` draws the samples; the
+    same ones each time where there is none. Raises InputError where the two do not belong together or nothing is left
+    to compare.
     """
     rng = rng or np.random.default_rng(0)
     surface = Surface(reference.mesh)
@@ -118,13 +127,9 @@ def evaluate(
     alignment = _align(scan, surface, options, rng)
     aligned = scan.transformed(alignment.reference_from_scan)
     labels = reference.face_labels if reference.face_labels is not None else np.full(len(reference.mesh.faces), GUM)
-    from_scan = _samples_of_scan(aligned, surface, labels, rules, options, rng)
+    from_scan, everything = _samples_of_scan(aligned, surface, labels, rules, options, rng)
     from_reference, counted_pct = _samples_of_reference(aligned, reference.mesh, labels, rules, options, rng)
-    completeness_by_tooth = {
-        fdi: _within_pct(from_reference.signed_mm[from_reference.labels == fdi])
-        for fdi in reference.teeth
-        if np.any(from_reference.labels == fdi)
-    }
+    completeness_by_tooth = from_reference.within_pct_by_tooth()
     centroids = {
         fdi: reference.mesh.centroid((labels == fdi) & rules.faces)
         for fdi, within in completeness_by_tooth.items()
@@ -134,8 +139,9 @@ def evaluate(
     vertex_feet = surface.feet(aligned.vertices)
     return Trueness(
         accuracy=statistics(from_scan.signed_mm),
+        everything=everything,
         completeness=statistics(from_reference.signed_mm),
-        completeness_pct=_within_pct(from_reference.signed_mm),
+        completeness_pct=within_pct(from_reference.signed_mm),
         scannable_pct=counted_pct,
         per_tooth={
             fdi: statistics(from_scan.signed_mm[from_scan.labels == fdi])
@@ -143,6 +149,7 @@ def evaluate(
             if np.sum(from_scan.labels == fdi) >= LEAST_SAMPLES
         },
         per_tooth_completeness_pct=completeness_by_tooth,
+        crown=None if crown is None else crown_completeness(aligned, crown, scannable, options.samples, rng),
         scale_error_ppm=1e6 * (alignment.scale - 1),
         inter_molar_error_um=distance_error_um(teeth, MOLARS),
         inter_canine_error_um=distance_error_um(teeth, CANINES),
@@ -172,20 +179,6 @@ def statistics(signed_mm: Float[np.ndarray, "n"]) -> DeviationStatistics:
         min_um=float(absolute_um.min()),
         max_um=float(absolute_um.max()),
     )
-
-
-def openness(mesh: Mesh) -> Float[np.ndarray, "f"]:
-    """Share of the directions above the occlusal plane (XY) from which the centre of each face can be seen."""
-    steps = np.arange(_OPENNESS_RAYS) + 0.5
-    z, azimuth = steps / _OPENNESS_RAYS, steps * np.pi * (3 - np.sqrt(5))
-    directions = np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], axis=1)
-    origins = mesh.face_centres + 2e-3 * mesh.face_normals
-    free = np.zeros(len(mesh.faces))
-    for direction in directions:
-        facing = np.flatnonzero(mesh.face_normals @ direction > 0)
-        hits = mesh.cast(origins[facing], np.broadcast_to(direction, (len(facing), 3)))
-        free[facing[hits.faces < 0]] += 1
-    return free / _OPENNESS_RAYS
 
 
 def _rules(reference: Mesh, scannable: Bool[np.ndarray, "f"] | None, options: EvaluationOptions) -> _Rules:
@@ -226,19 +219,22 @@ def _samples_of_scan(
     rules: _Rules,
     options: EvaluationOptions,
     rng: np.random.Generator,
-) -> _Samples:
+) -> tuple[_Samples, DeviationStatistics]:
+    """The samples, and the statistics of everything that was scanned."""
     points, _ = aligned.sample(options.samples, rng)
     feet = surface.feet(points)
     counts = rules.counts(feet)
-    over, past = 100 * rules.unscannable(feet).mean(), 100 * rules.past_border(feet).mean()
+    past_border = rules.past_border(feet)
+    over, past = 100 * rules.unscannable(feet).mean(), 100 * past_border.mean()
     limit = f" by at most {rules.margin_mm:g} mm" if rules.reference_is_all else ""
-    return _Samples(
+    samples = _Samples(
         points=points[counts],
         signed_mm=feet.signed_mm[counts],
         labels=labels[feet.faces[counts]],
         left_out=f"of the scan does not count: {over:.1f} % within {rules.margin_mm:g} mm of reference surface that "
         f"does not count, {past:.1f} % past an open border of the reference{limit}",
     )
+    return samples, statistics(feet.signed_mm[~past_border])
 
 
 def _samples_of_reference(
@@ -267,7 +263,3 @@ def _samples_of_reference(
         left_out=f"of the reference does not count as scanned: {cropped}",
     )
     return samples, float(area_pct * near.mean())
-
-
-def _within_pct(signed_mm: Float[np.ndarray, "n"]) -> dict[str, float]:
-    return {str(um): float(100 * np.mean(np.abs(signed_mm) <= um / 1000)) for um in _WITHIN_UM}

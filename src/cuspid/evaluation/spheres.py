@@ -156,7 +156,7 @@ def evaluate_spheres(
     if not reference.spheres:
         raise InputError("spheres: the reference has none; give the jaw that 'cuspid phantom --spheres' wrote")
     scan_from_reference = reference_from_scan.inverse()
-    weights = _vertex_areas(scan)
+    weights = scan.vertex_areas
     spheres: dict[str, SphereMeasurement] = {}
     not_measured: dict[str, str] = {}
     for label, nominal in reference.spheres.items():
@@ -321,11 +321,6 @@ def _measurement(fit: _Fit, weights: Float[np.ndarray, "n"], nominal: Sphere, co
         outliers_pct=float(100 * np.mean(~fit.used)),
         coverage_pct=coverage_pct,
     )
-
-
-def _vertex_areas(mesh: Mesh) -> Float[np.ndarray, "v"]:
-    """A third of the area of the faces around each vertex, mm^2."""
-    return np.bincount(mesh.faces.ravel(), np.repeat(mesh.face_areas / 3, 3), minlength=len(mesh.vertices))
 
 
 # --- all spheres --------------------------------------------------------------------------------------------------

@@ -163,6 +163,8 @@ def _read_scan(folder: Path, run: Mapping[str, Any], reference: Path | None, uni
     known = trueness is not None
     if known and deviation_um is None:
         missing.append("the deviation of each vertex, which an older version did not keep: run cuspid evaluate again")
+    if trueness is not None and "everything" not in trueness:
+        missing.append("the open crown surface, which an older version did not measure: run cuspid evaluate again")
     located, captured = folder / "motion" / "reconstruction.json", folder / "capture" / "handpiece.json"
     if not located.exists():
         missing.append("where the cameras were: a folder of cuspid run or reconstruct has it")

@@ -38,7 +38,7 @@ from cuspid.anatomy.shape.mean import mean_shape
 from cuspid.anatomy.surfaces import named_surfaces
 from cuspid.camera import Camera
 from cuspid.errors import CuspidError, InputError
-from cuspid.evaluation.deviation import openness
+from cuspid.evaluation.crown import LEAST_OPENNESS, open_faces
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.handpiece.optimise import handpiece_outline
@@ -58,8 +58,6 @@ _WITHIN_UM = (50, 100)
 _JUDGED = "tooth_within_50_um_pct"
 """By this share is judged whether completeness grows."""
 _TIMES = ("simulation_s", "reconstruction_s", "reconstruction_cpu_s")
-_NEIGHBOURHOOD_MM = 15.0
-"""What lies farther from a tooth does not cover it."""
 _MEAN_COUNT, _MEAN_EDGE_MM = 5, 0.4
 """The mean jaw is that of so many phantoms drawn from the thesis' Table 2.1; boxes need no fine mesh."""
 
@@ -86,7 +84,7 @@ class ComparisonOptions:
     image_scale: float = 1.0
     """All images are made smaller by this factor: 0.5 takes a quarter of the time, but more than doubles the errors and
     loses steep faces."""
-    minimum_openness: float = 0.05
+    minimum_openness: float = LEAST_OPENNESS
     """A face counts for completeness if so large a share of the directions above the occlusal plane is free."""
     samples: int = 60_000
     """Points on the tooth at which completeness is asked."""
@@ -255,12 +253,8 @@ def scan_case(
 
 def open_surfaces(jaw: Jaw, tooth: int, minimum_openness: float) -> dict[str, Bool[np.ndarray, "f"]]:
     """The open faces of a tooth, by the names of its surfaces."""
-    faces = jaw.tooth_faces(tooth)
-    middle = jaw.mesh.face_centres[faces].mean(axis=0)
-    near = np.linalg.norm(jaw.mesh.face_centres - middle, axis=1) < _NEIGHBOURHOOD_MM
-    is_open = np.zeros(len(near), dtype=bool)
-    is_open[near] = openness(jaw.mesh.submesh(near)) >= minimum_openness
-    named = {name: mask & faces & is_open for name, mask in named_surfaces(jaw).items()}
+    is_open = open_faces(jaw.mesh, jaw.tooth_faces(tooth), minimum_openness)
+    named = {name: mask & is_open for name, mask in named_surfaces(jaw).items()}
     return {name: mask for name, mask in named.items() if mask.any()}
 
 

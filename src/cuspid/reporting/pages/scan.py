@@ -197,6 +197,7 @@ def _tiles(result: ScanResult) -> list[tuple[str, str, str]]:
             ("mean absolute deviation", f"{found['mean_abs_um']:.1f}", "µm"),
             ("95 % within", f"{found['p95_um']:.1f}", "µm"),
             ("complete within 50 µm", f"{found['completeness_pct']['50']:.1f}", "%"),
+            *_crown_tiles(found.get("crown")),
             ("scale error", f"{found['scale_error_ppm']:+.0f}".replace("-", "−"), "ppm"),
         ]
         if found["inter_molar_error_um"] is not None:
@@ -209,22 +210,38 @@ def _tiles(result: ScanResult) -> list[tuple[str, str, str]]:
     return tiles
 
 
+def _crown_tiles(crown: Mapping[str, Any] | None) -> list[tuple[str, str, str]]:
+    if crown is None:
+        return []
+    told = ", crowns estimated by shape" if crown["estimated"] else ""
+    return [(f"of all open crown surface within 50 µm{told}", f"{crown['completeness_pct']['50']:.1f}", "%")]
+
+
 _FIGURES = ("mean_abs_um", "signed_mean_um", "std_um", "rms_um", "p95_um", "max_um")
 
 
 def _table(trueness: Mapping[str, Any] | None) -> list[dict[str, Any]]:
-    """Trueness in whole and by tooth."""
+    """Trueness in whole, by tooth, and with everything that was scanned."""
     if trueness is None:
         return []
-    complete = trueness["per_tooth_completeness_pct"]
-    whole = {"name": "all", "complete": trueness["completeness_pct"], "figures": [trueness[each] for each in _FIGURES]}
-    return [
-        whole,
-        *(
-            {"name": fdi, "complete": complete[fdi], "figures": [trueness["per_tooth"][fdi][each] for each in _FIGURES]}
-            for fdi in sorted(trueness["per_tooth"], key=int)
-        ),
+    seen = trueness["per_tooth_completeness_pct"]
+    crown = trueness.get("crown") or {"completeness_pct": None, "per_tooth_pct": {}}
+    teeth = [
+        _table_row(fdi, trueness["per_tooth"][fdi], seen[fdi], crown["per_tooth_pct"].get(fdi))
+        for fdi in sorted(trueness["per_tooth"], key=int)
     ]
+    return [
+        _table_row("all", trueness, trueness["completeness_pct"], crown["completeness_pct"]),
+        *teeth,
+        *(_table_row("everything", trueness[each], None, None) for each in ("everything",) if each in trueness),
+    ]
+
+
+def _table_row(
+    name: str, figures: Mapping[str, Any], seen: Mapping[str, float] | None, crown: Mapping[str, float] | None
+) -> dict[str, Any]:
+    """A row; shares of what could be seen and of the open crown, None where there are none."""
+    return {"name": name, "figures": [figures[each] for each in _FIGURES], "seen": seen, "crown": crown}
 
 
 def histogram(mesh: Mesh, deviation_um: Float[np.ndarray, "v"], range_um: float) -> dict[str, Any]:

@@ -1,0 +1,152 @@
+"""Crown surface that is open to some direction, and how much of it a scan has, whether or not a camera could see it.
+
+A face is open if a share of at least `LEAST_OPENNESS` of the directions above the occlusal plane (XY) is free, where
+only what lies within 15 mm of the tooth is in the way.
+
+Over all count the teeth that the scan was meant for: of which at least three quarters as much of the open crown was *in
+reach* as of the tooth that was best in reach. In reach is what two cameras could see at once where that is known, else
+what lies within 200 um of the scan.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from cuspid.geometry import read_only
+from cuspid.jaw import GUM
+from cuspid.mesh import Mesh
+from cuspid.trueness import CrownCompleteness
+
+LEAST_OPENNESS = 0.05
+"""Share of the directions above the occlusal plane that must be free for a face of a crown to count."""
+WITHIN_UM = (50, 100, 200)
+"""Distances at which completeness is asked."""
+_OPENNESS_RAYS = 64
+_NEIGHBOURHOOD_MM = 15.0
+"""What lies farther from a tooth does not cover it."""
+_IN_REACH_MM = 0.2
+_PIECE_MM = 10.0
+"""Side of the squares of the occlusal plane that stand for teeth where these have no names."""
+_MEANT = 0.75
+"""Share in reach, in proportion to that of the tooth best in reach, from which on a tooth counts over all."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OpenCrown:
+    """The open crown surface of a jaw."""
+
+    mesh: Mesh
+    """The surface of the jaw, in the frame of the reference."""
+    parts: Int[np.ndarray, "f"]
+    """For each open face of a crown the FDI number of its tooth, or the number of a piece of the size of a tooth where
+    crowns were told from gum by shape; 0 for all other faces."""
+    estimated: bool = False
+    """Whether crowns were told from gum by shape, for want of tooth labels."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "parts", read_only(self.parts))
+
+
+def open_parts(mesh: Mesh, parts: Int[np.ndarray, "f"]) -> Int[np.ndarray, "f"]:
+    """The parts of crowns of a mesh with +Z out of the gum, as in :class:`OpenCrown`; 0 where a face is not open."""
+    is_open = [open_faces(mesh, parts == part, LEAST_OPENNESS) for part in np.unique(parts) if part != GUM]
+    return np.where(np.any(is_open, axis=0), parts, GUM) if is_open else parts
+
+
+def pieces(mesh: Mesh, crown: Bool[np.ndarray, "f"]) -> Int[np.ndarray, "f"]:
+    """Numbers of pieces of the size of a tooth for the faces of crowns that have no names, 0 for the others."""
+    cells = np.floor(mesh.face_centres[crown, :2] / _PIECE_MM).astype(np.int64)
+    parts = np.full(len(mesh.faces), GUM)
+    parts[crown] = 1 + np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+    return parts
+
+
+def open_faces(mesh: Mesh, tooth: Bool[np.ndarray, "f"], least_openness: float) -> Bool[np.ndarray, "f"]:
+    """The open faces of a tooth, of a mesh with +Z out of the gum."""
+    middle = mesh.face_centres[tooth].mean(axis=0)
+    near = np.linalg.norm(mesh.face_centres - middle, axis=1) < _NEIGHBOURHOOD_MM
+    wanted = near & tooth
+    is_open = np.zeros(len(near), dtype=bool)
+    is_open[wanted] = openness(mesh.submesh(near), np.flatnonzero(tooth[near])) >= least_openness
+    return is_open
+
+
+def openness(mesh: Mesh, faces: Int[np.ndarray, "n"] | None = None) -> Float[np.ndarray, "n"]:
+    """Share of the directions above the occlusal plane (XY) from which the centres of faces (None: all) can be seen."""
+    steps = np.arange(_OPENNESS_RAYS) + 0.5
+    z, azimuth = steps / _OPENNESS_RAYS, steps * np.pi * (3 - np.sqrt(5))
+    directions = np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], axis=1)
+    asked = np.arange(len(mesh.faces)) if faces is None else faces
+    normals = mesh.face_normals[asked]
+    origins = mesh.face_centres[asked] + 2e-3 * normals
+    free = np.zeros(len(asked))
+    for direction in directions:
+        facing = np.flatnonzero(normals @ direction > 0)
+        hits = mesh.cast(origins[facing], np.broadcast_to(direction, (len(facing), 3)))
+        free[facing[hits.faces < 0]] += 1
+    return free / _OPENNESS_RAYS
+
+
+def within_pct(distances_mm: Float[np.ndarray, "n"]) -> dict[str, float]:
+    """Share within each of `WITHIN_UM`."""
+    return {str(um): float(100 * np.mean(np.abs(distances_mm) <= um / 1000)) for um in WITHIN_UM}
+
+
+def crown_completeness(
+    aligned: Mesh,
+    crown: OpenCrown,
+    scannable: Bool[np.ndarray, "f"] | None,
+    samples: int,
+    rng: np.random.Generator,
+) -> CrownCompleteness | None:
+    """How much of the open crown an aligned scan has; None where nothing of it was in reach.
+
+    ``scannable``: the faces that two cameras could see at once, where that is known. ``samples``: points on the crowns
+    that were in reach.
+    """
+    reach = _in_reach(aligned, crown, scannable)
+    faces = np.flatnonzero(np.isin(crown.parts, [part for part, share in reach.items() if share > 0]))
+    if len(faces) == 0:
+        return None
+    surface = Mesh(crown.mesh.vertices, crown.mesh.faces[faces])
+    points, picks = surface.sample(samples, rng)
+    distances_mm, _, _ = aligned.closest(points)
+    owners = crown.parts[faces][picks]
+    parts = [part for part in reach if np.any(owners == part)]
+    counting = [part for part in parts if reach[part] >= _MEANT * max(reach.values())]
+    return CrownCompleteness(
+        completeness_pct=within_pct(distances_mm[np.isin(owners, counting)]),
+        open_mm2=float(crown.mesh.face_areas[np.isin(crown.parts, counting)].sum()),
+        teeth=() if crown.estimated else tuple(counting),
+        per_tooth_pct={} if crown.estimated else {part: within_pct(distances_mm[owners == part]) for part in parts},
+        estimated=crown.estimated,
+        note=_note(crown, scannable is not None, counting),
+    )
+
+
+def _in_reach(aligned: Mesh, crown: OpenCrown, scannable: Bool[np.ndarray, "f"] | None) -> dict[int, float]:
+    """Share of the open crown of each part that was in reach."""
+    faces = np.flatnonzero(crown.parts != GUM)
+    owners, areas = crown.parts[faces], crown.mesh.face_areas[faces]
+    if scannable is not None:
+        reached = scannable[faces]
+    else:
+        reached = aligned.closest(crown.mesh.face_centres[faces])[0] <= _IN_REACH_MM
+    return {
+        int(part): float(areas[(owners == part) & reached].sum() / areas[owners == part].sum())
+        for part in np.unique(owners)
+    }
+
+
+def _note(crown: OpenCrown, could_be_seen: bool, counting: list[int]) -> str:
+    """What counts, for people."""
+    where = "could be seen by two cameras" if could_be_seen else "lies within 200 µm of the scan"
+    named = f"{len(counting)} pieces" if crown.estimated else ", ".join(map(str, counting))
+    told = "; crowns were told from gum by shape, an estimate" if crown.estimated else ""
+    return (
+        f"of the open crown surface counts, over all: {named}; of each of them at least three quarters as much {where} "
+        f"as of the best one{told}"
+    )
