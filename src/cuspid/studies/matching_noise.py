@@ -162,7 +162,8 @@ def _handpiece(options: MatchingNoiseOptions, baseline_mm: float) -> Handpiece:
 def _images(
     jaw: Jaw, handpiece: Handpiece, pose: Rigid3, options: MatchingNoiseOptions
 ) -> tuple[UInt8[np.ndarray, "h w"], ...]:
-    scene = Scene(jaw=jaw, handpiece=handpiece, appearance=APPEARANCES[options.texture], seed=options.seed)
+    appearance = APPEARANCES[options.texture].seen_by(handpiece.footprint_mm)
+    scene = Scene(jaw=jaw, handpiece=handpiece, appearance=appearance, seed=options.seed)
     gain = auto_gain(scene, [pose])
     frame = Frame(name=handpiece.name, cameras=handpiece.rig.names)
     rendered = [render_image(scene, frame, name, pose, gain) for name in frame.cameras]
