@@ -20,11 +20,13 @@ from cuspid.stereo.confidence import (
     Measured,
     Resolution,
     agreement,
+    at_near_borders,
     confidence,
     without_speckle,
 )
 from cuspid.stereo.matching import DepthEstimator, StereoOptions, coarser, group_geometry
 from cuspid.stereo.rectification import IdealView, rectify
+from cuspid.stereo.refinement import image_noise
 from cuspid.stereo.seeds import seed_pairs, semi_global
 from synthetic_scene import cast_depth, diamond, height_field, render
 
@@ -262,6 +264,30 @@ def test_cameras_that_agree_vote_for_a_depth_and_others_against() -> None:
     assert votes == 0
     assert agreement(measured[:2], 0, RESOLUTION, ConfidenceOptions())[10, 10] == 1
     assert agreement(measured[::3], 0, RESOLUTION, ConfidenceOptions())[10, 10] == 0
+
+
+def test_two_cameras_alone_must_agree_better() -> None:
+    measured = [flat((0, 0), 5.0), flat((0.5, 0), 5.02), flat((0, 0.5), 4.5)]
+    assert agreement(measured, 0, RESOLUTION, ConfidenceOptions())[10, 10] == 1
+    assert agreement(measured[:2], 0, RESOLUTION, ConfidenceOptions())[10, 10] == 0
+
+
+def test_the_near_side_of_a_border_is_found() -> None:
+    depth = np.full((20, 20), 5.0)
+    depth[:, :10], depth[:3] = 4.0, np.nan
+    one = replace(flat((0, 0), 5.0), depth_mm=depth)
+    borders = at_near_borders(one, 2, RESOLUTION, ConfidenceOptions())
+    assert borders[3:, 8:10].all()
+    assert not borders[:, :8].any()
+    assert not borders[:, 10:].any()
+
+
+@given(noise=st.floats(0.5, 5.0))
+def test_noise_is_told_where_the_image_is_smooth(noise: float) -> None:
+    rng = np.random.default_rng(0)
+    image = 128 + rng.normal(0, noise, (120, 120))
+    image[:60] += rng.normal(0, 30, (60, 120))
+    assert 0.7 * noise < image_noise(image.astype(np.float32)) < 1.1 * noise
 
 
 def test_speckle_goes_and_surface_stays() -> None:

@@ -22,6 +22,8 @@ from cuspid.geometry import Rigid3
 class ConfidenceOptions:
     """What is kept of the measured depth and how it is weighted."""
 
+    pair_agreement: float = 0.9
+    """The same where only two cameras look, whom no third one contradicts."""
     agreement: float = 2.5
     """Depths of two cameras agree within this many resolutions (0.03 mm at 12 um), or within three standard deviations
     where that is more."""
@@ -30,6 +32,11 @@ class ConfidenceOptions:
     best_sigma: float = 1 / 6
     """Standard deviation, in resolutions at the working distance (0.002 mm at 12 um), that has confidence 1; the
     confidence falls with its inverse square."""
+    border_px: int = 2
+    """Of two cameras, pixels so near to the border of a surface that lies before another one are dropped: no third
+    camera looks past it."""
+    border_jump: float = 2.0
+    """How far the other one lies behind, in resolutions, to be another one."""
     speckle_px: int = 100
     """Connected pieces of fewer depth pixels are dropped."""
     speckle_jump: float = 5.0
@@ -68,7 +75,8 @@ class Measured:
 def sample_inverse_depth(
     depth_mm: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n"]:
-    """Inverse depth (exact for planes) between pixel centres; NaN where a neighbour is unknown or it is outside."""
+    """Inverse depth (exact for planes) between pixel centres, of the known ones of the four around; NaN outside, and
+    where the known ones have less than a quarter of the weight."""
     height, width = depth_mm.shape
     place = np.nan_to_num(pixels - 0.5, nan=-1.0)
     base = np.floor(place).astype(int)
@@ -76,9 +84,14 @@ def sample_inverse_depth(
     column, row = np.where(inside[:, None], base, 0).T
     fx, fy = (place - base).T
     inverse = 1 / depth_mm
-    top = (1 - fx) * inverse[row, column] + fx * inverse[row, column + 1]
-    bottom = (1 - fx) * inverse[row + 1, column] + fx * inverse[row + 1, column + 1]
-    return np.where(inside, (1 - fy) * top + fy * bottom, np.nan)
+    total, weight = np.zeros(len(pixels)), np.zeros(len(pixels))
+    for down, share_y in ((0, 1 - fy), (1, fy)):
+        for right, share_x in ((0, 1 - fx), (1, fx)):
+            corner = inverse[row + down, column + right]
+            known = np.isfinite(corner)
+            total += np.where(known, share_x * share_y * corner, 0)
+            weight += np.where(known, share_x * share_y, 0)
+    return np.where(inside & (weight >= 0.25), total / np.maximum(weight, 0.25), np.nan)
 
 
 def agreement(
@@ -90,13 +103,33 @@ def agreement(
     known = np.isfinite(one.depth_mm)
     rays = one.camera.rays(one.camera.pixel_centres()[known])
     in_rig = one.cam_from_rig.inverse().apply(rays * one.depth_mm[known, None].astype(np.float64))
-    tolerance = np.maximum(options.agreement * resolution.at(one.depth_mm[known]), 3 * one.sigma_mm[known])
+    tolerance = _tolerance_mm(one, len(measured), resolution, options)[known]
     for other in (*measured[:index], *measured[index + 1 :]):
         in_other = other.cam_from_rig.apply(in_rig)
         with np.errstate(invalid="ignore"):
             behind = 1 / sample_inverse_depth(other.depth_mm, other.camera.project(in_other)) - in_other[:, 2]
         votes[known] += (np.abs(behind) <= tolerance).astype(int) - (behind > 3 * tolerance).astype(int)
     return votes
+
+
+def _tolerance_mm(
+    one: Measured, cameras: int, resolution: Resolution, options: ConfidenceOptions
+) -> Float[np.ndarray, "h w"]:
+    """How far from each other the depths of two of so many cameras may be."""
+    if cameras == 2:
+        return options.pair_agreement * resolution.at(one.depth_mm)
+    return np.maximum(options.agreement * resolution.at(one.depth_mm), 3 * one.sigma_mm)
+
+
+def at_near_borders(
+    one: Measured, radius: int, resolution: Resolution, options: ConfidenceOptions
+) -> Bool[np.ndarray, "h w"]:
+    """True where there is another surface behind within a few pixels of the grid: a window there sees mostly the nearer
+    one, whose depth reaches over its border."""
+    inverse = np.where(np.isfinite(one.depth_mm), 1 / one.depth_mm, np.finfo(np.float32).max).astype(np.float32)
+    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    step = options.border_jump * resolution.mm / resolution.working_distance_mm**2
+    return np.asarray(np.isfinite(one.depth_mm) & (inverse - cv2.erode(inverse, around) > step))
 
 
 def sure_enough(one: Measured, resolution: Resolution, options: ConfidenceOptions) -> Bool[np.ndarray, "h w"]:

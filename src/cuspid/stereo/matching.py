@@ -21,12 +21,13 @@ from cuspid.stereo.confidence import (
     Measured,
     Resolution,
     agreement,
+    at_near_borders,
     confidence,
     sure_enough,
     without_speckle,
 )
 from cuspid.stereo.rectification import IdealView, RectifiedPair, rectify
-from cuspid.stereo.refinement import SCORE, VARIANCE, GroupGeometry, Q, RefinementOptions, refine
+from cuspid.stereo.refinement import SCORE, VARIANCE, GroupGeometry, Q, RefinementOptions, image_noise, refine
 from cuspid.stereo.seeds import PairMatcher, seed_pairs, seed_points, semi_global
 
 
@@ -164,8 +165,8 @@ class DepthEstimator:
 
         A camera of the handpiece that is not among them, or whose image is blank, saw nothing of the frame.
         """
-        names, least = self.handpiece.rig.names, self.options.refinement.least_contrast_dn
-        groups = self._groups(tuple(name for name in names if name in images and _contrast_dn(images[name]) >= least))
+        names = self.handpiece.rig.names
+        groups = self._groups(tuple(name for name in names if name in images and not _is_blank(images[name])))
         found = [depth_map for group in groups for depth_map in self._measure_group(group, images, frame)]
         return tuple(sorted(found, key=lambda depth_map: names.index(depth_map.camera_name)))
 
@@ -199,9 +200,10 @@ class DepthEstimator:
             layers,
             self.handpiece.depth_range_mm,
             self.options.spacing_px,
+            image_noise(stack[index, : sizes[index, 0], : sizes[index, 1]]),
             self.options.refinement,
         )
-        found = planes[..., SCORE] >= self.options.refinement.accept_zncc
+        found = planes[..., SCORE] > 0
         depth = geometry.scale / np.where(found, planes[..., Q], np.nan)
         sigma = np.sqrt(planes[..., VARIANCE]) * depth**2 / geometry.scale
         return Measured(grid, view.cam_from_rig, depth, sigma)
@@ -216,6 +218,9 @@ class DepthEstimator:
     ) -> DepthMap:
         one, resolution, options = measured[index], self.resolution, self.options.confidence
         keep = (agreement(measured, index, resolution, options) > 0) & sure_enough(one, resolution, options)
+        if len(measured) == 2:
+            radius = -(-options.border_px // self.options.spacing_px)
+            keep &= ~at_near_borders(one, radius, resolution, options)
         keep = without_speckle(np.where(keep, one.depth_mm, np.nan), resolution, options)
         return DepthMap(
             frame=frame,
@@ -234,9 +239,12 @@ def _gray(image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w"]:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
-def _contrast_dn(image: UInt8[np.ndarray, "h w *c"]) -> float:
-    """Standard deviation of the values."""
-    return float(cv2.meanStdDev(image)[1].max())
+_BLANK_DN = 2.0
+
+
+def _is_blank(image: UInt8[np.ndarray, "h w *c"]) -> bool:
+    """Whether an image shows no more than noise."""
+    return bool(cv2.meanStdDev(image)[1].max() < _BLANK_DN)
 
 
 def _color_grid(image: UInt8[np.ndarray, "h w *c"], spacing_px: int) -> UInt8[np.ndarray, "r s 3"]:
