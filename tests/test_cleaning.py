@@ -8,10 +8,16 @@ import trimesh
 
 from builders import joined, moved, sphere
 from cuspid.mesh import Mesh
-from cuspid.surface.cleaning import CleaningOptions, boundaries, clean, face_pieces, non_manifold_faces
+from cuspid.surface.cleaning import CleaningReport, boundaries, face_pieces, non_manifold_faces
+from cuspid.surface.cleaning import clean as clean_mesh
 from synthetic_scene import height_field
 
 SHEET = height_field(lambda x, y: 5 + 0.2 * np.sin(x), half_width_mm=2.0, count=41)
+RESOLUTION_MM = 0.012
+
+
+def clean(mesh: Mesh) -> tuple[Mesh, CleaningReport]:
+    return clean_mesh(mesh, RESOLUTION_MM)
 
 
 def test_a_good_surface_is_left_alone() -> None:
@@ -97,4 +103,4 @@ def test_nothing_stays_nothing() -> None:
     cleaned, report = clean(empty)
     assert len(cleaned.faces) == 0
     assert report.holes == ()
-    assert len(clean(sphere(0.1, 3), CleaningOptions())[0].faces) == 0
+    assert len(clean(sphere(0.1, 3))[0].faces) == 0

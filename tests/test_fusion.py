@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cache
 
@@ -14,7 +15,8 @@ from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.reconstruction import DepthMap
 from cuspid.surface.evidence import Evidence, observe
-from cuspid.surface.fusion import FusionOptions, Votes, fuse
+from cuspid.surface.fusion import FusionOptions, Votes
+from cuspid.surface.fusion import fuse as fuse_depth_maps
 from cuspid.surface.volume import SparseVolume, pack, unpack
 from synthetic_scene import diamond, height_field, true_depth_map
 
@@ -26,6 +28,15 @@ POSES = {
     )
     for k in range(3)
 }
+
+
+RESOLUTION_MM = 0.012
+
+
+def fuse(
+    maps: Iterable[DepthMap], poses: Mapping[str, Rigid3], options: FusionOptions | None = None, **progress
+) -> Mesh:
+    return fuse_depth_maps(maps, poses, RESOLUTION_MM, options, **progress)
 
 
 def depth_maps(mesh: Mesh, poses=POSES, names=("west", "north")) -> list[DepthMap]:

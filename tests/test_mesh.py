@@ -29,8 +29,9 @@ def test_rays_hit_where_they_should():
     assert np.isinf(away.distances[0])
 
 
-def test_occlusion_is_of_the_open_segment():
-    mesh = sphere(10.0)
+@pytest.mark.parametrize("size", [1.0, 1000.0])
+def test_occlusion_is_of_the_open_segment(size):
+    mesh = sphere(10.0 * size)
     near, far = mesh.face_centres[:50], -mesh.face_centres[:50]
     eye = near * 2
     assert not mesh.occluded(near, eye).any()

@@ -248,6 +248,16 @@ def test_presets_differ_in_contrast_and_seeds_in_pattern() -> None:
     assert abs(np.corrcoef(one, other)[0, 1]) < 0.05
 
 
+def test_a_sprayed_texture_suits_the_cameras_and_enamel_stays_enamel() -> None:
+    for footprint_mm, factor in ((0.0117, 1), (0.0121, 1), (0.024, 2), (0.003, 0.25), (12.0, 1024)):
+        for name in ("artificial", "powder"):
+            before, after = APPEARANCES[name].gum, APPEARANCES[name].seen_by(footprint_mm).gum
+            assert after.wavelengths_mm == tuple(factor * wavelength for wavelength in before.wavelengths_mm)
+        assert (
+            APPEARANCES["enamel"].seen_by(footprint_mm).gum.wavelengths_mm == APPEARANCES["enamel"].gum.wavelengths_mm
+        )
+
+
 def test_gum_and_teeth_have_their_own_materials() -> None:
     two = jaw_of(quad((0, 0, 5.0), 1.0), quad((3, 0, 5.0), 1.0), labels=[11, 0])
     np.testing.assert_array_equal(face_materials(two), [0, 0, 1, 1])

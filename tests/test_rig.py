@@ -44,6 +44,21 @@ def test_groups_join_cameras_that_see_the_same():
     assert rig.stereo_pairs(5.0) == (("o1", "o2"), ("s1", "s2"))
 
 
+def test_what_a_handpiece_resolves_is_a_pixel_or_half_a_pixel_of_disparity():
+    pixel_mm = 5.0 / CAMERA.focal_px[0]
+    wide, narrow = (Handpiece(rig=rig_of(a=shifted(0), b=shifted(x))) for x in (2.5, 0.5))
+    assert wide.resolution_mm == pytest.approx(pixel_mm) == pytest.approx(wide.depth_step_mm / 2)
+    assert narrow.resolution_mm == pytest.approx(5 * pixel_mm)
+    assert Handpiece(rig=rig_of(a=shifted(0))).resolution_mm == pytest.approx(pixel_mm)
+
+
+@given(st.permutations(["a", "b", "c", "d"]))
+def test_cameras_have_an_order_of_their_own(names):
+    places = {"a": shifted(0), "b": shifted(0, 1), "c": shifted(1), "d": shifted(-2, 3)}
+    ordered = rig_of(**{name: places[name] for name in names}).in_own_order()
+    assert ordered.names == rig_of(**places).in_own_order().names
+
+
 def test_place_and_axis_in_the_rig():
     mounted = MountedCamera(CAMERA, Rigid3.from_rotation_vector(np.array([np.pi, 0, 0]), np.array([0, 0, 7.0])))
     np.testing.assert_allclose(mounted.centre_in_rig, [0, 0, 7], atol=1e-12)

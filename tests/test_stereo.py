@@ -15,9 +15,18 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.reconstruction import DepthMap
 from cuspid.rig import Handpiece, MountedCamera, Rig
-from cuspid.stereo.confidence import ConfidenceOptions, Measured, agreement, confidence, without_speckle
+from cuspid.stereo.confidence import (
+    ConfidenceOptions,
+    Measured,
+    Resolution,
+    agreement,
+    at_near_borders,
+    confidence,
+    without_speckle,
+)
 from cuspid.stereo.matching import DepthEstimator, StereoOptions, coarser, group_geometry
 from cuspid.stereo.rectification import IdealView, rectify
+from cuspid.stereo.refinement import image_noise
 from cuspid.stereo.seeds import seed_pairs, semi_global
 from synthetic_scene import cast_depth, diamond, height_field, render
 
@@ -239,6 +248,9 @@ def test_each_camera_gets_its_widest_partner() -> None:
     }
 
 
+RESOLUTION = Resolution(mm=0.012, working_distance_mm=5.0)
+
+
 def flat(centre: tuple[float, float], depth: float) -> Measured:
     camera = Camera.from_field_of_view(20, 20, 62.0)
     full = np.full((20, 20), depth)
@@ -247,11 +259,35 @@ def flat(centre: tuple[float, float], depth: float) -> Measured:
 
 def test_cameras_that_agree_vote_for_a_depth_and_others_against() -> None:
     measured = [flat((0, 0), 5.0), flat((0.5, 0), 5.01), flat((0, 0.5), 5.5), flat((0.5, 0.5), 4.5)]
-    votes = agreement(measured, 0, ConfidenceOptions(agreement_mm=0.03))[10, 10]
+    votes = agreement(measured, 0, RESOLUTION, ConfidenceOptions())[10, 10]
     # The second agrees, the third looks through the point, the fourth sees something in front and knows nothing of it.
     assert votes == 0
-    assert agreement(measured[:2], 0, ConfidenceOptions(agreement_mm=0.03))[10, 10] == 1
-    assert agreement(measured[::3], 0, ConfidenceOptions(agreement_mm=0.03))[10, 10] == 0
+    assert agreement(measured[:2], 0, RESOLUTION, ConfidenceOptions())[10, 10] == 1
+    assert agreement(measured[::3], 0, RESOLUTION, ConfidenceOptions())[10, 10] == 0
+
+
+def test_two_cameras_alone_must_agree_better() -> None:
+    measured = [flat((0, 0), 5.0), flat((0.5, 0), 5.02), flat((0, 0.5), 4.5)]
+    assert agreement(measured, 0, RESOLUTION, ConfidenceOptions())[10, 10] == 1
+    assert agreement(measured[:2], 0, RESOLUTION, ConfidenceOptions())[10, 10] == 0
+
+
+def test_the_near_side_of_a_border_is_found() -> None:
+    depth = np.full((20, 20), 5.0)
+    depth[:, :10], depth[:3] = 4.0, np.nan
+    one = replace(flat((0, 0), 5.0), depth_mm=depth)
+    borders = at_near_borders(one, 2, RESOLUTION, ConfidenceOptions())
+    assert borders[3:, 8:10].all()
+    assert not borders[:, :8].any()
+    assert not borders[:, 10:].any()
+
+
+@given(noise=st.floats(0.5, 5.0))
+def test_noise_is_told_where_the_image_is_smooth(noise: float) -> None:
+    rng = np.random.default_rng(0)
+    image = 128 + rng.normal(0, noise, (120, 120))
+    image[:60] += rng.normal(0, 30, (60, 120))
+    assert 0.7 * noise < image_noise(image.astype(np.float32)) < 1.1 * noise
 
 
 def test_speckle_goes_and_surface_stays() -> None:
@@ -259,7 +295,7 @@ def test_speckle_goes_and_surface_stays() -> None:
     depth[:, :20] = 5.0
     depth[5:8, 30:33] = 5.0
     depth[20:23, 5:8] = 6.0
-    keep = without_speckle(depth, ConfidenceOptions(speckle_px=20))
+    keep = without_speckle(depth, RESOLUTION, ConfidenceOptions(speckle_px=20))
     assert keep[:, :5].all()
     assert not keep[:, 20:].any()
     assert not keep[20:23, 5:8].any()
@@ -269,8 +305,8 @@ def test_speckle_goes_and_surface_stays() -> None:
 def test_confidence_is_inverse_variance_up_to_one(sigma: float) -> None:
     options = ConfidenceOptions()
     sigmas, keep = np.array([[sigma, 2 * sigma]]), np.array([[True, True]])
-    weight = confidence(sigmas, keep, options)
+    weight = confidence(sigmas, keep, RESOLUTION, options)
     assert 0 < weight[0, 1] <= weight[0, 0] <= 1
-    if sigma > options.best_sigma_mm:
+    if sigma > options.best_sigma * RESOLUTION.mm:
         assert weight[0, 0] == pytest.approx(4 * weight[0, 1], rel=1e-5)
-    assert not confidence(sigmas, ~keep, options).any()
+    assert not confidence(sigmas, ~keep, RESOLUTION, options).any()

@@ -17,6 +17,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, read_only
 
+_ROUNDING = 5e-7
+"""Of a length in single precision, four steps."""
+
 
 @dataclass(frozen=True, eq=False)
 class RayHits:
@@ -150,12 +153,14 @@ class Mesh:
         towards: Float[np.ndarray, "n 3"],
         tolerance_mm: float = 1e-3,
     ) -> Bool[np.ndarray, "n"]:
-        """True where the open segment from ``points`` to ``towards`` meets the mesh farther than the tolerance."""
+        """True where the open segment from ``points`` to ``towards`` meets the mesh farther than the tolerance, or than
+        single precision tells apart where the rays are long."""
         # The segment is shot backwards: a hit nearer than the surface point is an occluder.
         reach = points - towards
         length = np.linalg.norm(reach, axis=1)
         hits = self.cast(towards, reach / length[:, None])
-        return hits.distances < length - tolerance_mm
+        rounding_mm = _ROUNDING * (np.abs(points).max(axis=1, initial=0) + length)
+        return hits.distances < length - np.maximum(tolerance_mm, rounding_mm)
 
     @cached_property
     def _tree(self) -> igl.AABB:

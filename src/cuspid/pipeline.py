@@ -113,7 +113,8 @@ def reconstruct(
         depths = measure_depth(capture, folder / "depth-refined", options.stereo, progress=progress)
     if options.temporal.enabled:
         depths |= measure_temporal_depth(capture, poses, folder / "depth-temporal", options.temporal, progress=progress)
-    mesh = fuse(depths, depths.digest, poses, folder, options.fusion, options.cleaning, progress=progress)
+    made_from, resolution_mm = depths.digest, handpiece.resolution_mm
+    mesh = fuse(depths, made_from, poses, resolution_mm, folder, options.fusion, options.cleaning, progress=progress)
     return found, mesh
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
@@ -90,6 +90,14 @@ class Reconstruction:
     def frames(self) -> tuple[str, ...]:
         """Names of the located frames."""
         return tuple(self.rig_from_world)
+
+    def with_cameras_as(self, names: Sequence[str]) -> Reconstruction:
+        """The same with its cameras in another order."""
+        tracks = self.tracks
+        if tracks is not None:
+            place = np.array([names.index(name) for name in self.rig.names])
+            tracks = replace(tracks, camera_index=place[tracks.camera_index])
+        return replace(self, rig=Rig({name: self.rig[name] for name in names}), tracks=tracks)
 
     @property
     def known_tracks(self) -> Tracks:

@@ -66,6 +66,11 @@ class Rig:
             raise InputError(f"rig: no camera named {name!r}; it has {', '.join(self.cameras)}")
         return self.cameras[name]
 
+    def in_own_order(self) -> Rig:
+        """The same rig with its cameras ordered by where they are, whatever order and names they were given."""
+        ordered = sorted(self.cameras, key=lambda name: self[name].cam_from_rig.matrix[:3, ::-1].T.ravel().tolist())
+        return Rig({name: self[name] for name in ordered})
+
     def rebased(self, reference: str | None = None) -> tuple[Rig, Rigid3]:
         """The same rig in the frame of one of its cameras (default: the first), and ``reference_from_rig``."""
         reference_from_rig = self[reference or self.names[0]].cam_from_rig
@@ -209,6 +214,36 @@ class Handpiece:
         cameras = {f"camera {name}": module(each.cam_from_rig, CAMERA_MM) for name, each in self.rig.cameras.items()}
         leds = {f"light {name}": module(light.light_from_rig, LED_MM) for name, light in self.lights.items()}
         return Body({**cameras, **leds})
+
+    @property
+    def footprint_mm(self) -> float:
+        """Side of what a pixel sees of a surface at the working distance, mm: median of the cameras."""
+        focal_px = [mounted.camera.focal_px.mean() for mounted in self.rig.cameras.values()]
+        return self.working_distance_mm / float(np.median(focal_px))
+
+    @property
+    def depth_step_mm(self) -> float:
+        """Change of depth at the working distance that shifts a point by 1 px in the widest stereo pair, mm; infinite
+        where no two cameras see the same surface."""
+        pairs = self.rig.stereo_pairs(self.working_distance_mm)
+        parallax = max((self._parallax_px_mm(*pair) for pair in pairs), default=0.0)
+        return self.working_distance_mm**2 / parallax if parallax > 0 else float("inf")
+
+    def _parallax_px_mm(self, first: str, second: str) -> float:
+        """Focal length times the sideways distance of the second camera from the first."""
+        one = self.rig[first]
+        sideways = one.cam_from_rig.apply(self.rig[second].centre_in_rig)[:2]
+        return float(one.camera.focal_px.mean() * np.linalg.norm(sideways))
+
+    @cached_property
+    def resolution_mm(self) -> float:
+        """The detail that the images resolve at the working distance, mm, the yardstick of all limits that are lengths.
+
+        It is the footprint of a pixel or, where the cameras stand so close together that depth is less sure than that,
+        the depth of half a pixel of disparity; 12 um for the built-in handpieces.
+        """
+        half_step = self.depth_step_mm / 2
+        return max(self.footprint_mm, half_step) if np.isfinite(half_step) else self.footprint_mm
 
     def lights_on(self, lighting: str | None) -> list[Light]:
         """The lights of a lighting pattern; all of them where the pattern is not known (None).

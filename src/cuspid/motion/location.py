@@ -48,8 +48,9 @@ class MotionOptions:
     """Matching of a camera with itself at other frames once the poses are known about."""
     reach: int = 3
     """A camera is matched with itself at +1 to +reach frames."""
-    depth_slack_mm: float = 0.1
-    """Uncertainty of the depth of a point triangulated within a frame, when it is looked for in another."""
+    depth_slack: float = 8.3
+    """Uncertainty of the depth of a point triangulated within a frame, when it is looked for in another, in resolutions
+    of the handpiece (0.1 mm at 12 um)."""
     cell_px: float = 35.0
     """Every cell of this size of an image keeps its longest track for the adjustment; 0 keeps all tracks."""
     minimum_located: float = 0.5
@@ -114,13 +115,13 @@ def _match_frames(
     starts: Mapping[tuple[int, str], int],
 ) -> Int[np.ndarray, "k 2"]:
     """Matches, as numbers of keypoints, of each camera with itself at another frame."""
-    second_from_first = poses[second] @ poses[first].inverse()
+    second_from_first, slack_mm = poses[second] @ poses[first].inverse(), options.depth_slack * handpiece.resolution_mm
     matches = [np.zeros((0, 2), dtype=np.int64)]
     for camera, mounted in handpiece.rig.cameras.items():
         if camera not in frames[first] or camera not in frames[second]:
             continue
         motion = mounted.cam_from_rig @ second_from_first @ mounted.cam_from_rig.inverse()
-        here, there = (_depth_bounds(clouds[f], handpiece, camera, options.depth_slack_mm) for f in (first, second))
+        here, there = (_depth_bounds(clouds[f], handpiece, camera, slack_mm) for f in (first, second))
         found = match_guided(frames[first][camera], frames[second][camera], motion, here, there, options.between)
         matches.append(found + [starts[first, camera], starts[second, camera]])
     return np.concatenate(matches)
@@ -224,8 +225,10 @@ def locate_features(
 ) -> Reconstruction:
     """As :func:`locate`, from the keypoints by (frame, camera) of the frames ``names`` in the order of capture.
 
-    A camera without keypoints of a frame is left out of that frame.
+    A camera without keypoints of a frame is left out of that frame. In what order the handpiece has its cameras decides
+    nothing but their order in the result.
     """
+    given, handpiece = handpiece.rig.names, replace(handpiece, rig=handpiece.rig.in_own_order())
     rig, log = handpiece.rig, dict[str, float]()
     options = _loosened(options, 2 * calibration_sigma_px(rig, handpiece.working_distance_mm))
     frames = [
@@ -254,7 +257,7 @@ def locate_features(
     )
     with _timed(log, "adjustment"):
         adjusted = adjust(start, options.adjustment)
-    return replace(adjusted, log={**log, **adjusted.log})
+    return replace(adjusted.with_cameras_as(given), log={**log, **adjusted.log})
 
 
 def locate(

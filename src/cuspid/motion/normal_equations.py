@@ -21,7 +21,8 @@ CALIBRATION = 14
 _COLUMNS = 3 + POSE + CALIBRATION
 _PARTS = 4
 """Fixed, for the order of a sum shows in its last bits: the result must not depend on the number of cores."""
-_NEAREST_MM = 1e-3
+_FLATTEST = 1e-3
+"""Depth of a point, as a share of its distance from the axis, from which it counts as before the camera."""
 _SETTLING = 4
 """Most steps of a point after the rest has moved."""
 
@@ -107,6 +108,13 @@ def _move(rotation, translation, x, out):
 
 @njit(cache=True, nogil=True)
 @no_type_check
+def _is_before(x_in_cam):
+    """Whether a point lies before its camera, and not almost beside it."""
+    return x_in_cam[2] > _FLATTEST * (abs(x_in_cam[0]) + abs(x_in_cam[1]))
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
 def _times(a, b, out):
     """out (2xn) = a (2x3) @ b (3xn)."""
     for i in range(2):
@@ -132,7 +140,7 @@ def linearise(state, point, frame, camera, calibrated, scratch, pixel, jacobian)
     x_in_rig, x_in_cam, by_cam, by_rig, raw = scratch
     _move(state.frame_rotation[frame], state.frame_translation[frame], state.points[point], x_in_rig)
     _move(state.camera_rotation[camera], state.camera_translation[camera], x_in_rig, x_in_cam)
-    if x_in_cam[2] < _NEAREST_MM:
+    if not _is_before(x_in_cam):
         return False
     x, y, z = x_in_cam
     _camera_jacobian(state.intrinsics[camera], x, y, z, pixel, by_cam, raw[:, POSE:])
@@ -168,7 +176,7 @@ def _residuals(state, observations, out):
             _move(state.frame_rotation[frame], state.frame_translation[frame], state.points[point], x_in_rig)
             _move(state.camera_rotation[camera], state.camera_translation[camera], x_in_rig, x_in_cam)
             out[o] = np.nan
-            if x_in_cam[2] >= _NEAREST_MM:
+            if _is_before(x_in_cam):
                 x, y, z = x_in_cam
                 _camera_jacobian(state.intrinsics[camera], x, y, z, out[o], by_cam, raw[:, POSE:])
                 out[o] -= observations.pixels[o]
@@ -355,7 +363,7 @@ def _loss(state, observations, weighting, point, scratch, residual):
         frame, camera = observations.frame[o], observations.camera[o]
         _move(state.frame_rotation[frame], state.frame_translation[frame], state.points[point], x_in_rig)
         _move(state.camera_rotation[camera], state.camera_translation[camera], x_in_rig, x_in_cam)
-        if x_in_cam[2] < _NEAREST_MM:
+        if not _is_before(x_in_cam):
             return np.inf
         x, y, z = x_in_cam
         _camera_jacobian(state.intrinsics[camera], x, y, z, residual, by_cam, raw[:, POSE:])

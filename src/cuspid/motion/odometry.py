@@ -31,7 +31,9 @@ Views = Mapping[str, View]
 _CELL_PX = 40
 _POLISHING_ROUNDS = 12
 _DIFFERENCE = 1e-5
-"""Step of the derivatives, rad and mm."""
+"""Step of the derivatives, in rad and in mean distances of the points."""
+_DECIMALS = 9
+"""Of a polished pose, in rad and in mean distances of the points."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,6 +204,7 @@ def polish(
     COLMAP's estimate differs from call to call, and its refinement, of the same sum, stops some nanometres before the
     end.
     """
+    unit_mm = float(np.linalg.norm(points, axis=1).mean())
     mounted = list(rig.cameras.values())
     parts = [(mounted[camera], np.flatnonzero(cameras == camera)) for camera in np.unique(cameras)]
 
@@ -214,15 +217,16 @@ def polish(
     for _ in range(_POLISHING_ROUNDS):
         here = residuals(pose)
         weights = 1 / np.sqrt(1 + np.sum(here**2, axis=1, keepdims=True))
-        changes = [residuals(_moved(pose, step)) - residuals(_moved(pose, -step)) for step in steps]
+        changes = [residuals(_moved(pose, step, unit_mm)) - residuals(_moved(pose, -step, unit_mm)) for step in steps]
         slopes = np.stack([(weights * change).ravel() for change in changes], axis=1) / (2 * _DIFFERENCE)
-        pose = _moved(pose, np.linalg.lstsq(slopes, -(weights * here).ravel(), rcond=None)[0])
-    return Rigid3.from_rotation_vector(pose.rotation_vector.round(9), pose.translation.round(9))
+        pose = _moved(pose, np.linalg.lstsq(slopes, -(weights * here).ravel(), rcond=None)[0], unit_mm)
+    rounded_mm = unit_mm * (pose.translation / unit_mm).round(_DECIMALS)
+    return Rigid3.from_rotation_vector(pose.rotation_vector.round(_DECIMALS), rounded_mm)
 
 
-def _moved(pose: Rigid3, step: Float[np.ndarray, "6"]) -> Rigid3:
-    """A pose turned (rad) and shifted (mm)."""
-    return Rigid3.from_rotation_vector(step[:3], step[3:]) @ pose
+def _moved(pose: Rigid3, step: Float[np.ndarray, "6"], unit_mm: float) -> Rigid3:
+    """A pose turned (rad) and shifted (in units)."""
+    return Rigid3.from_rotation_vector(step[:3], unit_mm * step[3:]) @ pose
 
 
 def relative_pose(rig: Rig, cloud: Cloud, source: Views, target: Views, options: OdometryOptions, seed: int) -> Edge:

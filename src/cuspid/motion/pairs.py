@@ -21,7 +21,8 @@ from cuspid.geometry import Rigid3
 from cuspid.motion.features import DESCRIPTOR_NORM, Features
 
 _CELL_PX = 12.0
-_NEAREST_MM = 0.05
+_NEAREST_SHARE = 0.01
+"""Of a segment, what is nearer to the other camera than this share of its farthest depth is left out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,12 +82,13 @@ def _segment(ray, low, high, rotation, translation, focal, ends):
     """Ends in px, in the other image, of depth ``low`` to ``high`` on a ray. False if all of it lies behind."""
     turned = rotation @ np.array([ray[0], ray[1], 1.0])
     near, far = low * turned[2] + translation[2], high * turned[2] + translation[2]
-    if max(near, far) < _NEAREST_MM:
+    nearest = _NEAREST_SHARE * high
+    if max(near, far) < nearest:
         return False
-    if near < _NEAREST_MM:
-        low = (_NEAREST_MM - translation[2]) / turned[2]
-    if far < _NEAREST_MM:
-        high = (_NEAREST_MM - translation[2]) / turned[2]
+    if near < nearest:
+        low = (nearest - translation[2]) / turned[2]
+    if far < nearest:
+        high = (nearest - translation[2]) / turned[2]
     for k, depth in enumerate((low, high)):
         z = depth * turned[2] + translation[2]
         ends[k, 0] = focal * (depth * turned[0] + translation[0]) / z

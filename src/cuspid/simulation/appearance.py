@@ -7,7 +7,7 @@ on the point of the jaw alone, never on the camera. Colours are linear RGB.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Literal, NamedTuple, no_type_check
 
@@ -40,6 +40,16 @@ class Material:
     """GGX roughness (alpha) of the coat; small is a sharp highlight."""
     scattering_mm: Colour = (0.0, 0.0, 0.0)
     """How far red, green and blue light travels under the surface; only Blender renders it."""
+    applied: bool = False
+    """Whether the texture is sprayed or painted on, as fine as the cameras need it, and not the surface's own."""
+
+    def seen_by(self, footprint_mm: float) -> Material:
+        """With an applied texture that cameras resolve whose pixels see so much of the surface: coarser or finer by
+        whole octaves than the one that suits 12 um, so that cameras that are about alike see the same texture."""
+        if not self.applied:
+            return self
+        factor = 2.0 ** round(np.log2(footprint_mm / _SUITED_MM))
+        return replace(self, wavelengths_mm=tuple(factor * wavelength for wavelength in self.wavelengths_mm))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,12 +61,19 @@ class Appearance:
     gum: Material
     """Gingiva."""
 
+    def seen_by(self, footprint_mm: float) -> Appearance:
+        """Both materials as :meth:`Material.seen_by`."""
+        return Appearance(enamel=self.enamel.seen_by(footprint_mm), gum=self.gum.seen_by(footprint_mm))
 
+
+_SUITED_MM = 0.012
 _FINE = (0.06, 0.12, 0.24, 0.48, 0.96)
 """From 5 px of a camera at 12 um per px, so that 3 px are left of it in the farthest views, to 1 mm."""
 
-_ARTIFICIAL = Material(dark=(0.02, 0.02, 0.02), light=(0.85, 0.82, 0.78), wavelengths_mm=_FINE, hardness=1.6)
-_POWDER = Material(dark=(0.62, 0.62, 0.60), light=(0.90, 0.90, 0.88), wavelengths_mm=(0.06, 0.12, 0.24))
+_ARTIFICIAL = Material(
+    dark=(0.02, 0.02, 0.02), light=(0.85, 0.82, 0.78), wavelengths_mm=_FINE, hardness=1.6, applied=True
+)
+_POWDER = Material(dark=(0.62, 0.62, 0.60), light=(0.90, 0.90, 0.88), wavelengths_mm=(0.06, 0.12, 0.24), applied=True)
 
 APPEARANCES: Mapping[str, Appearance] = MappingProxyType(
     {

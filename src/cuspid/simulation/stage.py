@@ -168,7 +168,7 @@ def _scene(truth: GroundTruth, options: RenderOptions) -> Scene:
     return Scene(
         jaw=truth.jaw,
         handpiece=truth.handpiece,
-        appearance=APPEARANCES[options.texture],
+        appearance=APPEARANCES[options.texture].seen_by(truth.handpiece.footprint_mm),
         supersampling=options.supersampling,
         seed=options.seed,
     )

@@ -1,4 +1,9 @@
-"""Which depths to believe: agreement between the cameras of a group, speckle, and a weight per pixel."""
+"""Which depths to believe: agreement between the cameras of a group, speckle, and a weight per pixel.
+
+Limits that are lengths count in *resolutions*: what the handpiece resolves (:attr:`cuspid.rig.Handpiece.resolution_mm`,
+12 um for the built-in ones) at the working distance; at another depth it is in the ratio of the squared depths, as is
+the depth of a pixel of disparity.
+"""
 
 from __future__ import annotations
 
@@ -17,16 +22,40 @@ from cuspid.geometry import Rigid3
 class ConfidenceOptions:
     """What is kept of the measured depth and how it is weighted."""
 
-    agreement_mm: float = 0.03
-    """Depths of two cameras agree within this, or within three standard deviations where that is more."""
-    largest_sigma_mm: float = 0.01
-    """A depth with a larger standard deviation is dropped."""
-    best_sigma_mm: float = 0.002
-    """Standard deviation that has confidence 1; the confidence falls with its inverse square."""
+    pair_agreement: float = 0.9
+    """The same where only two cameras look, whom no third one contradicts."""
+    agreement: float = 2.5
+    """Depths of two cameras agree within this many resolutions (0.03 mm at 12 um), or within three standard deviations
+    where that is more."""
+    largest_sigma: float = 5 / 6
+    """A depth with a standard deviation of more resolutions (0.01 mm at 12 um) is dropped."""
+    best_sigma: float = 1 / 6
+    """Standard deviation, in resolutions at the working distance (0.002 mm at 12 um), that has confidence 1; the
+    confidence falls with its inverse square."""
+    border_px: int = 2
+    """Of two cameras, pixels so near to the border of a surface that lies before another one are dropped: no third
+    camera looks past it."""
+    border_jump: float = 2.0
+    """How far the other one lies behind, in resolutions, to be another one."""
     speckle_px: int = 100
     """Connected pieces of fewer depth pixels are dropped."""
-    speckle_jump_mm: float = 0.06
-    """Neighbours that differ by more than this are not connected."""
+    speckle_jump: float = 5.0
+    """Neighbours that differ by more resolutions (0.06 mm at 12 um), in proportion to their depth, are not
+    connected."""
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """What a handpiece resolves, and where."""
+
+    mm: float
+    """At the working distance."""
+    working_distance_mm: float
+    """The distance where that holds."""
+
+    def at(self, depth_mm: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """Depth that shifts the images as much as one resolution at the working distance does, mm."""
+        return self.mm * (depth_mm / self.working_distance_mm) ** 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +75,8 @@ class Measured:
 def sample_inverse_depth(
     depth_mm: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n"]:
-    """Inverse depth (exact for planes) between pixel centres; NaN where a neighbour is unknown or it is outside."""
+    """Inverse depth (exact for planes) between pixel centres, of the known ones of the four around; NaN outside, and
+    where the known ones have less than a quarter of the weight."""
     height, width = depth_mm.shape
     place = np.nan_to_num(pixels - 0.5, nan=-1.0)
     base = np.floor(place).astype(int)
@@ -54,19 +84,26 @@ def sample_inverse_depth(
     column, row = np.where(inside[:, None], base, 0).T
     fx, fy = (place - base).T
     inverse = 1 / depth_mm
-    top = (1 - fx) * inverse[row, column] + fx * inverse[row, column + 1]
-    bottom = (1 - fx) * inverse[row + 1, column] + fx * inverse[row + 1, column + 1]
-    return np.where(inside, (1 - fy) * top + fy * bottom, np.nan)
+    total, weight = np.zeros(len(pixels)), np.zeros(len(pixels))
+    for down, share_y in ((0, 1 - fy), (1, fy)):
+        for right, share_x in ((0, 1 - fx), (1, fx)):
+            corner = inverse[row + down, column + right]
+            known = np.isfinite(corner)
+            total += np.where(known, share_x * share_y * corner, 0)
+            weight += np.where(known, share_x * share_y, 0)
+    return np.where(inside & (weight >= 0.25), total / np.maximum(weight, 0.25), np.nan)
 
 
-def agreement(measured: Sequence[Measured], index: int, options: ConfidenceOptions) -> Int[np.ndarray, "h w"]:
+def agreement(
+    measured: Sequence[Measured], index: int, resolution: Resolution, options: ConfidenceOptions
+) -> Int[np.ndarray, "h w"]:
     """For each pixel of one camera: cameras whose depth agrees, minus cameras that look through the point."""
     one = measured[index]
     votes = np.zeros(one.depth_mm.shape, dtype=np.int64)
     known = np.isfinite(one.depth_mm)
     rays = one.camera.rays(one.camera.pixel_centres()[known])
     in_rig = one.cam_from_rig.inverse().apply(rays * one.depth_mm[known, None].astype(np.float64))
-    tolerance = np.maximum(options.agreement_mm, 3 * one.sigma_mm[known])
+    tolerance = _tolerance_mm(one, len(measured), resolution, options)[known]
     for other in (*measured[:index], *measured[index + 1 :]):
         in_other = other.cam_from_rig.apply(in_rig)
         with np.errstate(invalid="ignore"):
@@ -75,19 +112,51 @@ def agreement(measured: Sequence[Measured], index: int, options: ConfidenceOptio
     return votes
 
 
-def without_speckle(depth_mm: Float[np.ndarray, "h w"], options: ConfidenceOptions) -> Bool[np.ndarray, "h w"]:
+def _tolerance_mm(
+    one: Measured, cameras: int, resolution: Resolution, options: ConfidenceOptions
+) -> Float[np.ndarray, "h w"]:
+    """How far from each other the depths of two of so many cameras may be."""
+    if cameras == 2:
+        return options.pair_agreement * resolution.at(one.depth_mm)
+    return np.maximum(options.agreement * resolution.at(one.depth_mm), 3 * one.sigma_mm)
+
+
+def at_near_borders(
+    one: Measured, radius: int, resolution: Resolution, options: ConfidenceOptions
+) -> Bool[np.ndarray, "h w"]:
+    """True where there is another surface behind within a few pixels of the grid: a window there sees mostly the nearer
+    one, whose depth reaches over its border."""
+    inverse = np.where(np.isfinite(one.depth_mm), 1 / one.depth_mm, np.finfo(np.float32).max).astype(np.float32)
+    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    step = options.border_jump * resolution.mm / resolution.working_distance_mm**2
+    return np.asarray(np.isfinite(one.depth_mm) & (inverse - cv2.erode(inverse, around) > step))
+
+
+def sure_enough(one: Measured, resolution: Resolution, options: ConfidenceOptions) -> Bool[np.ndarray, "h w"]:
+    """True where the standard deviation of a depth is small enough."""
+    return np.asarray(one.sigma_mm <= options.largest_sigma * resolution.at(one.depth_mm))
+
+
+def without_speckle(
+    depth_mm: Float[np.ndarray, "h w"], resolution: Resolution, options: ConfidenceOptions
+) -> Bool[np.ndarray, "h w"]:
     """True where a known depth belongs to a connected piece that is large enough."""
     known = np.isfinite(depth_mm)
-    # cv2.filterSpeckles connects 16-bit values: count tenths of the jump, which leaves room for 200 mm.
-    levels = np.where(known, np.nan_to_num(depth_mm) / options.speckle_jump_mm * 10, -1e4)
-    levels = levels.clip(-1e4, 3e4).astype(np.int16)
+    # cv2.filterSpeckles connects 16-bit values: count tenths of the jump, which leaves room for 2000 jumps.
+    share = np.log(np.where(known, depth_mm, resolution.working_distance_mm) / resolution.working_distance_mm)
+    jump = options.speckle_jump * resolution.mm / resolution.working_distance_mm
+    levels = np.where(known, (share / jump * 10).clip(-9e3, 3e4), -1e4).astype(np.int16)
     cv2.filterSpeckles(levels, -10000, options.speckle_px, 10)
     return known & (levels != -10000)
 
 
 def confidence(
-    sigma_mm: Float[np.ndarray, "h w"], keep: Bool[np.ndarray, "h w"], options: ConfidenceOptions
+    sigma_mm: Float[np.ndarray, "h w"],
+    keep: Bool[np.ndarray, "h w"],
+    resolution: Resolution,
+    options: ConfidenceOptions,
 ) -> Float[np.ndarray, "h w"]:
     """Inverse variance relative to the best pixels, at most 1; 0 where a depth is not kept."""
-    weight = np.minimum(1, (options.best_sigma_mm / np.maximum(sigma_mm, 1e-9)) ** 2)
+    best_mm = options.best_sigma * resolution.mm
+    weight = (best_mm / np.maximum(sigma_mm, best_mm)) ** 2
     return np.where(keep, weight, 0).astype(np.float32)

@@ -16,9 +16,18 @@ from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.reconstruction import DepthMap
 from cuspid.rig import Handpiece, Rig
-from cuspid.stereo.confidence import ConfidenceOptions, Measured, agreement, confidence, without_speckle
+from cuspid.stereo.confidence import (
+    ConfidenceOptions,
+    Measured,
+    Resolution,
+    agreement,
+    at_near_borders,
+    confidence,
+    sure_enough,
+    without_speckle,
+)
 from cuspid.stereo.rectification import IdealView, RectifiedPair, rectify
-from cuspid.stereo.refinement import SCORE, VARIANCE, GroupGeometry, Q, RefinementOptions, refine
+from cuspid.stereo.refinement import SCORE, VARIANCE, GroupGeometry, Q, RefinementOptions, image_noise, refine
 from cuspid.stereo.seeds import PairMatcher, seed_pairs, seed_points, semi_global
 
 
@@ -105,12 +114,21 @@ class DepthEstimator:
     """Measures depth in the frames of one handpiece. Holds only what the handpiece fixes; safe to share by threads."""
 
     def __init__(
-        self, handpiece: Handpiece, options: StereoOptions | None = None, matcher: PairMatcher = semi_global
+        self,
+        handpiece: Handpiece,
+        options: StereoOptions | None = None,
+        matcher: PairMatcher = semi_global,
+        *,
+        resolution_mm: float | None = None,
     ) -> None:
-        """Prepare the groups. Raises InputError where no two cameras see the same surface."""
+        """Prepare the groups. Raises InputError where no two cameras see the same surface.
+
+        ``resolution_mm`` is what limits and confidences count in, by default what the handpiece resolves.
+        """
         self.handpiece = handpiece
         self.options = options or StereoOptions()
         self.matcher = matcher
+        self.resolution = Resolution(resolution_mm or handpiece.resolution_mm, handpiece.working_distance_mm)
         self._prepared: dict[tuple[str, ...], Group] = {}
         if not self._groups(handpiece.rig.names):
             raise InputError(
@@ -119,8 +137,10 @@ class DepthEstimator:
             )
 
     def _groups(self, cameras: tuple[str, ...]) -> list[Group]:
-        """The groups that some of the cameras make."""
-        rig = Rig({name: self.handpiece.rig[name] for name in cameras})
+        """The groups that some of the cameras make, whatever their order."""
+        if not cameras:
+            return []
+        rig = Rig({name: self.handpiece.rig[name] for name in cameras}).in_own_order()
         groups = rig.groups(self.handpiece.working_distance_mm)
         return [self._group(rig, names) for names in groups if len(names) > 1]
 
@@ -143,10 +163,12 @@ class DepthEstimator:
     def measure(self, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], frame: str) -> tuple[DepthMap, ...]:
         """Depth maps of a frame, one for each camera that has company, from RGB or grey images by camera name.
 
-        A camera of the handpiece that is not among them took no image of the frame.
+        A camera of the handpiece that is not among them, or whose image is blank, saw nothing of the frame.
         """
-        groups = self._groups(tuple(name for name in self.handpiece.rig.names if name in images))
-        return tuple(depth_map for group in groups for depth_map in self._measure_group(group, images, frame))
+        names = self.handpiece.rig.names
+        groups = self._groups(tuple(name for name in names if name in images and not _is_blank(images[name])))
+        found = [depth_map for group in groups for depth_map in self._measure_group(group, images, frame)]
+        return tuple(sorted(found, key=lambda depth_map: names.index(depth_map.camera_name)))
 
     def _measure_group(
         self, group: Group, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], frame: str
@@ -178,9 +200,10 @@ class DepthEstimator:
             layers,
             self.handpiece.depth_range_mm,
             self.options.spacing_px,
+            image_noise(stack[index, : sizes[index, 0], : sizes[index, 1]]),
             self.options.refinement,
         )
-        found = planes[..., SCORE] >= self.options.refinement.accept_zncc
+        found = planes[..., SCORE] > 0
         depth = geometry.scale / np.where(found, planes[..., Q], np.nan)
         sigma = np.sqrt(planes[..., VARIANCE]) * depth**2 / geometry.scale
         return Measured(grid, view.cam_from_rig, depth, sigma)
@@ -193,16 +216,19 @@ class DepthEstimator:
         image: UInt8[np.ndarray, "h w *c"],
         frame: str,
     ) -> DepthMap:
-        one, options = measured[index], self.options.confidence
-        keep = (agreement(measured, index, options) > 0) & (one.sigma_mm <= options.largest_sigma_mm)
-        keep = without_speckle(np.where(keep, one.depth_mm, np.nan), options)
+        one, resolution, options = measured[index], self.resolution, self.options.confidence
+        keep = (agreement(measured, index, resolution, options) > 0) & sure_enough(one, resolution, options)
+        if len(measured) == 2:
+            radius = -(-options.border_px // self.options.spacing_px)
+            keep &= ~at_near_borders(one, radius, resolution, options)
+        keep = without_speckle(np.where(keep, one.depth_mm, np.nan), resolution, options)
         return DepthMap(
             frame=frame,
             camera_name=view.name,
             camera=one.camera,
             cam_from_rig=one.cam_from_rig,
             depth_mm=np.where(keep, one.depth_mm, np.nan).astype(np.float32),
-            confidence=confidence(one.sigma_mm, keep, options),
+            confidence=confidence(one.sigma_mm, keep, resolution, options),
             color=_color_grid(view.resample(image), self.options.spacing_px),
         )
 
@@ -211,6 +237,14 @@ def _gray(image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w"]:
     if image.ndim == 2:
         return image
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+_BLANK_DN = 2.0
+
+
+def _is_blank(image: UInt8[np.ndarray, "h w *c"]) -> bool:
+    """Whether an image shows no more than noise."""
+    return bool(cv2.meanStdDev(image)[1].max() < _BLANK_DN)
 
 
 def _color_grid(image: UInt8[np.ndarray, "h w *c"], spacing_px: int) -> UInt8[np.ndarray, "r s 3"]:

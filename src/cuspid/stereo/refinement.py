@@ -17,12 +17,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple, no_type_check
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 
 Q, Q_U, Q_V, SCORE, VARIANCE, SUPPORT = range(6)
 """Channels of a refined field: the plane, mean ZNCC of the cameras used, variance of q, how many cameras."""
+
+_ROUNDING_DN = 12**-0.5
 
 FAST = {"cache": True, "nogil": True, "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
 
@@ -44,9 +47,12 @@ class RefinementOptions:
     camera_zncc_lag: float = 0.25
     """A camera that falls this much behind the best is taken to be occluded."""
     accept_zncc: float = 0.75
-    """Mean correlation from which a plane is kept and handed to neighbours."""
-    least_contrast_dn: float = 2.0
-    """Standard deviation of a window, in digital numbers, below which it carries no texture."""
+    """Mean correlation from which a plane is kept and handed to neighbours, where the texture drowns the noise."""
+    weak_zncc: float = 0.6
+    """The same at most where it does not: noise of standard deviation n leaves of the correlation of a texture of
+    standard deviation c the share c^2 / (c^2 + n^2)."""
+    least_contrast: float = 1.2
+    """Standard deviation of a window, in those of the noise, below which it carries no texture."""
     sweeps: int = 1
     """How often planes are handed on to neighbours without one, in each direction."""
 
@@ -89,6 +95,8 @@ class _Limits(NamedTuple):
     camera_zncc: np.float32
     lag: np.float32
     accept: float
+    weak: float
+    noise2: float
     least_contrast: float
     effective: float
 
@@ -107,6 +115,14 @@ class _Buffers(NamedTuple):
     step: np.ndarray
     result: np.ndarray
     candidates: np.ndarray
+
+
+def image_noise(image: Float[np.ndarray, "h w"]) -> float:
+    """Standard deviation of the noise of an image (Immerkaer 1996), taken from its smoothest tenth; at least what
+    rounding to whole numbers leaves."""
+    mask = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]).astype(np.float32) / 6
+    power = cv2.boxFilter(cv2.filter2D(image, -1, mask) ** 2, -1, (15, 15))
+    return max(float(np.sqrt(np.quantile(power[::5, ::5], 0.1))), _ROUNDING_DN)
 
 
 def patch_window(options: RefinementOptions) -> Float[np.ndarray, "3 k"]:
@@ -343,13 +359,13 @@ def _best_start(view, limits, buffers, u, v, count):
 
 @njit(**FAST)
 @no_type_check
-def _gather_candidates(field, seeds, row, column, direction, spacing, accept, candidates):
+def _gather_candidates(field, seeds, row, column, direction, spacing, candidates):
     """Planes of neighbours that were visited before, carried on to this pixel, and seeds that none of them explains."""
     rows, columns = field.shape[:2]
     count = 0
     for dr, dc in ((0, -1), (-1, 0), (-1, -1), (-1, 1)):
         r, c = row + direction * dr, column + direction * dc
-        if 0 <= r < rows and 0 <= c < columns and field[r, c, SCORE] >= accept:
+        if 0 <= r < rows and 0 <= c < columns and field[r, c, SCORE] > 0:
             plane = candidates[count]
             plane[1], plane[2] = field[r, c, Q_U], field[r, c, Q_V]
             plane[0] = field[r, c, Q] + spacing * ((column - c) * plane[1] + (row - r) * plane[2])
@@ -370,18 +386,22 @@ def _gather_candidates(field, seeds, row, column, direction, spacing, accept, ca
 @njit(**FAST)
 @no_type_check
 def _visit(view, limits, buffers, seeds, field, row, column, direction):
-    """Refine a pixel from the best of its candidates; writes the field where that is better than what it holds."""
+    """Refine a pixel from the best of its candidates; writes the field where it correlates as well as it should."""
     u, v = view.spacing // 2 + column * view.spacing, view.spacing // 2 + row * view.spacing
     height, width = view.sizes[view.reference]
     if not (view.radius <= u < width - view.radius and view.radius <= v < height - view.radius):
         return
-    count = _gather_candidates(field, seeds, row, column, direction, view.spacing, limits.accept, buffers.candidates)
-    if count == 0 or _load_template(view, u, v, buffers.template) < limits.least_contrast:
+    count = _gather_candidates(field, seeds, row, column, direction, view.spacing, buffers.candidates)
+    if count == 0:
+        return
+    contrast = _load_template(view, u, v, buffers.template)
+    if contrast < limits.least_contrast:
         return
     plane = buffers.candidates[_best_start(view, limits, buffers, u, v, count)]
     if not _refine_plane(view, limits, buffers, u, v, plane):
         return
-    if buffers.result[0] > field[row, column, SCORE] and view.q_low <= plane[0] <= view.q_high:
+    least = max(limits.weak, limits.accept * contrast * contrast / (contrast * contrast + limits.noise2))
+    if buffers.result[0] >= least and view.q_low <= plane[0] <= view.q_high:
         field[row, column, :3] = plane
         field[row, column, 3:] = buffers.result
 
@@ -389,7 +409,7 @@ def _visit(view, limits, buffers, seeds, field, row, column, direction):
 @njit(**FAST)
 @no_type_check
 def _refine_field(view, limits, buffers, seeds, sweeps):
-    """Visit the pixels that have no accepted plane yet, in raster order and against it, ``sweeps`` times."""
+    """Visit the pixels that have no plane yet, in raster order and against it, ``sweeps`` times."""
     rows, columns = seeds.shape[1:]
     field = np.zeros((rows, columns, 6))
     for sweep in range(2 * sweeps):
@@ -398,7 +418,7 @@ def _refine_field(view, limits, buffers, seeds, sweeps):
             row = i if direction > 0 else rows - 1 - i
             for k in range(columns):
                 column = k if direction > 0 else columns - 1 - k
-                if not field[row, column, SCORE] >= limits.accept:
+                if field[row, column, SCORE] == 0:
                     _visit(view, limits, buffers, seeds, field, row, column, direction)
     return field
 
@@ -411,12 +431,14 @@ def refine(
     seeds_mm: Float[np.ndarray, "l rows columns"],
     depth_range_mm: tuple[float, float],
     spacing_px: int,
+    noise_dn: float,
     options: RefinementOptions,
 ) -> Float[np.ndarray, "rows columns 6"]:
     """Refined planes on a grid of every ``spacing_px``-th pixel; SCORE is 0 where nothing was found.
 
     ``images`` are grey values 0 to 255 in float32, padded to one size; ``sizes`` are their true heights and widths.
-    ``seeds_mm`` are layers of first depths on the grid, NaN where there is none.
+    ``seeds_mm`` are layers of first depths on the grid, NaN where there is none; ``noise_dn`` is the noise of the
+    reference image.
     """
     window = patch_window(options)
     near, far = depth_range_mm
@@ -439,7 +461,9 @@ def refine(
         camera_zncc=np.float32(options.camera_zncc),
         lag=np.float32(options.camera_zncc_lag),
         accept=options.accept_zncc,
-        least_contrast=options.least_contrast_dn,
+        weak=options.weak_zncc,
+        noise2=noise_dn**2,
+        least_contrast=options.least_contrast * noise_dn,
         effective=float(1 / np.sum(window[2].astype(np.float64) ** 2)),
     )
     buffers = _new_buffers(window.shape[1], len(geometry.others), len(seeds_mm))

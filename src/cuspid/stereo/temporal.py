@@ -56,7 +56,8 @@ def measure_temporal(
         pair = moving_pair(handpiece, name, next_from_rig, options)
         if pair is not None:
             both = {name: images[name], f"{name}+": next_images[name]}
-            found += DepthEstimator(pair, options.stereo).measure(both, frame)
+            estimator = DepthEstimator(pair, options.stereo, resolution_mm=handpiece.resolution_mm)
+            found += estimator.measure(both, frame)
     return tuple(
         replace(depth_map, confidence=(options.confidence_share * depth_map.confidence).astype(np.float32))
         for depth_map in found

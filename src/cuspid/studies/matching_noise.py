@@ -29,7 +29,7 @@ from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.raycast import Scene, auto_gain, render_image
 from cuspid.stereo.matching import coarser, group_geometry
 from cuspid.stereo.rectification import IdealView
-from cuspid.stereo.refinement import SCORE, Q, RefinementOptions, refine
+from cuspid.stereo.refinement import SCORE, Q, RefinementOptions, image_noise, refine
 from cuspid.studies.camera_pair import (
     MATCHING,
     Matcher,
@@ -162,7 +162,8 @@ def _handpiece(options: MatchingNoiseOptions, baseline_mm: float) -> Handpiece:
 def _images(
     jaw: Jaw, handpiece: Handpiece, pose: Rigid3, options: MatchingNoiseOptions
 ) -> tuple[UInt8[np.ndarray, "h w"], ...]:
-    scene = Scene(jaw=jaw, handpiece=handpiece, appearance=APPEARANCES[options.texture], seed=options.seed)
+    appearance = APPEARANCES[options.texture].seen_by(handpiece.footprint_mm)
+    scene = Scene(jaw=jaw, handpiece=handpiece, appearance=appearance, seed=options.seed)
     gain = auto_gain(scene, [pose])
     frame = Frame(name=handpiece.name, cameras=handpiece.rig.names)
     rendered = [render_image(scene, frame, name, pose, gain) for name in frame.cameras]
@@ -220,8 +221,9 @@ def _slanted(
     seeds[points.known] = geometry.scale / (geometry.scale / true_mm + starts_px)
     stack = np.stack(images).astype(np.float32)
     sizes = np.array([image.shape for image in images])
-    refinement = RefinementOptions(radius_px=options.window_px // 2)
-    planes = refine(stack, sizes, 0, geometry, seeds[None], _DEPTHS_MM, options.spacing_px, refinement)[points.known]
+    refinement, noise_dn = RefinementOptions(radius_px=options.window_px // 2), image_noise(stack[0])
+    planes = refine(stack, sizes, 0, geometry, seeds[None], _DEPTHS_MM, options.spacing_px, noise_dn, refinement)
+    planes = planes[points.known]
     found = planes[:, SCORE] >= refinement.accept_zncc
     depth_mm = geometry.scale / np.where(found, planes[:, Q], np.nan)
     rays = grid.rays(grid.pixel_centres()[points.known])

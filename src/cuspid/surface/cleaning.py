@@ -16,14 +16,14 @@ from cuspid.mesh import Mesh
 
 @dataclass(frozen=True, kw_only=True)
 class CleaningOptions:
-    """Cleaning of a fused mesh."""
+    """Cleaning of a fused mesh. Lengths count in resolutions of the handpiece, 12 um for the built-in ones."""
 
-    least_piece_mm2: float = 2.0
-    """Connected pieces of a smaller area are removed."""
+    least_piece_width: float = 118.0
+    """Connected pieces of less area than a square of so many resolutions (2 mm2 at 12 um) are removed."""
     least_piece_share: float = 0.005
     """Connected pieces of a smaller share of the whole area are removed."""
-    ghost_depth_mm: float = 0.5
-    """A face that looks at the back of another one within this distance is removed."""
+    ghost_depth: float = 41.6
+    """A face that looks at the back of another one within so many resolutions (0.5 mm at 12 um) is removed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,14 +56,18 @@ class CleaningReport:
     """Length of the outer boundaries, one for each piece."""
 
 
-def clean(mesh: Mesh, options: CleaningOptions | None = None) -> tuple[Mesh, CleaningReport]:
-    """A manifold mesh without floating pieces and ghosts, and a report. An empty mesh stays empty."""
+def clean(mesh: Mesh, resolution_mm: float, options: CleaningOptions | None = None) -> tuple[Mesh, CleaningReport]:
+    """A manifold mesh without floating pieces and ghosts, and a report. An empty mesh stays empty.
+
+    ``resolution_mm`` is what the handpiece resolves (:attr:`cuspid.rig.Handpiece.resolution_mm`).
+    """
     options = options or CleaningOptions()
-    ghosts = ghost_faces(mesh, options.ghost_depth_mm)
+    ghosts = ghost_faces(mesh, options.ghost_depth * resolution_mm)
     cleaned = mesh.submesh(~ghosts)
     crowded = non_manifold_faces(cleaned)
     cleaned, split = with_split_fans(cleaned.submesh(~crowded))
-    floating, pieces = floating_faces(cleaned, options)
+    least_mm2 = (options.least_piece_width * resolution_mm) ** 2
+    floating, pieces = floating_faces(cleaned, least_mm2, options.least_piece_share)
     cleaned = cleaned.submesh(~floating)
     outer, holes = boundaries(cleaned)
     report = CleaningReport(
@@ -82,7 +86,7 @@ def ghost_faces(mesh: Mesh, depth_mm: float) -> Bool[np.ndarray, "f"]:
     """Faces whose outward normal soon meets the back of another face: they lie below the surface."""
     if len(mesh.faces) == 0:
         return np.zeros(0, dtype=bool)
-    start = mesh.face_centres + 1e-3 * mesh.face_normals
+    start = mesh.face_centres + depth_mm / 500 * mesh.face_normals
     hits = mesh.cast(start, mesh.face_normals)
     same_way = np.einsum("nd,nd->n", mesh.face_normals, mesh.face_normals[hits.faces]) > 0
     return (hits.faces >= 0) & (hits.distances < depth_mm) & same_way
@@ -115,13 +119,13 @@ def face_pieces(mesh: Mesh) -> Int[np.ndarray, "f"]:
     return parts_of(np.stack([face[order][pair], face[order][pair + 1]], axis=1), len(mesh.faces))
 
 
-def floating_faces(mesh: Mesh, options: CleaningOptions) -> tuple[Bool[np.ndarray, "f"], int]:
-    """Faces of pieces that are too small, and the number of such pieces."""
+def floating_faces(mesh: Mesh, least_mm2: float, least_share: float) -> tuple[Bool[np.ndarray, "f"], int]:
+    """Faces of pieces that are smaller than an area or than a share of the whole, and the number of such pieces."""
     if len(mesh.faces) == 0:
         return np.zeros(0, dtype=bool), 0
     piece = face_pieces(mesh)
     area = np.bincount(piece, mesh.face_areas)
-    small = area < max(options.least_piece_mm2, options.least_piece_share * area.sum())
+    small = area < max(least_mm2, least_share * area.sum())
     return small[piece], int(small.sum())
 
 

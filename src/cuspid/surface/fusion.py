@@ -31,43 +31,52 @@ from cuspid.workers import map_slices
 class FusionOptions:
     """Fusion of depth maps into a mesh."""
 
-    voxel_mm: float = 0.05
-    """Spacing of the grid, about the spacing of the mesh's vertices."""
+    voxel_mm: float | None = None
+    """Spacing of the grid, about the spacing of the mesh's vertices; by default 4.16 resolutions of the handpiece, 0.05
+    mm for the built-in ones."""
     truncation_voxels: float = 3.0
     """Distance from a surface, in voxels, up to which it is blended."""
-    largest_jump_mm: float = 0.15
-    """Neighbouring depths that differ by more do not belong to one surface."""
+    largest_jump: float = 12.5
+    """Neighbouring depths that differ by more resolutions (0.15 mm at 12 um) do not belong to one surface."""
     least_weight: float = 0.01
     """Weight (sum of confidences) from which a voxel counts as observed."""
-    agreement_mm: float = 0.08
-    """A depth map confirms a vertex within this distance; nearer ones count more."""
+    agreement: float = 6.65
+    """A depth map confirms a vertex within this many resolutions (0.08 mm at 12 um); nearer ones count more."""
     least_maps: int = 2
     """Number of depth maps that must confirm a vertex."""
+
+    def voxel_for(self, resolution_mm: float) -> float:
+        """Spacing of the grid for a handpiece, mm."""
+        return 4.16 * resolution_mm if self.voxel_mm is None else self.voxel_mm
 
 
 def fuse(
     depth_maps: Iterable[DepthMap],
     rig_from_world: Mapping[str, Rigid3],
+    resolution_mm: float,
     options: FusionOptions | None = None,
     *,
     progress: Progress = silent,
 ) -> Mesh:
     """One coloured mesh in the world frame from the depth maps whose frame was located; no faces if they hold nothing.
 
+    ``resolution_mm`` is what the handpiece resolves (:attr:`cuspid.rig.Handpiece.resolution_mm`); lengths count in it.
     ``depth_maps`` is gone through twice and may read its items lazily, but a generator, which is spent after the first
     time, will not do. The same maps in the same order give the same mesh.
     """
     options = options or FusionOptions()
-    volume = SparseVolume(options.voxel_mm, options.truncation_voxels * options.voxel_mm)
+    voxel_mm = options.voxel_for(resolution_mm)
+    jump_mm, agreement_mm = options.largest_jump * resolution_mm, options.agreement * resolution_mm
+    volume = SparseVolume(voxel_mm, options.truncation_voxels * voxel_mm)
     half = len(rig_from_world)
     for depth_map, cam_from_world, done in _located(depth_maps, rig_from_world):
         points = rig_from_world[depth_map.frame].inverse().apply(depth_map.points_in_rig()[0])
-        volume.integrate(Evidence.of(depth_map, options.largest_jump_mm), cam_from_world, points)
+        volume.integrate(Evidence.of(depth_map, jump_mm), cam_from_world, points)
         progress("fusion", done, 2 * half)
     votes = Votes.on(extract(volume, options.least_weight))
     del volume
     for depth_map, cam_from_world, done in _located(depth_maps, rig_from_world):
-        votes.collect(Evidence.of(depth_map, options.largest_jump_mm), depth_map, cam_from_world, options.agreement_mm)
+        votes.collect(Evidence.of(depth_map, jump_mm), depth_map, cam_from_world, agreement_mm)
         progress("fusion", half + done, 2 * half)
     return votes.outcome(options.least_maps)
 

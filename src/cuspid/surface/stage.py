@@ -22,6 +22,7 @@ def fuse(
     depths: Iterable[DepthMap],
     made_from: str,
     rig_from_world: Mapping[str, Rigid3],
+    resolution_mm: float,
     folder: Path,
     fusion: FusionOptions,
     cleaning: CleaningOptions,
@@ -30,19 +31,19 @@ def fuse(
 ) -> Mesh:
     """One clean mesh: ``mesh.ply`` with colour, ``mesh.stl``, and what was removed in ``mesh.json``.
 
-    ``made_from`` is the digest of the depth maps, which may be gone through more than once. Raises ReconstructionError
-    where they hold nothing.
+    ``made_from`` is the digest of the depth maps, which may be gone through more than once; ``resolution_mm`` is what
+    the handpiece resolves. Raises ReconstructionError where they hold nothing.
     """
-    stage = Stage("mesh", folder, [fusion, cleaning], ("surface",))
+    stage = Stage("mesh", folder, [fusion, cleaning, resolution_mm], ("surface",))
     files = [folder / name for name in ("mesh.json", "mesh.stl", "mesh.ply")]
 
     def write() -> None:
-        raw = fuse_depth_maps(depths, rig_from_world, fusion, progress=progress)
+        raw = fuse_depth_maps(depths, rig_from_world, resolution_mm, fusion, progress=progress)
         if not len(raw.faces):
             raise ReconstructionError(
                 "no surface: the depth maps are empty; the images need texture (spray, powder) or sharper focus"
             )
-        mesh, report = clean(raw, cleaning)
+        mesh, report = clean(raw, resolution_mm, cleaning)
         write_json(files[0], report)
         write_mesh(files[1], mesh)
         write_mesh(files[2], mesh)

@@ -1,0 +1,246 @@
+"""Laws that hold for every rig: its size, and the order and the names of its cameras, decide nothing."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cuspid import pipeline
+from cuspid.capture import Capture, Frame
+from cuspid.geometry import Rigid3
+from cuspid.mesh import Mesh
+from cuspid.motion import MotionOptions, locate
+from cuspid.pipeline import ReconstructionOptions
+from cuspid.reconstruction import DepthMap, Reconstruction
+from cuspid.rig import Handpiece, MountedCamera, Rig
+from cuspid.stereo import DepthEstimator
+from synthetic_scene import diamond, height_field, render
+
+HILLS = height_field(lambda x, y: 5 + 0.25 * np.sin(1.8 * x) * np.cos(1.5 * y), half_width_mm=5.0)
+SIZE_PX = 160
+WAY = {
+    f"{k:05d}": Rigid3.from_rotation_vector(np.array([0.01, -0.015, 0.02]) * k, np.array([-0.5, 0.1, 0.03]) * k)
+    for k in range(3)
+}
+FACTORS = (0.1, 0.5, 2.0, 10.0, 1000.0)
+Images = Mapping[tuple[str, str], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class InMemory:
+    """Images by (frame, camera). An :class:`cuspid.capture.ImageSource`."""
+
+    images: Images
+    suffix: str = ".png"
+
+    def read(self, frame: str, camera: str) -> np.ndarray:
+        return self.images[frame, camera]
+
+    def size(self, frame: str, camera: str) -> tuple[int, int]:
+        height, width = self.images[frame, camera].shape[:2]
+        return width, height
+
+    def digest(self, frame: str, camera: str) -> str:
+        return hashlib.sha256(self.images[frame, camera].tobytes()).hexdigest()
+
+    def where(self, frame: str, camera: str) -> str:
+        return f"{camera} of {frame}"
+
+
+@cache
+def scan() -> Capture:
+    """Three frames of four cameras over the hills."""
+    handpiece, rng = diamond(SIZE_PX), np.random.default_rng(3)
+    images = {
+        (frame, name): render(HILLS, mounted, pose, rng, cell_mm=0.1)
+        for frame, pose in WAY.items()
+        for name, mounted in handpiece.rig.cameras.items()
+    }
+    return capture_of(handpiece, images)
+
+
+def capture_of(handpiece: Handpiece, images: Images) -> Capture:
+    frames = tuple(Frame(name=frame, cameras=handpiece.rig.names) for frame in WAY)
+    return Capture(handpiece=handpiece, frames=frames, source=InMemory(images))
+
+
+def times(handpiece: Handpiece, factor: float) -> Handpiece:
+    """The handpiece with all lengths multiplied."""
+    cameras = {
+        name: replace(
+            mounted,
+            cam_from_rig=Rigid3(mounted.cam_from_rig.rotation, factor * mounted.cam_from_rig.translation),
+            covariance=None if mounted.covariance is None else mounted.covariance * np.outer(*[_units(factor)] * 2),
+        )
+        for name, mounted in handpiece.rig.cameras.items()
+    }
+    near, far = handpiece.depth_range_mm
+    return replace(
+        handpiece,
+        rig=Rig(cameras),
+        working_distance_mm=factor * handpiece.working_distance_mm,
+        depth_range_mm=(factor * near, factor * far),
+    )
+
+
+def _units(factor: float) -> np.ndarray:
+    return np.repeat([1.0, factor], 3)
+
+
+def uncertain(handpiece: Handpiece) -> Handpiece:
+    """The handpiece with a calibration that is only about right: 1 mrad, and 10 um at its size."""
+    covariance = np.diag(np.repeat([1e-3, 1e-2], 3) ** 2)
+    return replace(
+        handpiece,
+        rig=Rig({name: replace(each, covariance=covariance) for name, each in handpiece.rig.cameras.items()}),
+    )
+
+
+@cache
+def measured(factor: float = 1.0) -> tuple[DepthMap, ...]:
+    capture = scan()
+    return DepthEstimator(times(capture.handpiece, factor)).measure(capture.images(capture.frames[0]), "00000")
+
+
+@cache
+def reconstructed(factor: float, folder: Path) -> tuple[Reconstruction, Mesh]:
+    capture = replace(scan(), handpiece=times(scan().handpiece, factor))
+    return pipeline.reconstruct(capture, folder / f"{factor:g}", ReconstructionOptions())
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("scans")
+
+
+def check_depths(found: DepthMap, expected: DepthMap, factor: float = 1.0) -> None:
+    """Alike but for single pixels on the brink of a limit."""
+    share, wanted = (np.isfinite(each.depth_mm) for each in (found, expected))
+    assert share.mean() == pytest.approx(wanted.mean(), abs=0.01)
+    both = share & wanted
+    off = np.abs(found.depth_mm[both] / factor / expected.depth_mm[both] - 1)
+    assert both.sum() > 0.99 * wanted.sum()
+    assert np.quantile(off, 0.99) < 1e-5
+    assert np.quantile(np.abs(found.confidence[both] - expected.confidence[both]), 0.99) < 1e-3
+
+
+def check_poses(found: Reconstruction, expected: Reconstruction, factor: float = 1.0) -> None:
+    assert found.frames == expected.frames
+    for name, pose in found.rig_from_world.items():
+        off = Rigid3(pose.rotation, pose.translation / factor) @ expected.rig_from_world[name].inverse()
+        assert np.abs(off.rotation_vector).max() < 1e-5
+        assert np.abs(off.translation).max() < 5e-5
+
+
+def check_mesh(found: Mesh, expected: Mesh, factor: float = 1.0) -> None:
+    """As many faces, and the one lies on the other."""
+    assert len(found.faces) == pytest.approx(len(expected.faces), rel=0.01)
+    distance, _, _ = expected.closest(found.vertices / factor)
+    assert np.quantile(distance, 0.95) < 5e-4
+    assert (distance < 0.02).mean() > 0.99
+
+
+# --- lengths ----------------------------------------------------------------------------------------------------------
+
+
+def test_depth_is_dense_at_the_size_of_a_handpiece() -> None:
+    for depth_map in measured():
+        assert np.isfinite(depth_map.depth_mm).mean() > 0.6
+
+
+@pytest.mark.parametrize("factor", FACTORS)
+def test_the_same_images_of_a_larger_rig_give_larger_depths(factor: float) -> None:
+    for found, expected in zip(measured(factor), measured(), strict=True):
+        check_depths(found, expected, factor)
+
+
+@pytest.mark.parametrize("factor", FACTORS)
+def test_the_same_images_of_a_larger_rig_give_a_larger_scan(factor: float, folder: Path) -> None:
+    (found, mesh), (expected, reference) = reconstructed(factor, folder), reconstructed(1.0, folder)
+    assert len(expected.frames) == len(WAY)
+    assert len(reference.faces) > 5000
+    check_poses(found, expected, factor)
+    check_mesh(mesh, reference, factor)
+
+
+def test_a_larger_rig_is_calibrated_alike() -> None:
+    capture, factor = scan(), 1000.0
+    given = uncertain(capture.handpiece)
+    expected, found = (locate(replace(capture, handpiece=times(given, k)), MotionOptions()) for k in (1.0, factor))
+    check_poses(found, expected, factor)
+    refined = times(replace(given, rig=expected.rig), factor).rig
+    for one, other in zip(found.rig.cameras.values(), refined.cameras.values(), strict=True):
+        assert np.allclose(one.cam_from_rig.rotation, other.cam_from_rig.rotation, atol=1e-6)
+        assert np.allclose(one.cam_from_rig.translation / factor, other.cam_from_rig.translation / factor, atol=1e-5)
+        assert np.allclose(one.covariance, other.covariance, rtol=0.01, atol=0)
+
+
+# --- order and names --------------------------------------------------------------------------------------------------
+
+
+def rearranged(capture: Capture, name_of: Mapping[str, str]) -> Capture:
+    """The capture with its cameras in this order, under these names."""
+    images = {
+        (frame.name, new): capture.source.read(frame.name, old)
+        for frame in capture.frames
+        for old, new in name_of.items()
+    }
+    rig = Rig({new: capture.handpiece.rig[old] for old, new in name_of.items()})
+    return capture_of(replace(capture.handpiece, rig=rig), images)
+
+
+def with_another(capture: Capture, name: str, mounted: MountedCamera) -> Capture:
+    """The capture with a camera more, first in order, whose images are black."""
+    black = {(frame.name, name): np.zeros((SIZE_PX, SIZE_PX, 3), np.uint8) for frame in capture.frames}
+    taken = {(frame.name, each): capture.image(frame, each) for frame in capture.frames for each in frame.cameras}
+    rig = Rig({name: mounted, **capture.handpiece.rig.cameras})
+    return capture_of(replace(capture.handpiece, rig=rig), black | taken)
+
+
+def blind_cameras() -> dict[str, MountedCamera]:
+    """One among the others, its lens covered, and one that looks away."""
+    camera = scan().handpiece.rig["west"].camera
+    away = Rigid3.from_rotation_vector(np.array([0, np.pi, 0]), np.array([0.5, 0.5, 0.0]))
+    return {"covered": MountedCamera(camera, Rigid3.identity()), "away": MountedCamera(camera, away)}
+
+
+CHANGES = {
+    "reversed": lambda capture: rearranged(capture, {name: name for name in reversed(capture.handpiece.rig.names)}),
+    "shuffled": lambda capture: rearranged(capture, {name: name for name in ("north", "east", "south", "west")}),
+    "renamed": lambda capture: rearranged(
+        capture, dict(zip(capture.handpiece.rig.names, ("zeta", "a", "m 1", "B"), strict=True))
+    ),
+    "with one covered": lambda capture: with_another(capture, "covered", blind_cameras()["covered"]),
+    "with one that looks away": lambda capture: with_another(capture, "away", blind_cameras()["away"]),
+}
+
+
+def place(depth_map: DepthMap) -> tuple[float, ...]:
+    """Where its camera is, which tells it from the others whatever it is called."""
+    return tuple(depth_map.cam_from_rig.translation.round(6))
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_order_and_names_do_not_change_the_depth(change: str) -> None:
+    capture = CHANGES[change](scan())
+    found = DepthEstimator(capture.handpiece).measure(capture.images(capture.frames[0]), "00000")
+    expected = {place(depth_map): depth_map for depth_map in measured()}
+    assert len(found) == len(expected)
+    for depth_map in found:
+        check_depths(depth_map, expected[place(depth_map)])
+
+
+@pytest.mark.parametrize("change", ["reversed", "with one covered"])
+def test_order_and_names_do_not_change_the_scan(change: str, folder: Path) -> None:
+    capture = CHANGES[change](scan())
+    found, mesh = pipeline.reconstruct(capture, folder / change, ReconstructionOptions())
+    expected, reference = reconstructed(1.0, folder)
+    assert found.rig.names == capture.handpiece.rig.names
+    check_poses(found, expected)
+    check_mesh(mesh, reference)
