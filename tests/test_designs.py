@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from cuspid.errors import InputError
 from cuspid.handpiece.designs import DESIGNS, DesignOptions, essential_four, six_cameras, twelve_cameras
+from cuspid.pairing import camera_groups, stereo_pairs
 from cuspid.rig import Handpiece
 
 OPTIONS = st.builds(
@@ -75,8 +76,8 @@ def test_defaults_are_those_of_the_thesis() -> None:
 
 def test_twelve_cameras_pair_within_their_three_groups_only() -> None:
     rig = twelve_cameras().rig
-    assert [set(group) for group in rig.groups(5.0)] == [{f"{g}{k}" for k in range(1, 5)} for g in "obl"]
-    assert len(rig.stereo_pairs(5.0)) == 3 * 6
+    assert [set(group) for group in camera_groups(rig, 5.0)] == [{f"{g}{k}" for k in range(1, 5)} for g in "obl"]
+    assert len(stereo_pairs(rig, 5.0)) == 3 * 6
 
 
 def test_side_groups_aim_at_the_crown_from_the_working_distance() -> None:
@@ -156,4 +157,4 @@ def test_outer_cameras_lean_inwards_by_the_tilt() -> None:
 
 
 def test_six_cameras_are_one_group_for_stereo() -> None:
-    assert len(six_cameras().rig.groups(5.0)) == 1
+    assert len(camera_groups(six_cameras().rig, 5.0)) == 1

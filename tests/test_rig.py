@@ -3,21 +3,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid.camera import Camera
+from builders import THESIS_CAMERA, rig_of, shifted
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 from strategies import rigid3s
-
-CAMERA = Camera.from_field_of_view(500, 500, 62.0)
-
-
-def rig_of(**cam_from_rig: Rigid3) -> Rig:
-    return Rig({name: MountedCamera(CAMERA, transform) for name, transform in cam_from_rig.items()})
-
-
-def shifted(x: float, y: float = 0.0) -> Rigid3:
-    return Rigid3(np.eye(3), np.array([-x, -y, 0.0]))
 
 
 @given(st.lists(rigid3s(), min_size=2, max_size=4))
@@ -37,15 +27,8 @@ def test_overlap_of_a_parallel_pair_is_the_textbook_value():
     assert rig.overlap("a", "b", 5.0) == pytest.approx(expected, abs=0.09)
 
 
-def test_groups_join_cameras_that_see_the_same():
-    side = Rigid3.from_rotation_vector(np.array([0, np.pi / 2, 0]), np.array([0, 0, 0.0]))
-    rig = rig_of(o1=shifted(-1.25), o2=shifted(1.25), s1=side, s2=shifted(1.5) @ side, lone=shifted(40))
-    assert rig.groups(5.0) == (("o1", "o2"), ("s1", "s2"), ("lone",))
-    assert rig.stereo_pairs(5.0) == (("o1", "o2"), ("s1", "s2"))
-
-
 def test_place_and_axis_in_the_rig():
-    mounted = MountedCamera(CAMERA, Rigid3.from_rotation_vector(np.array([np.pi, 0, 0]), np.array([0, 0, 7.0])))
+    mounted = MountedCamera(THESIS_CAMERA, Rigid3.from_rotation_vector(np.array([np.pi, 0, 0]), np.array([0, 0, 7.0])))
     np.testing.assert_allclose(mounted.centre_in_rig, [0, 0, 7], atol=1e-12)
     np.testing.assert_allclose(mounted.axis_in_rig, [0, 0, -1], atol=1e-12)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from itertools import combinations
 from types import MappingProxyType
 
 import numpy as np
@@ -94,27 +93,10 @@ class Rig:
         in_other = (other.cam_from_rig @ one.cam_from_rig.inverse()).apply(plane)
         return float(np.mean(other.camera.contains(other.camera.project(in_other))))
 
-    def stereo_pairs(
-        self, distance_mm: float, *, minimum_overlap: float = 0.4, maximum_angle_deg: float = 30.0
-    ) -> tuple[tuple[str, str], ...]:
-        """Pairs of cameras that see the same surface at the working distance, from about the same side."""
-        return tuple(
-            (first, second)
-            for first, second in combinations(self.names, 2)
-            if self[first].axis_in_rig @ self[second].axis_in_rig >= np.cos(np.deg2rad(maximum_angle_deg))
-            and min(self.overlap(first, second, distance_mm), self.overlap(second, first, distance_mm))
-            >= minimum_overlap
-        )
-
-    def groups(self, distance_mm: float) -> tuple[tuple[str, ...], ...]:
-        """Cameras that are joined by stereo pairs, in the order of the rig; a lone camera is a group of one."""
-        group_of = {name: {name} for name in self.names}
-        for first, second in self.stereo_pairs(distance_mm):
-            merged = group_of[first] | group_of[second]
-            for name in merged:
-                group_of[name] = merged
-        unique = {min(map(self.names.index, group)): group for group in group_of.values()}
-        return tuple(tuple(sorted(unique[key], key=self.names.index)) for key in sorted(unique))
+    def angle_deg(self, first: str, second: str) -> float:
+        """Angle between the optical axes of two cameras."""
+        cosine = self[first].axis_in_rig @ self[second].axis_in_rig
+        return float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -28,6 +28,7 @@ from cuspid.motion.odometry import (
 )
 from cuspid.motion.pairs import MatchingOptions, frame_pairs, make_view, match_guided
 from cuspid.motion.tracks import intersect_rays, join, thin
+from cuspid.pairing import PairingOptions, stereo_pairs
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import Handpiece, Rig
@@ -40,6 +41,8 @@ class MotionOptions:
 
     features: FeatureOptions = field(default_factory=FeatureOptions)
     """Keypoints."""
+    pairing: PairingOptions = field(default_factory=PairingOptions)
+    """Which cameras are matched within a frame."""
     within: MatchingOptions = field(default_factory=MatchingOptions)
     """Matching of the cameras of a group within a frame."""
     odometry: OdometryOptions = field(default_factory=OdometryOptions)
@@ -233,7 +236,7 @@ def locate_features(
         for name in names
     ]
     with _timed(log, "triangulation"):
-        pairs = rig.stereo_pairs(handpiece.working_distance_mm)
+        pairs = stereo_pairs(rig, handpiece.working_distance_mm, options.pairing)
         clouds = map_in_threads(
             lambda views: triangulate_frame(handpiece, pairs, views, options.within),
             frames,
