@@ -45,8 +45,8 @@ class Source:
 class Probe:
     """What scans it."""
 
-    design: Literal["four", "six", "twelve"] = "twelve"
-    """Built-in design: the essential four cameras, six (give --turns 3), or the twelve."""
+    design: Literal["two", "four", "six", "twelve"] = "twelve"
+    """Built-in design: a stereo pair, the essential four cameras, six (give --turns 3), or the twelve."""
     handpiece: Path | None = None
     """A handpiece.json, or COLMAP's rig_config.json, of your own, instead of a built-in design."""
     working_distance_mm: float | None = None
