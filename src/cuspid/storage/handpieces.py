@@ -17,6 +17,7 @@ from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor, d
 from cuspid.storage.files import digest_of, read_json, reading, write_json
 
 _log = logging.getLogger("cuspid")
+_SET_BY = "a handpiece.json or, where the verb has it, --working-distance-mm"
 
 
 def rigid_to_json(target_from_source: Rigid3) -> dict[str, Any]:
@@ -148,11 +149,11 @@ def _guessed_mm(path: Path, rig: Rig) -> float:
     try:
         distance_mm, source = guess_working_distance_mm(rig)
     except InputError as error:
-        raise InputError(f"{path}: {error}; give --working-distance-mm, or a handpiece.json") from error
+        raise InputError(f"{path}: {error}; give {_SET_BY}") from error
     near_mm, far_mm = depth_of_field_mm(distance_mm)
     _log.info(
         f"{path}: it has no working distance; {distance_mm:.3g} mm are guessed from {source}. Depths of "
-        f"{near_mm:.3g} to {far_mm:.3g} mm are kept; --working-distance-mm sets another"
+        f"{near_mm:.3g} to {far_mm:.3g} mm are kept; {_SET_BY} sets others"
     )
     return distance_mm
 
