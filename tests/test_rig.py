@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -6,6 +8,7 @@ from hypothesis import strategies as st
 from builders import THESIS_CAMERA, rig_of, shifted
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.handpiece.designs import essential_four, six_cameras, stereo_pair
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 from strategies import rigid3s
 
@@ -19,6 +22,27 @@ def test_rebasing_keeps_the_relative_poses(transforms):
         np.testing.assert_allclose(
             (rebased[name].cam_from_rig @ reference_from_rig).matrix, rig[name].cam_from_rig.matrix, atol=1e-8
         )
+
+
+@given(rigid3s(), st.sampled_from([stereo_pair, essential_four, six_cameras]))
+def test_the_frame_on_the_surface_is_that_of_the_designs(other_from_rig, design):
+    """The rig frame of a design comes back from cameras that are given in any other one."""
+    rig = design().rig
+    elsewhere = Rig(
+        {
+            name: replace(mounted, cam_from_rig=mounted.cam_from_rig @ other_from_rig.inverse())
+            for name, mounted in rig.cameras.items()
+        }
+    )
+    found = elsewhere.over_surface(5.0)
+    for name, mounted in rig.cameras.items():
+        np.testing.assert_allclose(found[name].cam_from_rig.matrix, mounted.cam_from_rig.matrix, atol=1e-7)
+
+
+def test_cameras_that_look_in_all_directions_have_no_surface():
+    turned = Rigid3.from_rotation_vector(np.array([0, np.pi, 0]), np.zeros(3))
+    with pytest.raises(InputError, match="look in all directions"):
+        rig_of(ahead=shifted(0), back=turned).over_surface(5.0)
 
 
 def test_overlap_of_a_parallel_pair_is_the_textbook_value():

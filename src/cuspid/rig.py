@@ -15,7 +15,10 @@ from jaxtyping import Float
 
 from cuspid.camera import Camera
 from cuspid.errors import InputError
-from cuspid.geometry import Rigid3, read_only
+from cuspid.geometry import Rigid3, read_only, unit
+
+_NO_SIDE = 1e-3
+"""Length of the mean of unit vectors that have no direction in common."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,12 +69,31 @@ class Rig:
     def rebased(self, reference: str | None = None) -> tuple[Rig, Rigid3]:
         """The same rig in the frame of one of its cameras (default: the first), and ``reference_from_rig``."""
         reference_from_rig = self[reference or self.names[0]].cam_from_rig
-        rig_from_reference = reference_from_rig.inverse()
-        moved = {
-            name: replace(mounted, cam_from_rig=mounted.cam_from_rig @ rig_from_reference)
-            for name, mounted in self.cameras.items()
-        }
-        return Rig(moved), reference_from_rig
+        return self._in_frame(reference_from_rig), reference_from_rig
+
+    def over_surface(self, distance_mm: float) -> Rig:
+        """The same rig in a frame on the surface that it looks at from a distance: +Z back to the cameras, against
+        their mean axis, +X to the right of the image of the one that looks most along it. Raises InputError for cameras
+        that look in all directions."""
+        mounted = list(self.cameras.values())
+        axes = np.array([each.axis_in_rig for each in mounted])
+        if np.linalg.norm(axes.mean(axis=0)) < _NO_SIDE:
+            raise InputError("rig: its cameras look in all directions, not at one surface")
+        back = unit(-axes.mean(axis=0))
+        right = mounted[int(np.argmin(axes @ back))].cam_from_rig.rotation[0]
+        right = unit(right - (right @ back) * back)
+        rotation = np.stack([right, np.cross(back, right), back])
+        origin = np.mean([each.centre_in_rig for each in mounted] + distance_mm * axes, axis=0)
+        return self._in_frame(Rigid3(rotation, -rotation @ origin))
+
+    def _in_frame(self, new_from_rig: Rigid3) -> Rig:
+        rig_from_new = new_from_rig.inverse()
+        return Rig(
+            {
+                name: replace(mounted, cam_from_rig=mounted.cam_from_rig @ rig_from_new)
+                for name, mounted in self.cameras.items()
+            }
+        )
 
     def largest_shift_px(self, other: Rig, distance_mm: float) -> float:
         """How far at most points at a distance lie from each other in the images of this calibration and of another one

@@ -102,7 +102,7 @@ def _light_from_json(value: Mapping[str, Any]) -> Light:
 
 def read_handpiece(path: Path, working_distance_mm: float | None = None) -> Handpiece:
     """Read ``handpiece.json``, or COLMAP's ``rig_config.json``, which has no working distance: that is the one given
-    here, or else guessed, and said.
+    here, or else guessed, and said. Its frame is then on the surface, as :meth:`cuspid.rig.Rig.over_surface` has it.
 
     Raises InputError that names a missing or unusable field, where nothing can be guessed, and where a file that has a
     working distance is given another.
@@ -141,7 +141,10 @@ def read_handpiece(path: Path, working_distance_mm: float | None = None) -> Hand
 def _of_rig(path: Path, rig: Rig, working_distance_mm: float | None) -> Handpiece:
     distance_mm = _guessed_mm(path, rig) if working_distance_mm is None else working_distance_mm
     return Handpiece(
-        rig=rig, working_distance_mm=distance_mm, depth_range_mm=depth_of_field_mm(distance_mm), name=path.stem
+        rig=rig.over_surface(distance_mm),
+        working_distance_mm=distance_mm,
+        depth_range_mm=depth_of_field_mm(distance_mm),
+        name=path.stem,
     )
 
 
