@@ -167,3 +167,50 @@ def design_comparison(result: Result) -> str:
             markdown_table(head, rows),
         ]
     )
+
+
+def any_rig(result: Result) -> str:
+    """One molar, scanned with many rigs."""
+    scans = result["scans"]
+    parts = [
+        f"Tooth {result['tooth']} of the phantom, each rig without options of its own. The share within 50 um is of "
+        "what two cameras of one exposure could see, which differs between the rigs: *seen* is how much of the tooth "
+        "that is. Eight and ten cameras are those that a search found (docs/designs.md).",
+    ]
+    for title, names in result["tables"].items():
+        found = [scans[name] for name in names if name in scans]
+        parts += ["", f"By {title}:", "", markdown_table(_ANY_RIG, [_any_rig_row(scan) for scan in found])]
+    return "\n".join(parts)
+
+
+_ANY_RIG = (
+    "cameras",
+    "working distance mm",
+    "image px",
+    "mean um",
+    "P95 um",
+    "within 50 um %",
+    "tooth seen %",
+    "frames located",
+    "images",
+    "CPU s",
+)
+
+
+def _any_rig_row(scan: Result) -> tuple[object, ...]:
+    """Of a scan that failed, the reason."""
+    size = f"{scan['width_px']} x {scan['height_px']}"
+    if scan["failure"] is not None:
+        return (scan["cameras"], f"{scan['working_distance_mm']:g}", size, scan["failure"], *[""] * 6)
+    return (
+        scan["cameras"],
+        f"{scan['true_distance_mm']:.2g}",
+        size,
+        f"{scan['mean_abs_um']:.2f}",
+        f"{scan['p95_um']:.1f}",
+        f"{scan['complete_50_um_pct']:.1f}",
+        f"{scan['tooth_seen_pct']:.1f}",
+        f"{scan['located_frames']} of {scan['frames']}",
+        scan["images"],
+        f"{scan['reconstruction_cpu_s']:.0f}",
+    )

@@ -142,6 +142,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
     "camera_sweep": ("A pair of cameras, by simulated scans", handpiece_sections.camera_sweep),
     "design_comparison": ("Six cameras or twelve", handpiece_sections.design_comparison),
     "design_comparison_full_size": ("Six cameras or twelve, images of full size", handpiece_sections.design_comparison),
+    "any_rig": ("Any rig", handpiece_sections.any_rig),
     "grid": ("Running many", handpiece_sections.grid),
 }
 """Title and text for each file of results that is not of scans, by its stem."""

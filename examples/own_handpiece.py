@@ -11,6 +11,7 @@ import numpy as np
 from cuspid import storage
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
+from cuspid.pairing import stereo_pairs
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 
 folder = Path(sys.argv[1])
@@ -32,5 +33,5 @@ handpiece = Handpiece(
 )
 storage.write_handpiece(folder / "handpiece.json", handpiece)
 storage.write_rig_config(folder / "rig_config.json", handpiece.rig)
-print(f"stereo pairs: {handpiece.rig.stereo_pairs(handpiece.working_distance_mm)}")
+print(f"stereo pairs: {stereo_pairs(handpiece.rig, handpiece.working_distance_mm)}")
 print(f"overlap at the working distance: {handpiece.rig.overlap('left', 'right', 6.0):.0%}")

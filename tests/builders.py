@@ -19,6 +19,7 @@ from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 
 CAMERA = Camera.from_field_of_view(16, 12, 62.0)
+THESIS_CAMERA = Camera.from_field_of_view(500, 500, 62.0)
 
 
 def box_mesh() -> Mesh:
@@ -54,6 +55,16 @@ def joined(*meshes: Mesh) -> Mesh:
         np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]),
         np.concatenate(colors) if len(colors) == len(meshes) else None,
     )
+
+
+def rig_of(**cam_from_rig: Rigid3) -> Rig:
+    """The thesis' cameras in given places."""
+    return Rig({name: MountedCamera(THESIS_CAMERA, transform) for name, transform in cam_from_rig.items()})
+
+
+def shifted(x: float, y: float = 0.0) -> Rigid3:
+    """A camera beside the origin that looks along +Z."""
+    return Rigid3(np.eye(3), np.array([-x, -y, 0.0]))
 
 
 def any_pose(seed: int, reach_mm: float) -> Rigid3:

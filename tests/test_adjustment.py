@@ -108,6 +108,10 @@ def pose_errors(found: Reconstruction, truth: dict[str, Rigid3]) -> np.ndarray:
     return np.array([[*motion.rotation_vector, *motion.translation] for motion in motions])
 
 
+def poses_of(scene: Reconstruction) -> tuple[Rigid3, ...]:
+    return tuple(scene.rig_from_world.values())
+
+
 def normalised_squares(errors: np.ndarray, covariances: np.ndarray) -> np.ndarray:
     """Squared Mahalanobis lengths."""
     return np.einsum("ni,ni->n", errors, np.linalg.solve(covariances, errors[..., None])[..., 0])
@@ -170,7 +174,9 @@ def test_jacobian_agrees_with_finite_differences(seed: int) -> None:
     scene = Reconstruction(rig=rig, rig_from_world=make_path(2))
     point = np.array([*rng.uniform(-1, 1, 2), rng.uniform(4, 6)])
     whitened = 10 * rng.normal(size=(len(rig.names), 14))
-    start = adjustment._with_calibration(adjustment._initial_state(scene, point[None], prior), prior, whitened)
+    start = adjustment._with_calibration(
+        adjustment._initial_state(poses_of(scene), point[None], prior), prior, whitened
+    )
     camera = int(rng.integers(4))
     nothing = normal_equations.Observations(
         np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(2, np.int64)
@@ -222,7 +228,7 @@ def disturbed_state(seed: int, rig: Rig) -> tuple[normal_equations.State, normal
     scene = disturbed(make_scene(frames=3, points=40), rng, rig=rig)
     every = np.ones(len(scene.tracks.point_index), dtype=bool)
     observations, points = adjustment._sorted_by_point(scene.tracks, every)
-    start = adjustment._initial_state(scene, scene.tracks.points[points], prior)
+    start = adjustment._initial_state(poses_of(scene), scene.tracks.points[points], prior)
     whitened = rng.normal(size=start.whitened.shape)
     return adjustment._with_calibration(start, prior, whitened), observations, prior
 

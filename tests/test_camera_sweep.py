@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from cuspid import cli, storage
 from cuspid.errors import InputError
+from cuspid.pairing import stereo_pairs
 from cuspid.studies import camera_sweep, grid
 from cuspid.studies.camera_sweep import (
     SweepOptions,
@@ -94,9 +95,8 @@ def test_the_gum_of_a_tooth_lies_on_its_outer_side(coarse_phantom):
 @given(baseline=st.floats(0.5, 4.0), angle=st.floats(0.0, 9.0))
 def test_every_setting_of_the_thesis_is_taken_for_a_pair(site, baseline, angle):
     handpiece = pair_handpiece(site.pair_from_rig, (baseline, angle), SMALL)
-    assert handpiece.rig.groups(handpiece.working_distance_mm) == (("left", "right"),)
-    # 4 mm are 60 % of the view at 5.5 mm; turned inwards by little, it is the far corner that decides.
-    assert 5.0 <= handpiece.working_distance_mm < 6.4
+    assert handpiece.working_distance_mm == SMALL.distance_mm
+    assert stereo_pairs(handpiece.rig, handpiece.working_distance_mm, SMALL.pairing) == (("left", "right"),)
 
 
 @pytest.mark.parametrize(

@@ -49,6 +49,26 @@ def test_visibility_of_a_tooth(tmp_path, phantom_file):
     assert (out / "visibility.png").stat().st_size > 10_000
 
 
+def test_a_rig_of_colmap_is_simulated_and_what_is_assumed_is_said(tmp_path, phantom_file, capsys):
+    probe, scan = tmp_path / "probe", tmp_path / "scan"
+    run("handpiece", "--design", "two", "--width-px", 48, "--height-px", 48, "--out", probe)
+    short = ("--tooth", 46, "--frames", 2, "--length-mm", 1, "--supersampling", 1)
+    run("simulate", phantom_file, "--handpiece", probe / "rig_config.json", *short, "--out", scan)
+    notes = " ".join(capsys.readouterr().err.split())
+    assert "mm are guessed from their baselines" in notes
+    assert "it has no lights; one beside each camera is assumed" in notes
+    made = storage.read_handpiece(scan / "capture" / "handpiece.json")
+    assert len(made.lights) == 2
+    assert 2.5 < made.working_distance_mm < 10
+
+
+def test_a_working_distance_is_not_given_twice(tmp_path, phantom_file, capsys):
+    run("handpiece", "--design", "two", "--out", tmp_path)
+    command = ("visibility", phantom_file, "--handpiece", tmp_path / "handpiece.json", "--out", tmp_path / "seen")
+    assert "has a working distance of its own" in refused(capsys, *command, "--working-distance-mm", 8)
+    assert "must be positive" in refused(capsys, *command, "--working-distance-mm", 0)
+
+
 def test_precision_of_a_tooth_follows_the_noise(tmp_path, phantom_file):
     medians = []
     for sigma_px in (0.5, 1.0):

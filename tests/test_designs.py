@@ -8,13 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cuspid.errors import InputError
-from cuspid.handpiece.designs import DESIGNS, DesignOptions, essential_four, six_cameras, twelve_cameras
+from cuspid.handpiece.designs import DESIGNS, DesignOptions, essential_four, six_cameras, stereo_pair, twelve_cameras
+from cuspid.pairing import camera_groups, stereo_pairs
 from cuspid.rig import Handpiece
 
 OPTIONS = st.builds(
     DesignOptions,
     field_of_view_deg=st.floats(40, 90),
-    working_distance_mm=st.floats(3, 8),
+    working_distance_mm=st.floats(1, 30),
     baseline_across_mm=st.floats(0.5, 4),
     baseline_along_mm=st.floats(0.5, 4),
     side_tilt_deg=st.floats(45, 80),
@@ -75,8 +76,8 @@ def test_defaults_are_those_of_the_thesis() -> None:
 
 def test_twelve_cameras_pair_within_their_three_groups_only() -> None:
     rig = twelve_cameras().rig
-    assert [set(group) for group in rig.groups(5.0)] == [{f"{g}{k}" for k in range(1, 5)} for g in "obl"]
-    assert len(rig.stereo_pairs(5.0)) == 3 * 6
+    assert [set(group) for group in camera_groups(rig, 5.0)] == [{f"{g}{k}" for k in range(1, 5)} for g in "obl"]
+    assert len(stereo_pairs(rig, 5.0)) == 3 * 6
 
 
 def test_side_groups_aim_at_the_crown_from_the_working_distance() -> None:
@@ -109,7 +110,8 @@ def test_every_named_design_can_be_built(name: str) -> None:
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"working_distance_mm": 1.0},
+        {"working_distance_mm": 0.0},
+        {"width_px": 0},
         {"baseline_across_mm": 0.0},
         {"field_of_view_deg": 180.0},
         {"outer_distance_mm": 0.0},
@@ -119,6 +121,30 @@ def test_every_named_design_can_be_built(name: str) -> None:
 def test_impossible_designs_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(InputError, match="design"):
         DesignOptions(**wrong)
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+@pytest.mark.parametrize("size_px", [(320, 240), (500, 500), (640, 480), (1280, 960)])
+@pytest.mark.parametrize("distance_mm", [5.0, 8.0, 12.0, 20.0])
+def test_every_camera_of_a_design_has_a_partner(name: str, size_px: tuple[int, int], distance_mm: float) -> None:
+    width_px, height_px = size_px
+    made = DESIGNS[name](DesignOptions(width_px=width_px, height_px=height_px, working_distance_mm=distance_mm))
+    assert all(len(group) > 1 for group in camera_groups(made.rig, made.working_distance_mm))
+    near, far = made.depth_range_mm
+    assert (near, far) == pytest.approx((distance_mm / 2, 1.8 * distance_mm))
+
+
+def test_the_depth_range_of_the_thesis_is_kept() -> None:
+    assert twelve_cameras().depth_range_mm == (2.5, 9.0)
+
+
+@given(OPTIONS)
+def test_a_pair_is_half_of_the_four(options: DesignOptions) -> None:
+    four, two = essential_four(options), stereo_pair(options)
+    assert two.rig.names == ("o1", "o2")
+    for name, mounted in two.rig.cameras.items():
+        np.testing.assert_array_equal(mounted.cam_from_rig.matrix, four.rig[name].cam_from_rig.matrix)
+    assert two.lights.keys() == four.lights.keys()
 
 
 @given(OPTIONS)
@@ -156,4 +182,4 @@ def test_outer_cameras_lean_inwards_by_the_tilt() -> None:
 
 
 def test_six_cameras_are_one_group_for_stereo() -> None:
-    assert len(six_cameras().rig.groups(5.0)) == 1
+    assert len(camera_groups(six_cameras().rig, 5.0)) == 1

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from cuspid import cli, storage
+from cuspid.pairing import stereo_pairs
 from documents import ROOT, Block, blocks, commands, mentions, pages, words
 
 RUN = ["tutorial.md", *(f"how-to/{path.name}" for path in sorted((ROOT / "docs/how-to").glob("*.md")))]
@@ -163,7 +164,7 @@ def test_the_calibration_on_a_page_can_be_read(tmp_path):
     (shown,) = (block.text for block in blocks(page) if block.language == "json")
     (tmp_path / "handpiece.json").write_text(shown)
     rig = storage.read_handpiece(tmp_path / "handpiece.json").rig
-    assert rig.stereo_pairs(6.0) == (("left", "right"),)
+    assert stereo_pairs(rig, 6.0) == (("left", "right"),)
     assert 0.7 < rig.overlap("left", "right", 6.0) < 0.8
 
 

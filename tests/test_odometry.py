@@ -19,6 +19,7 @@ from cuspid.motion.features import DESCRIPTOR_NORM, Features
 from cuspid.motion.location import locate_features
 from cuspid.motion.odometry import Edge, OdometryOptions, chain, polish, triangulate_frame
 from cuspid.motion.pairs import MatchingOptions, make_view
+from cuspid.pairing import stereo_pairs
 from cuspid.reconstruction import Reconstruction
 from cuspid.rig import Handpiece, MountedCamera, Rig
 
@@ -240,7 +241,7 @@ def test_a_frame_is_triangulated_in_the_rig_frame() -> None:
     handpiece, path = make_handpiece(), make_path(1)
     seen = see(handpiece, path)
     views = {c: make_view(seen["00000", c], m.camera) for c, m in handpiece.rig.cameras.items()}
-    cloud = triangulate_frame(handpiece, handpiece.rig.stereo_pairs(5.0), views, MatchingOptions())
+    cloud = triangulate_frame(handpiece, stereo_pairs(handpiece.rig, 5.0), views, MatchingOptions())
     x, y, z = cloud.points.T
     assert len(z) > 100
     assert np.median(np.abs(z - (5 + 0.5 * np.sin(1.3 * x) * np.cos(y)))) < 0.02

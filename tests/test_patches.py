@@ -14,8 +14,8 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.motion.guided import GuidedOptions
 from cuspid.motion.patches import PatchOptions, align_patches, lengthen
-from cuspid.reconstruction import Reconstruction, Tracks
-from cuspid.rig import MountedCamera, Rig
+from cuspid.reconstruction import Tracks
+from cuspid.sparse_model import SparseModel
 
 
 def wall(seed: int = 0, size: int = 400) -> np.ndarray:
@@ -58,7 +58,7 @@ def test_what_is_not_there_is_not_found() -> None:
     assert np.isnan(align_patches(here, here, border, border, warps, PatchOptions())[1]).all()
 
 
-def over_a_wall(frames: int = 8) -> tuple[Reconstruction, dict[str, np.ndarray]]:
+def over_a_wall(frames: int = 8) -> tuple[SparseModel, dict[str, np.ndarray]]:
     """A camera that moves over a textured wall; every point is known from two frames alone, up to a pixel."""
     texture, camera = wall(3, 800), Camera.from_field_of_view(320, 240, 60.0)
     rng, px_per_mm = np.random.default_rng(1), 20.0
@@ -83,18 +83,17 @@ def over_a_wall(frames: int = 8) -> tuple[Reconstruction, dict[str, np.ndarray]]
         camera_index=np.zeros(len(pairs), np.int64),
         pixels=pixels,
     )
-    rig = Rig({"camera": MountedCamera(camera, Rigid3.identity())})
-    return Reconstruction(rig=rig, rig_from_world=poses, tracks=tracks), pictures
+    return SparseModel(camera=camera, cam_from_world=poses, tracks=tracks), pictures
 
 
 def test_points_are_followed_into_every_frame_that_sees_them() -> None:
     model, pictures = over_a_wall()
-    given_tracks, camera = model.known_tracks, model.rig["camera"].camera
-    longer = lengthen(model, lambda name: pictures[name], PatchOptions()).known_tracks
+    given_tracks, camera = model.tracks, model.camera
+    longer = lengthen(model, lambda name: pictures[name], PatchOptions()).tracks
     second = longer.point_index >= len(given_tracks.points)
     assert len(longer.points) - len(given_tracks.points) >= 50
     assert np.array_equal(longer.pixels[~second], given_tracks.pixels)
-    poses = list(model.rig_from_world.values())
+    poses = list(model.cam_from_world.values())
     true = np.array(
         [
             camera.project(poses[frame].apply(longer.points[point : point + 1]))[0]
@@ -110,8 +109,8 @@ def test_points_are_followed_into_every_frame_that_sees_them() -> None:
 def test_points_seen_in_too_few_frames_stay_as_they_were() -> None:
     model, pictures = over_a_wall()
     options = replace(PatchOptions(), minimum_views=9)
-    longer = lengthen(model, lambda name: pictures[name], options).known_tracks
-    assert len(longer.points) == len(model.known_tracks.points)
+    longer = lengthen(model, lambda name: pictures[name], options).tracks
+    assert len(longer.points) == len(model.tracks.points)
 
 
 def test_each_round_needs_a_tolerance_and_a_depth_share() -> None:

@@ -1,23 +1,17 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid.camera import Camera
+from builders import THESIS_CAMERA, rig_of, shifted
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.handpiece.designs import essential_four, six_cameras, stereo_pair
+from cuspid.pairing import depth_step_mm, resolved_mm
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 from strategies import rigid3s
-
-CAMERA = Camera.from_field_of_view(500, 500, 62.0)
-
-
-def rig_of(**cam_from_rig: Rigid3) -> Rig:
-    return Rig({name: MountedCamera(CAMERA, transform) for name, transform in cam_from_rig.items()})
-
-
-def shifted(x: float, y: float = 0.0) -> Rigid3:
-    return Rigid3(np.eye(3), np.array([-x, -y, 0.0]))
 
 
 @given(st.lists(rigid3s(), min_size=2, max_size=4))
@@ -31,25 +25,39 @@ def test_rebasing_keeps_the_relative_poses(transforms):
         )
 
 
+@given(rigid3s(), st.sampled_from([stereo_pair, essential_four, six_cameras]))
+def test_the_frame_on_the_surface_is_that_of_the_designs(other_from_rig, design):
+    """The rig frame of a design comes back from cameras that are given in any other one."""
+    rig = design().rig
+    elsewhere = Rig(
+        {
+            name: replace(mounted, cam_from_rig=mounted.cam_from_rig @ other_from_rig.inverse())
+            for name, mounted in rig.cameras.items()
+        }
+    )
+    found = elsewhere.over_surface(5.0)
+    for name, mounted in rig.cameras.items():
+        np.testing.assert_allclose(found[name].cam_from_rig.matrix, mounted.cam_from_rig.matrix, atol=1e-7)
+
+
+def test_cameras_that_look_in_all_directions_have_no_surface():
+    turned = Rigid3.from_rotation_vector(np.array([0, np.pi, 0]), np.zeros(3))
+    with pytest.raises(InputError, match="look in all directions"):
+        rig_of(ahead=shifted(0), back=turned).over_surface(5.0)
+
+
 def test_overlap_of_a_parallel_pair_is_the_textbook_value():
     rig = rig_of(a=shifted(0), b=shifted(2.5))
     expected = 1 - 2.5 / (2 * 5 * np.tan(np.deg2rad(31)))
     assert rig.overlap("a", "b", 5.0) == pytest.approx(expected, abs=0.09)
 
 
-def test_groups_join_cameras_that_see_the_same():
-    side = Rigid3.from_rotation_vector(np.array([0, np.pi / 2, 0]), np.array([0, 0, 0.0]))
-    rig = rig_of(o1=shifted(-1.25), o2=shifted(1.25), s1=side, s2=shifted(1.5) @ side, lone=shifted(40))
-    assert rig.groups(5.0) == (("o1", "o2"), ("s1", "s2"), ("lone",))
-    assert rig.stereo_pairs(5.0) == (("o1", "o2"), ("s1", "s2"))
-
-
 def test_what_a_handpiece_resolves_is_a_pixel_or_half_a_pixel_of_disparity():
-    pixel_mm = 5.0 / CAMERA.focal_px[0]
+    pixel_mm = 5.0 / THESIS_CAMERA.focal_px[0]
     wide, narrow = (Handpiece(rig=rig_of(a=shifted(0), b=shifted(x))) for x in (2.5, 0.5))
-    assert wide.resolution_mm == pytest.approx(pixel_mm) == pytest.approx(wide.depth_step_mm / 2)
-    assert narrow.resolution_mm == pytest.approx(5 * pixel_mm)
-    assert Handpiece(rig=rig_of(a=shifted(0))).resolution_mm == pytest.approx(pixel_mm)
+    assert resolved_mm(wide) == pytest.approx(pixel_mm) == pytest.approx(depth_step_mm(wide) / 2)
+    assert resolved_mm(narrow) == pytest.approx(5 * pixel_mm)
+    assert resolved_mm(Handpiece(rig=rig_of(a=shifted(0)))) == pytest.approx(pixel_mm)
 
 
 @given(st.permutations(["a", "b", "c", "d"]))
@@ -60,7 +68,7 @@ def test_cameras_have_an_order_of_their_own(names):
 
 
 def test_place_and_axis_in_the_rig():
-    mounted = MountedCamera(CAMERA, Rigid3.from_rotation_vector(np.array([np.pi, 0, 0]), np.array([0, 0, 7.0])))
+    mounted = MountedCamera(THESIS_CAMERA, Rigid3.from_rotation_vector(np.array([np.pi, 0, 0]), np.array([0, 0, 7.0])))
     np.testing.assert_allclose(mounted.centre_in_rig, [0, 0, 7], atol=1e-12)
     np.testing.assert_allclose(mounted.axis_in_rig, [0, 0, -1], atol=1e-12)
 

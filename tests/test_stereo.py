@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.pairing import camera_groups, stereo_pairs
 from cuspid.reconstruction import DepthMap
 from cuspid.rig import Handpiece, MountedCamera, Rig
 from cuspid.stereo.confidence import (
@@ -241,8 +242,8 @@ def test_semi_global_matching_finds_a_known_shift() -> None:
 
 def test_each_camera_gets_its_widest_partner() -> None:
     handpiece = diamond()
-    group = handpiece.rig.groups(5.0)[0]
-    assert set(seed_pairs(handpiece.rig, group, handpiece.rig.stereo_pairs(5.0))) == {
+    group = camera_groups(handpiece.rig, 5.0)[0]
+    assert set(seed_pairs(handpiece.rig, group, stereo_pairs(handpiece.rig, 5.0))) == {
         ("west", "east"),
         ("north", "south"),
     }

@@ -21,9 +21,9 @@ from cuspid.jaw import GUM, Jaw
 from cuspid.motion.single import SingleOptions, locate_single, mouth_share, normalise_contrast
 from cuspid.panorama import Panorama
 from cuspid.pipeline import RenderOptions, StitchOptions, take_images
-from cuspid.reconstruction import Reconstruction, Tracks
-from cuspid.rig import MountedCamera, Rig
+from cuspid.reconstruction import Tracks
 from cuspid.simulation.path.arch import arch_curve
+from cuspid.sparse_model import SparseModel
 from cuspid.stitching.exposure import ExposureOptions, Samples, balance
 from cuspid.stitching.mosaic import unlit
 from cuspid.stitching.ortho import Stitched
@@ -99,7 +99,7 @@ def test_every_frame_is_placed_and_pixels_show_what_lies_there(
 def test_the_camera_was_where_it_is_found(stitched: Stitched, film: tuple[Capture, GroundTruth]) -> None:
     assert stitched.motion is not None
     from_rig = film[1].handpiece.rig["camera"].cam_from_rig
-    found = np.array([pose.inverse().translation for pose in stitched.motion.rig_from_world.values()])
+    found = np.array([pose.inverse().translation for pose in stitched.motion.cam_from_world.values()])
     true = np.array([(from_rig @ pose).inverse().translation for pose in film[1].rig_from_world.values()])
     scale, rotation, shift = best_similarity(found, true)
     errors = np.linalg.norm(scale * found @ rotation.T + shift - true, axis=1)
@@ -145,8 +145,8 @@ def test_two_runs_on_the_same_frames_are_alike(stitched: Stitched, sequence: Ima
     (again,) = pipeline.stitch(sequence, StitchOptions())
     assert stitched.motion is not None
     assert again.motion is not None
-    for name, pose in stitched.motion.rig_from_world.items():
-        np.testing.assert_array_equal(again.motion.rig_from_world[name].matrix, pose.matrix)
+    for name, pose in stitched.motion.cam_from_world.items():
+        np.testing.assert_array_equal(again.motion.cam_from_world[name].matrix, pose.matrix)
     np.testing.assert_array_equal(again.panorama.image, stitched.panorama.image)
     np.testing.assert_array_equal(again.panorama.frame_pixel, stitched.panorama.frame_pixel)
 
@@ -172,7 +172,7 @@ def test_one_camera_without_a_calibration_finds_its_focal_length(sequence: Image
     motion = locate_single(replace(sequence, camera=None, working_distance_mm=None), SingleOptions())
     assert len(motion.parts) == 1
     assert sequence.camera is not None
-    focal = motion.parts[0].rig["camera"].camera.focal_px[0]
+    focal = motion.parts[0].camera.focal_px[0]
     assert focal == pytest.approx(sequence.camera.focal_px[0], rel=0.12)
     assert "self-calibrated" in motion.notes[0]
 
@@ -274,7 +274,7 @@ def test_a_burnt_out_place_is_taken_from_another_frame_and_lone_cells_are_not() 
     assert chosen[0, 0] == 0
 
 
-def motion_over(points: np.ndarray, rng: np.random.Generator) -> Reconstruction:
+def motion_over(points: np.ndarray, rng: np.random.Generator) -> SparseModel:
     """A camera 14 mm over a horseshoe path that sees points, in a model turned, moved and scaled at random."""
     angles = np.linspace(np.deg2rad(200), np.deg2rad(-20), 30)
     model_from_world = Rigid3.from_rotation_vector(rng.normal(0, 1, 3), rng.normal(0, 20, 3))
@@ -287,9 +287,9 @@ def motion_over(points: np.ndarray, rng: np.random.Generator) -> Reconstruction:
         moved = cam_from_world @ model_from_world.inverse()
         poses[f"{index}"] = Rigid3(moved.rotation, scale * moved.translation)
     number = np.arange(len(points))
-    return Reconstruction(
-        rig=Rig({"camera": MountedCamera(Camera.from_field_of_view(640, 480, 62.0), Rigid3.identity())}),
-        rig_from_world=poses,
+    return SparseModel(
+        camera=Camera.from_field_of_view(640, 480, 62.0),
+        cam_from_world=poses,
         tracks=Tracks(
             points=scale * model_from_world.apply(points),
             colors=np.zeros((len(points), 3), np.uint8),

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from builders import CAMERA, box_mesh, handpiece, image_path, make_capture
+from builders import CAMERA, box_mesh, handpiece, image_path, make_capture, rig_of, shifted
 from cuspid import storage
 from cuspid.capture import Dropped
 from cuspid.errors import CuspidError, InputError, OutputError
@@ -129,12 +129,29 @@ def test_handpiece_and_rig_config_return(tmp_path, camera, transform, other):
         assert (colmap[name].camera.width, colmap[name].camera.height) == (camera.width, camera.height)
 
 
-def test_a_rig_config_serves_as_a_handpiece(tmp_path):
-    original = handpiece("a", "b")
-    storage.write_rig_config(tmp_path / "rig_config.json", original.rig)
-    again = storage.read_handpiece(tmp_path / "rig_config.json")
+def test_a_rig_config_serves_as_a_handpiece(tmp_path, caplog):
+    path = tmp_path / "rig_config.json"
+    storage.write_rig_config(path, rig_of(a=shifted(0), b=shifted(2)))
+    with caplog.at_level("INFO", logger="cuspid"):
+        again = storage.read_handpiece(path)
     assert again.rig.names == ("a", "b")
-    assert again.depth_range_mm[0] < again.working_distance_mm < again.depth_range_mm[1]
+    assert 2 < again.depth_range_mm[0] < again.working_distance_mm < again.depth_range_mm[1] < 9
+    (told,) = caplog.messages
+    assert f"{again.working_distance_mm:.3g} mm are guessed from their baselines" in told
+    assert "--working-distance-mm" in told
+    caplog.clear()
+    given = storage.read_handpiece(path, 50.0)
+    assert (given.working_distance_mm, *given.depth_range_mm) == (50.0, 25.0, 90.0)
+    assert not caplog.messages
+
+
+def test_a_working_distance_that_cannot_be_known_or_is_known_is_told(tmp_path):
+    storage.write_rig_config(tmp_path / "rig_config.json", handpiece("a").rig)
+    with pytest.raises(InputError, match=r"rig_config.json: the cameras do not tell .*; give a handpiece"):
+        storage.read_handpiece(tmp_path / "rig_config.json")
+    storage.write_handpiece(tmp_path / "handpiece.json", handpiece("a"))
+    with pytest.raises(InputError, match="has a working distance of its own"):
+        storage.read_handpiece(tmp_path / "handpiece.json", 7.0)
 
 
 def test_a_rig_config_of_colmap_without_sizes(tmp_path):

@@ -16,8 +16,8 @@ from hypothesis.extra.numpy import arrays
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.reconstruction import Reconstruction, Tracks
-from cuspid.rig import MountedCamera, Rig
+from cuspid.reconstruction import Tracks
+from cuspid.sparse_model import SparseModel
 from cuspid.stitching.mosaic import MosaicOptions, compose
 from cuspid.stitching.surface import HeightMap, SurfaceOptions, height_map, uncovered
 from cuspid.stitching.sweep import SweepOptions, partners, semi_global, sweep
@@ -30,7 +30,7 @@ CAMERA = Camera(width=240, height=180, focal_px=np.array([200.0, 200.0]), princi
 class Scene(NamedTuple):
     """Frames over the bar, and the motion that took them."""
 
-    motion: Reconstruction
+    motion: SparseModel
     images: dict[str, np.ndarray]
 
     def read(self, name: str) -> np.ndarray:
@@ -72,9 +72,9 @@ def scene() -> Scene:
         poses[f"{index:03d}"] = tilt @ looking @ place
     points = rng.uniform([-6, -12, 0], [6, 12, 0], (900, 3))
     points[np.abs(points[:, 0]) > HALF_MM, 2] = -DEEP_MM
-    motion = Reconstruction(
-        rig=Rig({"camera": MountedCamera(CAMERA, Rigid3.identity())}),
-        rig_from_world=poses,
+    motion = SparseModel(
+        camera=CAMERA,
+        cam_from_world=poses,
         tracks=Tracks(
             points=points,
             colors=np.zeros((len(points), 3), np.uint8),
@@ -118,7 +118,7 @@ def test_a_plain_spot_in_a_crown_is_bridged(scene: Scene) -> None:
     spot = np.array([0.0, -3.0])
 
     def plain(name: str) -> np.ndarray:
-        places = true_places(scene.motion.rig_from_world[name], CAMERA.pixel_centres())
+        places = true_places(scene.motion.cam_from_world[name], CAMERA.pixel_centres())
         return np.where(np.linalg.norm(places[..., :2] - spot, axis=-1)[..., None] < 2.4, 120, scene.images[name])
 
     found = Scene(scene.motion, {name: plain(name).astype(np.uint8) for name in scene.images}).swept()
@@ -140,16 +140,15 @@ def test_distortion_is_taken_out(scene: Scene, surface: HeightMap) -> None:
     bent = replace(CAMERA, distortion=np.array([-0.2, 0.05, 0.0, 0.0]))
     where = CAMERA.project(bent.rays(bent.pixel_centres())).astype(np.float32) - np.float32(0.5)
     images = {name: cv2.remap(image, where, None, cv2.INTER_CUBIC) for name, image in scene.images.items()}
-    rig = Rig({"camera": MountedCamera(bent, Rigid3.identity())})
-    found = Scene(replace(scene.motion, rig=rig), images).swept()
+    found = Scene(replace(scene.motion, camera=bent), images).swept()
     assert found is not None
     middle = grid((-2.3, 2.3))
     assert np.median(np.abs(found.at(middle) - surface.at(middle))) < 0.05
 
 
 def test_a_camera_that_stands_still_finds_no_surface(scene: Scene) -> None:
-    pose = scene.motion.rig_from_world["009"]
-    still = replace(scene.motion, rig_from_world=dict.fromkeys(scene.motion.rig_from_world, pose))
+    pose = scene.motion.cam_from_world["009"]
+    still = replace(scene.motion, cam_from_world=dict.fromkeys(scene.motion.cam_from_world, pose))
     assert Scene(still, scene.images).swept() is None
 
 
@@ -157,7 +156,7 @@ def test_the_mosaic_shows_each_place_once(scene: Scene, surface: HeightMap) -> N
     """What lies behind the bar is taken from frames that see it there, and not shown where none does."""
     mosaic = compose(scene.motion, surface, scene.read, MosaicOptions())
     rows, columns = np.nonzero(mosaic.frame >= 0)
-    poses = list(scene.motion.rig_from_world.values())
+    poses = list(scene.motion.cam_from_world.values())
     shown = np.full((len(rows), 3), np.nan)
     for index, pose in enumerate(poses):
         mine = mosaic.frame[rows, columns] == index
@@ -186,8 +185,8 @@ def test_options_that_make_no_sense_are_refused(wrong: dict[str, float]) -> None
 
 @pytest.mark.parametrize("share", [0.1, 0.2, 0.3])
 def test_partners_lie_about_the_wanted_baseline_apart(scene: Scene, share: float) -> None:
-    poses = list(scene.motion.rig_from_world.values())
-    depth = float(np.median(scene.motion.depths_in_rig))
+    poses = list(scene.motion.cam_from_world.values())
+    depth = float(np.median(scene.motion.depths))
     found = partners(scene.motion, share)
     assert len(found) > 8
     for one, other in found.items():

@@ -34,6 +34,7 @@ from cuspid.mesh import Mesh
 from cuspid.motion.location import MotionOptions
 from cuspid.motion.single import SingleOptions, locate_single
 from cuspid.motion.stage import MotionMethod, locate, take_poses
+from cuspid.pairing import resolved_mm
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
 from cuspid.simulation.stage import FilmOptions, RenderOptions, SimulationOptions, film, simulate, take_images
@@ -113,7 +114,7 @@ def reconstruct(
         depths = measure_depth(capture, folder / "depth-refined", options.stereo, progress=progress)
     if options.temporal.enabled:
         depths |= measure_temporal_depth(capture, poses, folder / "depth-temporal", options.temporal, progress=progress)
-    made_from, resolution_mm = depths.digest, handpiece.resolution_mm
+    made_from, resolution_mm = depths.digest, resolved_mm(handpiece)
     mesh = fuse(depths, made_from, poses, resolution_mm, folder, options.fusion, options.cleaning, progress=progress)
     return found, mesh
 

@@ -11,7 +11,6 @@ from jaxtyping import Float, Int, UInt8
 
 from cuspid.camera import Camera
 from cuspid.capture import Dropped
-from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.rig import Rig
 
@@ -48,13 +47,13 @@ class Tracks:
     """Sparse points and where they were seen."""
 
     points: Float[np.ndarray, "p 3"]
-    """World positions, mm."""
+    """World positions, mm; of a :class:`cuspid.sparse_model.SparseModel` in units of its own."""
     colors: UInt8[np.ndarray, "p 3"]
     """RGB."""
     point_index: Int[np.ndarray, "o"]
     """For each observation: which point."""
     frame_index: Int[np.ndarray, "o"]
-    """For each observation: which frame, an index into ``Reconstruction.frames``."""
+    """For each observation: which frame, an index into the ``frames`` of what holds them."""
     camera_index: Int[np.ndarray, "o"]
     """For each observation: which camera, an index into ``rig.names``."""
     pixels: Float[np.ndarray, "o 2"]
@@ -98,25 +97,3 @@ class Reconstruction:
             place = np.array([names.index(name) for name in self.rig.names])
             tracks = replace(tracks, camera_index=place[tracks.camera_index])
         return replace(self, rig=Rig({name: self.rig[name] for name in names}), tracks=tracks)
-
-    @property
-    def known_tracks(self) -> Tracks:
-        """The sparse model. Raises ReconstructionError where there is none."""
-        if self.tracks is None or not len(self.tracks.point_index):
-            raise ReconstructionError("motion: nothing that several frames see is consistent; more detail is needed")
-        return self.tracks
-
-    @property
-    def depths_in_rig(self) -> Float[np.ndarray, "o"]:
-        """Z in the rig frame of the point of every observation, mm: of one camera at its origin, the depth."""
-        tracks = self.known_tracks
-        axes = np.stack([pose.rotation[2] for pose in self.rig_from_world.values()])
-        shifts = np.array([pose.translation[2] for pose in self.rig_from_world.values()])
-        along = np.einsum("oj,oj->o", axes[tracks.frame_index], tracks.points[tracks.point_index])
-        return np.asarray(along + shifts[tracks.frame_index])
-
-    def scaled(self, scale: float) -> Reconstruction:
-        """Poses and points times a scale, for one camera, whose rig fixes none. Raises ReconstructionError."""
-        tracks = self.known_tracks
-        poses = {name: Rigid3(pose.rotation, scale * pose.translation) for name, pose in self.rig_from_world.items()}
-        return replace(self, rig_from_world=poses, tracks=replace(tracks, points=scale * tracks.points))

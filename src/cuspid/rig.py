@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import combinations
 from types import MappingProxyType
 
 import numpy as np
@@ -18,7 +17,10 @@ from jaxtyping import Float
 from cuspid.body import CAMERA_MM, LED_MM, Body, module
 from cuspid.camera import Camera
 from cuspid.errors import InputError
-from cuspid.geometry import Rigid3, axes_about, read_only
+from cuspid.geometry import Rigid3, axes_about, read_only, unit
+
+_NO_SIDE = 1e-3
+"""Length of the mean of unit vectors that have no direction in common."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,12 +76,31 @@ class Rig:
     def rebased(self, reference: str | None = None) -> tuple[Rig, Rigid3]:
         """The same rig in the frame of one of its cameras (default: the first), and ``reference_from_rig``."""
         reference_from_rig = self[reference or self.names[0]].cam_from_rig
-        rig_from_reference = reference_from_rig.inverse()
-        moved = {
-            name: replace(mounted, cam_from_rig=mounted.cam_from_rig @ rig_from_reference)
-            for name, mounted in self.cameras.items()
-        }
-        return Rig(moved), reference_from_rig
+        return self._in_frame(reference_from_rig), reference_from_rig
+
+    def over_surface(self, distance_mm: float) -> Rig:
+        """The same rig in a frame on the surface that it looks at from a distance: +Z back to the cameras, against
+        their mean axis, +X to the right of the image of the one that looks most along it. Raises InputError for cameras
+        that look in all directions."""
+        mounted = list(self.cameras.values())
+        axes = np.array([each.axis_in_rig for each in mounted])
+        if np.linalg.norm(axes.mean(axis=0)) < _NO_SIDE:
+            raise InputError("rig: its cameras look in all directions, not at one surface")
+        back = unit(-axes.mean(axis=0))
+        right = mounted[int(np.argmin(axes @ back))].cam_from_rig.rotation[0]
+        right = unit(right - (right @ back) * back)
+        rotation = np.stack([right, np.cross(back, right), back])
+        origin = np.mean([each.centre_in_rig for each in mounted] + distance_mm * axes, axis=0)
+        return self._in_frame(Rigid3(rotation, -rotation @ origin))
+
+    def _in_frame(self, new_from_rig: Rigid3) -> Rig:
+        rig_from_new = new_from_rig.inverse()
+        return Rig(
+            {
+                name: replace(mounted, cam_from_rig=mounted.cam_from_rig @ rig_from_new)
+                for name, mounted in self.cameras.items()
+            }
+        )
 
     def largest_shift_px(self, other: Rig, distance_mm: float) -> float:
         """How far at most points at a distance lie from each other in the images of this calibration and of another one
@@ -101,27 +122,10 @@ class Rig:
         in_other = (other.cam_from_rig @ one.cam_from_rig.inverse()).apply(plane)
         return float(np.mean(other.camera.contains(other.camera.project(in_other))))
 
-    def stereo_pairs(
-        self, distance_mm: float, *, minimum_overlap: float = 0.4, maximum_angle_deg: float = 30.0
-    ) -> tuple[tuple[str, str], ...]:
-        """Pairs of cameras that see the same surface at the working distance, from about the same side."""
-        return tuple(
-            (first, second)
-            for first, second in combinations(self.names, 2)
-            if self[first].axis_in_rig @ self[second].axis_in_rig >= np.cos(np.deg2rad(maximum_angle_deg))
-            and min(self.overlap(first, second, distance_mm), self.overlap(second, first, distance_mm))
-            >= minimum_overlap
-        )
-
-    def groups(self, distance_mm: float) -> tuple[tuple[str, ...], ...]:
-        """Cameras that are joined by stereo pairs, in the order of the rig; a lone camera is a group of one."""
-        group_of = {name: {name} for name in self.names}
-        for first, second in self.stereo_pairs(distance_mm):
-            merged = group_of[first] | group_of[second]
-            for name in merged:
-                group_of[name] = merged
-        unique = {min(map(self.names.index, group)): group for group in group_of.values()}
-        return tuple(tuple(sorted(unique[key], key=self.names.index)) for key in sorted(unique))
+    def angle_deg(self, first: str, second: str) -> float:
+        """Angle between the optical axes of two cameras."""
+        cosine = self[first].axis_in_rig @ self[second].axis_in_rig
+        return float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -174,6 +178,20 @@ class Lighting:
     """Names of the lights that are on."""
 
 
+_IN_FOCUS = (0.5, 1.8)
+
+
+def depth_of_field_mm(working_distance_mm: float) -> tuple[float, float]:
+    """Nearest and farthest depth that a lens of a handpiece's size keeps usefully sharp, where nothing else is known.
+
+    Its blur disc is f A |1/Z - 1/Z0| wide and grows with the aperture A, while diffraction shrinks; at f = 416 px the
+    two meet at A = 0.07 mm. For a working distance of 5 mm, focused at Z0 = 3.9 mm, the disc is then 4 px wide at both
+    ends of the 2.5-9 mm that this gives, and narrower between; around a larger distance it is narrower still.
+    """
+    near, far = _IN_FOCUS
+    return near * working_distance_mm, far * working_distance_mm
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Handpiece:
     """Everything that is built into the probe."""
@@ -220,30 +238,6 @@ class Handpiece:
         """Side of what a pixel sees of a surface at the working distance, mm: median of the cameras."""
         focal_px = [mounted.camera.focal_px.mean() for mounted in self.rig.cameras.values()]
         return self.working_distance_mm / float(np.median(focal_px))
-
-    @property
-    def depth_step_mm(self) -> float:
-        """Change of depth at the working distance that shifts a point by 1 px in the widest stereo pair, mm; infinite
-        where no two cameras see the same surface."""
-        pairs = self.rig.stereo_pairs(self.working_distance_mm)
-        parallax = max((self._parallax_px_mm(*pair) for pair in pairs), default=0.0)
-        return self.working_distance_mm**2 / parallax if parallax > 0 else float("inf")
-
-    def _parallax_px_mm(self, first: str, second: str) -> float:
-        """Focal length times the sideways distance of the second camera from the first."""
-        one = self.rig[first]
-        sideways = one.cam_from_rig.apply(self.rig[second].centre_in_rig)[:2]
-        return float(one.camera.focal_px.mean() * np.linalg.norm(sideways))
-
-    @cached_property
-    def resolution_mm(self) -> float:
-        """The detail that the images resolve at the working distance, mm, the yardstick of all limits that are lengths.
-
-        It is the footprint of a pixel or, where the cameras stand so close together that depth is less sure than that,
-        the depth of half a pixel of disparity; 12 um for the built-in handpieces.
-        """
-        half_step = self.depth_step_mm / 2
-        return max(self.footprint_mm, half_step) if np.isfinite(half_step) else self.footprint_mm
 
     def lights_on(self, lighting: str | None) -> list[Light]:
         """The lights of a lighting pattern; all of them where the pattern is not known (None).

@@ -20,14 +20,14 @@ from cuspid.studies.forecast import room_for, sections_of
 def handpiece(
     *,
     out: Path,
-    design: Literal["four", "six", "twelve"] = "twelve",
+    design: Literal["two", "four", "six", "twelve"] = "twelve",
     options: Annotated[DesignOptions, Flat] = DesignOptions(),
 ) -> None:
     """Write a built-in handpiece as handpiece.json and COLMAP's rig_config.json, to use or to change.
 
     Args:
         out: Folder.
-        design: The essential four cameras, six to be turned, or the twelve.
+        design: A stereo pair, the essential four cameras, six to be turned, or the twelve.
     """
     made = DESIGNS[design](options)
     storage.write_handpiece(out / "handpiece.json", made)

@@ -67,7 +67,7 @@ def _hashes(sequence: ImageSequence, calibration: Path | None) -> dict[str, str]
 
 def _write(folder: Path, part: Stitched) -> None:
     if part.motion is not None:
-        storage.write_poses(folder / "poses.json", part.motion.rig_from_world)
+        storage.write_poses(folder / "poses.json", part.motion.cam_from_world)
         save_camera_path(folder / "camera_path.png", part.panorama, part.motion)
     if part.strip is not None:
         storage.write_strip(folder, part.strip)

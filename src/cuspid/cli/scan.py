@@ -73,6 +73,7 @@ def reconstruct(
     *,
     out: Path,
     handpiece: Path | None = None,
+    working_distance_mm: float | None = None,
     from_poses: Path | None = None,
     reconstruction: Annotated[ReconstructionOptions, Flat] = ReconstructionOptions(),
 ) -> None:
@@ -82,9 +83,11 @@ def reconstruct(
         capture: Folder with images/<camera>/<frame>.png.
         out: Folder for depth/, motion/, mesh.ply and mesh.stl.
         handpiece: Calibration (default: handpiece.json in the capture folder).
+        working_distance_mm: From the cameras to the teeth, for a rig_config.json, which does not have it (guessed
+            unless given).
         from_poses: Folder of a COLMAP model whose poses are used instead of our own.
     """
-    _reconstruct(storage.read_capture(capture, handpiece), out, reconstruction, from_poses)
+    _reconstruct(storage.read_capture(capture, handpiece, working_distance_mm), out, reconstruction, from_poses)
 
 
 def evaluate(

@@ -17,6 +17,7 @@ from cuspid import storage
 from cuspid.anatomy.jaw_files import load_jaw
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.errors import InputError
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.jaw import Arch, Jaw
 from cuspid.progress import Progress
@@ -44,10 +45,17 @@ class Source:
 class Probe:
     """What scans it."""
 
-    design: Literal["four", "six", "twelve"] = "twelve"
-    """Built-in design: the essential four cameras, six (give --turns 3), or the twelve."""
+    design: Literal["two", "four", "six", "twelve"] = "twelve"
+    """Built-in design: a stereo pair, the essential four cameras, six (give --turns 3), or the twelve."""
     handpiece: Path | None = None
     """A handpiece.json, or COLMAP's rig_config.json, of your own, instead of a built-in design."""
+    working_distance_mm: float | None = None
+    """From the cameras to the teeth: of a design (5 unless given), or of a rig_config.json, which does not have it
+    (guessed unless given)."""
+
+    def __post_init__(self) -> None:
+        if self.working_distance_mm is not None and not self.working_distance_mm > 0:
+            raise InputError(f"probe: the working distance {self.working_distance_mm:g} mm must be positive")
 
 
 @contextmanager
@@ -77,6 +85,7 @@ def load_source(mesh: Path | None, source: Source) -> Jaw:
 
 def load_probe(probe: Probe) -> Handpiece:
     """The handpiece of a file, or a built-in design."""
-    if probe.handpiece is None:
-        return DESIGNS[probe.design](DesignOptions())
-    return storage.read_handpiece(probe.handpiece)
+    if probe.handpiece is not None:
+        return storage.read_handpiece(probe.handpiece, probe.working_distance_mm)
+    distance_mm = probe.working_distance_mm or DesignOptions.working_distance_mm
+    return DESIGNS[probe.design](DesignOptions(working_distance_mm=distance_mm))

@@ -1,4 +1,4 @@
-"""The handpieces of the thesis: the essential four cameras (3.5.1), the twelve (3.5.2) and the six (3.5.3).
+"""Handpieces: the thesis' essential four cameras (3.5.1), twelve (3.5.2) and six (3.5.3), and a stereo pair.
 
 Rig frame: origin at the height of the cusp tips under the probe, +X along the arch in the direction of
 travel, +Y across the arch towards the cheek (buccal), +Z out of the gum. A group is four cameras with parallel axes in
@@ -24,12 +24,7 @@ from jaxtyping import Float
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
-
-DEPTH_RANGE_MM = (2.5, 9.0)
-"""What a lens of such size keeps usefully sharp. Its blur disc is f A |1/Z - 1/Z0| wide and grows with the aperture A,
-while diffraction shrinks; at f = 416 px the two meet at A = 0.07 mm. Focused at Z0 = 3.9 mm, the disc is then 4 px wide
-at both ends of this range and narrower between. Nearer than 2.5 mm the housing would touch the teeth."""
+from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, depth_of_field_mm
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,15 +55,22 @@ class DesignOptions:
     """How far the axes of these two lean towards the middle of the tooth (six cameras only)."""
 
     def __post_init__(self) -> None:
-        near, far = DEPTH_RANGE_MM
-        if not near < self.working_distance_mm < far:
-            raise InputError(f"design: working distance {self.working_distance_mm} mm must lie in {near}-{far} mm")
+        if not self.working_distance_mm > 0:
+            raise InputError(f"design: the working distance {self.working_distance_mm:g} mm must be positive")
+        if min(self.width_px, self.height_px) < 1:
+            raise InputError(f"design: images of {self.width_px} x {self.height_px} px have no pixel")
         if not (self.baseline_across_mm > 0 and self.baseline_along_mm > 0):
             raise InputError("design: the baselines must be positive")
         if not (self.outer_distance_mm > 0 and -90 < self.outer_tilt_deg < 90):
             raise InputError("design: the outer cameras' distance must be positive and their tilt within -90 to 90 deg")
         if not 0 < self.field_of_view_deg < 180:
             raise InputError(f"design: field of view {self.field_of_view_deg} deg must lie between 0 and 180")
+
+
+def stereo_pair(options: DesignOptions = DesignOptions()) -> Handpiece:
+    """Of the essential four those two that lie across the arch, with the same lights."""
+    four = essential_four(options)
+    return replace(four, rig=Rig({name: four.rig[name] for name in ("o1", "o2")}), name="stereo-pair")
 
 
 def essential_four(options: DesignOptions = DesignOptions()) -> Handpiece:
@@ -101,7 +103,7 @@ def six_cameras(options: DesignOptions = DesignOptions()) -> Handpiece:
 
 
 DESIGNS: Mapping[str, Callable[[DesignOptions], Handpiece]] = MappingProxyType(
-    {"four": essential_four, "six": six_cameras, "twelve": twelve_cameras}
+    {"two": stereo_pair, "four": essential_four, "six": six_cameras, "twelve": twelve_cameras}
 )
 """Designs by the name that the command line takes."""
 
@@ -117,7 +119,7 @@ def _handpiece(name: str, views: Mapping[str, Rigid3], options: DesignOptions) -
         lights=lights,
         lightings=(Lighting(name="all", lights=tuple(lights)),),
         working_distance_mm=options.working_distance_mm,
-        depth_range_mm=DEPTH_RANGE_MM,
+        depth_range_mm=depth_of_field_mm(options.working_distance_mm),
         name=name,
     )
 

@@ -2,7 +2,7 @@
 
 A *section* is the neighbourhood of a tooth in the frame of its mesh (+Z out of the gum) with the positions that the
 handpiece takes there. A face counts as seen if, at one position at least, both cameras of a stereo pair see it
-(:meth:`cuspid.rig.Rig.stereo_pairs`: the pairs that depth is measured from). Its *bound* is the Cramer-Rao bound at the
+(:func:`cuspid.pairing.stereo_pairs`: the pairs that depth is measured from). Its *bound* is the Cramer-Rao bound at the
 best position and for the best camera r, matched with its partners p:
 
     I = J_r^T J_r / sigma^2 + sum_p J_p^T J_p / sigma_rp^2
@@ -29,6 +29,7 @@ from cuspid.handpiece.family import BOUNDS, LAYOUTS, Layout, Shape, build_handpi
 from cuspid.handpiece.optics import Optics
 from cuspid.handpiece.precision import NoiseModel, bound_rms_um, noise_px, projection_jacobian
 from cuspid.mesh import Mesh
+from cuspid.pairing import PairingOptions, stereo_pairs
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, MountedCamera
 from cuspid.visibility import VisibilityOptions, visible_faces
@@ -51,6 +52,8 @@ class SearchOptions:
     """Of matched points. That matching has lost half of its precision at 25 deg is an assumption."""
     visibility: VisibilityOptions = field(default_factory=VisibilityOptions)
     """When a camera sees a face."""
+    pairing: PairingOptions = field(default_factory=PairingOptions)
+    """Which cameras depth is measured from."""
     points: int = 80
     """Faces of each section at which the bound is asked."""
     samples: int = 4
@@ -398,7 +401,7 @@ def _survey(
 ) -> tuple[Bool[np.ndarray, "f"], Int[np.ndarray, "p"], Float[np.ndarray, "p"]]:
     """Whether each face is seen; some faces, and the bound there (NaN where unseen)."""
     rig, mesh = handpiece.rig, section.mesh
-    paired = _paired(handpiece)
+    paired = _paired(handpiece, options.pairing)
     wanted = np.flatnonzero(np.any(list(section.surfaces.values()), axis=0))
     places = wanted[np.linspace(0, len(wanted) - 1, min(options.points, len(wanted))).astype(int)]
     found, best = np.zeros(len(mesh.faces), dtype=bool), np.full(len(places), np.inf)
@@ -418,10 +421,10 @@ def _survey(
     return found, places, np.where(np.isfinite(best), best, np.nan)
 
 
-def _paired(handpiece: Handpiece) -> Bool[np.ndarray, "c c"]:
+def _paired(handpiece: Handpiece, pairing: PairingOptions) -> Bool[np.ndarray, "c c"]:
     names = handpiece.rig.names
     paired = np.zeros((len(names), len(names)), dtype=bool)
-    for first, second in handpiece.rig.stereo_pairs(handpiece.working_distance_mm):
+    for first, second in stereo_pairs(handpiece.rig, handpiece.working_distance_mm, pairing):
         i, j = names.index(first), names.index(second)
         paired[i, j] = paired[j, i] = True
     return paired

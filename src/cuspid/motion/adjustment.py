@@ -18,6 +18,7 @@ on the number of threads.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -45,6 +46,7 @@ from cuspid.motion.normal_equations import (
 )
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
+from cuspid.sparse_model import SparseModel
 
 _LEAST_SIGMA_PX = 1e-6
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
@@ -76,8 +78,6 @@ class AdjustmentOptions:
     are then within the root of it of their best values, measured in their standard deviations."""
     minimum_angle_deg: float = 1.0
     """Points whose rays meet at less than this angle are dropped."""
-    covariance: bool = True
-    """Whether the covariance of the poses is found; one camera without a scale has none."""
 
 
 # --- states ------------------------------------------------------------------------------------------------------
@@ -169,10 +169,8 @@ def _with_calibration(state: State, prior: _Prior, whitened: Float[np.ndarray, "
     )
 
 
-def _initial_state(reconstruction: Reconstruction, points: Float[np.ndarray, "p 3"], prior: _Prior) -> State:
-    """The reconstruction as arrays."""
-    poses = reconstruction.rig_from_world.values()
-    cameras = len(reconstruction.rig.names)
+def _initial_state(poses: Sequence[Rigid3], points: Float[np.ndarray, "p 3"], prior: _Prior) -> State:
+    """Poses, points and the given calibration as arrays."""
     empty = np.zeros(0)
     state = State(
         frame_rotation=np.stack([pose.rotation for pose in poses]),
@@ -184,7 +182,7 @@ def _initial_state(reconstruction: Reconstruction, points: Float[np.ndarray, "p 
         whitened=empty,
         basis=empty,
     )
-    return _with_calibration(state, prior, np.zeros((cameras, CALIBRATION)))
+    return _with_calibration(state, prior, np.zeros((len(prior.rig.names), CALIBRATION)))
 
 
 def _moved(state: State, observations: Observations, weighting: Weighting, prior: _Prior, step: Any) -> State:
@@ -375,7 +373,8 @@ def residuals_px(reconstruction: Reconstruction) -> Float[np.ndarray, "o 2"]:
     if tracks is None:
         return np.zeros((0, 2))
     observations, points = _sorted_by_point(tracks, np.ones(len(tracks.point_index), dtype=bool))
-    state = _initial_state(reconstruction, tracks.points[points], _Prior.of(reconstruction.rig))
+    poses = tuple(reconstruction.rig_from_world.values())
+    state = _initial_state(poses, tracks.points[points], _Prior.of(reconstruction.rig))
     residuals = np.empty_like(observations.pixels)
     residuals[np.argsort(tracks.point_index, kind="stable")] = residual_vectors(state, observations)
     return residuals
@@ -402,6 +401,18 @@ def _posterior(
     return poses, state.basis @ whitened @ np.swapaxes(state.basis, 1, 2)
 
 
+def _known_posterior(
+    state: State, observations: Observations, weighting: Weighting
+) -> tuple[Float[np.ndarray, "f 6 6"], Float[np.ndarray, "c 14 14"] | None]:
+    """As :func:`_posterior`. Raises ReconstructionError where the observations do not determine every pose."""
+    try:
+        return _posterior(state, observations, weighting)
+    except LinAlgError as error:
+        raise ReconstructionError(
+            "adjustment: the tracks do not tie every frame to the others; more overlap is needed"
+        ) from error
+
+
 def _adjusted_rig(state: State, prior: _Prior, covariance: Float[np.ndarray, "c 14 14"] | None) -> Rig:
     """The rig with the refined calibration and what is still uncertain of it; what was held stays as given."""
     if not prior.is_free:
@@ -421,6 +432,19 @@ def _adjusted_rig(state: State, prior: _Prior, covariance: Float[np.ndarray, "c 
     return Rig(cameras)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Adjusted:
+    """What an adjustment finds."""
+
+    rig: Rig
+    poses: tuple[Rigid3, ...]
+    tracks: Tracks
+    pose_covariance: Float[np.ndarray, "f 6 6"] | None
+    reprojection_rms_px: float
+    notes: tuple[str, ...]
+    log: Mapping[str, float | int]
+
+
 def adjust(reconstruction: Reconstruction, options: AdjustmentOptions | None = None) -> Reconstruction:
     """Refine poses, points and free calibration together; the tracks come back without outliers.
 
@@ -429,13 +453,50 @@ def adjust(reconstruction: Reconstruction, options: AdjustmentOptions | None = N
     the poses were off by three to five times as much. Raises ReconstructionError where the observations do not
     determine every pose.
     """
-    options = options or AdjustmentOptions()
-    tracks = reconstruction.tracks
+    poses = tuple(reconstruction.rig_from_world.values())
+    found = _adjusted(reconstruction.rig, poses, reconstruction.tracks, options or AdjustmentOptions())
+    return replace(
+        reconstruction,
+        rig=found.rig,
+        rig_from_world=dict(zip(reconstruction.frames, found.poses, strict=True)),
+        tracks=found.tracks,
+        pose_covariance=found.pose_covariance,
+        reprojection_rms_px=found.reprojection_rms_px,
+        notes=(*reconstruction.notes, *found.notes),
+        log={**reconstruction.log, **found.log},
+    )
+
+
+def adjust_model(model: SparseModel, options: AdjustmentOptions | None = None) -> SparseModel:
+    """As :func:`adjust`, for one camera. Its images leave the scale free, so no covariance is found, and the scale may
+    change a little."""
+    name = "camera"
+    rig = Rig({name: MountedCamera(model.camera, Rigid3.identity())})
+    poses = tuple(model.cam_from_world.values())
+    found = _adjusted(rig, poses, model.tracks, options or AdjustmentOptions(), has_scale=False)
+    return replace(
+        model,
+        camera=found.rig[name].camera,
+        cam_from_world=dict(zip(model.frames, found.poses, strict=True)),
+        tracks=found.tracks,
+        reprojection_rms_px=found.reprojection_rms_px,
+    )
+
+
+def _adjusted(
+    rig: Rig,
+    poses: Sequence[Rigid3],
+    tracks: Tracks | None,
+    options: AdjustmentOptions,
+    *,
+    has_scale: bool = True,
+) -> _Adjusted:
+    """The adjustment itself; without a scale there is no covariance."""
     if tracks is None or len(tracks.point_index) == 0:
         raise ReconstructionError("adjustment: no tracks to adjust; more texture or more overlap is needed")
-    prior = _Prior.of(reconstruction.rig)
+    prior = _Prior.of(rig)
     observations, points = _sorted_by_point(tracks, np.ones(len(tracks.point_index), dtype=bool))
-    state, colors = _initial_state(reconstruction, tracks.points[points], prior), tracks.colors[points]
+    state, colors = _initial_state(poses, tracks.points[points], prior), tracks.colors[points]
     sigma_px, limit_px, steps = options.sigma_px, options.start_px, 0
     for _ in range(options.rounds):
         keep = _good(state, observations, limit_px, options.minimum_angle_deg)
@@ -448,11 +509,22 @@ def adjust(reconstruction: Reconstruction, options: AdjustmentOptions | None = N
         unknowns = state.points.size + POSE * (len(state.frame_rotation) - 1)
         sigma_px = _sigma_px(state, observations, weighting, unknowns)
         limit_px = options.outlier_sigmas * sigma_px
-    found = _result(reconstruction, state, observations, colors, prior, sigma_px, options.covariance)
-    return replace(
-        found,
-        notes=(*found.notes, *_unsettled(minimum, options), *_implausible(state, prior)),
-        log={**found.log, "adjustment_steps": steps, "calibration_cost": float(np.sum(state.whitened**2))},
+    weighting = Weighting(sigma_px, np.inf, prior.is_free)
+    covariance, calibration = _known_posterior(state, observations, weighting) if has_scale else (None, None)
+    residuals = residual_vectors(state, observations)
+    return _Adjusted(
+        rig=_adjusted_rig(state, prior, calibration),
+        poses=tuple(map(Rigid3, state.frame_rotation, state.frame_translation)),
+        tracks=_as_tracks(state, observations, colors),
+        pose_covariance=covariance,
+        reprojection_rms_px=float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))),
+        notes=(*_unsettled(minimum, options), *_implausible(state, prior)),
+        log={
+            "observation_sigma_px": sigma_px,
+            "observations": len(residuals),
+            "adjustment_steps": steps,
+            "calibration_cost": float(np.sum(state.whitened**2)),
+        },
     )
 
 
@@ -477,38 +549,4 @@ def _implausible(state: State, prior: _Prior) -> tuple[str, ...]:
         f"calibration: the images want it {np.sqrt(cost / numbers):.1f} standard deviations (root mean square of "
         f"{numbers} numbers) from the file, camera {prior.rig.names[camera]} farthest; is it the file of this "
         "handpiece, and are its covariances not too small?",
-    )
-
-
-def _result(
-    reconstruction: Reconstruction,
-    state: State,
-    observations: Observations,
-    colors: Any,
-    prior: _Prior,
-    sigma_px: float,
-    with_covariance: bool,
-) -> Reconstruction:
-    """The adjusted reconstruction, with its covariances where they are asked for."""
-    poses, calibration = None, None
-    try:
-        if with_covariance:
-            poses, calibration = _posterior(state, observations, Weighting(sigma_px, np.inf, prior.is_free))
-    except LinAlgError as error:
-        raise ReconstructionError(
-            "adjustment: the tracks do not tie every frame to the others; more overlap is needed"
-        ) from error
-    motions = zip(state.frame_rotation, state.frame_translation, strict=True)
-    residuals = residual_vectors(state, observations)
-    return replace(
-        reconstruction,
-        rig=_adjusted_rig(state, prior, calibration),
-        rig_from_world={
-            name: Rigid3(rotation, translation)
-            for name, (rotation, translation) in zip(reconstruction.frames, motions, strict=True)
-        },
-        tracks=_as_tracks(state, observations, colors),
-        pose_covariance=poses,
-        reprojection_rms_px=float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))),
-        log={**reconstruction.log, "observation_sigma_px": sigma_px, "observations": len(residuals)},
     )

@@ -12,14 +12,14 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from cuspid.camera import Camera
 from cuspid.errors import InputError
-from cuspid.motion.adjustment import AdjustmentOptions, adjust
+from cuspid.motion.adjustment import AdjustmentOptions, adjust_model
 from cuspid.motion.features import Features
 from cuspid.motion.pairs import MatchingOptions, View, make_view, match_guided
 from cuspid.motion.tracks import intersect_rays, join
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import Reconstruction, Tracks
+from cuspid.reconstruction import Tracks
+from cuspid.sparse_model import SparseModel
 from cuspid.workers import map_in_threads
 
 _DEPTH = 14.0
@@ -46,9 +46,7 @@ class GuidedOptions:
     start_px: float = 12.0
     """Residual beyond which an observation is dropped before the first adjustment; half of it later."""
     adjustment: AdjustmentOptions = field(
-        default_factory=lambda: AdjustmentOptions(
-            sigma_px=0.5, outlier_sigmas=3.0, rounds=4, iterations=60, covariance=False
-        )
+        default_factory=lambda: AdjustmentOptions(sigma_px=0.5, outlier_sigmas=3.0, rounds=4, iterations=60)
     )
     """The adjustment."""
 
@@ -61,45 +59,40 @@ class GuidedOptions:
 
 
 def refine(
-    model: Reconstruction,
+    model: SparseModel,
     features: Sequence[Features],
     options: GuidedOptions,
     *,
     progress: Progress = silent,
-) -> Reconstruction:
+) -> SparseModel:
     """The model of one camera with refined poses and new tracks; ``features`` of its frames, in their order.
 
     The scale is free and changes. Raises ReconstructionError where too little is consistent.
     """
     model = _rescaled(model)
     for number, (tolerance_px, share) in enumerate(zip(options.tolerances_px, options.depth_shares, strict=True)):
-        views = [make_view(each, _camera(model)) for each in features]
+        views = [make_view(each, model.camera) for each in features]
         matching = replace(options.matching, tolerance_px=tolerance_px)
         track, image_of = _tracks(model, views, matching, share, options.steps)
         limit_px = options.start_px / (1 if number == 0 else 2)
         found = _triangulated(model, features, views, track, image_of, limit_px, options)
-        model = _rescaled(adjust(found, replace(options.adjustment, start_px=limit_px)))
+        model = _rescaled(adjust_model(found, replace(options.adjustment, start_px=limit_px)))
         progress("refining", number + 1, len(options.tolerances_px))
     return model
 
 
-def _camera(model: Reconstruction) -> Camera:
-    """The one camera."""
-    return model.rig[model.rig.names[0]].camera
-
-
-def _rescaled(model: Reconstruction) -> Reconstruction:
+def _rescaled(model: SparseModel) -> SparseModel:
     """With a median depth of `_DEPTH`."""
-    return model.scaled(_DEPTH / float(np.median(model.depths_in_rig)))
+    return model.scaled(_DEPTH / float(np.median(model.depths)))
 
 
 def _bounds(
-    model: Reconstruction, frame: int, features: Features, share: float
+    model: SparseModel, frame: int, features: Features, share: float
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Least and greatest depth of each keypoint, about those of the points seen near it."""
-    tracks = model.known_tracks
+    tracks = model.tracks
     mine = tracks.frame_index == frame
-    depths = model.depths_in_rig[mine]
+    depths = model.depths[mine]
     if len(depths) < _NEIGHBOURS:
         return np.full(len(features), (1 - share) * _DEPTH), np.full(len(features), (1 + share) * _DEPTH)
     _, nearest = KDTree(tracks.pixels[mine]).query(features.pixels, k=_NEIGHBOURS)
@@ -108,10 +101,10 @@ def _bounds(
 
 
 def _tracks(
-    model: Reconstruction, views: Sequence[View], matching: MatchingOptions, share: float, steps: Sequence[int]
+    model: SparseModel, views: Sequence[View], matching: MatchingOptions, share: float, steps: Sequence[int]
 ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
     """Track and frame of every keypoint of all frames, one after the other."""
-    poses = list(model.rig_from_world.values())
+    poses = list(model.cam_from_world.values())
     sizes = np.array([len(view.features) for view in views])
     starts = np.concatenate([[0], np.cumsum(sizes)])
     bounds = [_bounds(model, index, view.features, share) for index, view in enumerate(views)]
@@ -129,16 +122,16 @@ def _tracks(
 
 
 def _triangulated(
-    model: Reconstruction,
+    model: SparseModel,
     features: Sequence[Features],
     views: Sequence[View],
     track: Int[np.ndarray, "n"],
     image_of: Int[np.ndarray, "n"],
     limit_px: float,
     options: GuidedOptions,
-) -> Reconstruction:
+) -> SparseModel:
     """The model with the tracks whose rays about meet."""
-    world_from_cam = [pose.inverse() for pose in model.rig_from_world.values()]
+    world_from_cam = [pose.inverse() for pose in model.cam_from_world.values()]
     centres = np.array([pose.translation for pose in world_from_cam])
     turns = np.stack([pose.rotation for pose in world_from_cam])
     rays = np.concatenate([np.column_stack([view.ideal, np.ones(len(view.ideal))]) for view in views])
@@ -164,14 +157,14 @@ def _triangulated(
 
 
 def _errors_px(
-    model: Reconstruction,
+    model: SparseModel,
     points: Float[np.ndarray, "o 3"],
     frame: Int[np.ndarray, "o"],
     pixels: Float[np.ndarray, "o 2"],
 ) -> Float[np.ndarray, "o"]:
     """Distance of every observation from its point's projection; infinite behind the camera."""
-    rotations = np.stack([pose.rotation for pose in model.rig_from_world.values()])
-    shifts = np.array([pose.translation for pose in model.rig_from_world.values()])
-    projected = _camera(model).project(np.einsum("oij,oj->oi", rotations[frame], points) + shifts[frame])
+    rotations = np.stack([pose.rotation for pose in model.cam_from_world.values()])
+    shifts = np.array([pose.translation for pose in model.cam_from_world.values()])
+    projected = model.camera.project(np.einsum("oij,oj->oi", rotations[frame], points) + shifts[frame])
     errors = np.linalg.norm(projected - pixels, axis=1)
     return np.where(np.isfinite(errors), errors, np.inf)

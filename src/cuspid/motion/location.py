@@ -28,6 +28,7 @@ from cuspid.motion.odometry import (
 )
 from cuspid.motion.pairs import MatchingOptions, frame_pairs, make_view, match_guided
 from cuspid.motion.tracks import intersect_rays, join, thin
+from cuspid.pairing import PairingOptions, resolved_mm, stereo_pairs
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import Handpiece, Rig
@@ -40,6 +41,8 @@ class MotionOptions:
 
     features: FeatureOptions = field(default_factory=FeatureOptions)
     """Keypoints."""
+    pairing: PairingOptions = field(default_factory=PairingOptions)
+    """Which cameras are matched within a frame."""
     within: MatchingOptions = field(default_factory=MatchingOptions)
     """Matching of the cameras of a group within a frame."""
     odometry: OdometryOptions = field(default_factory=OdometryOptions)
@@ -112,10 +115,11 @@ def _match_frames(
     poses: Sequence[Rigid3],
     handpiece: Handpiece,
     options: MotionOptions,
+    slack_mm: float,
     starts: Mapping[tuple[int, str], int],
 ) -> Int[np.ndarray, "k 2"]:
     """Matches, as numbers of keypoints, of each camera with itself at another frame."""
-    second_from_first, slack_mm = poses[second] @ poses[first].inverse(), options.depth_slack * handpiece.resolution_mm
+    second_from_first = poses[second] @ poses[first].inverse()
     matches = [np.zeros((0, 2), dtype=np.int64)]
     for camera, mounted in handpiece.rig.cameras.items():
         if camera not in frames[first] or camera not in frames[second]:
@@ -174,10 +178,10 @@ def _link(
 ) -> Tracks:
     """Tracks over the located frames: the matches within frames and, guided by the poses, between them."""
     numbering = _Numbering.of(frames, handpiece.rig)
-    pairs = frame_pairs(len(frames), options.reach)
+    pairs, slack_mm = frame_pairs(len(frames), options.reach), options.depth_slack * resolved_mm(handpiece)
 
     def match(pair: tuple[int, int]) -> Int[np.ndarray, "k 2"]:
-        return _match_frames(*pair, frames, clouds, poses, handpiece, options, numbering.starts)
+        return _match_frames(*pair, frames, clouds, poses, handpiece, options, slack_mm, numbering.starts)
 
     between = map_in_threads(match, pairs, stage="matching", progress=progress)
     image = numbering.frame * len(handpiece.rig.names) + numbering.camera
@@ -236,7 +240,7 @@ def locate_features(
         for name in names
     ]
     with _timed(log, "triangulation"):
-        pairs = rig.stereo_pairs(handpiece.working_distance_mm)
+        pairs = stereo_pairs(rig, handpiece.working_distance_mm, options.pairing)
         clouds = map_in_threads(
             lambda views: triangulate_frame(handpiece, pairs, views, options.within),
             frames,

@@ -20,7 +20,8 @@ from numba import njit
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import Reconstruction, Tracks
+from cuspid.reconstruction import Tracks
+from cuspid.sparse_model import SparseModel
 from cuspid.workers import map_in_threads
 
 _LEAST_CONTRAST = 0.5
@@ -148,9 +149,9 @@ class _Poses(NamedTuple):
     shifts: np.ndarray
 
     @staticmethod
-    def of(model: Reconstruction) -> _Poses:
+    def of(model: SparseModel) -> _Poses:
         """``cam_from_world`` of all frames."""
-        poses = list(model.rig_from_world.values())
+        poses = list(model.cam_from_world.values())
         return _Poses(np.stack([pose.rotation for pose in poses]), np.array([pose.translation for pose in poses]))
 
     def inside(self, frame: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -164,18 +165,18 @@ class _Poses(NamedTuple):
 
 
 def lengthen(
-    model: Reconstruction,
+    model: SparseModel,
     read: Callable[[str], UInt8[np.ndarray, "h w"]],
     options: PatchOptions,
     *,
     progress: Progress = silent,
-) -> Reconstruction:
+) -> SparseModel:
     """The model of one camera with a second track for each point whose patch was found in enough frames.
 
     ``read`` gives the picture of a frame by its name; only those within reach are held at a time.
     """
     own = _own_observations(model)
-    tracks, names = model.known_tracks, model.frames
+    tracks, names = model.tracks, model.frames
     poses, pictures = _Poses.of(model), dict[int, np.ndarray]()
     found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for frame in range(len(names)):
@@ -193,9 +194,9 @@ def lengthen(
     return replace(model, tracks=_with_second(tracks, point, seen_in, pixels, options))
 
 
-def _own_observations(model: Reconstruction) -> Int[np.ndarray, "p"]:
+def _own_observations(model: SparseModel) -> Int[np.ndarray, "p"]:
     """The observation of each point that is nearest to the middle of its frame."""
-    tracks, camera = model.known_tracks, model.rig[model.rig.names[0]].camera
+    tracks, camera = model.tracks, model.camera
     off = np.linalg.norm(tracks.pixels - np.array([camera.width, camera.height]) / 2, axis=1)
     order = np.lexsort((off, tracks.point_index))
     return np.asarray(order[np.unique(tracks.point_index[order], return_index=True)[1]])
@@ -206,7 +207,7 @@ def _smooth(picture: UInt8[np.ndarray, "h w"], sigma_px: float) -> Float32[np.nd
 
 
 def _follow(
-    model: Reconstruction,
+    model: SparseModel,
     poses: _Poses,
     pictures: Mapping[int, np.ndarray],
     here: int,
@@ -216,7 +217,7 @@ def _follow(
     there: int,
 ) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"], Float[np.ndarray, "m 2"]]:
     """Of the points ``mine`` of one frame those found in another: points, frames, pixels."""
-    camera, points = model.rig[model.rig.names[0]].camera, model.known_tracks.points[mine]
+    camera, points = model.camera, model.tracks.points[mine]
     turn = np.sum(poses.directions(here, points) * poses.directions(there, points), axis=1)
     depth = poses.inside(here, points)[:, 2]
     expected = camera.project(poses.inside(there, points))
@@ -225,7 +226,7 @@ def _follow(
     step = (depth[seen] / float(np.mean(camera.focal_px)))[:, None]
     beside = [camera.project(poses.inside(there, points + poses.rotations[here][axis] * step)) for axis in (0, 1)]
     warps = np.stack([each - expected for each in beside], axis=-1)
-    own_px = model.known_tracks.pixels[observations[seen]]
+    own_px = model.tracks.pixels[observations[seen]]
     pixels, correlation = align_patches(pictures[here], pictures[there], own_px, expected, warps, options)
     good = correlation > options.correlation
     return mine[good], np.full(int(good.sum()), there), pixels[good]

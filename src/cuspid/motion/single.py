@@ -1,8 +1,8 @@
 """Where one hand-held camera was: features on contrast-normalised frames, COLMAP's incremental mapper, broken models
 joined again.
 
-Frames: as in :mod:`cuspid.reconstruction`, with a rig of one camera whose frame is that of the camera. One camera does
-not know the scale: lengths are in units of the model, not millimetres.
+Frames: as in :mod:`cuspid.sparse_model`. One camera does not know the scale: lengths are in units of the model, not
+millimetres.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cuspid.camera import Camera
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3, best_similarity
 from cuspid.image_sequence import ImageSequence
-from cuspid.motion.adjustment import adjust
+from cuspid.motion.adjustment import adjust_model
 from cuspid.motion.colmap import quiet, rigid_from_colmap
 from cuspid.motion.features import FeatureOptions, Features, detect
 from cuspid.motion.guided import GuidedOptions, refine
@@ -29,12 +29,9 @@ from cuspid.motion.pairs import MatchingOptions, match_unguided
 from cuspid.motion.patches import PatchOptions, lengthen
 from cuspid.panorama import FrameUse
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import Reconstruction, Tracks
-from cuspid.rig import MountedCamera, Rig
+from cuspid.reconstruction import Tracks
+from cuspid.sparse_model import SparseModel
 from cuspid.workers import map_in_threads
-
-CAMERA = "camera"
-"""Name of the one camera in the rig."""
 
 _DARK, _BURNT = 16, 245
 """Grey levels outside of which an image says nothing: noise below, burnt-out highlights above."""
@@ -92,7 +89,7 @@ class SingleOptions:
 class SingleMotion:
     """What is known of the camera's way: one model, or several that nothing ties together."""
 
-    parts: tuple[Reconstruction, ...]
+    parts: tuple[SparseModel, ...]
     """Largest first; lengths in the model's units."""
     frames: tuple[FrameUse, ...]
     """Every frame of the sequence; used means that it is in one of the parts."""
@@ -376,9 +373,7 @@ def _join_all(models: Sequence[_Model], least: int) -> list[_Model]:
     return sorted(parts, key=lambda part: -len(part.poses))
 
 
-def _reconstruction(
-    model: _Model, camera: Camera, names: Sequence[str], features: Mapping[int, Features]
-) -> Reconstruction:
+def _as_noun(model: _Model, camera: Camera, names: Sequence[str], features: Mapping[int, Features]) -> SparseModel:
     """A model as the noun; points that fewer than two frames still see are left out."""
     order = sorted(model.poses)
     place = {frame: index for index, frame in enumerate(order)}
@@ -387,9 +382,9 @@ def _reconstruction(
     kept, point_index = np.unique(seen[:, 0], return_inverse=True)
     colors = np.zeros((len(kept), 3), dtype=np.uint8)
     colors[point_index] = np.array([features[frame].colors[keypoint] for _, frame, keypoint in seen.tolist()])
-    return Reconstruction(
-        rig=Rig({CAMERA: MountedCamera(camera, Rigid3.identity())}),
-        rig_from_world={names[frame]: model.poses[frame] for frame in order},
+    return SparseModel(
+        camera=camera,
+        cam_from_world={names[frame]: model.poses[frame] for frame in order},
         tracks=Tracks(
             points=model.points[kept],
             colors=colors,
@@ -454,7 +449,7 @@ def locate_single(
     return SingleMotion(
         parts=tuple(refined),
         frames=_uses(names, refused, refined, ties),
-        notes=(*_strangers(looks, names), *_notes(refined[0].rig[CAMERA].camera, calibrated, refined)),
+        notes=(*_strangers(looks, names), *_notes(refined[0].camera, calibrated, refined)),
     )
 
 
@@ -465,10 +460,10 @@ def _refined(
     features: Mapping[int, Features],
     options: SingleOptions,
     progress: Progress,
-) -> Reconstruction:
+) -> SparseModel:
     """A part with its poses made precise: by keypoints, then by patches too."""
     own = [features[index] for index in sorted(part.poses)]
-    start = _reconstruction(part, camera, sequence.names, features)
+    start = _as_noun(part, camera, sequence.names, features)
     by_keypoints = refine(start, own, options.guided, progress=progress)
     number = {name: index for index, name in enumerate(sequence.names)}
 
@@ -476,7 +471,7 @@ def _refined(
         return normalise_contrast(sequence.image(number[name]), options)
 
     longer = lengthen(by_keypoints, read, options.patches, progress=progress)
-    return adjust(longer, options.guided.adjustment)
+    return adjust_model(longer, options.guided.adjustment)
 
 
 def _strangers(looks: Sequence[_Look], names: Sequence[str]) -> tuple[str, ...]:
@@ -488,7 +483,7 @@ def _strangers(looks: Sequence[_Look], names: Sequence[str]) -> tuple[str, ...]:
     return (f"{which} show little that has the colour of teeth or gums: is this a film of teeth?",)
 
 
-def _notes(camera: Camera, calibrated: bool, parts: Sequence[Reconstruction]) -> tuple[str, ...]:
+def _notes(camera: Camera, calibrated: bool, parts: Sequence[SparseModel]) -> tuple[str, ...]:
     notes = []
     if not calibrated:
         notes.append(
@@ -533,14 +528,13 @@ def _why_nothing(
 def _uses(
     names: Sequence[str],
     refused: Mapping[int, str],
-    parts: Sequence[Reconstruction],
+    parts: Sequence[SparseModel],
     ties: Mapping[tuple[int, int], object],
 ) -> tuple[FrameUse, ...]:
     """What became of every frame."""
     inliers: dict[str, int] = {}
     for part in parts:
-        seen = np.zeros(0, np.int64) if part.tracks is None else part.tracks.frame_index
-        counts = np.bincount(seen, minlength=len(part.frames)).tolist()
+        counts = np.bincount(part.tracks.frame_index, minlength=len(part.frames)).tolist()
         inliers |= dict(zip(part.frames, counts, strict=True))
 
     def use(index: int, name: str) -> FrameUse:

@@ -18,6 +18,7 @@ from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece
 from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.blender import render_with_blender
+from cuspid.simulation.lights import lit
 from cuspid.simulation.occlusal import OcclusalOptions, render_occlusal_view
 from cuspid.simulation.path.free import FreePathOptions, plan_free_path
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
@@ -78,8 +79,10 @@ def simulate(
 ) -> tuple[Capture, GroundTruth]:
     """Scan a jaw: images to ``folder/capture``, what only the simulator knows to ``folder/truth``.
 
+    A handpiece without lights is given one beside each camera (:func:`cuspid.simulation.lights.lit`).
     Images that are there already are kept; a run that goes on gives the same bits as one that was not interrupted.
     """
+    handpiece = lit(handpiece)
     path = plan_scan_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
     write_path(folder / "truth" / "path.json", path.minimum_overlap, path.mean_overlap, path.seen)
     return take_images(jaw, handpiece, path.rig_from_world, folder, options, progress=progress)
@@ -92,6 +95,7 @@ def film(
 
     Also the arch in a single shot from above: ``truth/occlusal``, orthographic, and ``truth/shot``, from far above.
     """
+    handpiece = lit(handpiece)
     poses = plan_free_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
     capture, truth = take_images(jaw, handpiece, poses, folder, options, progress=progress)
     for done, (name, height_mm) in enumerate(SINGLE_SHOTS.items(), start=1):
@@ -117,6 +121,7 @@ def take_images(
     progress: Progress = silent,
 ) -> tuple[Capture, GroundTruth]:
     """As :func:`simulate`, from given poses of the handpiece, by the name of the frame."""
+    handpiece = lit(handpiece)
     frames, poses = lit_frames(handpiece, rig_from_world)
     truth = GroundTruth(jaw=jaw, handpiece=handpiece, rig_from_world=poses)
     write_truth(folder / "truth", truth)

@@ -1,6 +1,6 @@
 """Which depths to believe: agreement between the cameras of a group, speckle, and a weight per pixel.
 
-Limits that are lengths count in *resolutions*: what the handpiece resolves (:attr:`cuspid.rig.Handpiece.resolution_mm`,
+Limits that are lengths count in *resolutions*: what the handpiece resolves (:func:`cuspid.pairing.resolved_mm`,
 12 um for the built-in ones) at the working distance; at another depth it is in the ratio of the squared depths, as is
 the depth of a pixel of disparity.
 """

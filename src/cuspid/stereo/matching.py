@@ -14,6 +14,7 @@ from jaxtyping import Float, Int, UInt8
 
 from cuspid.camera import Camera
 from cuspid.errors import InputError
+from cuspid.pairing import PairingOptions, camera_groups, resolved_mm, stereo_pairs
 from cuspid.reconstruction import DepthMap
 from cuspid.rig import Handpiece, Rig
 from cuspid.stereo.confidence import (
@@ -39,6 +40,8 @@ class StereoOptions:
     """Depth is measured at every so many pixels."""
     seed_scale: float = 0.5
     """Resolution of the first matching relative to the images."""
+    pairing: PairingOptions = field(default_factory=PairingOptions)
+    """Which cameras make a group."""
     refinement: RefinementOptions = field(default_factory=RefinementOptions)
     """Multi-camera refinement."""
     confidence: ConfidenceOptions = field(default_factory=ConfidenceOptions)
@@ -128,7 +131,7 @@ class DepthEstimator:
         self.handpiece = handpiece
         self.options = options or StereoOptions()
         self.matcher = matcher
-        self.resolution = Resolution(resolution_mm or handpiece.resolution_mm, handpiece.working_distance_mm)
+        self.resolution = Resolution(resolution_mm or resolved_mm(handpiece), handpiece.working_distance_mm)
         self._prepared: dict[tuple[str, ...], Group] = {}
         if not self._groups(handpiece.rig.names):
             raise InputError(
@@ -141,7 +144,7 @@ class DepthEstimator:
         if not cameras:
             return []
         rig = Rig({name: self.handpiece.rig[name] for name in cameras}).in_own_order()
-        groups = rig.groups(self.handpiece.working_distance_mm)
+        groups = camera_groups(rig, self.handpiece.working_distance_mm, self.options.pairing)
         return [self._group(rig, names) for names in groups if len(names) > 1]
 
     def _group(self, rig: Rig, names: tuple[str, ...]) -> Group:
@@ -151,8 +154,8 @@ class DepthEstimator:
 
     def _prepare(self, rig: Rig, names: tuple[str, ...]) -> Group:
         views = tuple(IdealView.of(name, rig[name]) for name in names)
-        stereo_pairs = rig.stereo_pairs(self.handpiece.working_distance_mm)
-        pairs = seed_pairs(rig, names, stereo_pairs)
+        possible = stereo_pairs(rig, self.handpiece.working_distance_mm, self.options.pairing)
+        pairs = seed_pairs(rig, names, possible)
         return Group(
             views=views,
             pairs=tuple(rectify(pair, rig[pair[0]], rig[pair[1]], self.options.seed_scale) for pair in pairs),

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from cuspid.geometry import Rigid3
+from cuspid.pairing import resolved_mm, stereo_pairs
 from cuspid.reconstruction import DepthMap
 from cuspid.rig import Handpiece, MountedCamera, Rig
 from cuspid.stereo.matching import DepthEstimator, StereoOptions
@@ -56,7 +57,7 @@ def measure_temporal(
         pair = moving_pair(handpiece, name, next_from_rig, options)
         if pair is not None:
             both = {name: images[name], f"{name}+": next_images[name]}
-            estimator = DepthEstimator(pair, options.stereo, resolution_mm=handpiece.resolution_mm)
+            estimator = DepthEstimator(pair, options.stereo, resolution_mm=resolved_mm(handpiece))
             found += estimator.measure(both, frame)
     return tuple(
         replace(depth_map, confidence=(options.confidence_share * depth_map.confidence).astype(np.float32))
@@ -75,6 +76,6 @@ def moving_pair(handpiece: Handpiece, name: str, next_from_rig: Rigid3, options:
     if sideways < options.least_baseline_share * handpiece.working_distance_mm:
         return None
     rig = Rig({name: mounted, f"{name}+": moved})
-    if not rig.stereo_pairs(handpiece.working_distance_mm):
+    if not stereo_pairs(rig, handpiece.working_distance_mm, options.stereo.pairing):
         return None
     return replace(handpiece, rig=rig, lights={}, lightings=())

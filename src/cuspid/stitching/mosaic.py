@@ -22,7 +22,7 @@ from skimage.morphology import remove_small_objects
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.geometry import Rigid3
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import Reconstruction
+from cuspid.sparse_model import SparseModel
 from cuspid.stitching.exposure import ExposureOptions, Light, Samples, balance
 from cuspid.stitching.seams import SeamOptions, choose
 from cuspid.stitching.surface import HeightMap
@@ -140,14 +140,13 @@ def footprint(camera: Camera, cam_from_world: Rigid3, height: float) -> Float[np
     )
 
 
-def make_canvas(motion: Reconstruction, camera: Camera, mm_per_px: float | None) -> Canvas:
+def make_canvas(motion: SparseModel, camera: Camera, mm_per_px: float | None) -> Canvas:
     """The grid that holds what the frames see of the occlusal plane, not far beyond the points of the motion."""
-    poses = list(motion.rig_from_world.values())
+    poses = list(motion.cam_from_world.values())
     corners = np.concatenate([footprint(camera, pose, 0.0) for pose in poses])
     distances = [pose.inverse().translation[2] for pose in poses]
     size = mm_per_px or float(np.median(distances) / np.mean(camera.focal_px))
-    points = np.zeros((0, 3)) if motion.tracks is None else motion.tracks.points
-    seen = np.percentile(points[:, :2], [0.2, 99.8], axis=0) + [[-_MARGIN_MM], [_MARGIN_MM]]
+    seen = np.percentile(motion.tracks.points[:, :2], [0.2, 99.8], axis=0) + [[-_MARGIN_MM], [_MARGIN_MM]]
     low, high = np.maximum(corners.min(axis=0), seen[0]), np.minimum(corners.max(axis=0), seen[1])
     width, height = (CELL_PX * np.ceil((high - low) / size / CELL_PX)).astype(int).tolist()
     return Canvas(origin_px=np.array([-low[0], high[1]]) / size, mm_per_px=size, width=width, height=height)
@@ -316,7 +315,7 @@ def _blurred(image: Float[np.ndarray, "h w 3"], valid: Float[np.ndarray, "h w"],
 
 
 def compose(
-    motion: Reconstruction,
+    motion: SparseModel,
     surface: HeightMap,
     read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
     options: MosaicOptions,
@@ -324,10 +323,10 @@ def compose(
     progress: Progress = silent,
 ) -> Mosaic:
     """The orthophoto of all located frames; ``read`` gives the image of a frame by its name."""
-    camera = motion.rig[motion.rig.names[0]].camera
+    camera = motion.camera
     canvas = make_canvas(motion, camera, options.mm_per_px)
     names = motion.frames
-    views = [place(canvas, camera, motion.rig_from_world[name]) for name in names]
+    views = [place(canvas, camera, motion.cam_from_world[name]) for name in names]
     best, samples, overlaps = _survey(canvas, views, names, surface, read, options, progress)
     light = balance(samples, len(names), options.exposure)
     choice = choose(best.cost, best.frame, _evened(best, light), options.seams)

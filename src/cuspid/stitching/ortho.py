@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from cuspid.image_sequence import ImageSequence
 from cuspid.panorama import FrameUse, Panorama, Strip
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import Reconstruction
+from cuspid.sparse_model import SparseModel
 from cuspid.stitching.mosaic import Mosaic, MosaicOptions, compose
 from cuspid.stitching.strip import StripOptions, unroll
 from cuspid.stitching.surface import ScaleOptions, SurfaceOptions, height_map, in_occlusal_frame, uncovered
@@ -40,7 +40,7 @@ class Stitched:
 
     panorama: Panorama
     """The occlusal view."""
-    motion: Reconstruction | None
+    motion: SparseModel | None
     """The camera's way, in the panorama's world and its lengths; None where the method locates no camera."""
     strip: Strip | None
     """The panorama unrolled along the arch; None where the camera hardly moved, or is not located."""
@@ -48,7 +48,7 @@ class Stitched:
 
 def orthophoto(
     sequence: ImageSequence,
-    located: Reconstruction,
+    located: SparseModel,
     frames: Sequence[FrameUse],
     options: OrthoOptions,
     *,
@@ -86,7 +86,7 @@ def _scale_note(scale: ScaleOptions, *, given: bool) -> str:
 
 
 def _panorama(
-    mosaic: Mosaic, motion: Reconstruction, frames: Sequence[FrameUse], index: Mapping[str, int], metric: bool
+    mosaic: Mosaic, motion: SparseModel, frames: Sequence[FrameUse], index: Mapping[str, int], metric: bool
 ) -> Panorama:
     """The mosaic as the noun; its frames are numbered as in the sequence."""
     canvas = mosaic.canvas

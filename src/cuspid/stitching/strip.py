@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter1d
 from cuspid.camera import OPENCV_PIXEL_OFFSET
 from cuspid.geometry import lengths_along, unit
 from cuspid.panorama import ZONES, Panorama, Strip
-from cuspid.reconstruction import Reconstruction
+from cuspid.sparse_model import SparseModel
 from cuspid.stitching.surface import HeightMap
 
 
@@ -40,10 +40,10 @@ _TREMOR_FRAMES = 3.0
 """Standard deviation of the Gaussian filter over the camera's path, in frames."""
 
 
-def arch_curve(motion: Reconstruction, surface: HeightMap, options: StripOptions) -> Float[np.ndarray, "n 2"] | None:
+def arch_curve(motion: SparseModel, surface: HeightMap, options: StripOptions) -> Float[np.ndarray, "n 2"] | None:
     """World (x, y) of the middle of the crowns, every `_STEP_MM`, in the order in which the camera went; None where it
     hardly moved."""
-    centres = np.array([pose.inverse().translation[:2] for pose in motion.rig_from_world.values()])
+    centres = np.array([pose.inverse().translation[:2] for pose in motion.cam_from_world.values()])
     curve = _even(_smooth(_even(_forward(centres)), options.smoothing_mm))
     if _STEP_MM * len(curve) < _LEAST_MM:
         return None
@@ -104,7 +104,7 @@ def _normals(curve: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
 
 
 def unroll(
-    panorama: Panorama, motion: Reconstruction, surface: HeightMap, mm_per_px: float, options: StripOptions
+    panorama: Panorama, motion: SparseModel, surface: HeightMap, mm_per_px: float, options: StripOptions
 ) -> Strip | None:
     """The strip of a panorama at the panorama's own resolution; None where the camera hardly moved.
 

@@ -21,7 +21,7 @@ from skimage.morphology import remove_small_holes
 
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.reconstruction import Reconstruction
+from cuspid.sparse_model import SparseModel
 
 NOMINAL_MM = 14.0
 """Distance from an intra-oral camera to the teeth, where nothing else is known."""
@@ -152,20 +152,20 @@ class HeightMap:
 # --- the occlusal frame ------------------------------------------------------------------------------------------
 
 
-def in_occlusal_frame(model: Reconstruction, scale: ScaleOptions) -> Reconstruction:
+def in_occlusal_frame(model: SparseModel, scale: ScaleOptions) -> SparseModel:
     """The motion with the occlusal frame as its world, scaled to the known width of the arch, else to the working
     distance, else to `NOMINAL_MM`.
 
     Raises ReconstructionError where there are no points.
     """
-    near = model.scaled(NOMINAL_MM / float(np.median(model.depths_in_rig)))
-    points, (centres, axes) = near.known_tracks.points, _centres_and_axes(near)
+    near = model.scaled(NOMINAL_MM / float(np.median(model.depths)))
+    points, (centres, axes) = near.tracks.points, _centres_and_axes(near)
     world_from_model = _upright(points, centres, axes)
     world_from_model = _levelled(world_from_model.apply(points)) @ world_from_model
     front = _facing_front(world_from_model.apply(centres), world_from_model.apply(points))
     found = transformed(near, front @ world_from_model)
     if scale.width_mm is not None:
-        return found.scaled(scale.width_mm / _width(found.known_tracks.points))
+        return found.scaled(scale.width_mm / _width(found.tracks.points))
     heights = _centres_and_axes(found)[0][:, 2]
     return found.scaled((scale.working_distance_mm or NOMINAL_MM) / float(np.median(heights)))
 
@@ -176,20 +176,20 @@ def _width(points: Float[np.ndarray, "p 3"]) -> float:
     return float(np.diff(np.percentile(teeth[:, 0], [0.2, 99.8]))[0])
 
 
-def transformed(model: Reconstruction, new_from_world: Rigid3) -> Reconstruction:
+def transformed(model: SparseModel, new_from_world: Rigid3) -> SparseModel:
     """The same motion in another world."""
     world_from_new = new_from_world.inverse()
-    tracks = model.known_tracks
+    tracks = model.tracks
     return replace(
         model,
-        rig_from_world={name: pose @ world_from_new for name, pose in model.rig_from_world.items()},
+        cam_from_world={name: pose @ world_from_new for name, pose in model.cam_from_world.items()},
         tracks=replace(tracks, points=new_from_world.apply(tracks.points)),
     )
 
 
-def _centres_and_axes(model: Reconstruction) -> tuple[Float[np.ndarray, "f 3"], Float[np.ndarray, "f 3"]]:
+def _centres_and_axes(model: SparseModel) -> tuple[Float[np.ndarray, "f 3"], Float[np.ndarray, "f 3"]]:
     """Where the camera was and where it looked."""
-    poses = [pose.inverse() for pose in model.rig_from_world.values()]
+    poses = [pose.inverse() for pose in model.cam_from_world.values()]
     return np.array([pose.translation for pose in poses]), np.array([pose.rotation[:, 2] for pose in poses])
 
 
@@ -269,7 +269,7 @@ def _facing_front(centres: Float[np.ndarray, "f 3"], points: Float[np.ndarray, "
 # --- the surface -------------------------------------------------------------------------------------------------
 
 
-def height_map(model: Reconstruction, options: SurfaceOptions) -> HeightMap:
+def height_map(model: SparseModel, options: SurfaceOptions) -> HeightMap:
     """A smooth surface through the sparse points of a motion in the occlusal frame; robust against single points."""
     points = _sure_points(model)
     low, high = points[:, :2].min(axis=0) - 4, points[:, :2].max(axis=0) + 4
@@ -288,17 +288,17 @@ def height_map(model: Reconstruction, options: SurfaceOptions) -> HeightMap:
     return HeightMap(corner=low, cell_mm=options.cell_mm, heights=heights, known=np.ones(heights.shape, bool))
 
 
-def uncovered(dense: HeightMap, sparse: HeightMap, motion: Reconstruction) -> HeightMap:
+def uncovered(dense: HeightMap, sparse: HeightMap, motion: SparseModel) -> HeightMap:
     """A dense surface whose false rises do not hide what the camera went over.
 
     Where seen surface lies all around a place of a crown that is hidden from every frame, something rises beside it
     that cannot be: a highlight in a hollow. Gum far below the smooth surface may well be hidden behind a crown.
     """
-    camera, cells = motion.rig[motion.rig.names[0]].camera, dense.known.shape
+    camera, cells = motion.camera, dense.known.shape
     x, y = np.meshgrid(*(low + dense.cell_mm * np.arange(n) for low, n in zip(dense.corner, cells[::-1], strict=True)))
     places = np.stack([x, y, dense.heights], axis=-1)
     seen = np.zeros(cells, bool)
-    for pose in motion.rig_from_world.values():
+    for pose in motion.cam_from_world.values():
         there = pose.apply(places)
         inside = camera.contains(camera.project(there)) & (there[..., 2] > 0) & dense.known
         part = tuple(slice(at.min(initial=max(cells)), at.max(initial=-1) + 1) for at in np.nonzero(inside & ~seen))
@@ -316,9 +316,9 @@ def _bulging(heights: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r c"]:
     return np.where(np.isfinite(heights), np.maximum(heights, beside - _ROUND_MM), beside)
 
 
-def _sure_points(model: Reconstruction) -> Float[np.ndarray, "p 3"]:
+def _sure_points(model: SparseModel) -> Float[np.ndarray, "p 3"]:
     """Points that three frames saw, that do not stand apart in height and are not deep below the teeth."""
-    tracks = model.known_tracks
+    tracks = model.tracks
     counts = np.bincount(tracks.point_index, minlength=len(tracks.points))
     points = tracks.points[counts >= 3] if np.sum(counts >= 3) >= 20 else tracks.points
     low, high = np.percentile(points[:, 2], [1, 99.5])

@@ -28,7 +28,7 @@ from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera, undistortion_maps
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import Reconstruction
+from cuspid.sparse_model import SparseModel
 from cuspid.stitching.mosaic import BURNT, brightest, footprint
 from cuspid.stitching.surface import HOLE_MM2, HeightMap
 from cuspid.workers import map_in_threads
@@ -97,13 +97,13 @@ class SweepOptions:
 # --- which frames are compared -----------------------------------------------------------------------------------
 
 
-def partners(motion: Reconstruction, share: float) -> dict[int, int]:
+def partners(motion: SparseModel, share: float) -> dict[int, int]:
     """For each frame that has one a later frame beside it, whose baseline is nearest to ``share`` of the distance to
     the points (within a factor 1.8), mostly sideways, looking in about the same direction."""
-    poses = [pose.inverse() for pose in motion.rig_from_world.values()]
+    poses = [pose.inverse() for pose in motion.cam_from_world.values()]
     centres = np.array([pose.translation for pose in poses])
     axes = np.array([pose.rotation[:, 2] for pose in poses])
-    wanted = share * float(np.median(motion.depths_in_rig))
+    wanted = share * float(np.median(motion.depths))
     found: dict[int, int] = {}
     for one in range(len(poses) - 1):
         others = np.arange(one + 1, min(one + 1 + _REACH, len(poses)))
@@ -131,9 +131,9 @@ class Grid(NamedTuple):
     rows: int
 
     @staticmethod
-    def over(motion: Reconstruction, cell_mm: float) -> Grid:
+    def over(motion: SparseModel, cell_mm: float) -> Grid:
         """About the points of a motion, a whole number of pools wide."""
-        low, high = np.percentile(motion.known_tracks.points[:, :2], [0.2, 99.8], axis=0) + [[-4.0], [4.0]]
+        low, high = np.percentile(motion.tracks.points[:, :2], [0.2, 99.8], axis=0) + [[-4.0], [4.0]]
         columns, rows = (_POOL * np.ceil((high - low) / cell_mm / _POOL)).astype(int).tolist()
         return Grid(low, cell_mm, columns, rows)
 
@@ -240,7 +240,7 @@ def _compared(
 
 
 def sweep(
-    motion: Reconstruction,
+    motion: SparseModel,
     sparse: HeightMap,
     read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
     options: SweepOptions,
@@ -276,10 +276,10 @@ def sweep(
     )
 
 
-def _places(motion: Reconstruction, top: float, options: SweepOptions) -> tuple[Grid, Float[np.ndarray, "d"]]:
+def _places(motion: SparseModel, top: float, options: SweepOptions) -> tuple[Grid, Float[np.ndarray, "d"]]:
     """Where frames are compared: the cells, and the heights of the planes; not closer than pixels tell apart."""
-    camera = motion.rig[motion.rig.names[0]].camera
-    pixel_mm = float(np.median(motion.depths_in_rig) / np.mean(camera.focal_px))
+    camera = motion.camera
+    pixel_mm = float(np.median(motion.depths) / np.mean(camera.focal_px))
     step_mm = max(options.step_mm, 0.5 * pixel_mm / options.baseline_share)
     levels = np.arange(-options.depth_mm, top + step_mm, step_mm)
     return Grid.over(motion, max(options.cell_mm, pixel_mm)), levels
@@ -292,7 +292,7 @@ def _bridged(heights: Float32[np.ndarray, "r c"], holes: Bool[np.ndarray, "r c"]
 
 
 def _agreement(
-    motion: Reconstruction,
+    motion: SparseModel,
     pairs: Mapping[int, int],
     grid: Grid,
     levels: Float[np.ndarray, "d"],
@@ -301,7 +301,7 @@ def _agreement(
     progress: Progress,
 ) -> Float32[np.ndarray, "d r c"]:
     """Mean agreement (0 to 1) of the pairs of frames that see a place, at each height; the less, the fewer they are."""
-    camera, poses, names = motion.rig[motion.rig.names[0]].camera, list(motion.rig_from_world.values()), motion.frames
+    camera, poses, names = motion.camera, list(motion.cam_from_world.values()), motion.frames
     maps, window = undistortion_maps(camera), options.window
     sums, counts = np.zeros((2, len(levels), grid.rows // _POOL, grid.columns // _POOL), np.float32)
 

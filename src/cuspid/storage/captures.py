@@ -35,8 +35,9 @@ def write_image(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
     write_bytes(path, encoded.tobytes())
 
 
-def read_capture(folder: Path, handpiece: Path | None = None) -> Capture:
-    """A capture folder: ``images/<camera>/<frame>.*`` and a handpiece file (default ``handpiece.json`` in it).
+def read_capture(folder: Path, handpiece: Path | None = None, working_distance_mm: float | None = None) -> Capture:
+    """A capture folder: ``images/<camera>/<frame>.*`` and a handpiece file (default ``handpiece.json`` in it), or a rig
+    with its working distance, as :func:`cuspid.storage.handpieces.read_handpiece` takes them.
 
     Without ``capture.json`` the frames are those of the image folders, in the order of their names. A camera that has
     no image of a frame is left out of that frame, one that has none at all out of the handpiece (``left_out`` tells).
@@ -46,7 +47,7 @@ def read_capture(folder: Path, handpiece: Path | None = None) -> Capture:
     images = folder / "images"
     if not images.is_dir():
         raise InputError(f"{folder}: no folder 'images' in it; give the folder that holds images/<camera>/<frame>.png")
-    known = read_handpiece(handpiece or folder / "handpiece.json")
+    known = read_handpiece(handpiece or folder / "handpiece.json", working_distance_mm)
     unknown = {path.name for path in images.iterdir() if path.is_dir()} - set(known.rig.names)
     if unknown:
         raise InputError(

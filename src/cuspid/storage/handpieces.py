@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,12 @@ import numpy as np
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor
+from cuspid.pairing import guess_working_distance_mm
+from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor, depth_of_field_mm
 from cuspid.storage.files import digest_of, read_json, reading, write_json
+
+_log = logging.getLogger("cuspid")
+_SET_BY = "a handpiece.json or, where the verb has it, --working-distance-mm"
 
 
 def rigid_to_json(target_from_source: Rigid3) -> dict[str, Any]:
@@ -95,14 +100,18 @@ def _light_from_json(value: Mapping[str, Any]) -> Light:
     return Light(**{**value, **arrays})
 
 
-def read_handpiece(path: Path) -> Handpiece:
-    """Read ``handpiece.json``, or COLMAP's ``rig_config.json`` with the working distance of the built-in designs.
+def read_handpiece(path: Path, working_distance_mm: float | None = None) -> Handpiece:
+    """Read ``handpiece.json``, or COLMAP's ``rig_config.json``, which has no working distance: that is the one given
+    here, or else guessed, and said. Its frame is then on the surface, as :meth:`cuspid.rig.Rig.over_surface` has it.
 
-    Raises InputError that names a missing or unusable field.
+    Raises InputError that names a missing or unusable field, where nothing can be guessed, and where a file that has a
+    working distance is given another.
     """
     value = read_json(path)
     if isinstance(value, list):
-        return Handpiece(rig=read_rig_config(path), name=path.stem)
+        return _of_rig(path, read_rig_config(path), working_distance_mm)
+    if working_distance_mm is not None:
+        raise InputError(f"{path}: it has a working distance of its own; change it there, and give none here")
     with reading(path):
         strange = sorted(set(value) - _FIELDS)
         if strange:
@@ -127,6 +136,29 @@ def read_handpiece(path: Path) -> Handpiece:
             depth_range_mm=(float(near), float(far)),
             name=str(value.get("name", path.stem)),
         )
+
+
+def _of_rig(path: Path, rig: Rig, working_distance_mm: float | None) -> Handpiece:
+    distance_mm = _guessed_mm(path, rig) if working_distance_mm is None else working_distance_mm
+    return Handpiece(
+        rig=rig.over_surface(distance_mm),
+        working_distance_mm=distance_mm,
+        depth_range_mm=depth_of_field_mm(distance_mm),
+        name=path.stem,
+    )
+
+
+def _guessed_mm(path: Path, rig: Rig) -> float:
+    try:
+        distance_mm, source = guess_working_distance_mm(rig)
+    except InputError as error:
+        raise InputError(f"{path}: {error}; give {_SET_BY}") from error
+    near_mm, far_mm = depth_of_field_mm(distance_mm)
+    _log.info(
+        f"{path}: it has no working distance; {distance_mm:.3g} mm are guessed from {source}. Depths of "
+        f"{near_mm:.3g} to {far_mm:.3g} mm are kept; {_SET_BY} sets others"
+    )
+    return distance_mm
 
 
 def hash_handpiece(handpiece: Handpiece) -> str:

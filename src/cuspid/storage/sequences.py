@@ -15,10 +15,10 @@ from cuspid.capture import ImageFolder, image_size
 from cuspid.errors import InputError
 from cuspid.image_sequence import ImageSequence
 from cuspid.progress import Progress, silent
-from cuspid.rig import Handpiece
+from cuspid.rig import Handpiece, Rig
 from cuspid.storage.captures import IMAGE_SUFFIXES, read_capture, write_image
 from cuspid.storage.files import finished, read_json, reading
-from cuspid.storage.handpieces import camera_from_colmap, camera_from_json, read_handpiece
+from cuspid.storage.handpieces import camera_from_colmap, camera_from_json, read_handpiece, read_rig_config
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm")
 MOST_FRAMES = 300
@@ -119,15 +119,21 @@ def _calibrated(sequence: ImageSequence, path: Path) -> ImageSequence:
     if isinstance(value, dict) and "focal_px" in value:
         with reading(path):
             return _with_camera(sequence, camera_from_json(value), path)
+    if isinstance(value, list):
+        return _with_rig(sequence, read_rig_config(path), path)
     return _with_handpiece(sequence, read_handpiece(path), path)
 
 
 def _with_handpiece(sequence: ImageSequence, handpiece: Handpiece, path: Path) -> ImageSequence:
-    cameras = list(handpiece.rig.cameras.values())
+    found = _with_rig(sequence, handpiece.rig, path)
+    return replace(found, working_distance_mm=handpiece.working_distance_mm)
+
+
+def _with_rig(sequence: ImageSequence, rig: Rig, path: Path) -> ImageSequence:
+    cameras = list(rig.cameras.values())
     if len(cameras) > 1:
         raise InputError(f"{path}: {len(cameras)} cameras; the calibration of one is needed")
-    found = _with_camera(sequence, cameras[0].camera, path)
-    return replace(found, working_distance_mm=handpiece.working_distance_mm)
+    return _with_camera(sequence, cameras[0].camera, path)
 
 
 def _with_camera(sequence: ImageSequence, camera: Camera, path: Path) -> ImageSequence:

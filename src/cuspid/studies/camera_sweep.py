@@ -14,7 +14,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -32,6 +32,8 @@ from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DesignOptions
 from cuspid.jaw import Jaw
+from cuspid.motion.location import MotionOptions
+from cuspid.pairing import PairingOptions
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
@@ -39,6 +41,7 @@ from cuspid.simulation.appearance import Preset
 from cuspid.simulation.path.overlap import image_overlap
 from cuspid.simulation.path.room import Room, check_clearance
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path, steady_poses
+from cuspid.stereo.matching import StereoOptions
 from cuspid.stereo.temporal import TemporalOptions
 from cuspid.studies.camera_pair import Direction, baseline_axis, camera_pair, facing
 from cuspid.studies.grid import Case, Outcome, Value, run_grid
@@ -57,7 +60,6 @@ _ALONG_THE_ARCH = ("incisal",)
 _FRONT_TEETH = ("incisal", "labial")
 _NEIGHBOURHOOD_MM = 13.0
 """What lies farther from the middle of the surface is out of every camera's reach."""
-_STEP_MM = 0.05
 _NEAREST_MM = 0.5
 """Depth range of a lens begins here at the least."""
 _BUDGET_UM = 10.0
@@ -97,6 +99,9 @@ class SweepOptions:
     """Positions of the pair on it; consecutive images must overlap by more than 75 %."""
     texture: Preset = "artificial"
     """Surface of the teeth: artificial (the thesis' condition), powder, enamel."""
+    pairing: PairingOptions = field(default_factory=lambda: PairingOptions(minimum_overlap=0.0))
+    """When the two are matched at all: whatever they share at the distance, for a wide, parallel pair shares more
+    behind it."""
     temporal: bool = False
     """Also measure depth from consecutive frames, which shows less of what the pair itself can do."""
     contenders: int = 2
@@ -229,7 +234,7 @@ def pair_handpiece(pair_from_rig: Rigid3, setting: Setting, options: SweepOption
         rig=rig,
         lights=lights,
         lightings=(Lighting(name="all", lights=tuple(lights)),),
-        working_distance_mm=_pairing_distance_mm(rig, options.distance_mm, far),
+        working_distance_mm=options.distance_mm,
         depth_range_mm=(near, far),
         name=f"pair-{setting[0]:g}mm-{setting[1]:g}deg",
     )
@@ -246,15 +251,6 @@ def _lights(rig_from_pair: Rigid3) -> dict[str, Light]:
         )
         for number, (side, across) in enumerate(corners, start=1)
     }
-
-
-def _pairing_distance_mm(pair: Rig, distance_mm: float, far_mm: float) -> float:
-    """The nominal distance that the reconstruction is told: it takes two cameras for a pair only if they share enough
-    of what they see there. A wide, parallel pair shares too little at the distance itself, but more a little behind it.
-    Where no distance helps, the distance itself; the case then fails and says why."""
-    # They share it a step before already: what is enough by a rounding error here may not be enough there.
-    enough = (each for each in np.arange(distance_mm, far_mm, _STEP_MM) if pair.stereo_pairs(float(each - _STEP_MM)))
-    return float(next(enough, distance_mm))
 
 
 # --- A case -----------------------------------------------------------------------------------------------------------
@@ -282,7 +278,7 @@ def sweep_case(
     overlap = image_overlap(site.jaw.mesh, handpiece, list(poses.values()))
     how = TrialOptions(
         simulation=SimulationOptions(texture=options.texture, supersampling=options.supersampling, seed=seed),
-        reconstruction=ReconstructionOptions(temporal=TemporalOptions(enabled=options.temporal)),
+        reconstruction=_reconstruction(options),
         evaluation=EvaluationOptions(margin_mm=_ANY_DISTANCE_MM, samples=50_000),
     )
     with tempfile.TemporaryDirectory(prefix="cuspid-sweep-") as folder:
@@ -298,6 +294,15 @@ def sweep_case(
         **_figures(trial, site),
         "cpu_s": time.process_time() - begin,
     }
+
+
+def _reconstruction(options: SweepOptions) -> ReconstructionOptions:
+    stereo = StereoOptions(pairing=options.pairing)
+    return ReconstructionOptions(
+        stereo=stereo,
+        temporal=TemporalOptions(enabled=options.temporal, stereo=stereo),
+        tracking=MotionOptions(pairing=options.pairing),
+    )
 
 
 def _figures(trial: Trial, site: Site) -> dict[str, float | int]:

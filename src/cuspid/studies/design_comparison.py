@@ -67,7 +67,7 @@ class ComparisonOptions:
     """What is compared."""
 
     designs: tuple[str, ...] = ("twelve", "six")
-    """Built-in designs (four, six, twelve) and handpiece.json files, named after their file."""
+    """Built-in designs (two, four, six, twelve) and handpiece.json files, named after their file."""
     turned: tuple[str, ...] = ("four", "six")
     """Designs that are also turned, by name; the others are only moved along the teeth."""
     turns: tuple[int, ...] = (1, 3, 5)

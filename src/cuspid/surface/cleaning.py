@@ -59,7 +59,7 @@ class CleaningReport:
 def clean(mesh: Mesh, resolution_mm: float, options: CleaningOptions | None = None) -> tuple[Mesh, CleaningReport]:
     """A manifold mesh without floating pieces and ghosts, and a report. An empty mesh stays empty.
 
-    ``resolution_mm`` is what the handpiece resolves (:attr:`cuspid.rig.Handpiece.resolution_mm`).
+    ``resolution_mm`` is what the handpiece resolves (:func:`cuspid.pairing.resolved_mm`).
     """
     options = options or CleaningOptions()
     ghosts = ghost_faces(mesh, options.ghost_depth * resolution_mm)

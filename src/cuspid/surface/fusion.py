@@ -60,7 +60,7 @@ def fuse(
 ) -> Mesh:
     """One coloured mesh in the world frame from the depth maps whose frame was located; no faces if they hold nothing.
 
-    ``resolution_mm`` is what the handpiece resolves (:attr:`cuspid.rig.Handpiece.resolution_mm`); lengths count in it.
+    ``resolution_mm`` is what the handpiece resolves (:func:`cuspid.pairing.resolved_mm`); lengths count in it.
     ``depth_maps`` is gone through twice and may read its items lazily, but a generator, which is spent after the first
     time, will not do. The same maps in the same order give the same mesh.
     """

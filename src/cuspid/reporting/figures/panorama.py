@@ -9,20 +9,20 @@ from matplotlib.axes import Axes
 from matplotlib.patheffects import Normal, Stroke
 
 from cuspid.panorama import Panorama
-from cuspid.reconstruction import Reconstruction
 from cuspid.reporting.figures.drawing import new_figure, save_figure
+from cuspid.sparse_model import SparseModel
 
 _TICK = 10
 """Every so many frames one is named."""
 _WIDTH_IN = 8.0
 
 
-def save_camera_path(path: Path, panorama: Panorama, motion: Reconstruction) -> None:
+def save_camera_path(path: Path, panorama: Panorama, motion: SparseModel) -> None:
     """The panorama with the place of the camera at each frame, and below it height and tilt over the frames.
 
     ``motion`` is in the world of the panorama.
     """
-    poses = [pose.inverse() for pose in motion.rig_from_world.values()]
+    poses = [pose.inverse() for pose in motion.cam_from_world.values()]
     centres = np.array([pose.translation for pose in poses])
     axes = np.array([pose.rotation[:, 2] for pose in poses])
     height, width = panorama.covered.shape

@@ -93,7 +93,7 @@ def surfaces() -> Figures:
 
 def designs() -> Figures:
     """Fig 3.15 and 3.18: cameras of the designs, and how far the two outer ones stand from the essential four."""
-    made = {name: make(DesignOptions()) for name, make in DESIGNS.items()}
+    made = {name: DESIGNS[name](DesignOptions()) for name in ("four", "six", "twelve")}
     across = sorted(abs(mounted.centre_in_rig[1]) for mounted in made["six"].rig.cameras.values())
     groups = {name[0] for name in made["twelve"].rig.names}
     return {

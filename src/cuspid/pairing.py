@@ -1,0 +1,128 @@
+"""Which cameras of a rig are matched with each other, at what distance, and what they resolve: choices, made on the
+measures of :class:`cuspid.rig.Rig`."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from cuspid.errors import InputError
+from cuspid.graph import parts_of
+from cuspid.rig import Handpiece, Rig
+
+_ROUNDING_DEG = 1e-5
+_CONVERGING_DEG = 10.0
+"""Axes that lean less towards each other may meet far behind what the cameras were mounted for."""
+_SHARED = 0.6
+"""Of what a camera sees at the distance that it was mounted for, it shares about so much with its best partner: 0.45 to
+0.8 in the designs that come with cuspid."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairingOptions:
+    """When two cameras see the same surface, from about the same side."""
+
+    minimum_overlap: float = 0.4
+    """Share (0 to 1) of what either sees at the working distance that the other must see, too."""
+    maximum_angle_deg: float = 30.0
+    """Largest angle between their optical axes."""
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.minimum_overlap <= 1 and 0 <= self.maximum_angle_deg <= 180):
+            raise InputError("pairing: the overlap must lie between 0 and 1, the angle between 0 and 180 deg")
+
+
+def stereo_pairs(
+    rig: Rig, distance_mm: float, options: PairingOptions = PairingOptions()
+) -> tuple[tuple[str, str], ...]:
+    """Pairs of cameras that depth is measured from, where the surface is so far away."""
+    return tuple(
+        (first, second)
+        for first, second in combinations(rig.names, 2)
+        if rig.angle_deg(first, second) <= options.maximum_angle_deg + _ROUNDING_DEG
+        and _shared(rig, (first, second), distance_mm) >= options.minimum_overlap
+    )
+
+
+def camera_groups(
+    rig: Rig, distance_mm: float, options: PairingOptions = PairingOptions()
+) -> tuple[tuple[str, ...], ...]:
+    """Cameras that are joined by stereo pairs, in the order of the rig; a lone camera is a group of one."""
+    number = {name: index for index, name in enumerate(rig.names)}
+    pairs = [(number[first], number[second]) for first, second in stereo_pairs(rig, distance_mm, options)]
+    part = parts_of(np.array(pairs, dtype=np.int64).reshape(-1, 2), len(number)).tolist()
+    return tuple(tuple(name for name in rig.names if part[number[name]] == each) for each in dict.fromkeys(part))
+
+
+def guess_working_distance_mm(rig: Rig) -> tuple[float, str]:
+    """How far from the surface a rig was probably made to work, and what that was taken from.
+
+    Where no two of its cameras are about parallel, that is where the axes of the pairs meet (median); else where a
+    camera begins to share enough with its best partner (median): within a factor of two for the designs that come with
+    cuspid. Raises InputError for cameras of which no two can be a pair.
+    """
+    pairs = stereo_pairs(rig, 1.0, PairingOptions(minimum_overlap=0.0))
+    if not pairs:
+        raise InputError("the cameras do not tell the working distance: no two of them look the same way")
+    if min(rig.angle_deg(*pair) for pair in pairs) >= _CONVERGING_DEG:
+        distance_mm, source = float(np.median([_meeting_mm(rig, *pair) for pair in pairs])), "where their axes meet"
+    else:
+        distance_mm, source = _sharing_mm(rig, pairs), "their baselines"
+    if not 0 < distance_mm < np.inf:
+        raise InputError("the cameras do not tell the working distance: no two of them look at the same place")
+    return distance_mm, source
+
+
+def _meeting_mm(rig: Rig, first: str, second: str) -> float:
+    """How far in front of two cameras their axes come nearest to each other, on average; negative behind them."""
+    one, other = rig[first], rig[second]
+    axes = np.stack([one.axis_in_rig, -other.axis_in_rig], axis=1)
+    along = np.linalg.lstsq(axes, other.centre_in_rig - one.centre_in_rig, rcond=None)[0]
+    return float(along.mean())
+
+
+def _sharing_mm(rig: Rig, pairs: Sequence[tuple[str, str]]) -> float:
+    """From what distance on a camera shares enough of what it sees with its best partner; infinite if from none on."""
+    paired = [name for name in rig.names if any(name in pair for pair in pairs)]
+
+    def usual_share(distance_mm: float) -> float:
+        shares = {pair: _shared(rig, pair, distance_mm) for pair in pairs}
+        return float(np.median([max(share for pair, share in shares.items() if name in pair) for name in paired]))
+
+    baselines = [float(np.linalg.norm(rig[one].centre_in_rig - rig[other].centre_in_rig)) for one, other in pairs]
+    distances = np.append(np.median(baselines) * np.geomspace(0.1, 100.0, 1000), np.inf)
+    return float(distances[bisect_left(distances[:-1].tolist(), _SHARED, key=usual_share)])
+
+
+def _shared(rig: Rig, pair: tuple[str, str], distance_mm: float) -> float:
+    """What either camera of a pair sees at a distance that the other sees, too (0 to 1)."""
+    first, second = pair
+    return min(rig.overlap(first, second, distance_mm), rig.overlap(second, first, distance_mm))
+
+
+def depth_step_mm(handpiece: Handpiece) -> float:
+    """Change of depth at the working distance that shifts a point by 1 px in the widest stereo pair, mm; infinite where
+    no two cameras see the same surface."""
+    pairs = stereo_pairs(handpiece.rig, handpiece.working_distance_mm)
+    parallax = max((_parallax_px_mm(handpiece.rig, *pair) for pair in pairs), default=0.0)
+    return handpiece.working_distance_mm**2 / parallax if parallax > 0 else float("inf")
+
+
+def _parallax_px_mm(rig: Rig, first: str, second: str) -> float:
+    """Focal length times the sideways distance of the second camera from the first."""
+    sideways = rig[first].cam_from_rig.apply(rig[second].centre_in_rig)[:2]
+    return float(rig[first].camera.focal_px.mean() * np.linalg.norm(sideways))
+
+
+def resolved_mm(handpiece: Handpiece) -> float:
+    """The detail that the images resolve at the working distance, mm, the yardstick of all limits that are lengths.
+
+    It is the footprint of a pixel or, where the cameras stand so close together that depth is less sure than that,
+    the depth of half a pixel of disparity; 12 um for the built-in handpieces.
+    """
+    half_step = depth_step_mm(handpiece) / 2
+    return max(handpiece.footprint_mm, half_step) if np.isfinite(half_step) else handpiece.footprint_mm

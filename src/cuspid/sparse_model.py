@@ -1,0 +1,58 @@
+"""What one camera tells of its way and of the surface: no scale, so a model in lengths of its own.
+
+Frames: ``cam`` is the frame of the camera; the world is any.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+from jaxtyping import Float
+
+from cuspid.camera import Camera
+from cuspid.errors import ReconstructionError
+from cuspid.geometry import Rigid3
+from cuspid.reconstruction import Tracks
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SparseModel:
+    """Located frames of one camera and points that they see. Its lengths are in a unit of its own, until they are
+    :meth:`scaled` to millimetres by what else is known."""
+
+    camera: Camera
+    """Refined calibration (the given one where it was held fixed)."""
+    cam_from_world: Mapping[str, Rigid3]
+    """Pose for each located frame, in the order of capture; translations in units of the model."""
+    tracks: Tracks
+    """The points, in units of the model, and where they were seen, always by camera 0."""
+    reprojection_rms_px: float | None = None
+    """RMS reprojection error, where it was adjusted."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cam_from_world", MappingProxyType(dict(self.cam_from_world)))
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Names of the located frames."""
+        return tuple(self.cam_from_world)
+
+    @property
+    def depths(self) -> Float[np.ndarray, "o"]:
+        """Z in the camera of the point of every observation, in units of the model. Raises ReconstructionError where
+        there is none."""
+        tracks = self.tracks
+        if not len(tracks.point_index):
+            raise ReconstructionError("motion: nothing that several frames see is consistent; more detail is needed")
+        axes = np.stack([pose.rotation[2] for pose in self.cam_from_world.values()])
+        shifts = np.array([pose.translation[2] for pose in self.cam_from_world.values()])
+        along = np.einsum("oj,oj->o", axes[tracks.frame_index], tracks.points[tracks.point_index])
+        return np.asarray(along + shifts[tracks.frame_index])
+
+    def scaled(self, scale: float) -> SparseModel:
+        """The same in a unit that is so many times smaller."""
+        poses = {name: Rigid3(pose.rotation, scale * pose.translation) for name, pose in self.cam_from_world.items()}
+        return replace(self, cam_from_world=poses, tracks=replace(self.tracks, points=scale * self.tracks.points))

@@ -1,0 +1,42 @@
+"""A handpiece of which no lights are known can be simulated, and it is said how."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from cuspid import pipeline
+from cuspid.handpiece.designs import DesignOptions, essential_four
+from cuspid.simulation.lights import lit
+from cuspid.simulation.path.scan import ScanPathOptions, steady_poses
+
+FOUR = essential_four(DesignOptions(width_px=24, height_px=24))
+DARK = dataclasses.replace(FOUR, lights={}, lightings=())
+
+
+def test_each_camera_gets_a_light_beside_it(caplog):
+    with caplog.at_level("INFO", logger="cuspid"):
+        shining = lit(DARK)
+    assert tuple(shining.lights) == DARK.rig.names
+    for name, mounted in DARK.rig.cameras.items():
+        light = shining.lights[name]
+        assert 0.4 < np.linalg.norm(light.position_mm - mounted.centre_in_rig) < 0.6
+        assert mounted.cam_from_rig.apply(light.position_mm)[2] == 0
+        np.testing.assert_array_equal(light.direction, mounted.axis_in_rig)
+    assert caplog.messages == ["handpiece essential-four: it has no lights; one beside each camera is assumed"]
+
+
+def test_known_lights_are_left_alone(caplog):
+    assert lit(FOUR) is FOUR
+    assert not caplog.messages
+
+
+def test_a_handpiece_without_lights_is_simulated(coarse_phantom, tmp_path):
+    poses = steady_poses(coarse_phantom, ScanPathOptions(tooth=46), per_pass=1)
+    capture, truth = pipeline.take_images(
+        coarse_phantom, DARK, {"00000": poses[0]}, tmp_path, pipeline.RenderOptions(supersampling=1)
+    )
+    assert len(truth.handpiece.lights) == 4
+    for image in capture.images(capture.frames[0]).values():
+        assert image.std() > 10

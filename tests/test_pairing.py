@@ -1,0 +1,91 @@
+"""Which cameras are matched, and at what distance."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from builders import rig_of, shifted
+from cuspid import storage
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
+from cuspid.handpiece.designs import essential_four, six_cameras, twelve_cameras
+from cuspid.pairing import PairingOptions, camera_groups, guess_working_distance_mm, stereo_pairs
+
+DESIGNS = Path(__file__).parent.parent / "benchmarks" / "designs"
+FOUND = [storage.read_handpiece(path) for path in sorted(DESIGNS.glob("*.json"))]
+
+
+def turned(x: float, degrees: float) -> Rigid3:
+    """A camera beside the origin that looks along +Z, turned towards -X."""
+    return Rigid3.from_rotation_vector(np.array([0, np.deg2rad(degrees), 0]), np.zeros(3)) @ shifted(x)
+
+
+@given(distance=st.floats(1.0, 1000.0), angle=st.floats(11.0, 29.0))
+def test_a_converging_pair_works_where_its_axes_meet(distance, angle):
+    aside = distance * np.tan(np.deg2rad(angle / 2))
+    rig = rig_of(a=turned(-aside, -angle / 2), b=turned(aside, angle / 2))
+    found, source = guess_working_distance_mm(rig)
+    assert found == pytest.approx(np.hypot(distance, aside))
+    assert source == "where their axes meet"
+
+
+@given(baseline=st.floats(0.5, 500.0))
+def test_a_parallel_pair_works_where_it_shares_enough(baseline):
+    found, source = guess_working_distance_mm(rig_of(a=shifted(0), b=shifted(baseline)))
+    assert found == pytest.approx(baseline / (2 * np.tan(np.deg2rad(31)) * (1 - 0.6)), rel=0.3)
+    assert source == "their baselines"
+
+
+@pytest.mark.parametrize("handpiece", [*(make() for make in (essential_four, six_cameras, twelve_cameras)), *FOUND])
+def test_the_guess_for_a_design_is_of_the_right_size(handpiece):
+    found, _ = guess_working_distance_mm(handpiece.rig)
+    assert 0.5 < found / handpiece.working_distance_mm < 2.0
+
+
+@pytest.mark.parametrize(
+    "rig",
+    [
+        rig_of(alone=shifted(0)),
+        rig_of(ahead=shifted(0), back=turned(0, 180)),
+        rig_of(here=shifted(0), too=shifted(0)),
+        rig_of(a=turned(-1, 10), b=turned(1, -10)),
+    ],
+)
+def test_where_cameras_tell_no_distance_none_is_guessed(rig):
+    with pytest.raises(InputError, match="do not tell the working distance"):
+        guess_working_distance_mm(rig)
+
+
+def test_groups_join_cameras_that_see_the_same():
+    side = Rigid3.from_rotation_vector(np.array([0, np.pi / 2, 0]), np.array([0, 0, 0.0]))
+    rig = rig_of(o1=shifted(-1.25), o2=shifted(1.25), s1=side, s2=shifted(1.5) @ side, lone=shifted(40))
+    assert camera_groups(rig, 5.0) == (("o1", "o2"), ("s1", "s2"), ("lone",))
+    assert stereo_pairs(rig, 5.0) == (("o1", "o2"), ("s1", "s2"))
+
+
+def test_groups_follow_from_what_is_asked_of_a_pair():
+    rig = rig_of(a=shifted(0), b=shifted(2), c=shifted(4))
+    assert stereo_pairs(rig, 5.0) == (("a", "b"), ("b", "c"))
+    assert camera_groups(rig, 5.0) == (("a", "b", "c"),)
+    assert len(stereo_pairs(rig, 5.0, PairingOptions(minimum_overlap=0.2))) == 3
+    assert camera_groups(rig, 5.0, PairingOptions(minimum_overlap=0.9)) == (("a",), ("b",), ("c",))
+
+
+@given(st.floats(0.1, 170.0))
+def test_the_largest_angle_of_a_pair_is_still_one(angle):
+    turned = Rigid3.from_rotation_vector(np.array([0, np.deg2rad(angle), 0]), np.zeros(3))
+    rig = rig_of(a=shifted(0), b=turned)
+    assert rig.angle_deg("a", "b") == pytest.approx(angle)
+    assert stereo_pairs(rig, 5.0, PairingOptions(minimum_overlap=0.0, maximum_angle_deg=angle)) == (("a", "b"),)
+    assert stereo_pairs(rig, 5.0, PairingOptions(minimum_overlap=0.0, maximum_angle_deg=0.99 * angle)) == ()
+
+
+@pytest.mark.parametrize("wrong", [{"minimum_overlap": 1.1}, {"maximum_angle_deg": -1.0}])
+def test_pairs_that_cannot_be_asked_for_are_refused(wrong):
+    with pytest.raises(InputError, match="pairing: the overlap"):
+        PairingOptions(**wrong)
