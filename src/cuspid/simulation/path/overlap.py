@@ -68,8 +68,5 @@ def _shares(again: Bool[np.ndarray, "c n"], surface: Bool[np.ndarray, "c n"]) ->
 
 
 def frame_overlap(overlap: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n"]:
-    """Mean over the cameras of each frame; 1 where no image shows surface, for then none is lost."""
-    known = np.isfinite(overlap)
-    counts = known.sum(axis=1)
-    means = np.sum(overlap, axis=1, where=known) / np.maximum(counts, 1)
-    return np.asarray(np.where(counts > 0, means, 1.0))
+    """Mean over the cameras of each frame; an image without surface loses none."""
+    return np.asarray(1 - np.nan_to_num(1 - overlap).mean(axis=1))

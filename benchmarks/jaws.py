@@ -1,0 +1,195 @@
+"""Scan real jaws and parts of them, each without options of its own.
+
+    python benchmarks/jaws.py FOLDER [--work build/jaws] [--size half] [--passes auto] [--only 001 quadrant] [--plan]
+
+FOLDER holds meshes of jaws, ``lower`` or ``upper`` in their names; those of fewer than 30,000 faces are also scanned
+after two Loop subdivisions, for their facets are larger than teeth are smooth. Quadrants, single teeth and jaws with
+gaps are cut from labelled ones, with 3 mm of what is around them, turned at random and without their labels. ``--plan``
+only plans the paths. Finished scans are kept in the work folder and not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import tempfile
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from run import conditions
+from scipy.spatial.transform import Rotation
+
+from cuspid import pipeline
+from cuspid.anatomy.jaw_files import load_jaw
+from cuspid.evaluation.deviation import EvaluationOptions
+from cuspid.geometry import Rigid3
+from cuspid.handpiece.designs import DesignOptions, twelve_cameras
+from cuspid.jaw import ARCHES, GUM, Arch, Jaw
+from cuspid.mesh import Mesh
+from cuspid.pipeline import ReconstructionOptions, SimulationOptions
+from cuspid.rig import Handpiece
+from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
+from cuspid.storage import read_json, write_json
+from cuspid.studies.grid import Case, Value, run_grid
+
+HERE = Path(__file__).parent
+COARSE = 30_000
+PARTS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "quadrant": ("fullarch_upper_137k", tuple(range(11, 19))),
+    "quadrant-2": ("001_lower", tuple(range(41, 49))),
+    "quadrant-3": ("005_upper", tuple(range(21, 29))),
+    "quadrant-4": ("010_lower", tuple(range(31, 39))),
+    "quadrant-5": ("029_upper", tuple(range(11, 19))),
+    "molar": ("014_lower", (46,)),
+    "premolar": ("034_upper", (15,)),
+    "incisor": ("067_lower", (31,)),
+    "gaps": ("023_lower", tuple(t for q in (3, 4) for t in range(10 * q + 1, 10 * q + 9) if t not in (46, 34, 35))),
+    "gaps-2": ("048_upper", tuple(t for q in (1, 2) for t in range(10 * q + 1, 10 * q + 9) if t not in (16, 24, 25))),
+}
+"""From which jaw, and which teeth."""
+
+
+def arch_of(path: Path) -> Arch | None:
+    """As the name says."""
+    return next((each for each in ARCHES if each in path.stem), None)
+
+
+def face_count(path: Path) -> int:
+    """As the header of a PLY file says."""
+    header = path.read_bytes()[:2000].split(b"end_header")[0].decode()
+    return int(header.split("element face")[1].split()[0])
+
+
+def cases(files: dict[str, Path]) -> Iterator[Case]:
+    """Every jaw, the coarse ones again after subdivision, and the parts."""
+    for name, path in files.items():
+        yield Case(name=name, parameters={"file": str(path), "part": "", "smooth": False})
+        if face_count(path) < COARSE:
+            yield Case(name=f"{name}-smooth", parameters={"file": str(path), "part": "", "smooth": True})
+    for part, (name, _) in PARTS.items():
+        if name in files:
+            yield Case(name=f"{part}-{name}", parameters={"file": str(files[name]), "part": part, "smooth": True})
+
+
+def jaw_of(file: str, part: str, smooth: bool) -> Jaw:
+    """The jaw of a case; a part as a user would bring it, in any pose and without labels."""
+    jaw, _ = load_jaw(Path(file), arch=arch_of(Path(file)))
+    if smooth and len(jaw.mesh.faces) < COARSE:
+        jaw = subdivided(jaw)
+    if not part:
+        return jaw
+    with tempfile.TemporaryDirectory(prefix="cuspid-part-") as folder:
+        path = Path(folder) / f"{part}.ply"
+        cut = cut_out(jaw, PARTS[part][1])
+        trimesh.Trimesh(cut.vertices, cut.faces, process=False).export(path)
+        return load_jaw(path, arch=jaw.arch)[0]
+
+
+def subdivided(jaw: Jaw) -> Jaw:
+    """After two Loop subdivisions; faces keep their labels."""
+    vertices, faces, labels = jaw.mesh.vertices, jaw.mesh.faces, jaw.face_labels
+    for _ in range(2):
+        before = faces
+        vertices, faces = trimesh.remesh.subdivide_loop(vertices, faces, iterations=1)
+        if labels is not None:
+            labels = np.repeat(labels, len(faces) // len(before))
+    mesh = Mesh(vertices, faces)
+    return Jaw(mesh=mesh, face_labels=labels, arch=jaw.arch)
+
+
+def cut_out(jaw: Jaw, teeth: tuple[int, ...]) -> Mesh:
+    """Teeth with 3 mm of gum, in any pose."""
+    if jaw.face_labels is None:
+        raise SystemExit("parts are cut from labelled jaws")
+    wanted = np.isin(jaw.face_labels, teeth)
+    distance, _, _ = jaw.mesh.submesh(wanted).closest(jaw.mesh.face_centres)
+    part = jaw.mesh.submesh(wanted | ((jaw.face_labels == GUM) & (distance < 3.0)))
+    rng = np.random.default_rng(len(teeth))
+    return part.transformed(Rigid3(Rotation.random(rng=rng).as_matrix(), rng.normal(0, 50, 3)))
+
+
+def judge(*, file: str, part: str, smooth: bool, pixels: int, passes: str, plan_only: bool) -> dict[str, Value]:
+    """The figures of one jaw."""
+    jaw = jaw_of(file, part, smooth)
+    handpiece = twelve_cameras(DesignOptions(width_px=pixels, height_px=pixels))
+    path_options = ScanPathOptions(passes="auto" if passes == "auto" else "turns")
+    begin, begin_cpu = time.perf_counter(), time.process_time()
+    path = plan_scan_path(jaw, handpiece, path_options, np.random.default_rng([0, 1]))
+    planned: dict[str, Value] = {
+        "faces": len(jaw.mesh.faces),
+        "frames": len(path.rig_from_world),
+        "plan_s": time.perf_counter() - begin,
+        "plan_cpu_s": time.process_time() - begin_cpu,
+        "minimum_overlap_pct": 100 * path.minimum_overlap,
+        "seen_pct": 100 * path.seen[GUM],
+    }
+    if plan_only:
+        return planned
+    with tempfile.TemporaryDirectory(prefix="cuspid-jaw-") as folder:
+        return planned | scanned(jaw, handpiece, Path(folder), path_options)
+
+
+def scanned(jaw: Jaw, handpiece: Handpiece, folder: Path, path: ScanPathOptions) -> dict[str, Value]:
+    """The figures of a scan."""
+    capture, _ = pipeline.simulate(jaw, handpiece, folder, SimulationOptions(path=path))
+    begin, begin_cpu = time.perf_counter(), time.process_time()
+    reconstruction, mesh = pipeline.reconstruct(capture, folder, ReconstructionOptions())
+    took, took_cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
+    reference = pipeline.load_reference(folder / "truth")
+    found = pipeline.evaluate(
+        mesh, reference.jaw, EvaluationOptions(), scannable=reference.scannable, crown=reference.crown
+    )
+    crown = found.crown
+    return {
+        "images": len(list((folder / "capture" / "images").rglob("*.png"))),
+        "located": len(reconstruction.frames),
+        "mean_um": found.accuracy.mean_abs_um,
+        "p95_um": found.accuracy.p95_um,
+        "everything_mean_um": None if found.everything is None else found.everything.mean_abs_um,
+        "seen_complete_50_um_pct": found.completeness_pct["50"],
+        "crown_complete_50_um_pct": None if crown is None else crown.completeness_pct["50"],
+        "scale_ppm": found.scale_error_ppm,
+        "reconstruction_s": took,
+        "reconstruction_cpu_s": took_cpu,
+        "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+        "path_crowns_seen": float(read_json(folder / "truth" / "path.json")["crowns_seen"]["all"]),
+    }
+
+
+def asked() -> argparse.Namespace:
+    """What the command line says."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--work", type=Path, default=Path("build/jaws"))
+    parser.add_argument("--out", type=Path, default=None, help="default: benchmarks/results/jaws-<size>.json")
+    parser.add_argument("--size", choices=("half", "full"), default="half", help="of the images: 250 or 500 px")
+    parser.add_argument("--passes", choices=("turns", "auto"), default="turns")
+    parser.add_argument("--only", nargs="*", help="names of cases or parts of them; default: all")
+    parser.add_argument("--plan", action="store_true", help="only plan the paths")
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Scan what is asked for and write the figures."""
+    arguments = asked()
+    kind = "-".join([arguments.size, arguments.passes, *(["plan"] if arguments.plan else [])])
+    pixels = 500 if arguments.size == "full" else 250
+    files = {path.stem: path for path in sorted(arguments.folder.rglob("*.ply"))}
+    chosen = [each for each in cases(files) if not arguments.only or any(word in each.name for word in arguments.only)]
+    outcomes = run_grid(
+        chosen,
+        partial(judge, pixels=pixels, passes=arguments.passes, plan_only=arguments.plan),
+        arguments.work / kind,
+        workers=1,
+        progress=lambda stage, done, total: print(f"{stage}: {done} of {total}", flush=True),
+    )
+    scans = {each.case.name: {**each.figures, "failure": each.failure} for each in outcomes}
+    write_json(arguments.out or HERE / "results" / f"jaws-{kind}.json", {"kind": kind, "scans": scans, **conditions()})
+
+
+if __name__ == "__main__":
+    main()
