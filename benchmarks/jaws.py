@@ -15,6 +15,7 @@ import resource
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -90,15 +91,13 @@ def jaw_of(file: str, part: str, smooth: bool) -> Jaw:
 
 
 def subdivided(jaw: Jaw) -> Jaw:
-    """After two Loop subdivisions; faces keep their labels."""
-    vertices, faces, labels = jaw.mesh.vertices, jaw.mesh.faces, jaw.face_labels
-    for _ in range(2):
-        before = faces
-        vertices, faces = trimesh.remesh.subdivide_loop(vertices, faces, iterations=1)
-        if labels is not None:
-            labels = np.repeat(labels, len(faces) // len(before))
+    """After two Loop subdivisions; faces take the label of the nearest one before."""
+    vertices, faces = trimesh.remesh.subdivide_loop(jaw.mesh.vertices, jaw.mesh.faces, iterations=2)
     mesh = Mesh(vertices, faces)
-    return Jaw(mesh=mesh, face_labels=labels, arch=jaw.arch)
+    if jaw.face_labels is None:
+        return replace(jaw, mesh=mesh)
+    _, nearest, _ = jaw.mesh.closest(mesh.face_centres)
+    return replace(jaw, mesh=mesh, face_labels=jaw.face_labels[nearest])
 
 
 def cut_out(jaw: Jaw, teeth: tuple[int, ...]) -> Mesh:

@@ -137,8 +137,8 @@ class ScanPath:
 
     @property
     def mean_overlap(self) -> float:
-        """The mean over all images."""
-        return float(np.nanmean(self.overlap))
+        """The same, of all frames."""
+        return float(frame_overlap(self.overlap).mean())
 
 
 def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng: np.random.Generator) -> ScanPath:
