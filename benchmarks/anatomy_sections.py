@@ -212,3 +212,46 @@ def mouth(result: Result) -> str:
         [f"A handpiece that needs {result['needed_mm']:g} mm, {result['people']:,} drawn of each sex:", ""]
         + [markdown_table(head, rows)]
     )
+
+
+_JAW_COLUMNS = {
+    "faces": "faces",
+    "frames": "frames",
+    "planned in s": "plan_s",
+    "least overlap %": "minimum_overlap_pct",
+    "open crown that two cameras see %": "seen_pct",
+    "frames located": "located",
+    "mean um": "mean_um",
+    "P95 um": "p95_um",
+    "mean of everything um": "everything_mean_um",
+    "open crown within 50 um %": "crown_complete_50_um_pct",
+    "images to mesh, CPU s": "reconstruction_cpu_s",
+    "peak GB": "peak_gb",
+}
+
+
+def jaws(result: Result) -> str:
+    """Real jaws and parts of them, each scanned without options of its own."""
+    scans = result["scans"]
+    planned = [scan for scan in scans.values() if scan["failure"] is None]
+    heads = [head for head, key in _JAW_COLUMNS.items() if any(key in scan for scan in planned)]
+    rows = [
+        (name, *(_jaw_figure(scan, _JAW_COLUMNS[head]) for head in heads), scan["failure"] or "")
+        for name, scan in scans.items()
+    ]
+    return "\n".join(
+        [
+            f"{len(planned)} of {len(scans)} came to the end. A name with *smooth* is a coarse jaw after two Loop "
+            "subdivisions; quadrants, single teeth and jaws with gaps are cut from smooth ones, turned at random and "
+            "without labels. Twelve cameras; `python benchmarks/jaws.py`.",
+            "",
+            markdown_table(("jaw", *heads, "failed because"), rows),
+        ]
+    )
+
+
+def _jaw_figure(scan: Result, key: str) -> str:
+    value = scan.get(key)
+    if value is None:
+        return ""
+    return f"{value:,}" if isinstance(value, int) else f"{value:.1f}"

@@ -164,7 +164,7 @@ def asked() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--work", type=Path, default=Path("build/jaws"))
-    parser.add_argument("--out", type=Path, default=None, help="default: benchmarks/results/jaws-<size>.json")
+    parser.add_argument("--out", type=Path, default=None, help="default: benchmarks/results/jaws_<what>.json")
     parser.add_argument("--size", choices=("half", "full"), default="half", help="of the images: 250 or 500 px")
     parser.add_argument("--passes", choices=("turns", "auto"), default="turns")
     parser.add_argument("--only", nargs="*", help="names of cases or parts of them; default: all")
@@ -175,7 +175,8 @@ def asked() -> argparse.Namespace:
 def main() -> None:
     """Scan what is asked for and write the figures."""
     arguments = asked()
-    kind = "-".join([arguments.size, arguments.passes, *(["plan"] if arguments.plan else [])])
+    auto = ["auto"] if arguments.passes == "auto" else []
+    kind = "_".join(["plan" if arguments.plan else arguments.size, *auto])
     pixels = 500 if arguments.size == "full" else 250
     files = {path.stem: path for path in sorted(arguments.folder.rglob("*.ply"))}
     chosen = [each for each in cases(files) if not arguments.only or any(word in each.name for word in arguments.only)]
@@ -187,7 +188,7 @@ def main() -> None:
         progress=lambda stage, done, total: print(f"{stage}: {done} of {total}", flush=True),
     )
     scans = {each.case.name: {**each.figures, "failure": each.failure} for each in outcomes}
-    write_json(arguments.out or HERE / "results" / f"jaws-{kind}.json", {"kind": kind, "scans": scans, **conditions()})
+    write_json(arguments.out or HERE / "results" / f"jaws_{kind}.json", {"kind": kind, "scans": scans, **conditions()})
 
 
 if __name__ == "__main__":

@@ -143,6 +143,11 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
     "design_comparison": ("Six cameras or twelve", handpiece_sections.design_comparison),
     "design_comparison_full_size": ("Six cameras or twelve, images of full size", handpiece_sections.design_comparison),
     "any_rig": ("Any rig", handpiece_sections.any_rig),
+    "jaws_plan": ("Real jaws: the path", anatomy_sections.jaws),
+    "jaws_half": ("Real jaws at half size", anatomy_sections.jaws),
+    "jaws_half_auto": ("Real jaws at half size, with further passes", anatomy_sections.jaws),
+    "jaws_full": ("Real jaws at full size", anatomy_sections.jaws),
+    "jaws_full_auto": ("Real jaws at full size, with further passes", anatomy_sections.jaws),
     "grid": ("Running many", handpiece_sections.grid),
 }
 """Title and text for each file of results that is not of scans, by its stem."""
