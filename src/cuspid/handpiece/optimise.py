@@ -26,6 +26,7 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.brief import DesignBrief
 from cuspid.handpiece.family import BOUNDS, LAYOUTS, Layout, Shape, build_handpiece
+from cuspid.handpiece.holder import with_holder
 from cuspid.handpiece.optics import Optics
 from cuspid.handpiece.precision import NoiseModel, bound_rms_um, noise_px, projection_jacobian
 from cuspid.mesh import Mesh
@@ -245,7 +246,8 @@ class _Search:
         self.evaluations = 0
 
     def build(self, layout: Layout, shape: Shape) -> Handpiece:
-        return build_handpiece(layout, shape, self.brief.sensor, self.brief.depth_range_mm, self.brief.name)
+        bare = build_handpiece(layout, shape, self.brief.sensor, self.brief.depth_range_mm, self.brief.name)
+        return with_holder(bare, self.brief.holder)
 
     def assess(self, layout: Layout, shape: Shape) -> Trial:
         self.evaluations += 1
