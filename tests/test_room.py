@@ -20,9 +20,9 @@ from cuspid.handpiece.holder import HolderOptions, with_holder
 from cuspid.handpiece.presets import PRESETS
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
+from cuspid.room import Room, check_clearance, surface_points
 from cuspid.simulation.path.arch import arch_curve
 from cuspid.simulation.path.detour import up
-from cuspid.simulation.path.room import Room, check_clearance, surface_points
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 
 CUBE = Body({"cube": Box(Rigid3.identity(), np.array([1.0, 1.0, 1.0]))})

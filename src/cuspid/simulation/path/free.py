@@ -21,9 +21,9 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
 from cuspid.rig import Handpiece
+from cuspid.room import Room
 from cuspid.simulation.path.arch import arch_curve
 from cuspid.simulation.path.detour import lifts_needed, up
-from cuspid.simulation.path.room import Room
 
 _LOG = logging.getLogger("cuspid")
 

@@ -24,6 +24,7 @@ from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
+from cuspid.room import Room, check_clearance
 from cuspid.simulation.path.arch import ArchCurve, arch_curve
 from cuspid.simulation.path.coverage import CrownPoints, crown_points
 from cuspid.simulation.path.detour import Detour, PoseAt, lifted, plan_detour
@@ -31,7 +32,6 @@ from cuspid.simulation.path.further import further_legs, seen_from
 from cuspid.simulation.path.hand import HandMotion, hand_motion
 from cuspid.simulation.path.legs import Leg, SteadyPath, steady_path, there_and_back
 from cuspid.simulation.path.overlap import frame_overlap, image_overlap
-from cuspid.simulation.path.room import Room, check_clearance
 
 TOOTH_FRAMES, ARCH_FRAMES = 10, 100
 """Positions of the handpiece in the thesis: 120 images of a tooth and 1200 of an arch with twelve cameras."""
