@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import product
 from typing import no_type_check
 
@@ -31,7 +31,7 @@ _PITCH_MM = 0.15
 _INSIDE_PITCH_MM = 1.0
 """Of the grid of winding numbers; nearer to the surface than this the distance decides."""
 _INSIDE = 0.5
-_FAR_MM = 3.0
+FAR_MM = 3.0
 """Distances are told so far beyond the clearance."""
 
 
@@ -86,7 +86,7 @@ class Room:
         inside = self._inside([rig_from_world])[0]
         if inside.any():
             return -np.inf, self.body.names[int(np.argmax(inside))]
-        reach = self.clearance_mm + _FAR_MM
+        reach = self.clearance_mm + FAR_MM
         low, high = self._corners[0] - reach, self._corners[-1] + reach
         distances, parts = self.body.distances(self._within(rig_from_world, low, high))
         if len(distances) == 0:
@@ -100,9 +100,9 @@ class Room:
         """Points of the surface in a box of the rig frame."""
         return np.asarray(_in_box(self._points, rig_from_world.rotation, rig_from_world.translation, low, high))
 
-    @cached_property
+    @property
     def _points(self) -> Float[np.ndarray, "n 3"]:
-        return surface_points(self.mesh, _APART_MM)
+        return _points_of(self.mesh)
 
     @cached_property
     def _corners(self) -> Float[np.ndarray, "8 3"]:
@@ -117,14 +117,10 @@ class Room:
         places = _Grid.places(low, high, _PITCH_MM)
         return _Grid(self.body.distances(places.reshape(-1, 3))[0].reshape(places.shape[:3]), low, _PITCH_MM)
 
-    @cached_property
+    @property
     def _winding(self) -> _Grid:
         """Winding number of the jaw, in the world."""
-        low, high = self.mesh.bounds + [[-_FAR_MM], [_FAR_MM]]
-        places = _Grid.places(low, high, _INSIDE_PITCH_MM)
-        vertices, faces = (np.ascontiguousarray(each) for each in (self.mesh.vertices, self.mesh.faces))
-        numbers = igl.fast_winding_number(vertices, faces, np.ascontiguousarray(places.reshape(-1, 3)))
-        return _Grid(np.asarray(numbers).reshape(places.shape[:3]), low, _INSIDE_PITCH_MM)
+        return _winding_of(self.mesh)
 
     def _inside(self, rig_from_world: Sequence[Rigid3]) -> Bool[np.ndarray, "n p"]:
         """At each pose, which parts have their middle inside the jaw."""
@@ -136,6 +132,21 @@ class Room:
     @cached_property
     def _middles(self) -> Float[np.ndarray, "p 3"]:
         return np.array([box.box_from_rig.inverse().translation for box in self.body.parts.values()])
+
+
+# A search for a handpiece asks many bodies about few meshes.
+@lru_cache(maxsize=8)
+def _points_of(mesh: Mesh) -> Float[np.ndarray, "n 3"]:
+    return surface_points(mesh, _APART_MM)
+
+
+@lru_cache(maxsize=8)
+def _winding_of(mesh: Mesh) -> _Grid:
+    low, high = mesh.bounds + [[-FAR_MM], [FAR_MM]]
+    places = _Grid.places(low, high, _INSIDE_PITCH_MM)
+    vertices, faces = (np.ascontiguousarray(each) for each in (mesh.vertices, mesh.faces))
+    numbers = igl.fast_winding_number(vertices, faces, np.ascontiguousarray(places.reshape(-1, 3)))
+    return _Grid(np.asarray(numbers).reshape(places.shape[:3]), low, _INSIDE_PITCH_MM)
 
 
 def surface_points(mesh: Mesh, apart_mm: float) -> Float[np.ndarray, "n 3"]:

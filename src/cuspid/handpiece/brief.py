@@ -58,7 +58,7 @@ class MouthBrief:
     people: float = 0.95
     """Share (0 to 1) of people with enough room there."""
     clearance_mm: float = 1.0
-    """A steady handpiece keeps cameras and lights this far from teeth and gum; a hand that drifts takes up half."""
+    """A steady handpiece keeps its body this far from teeth and gum; a hand that drifts takes up half."""
 
 
 @dataclass(frozen=True, kw_only=True)
