@@ -20,7 +20,7 @@ from cuspid.handpiece.holder import HolderOptions, with_holder
 from cuspid.handpiece.presets import PRESETS
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
-from cuspid.room import Room, check_clearance, surface_points
+from cuspid.room import Room, check_clearance, room_for, surface_points
 from cuspid.simulation.path.arch import arch_curve
 from cuspid.simulation.path.detour import up
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
@@ -133,6 +133,17 @@ def test_the_part_that_touches_is_named() -> None:
         InputError, match=r"at frame 00001 the cube .* as near to the jaw as 0\.30 mm, and is to keep 0\.5"
     ):
         check_clearance(room, {"00000": at(0, 0, 2.0), "00001": at(0, 0, 1.3)})
+
+
+def test_an_assumed_body_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    known = twelve_cameras()
+    with caplog.at_level("INFO", logger="cuspid"):
+        assert room_for(plate(0.0, 20.0), known, 0.5).body is known.body
+        assert caplog.messages == []
+        assumed = room_for(plate(0.0, 20.0), replace(known, body=None), 0.5).body
+    (told,) = caplog.messages
+    assert "a box of 1.0 x 1.0 x 1.6 mm is assumed behind each lens" in told
+    assert set(assumed.names) < set(known.solid.names)
 
 
 def test_points_on_a_coarse_surface_are_close_together() -> None:

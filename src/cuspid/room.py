@@ -7,6 +7,7 @@ as scans answer as well as closed models: faces far away subtend little, whether
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -19,10 +20,13 @@ from jaxtyping import Bool, Float
 from numba import njit
 from scipy.ndimage import map_coordinates
 
-from cuspid.body import Body
+from cuspid.body import CAMERA_MM, LED_MM, Body
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
+from cuspid.rig import Handpiece
+
+_LOG = logging.getLogger("cuspid")
 
 _APART_MM = 0.3
 """Points on the surface lie no farther apart along an edge."""
@@ -160,6 +164,17 @@ def surface_points(mesh: Mesh, apart_mm: float) -> Float[np.ndarray, "n 3"]:
         weights = np.stack([i, j, count - i - j], axis=1) / count
         points.append(np.einsum("kc,fcd->fkd", weights, corners[steps == count]).reshape(-1, 3))
     return np.concatenate(points)
+
+
+def room_for(mesh: Mesh, handpiece: Handpiece, clearance_mm: float) -> Room:
+    """The room for a handpiece. Where its body is not known, what is assumed goes to the log."""
+    if handpiece.body is None:
+        camera, led = (" x ".join(f"{side:.1f}" for side in size) for size in (CAMERA_MM, LED_MM))
+        _LOG.info(
+            f"{handpiece.name}: its body is not known; a box of {camera} mm is assumed behind each lens and one of "
+            f"{led} mm behind each LED; a body in its handpiece.json sets others (docs/formats.md)"
+        )
+    return Room(mesh, handpiece.solid, clearance_mm)
 
 
 def check_clearance(room: Room, poses: Mapping[str, Rigid3]) -> None:
