@@ -12,9 +12,9 @@ from cuspid.cli import main
 from cuspid.errors import InputError
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
 from cuspid.jaw import Jaw
+from cuspid.room import Room
 from cuspid.simulation.path.arch import arch_curve
 from cuspid.simulation.path.free import REACH, FreePathOptions, hand_noise, plan_free_path
-from cuspid.simulation.path.room import Room
 from verbs import refused
 
 CAMERA = intra_oral_camera()

@@ -100,6 +100,12 @@ def test_a_brief_is_read_with_its_defaults(tmp_path: Path) -> None:
     assert 0 < near < 4.0 < 6.0 < far < 15.0
 
 
+@pytest.mark.parametrize("thickness_mm", [0.5, 2.0, 7.0])
+def test_modules_and_plates_have_the_thickness_together(thickness_mm: float) -> None:
+    holder = brief_of(thickness_mm=thickness_mm).holder
+    assert holder.camera_mm[2] + holder.wall_mm == pytest.approx(thickness_mm)
+
+
 def test_a_sensor_may_be_changed_or_given_by_its_own_figures() -> None:
     changed = brief_of(SMALL.replace('"thesis"', '{preset = "thesis", focus_mm = 4.2}'))
     assert changed.sensor == replace(PRESETS["thesis"], focus_mm=4.2)
@@ -264,6 +270,8 @@ def test_the_search_improves_over_the_thesis_and_can_be_repeated(section: Sectio
     assert first.evaluations == second.evaluations <= 2 * len(first.trials) + 20
     assert [t.assessment.cost for t in first.trials] == sorted(t.assessment.cost for t in first.trials)
     assert first.handpiece.working_distance_mm == first.best.shape.distance_mm
+    assert first.handpiece.body is not None
+    assert first.handpiece.body.bounds[1, 2] >= first.best.shape.distance_mm + brief.thickness_mm - 1e-9
     low, high = brief.working_distance_mm
     assert low <= first.handpiece.working_distance_mm <= high
 

@@ -11,13 +11,13 @@ import pytest
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import twelve_cameras
 from cuspid.jaw import GUM, Jaw
+from cuspid.room import Room
 from cuspid.simulation.path.arch import ArchCurve, arch_curve
 from cuspid.simulation.path.coverage import CrownPoints, crown_points
 from cuspid.simulation.path.detour import _APART, _UNITS, _shortest, plan_detour
 from cuspid.simulation.path.further import _largest_sum, _woven, further_legs, seen_from
 from cuspid.simulation.path.legs import Leg, steady_path
 from cuspid.simulation.path.overlap import frame_overlap
-from cuspid.simulation.path.room import Room
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 from cuspid.visibility import VisibilityOptions, visible_counts
 

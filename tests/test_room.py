@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,13 +14,16 @@ from builders import any_pose, plate, sphere
 from cuspid.body import Body, Box, module
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.handpiece.designs import twelve_cameras
+from cuspid.handpiece.designs import DESIGNS, DesignOptions, twelve_cameras
+from cuspid.handpiece.family import LAYOUTS, Layout, Shape, build_handpiece
 from cuspid.handpiece.holder import HolderOptions, with_holder
+from cuspid.handpiece.presets import PRESETS
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
+from cuspid.room import Room, check_clearance, room_for, surface_points
 from cuspid.simulation.path.arch import arch_curve
 from cuspid.simulation.path.detour import up
-from cuspid.simulation.path.room import Room, check_clearance, surface_points
+from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 
 CUBE = Body({"cube": Box(Rigid3.identity(), np.array([1.0, 1.0, 1.0]))})
 
@@ -130,6 +135,17 @@ def test_the_part_that_touches_is_named() -> None:
         check_clearance(room, {"00000": at(0, 0, 2.0), "00001": at(0, 0, 1.3)})
 
 
+def test_an_assumed_body_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    known = twelve_cameras()
+    with caplog.at_level("INFO", logger="cuspid"):
+        assert room_for(plate(0.0, 20.0), known, 0.5).body is known.body
+        assert caplog.messages == []
+        assumed = room_for(plate(0.0, 20.0), replace(known, body=None), 0.5).body
+    (told,) = caplog.messages
+    assert "a box of 1.0 x 1.0 x 1.6 mm is assumed behind each lens" in told
+    assert set(assumed.names) < set(known.solid.names)
+
+
 def test_points_on_a_coarse_surface_are_close_together() -> None:
     corners = np.array([[0, 0, 0], [5.0, 0, 0], [0, 4.0, 0], [0.1, 0.1, 0.05]])
     mesh = Mesh(corners, np.array([[0, 1, 2], [0, 1, 3]]))
@@ -140,8 +156,8 @@ def test_points_on_a_coarse_surface_are_close_together() -> None:
     np.testing.assert_allclose(mesh.closest(points)[0], 0, atol=1e-9)
 
 
-def test_the_holder_carries_all_modules_and_hides_nothing() -> None:
-    handpiece = with_holder(twelve_cameras(), HolderOptions())
+def test_the_holder_carries_all_modules() -> None:
+    handpiece = twelve_cameras()
     body = handpiece.solid
     assert {f"camera {name}" for name in handpiece.rig.names} <= set(body.names)
     assert {f"light {name}" for name in handpiece.lights} <= set(body.names)
@@ -149,9 +165,39 @@ def test_the_holder_carries_all_modules_and_hides_nothing() -> None:
     low, high = body.bounds
     assert high[1] - low[1] < 26
     assert high[2] - low[2] < 12
+
+
+@pytest.mark.parametrize("wall_mm", [0.8, 5.4])
+@pytest.mark.parametrize("layout", LAYOUTS, ids=str)
+def test_the_holder_hides_nothing(layout: Layout, wall_mm: float) -> None:
+    bare = build_handpiece(layout, Shape(), PRESETS["thesis"], (2.5, 9.0))
+    body = with_holder(bare, HolderOptions(wall_mm=wall_mm)).solid
     looked_at = np.array(
-        [each.cam_from_rig.inverse().apply(np.array([[0, 0, 5.0]]))[0] for each in handpiece.rig.cameras.values()]
+        [each.cam_from_rig.inverse().apply(np.array([[0, 0, 5.0]]))[0] for each in bare.rig.cameras.values()]
     )
-    eyes = np.array([each.centre_in_rig for each in handpiece.rig.cameras.values()])
+    eyes = np.array([each.centre_in_rig for each in bare.rig.cameras.values()])
     on_the_way = (eyes[:, None] + np.linspace(0.05, 1, 20)[None, :, None] * (looked_at - eyes)[:, None]).reshape(-1, 3)
     assert body.distances(on_the_way)[0].min() > 0
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_a_built_in_design_has_the_body_of_its_own_cameras(name: str) -> None:
+    thick = DESIGNS[name](DesignOptions(holder=HolderOptions(wall_mm=3.0)))
+    for handpiece in (DESIGNS[name](DesignOptions()), thick):
+        assert handpiece.body is not None
+        modules = {part.removeprefix("camera ") for part in handpiece.body.names if part.startswith("camera ")}
+        assert modules == set(handpiece.rig.names)
+    assert thick.solid.parts["plate 1"].half_mm[2] == 1.5
+
+
+def test_the_holder_of_the_twelve_fits_on_the_path_of_their_cameras(coarse_phantom: Jaw) -> None:
+    solid, curve = twelve_cameras(), arch_curve(coarse_phantom)
+    room = Room(coarse_phantom.mesh, solid.solid, 0.5)
+    assert min(room.clearance(curve.rig_from_world(at))[0] for at in np.linspace(0, curve.lengths_mm[-1], 40)) > 0.5
+    found, bare = (
+        plan_scan_path(coarse_phantom, each, ScanPathOptions(tooth=46), np.random.default_rng(0)).rig_from_world
+        for each in (solid, replace(solid, body=None))
+    )
+    for name, pose in bare.items():
+        np.testing.assert_array_equal(found[name].matrix, pose.matrix)
+    assert found.keys() == bare.keys()

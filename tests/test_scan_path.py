@@ -14,10 +14,10 @@ from cuspid.handpiece.designs import essential_four, six_cameras, twelve_cameras
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece, Rig
+from cuspid.room import Room
 from cuspid.simulation.path.arch import ArchCurve, arch_curve
 from cuspid.simulation.path.hand import HandMotion, hand_motion
 from cuspid.simulation.path.overlap import image_overlap
-from cuspid.simulation.path.room import Room
 from cuspid.simulation.path.scan import ScanPath, ScanPathOptions, plan_scan_path, steady_poses
 from cuspid.visibility import VisibilityOptions, scannable_faces
 

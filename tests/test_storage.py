@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from builders import CAMERA, box_mesh, handpiece, image_path, make_capture, rig_of, shifted
 from cuspid import storage
+from cuspid.body import Body, Box
 from cuspid.capture import Dropped
 from cuspid.errors import CuspidError, InputError, OutputError
 from cuspid.geometry import Rigid3
@@ -18,6 +19,7 @@ from cuspid.jaw import Jaw, Landmark, Sphere
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import MountedCamera, Rig
 from cuspid.storage.files import read_arrays, whole_files, write_arrays
+from cuspid.storage.handpieces import hash_handpiece
 from strategies import cameras, rigid3s
 
 
@@ -249,6 +251,65 @@ def test_a_handpiece_with_a_field_that_means_nothing_is_refused(tmp_path):
     storage.write_json(tmp_path / "handpiece.json", {**value, "exposures": value["lightings"]})
     with pytest.raises(InputError, match="the field 'exposures' is not known"):
         storage.read_handpiece(tmp_path / "handpiece.json")
+
+
+@given(poses=st.lists(rigid3s(), min_size=1, max_size=4), sizes=st.lists(st.floats(0.1, 80.0), min_size=3, max_size=6))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25, deadline=None)
+def test_the_body_of_a_handpiece_returns(tmp_path, poses, sizes):
+    boxes = {f"part {k}": Box(pose, np.roll(sizes, k)[:3] / 2) for k, pose in enumerate(poses)}
+    original = dataclasses.replace(handpiece("a", "b"), body=Body(boxes))
+    storage.write_handpiece(tmp_path / "handpiece.json", original)
+    again = storage.read_handpiece(tmp_path / "handpiece.json")
+    assert again.body.names == tuple(boxes)
+    for name, box in boxes.items():
+        np.testing.assert_array_equal(again.body.parts[name].half_mm, box.half_mm)
+        np.testing.assert_allclose(again.body.parts[name].corners, box.corners, atol=1e-9)
+
+
+def test_a_body_changes_no_reconstruction(tmp_path):
+    bare = handpiece("a", "b")
+    solid = dataclasses.replace(bare, body=Body({"bar": Box(Rigid3.identity(), np.ones(3))}))
+    assert hash_handpiece(solid) == hash_handpiece(bare)
+    storage.write_handpiece(tmp_path / "handpiece.json", bare)
+    assert "body" not in storage.read_json(tmp_path / "handpiece.json")
+    assert storage.read_handpiece(tmp_path / "handpiece.json").body is None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"size_mm": [1, 2]}, r"bar: size_mm is \[1, 2\]; it must be three positive lengths"),
+        ({"size_mm": [1, 2, 0]}, "bar: size_mm"),
+        ({"size_mm": [1, 2, float("nan")]}, "bar: size_mm"),
+        ({"size_mm": [1, 2, True]}, "bar: size_mm"),
+        ({"size_mm": "big"}, "bar: size_mm"),
+        ({"half_mm": [1, 2, 3]}, "bar: a box has the fields box_from_rig and size_mm"),
+        ({"box_from_rig": {"translation_mm": [0, 0, 0]}}, "bar: box_from_rig has the fields"),
+        ({"box_from_rig": [0, 0, 0]}, "bar: box_from_rig has the fields"),
+        ({"box_from_rig": {"rotation_wxyz": [0, 0, 0, 0], "translation_mm": [0, 0, 0]}}, "bar: rotation_wxyz"),
+        ({"box_from_rig": {"rotation_wxyz": [1, 0, 0], "translation_mm": [0, 0, 0]}}, "bar: rotation_wxyz"),
+        ({"box_from_rig": {"rotation_wxyz": [1, 0, 0, 0], "translation_mm": [0, 0]}}, "bar: translation_mm"),
+    ],
+)
+def test_a_mistake_in_a_body_is_told_in_one_line(tmp_path, change, message):
+    path = tmp_path / "handpiece.json"
+    solid = dataclasses.replace(handpiece("a"), body=Body({"bar": Box(Rigid3.identity(), np.ones(3))}))
+    storage.write_handpiece(path, solid)
+    value = storage.read_json(path)
+    value["body"]["bar"] |= change
+    path.write_text(json.dumps(value))
+    with pytest.raises(InputError, match=f"handpiece.json: body, {message}") as caught:
+        storage.read_handpiece(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("body", [{}, [], "box", 3])
+def test_a_body_without_boxes_is_refused(tmp_path, body):
+    path = tmp_path / "handpiece.json"
+    storage.write_handpiece(path, handpiece("a"))
+    storage.write_json(path, {**storage.read_json(path), "body": body})
+    with pytest.raises(InputError, match=r"handpiece.json: body must be boxes by name"):
+        storage.read_handpiece(path)
 
 
 def test_depth_maps_return(tmp_path):

@@ -39,7 +39,9 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+from cuspid.body import CAMERA_MM
 from cuspid.errors import InputError
+from cuspid.handpiece.holder import HolderOptions
 from cuspid.handpiece.optics import Optics
 from cuspid.handpiece.presets import PRESETS
 
@@ -56,7 +58,7 @@ class MouthBrief:
     people: float = 0.95
     """Share (0 to 1) of people with enough room there."""
     clearance_mm: float = 1.0
-    """A steady handpiece keeps cameras and lights this far from teeth and gum; a hand that drifts takes up half."""
+    """A steady handpiece keeps its body this far from teeth and gum; a hand that drifts takes up half."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,6 +147,13 @@ class DesignBrief:
         """Nearest and farthest distance that is drawn sharply."""
         near, far = self.sensor.depth_of_field_mm(self.blur_px)
         return near, min(far, _FARTHEST_MM)
+
+    @property
+    def holder(self) -> HolderOptions:
+        """Miniature modules and plates that together have the thickness, half of which the modules take up at most."""
+        width, height, depth = CAMERA_MM
+        depth = min(depth, self.thickness_mm / 2)
+        return HolderOptions(camera_mm=(width, height, depth), wall_mm=self.thickness_mm - depth)
 
     def check_gap(self, gap_mm: float) -> None:
         """Raise InputError where even the nearest working distance leaves no room between the jaws."""

@@ -15,7 +15,7 @@ one plane: two across the arch and two along the curve of Spee, with the LEDs at
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -24,6 +24,7 @@ from jaxtyping import Float
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.handpiece.holder import HolderOptions, with_holder
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, depth_of_field_mm
 
 
@@ -53,6 +54,8 @@ class DesignOptions:
     """From the outer of the four cameras across the arch to the one more on either side (six cameras only)."""
     outer_tilt_deg: float = 0.0
     """How far the axes of these two lean towards the middle of the tooth (six cameras only)."""
+    holder: HolderOptions = field(default_factory=HolderOptions)
+    """What carries cameras and LEDs."""
 
     def __post_init__(self) -> None:
         if not self.working_distance_mm > 0:
@@ -69,19 +72,20 @@ class DesignOptions:
 
 def stereo_pair(options: DesignOptions = DesignOptions()) -> Handpiece:
     """Of the essential four those two that lie across the arch, with the same lights."""
-    four = essential_four(options)
-    return replace(four, rig=Rig({name: four.rig[name] for name in ("o1", "o2")}), name="stereo-pair")
+    four = _four(options)
+    pair = replace(four, rig=Rig({name: four.rig[name] for name in ("o1", "o2")}), name="stereo-pair")
+    return with_holder(pair, options.holder)
 
 
 def essential_four(options: DesignOptions = DesignOptions()) -> Handpiece:
     """Four cameras that look down on the occlusal or incisal surface (thesis 3.5.1)."""
-    return _handpiece("essential-four", {"o": _occlusal_view(options)}, options)
+    return with_holder(_four(options), options.holder)
 
 
 def twelve_cameras(options: DesignOptions = DesignOptions()) -> Handpiece:
     """Three groups of four in a U-shaped holder: occlusal, buccal and lingual (thesis 3.5.2)."""
     views = {"o": _occlusal_view(options), "b": _side_view(options, +1), "l": _side_view(options, -1)}
-    return _handpiece("twelve-cameras", views, options)
+    return with_holder(_handpiece("twelve-cameras", views, options), options.holder)
 
 
 def six_cameras(options: DesignOptions = DesignOptions()) -> Handpiece:
@@ -90,22 +94,27 @@ def six_cameras(options: DesignOptions = DesignOptions()) -> Handpiece:
     The thesis says "in both sides with a 2mm away from the essential sensors": read as farther out across the arch, in
     line with the two cameras there, 2 mm from the nearer of them. Between the two lies an LED.
     """
-    four = essential_four(options)
+    four = _four(options)
     cameras = {f"o{5 + k}": _outer_camera(options, side) for k, side in enumerate((+1, -1))}
     lights = {f"o{5 + k}": _outer_light(options, side) for k, side in enumerate((+1, -1))}
-    return replace(
+    six = replace(
         four,
         rig=Rig({**four.rig.cameras, **cameras}),
         lights={**four.lights, **lights},
         lightings=(Lighting(name="all", lights=(*four.lights, *lights)),),
         name="six-cameras",
     )
+    return with_holder(six, options.holder)
 
 
 DESIGNS: Mapping[str, Callable[[DesignOptions], Handpiece]] = MappingProxyType(
     {"two": stereo_pair, "four": essential_four, "six": six_cameras, "twelve": twelve_cameras}
 )
 """Designs by the name that the command line takes."""
+
+
+def _four(options: DesignOptions) -> Handpiece:
+    return _handpiece("essential-four", {"o": _occlusal_view(options)}, options)
 
 
 def _handpiece(name: str, views: Mapping[str, Rigid3], options: DesignOptions) -> Handpiece:

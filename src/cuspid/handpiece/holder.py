@@ -1,7 +1,7 @@
 """The holder of a handpiece: camera modules and LEDs, plates behind them, bars from plate to plate, and a neck.
 
-Each *group* of cameras that look the same way has a plate behind its modules; bars join the plates' middles, which of
-three groups makes a U (thesis 3.5.2). Frames: ``group`` is that of the first camera of a group, seen from behind.
+Each *group* of cameras that look the same way has a plate behind its modules; bars join the plates, which of three
+groups makes a U (thesis 3.5.2). Frames: ``group`` is that of the first camera of a group, seen from behind.
 """
 
 from __future__ import annotations
@@ -49,11 +49,12 @@ def with_holder(handpiece: Handpiece, options: HolderOptions = HolderOptions()) 
     """The handpiece with a body: its modules and what carries them."""
     cameras = {name: module(each.cam_from_rig, options.camera_mm) for name, each in handpiece.rig.cameras.items()}
     lights = {name: module(each.light_from_rig, options.led_mm) for name, each in handpiece.lights.items()}
-    plates = [_plate(handpiece, group, [*cameras.values(), *lights.values()], options) for group in _alike(handpiece)]
+    modules = [*cameras.values(), *lights.values()]
+    plates = [_plate(handpiece, group, modules, options) for group in _alike(handpiece)]
     parts: dict[str, Box] = {f"camera {name}": box for name, box in cameras.items()}
     parts |= {f"light {name}": box for name, box in lights.items()}
     parts |= {f"plate {number}": plate for number, plate in enumerate(plates, start=1)}
-    parts |= {f"bar {number}": bar for number, bar in enumerate(_bars(plates, options), start=1)}
+    parts |= {f"bar {number}": bar for number, bar in enumerate(_bars(plates, modules, options), start=1)}
     if options.neck_mm:
         parts["neck"] = _neck(plates[0], options)
     return replace(handpiece, body=Body(parts))
@@ -99,19 +100,27 @@ def _belongs(box: Box, group_from_rig: Rigid3, reach: Float[np.ndarray, "2 3"], 
     return bool(inside and box.box_from_rig.rotation[2] @ axis > np.cos(np.deg2rad(_ALIKE_DEG)))
 
 
-def _bars(plates: Sequence[Box], options: HolderOptions) -> list[Box]:
-    """Bars from the first plate to each of the others, or along them where they go on to the same side."""
-    return [_bar(plates[0], other, options) for other in plates[1:]]
+def _bars(plates: Sequence[Box], modules: Sequence[Box], options: HolderOptions) -> list[Box]:
+    """Bars from the first plate to each of the others, behind all modules between."""
+    return [_bar(plates[0], other, modules, options) for other in plates[1:]]
 
 
-def _bar(one: Box, other: Box, options: HolderOptions) -> Box:
+def _bar(one: Box, other: Box, modules: Sequence[Box], options: HolderOptions) -> Box:
     start, end = (box.box_from_rig.inverse().translation for box in (one, other))
     along = end - start
     length = float(np.linalg.norm(along))
     z = _outward(one, other, along / length)
     axes = np.stack([np.cross(along / length, z), along / length, z])
     half = np.array([options.bar_mm / 2, length / 2, options.wall_mm / 2])
-    return Box(Rigid3(axes, -axes @ (start + end) / 2), half)
+    between_from_rig = Rigid3(axes, -axes @ (start + end) / 2)
+    inner = max(-half[2], _farthest_back(modules, between_from_rig, half[1]))
+    return Box(Rigid3(np.eye(3), np.array([0, 0, -inner - half[2]])) @ between_from_rig, half)
+
+
+def _farthest_back(modules: Sequence[Box], between_from_rig: Rigid3, reach: float) -> float:
+    """Largest Z of the modules' corners that lie no farther from the middle of a bar than its ends."""
+    corners = between_from_rig.apply(np.concatenate([box.corners for box in modules]))
+    return float(np.max(corners[np.abs(corners[:, 1]) <= reach, 2], initial=-np.inf))
 
 
 def _outward(one: Box, other: Box, along: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:

@@ -6,13 +6,14 @@ the right of the image, +Y towards the cheek and up in the image, +Z out of the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.handpiece.designs import looking_at
+from cuspid.handpiece.holder import HolderOptions, with_holder
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 
 
@@ -32,6 +33,8 @@ class IntraOralOptions:
     """LEDs around the lens."""
     led_ring_mm: float = 3.0
     """Radius of the ring of LEDs."""
+    holder: HolderOptions = field(default_factory=HolderOptions)
+    """What carries the camera and the LEDs."""
 
     def __post_init__(self) -> None:
         if self.width_px < 1 or self.height_px < 1:
@@ -58,7 +61,7 @@ def intra_oral_camera(options: IntraOralOptions = IntraOralOptions()) -> Handpie
         )
         for k, angle in enumerate(angles)
     }
-    return Handpiece(
+    bare = Handpiece(
         rig=Rig({"camera": MountedCamera(camera, looking_at(np.zeros(3), down, right, options.working_distance_mm))}),
         lights=lights,
         lightings=(Lighting(name="all", lights=tuple(lights)),),
@@ -66,3 +69,4 @@ def intra_oral_camera(options: IntraOralOptions = IntraOralOptions()) -> Handpie
         depth_range_mm=(options.working_distance_mm / 3, 2.5 * options.working_distance_mm),
         name="intra-oral-camera",
     )
+    return with_holder(bare, options.holder)

@@ -26,12 +26,14 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.brief import DesignBrief
 from cuspid.handpiece.family import BOUNDS, LAYOUTS, Layout, Shape, build_handpiece
+from cuspid.handpiece.holder import with_holder
 from cuspid.handpiece.optics import Optics
 from cuspid.handpiece.precision import NoiseModel, bound_rms_um, noise_px, projection_jacobian
 from cuspid.mesh import Mesh
 from cuspid.pairing import PairingOptions, stereo_pairs
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, MountedCamera
+from cuspid.room import FAR_MM, Room
 from cuspid.visibility import VisibilityOptions, visible_faces
 
 _REACH_MM = 11.0
@@ -245,7 +247,8 @@ class _Search:
         self.evaluations = 0
 
     def build(self, layout: Layout, shape: Shape) -> Handpiece:
-        return build_handpiece(layout, shape, self.brief.sensor, self.brief.depth_range_mm, self.brief.name)
+        bare = build_handpiece(layout, shape, self.brief.sensor, self.brief.depth_range_mm, self.brief.name)
+        return with_holder(bare, self.brief.holder)
 
     def assess(self, layout: Layout, shape: Shape) -> Trial:
         self.evaluations += 1
@@ -378,22 +381,18 @@ def _room(handpiece: Handpiece, brief: DesignBrief, sections: Sequence[Section],
 
 
 def _height_and_clearance(handpiece: Handpiece, brief: DesignBrief, section: Section) -> tuple[float, float]:
-    """Height in mm of the holder's back above the tooth, and the least distance of cameras and lights from the mesh,
-    negative within it, over all positions."""
-    rig, lights = handpiece.rig.cameras.values(), handpiece.lights.values()
-    parts = np.array([m.centre_in_rig for m in rig] + [light.position_mm for light in lights])
-    axes = np.array([m.axis_in_rig for m in rig] + [light.direction for light in lights])
-    backs = np.array([m.centre_in_rig - brief.thickness_mm * m.axis_in_rig for m in rig])
-    world_from_rig = [pose.inverse() for pose in section.rig_from_world]
+    """Height in mm of the back of holder and body above the tooth, and the least distance of the body from the mesh,
+    over all positions. Distances are told up to some millimetres; they are negative where the body cuts the surface,
+    and those of a part within the tooth are all alike."""
+    backs = [m.centre_in_rig - brief.thickness_mm * m.axis_in_rig for m in handpiece.rig.cameras.values()]
+    corners = np.concatenate([backs, *(box.corners for box in handpiece.solid.parts.values())])
     tooth = np.any(list(section.surfaces.values()), axis=0)
     top = section.mesh.face_centres[tooth, 2].max()
-    height = max(float(pose.apply(backs)[:, 2].max()) for pose in world_from_rig) - top
-    places = np.concatenate([pose.apply(parts) for pose in world_from_rig])
-    directions = np.concatenate([pose.rotate(axes) for pose in world_from_rig])
-    distances, _, _ = section.mesh.closest(places)
-    hits = section.mesh.cast(places, directions)
-    behind = np.sum(section.mesh.face_normals[hits.faces] * directions, axis=1) > 0
-    return float(height), float(np.where((hits.faces >= 0) & behind, -distances, distances).min())
+    height = max(float(pose.inverse().apply(corners)[:, 2].max()) for pose in section.rig_from_world) - top
+    wanted = brief.mouth.clearance_mm
+    room = Room(section.mesh, handpiece.solid, wanted)
+    nearest = min(room.clearance(pose)[0] for pose in section.rig_from_world)
+    return float(height), float(np.clip(nearest, -_REACH_MM, wanted + FAR_MM))
 
 
 def _survey(

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from cuspid.body import Body, Box
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
@@ -67,6 +68,12 @@ def camera_from_json(value: Mapping[str, Any]) -> Camera:
 
 def handpiece_to_json(handpiece: Handpiece) -> dict[str, Any]:
     """All of a handpiece (docs/formats.md)."""
+    known = {} if handpiece.body is None else {"body": _body_to_json(handpiece.body)}
+    return {**_optics_to_json(handpiece), **known}
+
+
+def _optics_to_json(handpiece: Handpiece) -> dict[str, Any]:
+    """What takes images and gives light, which is all that images depend on."""
     cameras = {
         name: {
             **camera_to_json(mounted.camera),
@@ -86,8 +93,16 @@ def handpiece_to_json(handpiece: Handpiece) -> dict[str, Any]:
     }
 
 
-_FIELDS = {"name", "working_distance_mm", "depth_range_mm", "cameras", "lights", "lightings", "sensor"}
+def _body_to_json(body: Body) -> dict[str, Any]:
+    return {
+        name: {"box_from_rig": rigid_to_json(box.box_from_rig), "size_mm": 2 * box.half_mm}
+        for name, box in body.parts.items()
+    }
+
+
+_FIELDS = {"name", "working_distance_mm", "depth_range_mm", "cameras", "lights", "lightings", "sensor", "body"}
 """Of ``handpiece.json``."""
+_BOX_FIELDS = {"box_from_rig", "size_mm"}
 
 
 def write_handpiece(path: Path, handpiece: Handpiece) -> None:
@@ -134,8 +149,37 @@ def read_handpiece(path: Path, working_distance_mm: float | None = None) -> Hand
             sensor=Sensor(**value.get("sensor", {})),
             working_distance_mm=float(value["working_distance_mm"]),
             depth_range_mm=(float(near), float(far)),
+            body=None if value.get("body") is None else _body_from_json(path, value["body"]),
             name=str(value.get("name", path.stem)),
         )
+
+
+def _body_from_json(path: Path, value: Any) -> Body:
+    if not (isinstance(value, dict) and value):
+        raise InputError(f"{path}: body must be boxes by name, one at least; leave it out where it is not known")
+    return Body({name: _box_from_json(f"{path}: body, {name}", box) for name, box in value.items()})
+
+
+def _box_from_json(where: str, value: Any) -> Box:
+    if not (isinstance(value, dict) and set(value) == _BOX_FIELDS):
+        raise InputError(f"{where}: a box has the fields {' and '.join(sorted(_BOX_FIELDS))}, no more and no less")
+    pose = value["box_from_rig"]
+    if not (isinstance(pose, dict) and set(pose) == {"rotation_wxyz", "translation_mm"}):
+        raise InputError(f"{where}: box_from_rig has the fields rotation_wxyz and translation_mm")
+    rotation, translation, size = pose["rotation_wxyz"], pose["translation_mm"], value["size_mm"]
+    if not (_are_numbers(rotation, 4) and any(rotation)):
+        raise InputError(f"{where}: rotation_wxyz is {rotation}; it must be four numbers that are not all 0")
+    if not _are_numbers(translation, 3):
+        raise InputError(f"{where}: translation_mm is {translation}; it must be three numbers")
+    if not (_are_numbers(size, 3) and min(size) > 0):
+        raise InputError(f"{where}: size_mm is {size}; it must be three positive lengths")
+    return Box(rigid_from_json(pose), np.array(size, dtype=np.float64) / 2)
+
+
+def _are_numbers(value: Any, count: int) -> bool:
+    """Whether it is a list of so many finite numbers."""
+    numbers = isinstance(value, list) and all(type(each) in (int, float) for each in value)
+    return numbers and len(value) == count and bool(np.isfinite(value).all())
 
 
 def _of_rig(path: Path, rig: Rig, working_distance_mm: float | None) -> Handpiece:
@@ -162,8 +206,8 @@ def _guessed_mm(path: Path, rig: Rig) -> float:
 
 
 def hash_handpiece(handpiece: Handpiece) -> str:
-    """SHA-256 of all of a handpiece."""
-    return digest_of(handpiece_to_json(handpiece))
+    """SHA-256 of all of a handpiece that a reconstruction depends on: not of its body."""
+    return digest_of(_optics_to_json(handpiece))
 
 
 def write_rig_config(path: Path, rig: Rig) -> None:

@@ -37,9 +37,9 @@ from cuspid.pairing import PairingOptions
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
+from cuspid.room import Room, check_clearance
 from cuspid.simulation.appearance import Preset
 from cuspid.simulation.path.overlap import image_overlap
-from cuspid.simulation.path.room import Room, check_clearance
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path, steady_poses
 from cuspid.stereo.matching import StereoOptions
 from cuspid.stereo.temporal import TemporalOptions

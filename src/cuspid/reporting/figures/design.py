@@ -1,4 +1,4 @@
-"""Drawings of a handpiece: its cameras with their views, its lights, the tooth below and the outline of the holder.
+"""Drawings of a handpiece: its cameras with their views, lights and body, the tooth below, the outline of the holder.
 
 All in the rig frame (mm): +X along the arch, +Y to the cheek, +Z out of the gum. The views are orthographic.
 """
@@ -13,7 +13,9 @@ from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.lines import Line2D
+from scipy.spatial import ConvexHull
 
+from cuspid.body import Body
 from cuspid.mesh import Mesh
 from cuspid.reporting.figures.drawing import look, new_figure, render, save_figure
 from cuspid.rig import Handpiece, MountedCamera
@@ -24,6 +26,7 @@ _OTHER = "#3fa66b"
 _LIGHT = "#f2c14e"
 _INK = "#333333"
 _HOLDER = "#9aa5ad"
+_BODY = "#5f6f7a"
 _BODY_MM = 0.55
 """Half the side of the square that stands for a camera."""
 _END_MM = 1.5
@@ -75,6 +78,8 @@ def _draw_view(
         _draw_mesh(panel, axes, mesh)
     if outline is not None:
         _draw_holder(panel, axes, handpiece, outline)
+    if handpiece.body is not None:
+        _draw_body(panel, axes, handpiece.body)
     for name, mounted in handpiece.rig.cameras.items():
         _draw_camera(panel, axes, mounted, handpiece.working_distance_mm, _colour(name))
     if handpiece.lights:
@@ -114,6 +119,13 @@ def _draw_holder(
     corners = [np.array([a, b])[:, :2] for a, b, turns in zip(*ends, _turns(outline), strict=True) if turns]
     edges = [np.concatenate([end, end[:1]])[:, :2] for end in ends] + corners
     panel.add_collection(LineCollection(edges, colors=_HOLDER, linewidths=0.8, zorder=1))
+
+
+def _draw_body(panel: Axes, axes: Float[np.ndarray, "3 3"], body: Body) -> None:
+    """The silhouette of each box."""
+    seen = [box.corners @ axes[:2].T for box in body.parts.values()]
+    shapes = [corners[ConvexHull(corners).vertices] for corners in seen]
+    panel.add_collection(PolyCollection(shapes, facecolors="none", edgecolors=_BODY, linewidths=0.8, zorder=2))
 
 
 def _turns(outline: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
@@ -161,6 +173,8 @@ def _legend(handpiece: Handpiece) -> list[Line2D]:
         for letter in present
     ]
     marks += [Line2D([], [], color=_INK, linewidth=0.7, label="their views up to the working distance")]
+    if handpiece.body is not None:
+        marks.append(Line2D([], [], color=_BODY, linewidth=0.8, label="body"))
     if handpiece.lights:
         marks.append(Line2D([], [], marker="o", color="none", markerfacecolor=_LIGHT, label="LED"))
     return marks

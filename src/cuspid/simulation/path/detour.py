@@ -21,8 +21,8 @@ from scipy.ndimage import binary_dilation, gaussian_filter1d, label, maximum_fil
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.rig import Handpiece
+from cuspid.room import Room
 from cuspid.simulation.path.coverage import CrownPoints
-from cuspid.simulation.path.room import Room
 
 PoseAt = Callable[[float], Rigid3]
 """``rig_from_world`` at a travel."""

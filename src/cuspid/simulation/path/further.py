@@ -15,10 +15,10 @@ from jaxtyping import Bool, Float
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
+from cuspid.room import Room
 from cuspid.simulation.path.coverage import CrownPoints
 from cuspid.simulation.path.detour import up
 from cuspid.simulation.path.legs import Leg, SteadyPath, steady_path
-from cuspid.simulation.path.room import Room
 
 _ROLLS_DEG = (-60.0, -45.0, -30.0, 30.0, 45.0, 60.0)
 _STATION_MM = 1.5

@@ -24,6 +24,7 @@ from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
+from cuspid.room import check_clearance, room_for
 from cuspid.simulation.path.arch import ArchCurve, arch_curve
 from cuspid.simulation.path.coverage import CrownPoints, crown_points
 from cuspid.simulation.path.detour import Detour, PoseAt, lifted, plan_detour
@@ -31,7 +32,6 @@ from cuspid.simulation.path.further import further_legs, seen_from
 from cuspid.simulation.path.hand import HandMotion, hand_motion
 from cuspid.simulation.path.legs import Leg, SteadyPath, steady_path, there_and_back
 from cuspid.simulation.path.overlap import frame_overlap, image_overlap
-from cuspid.simulation.path.room import Room, check_clearance
 
 TOOTH_FRAMES, ARCH_FRAMES = 10, 100
 """Positions of the handpiece in the thesis: 120 images of a tooth and 1200 of an arch with twelve cameras."""
@@ -147,7 +147,7 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
     What a user should know of it goes to the log. Raises InputError where the jaw has no such tooth, the handpiece does
     not fit even when lifted, or the asked number of frames is too small for the overlap.
     """
-    curve, room = arch_curve(jaw), Room(jaw.mesh, handpiece.solid, options.clearance_mm)
+    curve, room = arch_curve(jaw), room_for(jaw.mesh, handpiece, options.clearance_mm)
     crowns = crown_points(jaw, curve, _reach_mm(handpiece))
     steady = first = steady_path(jaw.mesh, curve, _legs(jaw, curve, options))
     if options.passes == "auto":

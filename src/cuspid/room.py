@@ -7,9 +7,10 @@ as scans answer as well as closed models: faces far away subtend little, whether
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import product
 from typing import no_type_check
 
@@ -19,10 +20,13 @@ from jaxtyping import Bool, Float
 from numba import njit
 from scipy.ndimage import map_coordinates
 
-from cuspid.body import Body
+from cuspid.body import CAMERA_MM, LED_MM, Body
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
+from cuspid.rig import Handpiece
+
+_LOG = logging.getLogger("cuspid")
 
 _APART_MM = 0.3
 """Points on the surface lie no farther apart along an edge."""
@@ -31,7 +35,7 @@ _PITCH_MM = 0.15
 _INSIDE_PITCH_MM = 1.0
 """Of the grid of winding numbers; nearer to the surface than this the distance decides."""
 _INSIDE = 0.5
-_FAR_MM = 3.0
+FAR_MM = 3.0
 """Distances are told so far beyond the clearance."""
 
 
@@ -86,7 +90,7 @@ class Room:
         inside = self._inside([rig_from_world])[0]
         if inside.any():
             return -np.inf, self.body.names[int(np.argmax(inside))]
-        reach = self.clearance_mm + _FAR_MM
+        reach = self.clearance_mm + FAR_MM
         low, high = self._corners[0] - reach, self._corners[-1] + reach
         distances, parts = self.body.distances(self._within(rig_from_world, low, high))
         if len(distances) == 0:
@@ -100,9 +104,9 @@ class Room:
         """Points of the surface in a box of the rig frame."""
         return np.asarray(_in_box(self._points, rig_from_world.rotation, rig_from_world.translation, low, high))
 
-    @cached_property
+    @property
     def _points(self) -> Float[np.ndarray, "n 3"]:
-        return surface_points(self.mesh, _APART_MM)
+        return _points_of(self.mesh)
 
     @cached_property
     def _corners(self) -> Float[np.ndarray, "8 3"]:
@@ -117,14 +121,10 @@ class Room:
         places = _Grid.places(low, high, _PITCH_MM)
         return _Grid(self.body.distances(places.reshape(-1, 3))[0].reshape(places.shape[:3]), low, _PITCH_MM)
 
-    @cached_property
+    @property
     def _winding(self) -> _Grid:
         """Winding number of the jaw, in the world."""
-        low, high = self.mesh.bounds + [[-_FAR_MM], [_FAR_MM]]
-        places = _Grid.places(low, high, _INSIDE_PITCH_MM)
-        vertices, faces = (np.ascontiguousarray(each) for each in (self.mesh.vertices, self.mesh.faces))
-        numbers = igl.fast_winding_number(vertices, faces, np.ascontiguousarray(places.reshape(-1, 3)))
-        return _Grid(np.asarray(numbers).reshape(places.shape[:3]), low, _INSIDE_PITCH_MM)
+        return _winding_of(self.mesh)
 
     def _inside(self, rig_from_world: Sequence[Rigid3]) -> Bool[np.ndarray, "n p"]:
         """At each pose, which parts have their middle inside the jaw."""
@@ -138,6 +138,21 @@ class Room:
         return np.array([box.box_from_rig.inverse().translation for box in self.body.parts.values()])
 
 
+# A search for a handpiece asks many bodies about few meshes.
+@lru_cache(maxsize=8)
+def _points_of(mesh: Mesh) -> Float[np.ndarray, "n 3"]:
+    return surface_points(mesh, _APART_MM)
+
+
+@lru_cache(maxsize=8)
+def _winding_of(mesh: Mesh) -> _Grid:
+    low, high = mesh.bounds + [[-FAR_MM], [FAR_MM]]
+    places = _Grid.places(low, high, _INSIDE_PITCH_MM)
+    vertices, faces = (np.ascontiguousarray(each) for each in (mesh.vertices, mesh.faces))
+    numbers = igl.fast_winding_number(vertices, faces, np.ascontiguousarray(places.reshape(-1, 3)))
+    return _Grid(np.asarray(numbers).reshape(places.shape[:3]), low, _INSIDE_PITCH_MM)
+
+
 def surface_points(mesh: Mesh, apart_mm: float) -> Float[np.ndarray, "n 3"]:
     """The vertices of a mesh, and on faces with longer edges a lattice of points no farther apart than asked."""
     corners = mesh.vertices[mesh.faces]
@@ -149,6 +164,17 @@ def surface_points(mesh: Mesh, apart_mm: float) -> Float[np.ndarray, "n 3"]:
         weights = np.stack([i, j, count - i - j], axis=1) / count
         points.append(np.einsum("kc,fcd->fkd", weights, corners[steps == count]).reshape(-1, 3))
     return np.concatenate(points)
+
+
+def room_for(mesh: Mesh, handpiece: Handpiece, clearance_mm: float) -> Room:
+    """The room for a handpiece. Where its body is not known, what is assumed goes to the log."""
+    if handpiece.body is None:
+        camera, led = (" x ".join(f"{side:.1f}" for side in size) for size in (CAMERA_MM, LED_MM))
+        _LOG.info(
+            f"{handpiece.name}: its body is not known; a box of {camera} mm is assumed behind each lens and one of "
+            f"{led} mm behind each LED; a body in its handpiece.json sets others (docs/formats.md)"
+        )
+    return Room(mesh, handpiece.solid, clearance_mm)
 
 
 def check_clearance(room: Room, poses: Mapping[str, Rigid3]) -> None:
