@@ -42,7 +42,7 @@ def run(
     """Scan a jaw in simulation, reconstruct it, and measure the trueness.
 
     Args:
-        jaw: Mesh of a jaw (STL, PLY, OBJ); without it the built-in phantom.
+        jaw: Mesh of a jaw or of a part of one (STL, PLY, OBJ); without it the built-in phantom.
         out: Folder for everything that is made. A killed run goes on when the same command is given again.
         evaluation: How the trueness is measured.
     """
@@ -62,7 +62,7 @@ def simulate(
     """Render what the handpiece sees: OUT/capture (images, calibration) and OUT/truth (what only the simulator knows).
 
     Args:
-        jaw: Mesh of a jaw (STL, PLY, OBJ); without it the built-in phantom.
+        jaw: Mesh of a jaw or of a part of one (STL, PLY, OBJ); without it the built-in phantom.
         out: Folder.
     """
     _simulate(jaw, out, source, probe, simulation)

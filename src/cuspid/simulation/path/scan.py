@@ -58,7 +58,7 @@ class ScanPathOptions:
     """How the jaw is scanned."""
 
     tooth: int | None = None
-    """FDI number of the one tooth to scan; None for the whole arch."""
+    """FDI number of the one tooth to scan; None for the whole arch, or what the mesh has of one."""
     frames: int | None = None
     """Positions of the handpiece; None for 10 over a tooth, 100 over an arch and one per millimetre over a part of one,
     or more where the overlap needs it."""
@@ -83,7 +83,8 @@ class ScanPathOptions:
     """How far the handpiece is rolled to either side in the first and the last pass."""
 
     passes: Literal["turns", "auto"] = "turns"
-    """turns: those that --turns says; auto: also others, rolled differently, over what two cameras did not see."""
+    """turns: those that --turns says; auto: also others, rolled differently, over what two cameras did not see;
+    a note tells how many frames they take."""
 
     def __post_init__(self) -> None:
         if self.turns < 1 or self.turns % 2 == 0:
