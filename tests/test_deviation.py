@@ -64,21 +64,21 @@ def test_signed_distance_to_a_box_is_the_analytic_one(seed: int):
     points = np.random.default_rng(seed).uniform(-6, 6, (50, 3))
     beyond = np.abs(points) - [2.0, 3.0, 4.0]
     expected = np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
-    feet = surface.feet(points)
-    np.testing.assert_allclose(feet.signed_mm, expected, atol=1e-12)
-    assert not feet.on_border.any()
+    closest = surface.closest_points(points)
+    np.testing.assert_allclose(closest.signed_mm, expected, atol=1e-12)
+    assert not closest.on_border.any()
     step = 1e-6
-    grown = surface.feet(points + step * feet.directions).signed_mm - feet.signed_mm
+    grown = surface.closest_points(points + step * closest.directions).signed_mm - closest.signed_mm
     np.testing.assert_allclose(grown[np.abs(expected) > 0.01], step, rtol=1e-3)
 
 
 def test_what_lies_past_a_border_is_told_from_what_lies_over_it():
     square = Surface(Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])))
     points = np.array([[0.5, 0.5, 0.3], [0.5, 0.5, -0.3], [1.2, 0.5, 0.1], [1.1, 0.5, 0.2], [1.2, 1.2, 0.0]])
-    feet = square.feet(points)
-    np.testing.assert_allclose(feet.signed_mm[:2], [0.3, -0.3])
-    assert feet.on_border.tolist() == [False, False, True, True, True]
-    assert feet.past_border.tolist() == [False, False, True, False, True]
+    closest = square.closest_points(points)
+    np.testing.assert_allclose(closest.signed_mm[:2], [0.3, -0.3])
+    assert closest.on_border.tolist() == [False, False, True, True, True]
+    assert closest.past_border.tolist() == [False, False, True, False, True]
 
 
 # Statistics

@@ -254,7 +254,7 @@ def test_a_best_fit_hides_a_bent_arch_that_the_spacing_shows(coarse_arch: Jaw) -
     points, _ = scan.sample(20_000, np.random.default_rng(0))
     surface = Surface(coarse_arch.mesh)
     best = fit(points, surface, Rigid3.identity(), RegistrationOptions())
-    deviation_um = 1000 * surface.feet(best.reference_from_scan.apply(points)).signed_mm
+    deviation_um = 1000 * surface.closest_points(best.reference_from_scan.apply(points)).signed_mm
     assert 0 < np.mean(np.abs(deviation_um)) < truth_um / 4
     assert abs(np.mean(deviation_um)) < truth_um / 10
 

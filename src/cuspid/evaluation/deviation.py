@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float, Int
 
 from cuspid.errors import InputError
 from cuspid.evaluation.crown import OpenCrown, crown_completeness, openness, within_pct
-from cuspid.evaluation.distance import Feet, Surface
+from cuspid.evaluation.distance import ClosestPoints, Surface
 from cuspid.evaluation.registration import Alignment, RegistrationOptions, best_scale, register
 from cuspid.evaluation.teeth import CANINES, LEAST_SAMPLES, MOLARS, distance_error_um, drift_um, find_teeth
 from cuspid.geometry import Rigid3
@@ -72,19 +72,19 @@ class _Rules:
     note: str
     """How the faces were chosen."""
 
-    def unscannable(self, feet: Feet) -> Bool[np.ndarray, "n"]:
+    def unscannable(self, closest: ClosestPoints) -> Bool[np.ndarray, "n"]:
         """Points that rule (a) leaves out."""
-        return ~self.faces[feet.faces] & (np.abs(feet.signed_mm) <= self.margin_mm)
+        return ~self.faces[closest.faces] & (np.abs(closest.signed_mm) <= self.margin_mm)
 
-    def past_border(self, feet: Feet) -> Bool[np.ndarray, "n"]:
+    def past_border(self, closest: ClosestPoints) -> Bool[np.ndarray, "n"]:
         """Points that rule (b) leaves out."""
         if not self.reference_is_all:
-            return feet.on_border
-        return feet.past_border & (np.abs(feet.signed_mm) <= self.margin_mm)
+            return closest.on_border
+        return closest.past_border & (np.abs(closest.signed_mm) <= self.margin_mm)
 
-    def counts(self, feet: Feet) -> Bool[np.ndarray, "n"]:
+    def counts(self, closest: ClosestPoints) -> Bool[np.ndarray, "n"]:
         """Points that count."""
-        return ~(self.unscannable(feet) | self.past_border(feet))
+        return ~(self.unscannable(closest) | self.past_border(closest))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -136,7 +136,7 @@ def evaluate(
         if within["200"] >= _LEAST_TOOTH_PCT
     }
     teeth = find_teeth(from_scan.points, from_scan.labels, centroids, surface, options.registration)
-    vertex_feet = surface.feet(aligned.vertices)
+    at_vertices = surface.closest_points(aligned.vertices)
     return Trueness(
         accuracy=statistics(from_scan.signed_mm),
         everything=everything,
@@ -155,7 +155,7 @@ def evaluate(
         inter_canine_error_um=distance_error_um(teeth, CANINES),
         drift_um=drift_um(teeth, surface),
         reference_from_scan=alignment.reference_from_scan,
-        deviation_um=np.where(rules.counts(vertex_feet), 1000 * vertex_feet.signed_mm, np.nan),
+        deviation_um=np.where(rules.counts(at_vertices), 1000 * at_vertices.signed_mm, np.nan),
         notes=(*alignment.notes, rules.note, from_scan.left_out, from_reference.left_out),
     )
 
@@ -222,19 +222,19 @@ def _samples_of_scan(
 ) -> tuple[_Samples, DeviationStatistics]:
     """The samples, and the statistics of everything that was scanned."""
     points, _ = aligned.sample(options.samples, rng)
-    feet = surface.feet(points)
-    counts = rules.counts(feet)
-    past_border = rules.past_border(feet)
-    over, past = 100 * rules.unscannable(feet).mean(), 100 * past_border.mean()
+    closest = surface.closest_points(points)
+    counts = rules.counts(closest)
+    past_border = rules.past_border(closest)
+    over, past = 100 * rules.unscannable(closest).mean(), 100 * past_border.mean()
     limit = f" by at most {rules.margin_mm:g} mm" if rules.reference_is_all else ""
     samples = _Samples(
         points=points[counts],
-        signed_mm=feet.signed_mm[counts],
-        labels=labels[feet.faces[counts]],
+        signed_mm=closest.signed_mm[counts],
+        labels=labels[closest.faces[counts]],
         left_out=f"of the scan does not count: {over:.1f} % within {rules.margin_mm:g} mm of reference surface that "
         f"does not count, {past:.1f} % past an open border of the reference{limit}",
     )
-    return samples, statistics(feet.signed_mm[~past_border])
+    return samples, statistics(closest.signed_mm[~past_border])
 
 
 def _samples_of_reference(

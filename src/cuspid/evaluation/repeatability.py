@@ -105,8 +105,8 @@ def _signed(
     scan: Mesh, surface: Surface, options: PairOptions, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
     """Signed distances of points of a scan from a surface, and which of them count."""
-    feet = surface.feet(scan.sample(options.samples, rng)[0])
-    return feet.signed_mm, ~feet.on_border & (np.abs(feet.signed_mm) <= options.farthest_mm)
+    closest = surface.closest_points(scan.sample(options.samples, rng)[0])
+    return closest.signed_mm, ~closest.on_border & (np.abs(closest.signed_mm) <= options.farthest_mm)
 
 
 def spread(

@@ -80,6 +80,6 @@ def drift_um(teeth: Mapping[int, ScannedTooth], surface: Surface) -> dict[int, f
         return {}
     anchor = next(iter(teeth.values())).reference_from_scan
     return {
-        fdi: float(1000 * np.abs(surface.feet(anchor.apply(tooth.points)).signed_mm).mean())
+        fdi: float(1000 * np.abs(surface.closest_points(anchor.apply(tooth.points)).signed_mm).mean())
         for fdi, tooth in teeth.items()
     }
