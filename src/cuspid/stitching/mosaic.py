@@ -212,7 +212,7 @@ def glance(
     dark = (largest < DARK).astype(np.float32)
     cost = options.seams.cost(tangent2, border - options.border_px, np.maximum(glare, dark))
     seen = (border >= options.border_px) & (in_cam[..., 2] > 0)
-    seen &= surface.known_at(world[..., :2]) & ~surface.hides(world, view.cam_from_world.inverse().translation)
+    seen &= surface.known_at(world[..., :2]) & ~surface.occludes(world, view.cam_from_world.inverse().translation)
     cost = np.where(seen, cost, np.inf)
     bright = (largest < BURNT) & (largest > DARK) & (glare < 0.02)
     # Lights at the camera: 1 / d^2, and a lobe about the optical axis.
@@ -425,8 +425,8 @@ def _put(
     burnt = cv2.dilate((brightest(rectified) >= BURNT).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     # A burnt-out pixel counts only where no other frame was to be had.
     world = positions(canvas, view, surface, CELL_PX)
-    hidden = surface.hides(world, view.cam_from_world.inverse().translation).astype(np.uint8)
-    in_view = cv2.resize(hidden, (view.width, view.height), interpolation=cv2.INTER_NEAREST) == 0
+    occluded = surface.occludes(world, view.cam_from_world.inverse().translation).astype(np.uint8)
+    in_view = cv2.resize(occluded, (view.width, view.height), interpolation=cv2.INTER_NEAREST) == 0
     valid = (inside & ((in_view & ~burnt) | chosen)).astype(np.float32)
     valid[burnt & chosen] = 0.05
     in_cam = view.cam_from_world.apply(world)
