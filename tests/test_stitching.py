@@ -216,7 +216,7 @@ def test_frames_that_have_nothing_in_common_are_named(tmp_path: Path) -> None:
 
 
 def test_two_films_are_stitched_as_two_parts(sequence: ImageSequence, tmp_path: Path) -> None:
-    """The two ends of the film, mirrored and turned for the second: nothing ties them together."""
+    """The two ends of the film, mirrored and turned for the second: no verified pair joins them."""
     first = [sequence.image(index) for index in range(5)]
     second = [np.ascontiguousarray(sequence.image(index)[::-1]) for index in range(7, 12)]
     both = replace(images_in(tmp_path, first + second), camera=sequence.camera)
