@@ -338,7 +338,7 @@ def test_the_page_of_a_sweep(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("column", "told"),
+    ("column", "label"),
     [
         ("baseline_mm", "baseline, mm"),
         ("complete_50_um_pct", "complete 50 µm, %"),
@@ -346,8 +346,8 @@ def test_the_page_of_a_sweep(tmp_path):
         ("tooth_p95_um", "tooth P95, µm"),
     ],
 )
-def test_headings(column, told):
-    assert heading(column) == told
+def test_headings(column, label):
+    assert heading(column) == label
 
 
 # --- the files behind them --------------------------------------------------------------------------------------------

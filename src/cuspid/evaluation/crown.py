@@ -145,8 +145,8 @@ def _note(crown: OpenCrown, could_be_seen: bool, counting: list[int]) -> str:
     """What counts, for people."""
     where = "could be seen by two cameras" if could_be_seen else "lies within 200 µm of the scan"
     named = f"{len(counting)} pieces" if crown.estimated else ", ".join(map(str, counting))
-    told = "; crowns were told from gum by shape, an estimate" if crown.estimated else ""
+    estimated = "; crowns were told from gum by shape, an estimate" if crown.estimated else ""
     return (
         f"of the open crown surface counts, over all: {named}; of each of them at least three quarters as much {where} "
-        f"as of the best one{told}"
+        f"as of the best one{estimated}"
     )

@@ -48,7 +48,7 @@ _MOST = 2
 _COARSE = 12
 """Rays along each side of an image that tell how fast it changes."""
 _LOW_SHARE = 0.9
-"""Teeth of which less can be seen are told of."""
+"""Teeth of which less can be seen get a note."""
 
 _LOG = logging.getLogger("cuspid")
 
@@ -170,7 +170,7 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
             "it; use a narrower one, a larger depth of field or a smaller --clearance-mm"
         )
     path = replace(path, seen=_seen(crowns, handpiece, path, options.tooth))
-    for note in (*_told_detour(jaw, steady, detour), *_told_passes(steady, first, path), *_told_unseen(path)):
+    for note in (*_detour_notes(jaw, steady, detour), *_further_pass_notes(steady, first, path), *_unseen_notes(path)):
         _LOG.info(note)
     return path
 
@@ -285,7 +285,7 @@ def _even_path(mesh: Mesh, handpiece: Handpiece, steady: SteadyPath, pose_at: Po
 # --- what a user should know ------------------------------------------------------------------------------------------
 
 
-def _told_detour(jaw: Jaw, steady: SteadyPath, detour: Detour) -> tuple[str, ...]:
+def _detour_notes(jaw: Jaw, steady: SteadyPath, detour: Detour) -> tuple[str, ...]:
     """Where the handpiece leaves the way of a steady hand."""
     changed = np.any(detour.changes != 0, axis=1)
     if not changed.any():
@@ -306,7 +306,7 @@ def _near_teeth(jaw: Jaw, places: Float[np.ndarray, "n 3"]) -> str:
     return " (near " + ", ".join(str(jaw.teeth[index]) for index in np.unique(nearest)) + ")"
 
 
-def _told_passes(steady: SteadyPath, first: SteadyPath, path: ScanPath) -> tuple[str, ...]:
+def _further_pass_notes(steady: SteadyPath, first: SteadyPath, path: ScanPath) -> tuple[str, ...]:
     """What further passes cost."""
     rolls = {leg.roll_deg for leg in first.legs}
     further = [leg for leg in steady.legs if leg.roll_deg not in rolls]
@@ -318,7 +318,7 @@ def _told_passes(steady: SteadyPath, first: SteadyPath, path: ScanPath) -> tuple
     return (f"scan path: further passes, rolled to the cheek by {what}, take about {more} of {frames} frames",)
 
 
-def _told_unseen(path: ScanPath) -> tuple[str, ...]:
+def _unseen_notes(path: ScanPath) -> tuple[str, ...]:
     """Teeth of which two cameras see little."""
     low = [f"{tooth} {100 * share:.0f} %" for tooth, share in path.seen.items() if share < _LOW_SHARE and tooth != GUM]
     if not low:
