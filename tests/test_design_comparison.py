@@ -203,7 +203,7 @@ def files(coarse_phantom, tmp_path_factory):
     return folder
 
 
-def test_a_scan_is_simulated_reconstructed_and_judged(files, tmp_path):
+def test_a_scan_is_simulated_reconstructed_and_evaluated(files, tmp_path):
     options = ComparisonOptions(designs=(str(files / "tiny.json"),), jaws=(str(files / "jaw.ply"),), samples=5000)
     trial = TrialOptions(
         simulation=SimulationOptions(supersampling=1, path=ScanPathOptions(frames=5, length_mm=4.0)),

@@ -199,7 +199,7 @@ def test_drift_grows_along_the_arch_from_the_first_tooth():
     assert found.drift_um[37] > 3 * found.drift_um[45]
 
 
-# What counts
+# What is evaluated
 
 
 @cache
@@ -210,10 +210,10 @@ def crown_side() -> np.ndarray:
 def test_what_could_not_be_seen_is_not_missed():
     mesh = jaw().mesh
     scan = mesh.submesh(crown_side())
-    judged = trueness(scan, scannable=crown_side())
-    assert judged.completeness_pct["50"] > 99.5
-    assert judged.scannable_pct == pytest.approx(100 * mesh.face_areas[crown_side()].sum() / mesh.face_areas.sum())
-    assert trueness(scan).completeness_pct["50"] == pytest.approx(judged.scannable_pct, abs=3)
+    evaluated = trueness(scan, scannable=crown_side())
+    assert evaluated.completeness_pct["50"] > 99.5
+    assert evaluated.scannable_pct == pytest.approx(100 * mesh.face_areas[crown_side()].sum() / mesh.face_areas.sum())
+    assert trueness(scan).completeness_pct["50"] == pytest.approx(evaluated.scannable_pct, abs=3)
 
 
 def test_errors_over_unseen_surface_are_left_out_only_near_it():
@@ -348,5 +348,5 @@ def test_in_everything_counts_also_what_was_scanned_where_nothing_could_be_seen(
 def test_a_mask_of_another_reference_is_refused():
     with pytest.raises(InputError, match=r"has 3 faces, the reference \d+; give the reference"):
         trueness(jaw().mesh, scannable=np.ones(3, dtype=bool))
-    with pytest.raises(InputError, match="no face of the reference counts"):
+    with pytest.raises(InputError, match="no face of the reference is left to evaluate"):
         trueness(jaw().mesh, scannable=np.zeros(len(jaw().mesh.faces), dtype=bool))

@@ -178,7 +178,7 @@ def test_a_path_with_further_passes_overlaps_and_fits(coarse_phantom: Jaw) -> No
     assert path.seen[31] >= alone.seen[31] - 0.01
 
 
-def test_frames_are_judged_by_all_their_cameras() -> None:
+def test_frames_are_evaluated_by_all_their_cameras() -> None:
     overlap = np.array([[0.8, 0.6], [np.nan, 0.9], [np.nan, np.nan]])
     np.testing.assert_allclose(frame_overlap(overlap), [0.7, 0.9, 1.0])
 

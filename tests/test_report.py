@@ -177,7 +177,7 @@ def test_the_page_of_a_scan(scan_folder):
     assert "&lt;script&gt;notes are text" in page
     assert "frame 00002: too few points" in page
     assert page.count("<td>91.5</td>") == 2
-    assert "what counts of the open crown" in page
+    assert "what is evaluated of the open crown" in page
     assert '<th scope="row">everything</th>' in page
     for known in ("reconstruct: images", "b" * 64, "evaluation.samples", "simulate: simulation.seed"):
         assert known in page

@@ -1,4 +1,4 @@
-"""Judge a panorama."""
+"""Evaluate a panorama."""
 
 from __future__ import annotations
 

@@ -181,11 +181,11 @@ def _evaluate_margins(scan: Mesh, reference: Jaw, trueness: Trueness, out: Path)
 
 def _print_margins(errors: Mapping[int, MarginError]) -> None:
     table = Table(title="Margins in µm: distance of the scan's edge from the true line", title_justify="left")
-    for column in ("tooth", "judged, %", "found, %", "mean", "SD", "P95", "max", "outward", "floor"):
+    for column in ("tooth", "evaluated, %", "found, %", "mean", "SD", "P95", "max", "outward", "floor"):
         table.add_column(column, justify="right")
     for fdi, error in sorted(errors.items()):
         found = error.scan
-        shares = (error.judged_pct, found.found_pct)
+        shares = (error.evaluated_pct, found.found_pct)
         figures = (found.mean_um, found.std_um, found.p95_um, found.max_um, found.outward_um, error.floor.mean_um)
         table.add_row(str(fdi), *(f"{figure:.1f}" for figure in (*shares, *figures)))
     Console().print(table)

@@ -1,6 +1,6 @@
 """How far a panorama is from the arch that it shows (thesis 4.3, with more than one number).
 
-A panorama that knows which frame each of its pixels came from is judged by geometry: the pixel's ray, from where the
+A panorama that knows which frame each of its pixels came from is evaluated by geometry: the pixel's ray, from where the
 frame truly was, meets the true jaw in a point, and the panorama places that point somewhere in the occlusal plane. The
 best similarity (least squares, Umeyama 1991) of all tooth pixels is taken away; what remains is the geometric error.
 The same similarity lays the panorama over the single shot of the true jaw (:class:`cuspid.trueness.OcclusalView`),
@@ -47,7 +47,7 @@ _FEATURES = 6000
 
 @dataclass(frozen=True, kw_only=True)
 class PanoramaEvaluationOptions:
-    """How a panorama is judged, and when it counts as failed."""
+    """How a panorama is evaluated, and when it is taken for failed."""
 
     samples: int = 200_000
     """Pixels of the panorama that are followed to the true jaw, at most, evenly spread."""
@@ -110,7 +110,7 @@ class PanoramaScore:
     method: str
     """How it was made."""
     failure: str | None
-    """Why it counts as failed: such a panorama has no scores. None where it does not."""
+    """Why it is taken for failed: such a panorama has no scores. None where it does not."""
     aligned_by: Literal["geometry", "pictures"] | None
     """What laid it over the single shot."""
     geometry: GeometricError | None
@@ -291,7 +291,7 @@ def image_scores(
     truth: Float[np.ndarray, "h w"],
     teeth: Bool[np.ndarray, "h w"],
 ) -> ImageScores:
-    """Compare a grey picture (0 to 1) with the truth; what is not ``shown`` counts as black."""
+    """Compare a grey picture (0 to 1) with the truth; what is not ``shown`` is taken for black."""
     black = np.where(shown, picture, 0.0)
     raw = _ssim_map(black, truth)
     on_teeth = _ssim_map(np.where(shown, _fitted(picture, truth, shown & teeth), 0.0), truth)
@@ -550,7 +550,7 @@ class _Comparison:
             picture=None,
             shot=None,
             trivial=trivial_scores(self.view),
-            notes=("the jaw has no tooth labels: its whole surface counts as teeth",) if unlabelled else (),
+            notes=("the jaw has no tooth labels: its whole surface is taken for teeth",) if unlabelled else (),
         )
 
 

@@ -85,7 +85,7 @@ class Spread:
 def compare_pair(first: Mesh, second: Mesh, options: PairOptions, *, rng: np.random.Generator) -> PairDeviation:
     """Distances between two scans that lie nearly on each other.
 
-    What lies past the border of the other scan, or far from it, does not count. Raises InputError where they have no
+    What lies past the border of the other scan, or far from it, is not evaluated. Raises InputError where they have no
     surface in common.
     """
     surface = Surface(first)

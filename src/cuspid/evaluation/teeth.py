@@ -52,7 +52,7 @@ def find_teeth(
 ) -> dict[int, ScannedTooth]:
     """Teeth with enough samples in an aligned scan, in the order along the arch.
 
-    ``labels`` are the FDI numbers of the samples; ``centroids`` those of the teeth that may be judged.
+    ``labels`` are the FDI numbers of the samples; ``centroids`` those of the teeth that may be evaluated.
     """
     teeth = {}
     for fdi in (tooth for tooth in _ARCH_ORDER if tooth in centroids):

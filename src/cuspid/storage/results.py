@@ -53,7 +53,7 @@ class ScanResult(_Result):
     scan: Mesh | None
     """The surface in its own frame."""
     deviation_um: Float[np.ndarray, "v"] | None
-    """Signed deviation of each of its vertices, NaN where it does not count; None before it was evaluated."""
+    """Signed deviation of each of its vertices, NaN where it is not evaluated; None before it was evaluated."""
     trueness: Mapping[str, Any] | None
     """``trueness.json``."""
     reference_from_scan: Rigid3 | None

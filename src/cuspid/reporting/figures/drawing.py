@@ -250,7 +250,7 @@ def _draw_histogram(figure: Figure, mesh: Mesh, deviation_um: Float[np.ndarray, 
     bar.ax.xaxis.set_major_formatter(lambda um, _: f"{um:+g}" if um else "0")
     bar.outline.set_visible(False)
     bar.set_label(
-        "deviation from the reference / µm (positive: outside)\ngrey: not counted, or seen from behind",
+        "deviation from the reference / µm (positive: outside)\ngrey: not evaluated, or seen from behind",
         fontsize=12,
         color=_INK,
     )

@@ -164,11 +164,11 @@ def _size(name: str, full: int, shown: int, off_um: float) -> dict[str, Any]:
 
 
 def _teeth(result: ScanResult) -> list[Place]:
-    """The teeth that were judged."""
-    jaw, judged = result.reference, {} if result.trueness is None else result.trueness["per_tooth"]
+    """The teeth that were evaluated."""
+    jaw, evaluated = result.reference, {} if result.trueness is None else result.trueness["per_tooth"]
     if jaw is None:
         return []
-    return [_tooth_place(jaw, fdi) for fdi in jaw.teeth if str(fdi) in judged]
+    return [_tooth_place(jaw, fdi) for fdi in jaw.teeth if str(fdi) in evaluated]
 
 
 def _tooth_place(jaw: Jaw, fdi: int) -> Place:
