@@ -40,7 +40,7 @@ STEP_MM = 0.2
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Known:
-    """A film of two frames from high above, its single shots, and the panorama without any error."""
+    """A film of two frames from high above, its reference renders, and the panorama without any error."""
 
     truth: GroundTruth
     view: OcclusalView
@@ -62,7 +62,7 @@ def known(coarse_phantom: Jaw) -> Known:
 
 
 def perfect(truth: GroundTruth, view: OcclusalView) -> Panorama:
-    """The single shot itself, whose pixels came from the frame that is left or right of the middle."""
+    """The reference render itself, whose pixels came from the frame that is left or right of the middle."""
     covered = view.labels >= 0
     points = view.points_at(covered)
     mounted = truth.handpiece.rig["camera"]
@@ -312,7 +312,7 @@ def write_truth(known: Known, folder: Path) -> Path:
     return folder / "truth"
 
 
-def test_single_shots_are_read_as_they_were_written(known: Known, tmp_path: Path) -> None:
+def test_reference_renders_are_read_as_they_were_written(known: Known, tmp_path: Path) -> None:
     truth = write_truth(known, tmp_path)
     for name, view in (("occlusal", known.view), ("shot", known.shot)):
         read = storage.read_occlusal_view(truth / name)

@@ -34,7 +34,8 @@ NOTHING = -1
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class OcclusalView:
-    """A jaw as one shot from above shows it: what a panorama should look like. Columns run along +X, rows along -Y.
+    """A reference render: a jaw as one image from above, as a panorama should show it. Columns run along +X, rows
+    along -Y.
 
     Pixel (u, v), the centre of the first one at (0.5, 0.5), shows x = (u - u0) s, y = (v0 - v) s of the occlusal frame,
     where (u0, v0) is ``origin_px`` and s ``mm_per_px``; a camera at a finite height shows what lies above or below the

@@ -84,12 +84,12 @@ def _save_picture(path: Path, view: OcclusalView, comparison: PanoramaComparison
         places * [1, -1] / view.mm_per_px + view.origin_px,
         comparison.errors_mm,
         title=f"{score.method}: {score.frames_used} of {score.frames} frames" if score.frames else score.method,
-        captions=("single shot of the true jaw", _pictured(score), _measured(score)),
+        captions=("reference render of the true jaw", _pictured(score), _measured(score)),
     )
 
 
 def _save_beside(out: Path, view: OcclusalView, comparison: PanoramaComparison) -> None:
-    """true.png and made.png: the single shot and the panorama laid over it, pixel by pixel."""
+    """true.png and made.png: the reference render and the panorama laid over it, pixel by pixel."""
     storage.write_image(out / "true.png", view.image)
     if comparison.aligned is not None:
         storage.write_image(out / "made.png", np.rint(255 * np.clip(comparison.aligned, 0, 1)).astype(np.uint8))
@@ -112,7 +112,7 @@ def _measured(score: PanoramaScore) -> str:
 
 
 def _print(score: PanoramaScore) -> None:
-    table = Table(title="Likeness to the single shot", title_justify="left")
+    table = Table(title="Likeness to the reference render", title_justify="left")
     heads = ("picture", "ZNCC teeth", "SSIM teeth, fitted", "as it is", "SSIM canvas, fitted", "as it is")
     for head in heads:
         table.add_column(head, justify="left" if head == "picture" else "right")

@@ -3,7 +3,7 @@
 A panorama that knows which frame each of its pixels came from is evaluated by geometry: the pixel's ray, from where the
 frame truly was, meets the true jaw in a point, and the panorama places that point somewhere in the occlusal plane. The
 best similarity (least squares, Umeyama 1991) of all tooth pixels is taken away; what remains is the geometric error.
-The same similarity lays the panorama over the single shot of the true jaw (:class:`cuspid.trueness.OcclusalView`),
+The same similarity lays the panorama over the reference render of the true jaw (:class:`cuspid.trueness.OcclusalView`),
 where the pictures are compared. A panorama without that knowledge is laid over it by image features, and only the
 pictures are compared.
 
@@ -89,7 +89,7 @@ class GeometricError:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageScores:
-    """How like a picture is to the single shot."""
+    """How like a picture is to the reference render."""
 
     zncc: float
     """Zero-mean normalised cross-correlation over the teeth; gain and offset do not change it."""
@@ -112,14 +112,14 @@ class PanoramaScore:
     failure: str | None
     """Why it is taken for failed: such a panorama has no scores. None where it does not."""
     aligned_by: Literal["geometry", "pictures"] | None
-    """What laid it over the single shot."""
+    """What laid it over the reference render."""
     geometry: GeometricError | None
     """Error of the places of tooth pixels; None where it cannot be known."""
     inter_molar_error_mm: float | None
     """Distance between the first molars (else second) in the panorama minus the true one; with the panorama's own
     millimetres where it has any, else after the similarity. None where it does not show both."""
     coverage_pct: float | None
-    """Share of the single shot's tooth pixels that it shows."""
+    """Share of the reference render's tooth pixels that it shows."""
     seen_pct: float
     """Share of them that any frame saw: the most that could be shown."""
     tooth_coverage_pct: Mapping[int, float]
@@ -133,9 +133,9 @@ class PanoramaScore:
     parts: int
     """Pieces into which the sequence broke."""
     picture: ImageScores | None
-    """Against the orthographic single shot."""
+    """Against the orthographic reference render."""
     shot: ImageScores | None
-    """Against the single shot of a camera at a height, aligned anew."""
+    """Against the reference render of a camera at a height, aligned anew."""
     trivial: Mapping[str, ImageScores]
     """What pictures score that show no work: empty, constant grey on the whole canvas and in the outline of the jaw,
     and the truth shifted by 1 mm."""
@@ -150,7 +150,7 @@ class PanoramaComparison:
     score: PanoramaScore
     """The figures."""
     aligned: Float[np.ndarray, "h w 3"] | None
-    """The panorama on the pixels of the single shot, RGB 0 to 1; None where it failed."""
+    """The panorama on the pixels of the reference render, RGB 0 to 1; None where it failed."""
     points_mm: Float[np.ndarray, "n 2"]
     """True places of the tooth pixels that were asked."""
     errors_mm: Float[np.ndarray, "n"]
@@ -256,7 +256,7 @@ def _spread_pixels(where: Bool[np.ndarray, "h w"], most: int) -> tuple[Int[np.nd
 
 
 def seen_by_frames(view: OcclusalView, truth: GroundTruth, samples: int = 10_000) -> Bool[np.ndarray, "h w"]:
-    """The pixels of the single shot's teeth that some frame saw, asked on a grid and spread to the nearest."""
+    """The pixels of the reference render's teeth that some frame saw, asked on a grid and spread to the nearest."""
     rows, columns = _spread_pixels(view.teeth, samples)
     asked = np.zeros_like(view.teeth)
     asked[rows, columns] = True
@@ -355,7 +355,7 @@ def trivial_scores(view: OcclusalView) -> dict[str, ImageScores]:
 def lay_over(
     panorama: Panorama, view: OcclusalView, plane_from_panorama: Similarity2
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """The panorama on the pixels of the single shot (RGB, 0 to 1), and where it shows something.
+    """The panorama on the pixels of the reference render (RGB, 0 to 1), and where it shows something.
 
     ``plane_from_panorama`` takes the panorama's world to the occlusal plane, mm. A finer panorama is averaged over the
     pixels first.
@@ -416,11 +416,11 @@ def evaluate_panorama(
 ) -> PanoramaComparison:
     """All figures of a panorama against the truth of its film.
 
-    ``view`` is the orthographic single shot and ``shot`` that of a camera at a height. Raises InputError where the
+    ``view`` is the orthographic reference render and ``shot`` that of a camera at a height. Raises InputError where the
     panorama's frames are not those of the truth.
     """
     if view.camera_height_mm is not None:
-        raise InputError("evaluation: the first single shot must be orthographic")
+        raise InputError("evaluation: the first reference render must be orthographic")
     seen = seen_by_frames(view, truth)
     traced = trace_pixels(panorama, truth, options.samples) if (panorama.frame_index >= 0).any() else None
     base = _Comparison(panorama=panorama, view=view, shot=shot, seen=seen, options=options)

@@ -1,4 +1,4 @@
-"""A jaw in a single shot from above: the ground truth of a panorama (thesis 4.3).
+"""A reference render: a jaw as a single image from above shows it, the ground truth of a panorama (thesis 4.3).
 
 The camera looks straight down on the occlusal plane, orthographic or from a height, and its light shines beside it, as
 the thesis assumes of the frames. Pixels: see :class:`cuspid.trueness.OcclusalView`.
@@ -27,7 +27,7 @@ _ROWS = 64
 
 @dataclass(frozen=True, kw_only=True)
 class OcclusalOptions:
-    """How the jaw is shot from above."""
+    """How the jaw is rendered from above."""
 
     mm_per_px: float = 0.05
     """Millimetres a pixel, in the occlusal plane."""
@@ -38,7 +38,7 @@ class OcclusalOptions:
 
     def __post_init__(self) -> None:
         if not self.mm_per_px > 0 or self.margin_mm < 0:
-            raise InputError("single shot: mm per px must be positive and the margin not negative")
+            raise InputError("reference render: mm per px must be positive and the margin not negative")
 
 
 def render_occlusal_view(scene: Scene, options: OcclusalOptions = OcclusalOptions()) -> OcclusalView:
@@ -46,7 +46,9 @@ def render_occlusal_view(scene: Scene, options: OcclusalOptions = OcclusalOption
     low, high = scene.jaw.mesh.bounds
     height = options.camera_height_mm
     if height is not None and height < high[2] + _ABOVE_MM:
-        raise InputError(f"single shot: the camera at {height:g} mm stands in the jaw; it reaches to {high[2]:.1f} mm")
+        raise InputError(
+            f"reference render: the camera at {height:g} mm stands in the jaw; it reaches to {high[2]:.1f} mm"
+        )
     sides = (high - low + 2 * options.margin_mm) / options.mm_per_px
     columns, bottom = int(np.ceil(sides[0])), int(np.ceil(sides[1]))
     origin = np.array([options.margin_mm - low[0], options.margin_mm + high[1]]) / options.mm_per_px

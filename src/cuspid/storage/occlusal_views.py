@@ -1,4 +1,4 @@
-"""A single shot of the true jaw from above: ``view.json``, ``picture.png`` and ``surface.npz`` in a folder."""
+"""A reference render of the true jaw from above: ``view.json``, ``picture.png`` and ``surface.npz`` in a folder."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OCCLUSAL_VIEW_FILES = ("picture.png", "surface.npz", "view.json")
 
 
 def write_occlusal_view(folder: Path, view: OcclusalView) -> None:
-    """Write a single shot; ``view.json`` comes last, so that what has one is whole."""
+    """Write a reference render; ``view.json`` comes last, so that what has one is whole."""
     write_image(folder / "picture.png", view.image)
     write_arrays(folder / "surface.npz", {"labels": view.labels, "height_mm": view.height_mm}, compressed=True)
     numbers = {name: getattr(view, name) for name in ("mm_per_px", "origin_px", "camera_height_mm")}
@@ -28,7 +28,7 @@ def read_occlusal_view(folder: Path) -> OcclusalView:
     """Read what :func:`write_occlusal_view` wrote. Raises InputError where a file is missing or damaged."""
     path = folder / "view.json"
     if not path.exists():
-        raise InputError(f"{folder}: no single shot of the jaw in it; make the truth with cuspid film")
+        raise InputError(f"{folder}: no reference render of the jaw in it; make the truth with cuspid film")
     value = read_json(path)
     surface = read_arrays(folder / "surface.npz", remedy="run cuspid film again")
     with reading(path):

@@ -115,7 +115,7 @@ class ScoreResult(_Result):
     made: Path | None
     """The panorama laid over the true jaw, a picture of the same size as ``true``."""
     true: Path | None
-    """The single shot of the true jaw."""
+    """The reference render of the true jaw."""
 
 
 Result = ScanResult | ShapeResult | StudyResult | PanoramaResult | ScoreResult
