@@ -274,7 +274,7 @@ def _visible_among(
 
 
 def _incidence_deg(mesh: Mesh, faces: Int[np.ndarray, "n"], eye: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n"]:
-    """Angle between the normals of the faces and the way to the eye."""
+    """Angle between the normals of the faces and the line of sight to the eye."""
     sight = eye - mesh.face_centres[faces]
     cosine = np.einsum("nd,nd->n", sight, mesh.face_normals[faces]) / np.linalg.norm(sight, axis=1)
     return np.asarray(np.rad2deg(np.arccos(np.clip(cosine, -1, 1))))

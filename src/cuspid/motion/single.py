@@ -49,7 +49,7 @@ _WINDOW = 15
 
 @dataclass(frozen=True, kw_only=True)
 class SingleOptions:
-    """How the way of one camera is found."""
+    """How the trajectory of one camera is found."""
 
     features: FeatureOptions = field(default_factory=lambda: FeatureOptions(count=2500, contrast=0.004, edge=30.0))
     """Keypoints of the contrast-normalised frames; plain enamel needs a low threshold."""
@@ -87,7 +87,7 @@ class SingleOptions:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SingleMotion:
-    """What is known of the camera's way: one model, or several that no verified pair joins."""
+    """What is known of the camera's trajectory: one model, or several that no verified pair joins."""
 
     parts: tuple[SparseModel, ...]
     """Largest first; lengths in the model's units."""
@@ -418,7 +418,7 @@ def _camera_of(found: pycolmap.Camera, given: Camera | None, options: SingleOpti
 def locate_single(
     sequence: ImageSequence, options: SingleOptions | None = None, *, progress: Progress = silent
 ) -> SingleMotion:
-    """The way of the one camera that took a sequence.
+    """The trajectory of the one camera that took a sequence.
 
     Frames that are black, blurred or repeated are skipped; where the model breaks, the frames are matched again at more
     distances and with a looser ratio, and models that share frames are joined. Raises ReconstructionError, naming

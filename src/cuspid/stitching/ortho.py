@@ -41,7 +41,7 @@ class Stitched:
     panorama: Panorama
     """The occlusal view."""
     motion: SparseModel | None
-    """The camera's way, in the panorama's world and its lengths; None where the method locates no camera."""
+    """The camera's trajectory, in the panorama's world and its lengths; None where the method locates no camera."""
     strip: Strip | None
     """The panorama unrolled along the arch; None where the camera hardly moved, or is not located."""
 

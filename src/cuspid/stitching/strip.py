@@ -35,7 +35,7 @@ class StripOptions:
 
 _STEP_MM = 0.25
 _LEAST_MM = 5.0
-"""A shorter way of the camera is not unrolled."""
+"""A shorter trajectory is not unrolled."""
 _TREMOR_FRAMES = 3.0
 """Standard deviation of the Gaussian filter over the camera's path, in frames."""
 

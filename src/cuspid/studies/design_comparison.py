@@ -240,7 +240,7 @@ def scan_case(
         **done.figures,
         **unknown,
         "minimum_overlap_pct": 100 * overlap,
-        "way_mm": way_mm(handpiece, tuple(done.truth.rig_from_world.values())),
+        "trajectory_mm": trajectory_mm(handpiece, tuple(done.truth.rig_from_world.values())),
         "data_mb": data_mb(handpiece, len(done.capture.frames)),
         **holder_size(section_outlines(subject, handpiece, path, options.thickness_mm)),
         "tooth_mean_abs_um": None if tooth_accuracy is None else tooth_accuracy.mean_abs_um,
@@ -282,7 +282,7 @@ def _percent(which: Bool[np.ndarray, "n"]) -> float:
     return float(100 * which.mean())
 
 
-def way_mm(handpiece: Handpiece, rig_from_world: Sequence[Rigid3]) -> float:
+def trajectory_mm(handpiece: Handpiece, rig_from_world: Sequence[Rigid3]) -> float:
     """How far the middle of the cameras moves, turns included."""
     middle = np.mean([mounted.centre_in_rig for mounted in handpiece.rig.cameras.values()], axis=0)
     places = np.array([pose.inverse().apply(middle) for pose in rig_from_world])
@@ -396,7 +396,7 @@ def comparison_rows(
     rooms = {sex: room_mm(group, mouth) for sex, group in people.items()}
     for row in rows:
         row["capture_s"] = number(row, "frames") / options.frame_rate_hz
-        row["speed_mm_s"] = number(row, "way_mm") / number(row, "capture_s")
+        row["speed_mm_s"] = number(row, "trajectory_mm") / number(row, "capture_s")
         for sex, room in rooms.items():
             shares = fit_pct(room, np.array([number(row, "height_mm")]))[0]
             row |= {f"fits_{sex}_{position}_pct": float(share) for position, share in enumerate(shares, start=1)}

@@ -24,7 +24,7 @@ from cuspid.jaw import GUM
 from cuspid.mesh import Mesh, edges_of
 
 _ON_BORDER = 0.7
-"""A partner on the rim of a patch counts only if the way to it leaves the patch at least this steeply (sine)."""
+"""A partner on the rim of a patch counts only if the line to it leaves the patch at least this steeply (sine)."""
 _PER_EDGE = 8
 """Points that stand for an edge of a border."""
 _LEAST_WEIGHT = 0.01
@@ -205,7 +205,7 @@ def fit(template: Template, start: Float[np.ndarray, "v 3"], target: Target, opt
 def partners(
     template: Template, vertices: Float[np.ndarray, "v 3"], target: Target, options: FitOptions
 ) -> tuple[Float[np.ndarray, "v 3"], Bool[np.ndarray, "v"]]:
-    """The way from each vertex to its partner on the sample, mm, and whether it has one."""
+    """The offset from each vertex to its partner on the sample, mm, and whether it has one."""
     normals = Mesh(vertices, template.faces).vertex_normals
     offsets, found = np.zeros_like(vertices), np.zeros(len(vertices), dtype=bool)
     for label, inner in template.inner.items():

@@ -121,7 +121,7 @@ class ScanPath:
     """For each frame but the last, and each camera: share of the surface in its image that the next image also sees;
     NaN where the image shows no surface."""
     steady: SteadyPath = field(repr=False)
-    """The way of a steady hand."""
+    """The trajectory of a steady hand."""
     seen: Mapping[int, float] = field(default_factory=dict)
     """About which share (0 to 1) of the open surface of each crown that the path passes two cameras see at once, by FDI
     number; by 0 of all crowns together."""
@@ -214,7 +214,7 @@ def _reach_mm(handpiece: Handpiece) -> float:
 
 
 def _held(steady: SteadyPath, detour: Detour, hand: HandMotion) -> PoseAt:
-    """The way of a hand that drifts."""
+    """The trajectory of a hand that drifts."""
     if not detour.changes.any():
         return lambda at: hand.at(at) @ steady.rig_from_world(at)
     return lambda at: hand.at(at) @ detour.at(at) @ steady.rig_from_world(at)
@@ -286,7 +286,7 @@ def _even_path(mesh: Mesh, handpiece: Handpiece, steady: SteadyPath, pose_at: Po
 
 
 def _detour_notes(jaw: Jaw, steady: SteadyPath, detour: Detour) -> tuple[str, ...]:
-    """Where the handpiece leaves the way of a steady hand."""
+    """Where the handpiece leaves the trajectory of a steady hand."""
     changed = np.any(detour.changes != 0, axis=1)
     if not changed.any():
         return ()
