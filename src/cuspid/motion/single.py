@@ -519,9 +519,7 @@ def _why_nothing(
     if np.median(counts) < 50:
         return f"{span} show too little detail ({np.median(counts):.0f} keypoints a frame): out of focus, or no teeth"
     if not verified:
-        return (
-            f"{span} have nothing in common with each other; film the arch in one sweep, each frame over half the last"
-        )
+        return f"{span} have nothing in common with each other; film the arch in one go, each frame over half the last"
     return f"{span} overlap, but the camera did not move enough between them to tell depth; move it along the arch"
 
 

@@ -13,9 +13,9 @@ from cuspid.panorama import FrameUse, Panorama, Strip
 from cuspid.progress import Progress, silent
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.mosaic import Mosaic, MosaicOptions, compose
+from cuspid.stitching.plane_sweep import PlaneSweepOptions, plane_sweep
 from cuspid.stitching.strip import StripOptions, unroll
 from cuspid.stitching.surface import ScaleOptions, SurfaceOptions, height_map, in_occlusal_frame, uncovered
-from cuspid.stitching.sweep import SweepOptions, sweep
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +26,7 @@ class OrthoOptions:
     """How large things are."""
     surface: SurfaceOptions = field(default_factory=SurfaceOptions)
     """The smooth surface through the sparse points of the motion."""
-    sweep: SweepOptions = field(default_factory=SweepOptions)
+    plane_sweep: PlaneSweepOptions = field(default_factory=PlaneSweepOptions)
     """The dense surface on which frames are rectified."""
     mosaic: MosaicOptions = field(default_factory=MosaicOptions)
     """Choice of frames, exposure, blending."""
@@ -65,7 +65,11 @@ def orthophoto(
         return sequence.image(index[name])
 
     sparse = height_map(motion, options.surface)
-    dense = sweep(motion, sparse, read, options.sweep, progress=progress) if options.sweep.enabled else None
+    dense = (
+        plane_sweep(motion, sparse, read, options.plane_sweep, progress=progress)
+        if options.plane_sweep.enabled
+        else None
+    )
     surface = sparse if dense is None else uncovered(dense, sparse, motion)
     mosaic = compose(motion, surface, read, options.mosaic, progress=progress)
     metric = scale.working_distance_mm is not None or scale.width_mm is not None

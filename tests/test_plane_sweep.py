@@ -19,8 +19,8 @@ from cuspid.geometry import Rigid3
 from cuspid.reconstruction import Tracks
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.mosaic import MosaicOptions, compose
+from cuspid.stitching.plane_sweep import PlaneSweepOptions, partners, plane_sweep, semi_global
 from cuspid.stitching.surface import HeightMap, SurfaceOptions, height_map, uncovered
-from cuspid.stitching.sweep import SweepOptions, partners, semi_global, sweep
 
 HALF_MM, DEEP_MM, CAMERA_MM = 3.0, 4.0, 14.0
 """A bar of this half width along Y stands so high over a floor; the camera goes along it so high over its top."""
@@ -38,7 +38,7 @@ class Scene(NamedTuple):
 
     def swept(self, **changes: object) -> HeightMap | None:
         sparse = height_map(self.motion, SurfaceOptions())
-        return sweep(self.motion, sparse, self.read, SweepOptions(**changes))
+        return plane_sweep(self.motion, sparse, self.read, PlaneSweepOptions(**changes))
 
 
 def true_places(pose: Rigid3, pixels: np.ndarray) -> np.ndarray:
@@ -179,8 +179,8 @@ def test_a_film_of_another_scale_needs_no_more_cells(scene: Scene, surface: Heig
     "wrong", [{"cell_mm": 0.0}, {"window": 4}, {"window": 1}, {"large_jump": 0.01}, {"small_jump": -1.0}]
 )
 def test_options_that_make_no_sense_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(InputError, match="sweep"):
-        SweepOptions(**wrong)
+    with pytest.raises(InputError, match="plane sweep"):
+        PlaneSweepOptions(**wrong)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.2, 0.3])
