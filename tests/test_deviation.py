@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from cuspid.errors import InputError
 from cuspid.evaluation.crown import OpenCrown, open_parts, openness
 from cuspid.evaluation.deviation import EvaluationOptions, evaluate, statistics
-from cuspid.evaluation.distance import Surface
+from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions
 from cuspid.evaluation.search import SearchOptions
 from cuspid.geometry import Rigid3
@@ -60,7 +60,7 @@ def with_plate(mesh: Mesh, centre: tuple[float, float, float], size_mm: float = 
 @given(st.integers(0, 2**32 - 1))
 def test_signed_distance_to_a_box_is_the_analytic_one(seed: int):
     box = trimesh.creation.box((4.0, 6.0, 8.0))
-    surface = Surface(Mesh(np.asarray(box.vertices), np.asarray(box.faces)))
+    surface = SignedDistance(Mesh(np.asarray(box.vertices), np.asarray(box.faces)))
     points = np.random.default_rng(seed).uniform(-6, 6, (50, 3))
     beyond = np.abs(points) - [2.0, 3.0, 4.0]
     expected = np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
@@ -73,7 +73,9 @@ def test_signed_distance_to_a_box_is_the_analytic_one(seed: int):
 
 
 def test_what_lies_past_a_border_is_told_from_what_lies_over_it():
-    square = Surface(Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])))
+    square = SignedDistance(
+        Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    )
     points = np.array([[0.5, 0.5, 0.3], [0.5, 0.5, -0.3], [1.2, 0.5, 0.1], [1.1, 0.5, 0.2], [1.2, 1.2, 0.0]])
     closest = square.closest_points(points)
     np.testing.assert_allclose(closest.signed_mm[:2], [0.3, -0.3])

@@ -18,9 +18,9 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.reconstruction import Tracks
 from cuspid.sparse_model import SparseModel
+from cuspid.stitching.height_map import HeightMap, HeightMapOptions, height_map, uncovered
 from cuspid.stitching.mosaic import MosaicOptions, compose
 from cuspid.stitching.plane_sweep import PlaneSweepOptions, partners, plane_sweep, semi_global
-from cuspid.stitching.surface import HeightMap, SurfaceOptions, height_map, uncovered
 
 HALF_MM, DEEP_MM, CAMERA_MM = 3.0, 4.0, 14.0
 """A bar of this half width along Y stands so high over a floor; the camera goes along it so high over its top."""
@@ -37,7 +37,7 @@ class Scene(NamedTuple):
         return self.images[name]
 
     def swept(self, **changes: object) -> HeightMap | None:
-        sparse = height_map(self.motion, SurfaceOptions())
+        sparse = height_map(self.motion, HeightMapOptions())
         return plane_sweep(self.motion, sparse, self.read, PlaneSweepOptions(**changes))
 
 
@@ -225,7 +225,7 @@ def test_a_false_rise_in_the_middle_of_a_crown_occludes_nothing_but_a_crown_occl
     false = replace(surface, heights=ringed)
     middle, centre = np.array([[[2.0, 0.5, 0.0]]]), np.array([4.0, 2.0, CAMERA_MM])
     assert false.occludes(middle, centre).all()
-    sparse = height_map(scene.motion, SurfaceOptions())
+    sparse = height_map(scene.motion, HeightMapOptions())
     assert not uncovered(false, sparse, scene.motion).occludes(middle, centre).any()
     behind = np.array([[[-HALF_MM - 0.7, 0.0, -DEEP_MM]]])
     assert uncovered(surface, sparse, scene.motion).occludes(behind, np.array([3.0, 0, CAMERA_MM])).all()

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from cuspid.stitching.exposure import ExposureOptions, Samples, balance
 
 from cuspid import pipeline, storage
 from cuspid.camera import Camera
@@ -24,11 +25,10 @@ from cuspid.pipeline import RenderOptions, StitchOptions, take_images
 from cuspid.reconstruction import Tracks
 from cuspid.simulation.path.arch import arch_curve
 from cuspid.sparse_model import SparseModel
-from cuspid.stitching.exposure import ExposureOptions, Samples, balance
+from cuspid.stitching.height_map import HeightMapOptions, ScaleOptions, height_map, in_occlusal_frame
 from cuspid.stitching.mosaic import unlit
 from cuspid.stitching.ortho import Stitched
 from cuspid.stitching.seams import SeamOptions, choose
-from cuspid.stitching.surface import ScaleOptions, SurfaceOptions, height_map, in_occlusal_frame
 from cuspid.trueness import GroundTruth
 from verbs import refused
 
@@ -339,7 +339,7 @@ def test_the_height_map_follows_the_points_and_is_known_everywhere() -> None:
     assert found.tracks is not None
     scale, rotation, shift = best_similarity(points, found.tracks.points)
     top, gum = scale * np.array([[0.0, 30.0, -1.0], [0.0, 36.0, -5.0]]) @ rotation.T + shift
-    surface = height_map(found, SurfaceOptions())
+    surface = height_map(found, HeightMapOptions())
     assert np.isfinite(surface.heights).all()
     heights = surface.at(np.array([[top[:2], gum[:2]]])).ravel()
     np.testing.assert_allclose(heights, [top[2], gum[2]], atol=0.7)

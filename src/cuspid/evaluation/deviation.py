@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float, Int
 
 from cuspid.errors import InputError
 from cuspid.evaluation.crown import OpenCrown, crown_completeness, openness, within_pct
-from cuspid.evaluation.distance import ClosestPoints, Surface
+from cuspid.evaluation.distance import ClosestPoints, SignedDistance
 from cuspid.evaluation.registration import Alignment, RegistrationOptions, best_scale, register
 from cuspid.evaluation.teeth import CANINES, LEAST_SAMPLES, MOLARS, distance_error_um, drift_um, find_teeth
 from cuspid.geometry import Rigid3
@@ -122,7 +122,7 @@ def evaluate(
     to compare.
     """
     rng = rng or np.random.default_rng(0)
-    surface = Surface(reference.mesh)
+    surface = SignedDistance(reference.mesh)
     rules = _rules(reference.mesh, scannable, options)
     alignment = _align(scan, surface, options, rng)
     aligned = scan.transformed(alignment.reference_from_scan)
@@ -203,7 +203,7 @@ def _rules(reference: Mesh, scannable: Bool[np.ndarray, "f"] | None, options: Ev
     )
 
 
-def _align(scan: Mesh, surface: Surface, options: EvaluationOptions, rng: np.random.Generator) -> Alignment:
+def _align(scan: Mesh, surface: SignedDistance, options: EvaluationOptions, rng: np.random.Generator) -> Alignment:
     if options.align:
         return register(scan, surface, options.registration, rng=rng)
     points, _ = scan.sample(options.registration.samples, rng)
@@ -214,7 +214,7 @@ def _align(scan: Mesh, surface: Surface, options: EvaluationOptions, rng: np.ran
 
 def _samples_of_scan(
     aligned: Mesh,
-    surface: Surface,
+    surface: SignedDistance,
     labels: Int[np.ndarray, "f"],
     rules: _Rules,
     options: EvaluationOptions,

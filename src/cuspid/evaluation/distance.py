@@ -36,8 +36,8 @@ class ClosestPoints:
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
-    """A mesh that answers signed distances."""
+class SignedDistance:
+    """Signed distances to a mesh."""
 
     mesh: Mesh
     """The surface, outward normals counter-clockwise."""

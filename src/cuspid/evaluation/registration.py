@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.errors import InputError
-from cuspid.evaluation.distance import ClosestPoints, Surface
+from cuspid.evaluation.distance import ClosestPoints, SignedDistance
 from cuspid.evaluation.search import SearchOptions, find_poses
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
@@ -56,18 +56,20 @@ class Alignment:
     """Why the alignment is doubtful; empty where it is not."""
 
 
-def register(scan: Mesh, surface: Surface, options: RegistrationOptions, *, rng: np.random.Generator) -> Alignment:
+def register(
+    scan: Mesh, surface: SignedDistance, options: RegistrationOptions, *, rng: np.random.Generator
+) -> Alignment:
     """Align a scan in any pose with a reference surface; the smaller of the two is laid on the larger one.
 
     Raises InputError where no pose brings a quarter of the smaller surface near the larger one.
     """
     if scan.face_areas.sum() > 1.5 * surface.mesh.face_areas.sum():
-        swapped = _lay(surface.mesh, Surface(scan), options, rng)
+        swapped = _lay(surface.mesh, SignedDistance(scan), options, rng)
         return replace(swapped, reference_from_scan=swapped.reference_from_scan.inverse(), scale=1 / swapped.scale)
     return _lay(scan, surface, options, rng)
 
 
-def _lay(scan: Mesh, surface: Surface, options: RegistrationOptions, rng: np.random.Generator) -> Alignment:
+def _lay(scan: Mesh, surface: SignedDistance, options: RegistrationOptions, rng: np.random.Generator) -> Alignment:
     few, _ = scan.sample(_FEW, rng)
     brief = replace(options, tolerance_um=1.0, iterations=25)
     starts = find_poses(scan, surface.mesh, options.search, rng=rng)
@@ -84,7 +86,9 @@ def _lay(scan: Mesh, surface: Surface, options: RegistrationOptions, rng: np.ran
     return replace(alignment, notes=(*_doubts(alignment), *_rivals(poses, misfits, few)))
 
 
-def fit(points: Float[np.ndarray, "n 3"], surface: Surface, start: Rigid3, options: RegistrationOptions) -> Alignment:
+def fit(
+    points: Float[np.ndarray, "n 3"], surface: SignedDistance, start: Rigid3, options: RegistrationOptions
+) -> Alignment:
     """Align points of a scan with a surface from a pose nearby."""
     pose = refine(points, surface, start, options)
     closest = surface.closest_points(pose.apply(points))
@@ -97,7 +101,9 @@ def fit(points: Float[np.ndarray, "n 3"], surface: Surface, start: Rigid3, optio
     )
 
 
-def refine(points: Float[np.ndarray, "n 3"], surface: Surface, start: Rigid3, options: RegistrationOptions) -> Rigid3:
+def refine(
+    points: Float[np.ndarray, "n 3"], surface: SignedDistance, start: Rigid3, options: RegistrationOptions
+) -> Rigid3:
     """``reference_from_scan`` with the least weighted sum of squared distances, from a pose nearby."""
     pose = start
     for _ in range(options.iterations):
@@ -113,7 +119,7 @@ def refine(points: Float[np.ndarray, "n 3"], surface: Surface, start: Rigid3, op
 
 
 def best_scale(
-    points: Float[np.ndarray, "n 3"], surface: Surface, reference_from_scan: Rigid3, options: RegistrationOptions
+    points: Float[np.ndarray, "n 3"], surface: SignedDistance, reference_from_scan: Rigid3, options: RegistrationOptions
 ) -> float:
     """Scale of the scan that the best similarity near an alignment would take away."""
     moved, shrinking = reference_from_scan.apply(points), 1.0
@@ -168,7 +174,7 @@ def _overlap(closest: ClosestPoints, near_mm: float) -> float:
     return float(np.mean(~closest.on_border & (np.abs(closest.signed_mm) < near_mm)))
 
 
-def _truncated_mean_mm(points: Float[np.ndarray, "n 3"], surface: Surface, pose: Rigid3) -> float:
+def _truncated_mean_mm(points: Float[np.ndarray, "n 3"], surface: SignedDistance, pose: Rigid3) -> float:
     closest = surface.closest_points(pose.apply(points))
     return float(np.where(closest.on_border, 0.5, np.minimum(np.abs(closest.signed_mm), 0.5)).mean())
 

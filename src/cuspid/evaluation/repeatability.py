@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int
 
 from cuspid.errors import InputError
 from cuspid.evaluation.deviation import statistics
-from cuspid.evaluation.distance import Surface
+from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions, refine
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
@@ -88,12 +88,12 @@ def compare_pair(first: Mesh, second: Mesh, options: PairOptions, *, rng: np.ran
     What lies past the border of the other scan, or far from it, is not evaluated. Raises InputError where they have no
     surface in common.
     """
-    surface = Surface(first)
+    surface = SignedDistance(first)
     if options.align:
         points, _ = second.sample(options.registration.samples, rng)
         second = second.transformed(refine(points, surface, Rigid3.identity(), options.registration))
     onto_first, first_counts = _signed(second, surface, options, rng)
-    onto_second, second_counts = _signed(first, Surface(second), options, rng)
+    onto_second, second_counts = _signed(first, SignedDistance(second), options, rng)
     common = np.concatenate([first_counts, second_counts])
     if not common.any():
         raise InputError("repeatability: two scans have no surface in common; check that both show the same teeth")
@@ -102,7 +102,7 @@ def compare_pair(first: Mesh, second: Mesh, options: PairOptions, *, rng: np.ran
 
 
 def _signed(
-    scan: Mesh, surface: Surface, options: PairOptions, rng: np.random.Generator
+    scan: Mesh, surface: SignedDistance, options: PairOptions, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
     """Signed distances of points of a scan from a surface, and which of them count."""
     closest = surface.closest_points(scan.sample(options.samples, rng)[0])

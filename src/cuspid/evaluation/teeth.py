@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from cuspid.evaluation.distance import Surface
+from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions, refine
 from cuspid.geometry import Rigid3
 
@@ -47,7 +47,7 @@ def find_teeth(
     points: Float[np.ndarray, "n 3"],
     labels: Int[np.ndarray, "n"],
     centroids: Mapping[int, Float[np.ndarray, "3"]],
-    surface: Surface,
+    surface: SignedDistance,
     options: RegistrationOptions,
 ) -> dict[int, ScannedTooth]:
     """Teeth with enough samples in an aligned scan, in the order along the arch.
@@ -74,7 +74,7 @@ def distance_error_um(teeth: Mapping[int, ScannedTooth], pairs: tuple[tuple[int,
     return None
 
 
-def drift_um(teeth: Mapping[int, ScannedTooth], surface: Surface) -> dict[int, float]:
+def drift_um(teeth: Mapping[int, ScannedTooth], surface: SignedDistance) -> dict[int, float]:
     """Mean absolute distance of each tooth when the scan is aligned on the first tooth alone."""
     if not teeth:
         return {}

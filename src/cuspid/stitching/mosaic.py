@@ -24,8 +24,8 @@ from cuspid.geometry import Rigid3
 from cuspid.progress import Progress, silent
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.exposure import ExposureOptions, Light, Samples, balance
+from cuspid.stitching.height_map import HeightMap
 from cuspid.stitching.seams import SeamOptions, choose
-from cuspid.stitching.surface import HeightMap
 
 CELL_PX = 6
 """Width in px of the cells on which the frame is chosen."""

@@ -12,10 +12,10 @@ from cuspid.image_sequence import ImageSequence
 from cuspid.panorama import FrameUse, Panorama, Strip
 from cuspid.progress import Progress, silent
 from cuspid.sparse_model import SparseModel
+from cuspid.stitching.height_map import HeightMapOptions, ScaleOptions, height_map, in_occlusal_frame, uncovered
 from cuspid.stitching.mosaic import Mosaic, MosaicOptions, compose
 from cuspid.stitching.plane_sweep import PlaneSweepOptions, plane_sweep
 from cuspid.stitching.strip import StripOptions, unroll
-from cuspid.stitching.surface import ScaleOptions, SurfaceOptions, height_map, in_occlusal_frame, uncovered
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,7 @@ class OrthoOptions:
 
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     """How large things are."""
-    surface: SurfaceOptions = field(default_factory=SurfaceOptions)
+    height_map: HeightMapOptions = field(default_factory=HeightMapOptions)
     """The smooth surface through the sparse points of the motion."""
     plane_sweep: PlaneSweepOptions = field(default_factory=PlaneSweepOptions)
     """The dense surface on which frames are rectified."""
@@ -64,7 +64,7 @@ def orthophoto(
     def read(name: str) -> UInt8[np.ndarray, "h w 3"]:
         return sequence.image(index[name])
 
-    sparse = height_map(motion, options.surface)
+    sparse = height_map(motion, options.height_map)
     dense = (
         plane_sweep(motion, sparse, read, options.plane_sweep, progress=progress)
         if options.plane_sweep.enabled

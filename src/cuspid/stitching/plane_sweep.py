@@ -29,8 +29,8 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.progress import Progress, silent
 from cuspid.sparse_model import SparseModel
+from cuspid.stitching.height_map import HOLE_MM2, HeightMap
 from cuspid.stitching.mosaic import BURNT, brightest, footprint
-from cuspid.stitching.surface import HOLE_MM2, HeightMap
 from cuspid.workers import map_in_threads
 
 _BLOCK, _REACH = 24, 14

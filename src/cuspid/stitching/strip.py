@@ -18,7 +18,7 @@ from cuspid.camera import OPENCV_PIXEL_OFFSET
 from cuspid.geometry import lengths_along, unit
 from cuspid.panorama import ZONES, Panorama, Strip
 from cuspid.sparse_model import SparseModel
-from cuspid.stitching.surface import HeightMap
+from cuspid.stitching.height_map import HeightMap
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,7 @@ from cuspid import pipeline
 from cuspid.capture import Capture
 from cuspid.errors import ReconstructionError
 from cuspid.evaluation.deviation import EvaluationOptions
-from cuspid.evaluation.distance import Surface
+from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import fit
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
@@ -146,7 +146,7 @@ def _compare(
     if start is None or not options.align:
         return pipeline.evaluate(mesh, jaw, options, scannable=evaluated)
     points, _ = mesh.sample(options.registration.samples, np.random.default_rng(0))
-    aligned = fit(points, Surface(jaw.mesh), start, options.registration).reference_from_scan
+    aligned = fit(points, SignedDistance(jaw.mesh), start, options.registration).reference_from_scan
     moved = mesh.transformed(aligned)
     found = pipeline.evaluate(moved, jaw, replace(options, align=False), scannable=evaluated)
     return replace(found, reference_from_scan=aligned)

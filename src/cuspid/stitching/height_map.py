@@ -68,7 +68,7 @@ class ScaleOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SurfaceOptions:
+class HeightMapOptions:
     """How coarse the surface is."""
 
     cell_mm: float = 0.4
@@ -269,7 +269,7 @@ def _facing_front(centres: Float[np.ndarray, "f 3"], points: Float[np.ndarray, "
 # --- the surface -------------------------------------------------------------------------------------------------
 
 
-def height_map(model: SparseModel, options: SurfaceOptions) -> HeightMap:
+def height_map(model: SparseModel, options: HeightMapOptions) -> HeightMap:
     """A smooth surface through the sparse points of a motion in the occlusal frame; robust against single points."""
     points = _sure_points(model)
     low, high = points[:, :2].min(axis=0) - 4, points[:, :2].max(axis=0) + 4
