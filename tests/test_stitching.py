@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from cuspid.stitching.exposure import ExposureOptions, Samples, balance
 
 from cuspid import pipeline, storage
 from cuspid.camera import Camera
@@ -25,6 +24,7 @@ from cuspid.pipeline import RenderOptions, StitchOptions, take_images
 from cuspid.reconstruction import Tracks
 from cuspid.simulation.path.arch import arch_curve
 from cuspid.sparse_model import SparseModel
+from cuspid.stitching.gain_compensation import GainOptions, Samples, balance
 from cuspid.stitching.height_map import HeightMapOptions, ScaleOptions, height_map, in_occlusal_frame
 from cuspid.stitching.mosaic import unlit
 from cuspid.stitching.ortho import Stitched
@@ -254,7 +254,7 @@ def test_gains_and_falloff_are_found_and_burnt_out_samples_do_not_count() -> Non
         level[~usable.ravel()] = 255.0
         color = np.repeat(level, 3).reshape(20, 20, 3)
         samples.take(frame, (slice(0, 20), slice(0, 20)), 20, color, falloff.reshape(20, 20), usable)
-    light = balance(samples, frames, ExposureOptions())
+    light = balance(samples, frames, GainOptions())
     np.testing.assert_allclose(light.gains, gains, atol=0.03)
     assert 0.4 < light.exponent < 0.5
 

@@ -29,7 +29,7 @@ class OrthoOptions:
     plane_sweep: PlaneSweepOptions = field(default_factory=PlaneSweepOptions)
     """The dense surface on which frames are rectified."""
     mosaic: MosaicOptions = field(default_factory=MosaicOptions)
-    """Choice of frames, exposure, blending."""
+    """Choice of frames, gain compensation, blending."""
     strip: StripOptions = field(default_factory=StripOptions)
     """The unrolled strip."""
 
