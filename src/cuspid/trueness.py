@@ -33,7 +33,7 @@ NOTHING = -1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class OcclusalView:
+class ReferenceRender:
     """A reference render: a jaw as one image from above, as a panorama should show it. Columns run along +X, rows
     along -Y.
 

@@ -3,9 +3,9 @@
 A panorama that knows which frame each of its pixels came from is evaluated by geometry: the pixel's ray, from where the
 frame truly was, meets the true jaw in a point, and the panorama places that point somewhere in the occlusal plane. The
 best similarity (least squares, Umeyama 1991) of all tooth pixels is taken away; what remains is the geometric error.
-The same similarity lays the panorama over the reference render of the true jaw (:class:`cuspid.trueness.OcclusalView`),
-where the pictures are compared. A panorama without that knowledge is laid over it by image features, and only the
-pictures are compared.
+The same similarity lays the panorama over the reference render of the true jaw
+(:class:`cuspid.trueness.ReferenceRender`), where the pictures are compared. A panorama without that knowledge is laid
+over it by image features, and only the pictures are compared.
 
 Pictures are compared in grey (Rec. 601), where the panorama shows nothing as black: ZNCC over the pixels of the teeth,
 SSIM (Wang et al. 2004, Gaussian window of 1.5 px) as the mean of its map over the teeth, and over the whole canvas as
@@ -29,7 +29,7 @@ from cuspid.camera import OPENCV_PIXEL_OFFSET
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, best_similarity
 from cuspid.panorama import Panorama
-from cuspid.trueness import NOTHING, GroundTruth, OcclusalView
+from cuspid.trueness import NOTHING, GroundTruth, ReferenceRender
 
 FEWEST_TEETH_PX = 200
 """Of the sampled pixels must show teeth, for an alignment by geometry."""
@@ -255,7 +255,7 @@ def _spread_pixels(where: Bool[np.ndarray, "h w"], most: int) -> tuple[Int[np.nd
     return rows * step + step // 2, columns * step + step // 2
 
 
-def seen_by_frames(view: OcclusalView, truth: GroundTruth, samples: int = 10_000) -> Bool[np.ndarray, "h w"]:
+def seen_by_frames(view: ReferenceRender, truth: GroundTruth, samples: int = 10_000) -> Bool[np.ndarray, "h w"]:
     """The pixels of the reference render's teeth that some frame saw, asked on a grid and spread to the nearest."""
     rows, columns = _spread_pixels(view.teeth, samples)
     asked = np.zeros_like(view.teeth)
@@ -336,7 +336,7 @@ def _inner_mean(similarity: Float[np.ndarray, "h w"]) -> float:
     return float(similarity[border:-border, border:-border].mean())
 
 
-def trivial_scores(view: OcclusalView) -> dict[str, ImageScores]:
+def trivial_scores(view: ReferenceRender) -> dict[str, ImageScores]:
     """What pictures score that show no work."""
     truth, everywhere, nowhere = grey(view.image), np.ones_like(view.teeth), np.zeros_like(view.teeth)
     jaw, level = view.labels != NOTHING, float(truth[view.teeth].mean())
@@ -353,7 +353,7 @@ def trivial_scores(view: OcclusalView) -> dict[str, ImageScores]:
 
 
 def lay_over(
-    panorama: Panorama, view: OcclusalView, plane_from_panorama: Similarity2
+    panorama: Panorama, view: ReferenceRender, plane_from_panorama: Similarity2
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """The panorama on the pixels of the reference render (RGB, 0 to 1), and where it shows something.
 
@@ -373,7 +373,7 @@ def lay_over(
     return np.asarray(laid, dtype=np.float64), np.asarray(shown > 0.5)
 
 
-def align_by_pictures(panorama: Panorama, view: OcclusalView) -> Similarity2 | None:
+def align_by_pictures(panorama: Panorama, view: ReferenceRender) -> Similarity2 | None:
     """``plane_from_panorama`` by SIFT features and RANSAC; None where too few agree."""
     sift = cv2.SIFT.create(_FEATURES)
     masks = (panorama.covered, view.labels != NOTHING)
@@ -410,8 +410,8 @@ def align_by_pictures(panorama: Panorama, view: OcclusalView) -> Similarity2 | N
 def evaluate_panorama(
     panorama: Panorama,
     truth: GroundTruth,
-    view: OcclusalView,
-    shot: OcclusalView | None = None,
+    view: ReferenceRender,
+    shot: ReferenceRender | None = None,
     options: PanoramaEvaluationOptions = PanoramaEvaluationOptions(),
 ) -> PanoramaComparison:
     """All figures of a panorama against the truth of its film.
@@ -430,8 +430,8 @@ def evaluate_panorama(
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Comparison:
     panorama: Panorama
-    view: OcclusalView
-    shot: OcclusalView | None
+    view: ReferenceRender
+    shot: ReferenceRender | None
     seen: Bool[np.ndarray, "h w"]
     options: PanoramaEvaluationOptions
 

@@ -1,7 +1,7 @@
 """A reference render: a jaw as a single image from above shows it, the ground truth of a panorama (thesis 4.3).
 
 The camera looks straight down on the occlusal plane, orthographic or from a height, and its light shines beside it, as
-the thesis assumes of the frames. Pixels: see :class:`cuspid.trueness.OcclusalView`.
+the thesis assumes of the frames. Pixels: see :class:`cuspid.trueness.ReferenceRender`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from cuspid.errors import InputError
 from cuspid.mesh import RayHits
 from cuspid.simulation.raycast import BRIGHT_LEVEL, BRIGHT_PERCENTILE, Lamps, Scene, radiance_along
 from cuspid.simulation.sensor import expose
-from cuspid.trueness import NOTHING, OcclusalView
+from cuspid.trueness import NOTHING, ReferenceRender
 
 FAR_LIGHT_MM = 1000.0
 """Height of the light of an orthographic view; from here it comes within 2 deg of straight down on all of an arch."""
@@ -26,7 +26,7 @@ _ROWS = 64
 
 
 @dataclass(frozen=True, kw_only=True)
-class OcclusalOptions:
+class ReferenceRenderOptions:
     """How the jaw is rendered from above."""
 
     mm_per_px: float = 0.05
@@ -41,7 +41,7 @@ class OcclusalOptions:
             raise InputError("reference render: mm per px must be positive and the margin not negative")
 
 
-def render_occlusal_view(scene: Scene, options: OcclusalOptions = OcclusalOptions()) -> OcclusalView:
+def render_reference(scene: Scene, options: ReferenceRenderOptions = ReferenceRenderOptions()) -> ReferenceRender:
     """The jaw from above, with the materials, the texture and the sensor's gamma of its scene, without noise."""
     low, high = scene.jaw.mesh.bounds
     height = options.camera_height_mm
@@ -60,7 +60,7 @@ def render_occlusal_view(scene: Scene, options: OcclusalOptions = OcclusalOption
         light[rows] = _light(scene, _on_plane(rows, columns, scene.supersampling, origin, options), height)
         heights[rows], labels[rows] = _surface(scene, _on_plane(rows, columns, 1, origin, options), height)
     quiet = replace(scene.handpiece.sensor, noise_dn=0.0)
-    return OcclusalView(
+    return ReferenceRender(
         image=expose(light, _gain(light), quiet, np.random.default_rng(0)),
         labels=labels,
         height_mm=heights,
@@ -71,7 +71,7 @@ def render_occlusal_view(scene: Scene, options: OcclusalOptions = OcclusalOption
 
 
 def _on_plane(
-    rows: slice, width: int, samples: int, origin_px: Float[np.ndarray, "2"], options: OcclusalOptions
+    rows: slice, width: int, samples: int, origin_px: Float[np.ndarray, "2"], options: ReferenceRenderOptions
 ) -> Float[np.ndarray, "r w s 2"]:
     """Where the rays through some rows of pixels meet the occlusal plane, mm."""
     offsets = (np.arange(samples) + 0.5) / samples
