@@ -70,7 +70,7 @@ def prepared(results: Sequence[Result]) -> str:
         for tooth, entry in result.get("margins", {}).items()
         if result["case"] in (f"prepared-{tooth}", arch)
     ]
-    margin_head = ("scan", "FDI", "judged %", "found %", "mean", "SD", "P95", "max", "outward", "detector's floor")
+    margin_head = ("scan", "FDI", "evaluated %", "found %", "mean", "SD", "P95", "max", "outward", "detector's floor")
     return "\n".join(
         [
             "Absolute deviations in um, all points of the scan on the tooth, 120 images for a tooth"
@@ -89,7 +89,7 @@ def prepared(results: Sequence[Result]) -> str:
 
 def _margin(entry: Result) -> list[str]:
     found = entry["scan"]
-    figures = [entry["judged_pct"], *(found[f"{name}"] for name in ("found_pct", "mean_um", "std_um", "p95_um"))]
+    figures = [entry["evaluated_pct"], *(found[f"{name}"] for name in ("found_pct", "mean_um", "std_um", "p95_um"))]
     figures += [found["max_um"], found["outward_um"], entry["floor"]["mean_um"]]
     return ["-" if figure is None else f"{figure:.1f}" for figure in figures]
 

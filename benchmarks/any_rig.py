@@ -2,8 +2,8 @@
 
     python benchmarks/any_rig.py [--work FOLDER] [--out benchmarks/results/any_rig.json] [--only two four] [--quick]
 
-Each rig is simulated, reconstructed and judged without options of its own. Finished scans are kept in the work folder
-and not run again.
+Each rig is simulated, reconstructed and evaluated without options of its own. Finished scans are kept in the work
+folder and not run again.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def rig(cameras: str, working_distance_mm: float, width_px: int, height_px: int)
     return DESIGNS[cameras](options)
 
 
-def judge(
+def evaluate_rig(
     *, cameras: str, working_distance_mm: float, width_px: int, height_px: int, jaw: Jaw, options: TrialOptions
 ) -> dict[str, Value]:
     """The figures of one scan."""
@@ -102,7 +102,7 @@ def main() -> None:
     chosen = [each for each in every.values() if not arguments.only or each.name.startswith(tuple(arguments.only))]
     outcomes = run_grid(
         chosen,
-        partial(judge, jaw=jaw, options=options),
+        partial(evaluate_rig, jaw=jaw, options=options),
         arguments.work / ("quick" if arguments.quick else "full"),
         workers=arguments.workers,
         progress=lambda stage, done, total: print(f"{stage}: {done} of {total}", flush=True),

@@ -3,7 +3,7 @@
     python benchmarks/compare_motion.py SCAN/ [--methods rig colmap colmap-rig] [--out benchmarks/results]
 
 SCAN is a folder that ``cuspid simulate`` wrote. COLMAP runs as a user would run it: pycolmap's defaults, sequential
-matching, every camera a sequence of its own. The truth only judges the result.
+matching, every camera a sequence of its own. The truth only evaluates the result.
 """
 
 from __future__ import annotations

@@ -174,7 +174,7 @@ def any_rig(result: Result) -> str:
     scans = result["scans"]
     parts = [
         f"Tooth {result['tooth']} of the phantom, each rig without options of its own. The share within 50 um is of "
-        "what two cameras of one exposure could see, which differs between the rigs: *seen* is how much of the tooth "
+        "what two cameras of one frame could see, which differs between the rigs: *seen* is how much of the tooth "
         "that is. Eight and ten cameras are those that a search found (docs/designs.md).",
     ]
     for title, names in result["tables"].items():

@@ -65,7 +65,7 @@ def quantiles_um(distances_mm: np.ndarray) -> dict[str, float]:
     return dict(zip(("median_um", "p95_um", "max_um"), values.round(2).tolist(), strict=True))
 
 
-def between(one: Jaw, other: Jaw) -> dict[str, dict[str, float]]:
+def surface_distances(one: Jaw, other: Jaw) -> dict[str, dict[str, float]]:
     """Distances from the vertices of one surface to the other: all, on teeth, on gum."""
     distances = other.mesh.closest(one.mesh.vertices)[0]
     on_tooth = np.zeros(len(distances), dtype=bool)
@@ -108,7 +108,7 @@ def population(work: Path, count: int, edge_mm: float) -> dict[str, object]:
     one, other = models["00"].mean, models["01"].mean
     result["a_b_c_mm"] = {"mean_of_the_jaws": widths.mean(axis=0).tolist(), "of_the_mean_jaw": widths_mm(one)}
     result["landmarks_apart_um"] = landmark_distance_um(one, other)
-    result["surfaces_apart"] = {"00_to_01": between(one, other), "01_to_00": between(other, one)}
+    result["surfaces_apart"] = {"00_to_01": surface_distances(one, other), "01_to_00": surface_distances(other, one)}
     return result
 
 
@@ -155,7 +155,7 @@ def known_mean(work: Path, edge_mm: float) -> dict[str, object]:
         edge = edge_mm * (1 + 0.03 * (number + 1))
         meshed = make_phantom(work / f"base-{edge:g}.ply", PhantomOptions(edge_mm=edge))
         jaws[f"{number:02d}"] = deformed(meshed, weights[number], base.landmarks)
-    meshing = between(meshed, base)
+    meshing = surface_distances(meshed, base)
     model = mean_shape(jaws)
     mean = _onto_landmarks(model.mean, base)
     places = np.stack([point.position for point in base.landmarks.values()])
@@ -165,10 +165,10 @@ def known_mean(work: Path, edge_mm: float) -> dict[str, object]:
         "count": KNOWN,
         "edge_mm": edge_mm,
         **iteration(model),
-        "samples_to_known_mean": between(jaws["00"], base),
+        "samples_to_known_mean": surface_distances(jaws["00"], base),
         "another_meshing_to_known_mean": meshing,
-        "mean_to_known_mean": between(mean, base),
-        "known_mean_to_mean": between(base, mean),
+        "mean_to_known_mean": surface_distances(mean, base),
+        "known_mean_to_mean": surface_distances(base, mean),
         "largest_angle_between_modes_deg": np.rad2deg(subspace_angles(known, found)).round(2).tolist(),
     }
 

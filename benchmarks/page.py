@@ -162,7 +162,7 @@ def page(results: list[Result], motions: list[Result], others: Mapping[str, Resu
         "",
         "Conditions of the thesis: texture `artificial`, twelve cameras with exact calibration, noise 1.5 DN in each "
         "colour channel, 120 images for a tooth and 1200 or more for an arch. Trueness is scan to reference over the "
-        "surface that two cameras of one exposure could see (rule: `cuspid.visibility`). Times are wall "
+        "surface that two cameras of one frame could see (rule: `cuspid.visibility`). Times are wall "
         "seconds of `cuspid reconstruct` on 2 cores with numba's compiled code cached.",
         "",
     ]

@@ -89,7 +89,7 @@ def film_command(jaw: Path, out: Path, seed: int) -> list[str]:
 
 
 def measure(name: str, method: str, folder: Path, limit_s: int) -> dict[str, object]:
-    """Stitch a film by a method through its command line, and judge the panorama."""
+    """Stitch a film by a method through its command line, and evaluate the panorama."""
     out = folder / method
     command = METHODS[method](folder / "film" / "capture", out, limit_s)
     status, figures = timed(*command)
@@ -118,7 +118,7 @@ def given_up(status: int, limit_s: int) -> str:
 
 
 def unmade(out: Path) -> str | None:
-    """Why there is no panorama of OpenCV's to judge, or None."""
+    """Why there is no panorama of OpenCV's to evaluate, or None."""
     if not (out / "result.json").exists():
         return None
     result = json.loads((out / "result.json").read_text())

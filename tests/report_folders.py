@@ -61,7 +61,7 @@ def known_trueness(deviation_um: np.ndarray) -> Trueness:
             teeth=(TOOTH,),
             per_tooth_pct={TOOTH: CROWN_WITHIN},
             estimated=False,
-            note="what counts of the open crown",
+            note="what is evaluated of the open crown",
         ),
         scale_error_ppm=-24.0,
         inter_molar_error_um=None,

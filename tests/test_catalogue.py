@@ -52,7 +52,7 @@ def test_rows_have_what_the_item_says_for_each_unless_they_say_otherwise():
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         (ITEM.replace("states", "state"), "fig-9.1: unknown key 'state'; did you mean states"),
         (ITEM.replace('section = "9"', "section = 9"), "fig-9.1: section cannot be 9"),
@@ -76,13 +76,13 @@ def test_rows_have_what_the_item_says_for_each_unless_they_say_otherwise():
         ("[[item]", "figures.toml: not valid TOML"),
     ],
 )
-def test_what_is_wrong_is_told_with_the_name_of_the_item(text, told):
-    with pytest.raises(InputError, match=told):
+def test_what_is_wrong_is_told_with_the_name_of_the_item(text, message):
+    with pytest.raises(InputError, match=message):
         read_items(text, "figures.toml")
 
 
 @pytest.mark.parametrize(
-    ("row", "told"),
+    ("row", "message"),
     [
         (ROW + 'computed = "rato"\nat_most = 1', "fig-9.1: no function 'rato'"),
         (ROW + 'computed = "ratio"\nwith = { of = "a" }\nat_most = 1', "fig-9.1: ratio: .*'to'"),
@@ -90,8 +90,8 @@ def test_what_is_wrong_is_told_with_the_name_of_the_item(text, told):
         ('table = "none"', "fig-9.1: no function 'none'"),
     ],
 )
-def test_functions_that_are_not_there_are_told_before_anything_is_run(row, told):
-    with pytest.raises(InputError, match=told):
+def test_functions_that_are_not_there_are_told_before_anything_is_run(row, message):
+    with pytest.raises(InputError, match=message):
         judge({}, [only_item(ITEM + row)])
 
 

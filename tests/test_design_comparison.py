@@ -31,7 +31,7 @@ from cuspid.studies.design_comparison import (
     prepare_comparison,
     section_outlines,
     tooth_completeness,
-    way_mm,
+    trajectory_mm,
     with_smaller_images,
 )
 from cuspid.studies.grid import Case, Outcome
@@ -112,7 +112,7 @@ def test_a_turned_holder_sweeps_more_width_and_the_twelve_are_wide_as_they_are(c
 def test_way_and_data_follow_from_the_frames():
     handpiece = essential_four(DesignOptions(width_px=200, height_px=100))
     poses = [Rigid3(np.eye(3), np.array([-float(x), 0, 0])) for x in range(4)]
-    assert way_mm(handpiece, poses) == pytest.approx(3.0)
+    assert trajectory_mm(handpiece, poses) == pytest.approx(3.0)
     assert data_mb(handpiece, 4) == pytest.approx(4 * 4 * 200 * 100 / 1e6)
 
 
@@ -143,7 +143,12 @@ def test_only_turned_designs_are_turned_and_cheap_scans_come_first():
 
 def outcome(turns, seed=0, complete=90.0, failure=None, design="six"):
     parameters = {"jaw": "phantom", "tooth": TOOTH, "design": design, "turns": turns, "seed": seed}
-    figures = {"frames": 10 * turns, "way_mm": 9.0 * turns, "height_mm": 12.0, "tooth_within_50_um_pct": complete}
+    figures = {
+        "frames": 10 * turns,
+        "trajectory_mm": 9.0 * turns,
+        "height_mm": 12.0,
+        "tooth_within_50_um_pct": complete,
+    }
     figures |= {"cameras": 6, "tooth_mean_abs_um": None if seed else 2.0}
     case = Case(name=f"{design}_{turns}_{seed}", parameters=parameters)
     return Outcome(case=case, figures={} if failure else figures, failure=failure)
@@ -203,7 +208,7 @@ def files(coarse_phantom, tmp_path_factory):
     return folder
 
 
-def test_a_scan_is_simulated_reconstructed_and_judged(files, tmp_path):
+def test_a_scan_is_simulated_reconstructed_and_evaluated(files, tmp_path):
     options = ComparisonOptions(designs=(str(files / "tiny.json"),), jaws=(str(files / "jaw.ply"),), samples=5000)
     trial = TrialOptions(
         simulation=SimulationOptions(supersampling=1, path=ScanPathOptions(frames=5, length_mm=4.0)),
@@ -216,7 +221,7 @@ def test_a_scan_is_simulated_reconstructed_and_judged(files, tmp_path):
     assert (figures["cameras"], figures["frames"], figures["images"]) == (4, 5, 20)
     assert 75 < figures["minimum_overlap_pct"] < 100
     assert figures["data_mb"] == pytest.approx(20 * 140 * 140 / 1e6)
-    assert 3 < figures["way_mm"] < 6
+    assert 3 < figures["trajectory_mm"] < 6
     assert 0 < figures["tooth_mean_abs_um"] < 30
     # Of what two cameras saw at once, images so small show a half, and the views from above no side.
     assert 0.3 < figures["occlusal_within_100_um_pct"] / figures["occlusal_seen_pct"] <= 1

@@ -89,7 +89,7 @@ def test_side_groups_aim_at_the_crown_from_the_working_distance() -> None:
         np.testing.assert_allclose(aim, [0, side * 4.0, -3.0], atol=1e-12)
 
 
-def test_lights_lie_between_the_cameras_of_their_group_and_are_on_in_the_one_exposure() -> None:
+def test_lights_lie_between_the_cameras_of_their_group_and_are_on_in_the_one_lighting_pattern() -> None:
     handpiece = twelve_cameras()
     assert [lighting.name for lighting in handpiece.lightings] == ["all"]
     assert set(handpiece.lightings[0].lights) == set(handpiece.lights)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from cuspid.errors import InputError
 from cuspid.evaluation.crown import OpenCrown, open_parts, openness
 from cuspid.evaluation.deviation import EvaluationOptions, evaluate, statistics
-from cuspid.evaluation.distance import Surface
+from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions
 from cuspid.evaluation.search import SearchOptions
 from cuspid.geometry import Rigid3
@@ -60,25 +60,27 @@ def with_plate(mesh: Mesh, centre: tuple[float, float, float], size_mm: float = 
 @given(st.integers(0, 2**32 - 1))
 def test_signed_distance_to_a_box_is_the_analytic_one(seed: int):
     box = trimesh.creation.box((4.0, 6.0, 8.0))
-    surface = Surface(Mesh(np.asarray(box.vertices), np.asarray(box.faces)))
+    surface = SignedDistance(Mesh(np.asarray(box.vertices), np.asarray(box.faces)))
     points = np.random.default_rng(seed).uniform(-6, 6, (50, 3))
     beyond = np.abs(points) - [2.0, 3.0, 4.0]
     expected = np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
-    feet = surface.feet(points)
-    np.testing.assert_allclose(feet.signed_mm, expected, atol=1e-12)
-    assert not feet.on_border.any()
+    closest = surface.closest_points(points)
+    np.testing.assert_allclose(closest.signed_mm, expected, atol=1e-12)
+    assert not closest.on_border.any()
     step = 1e-6
-    grown = surface.feet(points + step * feet.directions).signed_mm - feet.signed_mm
+    grown = surface.closest_points(points + step * closest.directions).signed_mm - closest.signed_mm
     np.testing.assert_allclose(grown[np.abs(expected) > 0.01], step, rtol=1e-3)
 
 
 def test_what_lies_past_a_border_is_told_from_what_lies_over_it():
-    square = Surface(Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])))
+    square = SignedDistance(
+        Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    )
     points = np.array([[0.5, 0.5, 0.3], [0.5, 0.5, -0.3], [1.2, 0.5, 0.1], [1.1, 0.5, 0.2], [1.2, 1.2, 0.0]])
-    feet = square.feet(points)
-    np.testing.assert_allclose(feet.signed_mm[:2], [0.3, -0.3])
-    assert feet.on_border.tolist() == [False, False, True, True, True]
-    assert feet.past_border.tolist() == [False, False, True, False, True]
+    closest = square.closest_points(points)
+    np.testing.assert_allclose(closest.signed_mm[:2], [0.3, -0.3])
+    assert closest.on_border.tolist() == [False, False, True, True, True]
+    assert closest.past_border.tolist() == [False, False, True, False, True]
 
 
 # Statistics
@@ -199,7 +201,7 @@ def test_drift_grows_along_the_arch_from_the_first_tooth():
     assert found.drift_um[37] > 3 * found.drift_um[45]
 
 
-# What counts
+# What is evaluated
 
 
 @cache
@@ -210,10 +212,10 @@ def crown_side() -> np.ndarray:
 def test_what_could_not_be_seen_is_not_missed():
     mesh = jaw().mesh
     scan = mesh.submesh(crown_side())
-    judged = trueness(scan, scannable=crown_side())
-    assert judged.completeness_pct["50"] > 99.5
-    assert judged.scannable_pct == pytest.approx(100 * mesh.face_areas[crown_side()].sum() / mesh.face_areas.sum())
-    assert trueness(scan).completeness_pct["50"] == pytest.approx(judged.scannable_pct, abs=3)
+    evaluated = trueness(scan, scannable=crown_side())
+    assert evaluated.completeness_pct["50"] > 99.5
+    assert evaluated.scannable_pct == pytest.approx(100 * mesh.face_areas[crown_side()].sum() / mesh.face_areas.sum())
+    assert trueness(scan).completeness_pct["50"] == pytest.approx(evaluated.scannable_pct, abs=3)
 
 
 def test_errors_over_unseen_surface_are_left_out_only_near_it():
@@ -348,5 +350,5 @@ def test_in_everything_counts_also_what_was_scanned_where_nothing_could_be_seen(
 def test_a_mask_of_another_reference_is_refused():
     with pytest.raises(InputError, match=r"has 3 faces, the reference \d+; give the reference"):
         trueness(jaw().mesh, scannable=np.ones(3, dtype=bool))
-    with pytest.raises(InputError, match="no face of the reference counts"):
+    with pytest.raises(InputError, match="no face of the reference is left to evaluate"):
         trueness(jaw().mesh, scannable=np.zeros(len(jaw().mesh.faces), dtype=bool))

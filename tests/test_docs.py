@@ -169,8 +169,8 @@ def test_the_calibration_on_a_page_can_be_read(tmp_path):
 
 
 def test_every_verb_is_documented():
-    told = {arguments[0] for page in pages() for _, arguments in commands(page)}
-    assert set(cli.COMMANDS) <= told
+    shown = {arguments[0] for page in pages() for _, arguments in commands(page)}
+    assert set(cli.COMMANDS) <= shown
 
 
 def test_the_command_line_has_a_page_for_every_verb(monkeypatch):

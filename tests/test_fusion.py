@@ -155,12 +155,12 @@ def test_colour_comes_from_the_maps() -> None:
 
 
 def test_fusion_is_deterministic_and_tells_progress() -> None:
-    told: list[tuple[str, int, int]] = []
-    again = fuse(depth_maps(HILLS), POSES, progress=lambda *step: told.append(step))
+    calls: list[tuple[str, int, int]] = []
+    again = fuse(depth_maps(HILLS), POSES, progress=lambda *step: calls.append(step))
     assert np.array_equal(again.vertices, fused_hills().vertices)
     assert np.array_equal(again.faces, fused_hills().faces)
-    assert told[0] == ("fusion", 1, 6)
-    assert told[-1] == ("fusion", 6, 6)
+    assert calls[0] == ("fusion", 1, 6)
+    assert calls[-1] == ("fusion", 6, 6)
 
 
 def test_the_frame_of_the_world_does_not_matter() -> None:

@@ -194,7 +194,7 @@ def test_too_little_texture_is_told_in_one_line(points: int) -> None:
 
 
 def test_a_single_frame_is_located_at_the_origin() -> None:
-    """One exposure is metric by itself."""
+    """One frame is metric by itself."""
     handpiece, path = make_handpiece(), make_path(1)
     found = locate_features(handpiece, see(handpiece, path), list(path), MotionOptions())
     np.testing.assert_array_equal(found.rig_from_world["00000"].matrix, np.eye(4))
@@ -237,7 +237,7 @@ def test_an_uncertain_calibration_is_refined() -> None:
 
 
 def test_a_frame_is_triangulated_in_the_rig_frame() -> None:
-    """Points of one exposure are where they are, seen by two or more cameras of the group only."""
+    """Points of one frame are where they are, seen by two or more cameras of the group only."""
     handpiece, path = make_handpiece(), make_path(1)
     seen = see(handpiece, path)
     views = {c: make_view(seen["00000", c], m.camera) for c, m in handpiece.rig.cameras.items()}

@@ -31,20 +31,20 @@ from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
 from cuspid.jaw import Jaw
 from cuspid.panorama import FrameUse, Panorama
 from cuspid.simulation.appearance import APPEARANCES
-from cuspid.simulation.occlusal import OcclusalOptions, render_occlusal_view
 from cuspid.simulation.raycast import Scene
-from cuspid.trueness import GroundTruth, OcclusalView
+from cuspid.simulation.reference_render import ReferenceRenderOptions, render_reference
+from cuspid.trueness import GroundTruth, ReferenceRender
 
 STEP_MM = 0.2
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Known:
-    """A film of two frames from high above, its single shots, and the panorama without any error."""
+    """A film of two frames from high above, its reference renders, and the panorama without any error."""
 
     truth: GroundTruth
-    view: OcclusalView
-    shot: OcclusalView
+    view: ReferenceRender
+    shot: ReferenceRender
     panorama: Panorama
 
 
@@ -56,13 +56,13 @@ def known(coarse_phantom: Jaw) -> Known:
     }
     truth = GroundTruth(jaw=coarse_phantom, handpiece=handpiece, rig_from_world=poses)
     scene = Scene(jaw=coarse_phantom, handpiece=handpiece, appearance=APPEARANCES["enamel"], supersampling=1)
-    view = render_occlusal_view(scene, OcclusalOptions(mm_per_px=STEP_MM))
-    shot = render_occlusal_view(scene, OcclusalOptions(mm_per_px=STEP_MM, camera_height_mm=300.0))
+    view = render_reference(scene, ReferenceRenderOptions(mm_per_px=STEP_MM))
+    shot = render_reference(scene, ReferenceRenderOptions(mm_per_px=STEP_MM, camera_height_mm=300.0))
     return Known(truth=truth, view=view, shot=shot, panorama=perfect(truth, view))
 
 
-def perfect(truth: GroundTruth, view: OcclusalView) -> Panorama:
-    """The single shot itself, whose pixels came from the frame that is left or right of the middle."""
+def perfect(truth: GroundTruth, view: ReferenceRender) -> Panorama:
+    """The reference render itself, whose pixels came from the frame that is left or right of the middle."""
     covered = view.labels >= 0
     points = view.points_at(covered)
     mounted = truth.handpiece.rig["camera"]
@@ -307,15 +307,15 @@ def test_molars_of_one_side_have_no_distance(known: Known) -> None:
 
 def write_truth(known: Known, folder: Path) -> Path:
     storage.write_truth(folder / "truth", known.truth)
-    storage.write_occlusal_view(folder / "truth" / "occlusal", known.view)
-    storage.write_occlusal_view(folder / "truth" / "shot", known.shot)
+    storage.write_reference_render(folder / "truth" / "occlusal", known.view)
+    storage.write_reference_render(folder / "truth" / "shot", known.shot)
     return folder / "truth"
 
 
-def test_single_shots_are_read_as_they_were_written(known: Known, tmp_path: Path) -> None:
+def test_reference_renders_are_read_as_they_were_written(known: Known, tmp_path: Path) -> None:
     truth = write_truth(known, tmp_path)
     for name, view in (("occlusal", known.view), ("shot", known.shot)):
-        read = storage.read_occlusal_view(truth / name)
+        read = storage.read_reference_render(truth / name)
         for array in ("image", "labels", "height_mm", "origin_px"):
             np.testing.assert_array_equal(getattr(read, array), getattr(view, array))
         assert (read.mm_per_px, read.camera_height_mm) == (view.mm_per_px, view.camera_height_mm)

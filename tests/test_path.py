@@ -45,20 +45,20 @@ def part_of(jaw: Jaw, teeth: tuple[int, ...]) -> Jaw:
 # --- around what is in the way ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("tied", list(product((False, True), repeat=2)))
-def test_the_chain_is_the_cheapest_of_all(tied: tuple[bool, bool]) -> None:
+@pytest.mark.parametrize("anchored", list(product((False, True), repeat=2)))
+def test_the_chain_is_the_cheapest_of_all(anchored: tuple[bool, bool]) -> None:
     rng = np.random.default_rng(4)
     stations = [(rng.normal(0, 1, (4, 5)) * _UNITS, rng.uniform(0, 3, 4)) for _ in range(4)]
 
     def cost(choice: tuple[int, ...]) -> float:
         rows = [station[0][index] for station, index in zip(stations, choice, strict=True)]
-        rows = [np.zeros(5)] * tied[0] + rows + [np.zeros(5)] * tied[1]
+        rows = [np.zeros(5)] * anchored[0] + rows + [np.zeros(5)] * anchored[1]
         steps = sum(np.sum(((b - a) / _UNITS) ** 2) for a, b in pairwise(rows))
         return _APART * steps + sum(station[1][index] for station, index in zip(stations, choice, strict=True))
 
     best = min(product(range(4), repeat=4), key=cost)
     expected = [station[0][index] for station, index in zip(stations, best, strict=True)]
-    np.testing.assert_array_equal(_shortest(stations, tied), expected)
+    np.testing.assert_array_equal(_shortest(stations, anchored), expected)
 
 
 def test_a_path_that_fits_is_left_alone(coarse_phantom: Jaw, curve: ArchCurve, crowns: CrownPoints) -> None:
@@ -178,7 +178,7 @@ def test_a_path_with_further_passes_overlaps_and_fits(coarse_phantom: Jaw) -> No
     assert path.seen[31] >= alone.seen[31] - 0.01
 
 
-def test_frames_are_judged_by_all_their_cameras() -> None:
+def test_frames_are_evaluated_by_all_their_cameras() -> None:
     overlap = np.array([[0.8, 0.6], [np.nan, 0.9], [np.nan, np.nan]])
     np.testing.assert_allclose(frame_overlap(overlap), [0.7, 0.95, 1.0])
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 
 from builders import any_pose, joined, moved, sphere
 from cuspid.errors import InputError
-from cuspid.evaluation.distance import Surface
+from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions, fit, refine, register
 from cuspid.evaluation.search import SearchOptions
 from cuspid.geometry import Rigid3
@@ -25,8 +25,8 @@ def jaw() -> Jaw:
 
 
 @cache
-def surface() -> Surface:
-    return Surface(jaw().mesh)
+def surface() -> SignedDistance:
+    return SignedDistance(jaw().mesh)
 
 
 def error_um(found: Rigid3, true: Rigid3, points: np.ndarray) -> float:
@@ -68,7 +68,7 @@ def test_a_noisy_tooth_finds_its_place_in_the_arch(fdi: int, seed: int):
 def test_a_scan_larger_than_its_reference_is_laid_too():
     scan_from_reference = any_pose(6, 200)
     scan = jaw().mesh.transformed(scan_from_reference)
-    found = register(scan, Surface(around_tooth(44, 10.0)), FAST, rng=np.random.default_rng(0))
+    found = register(scan, SignedDistance(around_tooth(44, 10.0)), FAST, rng=np.random.default_rng(0))
     assert error_um(found.reference_from_scan, scan_from_reference.inverse(), scan.vertices) < 1
 
 
@@ -105,7 +105,7 @@ def test_two_poses_that_fit_alike_are_told_and_chosen_from_alike():
     box = trimesh.creation.box((10.0, 6.0, 4.0)).subdivide_to_size(0.5)
     mesh = Mesh(np.asarray(box.vertices), np.asarray(box.faces))
     scan = mesh.transformed(any_pose(1, 200))
-    found, again = (register(scan, Surface(mesh), FAST, rng=np.random.default_rng(0)) for _ in range(2))
+    found, again = (register(scan, SignedDistance(mesh), FAST, rng=np.random.default_rng(0)) for _ in range(2))
     np.testing.assert_array_equal(found.reference_from_scan.matrix, again.reference_from_scan.matrix)
     assert any("another pose" in note for note in found.notes)
     assert found.rms_um < 0.01

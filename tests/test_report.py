@@ -177,7 +177,7 @@ def test_the_page_of_a_scan(scan_folder):
     assert "&lt;script&gt;notes are text" in page
     assert "frame 00002: too few points" in page
     assert page.count("<td>91.5</td>") == 2
-    assert "what counts of the open crown" in page
+    assert "what is evaluated of the open crown" in page
     assert '<th scope="row">everything</th>' in page
     for known in ("reconstruct: images", "b" * 64, "evaluation.samples", "simulate: simulation.seed"):
         assert known in page
@@ -338,7 +338,7 @@ def test_the_page_of_a_sweep(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("column", "told"),
+    ("column", "label"),
     [
         ("baseline_mm", "baseline, mm"),
         ("complete_50_um_pct", "complete 50 µm, %"),
@@ -346,8 +346,8 @@ def test_the_page_of_a_sweep(tmp_path):
         ("tooth_p95_um", "tooth P95, µm"),
     ],
 )
-def test_headings(column, told):
-    assert heading(column) == told
+def test_headings(column, label):
+    assert heading(column) == label
 
 
 # --- the files behind them --------------------------------------------------------------------------------------------

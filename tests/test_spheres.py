@@ -16,7 +16,7 @@ from PIL import Image
 from cuspid.anatomy.phantom.sphere_arch import SphereArchOptions, build_sphere_arch
 from cuspid.anatomy.teeth.dentition import ARCH_FORMS
 from cuspid.errors import InputError
-from cuspid.evaluation.distance import Surface
+from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions, fit
 from cuspid.evaluation.spheres import SphereOptions, SphereReport, evaluate_spheres, fit_sphere
 from cuspid.geometry import Rigid3
@@ -252,9 +252,9 @@ def test_a_best_fit_hides_a_bent_arch_that_the_spacing_shows(coarse_arch: Jaw) -
     truth_um = 2000 * per_mm * behind_mm**2 / 40
     assert report.inter_second_molar_um == pytest.approx(truth_um, rel=0.05)
     points, _ = scan.sample(20_000, np.random.default_rng(0))
-    surface = Surface(coarse_arch.mesh)
+    surface = SignedDistance(coarse_arch.mesh)
     best = fit(points, surface, Rigid3.identity(), RegistrationOptions())
-    deviation_um = 1000 * surface.feet(best.reference_from_scan.apply(points)).signed_mm
+    deviation_um = 1000 * surface.closest_points(best.reference_from_scan.apply(points)).signed_mm
     assert 0 < np.mean(np.abs(deviation_um)) < truth_um / 4
     assert abs(np.mean(deviation_um)) < truth_um / 10
 

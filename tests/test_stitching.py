@@ -24,11 +24,11 @@ from cuspid.pipeline import RenderOptions, StitchOptions, take_images
 from cuspid.reconstruction import Tracks
 from cuspid.simulation.path.arch import arch_curve
 from cuspid.sparse_model import SparseModel
-from cuspid.stitching.exposure import ExposureOptions, Samples, balance
+from cuspid.stitching.gain_compensation import GainOptions, Samples, balance
+from cuspid.stitching.height_map import HeightMapOptions, ScaleOptions, height_map, in_occlusal_frame
 from cuspid.stitching.mosaic import unlit
 from cuspid.stitching.ortho import Stitched
 from cuspid.stitching.seams import SeamOptions, choose
-from cuspid.stitching.surface import ScaleOptions, SurfaceOptions, height_map, in_occlusal_frame
 from cuspid.trueness import GroundTruth
 from verbs import refused
 
@@ -216,7 +216,7 @@ def test_frames_that_have_nothing_in_common_are_named(tmp_path: Path) -> None:
 
 
 def test_two_films_are_stitched_as_two_parts(sequence: ImageSequence, tmp_path: Path) -> None:
-    """The two ends of the film, mirrored and turned for the second: nothing ties them together."""
+    """The two ends of the film, mirrored and turned for the second: no verified pair joins them."""
     first = [sequence.image(index) for index in range(5)]
     second = [np.ascontiguousarray(sequence.image(index)[::-1]) for index in range(7, 12)]
     both = replace(images_in(tmp_path, first + second), camera=sequence.camera)
@@ -254,7 +254,7 @@ def test_gains_and_falloff_are_found_and_burnt_out_samples_do_not_count() -> Non
         level[~usable.ravel()] = 255.0
         color = np.repeat(level, 3).reshape(20, 20, 3)
         samples.take(frame, (slice(0, 20), slice(0, 20)), 20, color, falloff.reshape(20, 20), usable)
-    light = balance(samples, frames, ExposureOptions())
+    light = balance(samples, frames, GainOptions())
     np.testing.assert_allclose(light.gains, gains, atol=0.03)
     assert 0.4 < light.exponent < 0.5
 
@@ -339,7 +339,7 @@ def test_the_height_map_follows_the_points_and_is_known_everywhere() -> None:
     assert found.tracks is not None
     scale, rotation, shift = best_similarity(points, found.tracks.points)
     top, gum = scale * np.array([[0.0, 30.0, -1.0], [0.0, 36.0, -5.0]]) @ rotation.T + shift
-    surface = height_map(found, SurfaceOptions())
+    surface = height_map(found, HeightMapOptions())
     assert np.isfinite(surface.heights).all()
     heights = surface.at(np.array([[top[:2], gum[:2]]])).ravel()
     np.testing.assert_allclose(heights, [top[2], gum[2]], atol=0.7)

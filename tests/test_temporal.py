@@ -28,7 +28,7 @@ def test_one_moving_camera_measures_depth() -> None:
     found = measure_temporal(handpiece, images[0], images[1], STEP, "00000", options)
     assert [depth_map.camera_name for depth_map in found] == ["west", "west+"]
     for depth_map in found:
-        # Both are given in the rig frame of the first exposure, which is the world here.
+        # Both are given in the rig frame of the first frame, which is the world here.
         error = 1000 * (depth_map.depth_mm - cast_depth(HILLS, depth_map.camera, depth_map.cam_from_rig))
         error = error[np.isfinite(error)]
         assert depth_map.frame == "00000"

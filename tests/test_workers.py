@@ -24,14 +24,14 @@ def pinned(work):
 
 
 def test_results_come_in_the_order_of_the_items_and_each_is_told():
-    told = []
+    calls = []
 
     def late(item):
         time.sleep(0.01 * (3 - item))
         return 10 * item
 
-    assert map_in_threads(late, range(4), stage="tens", progress=lambda *step: told.append(step)) == [0, 10, 20, 30]
-    assert told == [("tens", done, 4) for done in (1, 2, 3, 4)]
+    assert map_in_threads(late, range(4), stage="tens", progress=lambda *step: calls.append(step)) == [0, 10, 20, 30]
+    assert calls == [("tens", done, 4) for done in (1, 2, 3, 4)]
     assert map_in_threads(late, []) == []
 
 

@@ -62,7 +62,7 @@ class Sphere:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Jaw:
-    """What is scanned, or the reference that a scan is judged by."""
+    """What is scanned, or the reference that a scan is evaluated against."""
 
     mesh: Mesh
     """Surface in the occlusal frame."""

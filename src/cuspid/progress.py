@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 Progress = Callable[[str, int, int], None]
-"""Told the stage, how much of it is done and how much there is."""
+"""Callback: called with the stage, how much of it is done and how much there is."""
 
 
 def silent(stage: str, done: int, total: int) -> None:

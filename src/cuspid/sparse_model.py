@@ -1,4 +1,4 @@
-"""What one camera tells of its way and of the surface: no scale, so a model in lengths of its own.
+"""What one camera tells of its trajectory and of the surface: no scale, so a model in lengths of its own.
 
 Frames: ``cam`` is the frame of the camera; the world is any.
 """

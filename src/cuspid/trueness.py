@@ -33,8 +33,9 @@ NOTHING = -1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class OcclusalView:
-    """A jaw as one shot from above shows it: what a panorama should look like. Columns run along +X, rows along -Y.
+class ReferenceRender:
+    """A reference render: a jaw as one image from above, as a panorama should show it. Columns run along +X, rows
+    along -Y.
 
     Pixel (u, v), the centre of the first one at (0.5, 0.5), shows x = (u - u0) s, y = (v0 - v) s of the occlusal frame,
     where (u0, v0) is ``origin_px`` and s ``mm_per_px``; a camera at a finite height shows what lies above or below the
@@ -121,7 +122,7 @@ class CrownCompleteness:
     estimated: bool
     """Whether crowns were told from gum by shape, for want of tooth labels; then nothing is said tooth by tooth."""
     note: str
-    """What counts, for people."""
+    """What is evaluated, for people."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -129,7 +130,7 @@ class Trueness:
     """Result of an evaluation."""
 
     accuracy: DeviationStatistics
-    """Scan to reference, where the reference counts (what two cameras could see, where that is known)."""
+    """Scan to reference, where the reference is evaluated (what two cameras could see, where that is known)."""
     everything: DeviationStatistics
     """Scan to reference, with everything that was scanned but what lies past an open border of the reference."""
     completeness: DeviationStatistics
@@ -137,7 +138,7 @@ class Trueness:
     completeness_pct: Mapping[str, float]
     """Share of the scannable reference surface within 50, 100, 200 um of the scan, keys "50", "100", "200"."""
     scannable_pct: float
-    """Share of the reference surface that counted as scannable."""
+    """Share of the reference surface that was scannable."""
     per_tooth: Mapping[int, DeviationStatistics]
     """Scan to reference, by FDI number."""
     per_tooth_completeness_pct: Mapping[int, Mapping[str, float]]
@@ -155,6 +156,6 @@ class Trueness:
     reference_from_scan: Rigid3
     """The rigid alignment that was found."""
     deviation_um: Float[np.ndarray, "v"]
-    """Signed deviation of each vertex of the scan; NaN where the vertex does not count."""
+    """Signed deviation of each vertex of the scan; NaN where the vertex is not evaluated."""
     notes: tuple[str, ...] = field(default=())
     """What a reader should know, for example how the scannable surface was chosen."""

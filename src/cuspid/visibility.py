@@ -1,4 +1,4 @@
-"""What of a surface the cameras of a handpiece could see: the rule for what counts as scannable, and tables of it.
+"""What of a surface the cameras of a handpiece could see: the rule for what is scannable, and tables of it.
 
 A face is seen by a camera if its centre lies in the image and in the depth range of the lens, if nothing is in the way,
 and if the line of sight meets it from the front no flatter than the largest incidence (0 degrees is square on). It is
@@ -28,7 +28,7 @@ _AT_ONCE = (1, 2, 3)
 
 @dataclass(frozen=True, kw_only=True)
 class VisibilityOptions:
-    """When a face counts as seen."""
+    """When a face is seen."""
 
     maximum_incidence_deg: float = 75.0
     """Largest angle between the line of sight and the face's normal."""
@@ -274,7 +274,7 @@ def _visible_among(
 
 
 def _incidence_deg(mesh: Mesh, faces: Int[np.ndarray, "n"], eye: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n"]:
-    """Angle between the normals of the faces and the way to the eye."""
+    """Angle between the normals of the faces and the line of sight to the eye."""
     sight = eye - mesh.face_centres[faces]
     cosine = np.einsum("nd,nd->n", sight, mesh.face_normals[faces]) / np.linalg.norm(sight, axis=1)
     return np.asarray(np.rad2deg(np.arccos(np.clip(cosine, -1, 1))))

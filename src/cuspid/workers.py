@@ -36,8 +36,8 @@ def map_in_threads(
 ) -> list[_Result]:
     """``work`` on each item, in a thread for each usable core; results in the order of the items.
 
-    Of errors the first in that order is raised, and items that were not begun are left. ``progress`` is told of
-    ``stage``.
+    Of errors the first in that order is raised, and items that were not begun are left. ``progress`` is called
+    with ``stage`` after each.
     """
     results: list[_Result] = []
     with ThreadPoolExecutor(usable_cores()) as pool:

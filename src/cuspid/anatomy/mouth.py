@@ -41,8 +41,8 @@ PRINTED_GAP_MM = (12.0, 26.6)
 """L as the thesis prints it (Eq. 2.4)."""
 _CURVE_STEP_MM = 0.25
 """Spacing of the fit curve."""
-_WAY_POINTS = 60
-"""Points of the way of a tooth in the sagittal view."""
+_ARC_POINTS = 60
+"""Points of the trajectory of a tooth in the sagittal view."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -466,19 +466,19 @@ class SagittalView:
     condyle_mm: Float[np.ndarray, "2"]
     """The condyle in the open mouth."""
     arcs_mm: tuple[Float[np.ndarray, "a 2"], Float[np.ndarray, "a 2"]]
-    """Ways of the lower incisal edges and of the second molar's end, the condyles sliding as the jaw turns."""
+    """Trajectories of the lower incisal edges and of the second molar's end, the condyles sliding as the jaw turns."""
 
 
 def sagittal_view(opening: Normal, options: MouthOptions) -> SagittalView:
     """The typical mouth of a group, for a picture."""
     mouth, ends = typical_mouth(opening, options)
     behind = np.concatenate([[0.0], ends])
-    ways = np.stack([mouth.places_mm(behind[[0, -1]], share) for share in np.linspace(0, 1, _WAY_POINTS)])
+    arcs = np.stack([mouth.places_mm(behind[[0, -1]], share) for share in np.linspace(0, 1, _ARC_POINTS)])
     return SagittalView(
         closed_mm=mouth.places_mm(behind, 0.0),
         opened_mm=mouth.places_mm(behind),
         condyle_mm=mouth.condyle_mm(),
-        arcs_mm=(ways[:, 0], ways[:, 1]),
+        arcs_mm=(arcs[:, 0], arcs[:, 1]),
     )
 
 

@@ -36,7 +36,7 @@ _ARCH_ORDER = (*range(48, 40, -1), *range(31, 39), *range(18, 10, -1), *range(21
 _UPWARDS = 0.5
 """Least z of the normal of a face of an edge or rim: it is inclined by less than 60 degrees."""
 _OUTWARDS = 0.5
-"""A face slopes outwards if its normal has more than this along the way from the middle: by more than 30 degrees."""
+"""A face slopes outwards if its normal has more than this away from the middle: by more than 30 degrees."""
 _WEDGES = 24
 """Directions in which the rim is looked for."""
 _BINS = 12

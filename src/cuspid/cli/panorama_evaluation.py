@@ -1,4 +1,4 @@
-"""Judge a panorama."""
+"""Evaluate a panorama."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from cuspid.evaluation.panorama import (
 )
 from cuspid.panorama import FrameUse, Panorama
 from cuspid.reporting.figures.panorama_evaluation import save_panorama_evaluation
-from cuspid.trueness import OcclusalView
+from cuspid.trueness import ReferenceRender
 
 
 def stitch_eval(
@@ -41,8 +41,8 @@ def stitch_eval(
         truth: The folder truth/ of cuspid film.
         out: Folder for the results.
     """
-    known, view = storage.read_truth(truth), storage.read_occlusal_view(truth / "occlusal")
-    shot = storage.read_occlusal_view(truth / "shot")
+    known, view = storage.read_truth(truth), storage.read_reference_render(truth / "occlusal")
+    shot = storage.read_reference_render(truth / "shot")
     made = storage.read_panorama(panorama) if panorama.is_dir() else read_picture(panorama)
     pictured = panorama / "panorama.png" if panorama.is_dir() else panorama
     hashes = {"panorama": storage.hash_file(pictured), "truth": storage.hash_file(truth / "poses.json")}
@@ -75,7 +75,7 @@ def read_picture(path: Path) -> Panorama:
     )
 
 
-def _save_picture(path: Path, view: OcclusalView, comparison: PanoramaComparison) -> None:
+def _save_picture(path: Path, view: ReferenceRender, comparison: PanoramaComparison) -> None:
     score, places = comparison.score, comparison.points_mm
     save_panorama_evaluation(
         path,
@@ -84,12 +84,12 @@ def _save_picture(path: Path, view: OcclusalView, comparison: PanoramaComparison
         places * [1, -1] / view.mm_per_px + view.origin_px,
         comparison.errors_mm,
         title=f"{score.method}: {score.frames_used} of {score.frames} frames" if score.frames else score.method,
-        captions=("single shot of the true jaw", _pictured(score), _measured(score)),
+        captions=("reference render of the true jaw", _pictured(score), _measured(score)),
     )
 
 
-def _save_beside(out: Path, view: OcclusalView, comparison: PanoramaComparison) -> None:
-    """true.png and made.png: the single shot and the panorama laid over it, pixel by pixel."""
+def _save_beside(out: Path, view: ReferenceRender, comparison: PanoramaComparison) -> None:
+    """true.png and made.png: the reference render and the panorama laid over it, pixel by pixel."""
     storage.write_image(out / "true.png", view.image)
     if comparison.aligned is not None:
         storage.write_image(out / "made.png", np.rint(255 * np.clip(comparison.aligned, 0, 1)).astype(np.uint8))
@@ -112,7 +112,7 @@ def _measured(score: PanoramaScore) -> str:
 
 
 def _print(score: PanoramaScore) -> None:
-    table = Table(title="Likeness to the single shot", title_justify="left")
+    table = Table(title="Likeness to the reference render", title_justify="left")
     heads = ("picture", "ZNCC teeth", "SSIM teeth, fitted", "as it is", "SSIM canvas, fitted", "as it is")
     for head in heads:
         table.add_column(head, justify="left" if head == "picture" else "right")

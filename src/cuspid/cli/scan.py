@@ -42,7 +42,7 @@ def run(
     """Scan a jaw in simulation, reconstruct it, and measure the trueness.
 
     Args:
-        jaw: Mesh of a jaw (STL, PLY, OBJ); without it the built-in phantom.
+        jaw: Mesh of a jaw or of a part of one (STL, PLY, OBJ); without it the built-in phantom.
         out: Folder for everything that is made. A killed run goes on when the same command is given again.
         evaluation: How the trueness is measured.
     """
@@ -62,7 +62,7 @@ def simulate(
     """Render what the handpiece sees: OUT/capture (images, calibration) and OUT/truth (what only the simulator knows).
 
     Args:
-        jaw: Mesh of a jaw (STL, PLY, OBJ); without it the built-in phantom.
+        jaw: Mesh of a jaw or of a part of one (STL, PLY, OBJ); without it the built-in phantom.
         out: Folder.
     """
     _simulate(jaw, out, source, probe, simulation)
@@ -181,11 +181,11 @@ def _evaluate_margins(scan: Mesh, reference: Jaw, trueness: Trueness, out: Path)
 
 def _print_margins(errors: Mapping[int, MarginError]) -> None:
     table = Table(title="Margins in µm: distance of the scan's edge from the true line", title_justify="left")
-    for column in ("tooth", "judged, %", "found, %", "mean", "SD", "P95", "max", "outward", "floor"):
+    for column in ("tooth", "evaluated, %", "found, %", "mean", "SD", "P95", "max", "outward", "floor"):
         table.add_column(column, justify="right")
     for fdi, error in sorted(errors.items()):
         found = error.scan
-        shares = (error.judged_pct, found.found_pct)
+        shares = (error.evaluated_pct, found.found_pct)
         figures = (found.mean_um, found.std_um, found.p95_um, found.max_um, found.outward_um, error.floor.mean_um)
         table.add_row(str(fdi), *(f"{figure:.1f}" for figure in (*shares, *figures)))
     Console().print(table)

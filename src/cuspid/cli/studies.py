@@ -42,7 +42,7 @@ def sweep(
 ) -> None:
     """Find the best baseline and angle of a pair of cameras for a surface of a tooth, by scanning with each setting.
 
-    Each setting is a whole scan: rendered, reconstructed and judged on that surface. The best ones are repeated with
+    Each setting is a whole scan: rendered, reconstructed and evaluated on that surface. The best ones are repeated with
     other textures, hands and noise, to tell which are level. A killed sweep goes on with the same command.
 
     Args:

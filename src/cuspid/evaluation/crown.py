@@ -3,9 +3,9 @@
 A face is open if a share of at least `LEAST_OPENNESS` of the directions above the occlusal plane (XY) is free, where
 only what lies within 15 mm of the tooth is in the way.
 
-Over all count the teeth that the scan was meant for: of which at least three quarters as much of the open crown was *in
-reach* as of the tooth that was best in reach. In reach is what two cameras could see at once where that is known, else
-what lies within 200 um of the scan.
+Over all, the teeth are evaluated that the scan was meant for: of which at least three quarters as much of the open
+crown was *in reach* as of the tooth that was best in reach. In reach is what two cameras could see at once where that
+is known, else what lies within 200 um of the scan.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cuspid.mesh import Mesh
 from cuspid.trueness import CrownCompleteness
 
 LEAST_OPENNESS = 0.05
-"""Share of the directions above the occlusal plane that must be free for a face of a crown to count."""
+"""Share of the directions above the occlusal plane that must be free for a face of a crown to be open."""
 WITHIN_UM = (50, 100, 200)
 """Distances at which completeness is asked."""
 _OPENNESS_RAYS = 64
@@ -31,7 +31,7 @@ _IN_REACH_MM = 0.2
 _PIECE_MM = 10.0
 """Side of the squares of the occlusal plane that stand for teeth where these have no names."""
 _MEANT = 0.75
-"""Share in reach, in proportion to that of the tooth best in reach, from which on a tooth counts over all."""
+"""Share in reach, in proportion to that of the tooth best in reach, from which on a tooth is evaluated over all."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -116,14 +116,14 @@ def crown_completeness(
     distances_mm, _, _ = aligned.closest(points)
     owners = crown.parts[faces][picks]
     parts = [part for part in reach if np.any(owners == part)]
-    counting = [part for part in parts if reach[part] >= _MEANT * max(reach.values())]
+    evaluated = [part for part in parts if reach[part] >= _MEANT * max(reach.values())]
     return CrownCompleteness(
-        completeness_pct=within_pct(distances_mm[np.isin(owners, counting)]),
-        open_mm2=float(crown.mesh.face_areas[np.isin(crown.parts, counting)].sum()),
-        teeth=() if crown.estimated else tuple(counting),
+        completeness_pct=within_pct(distances_mm[np.isin(owners, evaluated)]),
+        open_mm2=float(crown.mesh.face_areas[np.isin(crown.parts, evaluated)].sum()),
+        teeth=() if crown.estimated else tuple(evaluated),
         per_tooth_pct={} if crown.estimated else {part: within_pct(distances_mm[owners == part]) for part in parts},
         estimated=crown.estimated,
-        note=_note(crown, scannable is not None, counting),
+        note=_note(crown, scannable is not None, evaluated),
     )
 
 
@@ -141,12 +141,12 @@ def _in_reach(aligned: Mesh, crown: OpenCrown, scannable: Bool[np.ndarray, "f"] 
     }
 
 
-def _note(crown: OpenCrown, could_be_seen: bool, counting: list[int]) -> str:
-    """What counts, for people."""
+def _note(crown: OpenCrown, could_be_seen: bool, evaluated: list[int]) -> str:
+    """What is evaluated, for people."""
     where = "could be seen by two cameras" if could_be_seen else "lies within 200 µm of the scan"
-    named = f"{len(counting)} pieces" if crown.estimated else ", ".join(map(str, counting))
-    told = "; crowns were told from gum by shape, an estimate" if crown.estimated else ""
+    named = f"{len(evaluated)} pieces" if crown.estimated else ", ".join(map(str, evaluated))
+    estimated = "; crowns were told from gum by shape, an estimate" if crown.estimated else ""
     return (
-        f"of the open crown surface counts, over all: {named}; of each of them at least three quarters as much {where} "
-        f"as of the best one{told}"
+        f"of the open crown surface is evaluated, over all: {named}; of each of them at least three quarters as much "
+        f"{where} as of the best one{estimated}"
     )

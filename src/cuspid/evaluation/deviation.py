@@ -1,22 +1,22 @@
 """Trueness of a scan, as the field measures it, in both directions. Positive is outside the reference.
 
 Accuracy: signed distances from points even by area on the scan to the reference. Completeness: from points even by area
-on the reference to the scan. What counts:
+on the reference to the scan. What is evaluated:
 
 - Of the reference, the faces of the ``scannable`` mask, which the pipeline sets where at least two cameras could see.
   Without a mask all of it, less what ``min_openness`` and ``crop_mm`` take away.
 - Of the scan, every point, except
-  (a) a point whose closest reference face does not count and that lies within ``margin_mm`` of it: the scan has surface
-      where nothing could be measured, but where surface is. A point farther off is an error and counts;
+  (a) a point whose closest reference face is not evaluated and that lies within ``margin_mm`` of it: the scan has
+      surface where nothing could be measured, but where surface is. A point farther off is an error and is evaluated;
   (b) without a mask, a point whose closest point lies on an open border of the reference: the scan may simply show
       more. With a mask the reference is all there was to see, and a point is left out only if it lies past the border,
       farther sideways than up or down, and within ``margin_mm``, as where a scan frays at its rim.
 
-Beside this stand a figure in which everything scanned counts (all points but those of (b)), and the completeness of all
+Beside this stand a figure of everything scanned (all points but those of (b)), and the completeness of all
 crown surface that is open to some direction (:mod:`cuspid.evaluation.crown`).
 
-A point is always measured to the closest surface, whether that counts or not. ``Trueness.notes`` says how much was left
-out by each rule.
+A point is always measured to the closest surface, whether that is evaluated or not. ``Trueness.notes`` says how much
+was left out by each rule.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float, Int
 
 from cuspid.errors import InputError
 from cuspid.evaluation.crown import OpenCrown, crown_completeness, openness, within_pct
-from cuspid.evaluation.distance import Feet, Surface
+from cuspid.evaluation.distance import ClosestPoints, SignedDistance
 from cuspid.evaluation.registration import Alignment, RegistrationOptions, best_scale, register
 from cuspid.evaluation.teeth import CANINES, LEAST_SAMPLES, MOLARS, distance_error_um, drift_um, find_teeth
 from cuspid.geometry import Rigid3
@@ -37,7 +37,7 @@ from cuspid.mesh import Mesh
 from cuspid.trueness import DeviationStatistics, Trueness
 
 _LEAST_TOOTH_PCT = 30.0
-"""Share of a tooth's surface that must lie within 200 um of the scan for its place to be judged."""
+"""Share of a tooth's surface that must lie within 200 um of the scan for its place to be evaluated."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,20 +51,20 @@ class EvaluationOptions:
     samples: int = 200_000
     """Points on each of the two surfaces, even by area."""
     margin_mm: float = 0.5
-    """A point of the scan over surface that does not count is left out only within this distance."""
+    """A point of the scan over surface that is not evaluated is left out only within this distance."""
     crop_mm: float | None = None
-    """Reference surface farther than this from the scan is regarded as not scanned; by default all counts."""
+    """Reference surface farther than this from the scan is regarded as not scanned; by default all is evaluated."""
     min_openness: float = 0.0
-    """Without a mask: share of the directions above the occlusal plane that must be free for a face to count. 0.05
-    leaves out the hidden insides and the base of a model; 0 counts everything."""
+    """Without a mask: share of the directions above the occlusal plane that must be free for a face to be evaluated.
+    0.05 leaves out the hidden insides and the base of a model; 0 evaluates everything."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Rules:
-    """What counts; see the top of the module."""
+    """What is evaluated; see the top of the module."""
 
     faces: Bool[np.ndarray, "f"]
-    """Faces of the reference that count."""
+    """Faces of the reference that are evaluated."""
     margin_mm: float
     """Limit of both rules."""
     reference_is_all: bool
@@ -72,19 +72,19 @@ class _Rules:
     note: str
     """How the faces were chosen."""
 
-    def unscannable(self, feet: Feet) -> Bool[np.ndarray, "n"]:
+    def unscannable(self, closest: ClosestPoints) -> Bool[np.ndarray, "n"]:
         """Points that rule (a) leaves out."""
-        return ~self.faces[feet.faces] & (np.abs(feet.signed_mm) <= self.margin_mm)
+        return ~self.faces[closest.faces] & (np.abs(closest.signed_mm) <= self.margin_mm)
 
-    def past_border(self, feet: Feet) -> Bool[np.ndarray, "n"]:
+    def past_border(self, closest: ClosestPoints) -> Bool[np.ndarray, "n"]:
         """Points that rule (b) leaves out."""
         if not self.reference_is_all:
-            return feet.on_border
-        return feet.past_border & (np.abs(feet.signed_mm) <= self.margin_mm)
+            return closest.on_border
+        return closest.past_border & (np.abs(closest.signed_mm) <= self.margin_mm)
 
-    def counts(self, feet: Feet) -> Bool[np.ndarray, "n"]:
-        """Points that count."""
-        return ~(self.unscannable(feet) | self.past_border(feet))
+    def evaluated(self, closest: ClosestPoints) -> Bool[np.ndarray, "n"]:
+        """Points that are evaluated."""
+        return ~(self.unscannable(closest) | self.past_border(closest))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -98,7 +98,7 @@ class _Samples:
     labels: Int[np.ndarray, "n"]
     """FDI numbers of the reference faces to which they belong, 0 for gum or unknown."""
     left_out: str
-    """What does not count, for people."""
+    """What is not evaluated, for people."""
 
     def within_pct_by_tooth(self) -> dict[int, dict[str, float]]:
         """Shares within some um, of each tooth that has samples."""
@@ -122,7 +122,7 @@ def evaluate(
     to compare.
     """
     rng = rng or np.random.default_rng(0)
-    surface = Surface(reference.mesh)
+    surface = SignedDistance(reference.mesh)
     rules = _rules(reference.mesh, scannable, options)
     alignment = _align(scan, surface, options, rng)
     aligned = scan.transformed(alignment.reference_from_scan)
@@ -136,7 +136,7 @@ def evaluate(
         if within["200"] >= _LEAST_TOOTH_PCT
     }
     teeth = find_teeth(from_scan.points, from_scan.labels, centroids, surface, options.registration)
-    vertex_feet = surface.feet(aligned.vertices)
+    at_vertices = surface.closest_points(aligned.vertices)
     return Trueness(
         accuracy=statistics(from_scan.signed_mm),
         everything=everything,
@@ -155,7 +155,7 @@ def evaluate(
         inter_canine_error_um=distance_error_um(teeth, CANINES),
         drift_um=drift_um(teeth, surface),
         reference_from_scan=alignment.reference_from_scan,
-        deviation_um=np.where(rules.counts(vertex_feet), 1000 * vertex_feet.signed_mm, np.nan),
+        deviation_um=np.where(rules.evaluated(at_vertices), 1000 * at_vertices.signed_mm, np.nan),
         notes=(*alignment.notes, rules.note, from_scan.left_out, from_reference.left_out),
     )
 
@@ -199,11 +199,11 @@ def _rules(reference: Mesh, scannable: Bool[np.ndarray, "f"] | None, options: Ev
         faces=faces,
         margin_mm=options.margin_mm,
         reference_is_all=scannable is not None,
-        note=f"of the reference counts: {note}",
+        note=f"of the reference is evaluated: {note}",
     )
 
 
-def _align(scan: Mesh, surface: Surface, options: EvaluationOptions, rng: np.random.Generator) -> Alignment:
+def _align(scan: Mesh, surface: SignedDistance, options: EvaluationOptions, rng: np.random.Generator) -> Alignment:
     if options.align:
         return register(scan, surface, options.registration, rng=rng)
     points, _ = scan.sample(options.registration.samples, rng)
@@ -214,7 +214,7 @@ def _align(scan: Mesh, surface: Surface, options: EvaluationOptions, rng: np.ran
 
 def _samples_of_scan(
     aligned: Mesh,
-    surface: Surface,
+    surface: SignedDistance,
     labels: Int[np.ndarray, "f"],
     rules: _Rules,
     options: EvaluationOptions,
@@ -222,19 +222,19 @@ def _samples_of_scan(
 ) -> tuple[_Samples, DeviationStatistics]:
     """The samples, and the statistics of everything that was scanned."""
     points, _ = aligned.sample(options.samples, rng)
-    feet = surface.feet(points)
-    counts = rules.counts(feet)
-    past_border = rules.past_border(feet)
-    over, past = 100 * rules.unscannable(feet).mean(), 100 * past_border.mean()
+    closest = surface.closest_points(points)
+    evaluated = rules.evaluated(closest)
+    past_border = rules.past_border(closest)
+    over, past = 100 * rules.unscannable(closest).mean(), 100 * past_border.mean()
     limit = f" by at most {rules.margin_mm:g} mm" if rules.reference_is_all else ""
     samples = _Samples(
-        points=points[counts],
-        signed_mm=feet.signed_mm[counts],
-        labels=labels[feet.faces[counts]],
-        left_out=f"of the scan does not count: {over:.1f} % within {rules.margin_mm:g} mm of reference surface that "
-        f"does not count, {past:.1f} % past an open border of the reference{limit}",
+        points=points[evaluated],
+        signed_mm=closest.signed_mm[evaluated],
+        labels=labels[closest.faces[evaluated]],
+        left_out=f"of the scan is not evaluated: {over:.1f} % within {rules.margin_mm:g} mm of reference surface that "
+        f"is not evaluated, {past:.1f} % past an open border of the reference{limit}",
     )
-    return samples, statistics(feet.signed_mm[~past_border])
+    return samples, statistics(closest.signed_mm[~past_border])
 
 
 def _samples_of_reference(
@@ -249,7 +249,9 @@ def _samples_of_reference(
     indices = np.flatnonzero(rules.faces)
     area_pct = 100 * reference.face_areas[indices].sum() / reference.face_areas.sum()
     if not area_pct > 0:
-        raise InputError("evaluation: no face of the reference counts; check the scannable mask and --min-openness")
+        raise InputError(
+            "evaluation: no face of the reference is left to evaluate; check the scannable mask and --min-openness"
+        )
     points, picks = Mesh(reference.vertices, reference.faces[indices]).sample(options.samples, rng)
     faces = indices[picks]
     distances, _, positions = aligned.closest(points)
@@ -260,6 +262,6 @@ def _samples_of_reference(
         points=points[near],
         signed_mm=(signs * distances)[near],
         labels=labels[faces[near]],
-        left_out=f"of the reference does not count as scanned: {cropped}",
+        left_out=f"of the reference is not regarded as scanned: {cropped}",
     )
     return samples, float(area_pct * near.mean())

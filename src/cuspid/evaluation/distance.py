@@ -20,7 +20,7 @@ _ON_EDGE = 1e-7
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Feet:
+class ClosestPoints:
     """The closest points of a surface to some points."""
 
     signed_mm: Float[np.ndarray, "n"]
@@ -36,8 +36,8 @@ class Feet:
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
-    """A mesh that answers signed distances."""
+class SignedDistance:
+    """Signed distances to a mesh."""
 
     mesh: Mesh
     """The surface, outward normals counter-clockwise."""
@@ -76,7 +76,7 @@ class Surface:
         angles = np.arctan2(np.linalg.norm(np.cross(after, before), axis=2), np.sum(after * before, axis=2))
         return _summed(self.mesh.faces, angles[..., None] * self.mesh.face_normals[:, None], len(self.mesh.vertices))
 
-    def feet(self, points: Float[np.ndarray, "n 3"]) -> Feet:
+    def closest_points(self, points: Float[np.ndarray, "n 3"]) -> ClosestPoints:
         """Closest points of the surface to ``points`` (mm)."""
         distances, faces, positions = self.mesh.closest(points)
         on_edge = _barycentric(self.mesh.vertices[self.mesh.faces[faces]], positions) < _ON_EDGE
@@ -88,7 +88,7 @@ class Surface:
         directions[far] = (signs / np.where(far, distances, 1))[far, None] * offsets[far]
         on_border = self._on_border(faces, on_edge)
         height = np.abs(np.sum(offsets * self.mesh.face_normals[faces], axis=1))
-        return Feet(
+        return ClosestPoints(
             signed_mm=signs * distances,
             faces=faces,
             directions=directions,

@@ -28,7 +28,7 @@ _FINE_MM = 0.01
 _TANGENT_MM = 0.15
 """Half the chord from which the direction of the line is taken."""
 _STRAIGHT = 0.93
-"""A line is judged where that chord is at least this share of its arc: not at the corners of an inlay."""
+"""A line is evaluated where that chord is at least this share of its arc: not at the corners of an inlay."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,7 @@ class MarginOptions:
     least_bend_deg: float = 25.0
     """Least angle by which the flanks differ in direction."""
     most_floor_um: float = 20.0
-    """A section is judged only if the edge of the reference itself is found within this distance of the line."""
+    """A section is evaluated only if the edge of the reference itself is found within this distance of the line."""
 
     def __post_init__(self) -> None:
         if not (self.step_mm > 0 and 0 <= self.flank_from_mm < self.flank_to_mm and self.reach_mm > 0):
@@ -81,8 +81,8 @@ class MarginError:
 
     scan: MarginStatistics
     """The scan's edge."""
-    judged_pct: float
-    """Share of the sections that are judged: not at corners of the line, nor where the reference's edge is unclear."""
+    evaluated_pct: float
+    """Share of the sections that are evaluated: not those at corners, nor where the reference's edge is unclear."""
     floor: MarginStatistics
     """The reference's own edge by the same detector: what it cannot tell apart from zero."""
 
@@ -129,8 +129,8 @@ def margin_error(
         found.append(np.full(2, np.nan) if edge is None else frame @ edge.point)
     if not own:
         raise InputError("margin: the reference has no edge along its margin line; does the line belong to this mesh?")
-    judged_pct = 100 * len(own) / count
-    return MarginError(scan=_statistics(np.array(found)), judged_pct=judged_pct, floor=_statistics(np.array(own)))
+    evaluated_pct = 100 * len(own) / count
+    return MarginError(scan=_statistics(np.array(found)), evaluated_pct=evaluated_pct, floor=_statistics(np.array(own)))
 
 
 def _statistics(offsets_mm: Float[np.ndarray, "n 2"]) -> MarginStatistics:

@@ -1,11 +1,11 @@
 """How far a panorama is from the arch that it shows (thesis 4.3, with more than one number).
 
-A panorama that knows which frame each of its pixels came from is judged by geometry: the pixel's ray, from where the
+A panorama that knows which frame each of its pixels came from is evaluated by geometry: the pixel's ray, from where the
 frame truly was, meets the true jaw in a point, and the panorama places that point somewhere in the occlusal plane. The
 best similarity (least squares, Umeyama 1991) of all tooth pixels is taken away; what remains is the geometric error.
-The same similarity lays the panorama over the single shot of the true jaw (:class:`cuspid.trueness.OcclusalView`),
-where the pictures are compared. A panorama without that knowledge is laid over it by image features, and only the
-pictures are compared.
+The same similarity lays the panorama over the reference render of the true jaw
+(:class:`cuspid.trueness.ReferenceRender`), where the pictures are compared. A panorama without that knowledge is laid
+over it by image features, and only the pictures are compared.
 
 Pictures are compared in grey (Rec. 601), where the panorama shows nothing as black: ZNCC over the pixels of the teeth,
 SSIM (Wang et al. 2004, Gaussian window of 1.5 px) as the mean of its map over the teeth, and over the whole canvas as
@@ -29,7 +29,7 @@ from cuspid.camera import OPENCV_PIXEL_OFFSET
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, best_similarity
 from cuspid.panorama import Panorama
-from cuspid.trueness import NOTHING, GroundTruth, OcclusalView
+from cuspid.trueness import NOTHING, GroundTruth, ReferenceRender
 
 FEWEST_TEETH_PX = 200
 """Of the sampled pixels must show teeth, for an alignment by geometry."""
@@ -47,7 +47,7 @@ _FEATURES = 6000
 
 @dataclass(frozen=True, kw_only=True)
 class PanoramaEvaluationOptions:
-    """How a panorama is judged, and when it counts as failed."""
+    """How a panorama is evaluated, and when it is taken for failed."""
 
     samples: int = 200_000
     """Pixels of the panorama that are followed to the true jaw, at most, evenly spread."""
@@ -89,7 +89,7 @@ class GeometricError:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageScores:
-    """How like a picture is to the single shot."""
+    """How like a picture is to the reference render."""
 
     zncc: float
     """Zero-mean normalised cross-correlation over the teeth; gain and offset do not change it."""
@@ -110,16 +110,16 @@ class PanoramaScore:
     method: str
     """How it was made."""
     failure: str | None
-    """Why it counts as failed: such a panorama has no scores. None where it does not."""
+    """Why it is taken for failed: such a panorama has no scores. None where it does not."""
     aligned_by: Literal["geometry", "pictures"] | None
-    """What laid it over the single shot."""
+    """What laid it over the reference render."""
     geometry: GeometricError | None
     """Error of the places of tooth pixels; None where it cannot be known."""
     inter_molar_error_mm: float | None
     """Distance between the first molars (else second) in the panorama minus the true one; with the panorama's own
     millimetres where it has any, else after the similarity. None where it does not show both."""
     coverage_pct: float | None
-    """Share of the single shot's tooth pixels that it shows."""
+    """Share of the reference render's tooth pixels that it shows."""
     seen_pct: float
     """Share of them that any frame saw: the most that could be shown."""
     tooth_coverage_pct: Mapping[int, float]
@@ -133,9 +133,9 @@ class PanoramaScore:
     parts: int
     """Pieces into which the sequence broke."""
     picture: ImageScores | None
-    """Against the orthographic single shot."""
+    """Against the orthographic reference render."""
     shot: ImageScores | None
-    """Against the single shot of a camera at a height, aligned anew."""
+    """Against the reference render of a camera at a height, aligned anew."""
     trivial: Mapping[str, ImageScores]
     """What pictures score that show no work: empty, constant grey on the whole canvas and in the outline of the jaw,
     and the truth shifted by 1 mm."""
@@ -150,7 +150,7 @@ class PanoramaComparison:
     score: PanoramaScore
     """The figures."""
     aligned: Float[np.ndarray, "h w 3"] | None
-    """The panorama on the pixels of the single shot, RGB 0 to 1; None where it failed."""
+    """The panorama on the pixels of the reference render, RGB 0 to 1; None where it failed."""
     points_mm: Float[np.ndarray, "n 2"]
     """True places of the tooth pixels that were asked."""
     errors_mm: Float[np.ndarray, "n"]
@@ -255,8 +255,8 @@ def _spread_pixels(where: Bool[np.ndarray, "h w"], most: int) -> tuple[Int[np.nd
     return rows * step + step // 2, columns * step + step // 2
 
 
-def seen_by_frames(view: OcclusalView, truth: GroundTruth, samples: int = 10_000) -> Bool[np.ndarray, "h w"]:
-    """The pixels of the single shot's teeth that some frame saw, asked on a grid and spread to the nearest."""
+def seen_by_frames(view: ReferenceRender, truth: GroundTruth, samples: int = 10_000) -> Bool[np.ndarray, "h w"]:
+    """The pixels of the reference render's teeth that some frame saw, asked on a grid and spread to the nearest."""
     rows, columns = _spread_pixels(view.teeth, samples)
     asked = np.zeros_like(view.teeth)
     asked[rows, columns] = True
@@ -291,7 +291,7 @@ def image_scores(
     truth: Float[np.ndarray, "h w"],
     teeth: Bool[np.ndarray, "h w"],
 ) -> ImageScores:
-    """Compare a grey picture (0 to 1) with the truth; what is not ``shown`` counts as black."""
+    """Compare a grey picture (0 to 1) with the truth; what is not ``shown`` is taken for black."""
     black = np.where(shown, picture, 0.0)
     raw = _ssim_map(black, truth)
     on_teeth = _ssim_map(np.where(shown, _fitted(picture, truth, shown & teeth), 0.0), truth)
@@ -336,7 +336,7 @@ def _inner_mean(similarity: Float[np.ndarray, "h w"]) -> float:
     return float(similarity[border:-border, border:-border].mean())
 
 
-def trivial_scores(view: OcclusalView) -> dict[str, ImageScores]:
+def trivial_scores(view: ReferenceRender) -> dict[str, ImageScores]:
     """What pictures score that show no work."""
     truth, everywhere, nowhere = grey(view.image), np.ones_like(view.teeth), np.zeros_like(view.teeth)
     jaw, level = view.labels != NOTHING, float(truth[view.teeth].mean())
@@ -353,9 +353,9 @@ def trivial_scores(view: OcclusalView) -> dict[str, ImageScores]:
 
 
 def lay_over(
-    panorama: Panorama, view: OcclusalView, plane_from_panorama: Similarity2
+    panorama: Panorama, view: ReferenceRender, plane_from_panorama: Similarity2
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """The panorama on the pixels of the single shot (RGB, 0 to 1), and where it shows something.
+    """The panorama on the pixels of the reference render (RGB, 0 to 1), and where it shows something.
 
     ``plane_from_panorama`` takes the panorama's world to the occlusal plane, mm. A finer panorama is averaged over the
     pixels first.
@@ -373,7 +373,7 @@ def lay_over(
     return np.asarray(laid, dtype=np.float64), np.asarray(shown > 0.5)
 
 
-def align_by_pictures(panorama: Panorama, view: OcclusalView) -> Similarity2 | None:
+def align_by_pictures(panorama: Panorama, view: ReferenceRender) -> Similarity2 | None:
     """``plane_from_panorama`` by SIFT features and RANSAC; None where too few agree."""
     sift = cv2.SIFT.create(_FEATURES)
     masks = (panorama.covered, view.labels != NOTHING)
@@ -410,17 +410,17 @@ def align_by_pictures(panorama: Panorama, view: OcclusalView) -> Similarity2 | N
 def evaluate_panorama(
     panorama: Panorama,
     truth: GroundTruth,
-    view: OcclusalView,
-    shot: OcclusalView | None = None,
+    view: ReferenceRender,
+    shot: ReferenceRender | None = None,
     options: PanoramaEvaluationOptions = PanoramaEvaluationOptions(),
 ) -> PanoramaComparison:
     """All figures of a panorama against the truth of its film.
 
-    ``view`` is the orthographic single shot and ``shot`` that of a camera at a height. Raises InputError where the
+    ``view`` is the orthographic reference render and ``shot`` that of a camera at a height. Raises InputError where the
     panorama's frames are not those of the truth.
     """
     if view.camera_height_mm is not None:
-        raise InputError("evaluation: the first single shot must be orthographic")
+        raise InputError("evaluation: the first reference render must be orthographic")
     seen = seen_by_frames(view, truth)
     traced = trace_pixels(panorama, truth, options.samples) if (panorama.frame_index >= 0).any() else None
     base = _Comparison(panorama=panorama, view=view, shot=shot, seen=seen, options=options)
@@ -430,8 +430,8 @@ def evaluate_panorama(
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Comparison:
     panorama: Panorama
-    view: OcclusalView
-    shot: OcclusalView | None
+    view: ReferenceRender
+    shot: ReferenceRender | None
     seen: Bool[np.ndarray, "h w"]
     options: PanoramaEvaluationOptions
 
@@ -550,7 +550,7 @@ class _Comparison:
             picture=None,
             shot=None,
             trivial=trivial_scores(self.view),
-            notes=("the jaw has no tooth labels: its whole surface counts as teeth",) if unlabelled else (),
+            notes=("the jaw has no tooth labels: its whole surface is taken for teeth",) if unlabelled else (),
         )
 
 

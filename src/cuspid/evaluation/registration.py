@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.errors import InputError
-from cuspid.evaluation.distance import Feet, Surface
+from cuspid.evaluation.distance import ClosestPoints, SignedDistance
 from cuspid.evaluation.search import SearchOptions, find_poses
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
@@ -56,25 +56,27 @@ class Alignment:
     """Why the alignment is doubtful; empty where it is not."""
 
 
-def register(scan: Mesh, surface: Surface, options: RegistrationOptions, *, rng: np.random.Generator) -> Alignment:
+def register(
+    scan: Mesh, surface: SignedDistance, options: RegistrationOptions, *, rng: np.random.Generator
+) -> Alignment:
     """Align a scan in any pose with a reference surface; the smaller of the two is laid on the larger one.
 
     Raises InputError where no pose brings a quarter of the smaller surface near the larger one.
     """
     if scan.face_areas.sum() > 1.5 * surface.mesh.face_areas.sum():
-        swapped = _lay(surface.mesh, Surface(scan), options, rng)
+        swapped = _lay(surface.mesh, SignedDistance(scan), options, rng)
         return replace(swapped, reference_from_scan=swapped.reference_from_scan.inverse(), scale=1 / swapped.scale)
     return _lay(scan, surface, options, rng)
 
 
-def _lay(scan: Mesh, surface: Surface, options: RegistrationOptions, rng: np.random.Generator) -> Alignment:
+def _lay(scan: Mesh, surface: SignedDistance, options: RegistrationOptions, rng: np.random.Generator) -> Alignment:
     few, _ = scan.sample(_FEW, rng)
     brief = replace(options, tolerance_um=1.0, iterations=25)
     starts = find_poses(scan, surface.mesh, options.search, rng=rng)
     poses = [refine(few, surface, start, brief) for start in starts]
     misfits = np.array([_truncated_mean_mm(few, surface, pose) for pose in poses])
     best = poses[int(np.argmin(misfits))]
-    overlap = _overlap(surface.feet(best.apply(few)), options.outlier_mm)
+    overlap = _overlap(surface.closest_points(best.apply(few)), options.outlier_mm)
     if overlap < _LEAST_OVERLAP:
         raise InputError(
             f"registration: at best {overlap:.0%} of the scan comes near the reference; "
@@ -84,27 +86,31 @@ def _lay(scan: Mesh, surface: Surface, options: RegistrationOptions, rng: np.ran
     return replace(alignment, notes=(*_doubts(alignment), *_rivals(poses, misfits, few)))
 
 
-def fit(points: Float[np.ndarray, "n 3"], surface: Surface, start: Rigid3, options: RegistrationOptions) -> Alignment:
+def fit(
+    points: Float[np.ndarray, "n 3"], surface: SignedDistance, start: Rigid3, options: RegistrationOptions
+) -> Alignment:
     """Align points of a scan with a surface from a pose nearby."""
     pose = refine(points, surface, start, options)
-    feet = surface.feet(pose.apply(points))
-    weights = _weights(feet, options.outlier_mm)
+    closest = surface.closest_points(pose.apply(points))
+    weights = _weights(closest, options.outlier_mm)
     return Alignment(
         reference_from_scan=pose,
         scale=best_scale(points, surface, pose, options),
-        rms_um=float(1000 * np.sqrt(np.sum(weights * feet.signed_mm**2) / max(weights.sum(), 1e-300))),
-        overlap=_overlap(feet, options.outlier_mm),
+        rms_um=float(1000 * np.sqrt(np.sum(weights * closest.signed_mm**2) / max(weights.sum(), 1e-300))),
+        overlap=_overlap(closest, options.outlier_mm),
     )
 
 
-def refine(points: Float[np.ndarray, "n 3"], surface: Surface, start: Rigid3, options: RegistrationOptions) -> Rigid3:
+def refine(
+    points: Float[np.ndarray, "n 3"], surface: SignedDistance, start: Rigid3, options: RegistrationOptions
+) -> Rigid3:
     """``reference_from_scan`` with the least weighted sum of squared distances, from a pose nearby."""
     pose = start
     for _ in range(options.iterations):
         moved = pose.apply(points)
-        feet = surface.feet(moved)
+        closest = surface.closest_points(moved)
         centre = moved.mean(axis=0)
-        step = _gauss_newton(moved - centre, feet, _weights(feet, options.outlier_mm))
+        step = _gauss_newton(moved - centre, closest, _weights(closest, options.outlier_mm))
         motion = _about(centre, step)
         pose = motion @ pose
         if np.abs(motion.apply(moved) - moved).max() < options.tolerance_um / 1000:
@@ -113,14 +119,14 @@ def refine(points: Float[np.ndarray, "n 3"], surface: Surface, start: Rigid3, op
 
 
 def best_scale(
-    points: Float[np.ndarray, "n 3"], surface: Surface, reference_from_scan: Rigid3, options: RegistrationOptions
+    points: Float[np.ndarray, "n 3"], surface: SignedDistance, reference_from_scan: Rigid3, options: RegistrationOptions
 ) -> float:
     """Scale of the scan that the best similarity near an alignment would take away."""
     moved, shrinking = reference_from_scan.apply(points), 1.0
     for _ in range(options.iterations):
-        feet = surface.feet(moved)
+        closest = surface.closest_points(moved)
         centre = moved.mean(axis=0)
-        step = _gauss_newton(moved - centre, feet, _weights(feet, options.outlier_mm), with_scale=True)
+        step = _gauss_newton(moved - centre, closest, _weights(closest, options.outlier_mm), with_scale=True)
         before = moved
         moved = _about(centre, step[:6]).apply(centre + (1 + step[6]) * (moved - centre))
         shrinking *= 1 + step[6]
@@ -136,23 +142,27 @@ def _about(centre: Float[np.ndarray, "3"], step: Float[np.ndarray, "6"]) -> Rigi
 
 
 def _gauss_newton(
-    centred: Float[np.ndarray, "n 3"], feet: Feet, weights: Float[np.ndarray, "n"], *, with_scale: bool = False
+    centred: Float[np.ndarray, "n 3"],
+    closest: ClosestPoints,
+    weights: Float[np.ndarray, "n"],
+    *,
+    with_scale: bool = False,
 ) -> Float[np.ndarray, "p"]:
     """(turn in rad, shift in mm, and the relative growth if asked for) that lessens the distances most."""
-    columns = [np.cross(centred, feet.directions), feet.directions]
+    columns = [np.cross(centred, closest.directions), closest.directions]
     if with_scale:
-        columns.append(np.sum(centred * feet.directions, axis=1, keepdims=True))
+        columns.append(np.sum(centred * closest.directions, axis=1, keepdims=True))
     jacobian = np.concatenate(columns, axis=1)
     hessian = jacobian.T @ (weights[:, None] * jacobian)
     # What the surface leaves free (a plane slides, a sphere turns) stays where it is.
-    step = np.linalg.lstsq(hessian, -jacobian.T @ (weights * feet.signed_mm), rcond=1e-9)[0]
+    step = np.linalg.lstsq(hessian, -jacobian.T @ (weights * closest.signed_mm), rcond=1e-9)[0]
     return np.asarray(step)
 
 
-def _weights(feet: Feet, outlier_mm: float) -> Float[np.ndarray, "n"]:
+def _weights(closest: ClosestPoints, outlier_mm: float) -> Float[np.ndarray, "n"]:
     """Tukey's biweight, wide enough to leave normal errors their full weight; none at the border of the reference."""
-    distances = np.abs(feet.signed_mm)
-    inside = ~feet.on_border
+    distances = np.abs(closest.signed_mm)
+    inside = ~closest.on_border
     if not inside.any():
         return np.zeros_like(distances)
     sigma = 1.4826 * np.median(distances[inside])
@@ -160,13 +170,13 @@ def _weights(feet: Feet, outlier_mm: float) -> Float[np.ndarray, "n"]:
     return np.asarray(np.where(inside & (distances < cutoff), (1 - (distances / cutoff) ** 2) ** 2, 0.0))
 
 
-def _overlap(feet: Feet, near_mm: float) -> float:
-    return float(np.mean(~feet.on_border & (np.abs(feet.signed_mm) < near_mm)))
+def _overlap(closest: ClosestPoints, near_mm: float) -> float:
+    return float(np.mean(~closest.on_border & (np.abs(closest.signed_mm) < near_mm)))
 
 
-def _truncated_mean_mm(points: Float[np.ndarray, "n 3"], surface: Surface, pose: Rigid3) -> float:
-    feet = surface.feet(pose.apply(points))
-    return float(np.where(feet.on_border, 0.5, np.minimum(np.abs(feet.signed_mm), 0.5)).mean())
+def _truncated_mean_mm(points: Float[np.ndarray, "n 3"], surface: SignedDistance, pose: Rigid3) -> float:
+    closest = surface.closest_points(pose.apply(points))
+    return float(np.where(closest.on_border, 0.5, np.minimum(np.abs(closest.signed_mm), 0.5)).mean())
 
 
 def _doubts(alignment: Alignment) -> tuple[str, ...]:

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int
 
 from cuspid.errors import InputError
 from cuspid.evaluation.deviation import statistics
-from cuspid.evaluation.distance import Surface
+from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions, refine
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
@@ -85,28 +85,28 @@ class Spread:
 def compare_pair(first: Mesh, second: Mesh, options: PairOptions, *, rng: np.random.Generator) -> PairDeviation:
     """Distances between two scans that lie nearly on each other.
 
-    What lies past the border of the other scan, or far from it, does not count. Raises InputError where they have no
+    What lies past the border of the other scan, or far from it, is not evaluated. Raises InputError where they have no
     surface in common.
     """
-    surface = Surface(first)
+    surface = SignedDistance(first)
     if options.align:
         points, _ = second.sample(options.registration.samples, rng)
         second = second.transformed(refine(points, surface, Rigid3.identity(), options.registration))
-    onto_first, first_counts = _signed(second, surface, options, rng)
-    onto_second, second_counts = _signed(first, Surface(second), options, rng)
-    common = np.concatenate([first_counts, second_counts])
+    onto_first, first_common = _signed(second, surface, options, rng)
+    onto_second, second_common = _signed(first, SignedDistance(second), options, rng)
+    common = np.concatenate([first_common, second_common])
     if not common.any():
         raise InputError("repeatability: two scans have no surface in common; check that both show the same teeth")
-    signed_mm = np.concatenate([onto_first[first_counts], -onto_second[second_counts]])
+    signed_mm = np.concatenate([onto_first[first_common], -onto_second[second_common]])
     return PairDeviation(deviation=statistics(signed_mm), common_pct=float(100 * common.mean()))
 
 
 def _signed(
-    scan: Mesh, surface: Surface, options: PairOptions, rng: np.random.Generator
+    scan: Mesh, surface: SignedDistance, options: PairOptions, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
-    """Signed distances of points of a scan from a surface, and which of them count."""
-    feet = surface.feet(scan.sample(options.samples, rng)[0])
-    return feet.signed_mm, ~feet.on_border & (np.abs(feet.signed_mm) <= options.farthest_mm)
+    """Signed distances of points of a scan from a surface, and which of them the surface has, too."""
+    closest = surface.closest_points(scan.sample(options.samples, rng)[0])
+    return closest.signed_mm, ~closest.on_border & (np.abs(closest.signed_mm) <= options.farthest_mm)
 
 
 def spread(

@@ -339,7 +339,7 @@ def _report(
     distance = np.array([spacing.nominal_mm for spacing in spacings])
     error = np.array([spacing.error_um for spacing in spacings])
     slope = distance @ error / (distance @ distance)
-    between = {frozenset((spacing.first, spacing.second)): spacing.error_um for spacing in spacings}
+    error_um = {frozenset((spacing.first, spacing.second)): spacing.error_um for spacing in spacings}
     crossing = [(f"{one}3", f"{other}6") for sides in _SIDES for one, other in (sides, sides[::-1])]
     return SphereReport(
         spheres=spheres,
@@ -349,10 +349,10 @@ def _report(
         spacing_rms_um=float(np.sqrt(np.mean(error**2))),
         scale_ppm=float(1000 * slope),
         spacing_rms_without_scale_um=float(np.sqrt(np.mean((error - slope * distance) ** 2))),
-        inter_canine_um=_across(between, 3),
-        inter_first_molar_um=_across(between, 6),
-        inter_second_molar_um=_across(between, 7),
-        cross_arch_um={f"{a}-{b}": between[pair] for a, b in crossing if (pair := frozenset((a, b))) in between},
+        inter_canine_um=_across(error_um, 3),
+        inter_first_molar_um=_across(error_um, 6),
+        inter_second_molar_um=_across(error_um, 7),
+        cross_arch_um={f"{a}-{b}": error_um[pair] for a, b in crossing if (pair := frozenset((a, b))) in error_um},
         notes=_notes(options),
     )
 
@@ -365,10 +365,10 @@ def _spacing(
     return SphereSpacing(first=first, second=second, nominal_mm=expected, error_um=1000 * (measured - expected))
 
 
-def _across(between: Mapping[frozenset[str], float], position: int) -> float | None:
+def _across(error_um: Mapping[frozenset[str], float], position: int) -> float | None:
     """Error of the distance between the two spheres at a tooth position."""
     pairs = (frozenset((f"{one}{position}", f"{other}{position}")) for one, other in _SIDES)
-    return next((between[pair] for pair in pairs if pair in between), None)
+    return next((error_um[pair] for pair in pairs if pair in error_um), None)
 
 
 def _notes(options: SphereOptions) -> tuple[str, ...]:

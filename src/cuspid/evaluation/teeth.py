@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from cuspid.evaluation.distance import Surface
+from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions, refine
 from cuspid.geometry import Rigid3
 
@@ -47,12 +47,12 @@ def find_teeth(
     points: Float[np.ndarray, "n 3"],
     labels: Int[np.ndarray, "n"],
     centroids: Mapping[int, Float[np.ndarray, "3"]],
-    surface: Surface,
+    surface: SignedDistance,
     options: RegistrationOptions,
 ) -> dict[int, ScannedTooth]:
     """Teeth with enough samples in an aligned scan, in the order along the arch.
 
-    ``labels`` are the FDI numbers of the samples; ``centroids`` those of the teeth that may be judged.
+    ``labels`` are the FDI numbers of the samples; ``centroids`` those of the teeth that may be evaluated.
     """
     teeth = {}
     for fdi in (tooth for tooth in _ARCH_ORDER if tooth in centroids):
@@ -74,12 +74,12 @@ def distance_error_um(teeth: Mapping[int, ScannedTooth], pairs: tuple[tuple[int,
     return None
 
 
-def drift_um(teeth: Mapping[int, ScannedTooth], surface: Surface) -> dict[int, float]:
+def drift_um(teeth: Mapping[int, ScannedTooth], surface: SignedDistance) -> dict[int, float]:
     """Mean absolute distance of each tooth when the scan is aligned on the first tooth alone."""
     if not teeth:
         return {}
     anchor = next(iter(teeth.values())).reference_from_scan
     return {
-        fdi: float(1000 * np.abs(surface.feet(anchor.apply(tooth.points)).signed_mm).mean())
+        fdi: float(1000 * np.abs(surface.closest_points(anchor.apply(tooth.points)).signed_mm).mean())
         for fdi, tooth in teeth.items()
     }

@@ -409,7 +409,7 @@ def _known_posterior(
         return _posterior(state, observations, weighting)
     except LinAlgError as error:
         raise ReconstructionError(
-            "adjustment: the tracks do not tie every frame to the others; more overlap is needed"
+            "adjustment: the tracks do not join every frame to the others; more overlap is needed"
         ) from error
 
 

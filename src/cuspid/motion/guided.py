@@ -1,4 +1,4 @@
-"""One camera's way made precise: matched anew where the first poses say, joined to long tracks, adjusted; in rounds.
+"""One camera's trajectory made precise: matched anew where the first poses say, joined to tracks, adjusted; in rounds.
 
 The first rounds look far beyond what the poses say, so that their errors are not matched into place.
 """

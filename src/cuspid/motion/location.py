@@ -47,8 +47,8 @@ class MotionOptions:
     """Matching of the cameras of a group within a frame."""
     odometry: OdometryOptions = field(default_factory=OdometryOptions)
     """First poses."""
-    between: MatchingOptions = field(default_factory=lambda: MatchingOptions(tolerance_px=3.0))
-    """Matching of a camera with itself at other frames once the poses are known about."""
+    across_frames: MatchingOptions = field(default_factory=lambda: MatchingOptions(tolerance_px=3.0))
+    """Matching of a camera with itself across frames (motion stereo), once the poses are known about."""
     reach: int = 3
     """A camera is matched with itself at +1 to +reach frames."""
     depth_slack: float = 8.3
@@ -126,7 +126,7 @@ def _match_frames(
             continue
         motion = mounted.cam_from_rig @ second_from_first @ mounted.cam_from_rig.inverse()
         here, there = (_depth_bounds(clouds[f], handpiece, camera, slack_mm) for f in (first, second))
-        found = match_guided(frames[first][camera], frames[second][camera], motion, here, there, options.between)
+        found = match_guided(frames[first][camera], frames[second][camera], motion, here, there, options.across_frames)
         matches.append(found + [starts[first, camera], starts[second, camera]])
     return np.concatenate(matches)
 
@@ -183,9 +183,9 @@ def _link(
     def match(pair: tuple[int, int]) -> Int[np.ndarray, "k 2"]:
         return _match_frames(*pair, frames, clouds, poses, handpiece, options, slack_mm, numbering.starts)
 
-    between = map_in_threads(match, pairs, stage="matching", progress=progress)
+    across = map_in_threads(match, pairs, stage="matching", progress=progress)
     image = numbering.frame * len(handpiece.rig.names) + numbering.camera
-    matches = np.concatenate([*_within_frames(clouds, numbering.starts), *between])
+    matches = np.concatenate([*_within_frames(clouds, numbering.starts), *across])
     track = join(matches, image)
     if options.cell_px > 0:
         seen = np.flatnonzero(track >= 0)
@@ -210,12 +210,12 @@ def _require_enough(trajectory: Trajectory, clouds: Sequence[Cloud], options: Mo
 
 def _loosened(options: MotionOptions, slack_px: float) -> MotionOptions:
     """Options with tolerances that allow for an uncertain calibration."""
-    within, odometry, between = options.within, options.odometry, options.between
+    within, odometry, across = options.within, options.odometry, options.across_frames
     return replace(
         options,
         within=replace(within, tolerance_px=within.tolerance_px + slack_px),
         odometry=replace(odometry, error_px=odometry.error_px + slack_px),
-        between=replace(between, tolerance_px=between.tolerance_px + slack_px),
+        across_frames=replace(across, tolerance_px=across.tolerance_px + slack_px),
     )
 
 

@@ -2,7 +2,7 @@
 
 A keypoint of one image with a depth between two bounds lies on a segment of a line in another image whose relative
 pose is known. Only the keypoints near that segment are compared: within a frame the rig gives the pose and the depth of
-field the bounds; between frames the odometry gives the pose, and a point that is already triangulated narrow bounds.
+field the bounds; across frames the odometry gives the pose, and a point that is already triangulated narrow bounds.
 
 *Ideal* coordinates are normalised, without distortion: (X/Z, Y/Z).
 """

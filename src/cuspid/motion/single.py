@@ -49,7 +49,7 @@ _WINDOW = 15
 
 @dataclass(frozen=True, kw_only=True)
 class SingleOptions:
-    """How the way of one camera is found."""
+    """How the trajectory of one camera is found."""
 
     features: FeatureOptions = field(default_factory=lambda: FeatureOptions(count=2500, contrast=0.004, edge=30.0))
     """Keypoints of the contrast-normalised frames; plain enamel needs a low threshold."""
@@ -74,7 +74,7 @@ class SingleOptions:
     error_px: float = 2.0
     """Largest distance of a match from its epipolar line, px."""
     minimum_matches: int = 15
-    """Fewest consistent matches that tie two frames, or a frame to the model."""
+    """Fewest consistent matches that verify a pair of frames, or place a frame in the model."""
     minimum_share: float = 0.3
     """Least share (0 to 1) of the matches of two frames that must be consistent."""
     blurred_share: float = 0.4
@@ -87,7 +87,7 @@ class SingleOptions:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SingleMotion:
-    """What is known of the camera's way: one model, or several that nothing ties together."""
+    """What is known of the camera's trajectory: one model, or several that no verified pair joins."""
 
     parts: tuple[SparseModel, ...]
     """Largest first; lengths in the model's units."""
@@ -209,7 +209,7 @@ def _verify(
     return found if len(found.inlier_matches) >= least else None
 
 
-def _tie(
+def _verified_pairs(
     features: Mapping[int, Features],
     pairs: Sequence[tuple[int, int]],
     camera: pycolmap.Camera,
@@ -219,11 +219,11 @@ def _tie(
 ) -> dict[tuple[int, int], pycolmap.TwoViewGeometry]:
     """Verified matches of pairs of frames; pairs that have too few are not in it."""
 
-    def tie(pair: tuple[int, int]) -> pycolmap.TwoViewGeometry | None:
+    def verified(pair: tuple[int, int]) -> pycolmap.TwoViewGeometry | None:
         one, other = (features[index] for index in pair)
         return _verify(camera, one, other, match_unguided(one, other, matching), options)
 
-    found = map_in_threads(tie, pairs, stage="matching", progress=progress)
+    found = map_in_threads(verified, pairs, stage="matching", progress=progress)
     return {pair: geometry for pair, geometry in zip(pairs, found, strict=True) if geometry is not None}
 
 
@@ -239,7 +239,7 @@ def _fill_database(
     path: Path,
     camera: pycolmap.Camera,
     features: Mapping[int, Features],
-    ties: Mapping[tuple[int, int], pycolmap.TwoViewGeometry],
+    verified: Mapping[tuple[int, int], pycolmap.TwoViewGeometry],
 ) -> None:
     """A COLMAP database with keypoints and verified matches; frame i is image i + 1."""
     with pycolmap.Database.open(path) as database:
@@ -254,7 +254,7 @@ def _fill_database(
             frame.add_data_id(image.data_id)
             database.write_frame(frame, use_frame_id=True)
             database.write_keypoints(index + 1, found.pixels.astype(np.float32))
-        for (one, other), geometry in ties.items():
+        for (one, other), geometry in verified.items():
             database.write_two_view_geometry(one + 1, other + 1, geometry)
 
 
@@ -278,7 +278,7 @@ def _mapper_options(calibrated: bool, options: SingleOptions) -> pycolmap.Increm
 def _map(
     camera: pycolmap.Camera,
     features: Mapping[int, Features],
-    ties: Mapping[tuple[int, int], pycolmap.TwoViewGeometry],
+    verified: Mapping[tuple[int, int], pycolmap.TwoViewGeometry],
     calibrated: bool,
     options: SingleOptions,
     progress: Progress,
@@ -293,7 +293,7 @@ def _map(
 
     with tempfile.TemporaryDirectory() as folder, quiet():
         database = Path(folder) / "database.db"
-        _fill_database(database, camera, features, ties)
+        _fill_database(database, camera, features, verified)
         models = pycolmap.incremental_mapping(
             database,
             folder,
@@ -341,7 +341,7 @@ def _same_points(one: _Model, other: _Model) -> Int[np.ndarray, "k 2"]:
 
 
 def _joined(one: _Model, other: _Model, least: int) -> _Model | None:
-    """Both models in the frame of the first, tied by the points that they share; None where those do not agree."""
+    """Both models in the frame of the first, joined by the points that they share; None where those do not agree."""
     same = _same_points(one, other)
     for _ in range(3):
         if len(same) < least:
@@ -418,7 +418,7 @@ def _camera_of(found: pycolmap.Camera, given: Camera | None, options: SingleOpti
 def locate_single(
     sequence: ImageSequence, options: SingleOptions | None = None, *, progress: Progress = silent
 ) -> SingleMotion:
-    """The way of the one camera that took a sequence.
+    """The trajectory of the one camera that took a sequence.
 
     Frames that are black, blurred or repeated are skipped; where the model breaks, the frames are matched again at more
     distances and with a looser ratio, and models that share frames are joined. Raises ReconstructionError, naming
@@ -432,23 +432,23 @@ def locate_single(
     _check_enough(kept, refused, names)
     features = {index: looks[index].features for index in kept}
     camera = _colmap_camera(sequence.camera, sequence.size, options)
-    ties = _tie(features, _pairs_at(kept, options.steps), camera, options.matching, options, progress)
+    verified = _verified_pairs(features, _pairs_at(kept, options.steps), camera, options.matching, options, progress)
     calibrated = sequence.camera is not None
-    models = _map(camera, features, ties, calibrated, options, progress) if ties else []
+    models = _map(camera, features, verified, calibrated, options, progress) if verified else []
     if not models or models[0].num_reg_images() < len(kept):
         looser = replace(options.matching, ratio=options.bridge_ratio)
-        again = _tie(features, _pairs_at(kept, options.bridge_steps), camera, looser, options, progress)
-        ties = {**again, **ties}
-        wider = _map(camera, features, ties, calibrated, options, progress) if ties else []
+        again = _verified_pairs(features, _pairs_at(kept, options.bridge_steps), camera, looser, options, progress)
+        verified = {**again, **verified}
+        wider = _map(camera, features, verified, calibrated, options, progress) if verified else []
         models = max(models, wider, key=lambda each: each[0].num_reg_images() if each else 0)
     if not models:
-        raise ReconstructionError(_why_nothing(sequence, kept, features, ties))
+        raise ReconstructionError(_why_nothing(sequence, kept, features, verified))
     parts = _join_all([_model_of(model) for model in models], options.minimum_matches)
     first = _camera_of(models[0].cameras[1], sequence.camera, options)
     refined = [_refined(part, first, sequence, features, options, progress) for part in parts]
     return SingleMotion(
         parts=tuple(refined),
-        frames=_uses(names, refused, refined, ties),
+        frames=_uses(names, refused, refined, verified),
         notes=(*_strangers(looks, names), *_notes(refined[0].camera, calibrated, refined)),
     )
 
@@ -492,7 +492,7 @@ def _notes(camera: Camera, calibrated: bool, parts: Sequence[SparseModel]) -> tu
         )
     if len(parts) > 1:
         sizes = ", ".join(str(len(part.frames)) for part in parts)
-        notes.append(f"the sequence broke into {len(parts)} parts of {sizes} frames that nothing ties together")
+        notes.append(f"the sequence broke into {len(parts)} parts of {sizes} frames that no verified pair joins")
     return tuple(notes)
 
 
@@ -511,17 +511,15 @@ def _why_nothing(
     sequence: ImageSequence,
     kept: Sequence[int],
     features: Mapping[int, Features],
-    ties: Mapping[tuple[int, int], object],
+    verified: Mapping[tuple[int, int], object],
 ) -> str:
     """What to tell a user whose frames could not be placed."""
     names, counts = sequence.names, [len(features[index]) for index in kept]
     span = f"{sequence.source}: frames {names[kept[0]]} to {names[kept[-1]]}"
     if np.median(counts) < 50:
         return f"{span} show too little detail ({np.median(counts):.0f} keypoints a frame): out of focus, or no teeth"
-    if not ties:
-        return (
-            f"{span} have nothing in common with each other; film the arch in one sweep, each frame over half the last"
-        )
+    if not verified:
+        return f"{span} have nothing in common with each other; film the arch in one go, each frame over half the last"
     return f"{span} overlap, but the camera did not move enough between them to tell depth; move it along the arch"
 
 
@@ -529,7 +527,7 @@ def _uses(
     names: Sequence[str],
     refused: Mapping[int, str],
     parts: Sequence[SparseModel],
-    ties: Mapping[tuple[int, int], object],
+    verified: Mapping[tuple[int, int], object],
 ) -> tuple[FrameUse, ...]:
     """What became of every frame."""
     inliers: dict[str, int] = {}
@@ -542,8 +540,8 @@ def _uses(
             return FrameUse(name=name, used=False, reason=refused[index])
         if name in inliers:
             return FrameUse(name=name, used=True, inliers=inliers[name])
-        tied = sum(index in pair for pair in ties)
-        reason = f"does not agree with the {tied} frames that it matches" if tied else "matches no other frame"
+        partners = sum(index in pair for pair in verified)
+        reason = f"does not agree with the {partners} frames that it matches" if partners else "matches no other frame"
         return FrameUse(name=name, used=False, reason=reason)
 
     return tuple(use(index, name) for index, name in enumerate(names))

@@ -66,10 +66,10 @@ class Scene:
     """Chooses the texture and the sensor noise."""
 
     @cached_property
-    def surface(self) -> Surface:
+    def surface(self) -> ShadedMesh:
         """The jaw as arrays for the compiled shading."""
         mesh = self.jaw.mesh
-        return Surface(mesh.faces, mesh.face_normals, mesh.vertex_normals, face_materials(self.jaw))
+        return ShadedMesh(mesh.faces, mesh.face_normals, mesh.vertex_normals, face_materials(self.jaw))
 
     @cached_property
     def palette(self) -> Palette:
@@ -77,7 +77,7 @@ class Scene:
         return palette(self.appearance, self.seed)
 
 
-class Surface(NamedTuple):
+class ShadedMesh(NamedTuple):
     """A mesh as arrays for the compiled shading."""
 
     faces: np.ndarray

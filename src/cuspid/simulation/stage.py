@@ -19,13 +19,13 @@ from cuspid.rig import Handpiece
 from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.blender import render_with_blender
 from cuspid.simulation.lights import lit
-from cuspid.simulation.occlusal import OcclusalOptions, render_occlusal_view
 from cuspid.simulation.path.free import FreePathOptions, plan_free_path
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 from cuspid.simulation.raycast import Scene, lit_frames, render_capture
+from cuspid.simulation.reference_render import ReferenceRenderOptions, render_reference
 from cuspid.storage.captures import write_capture, write_image
 from cuspid.storage.files import digest_of, hash_file
-from cuspid.storage.occlusal_views import OCCLUSAL_VIEW_FILES, write_occlusal_view
+from cuspid.storage.reference_renders import REFERENCE_RENDER_FILES, write_reference_render
 from cuspid.storage.stages import Stage
 from cuspid.storage.truths import write_path, write_truth
 from cuspid.trueness import GroundTruth
@@ -70,7 +70,7 @@ class FilmOptions(RenderOptions):
     """How the hand moves the camera."""
 
 
-SINGLE_SHOTS: Mapping[str, float | None] = MappingProxyType({"occlusal": None, "shot": 300.0})
+REFERENCE_RENDERS: Mapping[str, float | None] = MappingProxyType({"occlusal": None, "shot": 300.0})
 """Height in mm of the camera of each picture of the true jaw; None for an orthographic view."""
 
 
@@ -93,22 +93,24 @@ def film(
 ) -> tuple[Capture, GroundTruth]:
     """As :func:`simulate`, with a camera that a shaky hand moves freely over the arch.
 
-    Also the arch in a single shot from above: ``truth/occlusal``, orthographic, and ``truth/shot``, from far above.
+    Also reference renders of the arch from above: ``truth/occlusal``, orthographic, and ``truth/shot``, from far above.
     """
     handpiece = lit(handpiece)
     poses = plan_free_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
     capture, truth = take_images(jaw, handpiece, poses, folder, options, progress=progress)
-    for done, (name, height_mm) in enumerate(SINGLE_SHOTS.items(), start=1):
-        _shoot(truth, folder / "truth", name, OcclusalOptions(camera_height_mm=height_mm), options)
-        progress("single shots", done, len(SINGLE_SHOTS))
+    for done, (name, height_mm) in enumerate(REFERENCE_RENDERS.items(), start=1):
+        _render_reference(truth, folder / "truth", name, ReferenceRenderOptions(camera_height_mm=height_mm), options)
+        progress("reference renders", done, len(REFERENCE_RENDERS))
     return capture, truth
 
 
-def _shoot(truth: GroundTruth, folder: Path, name: str, view: OcclusalOptions, options: FilmOptions) -> None:
-    stage = Stage("single shot", folder, [view, _look(options)], _CODE)
+def _render_reference(
+    truth: GroundTruth, folder: Path, name: str, view: ReferenceRenderOptions, options: FilmOptions
+) -> None:
+    stage = Stage("reference render", folder, [view, _look(options)], _CODE)
     scene = _scene(truth, replace(options, supersampling=max(2, options.supersampling)))
-    files = [folder / name / file for file in OCCLUSAL_VIEW_FILES]
-    stage.make(_jaw_files(folder), files, lambda: write_occlusal_view(folder / name, render_occlusal_view(scene, view)))
+    files = [folder / name / file for file in REFERENCE_RENDER_FILES]
+    stage.make(_jaw_files(folder), files, lambda: write_reference_render(folder / name, render_reference(scene, view)))
 
 
 def take_images(

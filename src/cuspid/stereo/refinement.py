@@ -53,8 +53,8 @@ class RefinementOptions:
     standard deviation c the share c^2 / (c^2 + n^2)."""
     least_contrast: float = 1.2
     """Standard deviation of a window, in those of the noise, below which it carries no texture."""
-    sweeps: int = 1
-    """How often planes are handed on to neighbours without one, in each direction."""
+    propagations: int = 1
+    """How often planes are propagated to neighbours without one, in each direction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -408,12 +408,12 @@ def _visit(view, limits, buffers, seeds, field, row, column, direction):
 
 @njit(**FAST)
 @no_type_check
-def _refine_field(view, limits, buffers, seeds, sweeps):
-    """Visit the pixels that have no plane yet, in raster order and against it, ``sweeps`` times."""
+def _refine_field(view, limits, buffers, seeds, propagations):
+    """Visit the pixels that have no plane yet, in raster order and against it, ``propagations`` times."""
     rows, columns = seeds.shape[1:]
     field = np.zeros((rows, columns, 6))
-    for sweep in range(2 * sweeps):
-        direction = 1 - 2 * (sweep % 2)
+    for number in range(2 * propagations):
+        direction = 1 - 2 * (number % 2)
         for i in range(rows):
             row = i if direction > 0 else rows - 1 - i
             for k in range(columns):
@@ -468,7 +468,7 @@ def refine(
     )
     buffers = _new_buffers(window.shape[1], len(geometry.others), len(seeds_mm))
     seeds = np.nan_to_num(geometry.scale / seeds_mm).astype(np.float64)
-    return np.asarray(_refine_field(view, limits, buffers, seeds, options.sweeps))
+    return np.asarray(_refine_field(view, limits, buffers, seeds, options.propagations))
 
 
 def _new_buffers(samples: int, others: int, layers: int) -> _Buffers:

@@ -23,9 +23,9 @@ from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.geometry import Rigid3
 from cuspid.progress import Progress, silent
 from cuspid.sparse_model import SparseModel
-from cuspid.stitching.exposure import ExposureOptions, Light, Samples, balance
+from cuspid.stitching.gain_compensation import Compensation, GainOptions, Samples, balance
+from cuspid.stitching.height_map import HeightMap
 from cuspid.stitching.seams import SeamOptions, choose
-from cuspid.stitching.surface import HeightMap
 
 CELL_PX = 6
 """Width in px of the cells on which the frame is chosen."""
@@ -54,7 +54,7 @@ class MosaicOptions:
     """Standard deviations in px of the Gaussians between the bands of frequencies."""
     seams: SeamOptions = field(default_factory=SeamOptions)
     """How the frame of each pixel is chosen."""
-    exposure: ExposureOptions = field(default_factory=ExposureOptions)
+    gain_compensation: GainOptions = field(default_factory=GainOptions)
     """How brightness is evened out."""
 
 
@@ -212,7 +212,7 @@ def glance(
     dark = (largest < DARK).astype(np.float32)
     cost = options.seams.cost(tangent2, border - options.border_px, np.maximum(glare, dark))
     seen = (border >= options.border_px) & (in_cam[..., 2] > 0)
-    seen &= surface.known_at(world[..., :2]) & ~surface.hides(world, view.cam_from_world.inverse().translation)
+    seen &= surface.known_at(world[..., :2]) & ~surface.occludes(world, view.cam_from_world.inverse().translation)
     cost = np.where(seen, cost, np.inf)
     bright = (largest < BURNT) & (largest > DARK) & (glare < 0.02)
     # Lights at the camera: 1 / d^2, and a lobe about the optical axis.
@@ -328,9 +328,9 @@ def compose(
     names = motion.frames
     views = [place(canvas, camera, motion.cam_from_world[name]) for name in names]
     best, samples, overlaps = _survey(canvas, views, names, surface, read, options, progress)
-    light = balance(samples, len(names), options.exposure)
-    choice = choose(best.cost, best.frame, _evened(best, light), options.seams)
-    return _render(canvas, views, names, surface, read, choice, light, overlaps, options, progress)
+    compensation = balance(samples, len(names), options.gain_compensation)
+    choice = choose(best.cost, best.frame, _evened(best, compensation), options.seams)
+    return _render(canvas, views, names, surface, read, choice, compensation, overlaps, options, progress)
 
 
 def _survey(
@@ -359,9 +359,9 @@ def _survey(
     return best, samples, tuple(overlaps)
 
 
-def _evened(best: _Best, light: Light) -> Float[np.ndarray, "k r c 3"]:
+def _evened(best: _Best, compensation: Compensation) -> Float[np.ndarray, "k r c 3"]:
     """Colours of the candidates after the gains, for comparing them across a seam."""
-    gains = np.append(light.gains, 0.0)[best.frame]
+    gains = np.append(compensation.gains, 0.0)[best.frame]
     return np.asarray(best.color * np.exp(-gains)[..., None], dtype=np.float32)
 
 
@@ -372,7 +372,7 @@ def _render(
     surface: HeightMap,
     read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
     choice: Int[np.ndarray, "r c"],
-    light: Light,
+    compensation: Compensation,
     overlaps: tuple[float | None, ...],
     options: MosaicOptions,
     progress: Progress,
@@ -385,7 +385,7 @@ def _render(
         chosen = frame[view.window] == index
         if chosen.any():
             px = frame_map(canvas, view, surface)
-            _put(bands, canvas, view, surface, px, read(name), chosen, light, index, options)
+            _put(bands, canvas, view, surface, px, read(name), chosen, compensation, index, options)
             frame_pixel[view.window][chosen] = px[chosen]
         progress("mosaic", index + 1, len(names))
     image = np.clip(np.rint(bands.image()), 0, 255).astype(np.uint8)
@@ -414,7 +414,7 @@ def _put(
     px: Float[np.ndarray, "h w 2"],
     image: UInt8[np.ndarray, "a b 3"],
     chosen: Bool[np.ndarray, "h w"],
-    light: Light,
+    compensation: Compensation,
     index: int,
     options: MosaicOptions,
 ) -> None:
@@ -425,12 +425,14 @@ def _put(
     burnt = cv2.dilate((brightest(rectified) >= BURNT).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     # A burnt-out pixel counts only where no other frame was to be had.
     world = positions(canvas, view, surface, CELL_PX)
-    hidden = surface.hides(world, view.cam_from_world.inverse().translation).astype(np.uint8)
-    in_view = cv2.resize(hidden, (view.width, view.height), interpolation=cv2.INTER_NEAREST) == 0
+    occluded = surface.occludes(world, view.cam_from_world.inverse().translation).astype(np.uint8)
+    in_view = cv2.resize(occluded, (view.width, view.height), interpolation=cv2.INTER_NEAREST) == 0
     valid = (inside & ((in_view & ~burnt) | chosen)).astype(np.float32)
     valid[burnt & chosen] = 0.05
     in_cam = view.cam_from_world.apply(world)
     distance2 = np.sum(in_cam**2, axis=-1)
     falloff = np.log(np.maximum(in_cam[..., 2], 1e-6) / np.sqrt(distance2) / distance2).astype(np.float32)
-    factor = cv2.resize(np.exp(-light.of(index, falloff)), (view.width, view.height), interpolation=cv2.INTER_LINEAR)
+    factor = cv2.resize(
+        np.exp(-compensation.of(index, falloff)), (view.width, view.height), interpolation=cv2.INTER_LINEAR
+    )
     bands.add(view.window, rectified * factor[..., None], valid, chosen.astype(np.float32))

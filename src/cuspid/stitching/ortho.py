@@ -12,10 +12,10 @@ from cuspid.image_sequence import ImageSequence
 from cuspid.panorama import FrameUse, Panorama, Strip
 from cuspid.progress import Progress, silent
 from cuspid.sparse_model import SparseModel
+from cuspid.stitching.height_map import HeightMapOptions, ScaleOptions, height_map, in_occlusal_frame, uncovered
 from cuspid.stitching.mosaic import Mosaic, MosaicOptions, compose
+from cuspid.stitching.plane_sweep import PlaneSweepOptions, plane_sweep
 from cuspid.stitching.strip import StripOptions, unroll
-from cuspid.stitching.surface import ScaleOptions, SurfaceOptions, height_map, in_occlusal_frame, uncovered
-from cuspid.stitching.sweep import SweepOptions, sweep
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,12 +24,12 @@ class OrthoOptions:
 
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     """How large things are."""
-    surface: SurfaceOptions = field(default_factory=SurfaceOptions)
+    height_map: HeightMapOptions = field(default_factory=HeightMapOptions)
     """The smooth surface through the sparse points of the motion."""
-    sweep: SweepOptions = field(default_factory=SweepOptions)
+    plane_sweep: PlaneSweepOptions = field(default_factory=PlaneSweepOptions)
     """The dense surface on which frames are rectified."""
     mosaic: MosaicOptions = field(default_factory=MosaicOptions)
-    """Choice of frames, exposure, blending."""
+    """Choice of frames, gain compensation, blending."""
     strip: StripOptions = field(default_factory=StripOptions)
     """The unrolled strip."""
 
@@ -41,7 +41,7 @@ class Stitched:
     panorama: Panorama
     """The occlusal view."""
     motion: SparseModel | None
-    """The camera's way, in the panorama's world and its lengths; None where the method locates no camera."""
+    """The camera's trajectory, in the panorama's world and its lengths; None where the method locates no camera."""
     strip: Strip | None
     """The panorama unrolled along the arch; None where the camera hardly moved, or is not located."""
 
@@ -64,8 +64,12 @@ def orthophoto(
     def read(name: str) -> UInt8[np.ndarray, "h w 3"]:
         return sequence.image(index[name])
 
-    sparse = height_map(motion, options.surface)
-    dense = sweep(motion, sparse, read, options.sweep, progress=progress) if options.sweep.enabled else None
+    sparse = height_map(motion, options.height_map)
+    dense = (
+        plane_sweep(motion, sparse, read, options.plane_sweep, progress=progress)
+        if options.plane_sweep.enabled
+        else None
+    )
     surface = sparse if dense is None else uncovered(dense, sparse, motion)
     mosaic = compose(motion, surface, read, options.mosaic, progress=progress)
     metric = scale.working_distance_mm is not None or scale.width_mm is not None

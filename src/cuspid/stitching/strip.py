@@ -18,7 +18,7 @@ from cuspid.camera import OPENCV_PIXEL_OFFSET
 from cuspid.geometry import lengths_along, unit
 from cuspid.panorama import ZONES, Panorama, Strip
 from cuspid.sparse_model import SparseModel
-from cuspid.stitching.surface import HeightMap
+from cuspid.stitching.height_map import HeightMap
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +35,7 @@ class StripOptions:
 
 _STEP_MM = 0.25
 _LEAST_MM = 5.0
-"""A shorter way of the camera is not unrolled."""
+"""A shorter trajectory is not unrolled."""
 _TREMOR_FRAMES = 3.0
 """Standard deviation of the Gaussian filter over the camera's path, in frames."""
 

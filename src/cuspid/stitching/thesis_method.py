@@ -182,7 +182,7 @@ def collapse_of(placed: list[Placed], options: ThesisOptions) -> str | None:
 def build_chain(
     looks: list[Look], start: int, size: tuple[int, int], options: ThesisOptions, examination: bool
 ) -> Chain:
-    """Frames from ``start`` on, each tied to the one used before, until the chain breaks or collapses."""
+    """Frames from ``start`` on, each joined to the one used before, until the chain breaks or collapses."""
     placed, refused = [first_of_chain(start, looks[start], size)], dict[int, str]()
     for index in range(start + 1, len(looks)):
         before = placed[-1]

@@ -26,7 +26,6 @@ from cuspid.storage.handpieces import read_handpiece, read_rig_config, write_han
 from cuspid.storage.jaws import is_jaw, read_jaw, read_labelled_mesh, write_jaw
 from cuspid.storage.landmarks import MARKUPS_SUFFIX, LandmarkFile, LandmarkFrame, read_landmarks, write_landmarks
 from cuspid.storage.meshes import MESH_SUFFIXES, MM_PER_UNIT, Unit, read_mesh, read_vertex_values, write_mesh
-from cuspid.storage.occlusal_views import read_occlusal_view, write_occlusal_view
 from cuspid.storage.panoramas import read_panorama, write_panorama, write_strip
 from cuspid.storage.reconstructions import (
     read_depth_maps,
@@ -36,6 +35,7 @@ from cuspid.storage.reconstructions import (
     write_poses,
     write_reconstruction,
 )
+from cuspid.storage.reference_renders import read_reference_render, write_reference_render
 from cuspid.storage.results import (
     PanoramaResult,
     Result,
@@ -81,10 +81,10 @@ __all__ = [
     "read_labelled_mesh",
     "read_landmarks",
     "read_mesh",
-    "read_occlusal_view",
     "read_panorama",
     "read_poses",
     "read_reconstruction",
+    "read_reference_render",
     "read_result",
     "read_rig_config",
     "read_sequence",
@@ -103,11 +103,11 @@ __all__ = [
     "write_json",
     "write_landmarks",
     "write_mesh",
-    "write_occlusal_view",
     "write_panorama",
     "write_path",
     "write_poses",
     "write_reconstruction",
+    "write_reference_render",
     "write_rig_config",
     "write_shape_model",
     "write_strip",

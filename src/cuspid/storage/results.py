@@ -53,7 +53,7 @@ class ScanResult(_Result):
     scan: Mesh | None
     """The surface in its own frame."""
     deviation_um: Float[np.ndarray, "v"] | None
-    """Signed deviation of each of its vertices, NaN where it does not count; None before it was evaluated."""
+    """Signed deviation of each of its vertices, NaN where it is not evaluated; None before it was evaluated."""
     trueness: Mapping[str, Any] | None
     """``trueness.json``."""
     reference_from_scan: Rigid3 | None
@@ -115,7 +115,7 @@ class ScoreResult(_Result):
     made: Path | None
     """The panorama laid over the true jaw, a picture of the same size as ``true``."""
     true: Path | None
-    """The single shot of the true jaw."""
+    """The reference render of the true jaw."""
 
 
 Result = ScanResult | ShapeResult | StudyResult | PanoramaResult | ScoreResult

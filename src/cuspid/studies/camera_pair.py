@@ -75,7 +75,7 @@ _CLEARANCE_MM = 0.3
 
 @dataclass(frozen=True, kw_only=True)
 class CameraPairOptions:
-    """The grid of pairs and how they are judged."""
+    """The grid of pairs and how they are evaluated."""
 
     tooth: int = 47
     """FDI number of the tooth."""
@@ -180,7 +180,7 @@ def study_camera_pair(
     cases = list(product(options.facing, options.baselines_mm, options.axis_angles_deg, options.distances_mm))
     rows: list[Row] = []
     for done, case in enumerate(cases, start=1):
-        rows += _judge(jaw.mesh, tooth, options, *case)
+        rows += _evaluate(jaw.mesh, tooth, options, *case)
         progress("camera pairs", done, len(cases))
     return tuple(rows)
 
@@ -208,7 +208,7 @@ def _tooth(jaw: Jaw, options: CameraPairOptions) -> _Tooth:
     )
 
 
-def _judge(
+def _evaluate(
     mesh: Mesh,
     tooth: _Tooth,
     options: CameraPairOptions,
@@ -334,7 +334,7 @@ Term = Literal["bound_centre_um", "seen_pct", "expected_rms_um", "within_budget_
 def best_pairs(
     rows: Sequence[Row], term: Term = "within_budget_pct", by: Sequence[str] = ("distance_mm",)
 ) -> list[Row]:
-    """For each surface faced, judged on itself, and each value of ``by``: the row that is best in one term.
+    """For each surface faced, evaluated on itself, and each value of ``by``: the row that is best in one term.
 
     More is better of what is a share, less of what is an error.
     """
@@ -349,7 +349,7 @@ def best_pairs(
 def table(
     rows: Sequence[Row], faced: str, column: str, axes: tuple[str, str] = ("baseline_mm", "distance_mm"), **fixed: float
 ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "n"], Float[np.ndarray, "m n"]]:
-    """Values on both axes and a column over them, for a surface faced and judged on itself; NaN where unknown."""
+    """Values on both axes and a column over them, for a surface faced and evaluated on itself; NaN where unknown."""
     chosen = [
         row
         for row in rows

@@ -1,7 +1,7 @@
 """The practical study of a pair of cameras (thesis 3.5.1, Fig 3.14): baseline and axis angle for a surface of a tooth.
 
 Each case is a whole scan: the pair moves over the tooth in a human hand, its images are rendered and reconstructed, and
-the mesh is judged on the faces of the named surface alone. What one pass of the pair does not see counts as missing.
+the mesh is evaluated on the faces of the named surface alone. What one pass of the pair does not see is missing.
 :mod:`cuspid.studies.camera_pair` is the theory of the same.
 
 Frames: ``pair`` as there: origin midway between the projection centres, +X along the baseline, +Z where the pair looks.
@@ -266,7 +266,7 @@ def sweep_case(
     site: Site,
     options: SweepOptions,
 ) -> dict[str, float | int]:
-    """Scan, reconstruct and judge one setting; the figures of the surface, units in the names.
+    """Scan, reconstruct and evaluate one setting; the figures of the surface, units in the names.
 
     Raises what the stages raise, InputError where a camera touches the jaw. (``surface`` and ``tooth`` are for the
     table; the site knows them.)
@@ -286,7 +286,7 @@ def sweep_case(
             lambda out: pipeline.take_images(site.jaw, handpiece, poses, out, how.simulation),
             Path(folder),
             how,
-            judged=site.faces,
+            evaluated=site.faces,
             start_from_truth=True,
         )
     return {
@@ -389,7 +389,7 @@ Term = Literal["complete_50_um_pct", "complete_10_um_pct", "points", "mean_abs_u
 TERMS: Mapping[Term, int] = MappingProxyType(
     {"complete_50_um_pct": 1, "complete_10_um_pct": 1, "points": 1, "mean_abs_um": -1}
 )
-"""What a setting is judged by, and whether more of it (1) or less (-1) is better."""
+"""What a setting is evaluated by, and whether more of it (1) or less (-1) is better."""
 _SURE = 2.0
 """A difference of so many standard errors counts (95 % for one comparison of two settings)."""
 

@@ -4,7 +4,7 @@ The thesis sets six cameras that are turned against twelve that are only moved (
 any designs are compared, each with the same jaw, the same hand and the same seeds, with the number of turns raised for
 those that turn.
 
-*Completeness* is judged in two ways. That of :mod:`cuspid.evaluation.deviation` is the share of what two cameras of
+*Completeness* is evaluated in two ways. That of :mod:`cuspid.evaluation.deviation` is the share of what two cameras of
 this design could see. A design that sees little can be complete by that, so the other one asks for the same surface of
 all: the *open* faces of the tooth, those that are free to at least a small share of the directions above the occlusal
 plane, whatever looks at them. Accuracy is that of the tooth alone, without the gum and the neighbours, of which designs
@@ -55,8 +55,8 @@ Outlines = tuple[Float[np.ndarray, "n 2"], ...]
 """Section of the holder in the middle of each pass."""
 
 _WITHIN_UM = (50, 100)
-_JUDGED = "tooth_within_50_um_pct"
-"""By this share is judged whether completeness grows."""
+_EVALUATED_BY = "tooth_within_50_um_pct"
+"""By this share is decided whether completeness grows."""
 _TIMES = ("simulation_s", "reconstruction_s", "reconstruction_cpu_s")
 _MEAN_COUNT, _MEAN_EDGE_MM = 5, 0.4
 """The mean jaw is that of so many phantoms drawn from the thesis' Table 2.1; boxes need no fine mesh."""
@@ -85,7 +85,7 @@ class ComparisonOptions:
     """All images are made smaller by this factor: 0.5 takes a quarter of the time, but more than doubles the errors and
     loses steep faces."""
     minimum_openness: float = LEAST_OPENNESS
-    """A face counts for completeness if so large a share of the directions above the occlusal plane is free."""
+    """A face is evaluated for completeness if so large a share of the directions above the occlusal plane is free."""
     samples: int = 60_000
     """Points on the tooth at which completeness is asked."""
     enough_pct: float = 0.5
@@ -240,7 +240,7 @@ def scan_case(
         **done.figures,
         **unknown,
         "minimum_overlap_pct": 100 * overlap,
-        "way_mm": way_mm(handpiece, tuple(done.truth.rig_from_world.values())),
+        "trajectory_mm": trajectory_mm(handpiece, tuple(done.truth.rig_from_world.values())),
         "data_mb": data_mb(handpiece, len(done.capture.frames)),
         **holder_size(section_outlines(subject, handpiece, path, options.thickness_mm)),
         "tooth_mean_abs_um": None if tooth_accuracy is None else tooth_accuracy.mean_abs_um,
@@ -270,11 +270,11 @@ def tooth_completeness(
     distances_mm, _, _ = aligned.closest(points)
     shares = {"open_mm2": float(surface.face_areas.sum())}
     for name, mask in {"tooth": np.ones(len(jaw.mesh.faces), dtype=bool), **surfaces}.items():
-        counts = mask[faces]
-        if counts.any():
-            shares[f"{name}_seen_pct"] = _percent(scannable[faces[counts]])
+        named = mask[faces]
+        if named.any():
+            shares[f"{name}_seen_pct"] = _percent(scannable[faces[named]])
             for um in _WITHIN_UM:
-                shares[f"{name}_within_{um}_um_pct"] = _percent(distances_mm[counts] <= um / 1000)
+                shares[f"{name}_within_{um}_um_pct"] = _percent(distances_mm[named] <= um / 1000)
     return shares
 
 
@@ -282,7 +282,7 @@ def _percent(which: Bool[np.ndarray, "n"]) -> float:
     return float(100 * which.mean())
 
 
-def way_mm(handpiece: Handpiece, rig_from_world: Sequence[Rigid3]) -> float:
+def trajectory_mm(handpiece: Handpiece, rig_from_world: Sequence[Rigid3]) -> float:
     """How far the middle of the cameras moves, turns included."""
     middle = np.mean([mounted.centre_in_rig for mounted in handpiece.rig.cameras.values()], axis=0)
     places = np.array([pose.inverse().apply(middle) for pose in rig_from_world])
@@ -396,7 +396,7 @@ def comparison_rows(
     rooms = {sex: room_mm(group, mouth) for sex, group in people.items()}
     for row in rows:
         row["capture_s"] = number(row, "frames") / options.frame_rate_hz
-        row["speed_mm_s"] = number(row, "way_mm") / number(row, "capture_s")
+        row["speed_mm_s"] = number(row, "trajectory_mm") / number(row, "capture_s")
         for sex, room in rooms.items():
             shares = fit_pct(room, np.array([number(row, "height_mm")]))[0]
             row |= {f"fits_{sex}_{position}_pct": float(share) for position, share in enumerate(shares, start=1)}
@@ -421,8 +421,8 @@ def enough_turns(rows: Sequence[Row], options: ComparisonOptions) -> dict[str, i
     found: dict[str, int] = {}
     for row in sorted(rows, key=lambda row: number(row, "turns")):
         same = [other for other in rows if all(other[name] == row[name] for name in ("jaw", "tooth", "design"))]
-        more = [number(other, _JUDGED) for other in same if number(other, "turns") > number(row, "turns")]
-        if row["design"] in options.turned and more and max(more) < number(row, _JUDGED) + options.enough_pct:
+        more = [number(other, _EVALUATED_BY) for other in same if number(other, "turns") > number(row, "turns")]
+        if row["design"] in options.turned and more and max(more) < number(row, _EVALUATED_BY) + options.enough_pct:
             found.setdefault(f"{row['jaw']}, {row['tooth']}, {row['design']}", int(number(row, "turns")))
     return found
 

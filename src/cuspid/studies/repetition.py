@@ -213,12 +213,12 @@ def _keep(
 
 
 def _kept(folder: Path, name: str) -> Mesh:
-    """The part of a scan that counts: where the reference could be seen."""
+    """The part of a scan that is evaluated: where the reference could be seen."""
     mesh, values = storage.read_vertex_values(folder / "scans" / f"{name}.ply")
-    counts = np.isfinite(values["deviation_um"])[mesh.faces].all(axis=1)
-    if not counts.any():
-        raise ReconstructionError(f"{name}: nothing of the scan counts; see its row in results.csv")
-    return mesh.submesh(counts)
+    evaluated = np.isfinite(values["deviation_um"])[mesh.faces].all(axis=1)
+    if not evaluated.any():
+        raise ReconstructionError(f"{name}: nothing of the scan can be evaluated; see its row in results.csv")
+    return mesh.submesh(evaluated)
 
 
 def compare_scans(*, first: str, second: str, folder: Path, options: RepeatOptions) -> dict[str, Value]:

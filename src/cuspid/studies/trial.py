@@ -14,7 +14,7 @@ from cuspid import pipeline
 from cuspid.capture import Capture
 from cuspid.errors import ReconstructionError
 from cuspid.evaluation.deviation import EvaluationOptions
-from cuspid.evaluation.distance import Surface
+from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import fit
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
@@ -31,7 +31,7 @@ Shoot = Callable[[Path], tuple[Capture, GroundTruth]]
 
 @dataclass(frozen=True, kw_only=True)
 class TrialOptions:
-    """How each scan of a study is made and judged."""
+    """How each scan of a study is made and evaluated."""
 
     simulation: SimulationOptions = field(default_factory=SimulationOptions)
     """How the images are made."""
@@ -103,10 +103,10 @@ def run_trial(
     folder: Path,
     options: TrialOptions,
     *,
-    judged: Bool[np.ndarray, "f"] | None = None,
+    evaluated: Bool[np.ndarray, "f"] | None = None,
     start_from_truth: bool = False,
 ) -> Trial:
-    """Images to mesh to trueness, on the faces of the jaw in ``judged`` (None: those that were scannable).
+    """Images to mesh to trueness, on the faces of the jaw in ``evaluated`` (None: those that were scannable).
 
     With ``start_from_truth`` the mesh is aligned from the true pose of its first frame on, which saves the search over
     all poses (some ten seconds). Raises what the stages raise, ReconstructionError where no surface is left.
@@ -126,7 +126,7 @@ def run_trial(
         reconstruction=reconstruction,
         mesh=mesh,
         scannable=scannable,
-        trueness=_compare(mesh, truth.jaw, scannable if judged is None else judged, start, options.evaluation),
+        trueness=_compare(mesh, truth.jaw, scannable if evaluated is None else evaluated, start, options.evaluation),
         simulation_s=shot - begin,
         reconstruction_s=reconstructed - shot,
         reconstruction_cpu_s=reconstructed_cpu - shot_cpu,
@@ -140,13 +140,13 @@ def _true_start(reconstruction: Reconstruction, truth: GroundTruth) -> Rigid3:
 
 
 def _compare(
-    mesh: Mesh, jaw: Jaw, judged: Bool[np.ndarray, "f"], start: Rigid3 | None, options: EvaluationOptions
+    mesh: Mesh, jaw: Jaw, evaluated: Bool[np.ndarray, "f"], start: Rigid3 | None, options: EvaluationOptions
 ) -> Trueness:
     """Trueness of a mesh whose pose is to be found, or is near ``start``."""
     if start is None or not options.align:
-        return pipeline.evaluate(mesh, jaw, options, scannable=judged)
+        return pipeline.evaluate(mesh, jaw, options, scannable=evaluated)
     points, _ = mesh.sample(options.registration.samples, np.random.default_rng(0))
-    aligned = fit(points, Surface(jaw.mesh), start, options.registration).reference_from_scan
+    aligned = fit(points, SignedDistance(jaw.mesh), start, options.registration).reference_from_scan
     moved = mesh.transformed(aligned)
-    found = pipeline.evaluate(moved, jaw, replace(options, align=False), scannable=judged)
+    found = pipeline.evaluate(moved, jaw, replace(options, align=False), scannable=evaluated)
     return replace(found, reference_from_scan=aligned)

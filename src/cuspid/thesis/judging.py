@@ -56,8 +56,8 @@ def judge(results: Results, items: Sequence[Item] = ITEMS) -> tuple[Finding, ...
 def _finding(item: Item, results: Results) -> Finding:
     comparisons = tuple(_compared(row, item, results) for row in _rows(item, results))
     table = _function(TABLES, item.table, {}, item)(results) if item.table else None
-    told = (*(_told(note, results) for note in item.notes), item.table_note if table else "")
-    return Finding(item=item, comparisons=comparisons, notes=tuple(filter(None, told)), table=table)
+    notes = (*(_note_text(note, results) for note in item.notes), item.table_note if table else "")
+    return Finding(item=item, comparisons=comparisons, notes=tuple(filter(None, notes)), table=table)
 
 
 def _rows(item: Item, results: Results) -> Iterator[Row]:
@@ -68,7 +68,7 @@ def _rows(item: Item, results: Results) -> Iterator[Row]:
             yield from _function(ROWS, row.function, row.arguments, item)(results)
 
 
-def _told(note: Note, results: Results) -> str:
+def _note_text(note: Note, results: Results) -> str:
     if not note.source:
         return note.text
     return in_words(note.text, results[note.source]) if note.source in results else note.otherwise

@@ -54,7 +54,7 @@ def draw_likeness(path: Path, results: Results) -> None:
             if each
         ],
         [_grey(next(each[subject] for each in found.values() if subject in each)) for subject in subjects],
-        title="Fig 4.4: likeness to the single shot",
+        title="Fig 4.4: likeness to the reference render",
     )
 
 

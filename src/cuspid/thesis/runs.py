@@ -271,7 +271,7 @@ def _panoramas(task: Task) -> Iterator[tuple[str, Result]]:
 
 
 def _stitched(task: Task, film: Path, subject: str, method: str) -> dict[str, object]:
-    """A panorama of a film, judged; in parts, the largest one. What cannot be stitched is a result, too."""
+    """A panorama of a film, evaluated; in parts, the largest one. What cannot be stitched is a result, too."""
     out, score = task.work / method, task.work / f"{method}-score"
     command = " ".join(("cuspid", "stitch", "film/capture", *METHODS[method], "--out", method))
     common = {"subject": subject, "method": method, "command": command}

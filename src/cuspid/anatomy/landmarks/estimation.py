@@ -296,7 +296,7 @@ def _midline_points(
     if jaw.face_labels is None or not all(label in points for label in labels):
         return {}
     middle = (points[labels[0]] + points[labels[1]]) / 2
-    between = (views[right].origin + views[left].origin) / 2
+    midpoint = (views[right].origin + views[left].origin) / 2
     inwards = -(views[right].axes[1] + views[left].axes[1])
     inwards /= np.linalg.norm(inwards)
     found = {"midline": _surface_below(jaw, middle)}
@@ -304,7 +304,7 @@ def _midline_points(
         papilla = _lingual_papilla(jaw.mesh, jaw.face_labels, middle, inwards)
     else:
         cervices = [points[f"{fdi}.lingual_cervix"] for fdi in (right, left) if f"{fdi}.lingual_cervix" in points]
-        papilla = _incisive_papilla(jaw, between, inwards, cervices)
+        papilla = _incisive_papilla(jaw, midpoint, inwards, cervices)
     return found if papilla is None else {**found, "papilla": papilla}
 
 
@@ -331,12 +331,12 @@ def _lingual_papilla(mesh: Mesh, labels: Int[np.ndarray, "f"], contact: Point, i
     return weights @ seen / weights.sum()
 
 
-def _incisive_papilla(jaw: Jaw, between: Point, inwards: Point, cervices: Sequence[Point]) -> Point | None:
+def _incisive_papilla(jaw: Jaw, midpoint: Point, inwards: Point, cervices: Sequence[Point]) -> Point | None:
     """The palatal gum behind the central incisors, `_PAPILLA_BELOW_MM` apical of their palatal margin."""
     if not cervices:
         return None
     depth = np.arange(0.0, 10.0, 0.05)
-    over = between * [1, 1, 0] + depth[:, None] * inwards + 20.0 * _UP
+    over = midpoint * [1, 1, 0] + depth[:, None] * inwards + 20.0 * _UP
     hits = jaw.mesh.cast(over, np.broadcast_to(-_UP, over.shape))
     heights = 20.0 - hits.distances
     below = heights < np.mean([cervix[2] for cervix in cervices]) - _PAPILLA_BELOW_MM

@@ -138,24 +138,24 @@ def _midline(solid: Solid, points: dict[str, Point]) -> Point:
 
 def _incisive_papilla(solid: Solid) -> Point:
     """The point of the palatal gum behind the contact of the central incisors."""
-    between, lingual = _between_centrals(solid)
+    midpoint, lingual = _between_centrals(solid)
     level = np.mean([placed.origin[2] for placed in solid.teeth if placed.position == 1])
-    start = np.array([[*between[:2], level + PAPILLA_ABOVE_MM]])
+    start = np.array([[*midpoint[:2], level + PAPILLA_ABOVE_MM]])
     return _first_inside(solid, start + 12.0 * lingual, -lingual, 12.0)[0]
 
 
 def _lingual_papilla(solid: Solid) -> Point:
     """The tip of the gum between the central incisors, seen from lingual and above."""
-    between, lingual = _between_centrals(solid)
+    midpoint, lingual = _between_centrals(solid)
     lean = np.radians(PAPILLA_LEAN_DEG)
     towards = lingual * np.sin(lean) + [0.0, 0.0, np.cos(lean)]
-    along, best = np.linspace(-1.0, 4.0, 26), between
+    along, best = np.linspace(-1.0, 4.0, 26), midpoint
     for _ in range(3):
-        above = between + along[:, None] * lingual + [0.0, 0.0, 6.0]
+        above = midpoint + along[:, None] * lingual + [0.0, 0.0, 6.0]
         seen = _first_inside(solid, above, np.array([0.0, 0.0, -1.0]), 12.0)
         score = np.where(solid.lead_of_gum(seen) > 0, seen @ towards, -np.inf)
         best = seen[score.argmax()]
-        along = (best - between) @ lingual + (along[1] - along[0]) * np.linspace(-1.0, 1.0, 11)
+        along = (best - midpoint) @ lingual + (along[1] - along[0]) * np.linspace(-1.0, 1.0, 11)
     return best
 
 

@@ -142,8 +142,8 @@ class ToothSite:
 
     def side_distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Distance to the sides of the tooth, mm; negative inside, minus infinity where a side is not the nearest."""
-        distances, faces, feet = self._sides.closest(points)
-        above = np.sum((points - feet) * self._sides.face_normals[faces], axis=1)
+        distances, faces, closest = self._sides.closest(points)
+        above = np.sum((points - closest) * self._sides.face_normals[faces], axis=1)
         return np.where(np.abs(above) < 0.8 * distances, -np.inf, above)
 
     def occlusal_height(self, x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:

@@ -24,7 +24,7 @@ from cuspid.jaw import GUM
 from cuspid.mesh import Mesh, edges_of
 
 _ON_BORDER = 0.7
-"""A partner on the rim of a patch counts only if the way to it leaves the patch at least this steeply (sine)."""
+"""A partner on the rim of a patch counts only if the line to it leaves the patch at least this steeply (sine)."""
 _PER_EDGE = 8
 """Points that stand for an edge of a border."""
 _LEAST_WEIGHT = 0.01
@@ -94,13 +94,13 @@ class Template:
             np.maximum.at(high, corner, labels)
         pairs = np.stack([low, high], axis=1)
         inner = {int(label): np.flatnonzero((low == label) & (high == label)) for label in np.unique(labels)}
-        between = np.unique(pairs[low < high], axis=0)
+        adjacent = np.unique(pairs[low < high], axis=0)
         ends = mesh.vertices[mesh.faces] - mesh.vertices[np.roll(mesh.faces, 1, axis=1)]
         return Template(
             faces=mesh.faces,
             edge_mm=float(np.linalg.norm(ends, axis=2).mean()),
             inner=inner,
-            borders={(int(a), int(b)): np.flatnonzero((low == a) & (high == b)) for a, b in between},
+            borders={(int(a), int(b)): np.flatnonzero((low == a) & (high == b)) for a, b in adjacent},
             averaging=_averaging(mesh.faces, count),
         )
 
@@ -205,7 +205,7 @@ def fit(template: Template, start: Float[np.ndarray, "v 3"], target: Target, opt
 def partners(
     template: Template, vertices: Float[np.ndarray, "v 3"], target: Target, options: FitOptions
 ) -> tuple[Float[np.ndarray, "v 3"], Bool[np.ndarray, "v"]]:
-    """The way from each vertex to its partner on the sample, mm, and whether it has one."""
+    """The offset from each vertex to its partner on the sample, mm, and whether it has one."""
     normals = Mesh(vertices, template.faces).vertex_normals
     offsets, found = np.zeros_like(vertices), np.zeros(len(vertices), dtype=bool)
     for label, inner in template.inner.items():
@@ -213,11 +213,11 @@ def partners(
             offsets[inner], found[inner] = _onto_patch(
                 vertices[inner], normals[inner], target.patches[label], options.least_cosine
             )
-    for border, between in template.borders.items():
+    for border, on_border in template.borders.items():
         if border in target.borders:
-            _, nearest = target.borders[border].query(vertices[between])
-            offsets[between] = target.borders[border].data[nearest] - vertices[between]
-            found[between] = True
+            _, nearest = target.borders[border].query(vertices[on_border])
+            offsets[on_border] = target.borders[border].data[nearest] - vertices[on_border]
+            found[on_border] = True
     found &= np.linalg.norm(offsets, axis=1) < options.reach_mm
     return np.where(found[:, None], offsets, 0.0), found
 

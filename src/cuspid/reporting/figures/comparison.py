@@ -65,8 +65,8 @@ def save_comparison_picture(
     figure = new_figure(max(9.0, 3.3 * len(panels), 1.7 * len(sections)), 9.4, dpi=84, layout="constrained")
     halves: NDArray[np.object_] = np.asarray(figure.subfigures(2, 1, height_ratios=(1.0, 2.6)))
     above, below = halves
-    told = fill(title, int(_LETTERS_PER_IN * figure.get_figwidth()))
-    above.suptitle(f"{told}\n", x=0.01, ha="left", fontsize=14, color=_INK, fontweight="bold")
+    wrapped = fill(title, int(_LETTERS_PER_IN * figure.get_figwidth()))
+    above.suptitle(f"{wrapped}\n", x=0.01, ha="left", fontsize=14, color=_INK, fontweight="bold")
     _draw_sections(above.subplots(1, len(sections), squeeze=False)[0].tolist(), sections, colours, gap_mm)
     places = below.subplots(2, len(panels), squeeze=False)
     for (complete, error), (name, curves) in zip(places.T, panels.items(), strict=True):

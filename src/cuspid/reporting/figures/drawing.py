@@ -53,8 +53,8 @@ class FigureOptions:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class View:
-    """An orthographic picture."""
+class RenderedMesh:
+    """An orthographic picture of a mesh."""
 
     image: UInt8[np.ndarray, "h w 3"]
     """sRGB, white where nothing is."""
@@ -106,7 +106,7 @@ OCCLUSAL = look(-90.0, 90.0)
 
 def render(
     mesh: Mesh, axes: Float[np.ndarray, "3 3"] = OCCLUSAL, *, width_px: int = 1000, supersampling: int = 2
-) -> View:
+) -> RenderedMesh:
     """A shaded picture of a mesh in its own colours, cropped to it."""
     seen = mesh.vertices @ axes.T
     lower, upper = seen.min(axis=0), seen.max(axis=0)
@@ -122,7 +122,9 @@ def render(
     canvas = np.ones((rows * columns, 3), dtype=np.float32)
     canvas[hits.faces >= 0] = _lit(mesh, hits, axes) * (1 - _crevices(depth, step).reshape(-1, 1)[hits.faces >= 0])
     pixels = canvas.reshape(rows // supersampling, supersampling, width_px, supersampling, 3).mean(axis=(1, 3))
-    return View(image=np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8), mm_per_px=float(step * supersampling))
+    return RenderedMesh(
+        image=np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8), mm_per_px=float(step * supersampling)
+    )
 
 
 def _lit(mesh: Mesh, hits: RayHits, axes: Float[np.ndarray, "3 3"]) -> Float32[np.ndarray, "n 3"]:
@@ -211,7 +213,7 @@ def _outward(mesh: Mesh) -> tuple[float, tuple[str, str]]:
     return 90.0, ("from the front", "from behind")
 
 
-def _draw_view(figure: Figure, place: tuple[float, float, float, float], view: View, name: str) -> None:
+def _draw_view(figure: Figure, place: tuple[float, float, float, float], view: RenderedMesh, name: str) -> None:
     axes = figure.add_axes(place)
     height, width = view.image.shape[:2]
     axes.imshow(view.image, extent=(0, width * view.mm_per_px, 0, height * view.mm_per_px), interpolation="antialiased")
@@ -250,7 +252,7 @@ def _draw_histogram(figure: Figure, mesh: Mesh, deviation_um: Float[np.ndarray, 
     bar.ax.xaxis.set_major_formatter(lambda um, _: f"{um:+g}" if um else "0")
     bar.outline.set_visible(False)
     bar.set_label(
-        "deviation from the reference / µm (positive: outside)\ngrey: not counted, or seen from behind",
+        "deviation from the reference / µm (positive: outside)\ngrey: not evaluated, or seen from behind",
         fontsize=12,
         color=_INK,
     )

@@ -49,7 +49,7 @@ def save_sagittal_picture(
 
     ``upper_mm``: the incisal edges and the distal ends of the teeth, front to back, with the mouth closed;
     ``lower_mm``: the same of the lower jaw with the mouth open; ``condyle_mm``: the condyle then (closed: 0, 0);
-    ``arcs_mm``: ways of the lower incisal edges and of the last tooth's end.
+    ``arcs_mm``: trajectories of the lower incisal edges and of the last tooth's end.
     """
     figure = new_figure(11.0, 8.6, dpi=110)
     figure.text(0.03, 0.965, title, fontsize=15, color=_INK, va="center", fontweight="bold")
@@ -86,7 +86,7 @@ def _draw_hinge(
     condyle: Float[np.ndarray, "2"],
     arcs: tuple[Float[np.ndarray, "a 2"], Float[np.ndarray, "a 2"]],
 ) -> None:
-    """Condyle closed and open, the lines from it to incisors and last molar, their ways, and the occlusal plane."""
+    """Condyle closed and open, lines from it to incisors and last molar, their trajectories, and the occlusal plane."""
     axes.add_patch(Circle((0, 0), 4.5, facecolor="#ececec", edgecolor=_FAINT))
     axes.add_patch(Circle((float(condyle[0]), float(condyle[1])), 4.5, facecolor="none", edgecolor=_INK))
     axes.annotate("", tuple(condyle), (0, 0), arrowprops={"arrowstyle": "->", "color": _INK})
@@ -104,8 +104,8 @@ def _draw_hinge(
     for start, points, style in ((np.zeros(2), upper, "--"), (condyle, lower, "-")):
         for end in (points[0], points[-1]):
             axes.plot(*np.column_stack([start, end]), color=_FAINT, linewidth=1, linestyle=style, zorder=0)
-    for way in arcs:
-        axes.plot(way[:, 0], way[:, 1], color=_INK, linewidth=1.2, linestyle=(0, (1, 1.5)))
+    for arc in arcs:
+        axes.plot(arc[:, 0], arc[:, 1], color=_INK, linewidth=1.2, linestyle=(0, (1, 1.5)))
 
 
 def _draw_probe(

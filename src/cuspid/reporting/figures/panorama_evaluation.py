@@ -28,10 +28,10 @@ def save_panorama_evaluation(
     title: str,
     captions: tuple[str, str, str],
 ) -> None:
-    """PNG: the single shot of the true jaw, the panorama laid over it, and the geometric error of its tooth pixels.
+    """PNG: the reference render of the true jaw, the panorama laid over it, and the error in place of its tooth pixels.
 
-    ``aligned`` (RGB, 0 to 1) is None for a panorama that failed. ``places_px``: where on the single shot the errors
-    belong; none where they are not known. ``captions``: one line below each of the three.
+    ``aligned`` (RGB, 0 to 1) is None for a panorama that failed. ``places_px``: where on the reference render the
+    errors belong; none where they are not known. ``captions``: one line below each of the three.
     """
     height, width = truth.shape[:2]
     figure = new_figure(15.0, 15 / 3 * height / width + 1.9, dpi=100)

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures.drawing import OCCLUSAL, PLASTER, View, look, new_figure, render, save_figure
+from cuspid.reporting.figures.drawing import OCCLUSAL, PLASTER, RenderedMesh, look, new_figure, render, save_figure
 
 SURFACE_COLOURS: Mapping[str, str] = {
     "occlusal": "#f2c14e",
@@ -112,7 +112,7 @@ def _vertex_colors(mesh: Mesh, codes: Int[np.ndarray, "f"], palette: Sequence[st
     return colours[votes.argmax(axis=1)]
 
 
-def _draw(figure: Figure, place: tuple[float, float, float, float], view: View, name: str) -> None:
+def _draw(figure: Figure, place: tuple[float, float, float, float], view: RenderedMesh, name: str) -> None:
     axes = figure.add_axes(place)
     axes.imshow(view.image, interpolation="antialiased")
     axes.set_axis_off()

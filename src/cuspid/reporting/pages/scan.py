@@ -164,11 +164,11 @@ def _size(name: str, full: int, shown: int, off_um: float) -> dict[str, Any]:
 
 
 def _teeth(result: ScanResult) -> list[Place]:
-    """The teeth that were judged."""
-    jaw, judged = result.reference, {} if result.trueness is None else result.trueness["per_tooth"]
+    """The teeth that were evaluated."""
+    jaw, evaluated = result.reference, {} if result.trueness is None else result.trueness["per_tooth"]
     if jaw is None:
         return []
-    return [_tooth_place(jaw, fdi) for fdi in jaw.teeth if str(fdi) in judged]
+    return [_tooth_place(jaw, fdi) for fdi in jaw.teeth if str(fdi) in evaluated]
 
 
 def _tooth_place(jaw: Jaw, fdi: int) -> Place:
@@ -213,8 +213,8 @@ def _tiles(result: ScanResult) -> list[tuple[str, str, str]]:
 def _crown_tiles(crown: Mapping[str, Any] | None) -> list[tuple[str, str, str]]:
     if crown is None:
         return []
-    told = ", crowns estimated by shape" if crown["estimated"] else ""
-    return [(f"of all open crown surface within 50 µm{told}", f"{crown['completeness_pct']['50']:.1f}", "%")]
+    estimated = ", crowns estimated by shape" if crown["estimated"] else ""
+    return [(f"of all open crown surface within 50 µm{estimated}", f"{crown['completeness_pct']['50']:.1f}", "%")]
 
 
 _FIGURES = ("mean_abs_um", "signed_mean_um", "std_um", "rms_um", "p95_um", "max_um")

@@ -134,7 +134,7 @@ def _frustum(rig: Rig, name: str) -> Float[np.ndarray, "16 3"]:
 
 
 def path_layer(rig: Rig, rig_from_shown: Mapping[str, Rigid3]) -> dict[str, Any]:
-    """The way of the middle of the cameras."""
+    """The trajectory of the middle of the cameras."""
     points = camera_path(rig, rig_from_shown)
     return {
         "kind": "line",

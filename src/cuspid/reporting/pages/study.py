@@ -94,8 +94,8 @@ def heading(column: str) -> str:
     *words, last = column.split("_")
     if last not in _UNITS or not words:
         return column.replace("_", " ")
-    told = " ".join(_WORDS.get(word, word) for word in words).replace("mean abs", "mean |d|")
-    return f"{told}, {_UNITS[last]}"
+    label = " ".join(_WORDS.get(word, word) for word in words).replace("mean abs", "mean |d|")
+    return f"{label}, {_UNITS[last]}"
 
 
 def _all_rows(rows: Sequence[Mapping[str, str]]) -> Table | None:
@@ -103,8 +103,8 @@ def _all_rows(rows: Sequence[Mapping[str, str]]) -> Table | None:
     if not rows:
         return None
     names = list(dict.fromkeys(name for row in rows for name in row))
-    told = [name for name in names if name not in ("failure", *_WHEN)]
-    columns = [name for name in told if name == "case" or len({row.get(name) for row in rows}) > 1]
+    shown = [name for name in names if name not in ("failure", *_WHEN)]
+    columns = [name for name in shown if name == "case" or len({row.get(name) for row in rows}) > 1]
     return {
         "heads": [heading(name) for name in columns],
         "rows": [[_short(row.get(name, "")) for name in columns] for row in rows],

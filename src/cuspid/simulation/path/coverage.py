@@ -1,7 +1,7 @@
-"""What a handpiece sees of the crowns from many poses, quickly: for planning, not for judging.
+"""What a handpiece sees of the crowns from many poses, quickly: for planning, not for evaluation.
 
-Whether something hides a point is looked up in its *sky*, the directions in which nothing stands within reach, so that
-thousands of poses are asked at the cost of one round of rays. The judgement of a plan casts its rays:
+Whether something occludes a point is looked up in its *sky*, the directions in which nothing stands within reach, so
+that thousands of poses are asked at the cost of one round of rays. The evaluation of a plan casts its rays:
 :func:`cuspid.visibility.visible_counts`.
 """
 

@@ -95,8 +95,8 @@ def plan_detour(
     for number in range(1, count + 1):
         inside = np.flatnonzero(stretches == number)
         fitting = [_fitting(room, crowns, handpiece, poses[index]) for index in inside]
-        tied = bool(inside[0] > 0), bool(inside[-1] < len(travel) - 1)
-        changes[inside] = _shortest(fitting, tied)
+        anchored = bool(inside[0] > 0), bool(inside[-1] < len(travel) - 1)
+        changes[inside] = _shortest(fitting, anchored)
     return Detour(travel_mm=travel, changes=changes)
 
 
@@ -131,11 +131,11 @@ def _missed(crowns: CrownPoints, handpiece: Handpiece, pose: Rigid3, motions: li
 
 
 def _shortest(
-    stations: list[tuple[Float[np.ndarray, "_ 5"], Float[np.ndarray, "_"]]], tied: tuple[bool, bool]
+    stations: list[tuple[Float[np.ndarray, "_ 5"], Float[np.ndarray, "_"]]], anchored: tuple[bool, bool]
 ) -> Float[np.ndarray, "n 5"]:
-    """One candidate of each station, the cheapest chain; it begins and ends unchanged where it is tied."""
+    """One candidate of each station, the cheapest chain; it begins and ends unchanged where it is anchored."""
     unchanged = (np.zeros((1, 5)), np.zeros(1))
-    chain = [*[unchanged] * tied[0], *stations, *[unchanged] * tied[1]]
+    chain = [*[unchanged] * anchored[0], *stations, *[unchanged] * anchored[1]]
     total, came_from = chain[0][1], []
     for (before, _), (after, cost) in pairwise(chain):
         step = _APART * np.sum(((after[:, None] - before[None]) / _UNITS) ** 2, axis=2) + total
@@ -147,7 +147,7 @@ def _shortest(
         index = int(back[index])
         chosen.append(candidates[index])
     chosen = chosen[::-1]
-    return np.array(chosen[tied[0] : len(chosen) - tied[1]])
+    return np.array(chosen[anchored[0] : len(chosen) - anchored[1]])
 
 
 def lifted(room: Room, pose_at: PoseAt, span_mm: tuple[float, float]) -> PoseAt:

@@ -1,10 +1,10 @@
 """Where a camera goes that a shaky hand moves over the teeth, unrestricted (thesis chapter 4, Fig. 4.2).
 
-The steady way is the arch curve of :mod:`cuspid.simulation.path.arch`, from the first crown to the last. To it the hand
-adds a random shift, tilt and turn, and it goes at a random speed. Each of these is smooth noise over the frames: a slow
-drift and a quick tremor, both Gaussian and of the asked standard deviation together, and none beyond `REACH` of it, for
-who holds the camera watches the picture. The camera is shifted and turned about the place on the teeth that it looks
-at, in the rig frame: X along the arch, Y to the cheek, Z out of the gum.
+The steady trajectory is the arch curve of :mod:`cuspid.simulation.path.arch`, from the first crown to the last. To it
+the hand adds a random shift, tilt and turn, and it goes at a random speed. Each of these is smooth noise over the
+frames: a slow drift and a quick tremor, both Gaussian and of the asked standard deviation together, and none beyond
+`REACH` of it, for who holds the camera watches the picture. The camera is shifted and turned about the place on the
+teeth that it looks at, in the rig frame: X along the arch, Y to the cheek, Z out of the gum.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class FreePathOptions:
     """How a hand moves a camera over the arch; the defaults are a full shake."""
 
     frames: int = 120
-    """Frames on the way from the first crown to the last."""
+    """Frames from the first crown to the last."""
     shake: float = 1.0
     """Multiplies all standard deviations below: 1 is a full shake, 0 a steady hand at an even speed."""
     position_mm: float = 1.0

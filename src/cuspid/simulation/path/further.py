@@ -116,8 +116,10 @@ def _ordered(last: Leg, legs: Sequence[Leg]) -> Iterator[Leg]:
     """From the end of each pass to the nearest end of one that is left."""
     left = list(legs)
     while left:
-        ways = [leg for each in left for leg in (each, _reversed(each))]
-        following = min(ways, key=lambda leg: abs(leg.start_mm - last.end_mm) + abs(leg.roll_deg - last.roll_deg) / 10)
+        candidates = [leg for each in left for leg in (each, _reversed(each))]
+        following = min(
+            candidates, key=lambda leg: abs(leg.start_mm - last.end_mm) + abs(leg.roll_deg - last.roll_deg) / 10
+        )
         left = [each for each in left if each not in (following, _reversed(following))]
         yield following
         last = following

@@ -1,8 +1,8 @@
-"""The way of a steady hand: passes along the arch, each with its roll, and the turns between them.
+"""The trajectory of a steady hand: passes along the arch, each with its roll, and the turns between them.
 
 A handpiece with few cameras is also rolled about the tangent of the arch (thesis 3.5.3), to scan a cross-section from
 several sides. ``hold`` is the rig frame of a handpiece held upright; a roll is positive when the cameras turn to the
-cheek. The *travel* is the way on all passes and turns, in mm.
+cheek. The *travel* is the length of it, passes and turns, in mm.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from cuspid.simulation.path.arch import NEAR_MM, ArchCurve
 _SIDE_DEG, _SIDE_MM = 60.0, (4.5, 2.5)
 """A handpiece rolled so far looks at this place: across from the middle of the crown, and down from the cusp tips."""
 _TURN_RADIUS_MM = 8.0
-"""A turn by an angle counts as the way on a circle of this radius: about that of the cameras around the crown."""
+"""A turn by an angle is as long as the arc of a circle of this radius: about that of the cameras around the crown."""
 _STATION_MM = 1.0
 """Spacing of the places at which the room beside the teeth is measured."""
 _PATCH_MM = 1.5
@@ -96,7 +96,7 @@ def there_and_back(rolls_deg: Sequence[float], start_mm: float, end_mm: float) -
 
 
 def steady_path(mesh: Mesh, curve: ArchCurve, legs: tuple[Leg, ...]) -> SteadyPath:
-    """The way along all legs; where the surface stands out or falls back, a rolled handpiece follows it."""
+    """The trajectory along all legs; where the surface stands out or falls back, a rolled handpiece follows it."""
     low, high = (pick(at for leg in legs for at in (leg.start_mm, leg.end_mm)) for pick in (min, max))
     stations = np.linspace(low, high, max(2, round((high - low) / _STATION_MM)))
     rolls = np.unique([leg.roll_deg for leg in legs])

@@ -48,7 +48,7 @@ _MOST = 2
 _COARSE = 12
 """Rays along each side of an image that tell how fast it changes."""
 _LOW_SHARE = 0.9
-"""Teeth of which less can be seen are told of."""
+"""Teeth of which less can be seen get a note."""
 
 _LOG = logging.getLogger("cuspid")
 
@@ -58,7 +58,7 @@ class ScanPathOptions:
     """How the jaw is scanned."""
 
     tooth: int | None = None
-    """FDI number of the one tooth to scan; None for the whole arch."""
+    """FDI number of the one tooth to scan; None for the whole arch, or what the mesh has of one."""
     frames: int | None = None
     """Positions of the handpiece; None for 10 over a tooth, 100 over an arch and one per millimetre over a part of one,
     or more where the overlap needs it."""
@@ -83,7 +83,8 @@ class ScanPathOptions:
     """How far the handpiece is rolled to either side in the first and the last pass."""
 
     passes: Literal["turns", "auto"] = "turns"
-    """turns: those that --turns says; auto: also others, rolled differently, over what two cameras did not see."""
+    """turns: those that --turns says; auto: also others, rolled differently, over what two cameras did not see;
+    a note tells how many frames they take."""
 
     def __post_init__(self) -> None:
         if self.turns < 1 or self.turns % 2 == 0:
@@ -120,7 +121,7 @@ class ScanPath:
     """For each frame but the last, and each camera: share of the surface in its image that the next image also sees;
     NaN where the image shows no surface."""
     steady: SteadyPath = field(repr=False)
-    """The way of a steady hand."""
+    """The trajectory of a steady hand."""
     seen: Mapping[int, float] = field(default_factory=dict)
     """About which share (0 to 1) of the open surface of each crown that the path passes two cameras see at once, by FDI
     number; by 0 of all crowns together."""
@@ -169,7 +170,7 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
             "it; use a narrower one, a larger depth of field or a smaller --clearance-mm"
         )
     path = replace(path, seen=_seen(crowns, handpiece, path, options.tooth))
-    for note in (*_told_detour(jaw, steady, detour), *_told_passes(steady, first, path), *_told_unseen(path)):
+    for note in (*_detour_notes(jaw, steady, detour), *_further_pass_notes(steady, first, path), *_unseen_notes(path)):
         _LOG.info(note)
     return path
 
@@ -213,7 +214,7 @@ def _reach_mm(handpiece: Handpiece) -> float:
 
 
 def _held(steady: SteadyPath, detour: Detour, hand: HandMotion) -> PoseAt:
-    """The way of a hand that drifts."""
+    """The trajectory of a hand that drifts."""
     if not detour.changes.any():
         return lambda at: hand.at(at) @ steady.rig_from_world(at)
     return lambda at: hand.at(at) @ detour.at(at) @ steady.rig_from_world(at)
@@ -284,8 +285,8 @@ def _even_path(mesh: Mesh, handpiece: Handpiece, steady: SteadyPath, pose_at: Po
 # --- what a user should know ------------------------------------------------------------------------------------------
 
 
-def _told_detour(jaw: Jaw, steady: SteadyPath, detour: Detour) -> tuple[str, ...]:
-    """Where the handpiece leaves the way of a steady hand."""
+def _detour_notes(jaw: Jaw, steady: SteadyPath, detour: Detour) -> tuple[str, ...]:
+    """Where the handpiece leaves the trajectory of a steady hand."""
     changed = np.any(detour.changes != 0, axis=1)
     if not changed.any():
         return ()
@@ -305,7 +306,7 @@ def _near_teeth(jaw: Jaw, places: Float[np.ndarray, "n 3"]) -> str:
     return " (near " + ", ".join(str(jaw.teeth[index]) for index in np.unique(nearest)) + ")"
 
 
-def _told_passes(steady: SteadyPath, first: SteadyPath, path: ScanPath) -> tuple[str, ...]:
+def _further_pass_notes(steady: SteadyPath, first: SteadyPath, path: ScanPath) -> tuple[str, ...]:
     """What further passes cost."""
     rolls = {leg.roll_deg for leg in first.legs}
     further = [leg for leg in steady.legs if leg.roll_deg not in rolls]
@@ -317,7 +318,7 @@ def _told_passes(steady: SteadyPath, first: SteadyPath, path: ScanPath) -> tuple
     return (f"scan path: further passes, rolled to the cheek by {what}, take about {more} of {frames} frames",)
 
 
-def _told_unseen(path: ScanPath) -> tuple[str, ...]:
+def _unseen_notes(path: ScanPath) -> tuple[str, ...]:
     """Teeth of which two cameras see little."""
     low = [f"{tooth} {100 * share:.0f} %" for tooth, share in path.seen.items() if share < _LOW_SHARE and tooth != GUM]
     if not low:

@@ -114,9 +114,9 @@ def epipolar() -> Figures:
 
 def _plane_residual(camera: Camera, first: Rigid3, second: Rigid3, matrix: Float[np.ndarray, "3 3"]) -> float:
     """F = [e']_x H with H induced by the plane Z = 6 mm of the first camera, up to scale and sign."""
-    between = second @ first.inverse()
-    translation = between.matrix[:3, 3]
-    plane = between.rotation + np.outer(translation, [0, 0, 1 / 6.0])
+    second_from_first = second @ first.inverse()
+    translation = second_from_first.matrix[:3, 3]
+    plane = second_from_first.rotation + np.outer(translation, [0, 0, 1 / 6.0])
     by_plane = skew(camera.matrix @ translation) @ camera.matrix @ plane @ np.linalg.inv(camera.matrix)
     by_plane /= np.linalg.norm(by_plane)
     return min(_largest(by_plane - matrix), _largest(by_plane + matrix))

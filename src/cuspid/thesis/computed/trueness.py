@@ -73,7 +73,7 @@ def _trueness_cells(row: TruenessRow, result: Result) -> tuple[str, ...]:
 
 def margins_table(results: Results) -> Table | None:
     """How well the edges of the preparations were found."""
-    head = ("scan", "margin of", "judged, %", "found, %", "mean distance, µm", "P95, µm")
+    head = ("scan", "margin of", "evaluated, %", "found, %", "mean distance, µm", "P95, µm")
     rows = tuple(
         _margin_cells(name, tooth, margin)
         for name, result in sorted(results.items())
@@ -85,5 +85,5 @@ def margins_table(results: Results) -> Table | None:
 
 def _margin_cells(name: str, tooth: str, margin: Result) -> tuple[str, ...]:
     found = margin["scan"]
-    figures = (margin["judged_pct"], found["found_pct"], found["mean_um"], found["p95_um"])
+    figures = (margin["evaluated_pct"], found["found_pct"], found["mean_um"], found["p95_um"])
     return (name, tooth, *("-" if value is None else f"{value:.1f}" for value in figures))

@@ -1,4 +1,4 @@
-"""A dense surface under the occlusal plane, by a sweep of horizontal planes through the frames of one camera.
+"""A dense surface under the occlusal plane, by sweeping horizontal planes through the frames of one camera.
 
 On each plane z = const all frames are laid down as if the surface were there (Collins 1996); where it is, frames from
 different places agree. What agrees is the zero-mean normalised cross-correlation (ZNCC) of small windows, averaged over
@@ -29,8 +29,8 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.progress import Progress, silent
 from cuspid.sparse_model import SparseModel
+from cuspid.stitching.height_map import HOLE_MM2, HeightMap
 from cuspid.stitching.mosaic import BURNT, brightest, footprint
-from cuspid.stitching.surface import HOLE_MM2, HeightMap
 from cuspid.workers import map_in_threads
 
 _BLOCK, _REACH = 24, 14
@@ -54,12 +54,12 @@ _GLARE_WEIGHT = 0.1
 _PAIRS = 1.0
 """So many pairs without any agreement are added, so that what few saw counts little."""
 _POOL = 2
-"""Cells of the sweep to one cell of the height map, in each direction."""
+"""Cells of the plane sweep to one cell of the height map, in each direction."""
 _DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepOptions:
+class PlaneSweepOptions:
     """The dense surface."""
 
     enabled: bool = True
@@ -89,9 +89,11 @@ class SweepOptions:
     def __post_init__(self) -> None:
         lengths = (self.cell_mm, self.step_mm, self.depth_mm, self.detail_px, self.baseline_share, self.smoothing_mm)
         if min(lengths) <= 0 or self.window < 3 or self.window % 2 == 0:
-            raise InputError("sweep: lengths and shares must be positive, and the window an odd number from 3")
+            raise InputError("plane sweep: lengths and shares must be positive, and the window an odd number from 3")
         if not 0 <= self.small_jump <= self.large_jump:
-            raise InputError("sweep: a small jump must cost something and a large one no less: 0 <= small <= large")
+            raise InputError(
+                "plane sweep: a small jump must cost something and a large one no less: 0 <= small <= large"
+            )
 
 
 # --- which frames are compared -----------------------------------------------------------------------------------
@@ -239,11 +241,11 @@ def _compared(
     return picture if maps is None else np.asarray(cv2.remap(picture, *maps, cv2.INTER_LINEAR))
 
 
-def sweep(
+def plane_sweep(
     motion: SparseModel,
     sparse: HeightMap,
     read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
-    options: SweepOptions,
+    options: PlaneSweepOptions,
     *,
     progress: Progress = silent,
 ) -> HeightMap | None:
@@ -276,7 +278,7 @@ def sweep(
     )
 
 
-def _places(motion: SparseModel, top: float, options: SweepOptions) -> tuple[Grid, Float[np.ndarray, "d"]]:
+def _places(motion: SparseModel, top: float, options: PlaneSweepOptions) -> tuple[Grid, Float[np.ndarray, "d"]]:
     """Where frames are compared: the cells, and the heights of the planes; not closer than pixels tell apart."""
     camera = motion.camera
     pixel_mm = float(np.median(motion.depths) / np.mean(camera.focal_px))
@@ -297,7 +299,7 @@ def _agreement(
     grid: Grid,
     levels: Float[np.ndarray, "d"],
     read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
-    options: SweepOptions,
+    options: PlaneSweepOptions,
     progress: Progress,
 ) -> Float32[np.ndarray, "d r c"]:
     """Mean agreement (0 to 1) of the pairs of frames that see a place, at each height; the less, the fewer they are."""

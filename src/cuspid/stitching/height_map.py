@@ -45,7 +45,7 @@ _ROUND_MM = 0.8
 """Crowns bulge out below their edges: the surface goes on by one cell, at most so much lower."""
 
 _RIM_MM, _OVER_MM = 0.4, 0.2
-"""The surface hides what it stands over by more than the second, farther away than the first."""
+"""The surface occludes what it stands over by more than the second, farther away than the first."""
 HOLE_MM2 = 20.0
 """Holes up to this size in what is known or seen of the teeth are none."""
 _CROWN_MM = 1.5
@@ -68,7 +68,7 @@ class ScaleOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SurfaceOptions:
+class HeightMapOptions:
     """How coarse the surface is."""
 
     cell_mm: float = 0.4
@@ -85,9 +85,9 @@ def _disc(radius_mm: float, cell_mm: float) -> UInt8[np.ndarray, "k k"]:
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _hide(places, centre, roof, corner, cell, start, over, hidden):
-    """Fill in whether the way from a place to the centre goes under the roof, more than ``start`` cells away."""
-    top, (rows, columns) = roof.max(), roof.shape
+def _mark_occluded(places, centre, occluder, corner, cell, start, over, occluded):
+    """Fill in whether a place's line of sight to the centre passes under the occluder, beyond ``start`` cells."""
+    top, (rows, columns) = occluder.max(), occluder.shape
     for r in range(places.shape[0]):
         for c in range(places.shape[1]):
             x, y, z = places[r, c]
@@ -99,8 +99,8 @@ def _hide(places, centre, roof, corner, cell, start, over, hidden):
                 share = step * cell / length
                 i = int(np.rint((x + share * dx - corner[0]) / cell))
                 j = int(np.rint((y + share * dy - corner[1]) / cell))
-                if 0 <= i < columns and 0 <= j < rows and roof[j, i] > z + share * dz + over:
-                    hidden[r, c] = True
+                if 0 <= i < columns and 0 <= j < rows and occluder[j, i] > z + share * dz + over:
+                    occluded[r, c] = True
                     break
 
 
@@ -116,20 +116,20 @@ class HeightMap:
     """World Z of each cell. float32."""
     known: Bool[np.ndarray, "r c"]
     """Whether there is a surface that was seen."""
-    bare: Bool[np.ndarray, "r c"] | None = None
-    """Places that nothing hides, whatever rises beside them."""
+    visible: Bool[np.ndarray, "r c"] | None = None
+    """Places that nothing occludes, whatever rises beside them."""
 
     @cached_property
-    def _roof(self) -> Float[np.ndarray, "r c"]:
+    def _occluder(self) -> Float[np.ndarray, "r c"]:
         """The highest surface within `_RIM_MM`, for the crowns' rims may lie that far out."""
         return np.asarray(cv2.dilate(self.heights, _disc(_RIM_MM, self.cell_mm)))
 
-    def hides(self, places: Float[np.ndarray, "h w 3"], centre: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "h w"]:
+    def occludes(self, places: Float[np.ndarray, "h w 3"], centre: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "h w"]:
         """Whether the surface stands between places on it and a camera's centre."""
-        hidden = np.zeros(places.shape[:2], bool)
+        occluded = np.zeros(places.shape[:2], bool)
         start = round(_RIM_MM / self.cell_mm) + 1
-        _hide(places, centre, self._roof, self.corner, self.cell_mm, start, _OVER_MM, hidden)
-        return hidden if self.bare is None else hidden & ~self._marked(self.bare, places[..., :2])
+        _mark_occluded(places, centre, self._occluder, self.corner, self.cell_mm, start, _OVER_MM, occluded)
+        return occluded if self.visible is None else occluded & ~self._marked(self.visible, places[..., :2])
 
     def known_at(self, xy: Float[np.ndarray, "h w 2"]) -> Bool[np.ndarray, "h w"]:
         """Whether the surface was seen at a grid of places; not so beyond the border."""
@@ -269,7 +269,7 @@ def _facing_front(centres: Float[np.ndarray, "f 3"], points: Float[np.ndarray, "
 # --- the surface -------------------------------------------------------------------------------------------------
 
 
-def height_map(model: SparseModel, options: SurfaceOptions) -> HeightMap:
+def height_map(model: SparseModel, options: HeightMapOptions) -> HeightMap:
     """A smooth surface through the sparse points of a motion in the occlusal frame; robust against single points."""
     points = _sure_points(model)
     low, high = points[:, :2].min(axis=0) - 4, points[:, :2].max(axis=0) + 4
@@ -289,10 +289,10 @@ def height_map(model: SparseModel, options: SurfaceOptions) -> HeightMap:
 
 
 def uncovered(dense: HeightMap, sparse: HeightMap, motion: SparseModel) -> HeightMap:
-    """A dense surface whose false rises do not hide what the camera went over.
+    """A dense surface whose false rises do not occlude what the camera went over.
 
-    Where seen surface lies all around a place of a crown that is hidden from every frame, something rises beside it
-    that cannot be: a highlight in a hollow. Gum far below the smooth surface may well be hidden behind a crown.
+    Where seen surface lies all around a place of a crown that is occluded in every frame, something rises beside it
+    that cannot be: a highlight in a hollow. Gum far below the smooth surface may well be occluded by a crown.
     """
     camera, cells = motion.camera, dense.known.shape
     x, y = np.meshgrid(*(low + dense.cell_mm * np.arange(n) for low, n in zip(dense.corner, cells[::-1], strict=True)))
@@ -302,11 +302,11 @@ def uncovered(dense: HeightMap, sparse: HeightMap, motion: SparseModel) -> Heigh
         there = pose.apply(places)
         inside = camera.contains(camera.project(there)) & (there[..., 2] > 0) & dense.known
         part = tuple(slice(at.min(initial=max(cells)), at.max(initial=-1) + 1) for at in np.nonzero(inside & ~seen))
-        seen[part] |= inside[part] & ~dense.hides(places[part], pose.inverse().translation)
+        seen[part] |= inside[part] & ~dense.occludes(places[part], pose.inverse().translation)
     holes = remove_small_holes(seen, max_size=round(HOLE_MM2 / dense.cell_mm**2)) & ~seen
     crown = dense.heights > sparse.at(places[..., :2]) - _CROWN_MM
     wide = cv2.dilate(holes.astype(np.uint8), _disc(_RIM_MM, dense.cell_mm)) > 0
-    return replace(dense, bare=wide & crown)
+    return replace(dense, visible=wide & crown)
 
 
 def _bulging(heights: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r c"]:

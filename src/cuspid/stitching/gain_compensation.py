@@ -19,7 +19,7 @@ _STRIDE = 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExposureOptions:
+class GainOptions:
     """How brightness is evened out."""
 
     gains: bool = True
@@ -67,8 +67,8 @@ class Samples:
 
 
 @dataclass(frozen=True, eq=False)
-class Light:
-    """What was found of the light."""
+class Compensation:
+    """Gains of the frames and falloff of the light, as found."""
 
     gains: Float[np.ndarray, "f"]
     """Logarithm of the gain of each frame."""
@@ -82,14 +82,14 @@ class Light:
         return np.asarray(self.gains[index] + self.exponent * (falloff - self.reference), dtype=np.float32)
 
 
-def balance(samples: Samples, frames: int, options: ExposureOptions) -> Light:
+def balance(samples: Samples, frames: int, options: GainOptions) -> Compensation:
     """Gains and falloff by alternating robust least squares over the cells that several frames saw."""
     frame, cell, level, falloff = (
         np.concatenate(each) if each else np.zeros(0)
         for each in (samples.frame, samples.cell, samples.level, samples.falloff)
     )
     if not len(level):
-        return Light(np.zeros(frames), 0.0, 0.0)
+        return Compensation(np.zeros(frames), 0.0, 0.0)
     frame, (_, number) = frame.astype(np.int64), np.unique(cell, return_inverse=True)
     reference = float(np.median(falloff))
     q = falloff - reference
@@ -108,7 +108,7 @@ def balance(samples: Samples, frames: int, options: ExposureOptions) -> Light:
             sums = np.bincount(frame, weight * rest, frames)
             gains = sums / (np.bincount(frame, weight, frames) + prior)
             gains -= gains.mean()
-    return Light(gains, exponent, reference)
+    return Compensation(gains, exponent, reference)
 
 
 def _means(

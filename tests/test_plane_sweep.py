@@ -18,9 +18,9 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.reconstruction import Tracks
 from cuspid.sparse_model import SparseModel
+from cuspid.stitching.height_map import HeightMap, HeightMapOptions, height_map, uncovered
 from cuspid.stitching.mosaic import MosaicOptions, compose
-from cuspid.stitching.surface import HeightMap, SurfaceOptions, height_map, uncovered
-from cuspid.stitching.sweep import SweepOptions, partners, semi_global, sweep
+from cuspid.stitching.plane_sweep import PlaneSweepOptions, partners, plane_sweep, semi_global
 
 HALF_MM, DEEP_MM, CAMERA_MM = 3.0, 4.0, 14.0
 """A bar of this half width along Y stands so high over a floor; the camera goes along it so high over its top."""
@@ -37,8 +37,8 @@ class Scene(NamedTuple):
         return self.images[name]
 
     def swept(self, **changes: object) -> HeightMap | None:
-        sparse = height_map(self.motion, SurfaceOptions())
-        return sweep(self.motion, sparse, self.read, SweepOptions(**changes))
+        sparse = height_map(self.motion, HeightMapOptions())
+        return plane_sweep(self.motion, sparse, self.read, PlaneSweepOptions(**changes))
 
 
 def true_places(pose: Rigid3, pixels: np.ndarray) -> np.ndarray:
@@ -179,8 +179,8 @@ def test_a_film_of_another_scale_needs_no_more_cells(scene: Scene, surface: Heig
     "wrong", [{"cell_mm": 0.0}, {"window": 4}, {"window": 1}, {"large_jump": 0.01}, {"small_jump": -1.0}]
 )
 def test_options_that_make_no_sense_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(InputError, match="sweep"):
-        SweepOptions(**wrong)
+    with pytest.raises(InputError, match="plane sweep"):
+        PlaneSweepOptions(**wrong)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.2, 0.3])
@@ -203,39 +203,39 @@ def flat_with(bump_mm: float, inside: Callable[[np.ndarray], np.ndarray]) -> Hei
 
 
 @given(st.floats(1.0, 5.0), st.floats(-8.0, 8.0))
-def test_a_wall_hides_what_lies_in_its_shadow(height_mm: float, centre_x: float) -> None:
+def test_a_wall_occludes_what_lies_in_its_shadow(height_mm: float, centre_x: float) -> None:
     """A camera 14 mm over the floor, a wall of 1 mm about x = 0: the shadow is as long as similar triangles say."""
     wall = flat_with(height_mm, lambda x: np.abs(x[..., 0]) <= 0.5)
     x = np.arange(0.95, 9.0, 0.1)
     places = np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=-1)[None]
-    hidden = wall.hides(places, np.array([centre_x, 0, 14.0]))[0]
+    occluded = wall.occludes(places, np.array([centre_x, 0, 14.0]))[0]
     top = 0.5 + (-centre_x + 0.5) * height_mm / (14 - height_mm)
-    assert not hidden[x > top + 0.9].any()
-    assert hidden[(x > 1.6) & (x < top - 0.3)].all()
+    assert not occluded[x > top + 0.9].any()
+    assert occluded[(x > 1.6) & (x < top - 0.3)].all()
 
 
-def test_a_false_rise_in_the_middle_of_a_crown_hides_nothing_but_a_crown_hides_gum(
+def test_a_false_rise_in_the_middle_of_a_crown_occludes_nothing_but_a_crown_occludes_gum(
     scene: Scene, surface: HeightMap
 ) -> None:
-    """A ring on the bar is high enough to hide its middle from all frames; no such thing stands on a crown."""
+    """A ring on the bar is high enough to occlude its middle from all frames; no such thing stands on a crown."""
     rows, columns = surface.known.shape
     x, y = np.meshgrid(surface.corner[0] + 0.2 * np.arange(columns), surface.corner[1] + 0.2 * np.arange(rows))
     away = np.hypot(x - 2.0, y - 0.5)
     ringed = np.where((away > 0.7) & (away < 1.0), 11.0, surface.heights).astype(np.float32)
     false = replace(surface, heights=ringed)
     middle, centre = np.array([[[2.0, 0.5, 0.0]]]), np.array([4.0, 2.0, CAMERA_MM])
-    assert false.hides(middle, centre).all()
-    sparse = height_map(scene.motion, SurfaceOptions())
-    assert not uncovered(false, sparse, scene.motion).hides(middle, centre).any()
+    assert false.occludes(middle, centre).all()
+    sparse = height_map(scene.motion, HeightMapOptions())
+    assert not uncovered(false, sparse, scene.motion).occludes(middle, centre).any()
     behind = np.array([[[-HALF_MM - 0.7, 0.0, -DEEP_MM]]])
-    assert uncovered(surface, sparse, scene.motion).hides(behind, np.array([3.0, 0, CAMERA_MM])).all()
+    assert uncovered(surface, sparse, scene.motion).occludes(behind, np.array([3.0, 0, CAMERA_MM])).all()
 
 
 @given(st.floats(-9.0, 9.0), st.floats(-9.0, 9.0))
-def test_a_plane_hides_nothing(x: float, y: float) -> None:
+def test_a_plane_occludes_nothing(x: float, y: float) -> None:
     plane = flat_with(0.0, lambda x: np.zeros(x.shape[:-1], bool))
     places = np.concatenate([grid((-8, 8), (-8, 8)), np.zeros((160, 160, 1))], axis=-1)
-    assert not plane.hides(places, np.array([x, y, 10.0])).any()
+    assert not plane.occludes(places, np.array([x, y, 10.0])).any()
 
 
 @given(arrays(np.float32, (7, 4, 5), elements=st.floats(0, 1, width=16)))

@@ -1,7 +1,7 @@
-"""A jaw in a single shot from above: the ground truth of a panorama (thesis 4.3).
+"""A reference render: a jaw as a single image from above shows it, the ground truth of a panorama (thesis 4.3).
 
 The camera looks straight down on the occlusal plane, orthographic or from a height, and its light shines beside it, as
-the thesis assumes of the frames. Pixels: see :class:`cuspid.trueness.OcclusalView`.
+the thesis assumes of the frames. Pixels: see :class:`cuspid.trueness.ReferenceRender`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from cuspid.errors import InputError
 from cuspid.mesh import RayHits
 from cuspid.simulation.raycast import BRIGHT_LEVEL, BRIGHT_PERCENTILE, Lamps, Scene, radiance_along
 from cuspid.simulation.sensor import expose
-from cuspid.trueness import NOTHING, OcclusalView
+from cuspid.trueness import NOTHING, ReferenceRender
 
 FAR_LIGHT_MM = 1000.0
 """Height of the light of an orthographic view; from here it comes within 2 deg of straight down on all of an arch."""
@@ -26,8 +26,8 @@ _ROWS = 64
 
 
 @dataclass(frozen=True, kw_only=True)
-class OcclusalOptions:
-    """How the jaw is shot from above."""
+class ReferenceRenderOptions:
+    """How the jaw is rendered from above."""
 
     mm_per_px: float = 0.05
     """Millimetres a pixel, in the occlusal plane."""
@@ -38,15 +38,17 @@ class OcclusalOptions:
 
     def __post_init__(self) -> None:
         if not self.mm_per_px > 0 or self.margin_mm < 0:
-            raise InputError("single shot: mm per px must be positive and the margin not negative")
+            raise InputError("reference render: mm per px must be positive and the margin not negative")
 
 
-def render_occlusal_view(scene: Scene, options: OcclusalOptions = OcclusalOptions()) -> OcclusalView:
+def render_reference(scene: Scene, options: ReferenceRenderOptions = ReferenceRenderOptions()) -> ReferenceRender:
     """The jaw from above, with the materials, the texture and the sensor's gamma of its scene, without noise."""
     low, high = scene.jaw.mesh.bounds
     height = options.camera_height_mm
     if height is not None and height < high[2] + _ABOVE_MM:
-        raise InputError(f"single shot: the camera at {height:g} mm stands in the jaw; it reaches to {high[2]:.1f} mm")
+        raise InputError(
+            f"reference render: the camera at {height:g} mm stands in the jaw; it reaches to {high[2]:.1f} mm"
+        )
     sides = (high - low + 2 * options.margin_mm) / options.mm_per_px
     columns, bottom = int(np.ceil(sides[0])), int(np.ceil(sides[1]))
     origin = np.array([options.margin_mm - low[0], options.margin_mm + high[1]]) / options.mm_per_px
@@ -58,7 +60,7 @@ def render_occlusal_view(scene: Scene, options: OcclusalOptions = OcclusalOption
         light[rows] = _light(scene, _on_plane(rows, columns, scene.supersampling, origin, options), height)
         heights[rows], labels[rows] = _surface(scene, _on_plane(rows, columns, 1, origin, options), height)
     quiet = replace(scene.handpiece.sensor, noise_dn=0.0)
-    return OcclusalView(
+    return ReferenceRender(
         image=expose(light, _gain(light), quiet, np.random.default_rng(0)),
         labels=labels,
         height_mm=heights,
@@ -69,7 +71,7 @@ def render_occlusal_view(scene: Scene, options: OcclusalOptions = OcclusalOption
 
 
 def _on_plane(
-    rows: slice, width: int, samples: int, origin_px: Float[np.ndarray, "2"], options: OcclusalOptions
+    rows: slice, width: int, samples: int, origin_px: Float[np.ndarray, "2"], options: ReferenceRenderOptions
 ) -> Float[np.ndarray, "r w s 2"]:
     """Where the rays through some rows of pixels meet the occlusal plane, mm."""
     offsets = (np.arange(samples) + 0.5) / samples
