@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from cuspid import storage
+from cuspid.handpiece.designs import twelve_cameras
 from cuspid.jaw import Jaw, Landmark
 from cuspid.mesh import Mesh
 from verbs import refused, run
@@ -112,6 +113,18 @@ def test_a_box_needs_labels(tmp_path, capsys, coarse_phantom):
     storage.write_jaw(tmp_path / "bare.ply", replace(coarse_phantom, face_labels=None))
     assert "label" in refused(capsys, "box", tmp_path / "bare.ply", "--out", tmp_path / "box.ply")
     assert not (tmp_path / "box.ply").exists()
+
+
+def test_a_mouth_takes_the_size_of_a_handpiece(tmp_path, capsys):
+    made = twelve_cameras()
+    storage.write_handpiece(tmp_path / "handpiece.json", made)
+    run("mouth", "--handpiece", tmp_path / "handpiece.json", "--people", "50", "--out", tmp_path / "mouth")
+    needed = storage.read_json(tmp_path / "mouth" / "mouth.json")["needed_mm"]
+    assert needed == pytest.approx(made.solid.bounds[1, 2])
+    storage.write_handpiece(tmp_path / "bare.json", replace(made, body=None))
+    refusal = refused(capsys, "mouth", "--handpiece", tmp_path / "bare.json", "--out", tmp_path / "none")
+    assert "bare.json: its body is not known" in refusal
+    assert not (tmp_path / "none").exists()
 
 
 def test_a_mouth_that_cannot_be(tmp_path, capsys):

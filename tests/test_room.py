@@ -20,7 +20,7 @@ from cuspid.handpiece.holder import HolderOptions, with_holder
 from cuspid.handpiece.presets import PRESETS
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
-from cuspid.room import Room, check_clearance, room_for, surface_points
+from cuspid.room import Room, check_clearance, room_about, surface_points
 from cuspid.simulation.path.arch import arch_curve
 from cuspid.simulation.path.detour import up
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
@@ -138,9 +138,9 @@ def test_the_part_that_touches_is_named() -> None:
 def test_an_assumed_body_is_told(caplog: pytest.LogCaptureFixture) -> None:
     known = twelve_cameras()
     with caplog.at_level("INFO", logger="cuspid"):
-        assert room_for(plate(0.0, 20.0), known, 0.5).body is known.body
+        assert room_about(plate(0.0, 20.0), known, 0.5).body is known.body
         assert caplog.messages == []
-        assumed = room_for(plate(0.0, 20.0), replace(known, body=None), 0.5).body
+        assumed = room_about(plate(0.0, 20.0), replace(known, body=None), 0.5).body
     (told,) = caplog.messages
     assert "a box of 1.0 x 1.0 x 1.6 mm is assumed behind each lens" in told
     assert set(assumed.names) < set(known.solid.names)

@@ -234,6 +234,12 @@ class Handpiece:
         return Body({**cameras, **leds})
 
     @property
+    def thickness_mm(self) -> float:
+        """How far the body reaches out of the gum beyond the working distance, with the rig frame over the teeth as in
+        :mod:`cuspid.handpiece.designs`."""
+        return float(self.solid.bounds[1, 2]) - self.working_distance_mm
+
+    @property
     def footprint_mm(self) -> float:
         """Side of what a pixel sees of a surface at the working distance, mm: median of the cameras."""
         focal_px = [mounted.camera.focal_px.mean() for mounted in self.rig.cameras.values()]

@@ -166,7 +166,7 @@ def surface_points(mesh: Mesh, apart_mm: float) -> Float[np.ndarray, "n 3"]:
     return np.concatenate(points)
 
 
-def room_for(mesh: Mesh, handpiece: Handpiece, clearance_mm: float) -> Room:
+def room_about(mesh: Mesh, handpiece: Handpiece, clearance_mm: float) -> Room:
     """The room for a handpiece. Where its body is not known, what is assumed goes to the log."""
     if handpiece.body is None:
         camera, led = (" x ".join(f"{side:.1f}" for side in size) for size in (CAMERA_MM, LED_MM))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -21,16 +22,21 @@ from cuspid.anatomy.mouth import (
     study_mouths,
 )
 from cuspid.cli.shared import Flat, console
+from cuspid.errors import InputError
 from cuspid.reporting.figures.mouth import TOOTH_NAMES, save_fit_picture, save_gap_picture, save_sagittal_picture
 
 
-def mouth(*, out: Path, options: Annotated[MouthOptions, Flat] = MouthOptions()) -> None:
+def mouth(*, out: Path, handpiece: Path | None = None, options: Annotated[MouthOptions, Flat] = MouthOptions()) -> None:
     """Find how much room there is between the jaws, and for how many people a handpiece fits at each tooth.
 
     Args:
         out: Folder for mouth.json and the pictures: the sagittal plane, whom a handpiece fits, the gap at the molars.
+        handpiece: A handpiece.json with a body: its thickness and working distance, in place of those given.
     """
-    with storage.claimed_folder(out, "mouth", {"mouth": options}, {}, replace=True):
+    inputs = {} if handpiece is None else {"handpiece": storage.hash_file(handpiece)}
+    if handpiece is not None:
+        options = _sized(options, handpiece)
+    with storage.claimed_folder(out, "mouth", {"mouth": options}, inputs, replace=True):
         report, people = study_mouths(options)
         storage.write_json(out / "mouth.json", report)
         opening = OPENINGS[options.study]["women"]
@@ -57,6 +63,16 @@ def mouth(*, out: Path, options: Annotated[MouthOptions, Flat] = MouthOptions())
         save_gap_picture(out / "gap.png", at_molars, PRINTED_GAP_MM, title="Gap L at the second molars")
     _print_fit(report)
     _print_thesis(report)
+
+
+def _sized(options: MouthOptions, path: Path) -> MouthOptions:
+    device = storage.read_handpiece(path)
+    if device.body is None:
+        raise InputError(
+            f"{path}: its body is not known; give --thickness-mm and --working-distance-mm, or a body there"
+        )
+    console.print(f"{path}: {device.thickness_mm:.1f} mm thick, {device.working_distance_mm:g} mm over the teeth")
+    return replace(options, thickness_mm=device.thickness_mm, working_distance_mm=device.working_distance_mm)
 
 
 def _print_fit(report: MouthReport) -> None:

@@ -123,7 +123,7 @@ def _draw_probe(
     axes.add_patch(Polygon(corners, facecolor="none", edgecolor=_PROBE, linewidth=1.4))
     place = low + 0.78 * _PROBE_MM * along + thickness / 2 * normal
     turn = float(np.rad2deg(np.arctan2(along[1], along[0])))
-    text = f"handpiece {thickness:g} mm, at {distance:g} mm"
+    text = f"handpiece {thickness:.4g} mm, at {distance:.4g} mm"
     axes.text(place[0], place[1], text, fontsize=11, color=_PROBE, ha="center", va="center", rotation=turn)
 
 

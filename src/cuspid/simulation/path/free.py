@@ -21,7 +21,7 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
 from cuspid.rig import Handpiece
-from cuspid.room import room_for
+from cuspid.room import room_about
 from cuspid.simulation.path.arch import arch_curve
 from cuspid.simulation.path.detour import lifts_needed, up
 
@@ -96,7 +96,7 @@ def plan_free_path(
             f"free path: at --clearance-mm {options.clearance_mm:g} nothing is in focus; the camera sees sharply up to "
             f"{handpiece.depth_range_mm[1]:g} mm"
         )
-    room, reach = room_for(jaw.mesh, handpiece, options.clearance_mm), round(options.drift_frames)
+    room, reach = room_about(jaw.mesh, handpiece, options.clearance_mm), round(options.drift_frames)
     lifts = lifts_needed(room, poses, reach)
     if lifts.any():
         _LOG.info(f"free path: the hand lifts the camera by up to {lifts.max():.1f} mm where it would come too near")

@@ -24,7 +24,7 @@ from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
-from cuspid.room import check_clearance, room_for
+from cuspid.room import check_clearance, room_about
 from cuspid.simulation.path.arch import ArchCurve, arch_curve
 from cuspid.simulation.path.coverage import CrownPoints, crown_points
 from cuspid.simulation.path.detour import Detour, PoseAt, lifted, plan_detour
@@ -148,7 +148,7 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
     What a user should know of it goes to the log. Raises InputError where the jaw has no such tooth, the handpiece does
     not fit even when lifted, or the asked number of frames is too small for the overlap.
     """
-    curve, room = arch_curve(jaw), room_for(jaw.mesh, handpiece, options.clearance_mm)
+    curve, room = arch_curve(jaw), room_about(jaw.mesh, handpiece, options.clearance_mm)
     crowns = crown_points(jaw, curve, _reach_mm(handpiece))
     steady = first = steady_path(jaw.mesh, curve, _legs(jaw, curve, options))
     if options.passes == "auto":
