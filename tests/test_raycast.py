@@ -249,7 +249,7 @@ def test_presets_differ_in_contrast_and_seeds_in_pattern() -> None:
 
 
 def test_a_sprayed_texture_suits_the_cameras_and_enamel_stays_enamel() -> None:
-    for footprint_mm, factor in ((0.0117, 1), (0.0121, 1), (0.024, 2), (0.003, 0.25), (12.0, 1024)):
+    for footprint_mm, factor in ((0.0117, 1), (0.003, 1), (0.053, 1), (0.1, 8), (0.0015, 0.125), (12.0, 1024)):
         for name in ("artificial", "powder"):
             before, after = APPEARANCES[name].gum, APPEARANCES[name].seen_by(footprint_mm).gum
             assert after.wavelengths_mm == tuple(factor * wavelength for wavelength in before.wavelengths_mm)

@@ -44,11 +44,12 @@ class Material:
     """Whether the texture is sprayed or painted on, as fine as the cameras need it, and not the surface's own."""
 
     def seen_by(self, footprint_mm: float) -> Material:
-        """With an applied texture that cameras resolve whose pixels see so much of the surface: coarser or finer by
-        whole octaves than the one that suits 12 um, so that cameras that are about alike see the same texture."""
-        if not self.applied:
+        """With an applied texture that cameras resolve whose pixels see so much of the surface: the one that suits 12 um,
+        unless its finest octave has less than 1 px or more than 25; then coarser or finer by whole octaves."""
+        octaves = np.log2(footprint_mm / _SUITED_MM)
+        if not self.applied or abs(octaves) < _ALIKE_OCTAVES:
             return self
-        factor = 2.0 ** round(np.log2(footprint_mm / _SUITED_MM))
+        factor = 2.0 ** round(octaves)
         return replace(self, wavelengths_mm=tuple(factor * wavelength for wavelength in self.wavelengths_mm))
 
 
@@ -66,7 +67,7 @@ class Appearance:
         return Appearance(enamel=self.enamel.seen_by(footprint_mm), gum=self.gum.seen_by(footprint_mm))
 
 
-_SUITED_MM = 0.012
+_SUITED_MM, _ALIKE_OCTAVES = 0.012, 2.3
 _FINE = (0.06, 0.12, 0.24, 0.48, 0.96)
 """From 5 px of a camera at 12 um per px, so that 3 px are left of it in the farthest views, to 1 mm."""
 
