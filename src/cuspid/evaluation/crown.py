@@ -147,6 +147,6 @@ def _note(crown: OpenCrown, could_be_seen: bool, evaluated: list[int]) -> str:
     named = f"{len(evaluated)} pieces" if crown.estimated else ", ".join(map(str, evaluated))
     estimated = "; crowns were told from gum by shape, an estimate" if crown.estimated else ""
     return (
-        f"of the open crown surface is evaluated, over all: {named}; of each of them at least three quarters as much "
+        f"evaluated of the open crown surface: {named}; of each of them at least three quarters as much "
         f"{where} as of the best one{estimated}"
     )

@@ -199,7 +199,7 @@ def _rules(reference: Mesh, scannable: Bool[np.ndarray, "f"] | None, options: Ev
         faces=faces,
         margin_mm=options.margin_mm,
         reference_is_all=scannable is not None,
-        note=f"of the reference is evaluated: {note}",
+        note=f"evaluated of the reference: {note}",
     )
 
 
@@ -231,7 +231,7 @@ def _samples_of_scan(
         points=points[evaluated],
         signed_mm=closest.signed_mm[evaluated],
         labels=labels[closest.faces[evaluated]],
-        left_out=f"of the scan is not evaluated: {over:.1f} % within {rules.margin_mm:g} mm of reference surface that "
+        left_out=f"left out of the scan: {over:.1f} % within {rules.margin_mm:g} mm of reference surface that "
         f"is not evaluated, {past:.1f} % past an open border of the reference{limit}",
     )
     return samples, statistics(closest.signed_mm[~past_border])
@@ -262,6 +262,6 @@ def _samples_of_reference(
         points=points[near],
         signed_mm=(signs * distances)[near],
         labels=labels[faces[near]],
-        left_out=f"of the reference is not regarded as scanned: {cropped}",
+        left_out=f"regarded as not scanned of the reference: {cropped}",
     )
     return samples, float(area_pct * near.mean())
