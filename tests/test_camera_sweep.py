@@ -104,8 +104,8 @@ def test_every_setting_of_the_thesis_is_taken_for_a_pair(site, baseline, angle):
     [
         ({"surface": "incisal", "tooth": 47}, "tooth 47 has no incisal surface; it has occlusal, buccal, lingual"),
         ({"tooth": 48}, "no tooth 48"),
-        ({"distance_mm": 0.6, "depth_of_field_mm": 1.0}, "nearer to the jaw|lies inside"),
-        ({"surface": "mesial"}, "nearer to the jaw|lies inside"),
+        ({"distance_mm": 0.6, "depth_of_field_mm": 1.0}, "comes as near to the jaw|lies inside"),
+        ({"surface": "mesial"}, "comes as near to the jaw|lies inside"),
         ({"path_mm": 9.0}, "frames consecutive images overlap by only"),
     ],
 )
@@ -147,7 +147,7 @@ def test_a_real_sweep_measures_the_surface_alone(swept):
         assert figures["mean_abs_um"] < figures["p95_um"] < figures["max_um"]
         assert 10 < figures["complete_50_um_pct"] <= figures["seen_pct"] + 6 < 90
         assert figures["complete_10_um_pct"] <= figures["complete_50_um_pct"] <= figures["complete_100_um_pct"]
-        assert figures["points"] > 500
+        assert figures["points"] > 250
         assert figures["located_frames"] == 2
     narrow, wide = (each.figures for each in outcomes)
     assert narrow["seen_pct"] > wide["seen_pct"] + 3, "a longer baseline shares less"
@@ -263,7 +263,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(jaw_file, tmp_path, capsys, mo
     absent = refused(capsys, "sweep", jaw_file, "--surface", "incisal", "--tooth", 47, "--out", out)
     assert "no incisal surface" in absent
     close = refused(capsys, "sweep", jaw_file, "--distance-mm", 0.6, "--depth-of-field-mm", 1, "--out", out)
-    assert "larger working distance" in close
+    assert "of the handpiece" in close
     assert "--workers is 0" in refused(capsys, "sweep", jaw_file, "--workers", 0, "--out", out)
     pytest.importorskip("distributed")
     monkeypatch.setattr("cuspid.studies.grid.CLUSTER_TIMEOUT_S", 1)

@@ -13,11 +13,11 @@ from cuspid.surface.cleaning import clean as clean_mesh
 from synthetic_scene import height_field
 
 SHEET = height_field(lambda x, y: 5 + 0.2 * np.sin(x), half_width_mm=2.0, count=41)
-RESOLUTION_MM = 0.012
+WORKING_DISTANCE_MM = 5.0
 
 
 def clean(mesh: Mesh) -> tuple[Mesh, CleaningReport]:
-    return clean_mesh(mesh, RESOLUTION_MM)
+    return clean_mesh(mesh, WORKING_DISTANCE_MM)
 
 
 def test_a_good_surface_is_left_alone() -> None:

@@ -114,9 +114,9 @@ def reconstruct(
         depths = measure_depth(capture, folder / "depth-refined", options.stereo, progress=progress)
     if options.temporal.enabled:
         depths |= measure_temporal_depth(capture, poses, folder / "depth-temporal", options.temporal, progress=progress)
-    made_from, resolution_mm = depths.digest, resolved_mm(handpiece)
-    mesh = fuse(depths, made_from, poses, resolution_mm, folder, options.fusion, options.cleaning, progress=progress)
-    return found, mesh
+    lengths_mm = resolved_mm(handpiece), handpiece.working_distance_mm
+    how = options.fusion, options.cleaning
+    return found, fuse(depths, depths.digest, poses, *lengths_mm, folder, *how, progress=progress)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -44,8 +44,8 @@ class Material:
     """Whether the texture is sprayed or painted on, as fine as the cameras need it, and not the surface's own."""
 
     def seen_by(self, footprint_mm: float) -> Material:
-        """With an applied texture that cameras resolve whose pixels see so much of the surface: the one that suits 12 um,
-        unless its finest octave has less than 1 px or more than 25; then coarser or finer by whole octaves."""
+        """With an applied texture that suits cameras whose pixels see so much of the surface: the one for 12 um, unless
+        its finest octave has less than 1 px or more than 25 there; then coarser or finer by whole octaves."""
         octaves = np.log2(footprint_mm / _SUITED_MM)
         if not self.applied or abs(octaves) < _ALIKE_OCTAVES:
             return self

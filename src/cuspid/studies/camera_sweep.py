@@ -183,6 +183,10 @@ def find_site(jaw: Jaw, options: SweepOptions) -> Site:
     middle = steady_poses(jaw, options.path, per_pass=3)[1]
     pair_from_rig = pair_from_world @ middle.inverse()
     narrowest = pair_handpiece(pair_from_rig, (min(options.baseline_mm), options.angle_deg[0]), options)
+    # A sweep keeps its distance: the pair is not lifted over what it would touch.
+    steady = steady_poses(jaw, options.path, per_pass=options.path.frames or 10)
+    room = Room(jaw.mesh, narrowest.solid, options.path.clearance_mm)
+    check_clearance(room, {f"{index:05d}": pose for index, pose in enumerate(steady)})
     paths = {
         seed: plan_scan_path(jaw, narrowest, options.path, np.random.default_rng([seed, 1])).rig_from_world
         for seed in range(options.repeats + 1)

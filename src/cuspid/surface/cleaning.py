@@ -18,12 +18,12 @@ from cuspid.mesh import Mesh
 class CleaningOptions:
     """Cleaning of a fused mesh. Lengths count in resolutions of the handpiece, 12 um for the built-in ones."""
 
-    least_piece_width: float = 118.0
-    """Connected pieces of less area than a square of so many resolutions (2 mm2 at 12 um) are removed."""
+    least_piece_width: float = 0.283
+    """Connected pieces of less area than a square of so many working distances (2 mm2 at 5 mm) are removed."""
     least_piece_share: float = 0.005
     """Connected pieces of a smaller share of the whole area are removed."""
-    ghost_depth: float = 41.6
-    """A face that looks at the back of another one within so many resolutions (0.5 mm at 12 um) is removed."""
+    ghost_depth: float = 0.1
+    """A face that looks at the back of another one within so many working distances (0.5 mm at 5 mm) is removed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,17 +56,19 @@ class CleaningReport:
     """Length of the outer boundaries, one for each piece."""
 
 
-def clean(mesh: Mesh, resolution_mm: float, options: CleaningOptions | None = None) -> tuple[Mesh, CleaningReport]:
+def clean(
+    mesh: Mesh, working_distance_mm: float, options: CleaningOptions | None = None
+) -> tuple[Mesh, CleaningReport]:
     """A manifold mesh without floating pieces and ghosts, and a report. An empty mesh stays empty.
 
-    ``resolution_mm`` is what the handpiece resolves (:func:`cuspid.pairing.resolved_mm`).
+    ``working_distance_mm`` is that of the handpiece; lengths count in it.
     """
     options = options or CleaningOptions()
-    ghosts = ghost_faces(mesh, options.ghost_depth * resolution_mm)
+    ghosts = ghost_faces(mesh, options.ghost_depth * working_distance_mm)
     cleaned = mesh.submesh(~ghosts)
     crowded = non_manifold_faces(cleaned)
     cleaned, split = with_split_fans(cleaned.submesh(~crowded))
-    least_mm2 = (options.least_piece_width * resolution_mm) ** 2
+    least_mm2 = (options.least_piece_width * working_distance_mm) ** 2
     floating, pieces = floating_faces(cleaned, least_mm2, options.least_piece_share)
     cleaned = cleaned.submesh(~floating)
     outer, holes = boundaries(cleaned)

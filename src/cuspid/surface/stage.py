@@ -23,6 +23,7 @@ def fuse(
     made_from: str,
     rig_from_world: Mapping[str, Rigid3],
     resolution_mm: float,
+    working_distance_mm: float,
     folder: Path,
     fusion: FusionOptions,
     cleaning: CleaningOptions,
@@ -32,9 +33,10 @@ def fuse(
     """One clean mesh: ``mesh.ply`` with colour, ``mesh.stl``, and what was removed in ``mesh.json``.
 
     ``made_from`` is the digest of the depth maps, which may be gone through more than once; ``resolution_mm`` is what
-    the handpiece resolves. Raises ReconstructionError where they hold nothing.
+    the handpiece resolves, ``working_distance_mm`` how far it is held. Raises ReconstructionError where they hold
+    nothing.
     """
-    stage = Stage("mesh", folder, [fusion, cleaning, resolution_mm], ("surface",))
+    stage = Stage("mesh", folder, [fusion, cleaning, resolution_mm, working_distance_mm], ("surface",))
     files = [folder / name for name in ("mesh.json", "mesh.stl", "mesh.ply")]
 
     def write() -> None:
@@ -43,7 +45,7 @@ def fuse(
             raise ReconstructionError(
                 "no surface: the depth maps are empty; the images need texture (spray, powder) or sharper focus"
             )
-        mesh, report = clean(raw, resolution_mm, cleaning)
+        mesh, report = clean(raw, working_distance_mm, cleaning)
         write_json(files[0], report)
         write_mesh(files[1], mesh)
         write_mesh(files[2], mesh)
