@@ -21,7 +21,6 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from jaxtyping import Int
 from run import conditions
 from scipy.spatial.transform import Rotation
 
@@ -93,19 +92,19 @@ def jaw_of(file: str, part: str, smooth: bool) -> Jaw:
 
 def subdivided(jaw: Jaw) -> Jaw:
     """After two Loop subdivisions; faces take the label of the nearest one before."""
-    vertices, faces = trimesh.remesh.subdivide_loop(jaw.mesh.vertices, _manifold(jaw.mesh), iterations=2)
-    mesh = Mesh(vertices, faces)
+    clean = _manifold(jaw.mesh)
+    mesh = Mesh(*trimesh.remesh.subdivide_loop(clean.vertices, clean.faces, iterations=2))
     if jaw.face_labels is None:
         return replace(jaw, mesh=mesh)
     _, nearest, _ = jaw.mesh.closest(mesh.face_centres)
     return replace(jaw, mesh=mesh, face_labels=jaw.face_labels[nearest])
 
 
-def _manifold(mesh: Mesh) -> Int[np.ndarray, "f 3"]:
-    """The faces but those on edges that more than two share, which cannot be subdivided."""
+def _manifold(mesh: Mesh) -> Mesh:
+    """Without the faces on edges that more than two share, which cannot be subdivided, and without lone vertices."""
     edges = np.sort(edges_of(mesh.faces), axis=1)
     _, edge, sharing = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
-    return mesh.faces[(sharing[edge.ravel()] <= 2).reshape(-1, 3).all(axis=1)]
+    return mesh.submesh((sharing[edge.ravel()] <= 2).reshape(-1, 3).all(axis=1))
 
 
 def cut_out(jaw: Jaw, teeth: tuple[int, ...]) -> Mesh:
