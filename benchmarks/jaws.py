@@ -104,7 +104,8 @@ def _manifold(mesh: Mesh) -> Mesh:
     """Without the faces on edges that more than two share, which cannot be subdivided, and without lone vertices."""
     edges = np.sort(edges_of(mesh.faces), axis=1)
     _, edge, sharing = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
-    return mesh.submesh((sharing[edge.ravel()] <= 2).reshape(-1, 3).all(axis=1))
+    alone = np.asarray(sharing[edge.ravel()] <= 2).reshape(-1, 3)
+    return mesh.submesh(np.asarray(alone.all(axis=1)))
 
 
 def cut_out(jaw: Jaw, teeth: tuple[int, ...]) -> Mesh:
