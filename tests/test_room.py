@@ -51,13 +51,6 @@ def test_distances_move_with_the_body(seed: int) -> None:
     )
 
 
-def test_the_surface_points_of_a_box_lie_on_it() -> None:
-    box = Box(any_pose(3, 5.0), np.array([0.5, 1.0, 2.0]))
-    points = box.surface_points(0.3)
-    np.testing.assert_allclose(Body({"box": box}).distances(points)[0], 0, atol=1e-9)
-    assert len(points) > 200
-
-
 def test_a_module_lies_behind_its_front() -> None:
     corners = module(Rigid3.identity(), (1.0, 2.0, 3.0)).corners
     np.testing.assert_allclose([corners.min(axis=0), corners.max(axis=0)], [[-0.5, -1, -3], [0.5, 1, 0]], atol=1e-12)

@@ -38,14 +38,6 @@ class Box:
         """In the rig frame, mm."""
         return self.box_from_rig.inverse().apply((np.array(list(np.ndindex(2, 2, 2))) * 2 - 1.0) * self.half_mm)
 
-    def surface_points(self, spacing_mm: float) -> Float[np.ndarray, "n 3"]:
-        """Points on its faces, edges and corners, no farther apart than the spacing along an edge; rig frame, mm."""
-        counts = np.maximum(np.ceil(2 * self.half_mm / spacing_mm).astype(int), 1)
-        ticks = [np.linspace(-half, half, count + 1) for half, count in zip(self.half_mm, counts, strict=True)]
-        grid = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-        on_surface = (np.abs(grid) >= self.half_mm * (1 - 1e-9)).any(axis=1)
-        return self.box_from_rig.inverse().apply(grid[on_surface])
-
 
 CAMERA_MM, LED_MM = (1.0, 1.0, 1.6), (0.5, 0.5, 0.6)
 """Width, height and depth of a miniature camera module (with a sensor of 1/14 inch or less) and of an LED."""
@@ -79,10 +71,6 @@ class Body:
         """Lower and upper corner of the box around it all, in the rig frame, mm."""
         corners = np.concatenate([box.corners for box in self.parts.values()])
         return np.stack([corners.min(axis=0), corners.max(axis=0)])
-
-    def surface_points(self, spacing_mm: float) -> Float[np.ndarray, "n 3"]:
-        """As :meth:`Box.surface_points`, of all parts."""
-        return np.concatenate([box.surface_points(spacing_mm) for box in self.parts.values()])
 
     def distances(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"]]:
         """Signed distance in mm of points of the rig frame to the nearest part, negative inside, and which part."""
