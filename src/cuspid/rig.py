@@ -117,7 +117,8 @@ class Rig:
     def overlap(self, first: str, second: str, distance_mm: float) -> float:
         """Share (0 to 1) of a plane across the first camera's axis, filling its image, that the second sees too."""
         one, other = self[first], self[second]
-        grid = np.stack(np.meshgrid(*(np.linspace(0, size, 12) for size in (one.camera.width, one.camera.height))), -1)
+        cells = (np.arange(24) + 0.5) / 24  # middles: on the border rounding would decide
+        grid = np.stack(np.meshgrid(cells * one.camera.width, cells * one.camera.height), -1)
         plane = one.camera.rays(grid.reshape(-1, 2)) * distance_mm
         in_other = (other.cam_from_rig @ one.cam_from_rig.inverse()).apply(plane)
         return float(np.mean(other.camera.contains(other.camera.project(in_other))))
