@@ -158,9 +158,15 @@ class Mesh:
         # The segment is shot backwards: a hit nearer than the surface point is an occluder.
         reach = points - towards
         length = np.linalg.norm(reach, axis=1)
-        hits = self.cast(towards, reach / length[:, None])
         rounding_mm = _ROUNDING * (np.abs(points).max(axis=1, initial=0) + length)
-        return hits.distances < length - np.maximum(tolerance_mm, rounding_mm)
+        farthest = length - np.maximum(tolerance_mm, rounding_mm)
+        hits = self._scene.run(
+            np.ascontiguousarray(towards, dtype=np.float32),
+            np.ascontiguousarray(reach / length[:, None], dtype=np.float32),
+            dists=farthest.astype(np.float32),
+            query="OCCLUDED",
+        )
+        return np.asarray((hits >= 0) & (farthest > 0))
 
     @cached_property
     def _tree(self) -> igl.AABB:
