@@ -1,12 +1,11 @@
 """Values that are costly to make, once for each worker."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
-import jaxtyping
 import pytest
 from hypothesis import settings
 
+import shape_checks
 from cuspid import storage
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
@@ -18,14 +17,10 @@ settings.register_profile("cuspid", deadline=None)
 settings.load_profile("cuspid")
 
 
-@pytest.fixture(scope="module")
-def without_shape_checks() -> Iterator[None]:
-    """For modules that place teeth again and again: on few points the checks of shapes take five times as long as the
-    work itself. ``test_phantom.py`` has them on."""
-    before = jaxtyping.config.jaxtyping_disable
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", before)
+@pytest.fixture(scope="module", autouse=True)
+def shapes_are_checked() -> None:
+    """Of the first calls of each function in each module of tests."""
+    shape_checks.check_again()
 
 
 @pytest.fixture(scope="session")

@@ -94,7 +94,7 @@ def test_commands_are_found_wherever_they_stand(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("page", RUN)
-def test_the_commands_of_a_page_run(page, tmp_path, monkeypatch, phantom_file, without_shape_checks):
+def test_the_commands_of_a_page_run(page, tmp_path, monkeypatch, phantom_file):
     """In their order, in an empty folder; a how-to page has ``jaw.ply``, as it says."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "examples").symlink_to(ROOT / "examples")

@@ -17,8 +17,6 @@ from cuspid.anatomy.phantom.population import GROUPS, LENGTHS, GroupName, Normal
 from cuspid.errors import InputError
 from cuspid.jaw import Arch, Jaw, Landmark
 
-pytestmark = pytest.mark.usefixtures("without_shape_checks")
-
 TOLERANCE_MM = 0.05
 QUADRANTS = {"lower": (30, 40), "upper": (10, 20)}
 

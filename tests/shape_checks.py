@@ -1,0 +1,35 @@
+"""Checks of shapes that do not slow the suite down: each function's first calls in each module of tests are checked.
+
+On the small arrays of a geometry that is called a million times, the checks take several times as long as the work.
+"""
+
+import functools
+import itertools
+import sys
+
+from beartype import beartype
+
+CALLS = 50
+_trusted = []
+
+
+def first_calls(stub):
+    """Beartype for jaxtyping, until a function was called often enough."""
+    checked, calls = beartype(stub), itertools.count(1)
+
+    @functools.wraps(stub)
+    def check(*arguments, **named):
+        if next(calls) % CALLS == 0:
+            # jaxtyping calls this stub in place of the function, which only its own frame knows.
+            function = sys._getframe(1).f_locals["fn"]
+            function.__no_type_check__ = True
+            _trusted.append(function)
+        return checked(*arguments, **named)
+
+    return check
+
+
+def check_again():
+    """From now on the next calls are checked again."""
+    while _trusted:
+        vars(_trusted.pop()).pop("__no_type_check__", None)
