@@ -53,10 +53,12 @@ def words(rng: np.random.Generator, count: int) -> np.ndarray:
     return DESCRIPTOR_NORM * np.sqrt(raw / raw.sum(axis=1, keepdims=True))
 
 
-def see(handpiece: Handpiece, path: dict[str, Rigid3], *, seed: int = 0, points: int = 900) -> Keypoints:
+def see(
+    handpiece: Handpiece, path: dict[str, Rigid3], *, seed: int = 0, points: int = 900, length_mm: float = 9.0
+) -> Keypoints:
     """Keypoints of a wavy surface: noisy places and descriptors, in random order."""
     rng = np.random.default_rng(seed)
-    xy = rng.uniform([-4, -4], [9, 5], (points, 2))
+    xy = rng.uniform([-4, -4], [length_mm, 5], (points, 2))
     surface = np.column_stack([xy, 5 + 0.5 * np.sin(1.3 * xy[:, 0]) * np.cos(xy[:, 1])])
     dictionary, seen = words(rng, points), {}
     for frame, pose in path.items():

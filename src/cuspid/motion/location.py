@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from cuspid.capture import Capture
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.motion.adjustment import AdjustmentOptions, adjust, calibration_sigma_px
+from cuspid.motion.closure import Image, closing_pairs
 from cuspid.motion.features import FeatureOptions, Features, detect_all
 from cuspid.motion.odometry import (
     Cloud,
@@ -72,16 +74,6 @@ def _timed(log: dict[str, float], stage: str) -> Iterator[None]:
     log[f"{stage}_s"] = time.perf_counter() - start
 
 
-def _depth_bounds(
-    cloud: Cloud, handpiece: Handpiece, camera: str, slack_mm: float
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Least and greatest depth of each keypoint: about that of its point, else the depth of field."""
-    depth = cloud.depths(handpiece.rig, camera)
-    near, far = handpiece.depth_range_mm
-    known = np.isfinite(depth)
-    return np.where(known, depth - slack_mm, near), np.where(known, depth + slack_mm, far)
-
-
 @dataclass(frozen=True, eq=False)
 class _Numbering:
     """Numbers every keypoint of the located frames: frame after frame, camera after camera."""
@@ -107,47 +99,64 @@ class _Numbering:
         )
 
 
-def _match_frames(
-    first: int,
-    second: int,
-    frames: Sequence[Views],
-    clouds: Sequence[Cloud],
-    poses: Sequence[Rigid3],
-    handpiece: Handpiece,
-    options: MotionOptions,
-    slack_mm: float,
-    starts: Mapping[tuple[int, str], int],
-) -> Int[np.ndarray, "k 2"]:
-    """Matches, as numbers of keypoints, of each camera with itself at another frame."""
-    second_from_first = poses[second] @ poses[first].inverse()
-    matches = [np.zeros((0, 2), dtype=np.int64)]
-    for camera, mounted in handpiece.rig.cameras.items():
-        if camera not in frames[first] or camera not in frames[second]:
-            continue
-        motion = mounted.cam_from_rig @ second_from_first @ mounted.cam_from_rig.inverse()
-        here, there = (_depth_bounds(clouds[f], handpiece, camera, slack_mm) for f in (first, second))
-        found = match_guided(frames[first][camera], frames[second][camera], motion, here, there, options.across_frames)
-        matches.append(found + [starts[first, camera], starts[second, camera]])
-    return np.concatenate(matches)
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Scan:
+    """The located frames."""
+
+    handpiece: Handpiece
+    frames: Sequence[Views]
+    clouds: Sequence[Cloud]
+    poses: Sequence[Rigid3]
+
+    @cached_property
+    def numbering(self) -> _Numbering:
+        """Of all keypoints."""
+        return _Numbering.of(self.frames, self.handpiece.rig)
+
+    def has(self, image: Image) -> bool:
+        """Whether the camera has an image of the frame."""
+        frame, camera = image
+        return camera in self.frames[frame]
+
+    def cam_from_world(self, image: Image) -> Rigid3:
+        """Where an image was taken from."""
+        frame, camera = image
+        return self.handpiece.rig[camera].cam_from_rig @ self.poses[frame]
+
+    def depth_bounds(self, image: Image, slack_mm: float) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+        """Least and greatest depth of each keypoint: about that of its point, else the depth of field."""
+        frame, camera = image
+        depth = self.clouds[frame].depths(self.handpiece.rig, camera)
+        near, far = self.handpiece.depth_range_mm
+        known = np.isfinite(depth)
+        return np.where(known, depth - slack_mm, near), np.where(known, depth + slack_mm, far)
+
+    def match(self, one: Image, other: Image, options: MotionOptions) -> Int[np.ndarray, "k 2"]:
+        """Matches of two images, as numbers of keypoints."""
+        here, there = (self.frames[frame][camera] for frame, camera in (one, other))
+        motion = self.cam_from_world(other) @ self.cam_from_world(one).inverse()
+        slack_mm = options.depth_slack * resolved_mm(self.handpiece)
+        depths_here, depths_there = (self.depth_bounds(image, slack_mm) for image in (one, other))
+        found = match_guided(here, there, motion, depths_here, depths_there, options.across_frames)
+        return found + [self.numbering.starts[one], self.numbering.starts[other]]
 
 
-def _within_frames(clouds: Sequence[Cloud], starts: Mapping[tuple[int, str], int]) -> list[Int[np.ndarray, "k 2"]]:
+def _within_frames(scan: _Scan) -> list[Int[np.ndarray, "_ 2"]]:
     """Matches within the frames, as numbers of keypoints."""
+    starts = scan.numbering.starts
     return [
         found + [starts[f, first], starts[f, second]]
-        for f, cloud in enumerate(clouds)
+        for f, cloud in enumerate(scan.clouds)
         for first, second, found in cloud.matches
     ]
 
 
-def _triangulated(
-    frames: Sequence[Views], poses: Sequence[Rigid3], rig: Rig, track: Int[np.ndarray, "n"], numbering: _Numbering
-) -> Tracks:
+def _triangulated(scan: _Scan, track: Int[np.ndarray, "n"]) -> Tracks:
     """Tracks with a point each where their rays meet."""
     centres, directions = [], []
-    for views, pose in zip(frames, poses, strict=True):
+    for views, pose in zip(scan.frames, scan.poses, strict=True):
         world_from_rig = pose.inverse()
-        in_rig = rays_in_rig(rig, views)
+        in_rig = rays_in_rig(scan.handpiece.rig, views)
         centres.append(world_from_rig.apply(in_rig[0]))
         directions.append(world_from_rig.rotate(in_rig[1]))
     seen = np.flatnonzero(track >= 0)
@@ -155,43 +164,37 @@ def _triangulated(
     points = intersect_rays(np.concatenate(centres)[seen], np.concatenate(directions)[seen], track[seen], count)
     finite = np.isfinite(points).all(axis=1)
     seen = seen[finite[track[seen]]]
-    every = [view.features for views in frames for view in views.values()]
+    every = [view.features for views in scan.frames for view in views.values()]
     colors = np.zeros((count, 3), dtype=np.uint8)
     colors[track[seen]] = np.concatenate([f.colors for f in every])[seen]
     return Tracks(
         points=np.nan_to_num(points),
         colors=colors,
         point_index=track[seen],
-        frame_index=numbering.frame[seen],
-        camera_index=numbering.camera[seen],
+        frame_index=scan.numbering.frame[seen],
+        camera_index=scan.numbering.camera[seen],
         pixels=np.concatenate([f.pixels for f in every])[seen],
     )
 
 
-def _link(
-    frames: Sequence[Views],
-    clouds: Sequence[Cloud],
-    poses: Sequence[Rigid3],
-    handpiece: Handpiece,
-    options: MotionOptions,
-    progress: Progress,
-) -> Tracks:
-    """Tracks over the located frames: the matches within frames and, guided by the poses, between them."""
-    numbering = _Numbering.of(frames, handpiece.rig)
-    pairs, slack_mm = frame_pairs(len(frames), options.reach), options.depth_slack * resolved_mm(handpiece)
+def _across_frames(
+    scan: _Scan, pairs: Iterable[tuple[Image, Image]], options: MotionOptions, stage: str, progress: Progress
+) -> list[Int[np.ndarray, "_ 2"]]:
+    """Matches of pairs of images, guided by the poses, as numbers of keypoints."""
+    there = [pair for pair in pairs if all(map(scan.has, pair))]
+    return map_in_threads(lambda pair: scan.match(*pair, options), there, stage=stage, progress=progress)
 
-    def match(pair: tuple[int, int]) -> Int[np.ndarray, "k 2"]:
-        return _match_frames(*pair, frames, clouds, poses, handpiece, options, slack_mm, numbering.starts)
 
-    across = map_in_threads(match, pairs, stage="matching", progress=progress)
-    image = numbering.frame * len(handpiece.rig.names) + numbering.camera
-    matches = np.concatenate([*_within_frames(clouds, numbering.starts), *across])
-    track = join(matches, image)
-    if options.cell_px > 0:
+def _tracks(scan: _Scan, matches: Sequence[Int[np.ndarray, "_ 2"]], cell_px: float) -> Tracks:
+    """Matches joined, and thinned out."""
+    numbering = scan.numbering
+    image = numbering.frame * len(scan.handpiece.rig.names) + numbering.camera
+    track = join(np.concatenate([np.zeros((0, 2), dtype=np.int64), *matches]), image)
+    if cell_px > 0:
         seen = np.flatnonzero(track >= 0)
-        pixels = np.concatenate([view.features.pixels for views in frames for view in views.values()])
-        track[seen[~thin(track[seen], image[seen], pixels[seen], options.cell_px)]] = -1
-    return _triangulated(frames, poses, handpiece.rig, track, numbering)
+        pixels = np.concatenate([view.features.pixels for views in scan.frames for view in views.values()])
+        track[seen[~thin(track[seen], image[seen], pixels[seen], cell_px)]] = -1
+    return _triangulated(scan, track)
 
 
 def _require_enough(trajectory: Trajectory, clouds: Sequence[Cloud], options: MotionOptions) -> None:
@@ -250,18 +253,41 @@ def locate_features(
     with _timed(log, "odometry"):
         trajectory = chain(find_edges(rig, frames, clouds, options.odometry, options.seed), names, options.odometry)
     _require_enough(trajectory, clouds, options)
-    with _timed(log, "matching"):
-        frames, clouds = [frames[f] for f in trajectory.rig_from_world], [clouds[f] for f in trajectory.rig_from_world]
-        tracks = _link(frames, clouds, list(trajectory.rig_from_world.values()), handpiece, options, progress)
     start = Reconstruction(
         rig=rig,
         rig_from_world={names[f]: pose for f, pose in trajectory.rig_from_world.items()},
-        tracks=tracks,
         dropped=trajectory.dropped,
     )
-    with _timed(log, "adjustment"):
-        adjusted = adjust(start, options.adjustment)
+    scan = _Scan(
+        handpiece=handpiece,
+        frames=[frames[f] for f in trajectory.rig_from_world],
+        clouds=[clouds[f] for f in trajectory.rig_from_world],
+        poses=list(trajectory.rig_from_world.values()),
+    )
+    adjusted = _adjusted(start, scan, options, log, progress)
     return replace(adjusted.with_cameras_as(given), log={**log, **adjusted.log})
+
+
+def _adjusted(
+    start: Reconstruction, scan: _Scan, options: MotionOptions, log: dict[str, float], progress: Progress
+) -> Reconstruction:
+    """Tracks over the located frames, adjusted; and again with those that join what was seen twice."""
+    with _timed(log, "matching"):
+        pairs = frame_pairs(len(scan.frames), options.reach)
+        images = (((i, camera), (j, camera)) for i, j in pairs for camera in scan.handpiece.rig.names)
+        matches = [*_within_frames(scan), *_across_frames(scan, images, options, "matching", progress)]
+        tracks = _tracks(scan, matches, options.cell_px)
+    with _timed(log, "adjustment"):
+        adjusted = adjust(replace(start, tracks=tracks), options.adjustment)
+    with _timed(log, "closure"):
+        scan = replace(scan, poses=list(adjusted.rig_from_world.values()))
+        closing = closing_pairs(scan.handpiece, scan.poses, adjusted.tracks or tracks)
+        again = _across_frames(scan, closing, options, "loop closure", progress)
+        log["closing_matches"] = float(sum(map(len, again)))
+        if not log["closing_matches"]:
+            return adjusted
+        tracks = _tracks(scan, [*matches, *again], options.cell_px)
+        return adjust(replace(start, rig_from_world=adjusted.rig_from_world, tracks=tracks), options.adjustment)
 
 
 def locate(

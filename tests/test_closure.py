@@ -1,0 +1,85 @@
+"""What is seen again joins the frames that saw it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cuspid.geometry import Rigid3
+from cuspid.motion import MotionOptions, location
+from cuspid.motion.closure import closing_pairs
+from cuspid.motion.location import locate_features
+from cuspid.reconstruction import Tracks
+from test_odometry import errors, make_handpiece, see
+
+OUT, STEP_MM = 13, 1.2
+
+
+def there_and_back() -> dict[str, Rigid3]:
+    """A walk, and the same way back a little aside."""
+    travel = [*(STEP_MM * k for k in range(OUT)), *(STEP_MM * k + 0.2 for k in reversed(range(OUT)))]
+    return {
+        f"{k:05d}": Rigid3.from_rotation_vector(
+            np.array([0.0, 0, 0.02 * (k >= OUT)]), np.array([-x, 0.1 * (k >= OUT), 0])
+        )
+        for k, x in enumerate(travel)
+    }
+
+
+def no_tracks() -> Tracks:
+    nothing = np.zeros(0, np.int64)
+    return Tracks(
+        points=np.zeros((0, 3)),
+        colors=np.zeros((0, 3), np.uint8),
+        point_index=nothing,
+        frame_index=nothing,
+        camera_index=nothing,
+        pixels=np.zeros((0, 2)),
+    )
+
+
+def every_frame_once(frames: int) -> Tracks:
+    """One track that joins all frames."""
+    index = np.arange(frames)
+    return Tracks(
+        points=np.zeros((1, 3)),
+        colors=np.zeros((1, 3), np.uint8),
+        point_index=0 * index,
+        frame_index=index,
+        camera_index=0 * index,
+        pixels=np.zeros((frames, 2)),
+    )
+
+
+def test_only_what_sees_the_same_from_the_same_side_is_paired():
+    handpiece, poses = make_handpiece(), list(there_and_back().values())
+    pairs = closing_pairs(handpiece, poses, no_tracks())
+    for (one, camera), (other, partner) in pairs:
+        first, second = (handpiece.rig[c].cam_from_rig @ poses[f] for f, c in ((one, camera), (other, partner)))
+        assert first.rotation[2] @ second.rotation[2] > np.cos(np.deg2rad(26))
+        seen = [pose.inverse().apply(np.array([0.0, 0, handpiece.working_distance_mm])) for pose in (first, second)]
+        assert np.linalg.norm(seen[1] - seen[0]) < 0.5 * handpiece.working_distance_mm
+    assert {frame for pair in pairs for frame, _ in pair} == set(range(len(poses)))
+    assert closing_pairs(handpiece, poses, every_frame_once(len(poses))) == []
+
+
+def test_a_way_back_is_tied_to_the_way_there(monkeypatch: pytest.MonkeyPatch):
+    """The frames of the end come to those of the beginning much better than by the chain alone."""
+    handpiece, path = make_handpiece(), there_and_back()
+    closed, open_ended = [], []
+    for seed in range(3):
+        seen = see(handpiece, path, seed=seed, points=1600, length_mm=20.0)
+        found = locate_features(handpiece, seen, list(path), MotionOptions())
+        assert found.log["closing_matches"] > 100
+        closed.append(errors(found, path)[-1])
+        with monkeypatch.context() as without:
+            without.setattr(location, "closing_pairs", lambda *_: [])
+            open_ended.append(errors(locate_features(handpiece, seen, list(path), MotionOptions()), path)[-1])
+    ratio = np.linalg.norm(closed) / np.linalg.norm(open_ended)
+    assert 0.05 < ratio < 0.6
+
+
+def test_one_way_has_nothing_to_close():
+    handpiece, path = make_handpiece(), dict(list(there_and_back().items())[:OUT])
+    found = locate_features(handpiece, see(handpiece, path, points=1600, length_mm=20.0), list(path), MotionOptions())
+    assert found.log["closing_matches"] == 0
