@@ -113,6 +113,11 @@ class _Scan:
         """Of all keypoints."""
         return _Numbering.of(self.frames, self.handpiece.rig)
 
+    @cached_property
+    def resolved_mm(self) -> float:
+        """Of the handpiece."""
+        return resolved_mm(self.handpiece)
+
     def has(self, image: Image) -> bool:
         """Whether the camera has an image of the frame."""
         frame, camera = image
@@ -135,7 +140,7 @@ class _Scan:
         """Matches of two images, as numbers of keypoints."""
         here, there = (self.frames[frame][camera] for frame, camera in (one, other))
         motion = self.cam_from_world(other) @ self.cam_from_world(one).inverse()
-        slack_mm = options.depth_slack * resolved_mm(self.handpiece)
+        slack_mm = options.depth_slack * self.resolved_mm
         depths_here, depths_there = (self.depth_bounds(image, slack_mm) for image in (one, other))
         found = match_guided(here, there, motion, depths_here, depths_there, options.across_frames)
         return found + [self.numbering.starts[one], self.numbering.starts[other]]
