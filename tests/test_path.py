@@ -18,7 +18,7 @@ from cuspid.simulation.path.detour import _APART, _UNITS, _shortest, plan_detour
 from cuspid.simulation.path.further import _largest_sum, _woven, further_legs, seen_from
 from cuspid.simulation.path.legs import Leg, steady_path
 from cuspid.simulation.path.overlap import frame_overlap
-from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
+from cuspid.simulation.path.scan import ScanPathOptions, _goes_on, plan_scan_path
 from cuspid.visibility import VisibilityOptions, visible_counts
 
 HANDPIECE = twelve_cameras()
@@ -166,6 +166,28 @@ def test_further_passes_see_more_and_never_less(coarse_phantom: Jaw, curve: Arch
     )
     assert after.mean() > before.mean() + 0.005
     assert (before & ~after).mean() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("said", "again"),
+    [
+        ({}, True),
+        ({"passes": "turns"}, False),
+        ({"turns": 3}, False),
+        ({"frames": 50}, False),
+        ({"length_mm": 30.0}, False),
+        ({"tooth": 46}, False),
+        ({"tooth": 46, "passes": "auto"}, True),
+    ],
+)
+def test_a_whole_arch_of_which_nothing_is_said_is_gone_over_again(curve: ArchCurve, said: dict, again: bool) -> None:
+    assert _goes_on(ScanPathOptions(**said), curve) == again
+
+
+def test_a_part_is_not(coarse_phantom: Jaw) -> None:
+    part = arch_curve(part_of(coarse_phantom, (44, 45, 46, 47)))
+    assert not _goes_on(ScanPathOptions(), part)
+    assert _goes_on(ScanPathOptions(passes="auto"), part)
 
 
 def test_a_path_with_further_passes_overlaps_and_fits(coarse_phantom: Jaw) -> None:

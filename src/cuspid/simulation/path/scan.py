@@ -81,10 +81,9 @@ class ScanPathOptions:
     look in finer steps between."""
     turn_deg: float = 60.0
     """How far the handpiece is rolled to either side in the first and the last pass."""
-
-    passes: Literal["turns", "auto"] = "turns"
-    """turns: those that --turns says; auto: also others, rolled differently, over what two cameras did not see;
-    a note tells how many frames they take."""
+    passes: Literal["turns", "auto"] | None = None
+    """turns: those that --turns says; auto: also others, rolled differently, over what two cameras did not see; a note
+    tells how many frames they take. None for auto over a whole arch of which nothing else is said, else turns."""
 
     def __post_init__(self) -> None:
         if self.turns < 1 or self.turns % 2 == 0:
@@ -151,7 +150,7 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
     curve, room = arch_curve(jaw), room_about(jaw.mesh, handpiece, options.clearance_mm)
     crowns = crown_points(jaw, curve, _reach_mm(handpiece))
     steady = first = steady_path(jaw.mesh, curve, _legs(jaw, curve, options))
-    if options.passes == "auto":
+    if _goes_on(options, curve):
         steady = further_legs(jaw.mesh, room, crowns, handpiece, first)
     detour = plan_detour(room, crowns, handpiece, steady.rig_from_world, steady.span_mm)
     hand = hand_motion(
@@ -196,6 +195,14 @@ def _legs(jaw: Jaw, curve: ArchCurve, options: ScanPathOptions) -> tuple[Leg, ..
     return there_and_back(options.rolls_deg, *_stretch(jaw, curve, options))
 
 
+def _goes_on(options: ScanPathOptions, curve: ArchCurve) -> bool:
+    """Whether further passes go over what the first ones did not see."""
+    if options.passes is not None:
+        return options.passes == "auto"
+    said = (options.tooth, options.frames, options.length_mm)
+    return float(curve.lengths_mm[-1]) > _ARCH_MM and options.turns == 1 and all(each is None for each in said)
+
+
 def _stretch(jaw: Jaw, curve: ArchCurve, options: ScanPathOptions) -> tuple[float, float]:
     """Start and end of the path, in mm along the curve."""
     if options.tooth is None:
@@ -238,7 +245,7 @@ def _with_frames(
         path = _even_path(mesh, handpiece, steady, pose_at, frames)
         if path.minimum_overlap > options.minimum_overlap:
             return path
-        needed = _needed(frames, path.minimum_overlap, options)
+        needed = _needed(frames, path, options)
         shortfall = (
             f"with {frames} frames consecutive images overlap by only {path.minimum_overlap:.0%}, less than "
             f"{options.minimum_overlap:.0%}"
@@ -258,10 +265,10 @@ def _usual_frames(steady: SteadyPath, first: SteadyPath, options: ScanPathOption
     return round(per_pass * len(first.legs) * np.ptp(steady.span_mm) / np.ptp(first.span_mm))
 
 
-def _needed(frames: int, overlap: float, options: ScanPathOptions) -> int:
+def _needed(frames: int, path: ScanPath, options: ScanPathOptions) -> int:
     """Frames that are about enough: the surface that an image loses is in proportion to the step."""
-    growth = (1 - overlap) / (1 - options.minimum_overlap)
-    if options.turns > 1 or options.passes == "auto":
+    growth = (1 - path.minimum_overlap) / (1 - options.minimum_overlap)
+    if len(path.steady.legs) > 1:
         # A single image on a turn is no reason for as many more everywhere.
         growth = min(growth, _GROWTH)
     return max(frames + 1, int(np.ceil(1 + (frames - 1) * growth)))
