@@ -55,7 +55,7 @@ def results_belong_to_what_made_them(folder: Path) -> None:
     capture, options = storage.read_capture(folder / "capture"), pipeline.ReconstructionOptions()
     found = pipeline.locate(capture, folder / "motion", options.tracking)
     assert len(found.tracks.point_index) == found.log["observations"]
-    coarse = replace(options, fusion=replace(options.fusion, voxel_mm=0.1))
+    coarse = replace(options, fusion=replace(options.fusion, voxel_mm=0.2))
     fine = storage.read_mesh(folder / "mesh.ply")
     assert len(pipeline.reconstruct(capture, folder, coarse)[1].faces) < 0.5 * len(fine.faces)
     shutil.copy(capture.source.path("00005", "o1"), capture.source.path("00004", "o1"))
