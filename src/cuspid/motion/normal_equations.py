@@ -160,6 +160,34 @@ def linearise(state, point, frame, camera, calibrated, scratch, pixel, jacobian)
 
 @njit(cache=True, nogil=True)
 @no_type_check
+def pose_equations(lenses, rotations, translations, pose, points, pixels, cameras):
+    """Normal equations of the pose of one frame alone, with Cauchy's weights at 1 px; a small motion on its left.
+
+    ``pose`` is (rotation, translation); an observation is a point, a pixel and the camera that saw it.
+    """
+    matrix, gradient = np.zeros((POSE, POSE)), np.zeros(POSE)
+    x_in_rig, x_in_cam, by_cam, by_rig = np.zeros(3), np.zeros(3), np.zeros((2, 3)), np.zeros((2, 3))
+    pixel, by_lens, by_pose = np.zeros(2), np.zeros((2, 8)), np.zeros((2, POSE))
+    for o in range(len(points)):
+        camera = cameras[o]
+        _move(pose[0], pose[1], points[o], x_in_rig)
+        _move(rotations[camera], translations[camera], x_in_rig, x_in_cam)
+        if not _is_before(x_in_cam):
+            continue
+        _camera_jacobian(lenses[camera], x_in_cam[0], x_in_cam[1], x_in_cam[2], pixel, by_cam, by_lens)
+        _times(by_cam, rotations[camera], by_rig)
+        _times_motion(by_rig, x_in_rig, by_pose)
+        x, y = pixel[0] - pixels[o, 0], pixel[1] - pixels[o, 1]
+        weight = 1 / (1 + x * x + y * y)
+        for i in range(POSE):
+            gradient[i] += weight * (by_pose[0, i] * x + by_pose[1, i] * y)
+            for j in range(POSE):
+                matrix[i, j] += weight * (by_pose[0, i] * by_pose[0, j] + by_pose[1, i] * by_pose[1, j])
+    return matrix, gradient
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
 def make_scratch():
     """Working memory of :func:`linearise`."""
     return np.zeros(3), np.zeros(3), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, CALIBRATION))

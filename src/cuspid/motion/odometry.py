@@ -20,6 +20,7 @@ from cuspid.geometry import Rigid3
 from cuspid.graph import graph_of, parts_of
 from cuspid.motion.colmap import colmap_camera, colmap_rigid, rigid_from_colmap
 from cuspid.motion.features import Features, spread
+from cuspid.motion.normal_equations import pose_equations
 from cuspid.motion.pairs import MatchingOptions, View, match_guided, match_unguided
 from cuspid.motion.tracks import intersect_rays, join
 from cuspid.rig import Handpiece, Rig
@@ -30,8 +31,6 @@ Views = Mapping[str, View]
 
 _CELL_PX = 40
 _POLISHING_ROUNDS = 12
-_DIFFERENCE = 1e-5
-"""Step of the derivatives, in rad and in mean distances of the points."""
 _DECIMALS = 9
 """Of a polished pose, in rad and in mean distances of the points."""
 
@@ -205,28 +204,20 @@ def polish(
     end.
     """
     unit_mm = float(np.linalg.norm(points, axis=1).mean())
+    scale = np.array([1.0, 1.0, 1.0, unit_mm, unit_mm, unit_mm])
     mounted = list(rig.cameras.values())
-    parts = [(mounted[camera], np.flatnonzero(cameras == camera)) for camera in np.unique(cameras)]
-
-    def residuals(pose: Rigid3) -> Float[np.ndarray, "r 2"]:
-        return np.concatenate(
-            [each.camera.project((each.cam_from_rig @ pose).apply(points[seen])) - pixels[seen] for each, seen in parts]
-        )
-
-    steps, pose = _DIFFERENCE * np.eye(6), rig_from_world
+    lenses = np.array([each.camera.parameters for each in mounted])
+    rotations = np.array([each.cam_from_rig.rotation for each in mounted])
+    translations = np.array([each.cam_from_rig.translation for each in mounted])
+    pose = rig_from_world
     for _ in range(_POLISHING_ROUNDS):
-        here = residuals(pose)
-        weights = 1 / np.sqrt(1 + np.sum(here**2, axis=1, keepdims=True))
-        changes = [residuals(_moved(pose, step, unit_mm)) - residuals(_moved(pose, -step, unit_mm)) for step in steps]
-        slopes = np.stack([(weights * change).ravel() for change in changes], axis=1) / (2 * _DIFFERENCE)
-        pose = _moved(pose, np.linalg.lstsq(slopes, -(weights * here).ravel(), rcond=None)[0], unit_mm)
+        matrix, gradient = pose_equations(
+            lenses, rotations, translations, (pose.rotation, pose.translation), points, pixels, cameras
+        )
+        step = scale * np.linalg.lstsq(scale[:, None] * matrix * scale, -scale * gradient, rcond=None)[0]
+        pose = Rigid3.from_rotation_vector(step[:3], step[3:]) @ pose
     rounded_mm = unit_mm * (pose.translation / unit_mm).round(_DECIMALS)
     return Rigid3.from_rotation_vector(pose.rotation_vector.round(_DECIMALS), rounded_mm)
-
-
-def _moved(pose: Rigid3, step: Float[np.ndarray, "6"], unit_mm: float) -> Rigid3:
-    """A pose turned (rad) and shifted (in units)."""
-    return Rigid3.from_rotation_vector(step[:3], unit_mm * step[3:]) @ pose
 
 
 def relative_pose(rig: Rig, cloud: Cloud, source: Views, target: Views, options: OdometryOptions, seed: int) -> Edge:
