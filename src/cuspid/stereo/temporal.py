@@ -50,14 +50,14 @@ def measure_temporal(
     in the rig frame at ``frame``; those of the moved cameras have ``+`` after the camera's name.
     """
     options = options or TemporalOptions()
-    found: list[DepthMap] = []
+    resolution_mm, found = resolved_mm(handpiece), list[DepthMap]()
     for name in handpiece.rig.names:
         if name not in images or name not in next_images:
             continue
         pair = moving_pair(handpiece, name, next_from_rig, options)
         if pair is not None:
             both = {name: images[name], f"{name}+": next_images[name]}
-            estimator = DepthEstimator(pair, options.stereo, resolution_mm=resolved_mm(handpiece))
+            estimator = DepthEstimator(pair, options.stereo, resolution_mm=resolution_mm)
             found += estimator.measure(both, frame)
     return tuple(
         replace(depth_map, confidence=(options.confidence_share * depth_map.confidence).astype(np.float32))
