@@ -70,6 +70,25 @@ def test_every_seen_place_is_covered() -> None:
     assert (distance < 0.05).mean() > 0.98
 
 
+@pytest.mark.parametrize("steepness", [2.1, 3.0])
+def test_a_narrow_strip_of_a_slope_is_covered_and_not_widened(steepness: float) -> None:
+    """Seen along the slope, what lies outside of the surface stands before places that the map does not know."""
+    slope = height_field(lambda x, y: 5 + steepness * x)
+    poses = {"a": Rigid3.identity(), "b": Rigid3(np.eye(3), np.array([0.02, 0.01, 0.0]))}
+    strips = []
+    for seen in depth_maps(slope, poses, names=("west",)):
+        known = np.zeros(seen.depth_mm.shape, dtype=bool)
+        known[:, 56:59] = True
+        strips.append(replace(seen, depth_mm=np.where(known, seen.depth_mm, np.nan).astype(np.float32)))
+    points = np.concatenate([poses[strip.frame].inverse().apply(strip.points_in_rig()[0]) for strip in strips])
+    mesh = fuse(strips, poses)
+    assert (mesh.closest(points)[0] < 0.03).mean() > 0.93
+    pixel_mm = float(points[:, 2].mean()) / strips[0].camera.focal_px[0]
+    beyond = np.maximum(mesh.vertices[:, 0] - points[:, 0].max(), points[:, 0].min() - mesh.vertices[:, 0])
+    assert beyond.max() < 1.6 * pixel_mm
+    assert 0 < np.abs(signed_um(mesh, slope)).mean() < 2
+
+
 def test_faces_look_at_the_cameras() -> None:
     mesh = fused_hills()
     _, face, _ = HILLS.closest(mesh.face_centres)

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from typing import Any, no_type_check
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from numba import njit
+from scipy.ndimage import distance_transform_edt
 
 from cuspid.reconstruction import DepthMap
 
@@ -38,6 +39,11 @@ class Evidence:
     def arrays(self) -> tuple[Any, ...]:
         """For numba."""
         return self.plane, self.weight, self.intrinsics
+
+    def nearest(self, reach_px: int) -> Int[np.ndarray, "h w"]:
+        """Flat index of the nearest pixel that is known, -1 where none lies within the reach."""
+        apart, (row, column) = distance_transform_edt(self.weight <= 0, return_indices=True)
+        return np.where(apart <= reach_px, row * self.weight.shape[1] + column, -1)
 
     @staticmethod
     def of(depth_map: DepthMap, largest_jump_mm: float) -> Evidence:
@@ -128,6 +134,34 @@ def observe(evidence, right, down, depth, seen):
     seen[1] = weight[row, column]
     seen[2], seen[3], seen[4] = -a * inverse_length, -b * inverse_length, -c * inverse_length
     seen[5] = row * weight.shape[1] + column
+    return True
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def observe_foot(evidence, nearest, farthest, right, down, depth, seen):
+    """As :func:`observe` for a point whose own pixel tells nothing: what the pixel tells at the foot of its
+    perpendicular on a surface that is not farther away than ``farthest``. A camera that looks along a slope sees past
+    it what lies outside of it.
+
+    ``nearest`` is what :meth:`Evidence.nearest` gives.
+    """
+    plane, weight, intrinsics = evidence
+    height, width = weight.shape
+    u = int(intrinsics[0] * right / depth + intrinsics[2] + 0.5)
+    v = int(intrinsics[1] * down / depth + intrinsics[3] + 0.5)
+    if not (u >= 0 and v >= 0 and u < width and v < height) or nearest[v, u] < 0:
+        return False
+    row, column = nearest[v, u] // width, nearest[v, u] % width
+    a, b, c = plane[row, column, 0], plane[row, column, 1], plane[row, column, 2]
+    square = a * a + b * b + c * c
+    along = (1 - a * right - b * down - c * depth) / square
+    if along * along * square > farthest * farthest or depth + along * c <= 0:
+        return False
+    if not observe(evidence, right + along * a, down + along * b, depth + along * c, seen):
+        return False
+    # seen[2:5] is the unit normal there, and seen[0] how far its plane lies from the foot.
+    seen[0] -= along * (a * seen[2] + b * seen[3] + c * seen[4])
     return True
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from numba import njit
 
 from cuspid.geometry import Rigid3
-from cuspid.surface.evidence import Evidence, observe
+from cuspid.surface.evidence import Evidence, observe, observe_foot
 from cuspid.workers import map_slices
 
 BLOCK = 8
@@ -61,6 +61,7 @@ class SparseVolume:
         keys = self._keys_around(points)
         slots = self._allocate(keys)
         origins = unpack(keys).astype(np.float64) * BLOCK
+        nearest = evidence.nearest(self._reach_px(evidence, cam_from_world, points))
         map_slices(
             lambda part: _integrate(
                 self.distance,
@@ -71,10 +72,18 @@ class SparseVolume:
                 cam_from_world.rotation,
                 cam_from_world.translation,
                 evidence.arrays,
+                nearest,
                 self.truncation_mm,
             ),
             len(slots),
         )
+
+    def _reach_px(self, evidence: Evidence, cam_from_world: Rigid3, points: Float[np.ndarray, "n 3"]) -> int:
+        """How many pixels the truncation distance takes at most, seen from the camera."""
+        if not len(points):
+            return 0
+        nearest_mm = float(cam_from_world.apply(points)[:, 2].min())
+        return int(np.ceil(evidence.intrinsics[:2].max() * self.truncation_mm / max(nearest_mm, self.truncation_mm)))
 
     def _keys_around(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "b"]:
         """Blocks within the truncation distance of points, sorted."""
@@ -115,7 +124,7 @@ def _grown(array: Float[np.ndarray, "b v"], room: int) -> Float[np.ndarray, "r v
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _integrate(distance, weight, slots, origins, voxel, rotation, translation, evidence, truncation):
+def _integrate(distance, weight, slots, origins, voxel, rotation, translation, evidence, nearest, truncation):
     """Running weighted mean of the signed distance in each voxel of the blocks."""
     seen = np.zeros(6)
     for n in range(slots.size):
@@ -131,7 +140,10 @@ def _integrate(distance, weight, slots, origins, voxel, rotation, translation, e
                         continue
                     right = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]
                     down = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]
-                    if not observe(evidence, right, down, depth, seen) or seen[0] < -truncation:
+                    if observe(evidence, right, down, depth, seen):
+                        if seen[0] < -truncation:
+                            continue
+                    elif not observe_foot(evidence, nearest, truncation, right, down, depth, seen):
                         continue
                     voxel_index = (i * 8 + j) * 8 + k
                     new = seen[1]
