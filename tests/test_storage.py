@@ -278,7 +278,7 @@ def test_a_body_changes_no_reconstruction(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"size_mm": [1, 2]}, r"bar: size_mm is \[1, 2\]; it must be three positive lengths"),
+        ({"size_mm": [1, 2]}, r"bar: size_mm is \[1, 2\]; it must be 3 numbers"),
         ({"size_mm": [1, 2, 0]}, "bar: size_mm"),
         ({"size_mm": [1, 2, float("nan")]}, "bar: size_mm"),
         ({"size_mm": [1, 2, True]}, "bar: size_mm"),
@@ -286,9 +286,18 @@ def test_a_body_changes_no_reconstruction(tmp_path):
         ({"half_mm": [1, 2, 3]}, "bar: a box has the fields box_from_rig and size_mm"),
         ({"box_from_rig": {"translation_mm": [0, 0, 0]}}, "bar: box_from_rig has the fields"),
         ({"box_from_rig": [0, 0, 0]}, "bar: box_from_rig has the fields"),
-        ({"box_from_rig": {"rotation_wxyz": [0, 0, 0, 0], "translation_mm": [0, 0, 0]}}, "bar: rotation_wxyz"),
-        ({"box_from_rig": {"rotation_wxyz": [1, 0, 0], "translation_mm": [0, 0, 0]}}, "bar: rotation_wxyz"),
-        ({"box_from_rig": {"rotation_wxyz": [1, 0, 0, 0], "translation_mm": [0, 0]}}, "bar: translation_mm"),
+        (
+            {"box_from_rig": {"rotation_wxyz": [0, 0, 0, 0], "translation_mm": [0, 0, 0]}},
+            "bar: box_from_rig: rotation_wxyz",
+        ),
+        (
+            {"box_from_rig": {"rotation_wxyz": [1, 0, 0], "translation_mm": [0, 0, 0]}},
+            "bar: box_from_rig: rotation_wxyz",
+        ),
+        (
+            {"box_from_rig": {"rotation_wxyz": [1, 0, 0, 0], "translation_mm": [0, 0]}},
+            "bar: box_from_rig: translation_mm",
+        ),
     ],
 )
 def test_a_mistake_in_a_body_is_told_in_one_line(tmp_path, change, message):

@@ -80,7 +80,12 @@ class Camera:
         if self.covariance is not None:
             object.__setattr__(self, "covariance", read_only(np.asarray(self.covariance, dtype=np.float64)))
         if self.width <= 0 or self.height <= 0 or not np.all(self.focal_px > 0):
-            raise InputError(f"camera: width, height and focal length must be positive, got {self}")
+            raise InputError(
+                f"camera: width, height and focal length must be positive, not {self.width} x {self.height} px and "
+                f"{self.focal_px} px"
+            )
+        if not np.isfinite(self.parameters).all():
+            raise InputError(f"camera: its parameters are not finite: {self.parameters}")
 
     @staticmethod
     def from_field_of_view(width: int, height: int, horizontal_fov_deg: float) -> Camera:

@@ -15,6 +15,7 @@ from PIL import Image, UnidentifiedImageError
 
 from cuspid.errors import InputError
 from cuspid.rig import Handpiece
+from cuspid.values import checked_name
 
 PNG_END = b"IEND\xaeB`\x82"
 """The last bytes of a whole PNG file."""
@@ -57,6 +58,9 @@ class Frame:
     """Name of the lighting pattern of the handpiece, or None where it is not known."""
     time_s: float | None = None
     """When it was taken, from any zero, or None where that is not known."""
+
+    def __post_init__(self) -> None:
+        checked_name("frame", self.name)
 
 
 @dataclass(frozen=True, kw_only=True)

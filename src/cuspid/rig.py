@@ -18,6 +18,7 @@ from cuspid.body import CAMERA_MM, LED_MM, Body, module
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, axes_about, read_only, unit
+from cuspid.values import checked_name
 
 _NO_SIDE = 1e-3
 """Length of the mean of unit vectors that have no direction in common."""
@@ -56,6 +57,8 @@ class Rig:
     def __post_init__(self) -> None:
         if not self.cameras:
             raise InputError("rig: at least one camera is needed")
+        for key in self.cameras:
+            checked_name("rig: cameras", key)
         object.__setattr__(self, "cameras", MappingProxyType(dict(self.cameras)))
 
     @property

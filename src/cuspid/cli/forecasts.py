@@ -94,7 +94,7 @@ def visibility(
     """
     settings = {"source": source, "probe": probe, "path": path, "seed": seed, "visibility": options}
     with storage.claimed_folder(out, "visibility", settings, _hashes(jaw, probe), replace=True):
-        scanned, device = load_source(jaw, source), load_probe(probe)
+        device, scanned = load_probe(probe), load_source(jaw, source)
         seen = foresee(scanned, device, path, options, seed=seed)
         surfaces = _surfaces(scanned, path.tooth)
         rows = surface_rows(seen, scanned.mesh.face_areas, surfaces)
@@ -129,7 +129,7 @@ def precision(
     """
     settings = {"source": source, "probe": probe, "tooth": tooth, "turns": turns, "noise": noise, "rule": visibility}
     with storage.claimed_folder(out, "precision", settings, _hashes(jaw, probe), replace=True):
-        scanned, device = load_source(jaw, source), load_probe(probe)
+        device, scanned = load_probe(probe), load_source(jaw, source)
         found = bound_over(scanned, device, ScanPathOptions(tooth=tooth, turns=turns), noise, visibility)
         faces = scanned.tooth_faces(tooth)
         rows = _precision_rows(scanned, found, _surfaces(scanned, tooth))

@@ -56,7 +56,7 @@ def repeat(
     given = {"jaw": jaw, "handpiece": probe.handpiece}
     hashes = {name: storage.hash_file(path) for name, path in given.items() if path is not None}
     with storage.claimed_folder(out, "repeat", settings, hashes):
-        scanned, handpiece = load_source(jaw, source), load_probe(probe)
+        handpiece, scanned = load_probe(probe), load_source(jaw, source)
         with show_progress() as progress:
             found = repeat_scans(
                 scanned,

@@ -113,7 +113,7 @@ def _simulate(mesh: Path | None, out: Path, source: Source, probe: Probe, option
     given = {"jaw": mesh, "handpiece": probe.handpiece}
     hashes = {name: storage.hash_file(path) for name, path in given.items() if path is not None}
     with storage.claimed_folder(out, "simulate", settings, hashes):
-        jaw, device = load_source(mesh, source), load_probe(probe)
+        device, jaw = load_probe(probe), load_source(mesh, source)
         with show_progress() as progress:
             capture, _ = pipeline.simulate(jaw, device, out, options, progress=progress)
     overlap = storage.read_json(out / "truth" / "path.json")

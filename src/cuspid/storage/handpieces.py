@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,13 @@ from cuspid.geometry import Rigid3
 from cuspid.pairing import guess_working_distance_mm
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor, depth_of_field_mm
 from cuspid.storage.files import digest_of, read_json, reading, write_json
+from cuspid.values import LONGEST_MM, checked_name, covariance, number, numbers, shown, whole
 
+MOST_PX = 65_535
+"""Sides of an image; what PNG and JPEG files of cameras stay below."""
+_MOST_DISTORTION = 1e3
+_BRIGHTEST, _NARROWEST_LOBE = 1e6, 1e4
+_SHORTEST_QUATERNION = 1e-6
 _log = logging.getLogger("cuspid")
 _SET_BY = "a handpiece.json or, where the verb has it, --working-distance-mm"
 
@@ -29,17 +36,13 @@ def rigid_to_json(target_from_source: Rigid3) -> dict[str, Any]:
     }
 
 
-def rigid_from_json(value: Mapping[str, Any]) -> Rigid3:
-    """Inverse of :func:`rigid_to_json`."""
-    return Rigid3.from_quaternion(
-        np.array(value["rotation_wxyz"], dtype=np.float64),
-        np.array(value["translation_mm"], dtype=np.float64),
-    )
-
-
-def covariance_from_json(value: Any) -> np.ndarray | None:
-    """A covariance matrix, or None."""
-    return None if value is None else np.array(value, dtype=np.float64)
+def rigid_from_json(value: Mapping[str, Any], what: str = "pose") -> Rigid3:
+    """Inverse of :func:`rigid_to_json`. Raises InputError for what is no rigid motion."""
+    quaternion = numbers(f"{what}: rotation_wxyz", value["rotation_wxyz"], (4,), -LONGEST_MM, LONGEST_MM)
+    if not np.linalg.norm(quaternion) > _SHORTEST_QUATERNION:
+        raise InputError(f"{what}: rotation_wxyz is {shown(value['rotation_wxyz'])}; it must not be all 0")
+    translation = numbers(f"{what}: translation_mm", value["translation_mm"], (3,), -LONGEST_MM, LONGEST_MM)
+    return Rigid3.from_quaternion(quaternion, translation)
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
@@ -54,15 +57,25 @@ def camera_to_json(camera: Camera) -> dict[str, Any]:
     }
 
 
-def camera_from_json(value: Mapping[str, Any]) -> Camera:
-    """Inverse of :func:`camera_to_json`."""
+def camera_from_json(value: Mapping[str, Any], what: str = "camera") -> Camera:
+    """Inverse of :func:`camera_to_json`. Raises InputError for what no camera can have."""
+    width, height = (whole(f"{what}: {side}_px", value[f"{side}_px"], 1, MOST_PX) for side in ("width", "height"))
+    matrix = value.get("covariance_fx_fy_cx_cy_k1_k2_p1_p2")
     return Camera(
-        width=int(value["width_px"]),
-        height=int(value["height_px"]),
-        focal_px=np.array(value["focal_px"], dtype=np.float64),
-        principal_point_px=np.array(value["principal_point_px"], dtype=np.float64),
-        distortion=np.array(value.get("distortion_k1_k2_p1_p2", np.zeros(4)), dtype=np.float64),
-        covariance=covariance_from_json(value.get("covariance_fx_fy_cx_cy_k1_k2_p1_p2")),
+        width=width,
+        height=height,
+        focal_px=numbers(f"{what}: focal_px", value["focal_px"], (2,), 1.0, 100.0 * MOST_PX),
+        principal_point_px=numbers(
+            f"{what}: principal_point_px", value["principal_point_px"], (2,), -2.0 * MOST_PX, 2.0 * MOST_PX
+        ),
+        distortion=numbers(
+            f"{what}: distortion_k1_k2_p1_p2",
+            value.get("distortion_k1_k2_p1_p2", [0, 0, 0, 0]),
+            (4,),
+            -_MOST_DISTORTION,
+            _MOST_DISTORTION,
+        ),
+        covariance=None if matrix is None else covariance(f"{what}: covariance_fx_fy_cx_cy_k1_k2_p1_p2", matrix, 8),
     )
 
 
@@ -110,9 +123,37 @@ def write_handpiece(path: Path, handpiece: Handpiece) -> None:
     write_json(path, handpiece_to_json(handpiece))
 
 
-def _light_from_json(value: Mapping[str, Any]) -> Light:
-    arrays = {key: np.array(value[key], dtype=np.float64) for key in ("position_mm", "direction", "colour")}
-    return Light(**{**value, **arrays})
+def _light_from_json(value: Mapping[str, Any], what: str) -> Light:
+    strange = sorted(set(value) - {each.name for each in fields(Light)})
+    if strange:
+        raise InputError(f"{what}: the field {shown(strange[0])} is not known; see docs/formats.md")
+    direction = numbers(f"{what}: direction", value["direction"], (3,), -LONGEST_MM, LONGEST_MM)
+    if not direction.any():
+        raise InputError(f"{what}: direction is {shown(value['direction'])}; it must not be all 0")
+    return Light(
+        position_mm=numbers(f"{what}: position_mm", value["position_mm"], (3,), -LONGEST_MM, LONGEST_MM),
+        direction=direction,
+        power=number(f"{what}: power", value.get("power", 1.0), 0.0, _BRIGHTEST),
+        colour=numbers(f"{what}: colour", value["colour"], (3,), 0.0, _BRIGHTEST),
+        lobe_exponent=number(f"{what}: lobe_exponent", value.get("lobe_exponent", 1.0), 0.0, _NARROWEST_LOBE),
+    )
+
+
+def _sensor_from_json(value: Mapping[str, Any], what: str) -> Sensor:
+    ranges = {"noise_dn": (0.0, 255.0), "shot_noise_share": (0.0, 1.0), "gamma": (0.1, 10.0)}
+    strange = sorted(set(value) - set(ranges))
+    if strange:
+        raise InputError(f"{what}: the field {shown(strange[0])} is not known; it has {', '.join(ranges)}")
+    return Sensor(**{key: number(f"{what}: {key}", each, *ranges[key]) for key, each in value.items()})
+
+
+def _mounted_from_json(value: Mapping[str, Any], what: str) -> MountedCamera:
+    matrix = value.get("covariance_rotation_rad_translation_mm")
+    return MountedCamera(
+        camera_from_json(value, what),
+        rigid_from_json(value["cam_from_rig"], f"{what}: cam_from_rig"),
+        None if matrix is None else covariance(f"{what}: covariance_rotation_rad_translation_mm", matrix, 6),
+    )
 
 
 def read_handpiece(path: Path, working_distance_mm: float | None = None) -> Handpiece:
@@ -132,23 +173,24 @@ def read_handpiece(path: Path, working_distance_mm: float | None = None) -> Hand
         if strange:
             raise InputError(f"{path}: the field {strange[0]!r} is not known; it has {', '.join(sorted(_FIELDS))}")
         cameras = {
-            name: MountedCamera(
-                camera_from_json(camera),
-                rigid_from_json(camera["cam_from_rig"]),
-                covariance_from_json(camera.get("covariance_rotation_rad_translation_mm")),
-            )
-            for name, camera in value["cameras"].items()
+            checked_name(f"{path}: cameras", key): _mounted_from_json(camera, f"{path}: camera {shown(key)}")
+            for key, camera in value["cameras"].items()
         }
-        near, far = value["depth_range_mm"]
+        distance_mm = number(f"{path}: working_distance_mm", value["working_distance_mm"], 0.0, LONGEST_MM)
+        near, far = numbers(f"{path}: depth_range_mm", value["depth_range_mm"], (2,), 0.0, LONGEST_MM).tolist()
         return Handpiece(
             rig=Rig(cameras),
-            lights={name: _light_from_json(light) for name, light in value.get("lights", {}).items()},
+            lights={
+                checked_name(f"{path}: lights", key): _light_from_json(light, f"{path}: light {shown(key)}")
+                for key, light in value.get("lights", {}).items()
+            },
             lightings=tuple(
-                Lighting(name=each["name"], lights=tuple(each["lights"])) for each in value.get("lightings", [])
+                Lighting(name=checked_name(f"{path}: lightings", each["name"]), lights=tuple(each["lights"]))
+                for each in value.get("lightings", [])
             ),
-            sensor=Sensor(**value.get("sensor", {})),
-            working_distance_mm=float(value["working_distance_mm"]),
-            depth_range_mm=(float(near), float(far)),
+            sensor=_sensor_from_json(value.get("sensor", {}), f"{path}: sensor"),
+            working_distance_mm=distance_mm,
+            depth_range_mm=(near, far),
             body=None if value.get("body") is None else _body_from_json(path, value["body"]),
             name=str(value.get("name", path.stem)),
         )
@@ -166,20 +208,10 @@ def _box_from_json(where: str, value: Any) -> Box:
     pose = value["box_from_rig"]
     if not (isinstance(pose, dict) and set(pose) == {"rotation_wxyz", "translation_mm"}):
         raise InputError(f"{where}: box_from_rig has the fields rotation_wxyz and translation_mm")
-    rotation, translation, size = pose["rotation_wxyz"], pose["translation_mm"], value["size_mm"]
-    if not (_are_numbers(rotation, 4) and any(rotation)):
-        raise InputError(f"{where}: rotation_wxyz is {rotation}; it must be four numbers that are not all 0")
-    if not _are_numbers(translation, 3):
-        raise InputError(f"{where}: translation_mm is {translation}; it must be three numbers")
-    if not (_are_numbers(size, 3) and min(size) > 0):
-        raise InputError(f"{where}: size_mm is {size}; it must be three positive lengths")
-    return Box(rigid_from_json(pose), np.array(size, dtype=np.float64) / 2)
-
-
-def _are_numbers(value: Any, count: int) -> bool:
-    """Whether it is a list of so many finite numbers."""
-    numbers = isinstance(value, list) and all(type(each) in (int, float) for each in value)
-    return numbers and len(value) == count and bool(np.isfinite(value).all())
+    size = numbers(f"{where}: size_mm", value["size_mm"], (3,), 0.0, LONGEST_MM)
+    if not size.all():
+        raise InputError(f"{where}: size_mm is {shown(value['size_mm'])}; it must be three positive lengths")
+    return Box(rigid_from_json(pose, f"{where}: box_from_rig"), size / 2)
 
 
 def _of_rig(path: Path, rig: Rig, working_distance_mm: float | None) -> Handpiece:
@@ -242,16 +274,17 @@ def read_rig_config(path: Path, image_size_px: tuple[int, int] | None = None) ->
             raise InputError(f"{path}: {len(value)} rigs; cuspid works with one")
         cameras: dict[str, MountedCamera] = {}
         for entry in value[0]["cameras"]:
-            name = str(entry["image_prefix"]).strip("/")
-            cam_from_rig = (
-                Rigid3.identity()
-                if entry.get("ref_sensor")
-                else Rigid3.from_quaternion(
-                    np.array(entry["cam_from_rig_rotation"], dtype=np.float64),
-                    np.array(entry["cam_from_rig_translation"], dtype=np.float64),
+            key = checked_name(f"{path}: image_prefix", str(entry["image_prefix"]).rstrip("/"))
+            what = f"{path}: camera {shown(key)}"
+            pose = {
+                "rotation_wxyz": entry.get("cam_from_rig_rotation", [1, 0, 0, 0]),
+                "translation_mm": entry.get("cam_from_rig_translation", [0, 0, 0]),
+            }
+            if not entry.get("ref_sensor") and "cam_from_rig_rotation" not in entry:
+                raise InputError(
+                    f"{what}: the field 'cam_from_rig_rotation' is missing; cuspid works with calibrated rigs"
                 )
-            )
-            cameras[name] = MountedCamera(camera_from_colmap(entry, image_size_px), cam_from_rig)
+            cameras[key] = MountedCamera(camera_from_colmap(entry, image_size_px, what), rigid_from_json(pose, what))
         return Rig(cameras)
 
 
@@ -265,19 +298,23 @@ _COLMAP_PARAMETERS: Mapping[str, Sequence[int]] = {
 """Where (fx, fy, cx, cy, k1, k2, p1, p2) stand among a COLMAP model's parameters."""
 
 
-def camera_from_colmap(entry: Mapping[str, Any], image_size_px: tuple[int, int] | None) -> Camera:
+def camera_from_colmap(entry: Mapping[str, Any], image_size_px: tuple[int, int] | None, what: str = "camera") -> Camera:
+    """A camera of ``rig_config.json``; see :func:`read_rig_config`. Raises InputError for what no camera can have."""
     model = entry["camera_model_name"]
     if model not in _COLMAP_PARAMETERS:
-        raise InputError(f"camera model {model} is not known here; use one of {', '.join(_COLMAP_PARAMETERS)}")
+        raise InputError(f"{what}: model {shown(model)} is not known here; use one of {', '.join(_COLMAP_PARAMETERS)}")
     given = np.array(entry["camera_params"], dtype=np.float64)
     parameters = np.zeros(8)
     chosen = given[list(_COLMAP_PARAMETERS[model])]
     parameters[: len(chosen)] = chosen
-    width, height = entry.get("camera_size") or image_size_px or np.rint(2 * parameters[2:4]).astype(int)
-    return Camera(
-        width=int(width),
-        height=int(height),
-        focal_px=parameters[:2],
-        principal_point_px=parameters[2:4],
-        distortion=parameters[4:],
+    width, height = entry.get("camera_size") or image_size_px or np.rint(2 * parameters[2:4]).tolist()
+    return camera_from_json(
+        {
+            "width_px": width,
+            "height_px": height,
+            "focal_px": parameters[:2],
+            "principal_point_px": parameters[2:4],
+            "distortion_k1_k2_p1_p2": parameters[4:],
+        },
+        what,
     )

@@ -19,12 +19,12 @@ from cuspid.storage.files import read_json, reading, to_plain, write_arrays, wri
 from cuspid.storage.handpieces import (
     camera_from_json,
     camera_to_json,
-    covariance_from_json,
     read_handpiece,
     rigid_from_json,
     rigid_to_json,
     write_handpiece,
 )
+from cuspid.values import checked_name, shown
 
 
 def write_poses(path: Path, rig_from_world: Mapping[str, Rigid3]) -> None:
@@ -36,7 +36,10 @@ def read_poses(path: Path) -> dict[str, Rigid3]:
     """Read what :func:`write_poses` wrote."""
     value = read_json(path)
     with reading(path):
-        return {name: rigid_from_json(pose) for name, pose in value.items()}
+        return {
+            checked_name(f"{path}: frames", key): rigid_from_json(pose, f"{path}: frame {shown(key)}")
+            for key, pose in value.items()
+        }
 
 
 RECONSTRUCTION_FILES = ("poses.json", "handpiece.json", "tracks.npz", "reconstruction.json")
@@ -68,12 +71,13 @@ def read_reconstruction(folder: Path) -> Reconstruction:
     path, tracks = folder / "reconstruction.json", folder / "tracks.npz"
     value = read_json(path)
     with reading(path):
+        covariance = value["pose_covariance_rotation_rad_translation_mm"]
         return Reconstruction(
             rig=read_handpiece(folder / "handpiece.json").rig,
             rig_from_world=read_poses(folder / "poses.json"),
             tracks=_read_tracks(tracks) if value["points"] else None,
             dropped=tuple(Dropped(**entry) for entry in value["frames_dropped"]),
-            pose_covariance=covariance_from_json(value["pose_covariance_rotation_rad_translation_mm"]),
+            pose_covariance=None if covariance is None else np.array(covariance, dtype=np.float64),
             reprojection_rms_px=value["reprojection_rms_px"],
             log=value["log"],
             notes=tuple(value.get("notes", ())),

@@ -1,0 +1,96 @@
+"""Values from outside, checked once where they come in: numbers that can be reckoned with, names that can be files.
+
+``what`` names the value in the one line that an error shows, for example ``rig.json: camera a: focal_px``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from cuspid.errors import InputError
+
+LONGEST_MM = 1e5
+"""No place, distance or size of a handpiece or of a jaw is farther than this."""
+_LONGEST_NAME = 100
+_NOT_IN_FILES = '/\\:*?"<>|'
+_SHOWN = 40
+_ROUNDING = 1e-6
+"""Least eigenvalue of a covariance, as a share of the largest, that counts as zero."""
+
+
+def checked_name(what: str, value: object) -> str:
+    """A name that can be the stem of a file, or of one in folders (``rig/left``), on any system and nowhere else.
+
+    Raises InputError for one that is empty or too long, or where a part of it is empty, begins with a dot, or has a
+    character that no system's files may have.
+    """
+    if not (isinstance(value, str) and len(value) <= _LONGEST_NAME and all(map(_can_be_a_file, value.split("/")))):
+        raise InputError(f"{what}: {shown(value)} cannot be a name; use letters, digits, - and _")
+    return value
+
+
+def _can_be_a_file(part: str) -> bool:
+    if not part or part[0] == "." or part != part.strip():
+        return False
+    return part.isprintable() and not any(each in _NOT_IN_FILES for each in part)
+
+
+def number(what: str, value: object, low: float, high: float) -> float:
+    """A finite number between two bounds (inclusive). Raises InputError."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        raise InputError(f"{what} is {shown(value)}; it must be a number")
+    if not low <= value <= high:
+        raise InputError(f"{what} is {shown(value)}; it must lie between {low:g} and {high:g}")
+    return float(value)
+
+
+def whole(what: str, value: object, low: int, high: int) -> int:
+    """A whole number between two bounds (inclusive). Raises InputError."""
+    found = number(what, value, float(low), float(high))
+    if found != int(found):
+        raise InputError(f"{what} is {shown(value)}; it must be a whole number")
+    return int(found)
+
+
+def numbers(what: str, value: Any, shape: tuple[int, ...], low: float, high: float) -> Float[np.ndarray, "..."]:
+    """Finite numbers of a shape, each between two bounds (inclusive). Raises InputError."""
+    try:
+        found = np.asarray(value)
+        plain = found.dtype.kind in "iuf" and not _has_truth(value)
+        found = found.astype(np.float64) if plain else np.full(1, np.nan)
+    except (ValueError, TypeError, OverflowError):  # a list of unequal lists, or of what is no number
+        found = np.full(1, np.nan)
+    if found.shape != shape:
+        size = " x ".join(map(str, shape))
+        raise InputError(f"{what} is {shown(value)}; it must be {size} numbers")
+    if not np.all((found >= low) & (found <= high)):
+        raise InputError(f"{what} is {shown(value)}; each must lie between {low:g} and {high:g}")
+    return found
+
+
+def _has_truth(value: Any) -> bool:
+    """Whether true or false stands somewhere in lists of lists."""
+    return isinstance(value, bool) or (isinstance(value, list) and any(map(_has_truth, value)))
+
+
+def covariance(what: str, value: Any, size: int) -> Float[np.ndarray, "n n"]:
+    """A covariance matrix: symmetric, without a negative eigenvalue. Raises InputError."""
+    found = numbers(what, value, (size, size), -math.inf, math.inf)
+    if not np.isfinite(found).all():
+        raise InputError(f"{what} is not finite; leave it out where it is not known")
+    eigenvalues = np.linalg.eigvalsh((found + found.T) / 2)
+    if not np.allclose(found, found.T, rtol=0, atol=_ROUNDING * np.abs(found).max()) or eigenvalues[
+        0
+    ] < -_ROUNDING * abs(eigenvalues[-1]):
+        raise InputError(f"{what} is no covariance: it must be symmetric, without negative eigenvalues")
+    return found
+
+
+def shown(value: object) -> str:
+    """A value for a message: short, on one line, without control characters."""
+    text = repr(value if not isinstance(value, np.ndarray) else value.tolist()).replace("\n", " ")
+    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
