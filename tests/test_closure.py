@@ -10,7 +10,7 @@ from cuspid.motion import MotionOptions, location
 from cuspid.motion.closure import closing_pairs
 from cuspid.motion.location import locate_features
 from cuspid.reconstruction import Tracks
-from test_odometry import errors, make_handpiece, see
+from test_odometry import errors, make_handpiece, see, wrongly_calibrated
 
 OUT, STEP_MM = 13, 1.2
 
@@ -63,10 +63,12 @@ def test_only_what_sees_the_same_from_the_same_side_is_paired():
     assert closing_pairs(handpiece, poses, every_frame_once(len(poses))) == []
 
 
-def test_a_way_back_is_tied_to_the_way_there(monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_a_way_back_is_tied_to_the_way_there(monkeypatch: pytest.MonkeyPatch, calibrated: bool):
     """The frames of the end come to those of the beginning much better than by the chain alone."""
     handpiece, path = make_handpiece(), there_and_back()
     seen = see(handpiece, path, points=1600, length_mm=20.0)
+    handpiece = handpiece if calibrated else wrongly_calibrated(handpiece)
     closed = locate_features(handpiece, seen, list(path), MotionOptions())
     assert closed.log["closing_matches"] > 100
     monkeypatch.setattr(location, "closing_pairs", lambda *_: [])

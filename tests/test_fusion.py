@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.reconstruction import DepthMap
-from cuspid.surface.evidence import Evidence, observe
+from cuspid.surface.evidence import Evidence, observe, observe_foot
 from cuspid.surface.fusion import FusionOptions, Votes
 from cuspid.surface.fusion import fuse as fuse_depth_maps
 from cuspid.surface.volume import SparseVolume, pack, unpack
@@ -87,6 +88,31 @@ def test_a_narrow_strip_of_a_slope_is_covered_and_not_widened(steepness: float) 
     beyond = np.maximum(mesh.vertices[:, 0] - points[:, 0].max(), points[:, 0].min() - mesh.vertices[:, 0])
     assert beyond.max() < 1.6 * pixel_mm
     assert 0 < np.abs(signed_um(mesh, slope)).mean() < 2
+
+
+def test_the_foot_of_a_perpendicular_must_lie_on_the_surface() -> None:
+    """A slope that ends before a far wall tells nothing of what stands over its extension: there is the wall."""
+    camera = Camera.from_field_of_view(100, 100, 62.0)
+    x = camera.rays(camera.pixel_centres().reshape(-1, 2))[:, 0].reshape(100, 100)
+    column = np.arange(100)
+    depth = np.where(column < 50, 4 / (1 + 1.5 * x), np.where(column < 53, np.nan, 8.0)).astype(np.float32)
+    seen_map = DepthMap(
+        frame="a",
+        camera_name="c",
+        camera=camera,
+        cam_from_rig=Rigid3.identity(),
+        depth_mm=depth,
+        confidence=np.ones_like(depth),
+    )
+    evidence = Evidence.of(seen_map, 0.15)
+    nearest, out, answers = evidence.nearest(6), np.zeros(6), []
+    normal = np.array([1.5, 0, 1]) / np.hypot(1.5, 1)
+    for right, away in [(r, a) for r in np.linspace(-0.3, 0.6, 60) for a in np.linspace(-0.3, 0.3, 25)]:
+        point = np.array([right, 0.0, 4 - 1.5 * right]) - away * normal
+        if observe_foot(evidence.arrays, nearest, 0.3, *point, out):
+            answers.append(abs(out[0] - away))
+    assert len(answers) > 100
+    assert max(answers) < 1e-4
 
 
 def test_faces_look_at_the_cameras() -> None:

@@ -217,16 +217,21 @@ def test_wrong_matches_do_not_harm() -> None:
     assert np.abs(errors(found, path)[:, 3:]).max() < 0.02
 
 
-def test_an_uncertain_calibration_is_refined() -> None:
-    """Given with its covariance, the extrinsic calibration comes back nearer to the truth."""
-    truth, path = make_handpiece(), make_path(6)
+def wrongly_calibrated(truth: Handpiece) -> Handpiece:
+    """The same with its cameras somewhat elsewhere, and how much that may be."""
     sigma, rng = np.array([2e-3] * 3 + [0.01] * 3), np.random.default_rng(2)
     given = {}
     for name, mounted in truth.rig.cameras.items():
         motion = rng.normal(0, sigma)
         moved = Rigid3.from_rotation_vector(motion[:3], motion[3:]) @ mounted.cam_from_rig
         given[name] = replace(mounted, cam_from_rig=moved, covariance=np.diag(sigma**2))
-    nominal = replace(truth, rig=Rig(given))
+    return replace(truth, rig=Rig(given))
+
+
+def test_an_uncertain_calibration_is_refined() -> None:
+    """Given with its covariance, the extrinsic calibration comes back nearer to the truth."""
+    truth, path = make_handpiece(), make_path(6)
+    nominal = wrongly_calibrated(truth)
     found = locate_features(nominal, see(truth, path), list(path), MotionOptions())
 
     def relative(rig: Rig) -> np.ndarray:

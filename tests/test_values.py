@@ -160,12 +160,12 @@ def test_nonsense_in_a_handpiece_is_one_line_that_names_file_and_field(place, va
     assert place[-1] in said
     assert "\n" not in said
     assert len(said) < 300
-    before = sorted(tmp_path.rglob("*"))
     with pytest.raises(SystemExit) as ended:
         cli.main(["simulate", "--handpiece", str(path), "--out", str(tmp_path / "inner" / "out")])
     assert ended.value.code == 1
     assert capsys.readouterr().err.count("\n") < 6
-    assert sorted(each for each in tmp_path.rglob("*") if each.is_file()) == [each for each in before if each.is_file()]
+    assert [each for each in tmp_path.rglob("*") if each.is_file()] == [path]
+    assert not (tmp_path / "inner" / "out").exists()
 
 
 def test_a_handpiece_comes_back_as_it_was(tmp_path):
@@ -175,3 +175,26 @@ def test_a_handpiece_comes_back_as_it_was(tmp_path):
     for camera, mounted in twelve_cameras().rig.cameras.items():
         np.testing.assert_array_equal(again.rig[camera].camera.parameters, mounted.camera.parameters)
         np.testing.assert_allclose(again.rig[camera].cam_from_rig.matrix, mounted.cam_from_rig.matrix, atol=1e-15)
+
+
+RIG = {"image_prefix": "b/", "camera_model_name": "PINHOLE", "camera_params": [400, 400, 250, 250]}
+"""A camera of COLMAP's rig_config.json without its place."""
+
+
+def rig_config(tmp_path, **place):
+    path = tmp_path / "rig_config.json"
+    path.write_text(json.dumps([{"cameras": [{**RIG, "image_prefix": "a/", "ref_sensor": True}, {**RIG, **place}]}]))
+    return storage.read_rig_config(path)
+
+
+@pytest.mark.parametrize("missing", ["cam_from_rig_rotation", "cam_from_rig_translation"])
+def test_a_camera_of_a_rig_has_a_whole_place(tmp_path, missing):
+    place = {"cam_from_rig_rotation": [1, 0, 0, 0], "cam_from_rig_translation": [-2, 0, 0]}
+    assert rig_config(tmp_path, **place)["b"].centre_in_rig.tolist() == [2, 0, 0]
+    with pytest.raises(InputError, match=f"the field '{missing}' is missing"):
+        rig_config(tmp_path, **{key: value for key, value in place.items() if key != missing})
+
+
+def test_the_reference_sensor_is_the_rig(tmp_path):
+    place = {"ref_sensor": True, "cam_from_rig_rotation": [1, 0, 0, 0], "cam_from_rig_translation": [-2, 0, 0]}
+    assert rig_config(tmp_path, **place)["b"].centre_in_rig.tolist() == [0, 0, 0]

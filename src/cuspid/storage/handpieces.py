@@ -276,16 +276,14 @@ def read_rig_config(path: Path, image_size_px: tuple[int, int] | None = None) ->
         for entry in value[0]["cameras"]:
             key = checked_name(f"{path}: image_prefix", str(entry["image_prefix"]).rstrip("/"))
             what = f"{path}: camera {shown(key)}"
-            pose = {
-                "rotation_wxyz": entry.get("cam_from_rig_rotation", [1, 0, 0, 0]),
-                "translation_mm": entry.get("cam_from_rig_translation", [0, 0, 0]),
-            }
-            if not entry.get("ref_sensor") and "cam_from_rig_rotation" not in entry:
-                raise InputError(
-                    f"{what}: the field 'cam_from_rig_rotation' is missing; cuspid works with calibrated rigs"
-                )
-            cameras[key] = MountedCamera(camera_from_colmap(entry, image_size_px, what), rigid_from_json(pose, what))
+            cam_from_rig = Rigid3.identity() if entry.get("ref_sensor") else _place_in_rig(entry, what)
+            cameras[key] = MountedCamera(camera_from_colmap(entry, image_size_px, what), cam_from_rig)
         return Rig(cameras)
+
+
+def _place_in_rig(entry: Mapping[str, Any], what: str) -> Rigid3:
+    rotation, translation = entry["cam_from_rig_rotation"], entry["cam_from_rig_translation"]
+    return rigid_from_json({"rotation_wxyz": rotation, "translation_mm": translation}, what)
 
 
 _COLMAP_PARAMETERS: Mapping[str, Sequence[int]] = {

@@ -20,6 +20,9 @@ from cuspid.reconstruction import DepthMap
 DISTANCE, WEIGHT, NORMAL_X, NORMAL_Y, NORMAL_Z, PIXEL = range(6)
 """What :func:`observe` writes: signed distance (mm), weight, unit normal in the camera, flat index of the pixel."""
 
+_SAME_SURFACE = 0.5
+"""A foot that lies farther from the plane of its own pixel, as a share of the farthest distance, is on no surface."""
+
 EXTRAPOLATED = 0.1
 """Weight of a pixel without depth beside pixels with depth, relative to theirs."""
 
@@ -141,18 +144,21 @@ def observe(evidence, right, down, depth, seen):
 @no_type_check
 def observe_foot(evidence, nearest, farthest, right, down, depth, seen):
     """As :func:`observe` for a point whose own pixel tells nothing: what the pixel tells at the foot of its
-    perpendicular on a surface that is not farther away than ``farthest``. A camera that looks along a slope sees past
-    it what lies outside of it.
+    perpendicular, where the surface is seen there and is not farther away than ``farthest``. A camera that looks along
+    a slope sees past it what lies outside of it.
 
     ``nearest`` is what :meth:`Evidence.nearest` gives.
     """
     plane, weight, intrinsics = evidence
     height, width = weight.shape
-    u = int(intrinsics[0] * right / depth + intrinsics[2] + 0.5)
-    v = int(intrinsics[1] * down / depth + intrinsics[3] + 0.5)
-    if not (u >= 0 and v >= 0 and u < width and v < height) or nearest[v, u] < 0:
+    u = intrinsics[0] * right / depth + intrinsics[2] + 0.5
+    v = intrinsics[1] * down / depth + intrinsics[3] + 0.5
+    if not (u >= 0 and v >= 0 and u < width and v < height):
         return False
-    row, column = nearest[v, u] // width, nearest[v, u] % width
+    pixel = nearest[int(v), int(u)]
+    if pixel < 0:
+        return False
+    row, column = pixel // width, pixel % width
     a, b, c = plane[row, column, 0], plane[row, column, 1], plane[row, column, 2]
     square = a * a + b * b + c * c
     along = (1 - a * right - b * down - c * depth) / square
@@ -160,9 +166,11 @@ def observe_foot(evidence, nearest, farthest, right, down, depth, seen):
         return False
     if not observe(evidence, right + along * a, down + along * b, depth + along * c, seen):
         return False
-    # seen[2:5] is the unit normal there, and seen[0] how far its plane lies from the foot.
+    # seen[2:5] is the unit normal there, and seen[0] how far its plane lies from the foot: far where the slope ended.
+    if abs(seen[0]) > _SAME_SURFACE * farthest:
+        return False
     seen[0] -= along * (a * seen[2] + b * seen[3] + c * seen[4])
-    return True
+    return abs(seen[0]) <= farthest
 
 
 def colors_of(depth_map: DepthMap) -> UInt8[np.ndarray, "p 3"]:
