@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from cuspid.motion import MotionOptions, location
 from cuspid.motion.closure import closing_pairs
 from cuspid.motion.location import locate_features
 from cuspid.reconstruction import Tracks
+from cuspid.rig import Handpiece, Rig
 from test_odometry import errors, make_handpiece, see, wrongly_calibrated
 
 OUT, STEP_MM = 13, 1.2
@@ -24,6 +27,12 @@ def there_and_back() -> dict[str, Rigid3]:
         )
         for k, x in enumerate(travel)
     }
+
+
+def without_far_sight() -> Handpiece:
+    """Without the camera from the side, that sees one place from the whole way and so ties its ends already."""
+    handpiece = make_handpiece()
+    return replace(handpiece, rig=Rig({name: handpiece.rig[name] for name in "abc"}))
 
 
 def no_tracks() -> Tracks:
@@ -66,7 +75,7 @@ def test_only_what_sees_the_same_from_the_same_side_is_paired():
 @pytest.mark.parametrize("calibrated", [True, False])
 def test_a_way_back_is_tied_to_the_way_there(monkeypatch: pytest.MonkeyPatch, calibrated: bool):
     """The frames of the end come to those of the beginning much better than by the chain alone."""
-    handpiece, path = make_handpiece(), there_and_back()
+    handpiece, path = without_far_sight(), there_and_back()
     seen = see(handpiece, path, points=1600, length_mm=20.0)
     handpiece = handpiece if calibrated else wrongly_calibrated(handpiece)
     closed = locate_features(handpiece, seen, list(path), MotionOptions())
@@ -78,6 +87,6 @@ def test_a_way_back_is_tied_to_the_way_there(monkeypatch: pytest.MonkeyPatch, ca
 
 
 def test_one_way_has_nothing_to_close():
-    handpiece, path = make_handpiece(), dict(list(there_and_back().items())[:OUT])
+    handpiece, path = without_far_sight(), dict(list(there_and_back().items())[:OUT])
     found = locate_features(handpiece, see(handpiece, path, points=1600, length_mm=20.0), list(path), MotionOptions())
     assert found.log["closing_matches"] == 0

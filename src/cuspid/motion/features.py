@@ -64,10 +64,8 @@ def spread(
     """Indices of at most ``count`` keypoints: the strongest of every cell, then the second of every cell, and so on."""
     cells = np.floor(pixels / cell_px).astype(np.int64) @ [1, 1 << 20]
     order = np.lexsort((-strengths, cells))
-    starts = np.flatnonzero(np.diff(cells[order], prepend=-1))
-    sizes = np.diff(np.append(starts, len(order)))
     rank = np.empty(len(order), dtype=np.int64)
-    rank[order] = np.arange(len(order)) - np.repeat(starts, sizes)
+    rank[order] = np.arange(len(order)) - np.searchsorted(cells[order], cells[order])
     return np.sort(np.lexsort((-strengths, rank))[:count])
 
 
