@@ -29,6 +29,8 @@ PACKAGES = ("cuspid", "numpy", "numba", "opencv-contrib-python-headless", "pycol
 PREPARED = (46, 45, 42, 36, 35)
 """Teeth (FDI) of the thesis' reference model (Fig 3.20), in the order B, C, D, F, E of its Table 3.2: cracked, crown,
 full-contour crown, and two inlays."""
+ONE_PASS = ("--passes", "turns")
+"""Whole arches are measured in one pass, as the thesis scans them."""
 _LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 _PR_SET_PDEATHSIG = 1
 _STAGES = ("depth", "depth-temporal", "motion")
@@ -121,10 +123,10 @@ def scan_cases(jaw: Path | None = None) -> dict[str, ScanCase]:
         f"molar-seed{seed}": ScanCase(seed=seed, simulate=("--tooth", "46", "--jaw-seed", str(seed)))
         for seed in range(3)
     }
-    table["arch"] = ScanCase()
+    table["arch"] = ScanCase(simulate=ONE_PASS)
     if jaw is not None:
-        table["real-arch"] = ScanCase(jaw=str(jaw.resolve()))
-    table["spheres"] = ScanCase(jaw="spheres.ply", make=("phantom", "--spheres"))
+        table["real-arch"] = ScanCase(jaw=str(jaw.resolve()), simulate=ONE_PASS)
+    table["spheres"] = ScanCase(jaw="spheres.ply", make=("phantom", "--spheres"), simulate=ONE_PASS)
     return table | prepared_cases()
 
 
@@ -135,7 +137,7 @@ def prepared_cases() -> dict[str, ScanCase]:
         f"prepared-{tooth}": ScanCase(jaw="thesis-reference.ply", make=make, simulate=("--tooth", str(tooth)))
         for tooth in PREPARED
     }
-    return {**teeth, "prepared-arch": ScanCase(jaw="thesis-reference.ply", make=make)}
+    return {**teeth, "prepared-arch": ScanCase(jaw="thesis-reference.ply", make=make, simulate=ONE_PASS)}
 
 
 def measure_scan(
