@@ -7,11 +7,13 @@ from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Annotated
 
 import numpy as np
 
 from cuspid.errors import InputError
 from cuspid.graph import parts_of
+from cuspid.options import SHARE, Options, Range
 from cuspid.rig import Handpiece, Rig
 
 _ROUNDING_DEG = 1e-5
@@ -23,17 +25,13 @@ _SHARED = 0.6
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairingOptions:
+class PairingOptions(Options):
     """When two cameras see the same surface, from about the same side."""
 
-    minimum_overlap: float = 0.4
+    minimum_overlap: Annotated[float, SHARE] = 0.4
     """Share (0 to 1) of what either sees at the working distance that the other must see, too."""
-    maximum_angle_deg: float = 30.0
+    maximum_angle_deg: Annotated[float, Range(0, 180)] = 30.0
     """Largest angle between their optical axes."""
-
-    def __post_init__(self) -> None:
-        if not (0 <= self.minimum_overlap <= 1 and 0 <= self.maximum_angle_deg <= 180):
-            raise InputError("pairing: the overlap must lie between 0 and 1, the angle between 0 and 180 deg")
 
 
 def stereo_pairs(

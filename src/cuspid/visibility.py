@@ -10,16 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import no_type_check
+from typing import Annotated, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numba import njit
 
 from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, read_only
 from cuspid.mesh import Mesh
+from cuspid.options import Options, Range
 from cuspid.rig import Handpiece
 
 _AT_ONCE = (1, 2, 3)
@@ -27,21 +27,13 @@ _AT_ONCE = (1, 2, 3)
 
 
 @dataclass(frozen=True, kw_only=True)
-class VisibilityOptions:
+class VisibilityOptions(Options):
     """When a face is seen."""
 
-    maximum_incidence_deg: float = 75.0
+    maximum_incidence_deg: Annotated[float, Range(1, 90)] = 75.0
     """Largest angle between the line of sight and the face's normal."""
-    cameras: int = 2
+    cameras: Annotated[int, Range(1, 1000)] = 2
     """How many cameras must see a face at once."""
-
-    def __post_init__(self) -> None:
-        if not 0 < self.maximum_incidence_deg <= 90:
-            raise InputError(
-                f"visibility: the largest incidence must lie in 0-90 deg, not {self.maximum_incidence_deg:g}"
-            )
-        if self.cameras < 1:
-            raise InputError(f"visibility: at least 1 camera must see a face, not {self.cameras}")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

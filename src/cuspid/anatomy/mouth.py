@@ -23,13 +23,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from types import MappingProxyType
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from cuspid.anatomy.teeth.dentition import ARCH_FORMS, QUADRANTS
 from cuspid.errors import InputError
+from cuspid.options import SEED, Options, Range
 
 Sizes = float | Float[np.ndarray, "*n"]
 """A value for one person, or one for each of many."""
@@ -251,18 +252,18 @@ class Anatomy:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MouthOptions:
+class MouthOptions(Options):
     """The handpiece, and whom it is to fit."""
 
-    thickness_mm: float = 7.0
+    thickness_mm: Annotated[float, Range(0, 1000)] = 7.0
     """Thickness of the handpiece between the jaws."""
-    working_distance_mm: float = 5.0
+    working_distance_mm: Annotated[float, Range(0, 1000)] = 5.0
     """From its cameras to the teeth."""
-    clearance_mm: float = 0.0
+    clearance_mm: Annotated[float, Range(0, 1000)] = 0.0
     """Room to spare."""
     study: Study = "india-2012"
     """Whose mouth openings: a survey of 894 adults, of 452 young adults, or the thesis' (Rieder's intervals)."""
-    held: float = 1.0
+    held: Annotated[float, Range(0.01, 1)] = 1.0
     """Part of the maximal opening that is held during a scan; the condyles slide in proportion."""
     overlap: bool = True
     """Add the vertical overlap of the incisors to the opening; without it the room is underestimated."""
@@ -270,23 +271,12 @@ class MouthOptions:
     """Take the ramus height for the depth of the occlusal plane, as the thesis does."""
     vertical: bool = False
     """Judge by the vertical distance of the occlusal planes, V, instead of the straight one of the teeth, L."""
-    correlation: float = 0.0
+    correlation: Annotated[float, Range(-1, 1)] = 0.0
     """Correlation between opening and condyle-incisor distance; not known, so none is assumed."""
-    people: int = 20_000
+    people: Annotated[int, Range(1, 10_000_000)] = 20_000
     """How many men and how many women are drawn."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """Seed of the draw."""
-
-    def __post_init__(self) -> None:
-        for name in ("thickness_mm", "working_distance_mm", "clearance_mm"):
-            if getattr(self, name) < 0:
-                raise InputError(f"mouth: {name} is {getattr(self, name):g}; it must not be negative")
-        if not 0 < self.held <= 1:
-            raise InputError(f"mouth: held is {self.held:g}; it must be above 0 and at most 1")
-        if self.people < 1:
-            raise InputError(f"mouth: people is {self.people}; draw at least one")
-        if not -1 <= self.correlation <= 1:
-            raise InputError(f"mouth: correlation is {self.correlation:g}; it must lie in -1 to 1")
 
     @property
     def total_mm(self) -> float:

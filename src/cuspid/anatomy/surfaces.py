@@ -18,6 +18,7 @@ are divided by half that extent, so that the crown spans -1 to 1.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -27,6 +28,7 @@ from cuspid.anatomy.landmarks.scheme import kind_of
 from cuspid.errors import InputError
 from cuspid.geometry import unit
 from cuspid.jaw import Jaw
+from cuspid.options import Options, Range
 
 SURFACES = ("occlusal", "incisal", "buccal", "labial", "lingual", "mesial", "distal", "gingival")
 """Names of the surfaces, in the order of tables."""
@@ -47,17 +49,13 @@ Local = Float[np.ndarray, "n 3"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class SurfaceOptions:
+class SurfaceOptions(Options):
     """Where surfaces end."""
 
-    incisal_mm: float = 1.0
+    incisal_mm: Annotated[float, Range(0.01, 100)] = 1.0
     """Height of the incisal surface."""
-    gingival_mm: float = 3.0
+    gingival_mm: Annotated[float, Range(0.01, 100)] = 3.0
     """Width of the gum around the teeth that counts as gingival surface."""
-
-    def __post_init__(self) -> None:
-        if not (self.incisal_mm > 0 and self.gingival_mm > 0):
-            raise InputError("surfaces: --incisal-mm and --gingival-mm must be positive")
 
 
 def named_surfaces(jaw: Jaw, options: SurfaceOptions = SurfaceOptions()) -> dict[str, Bool[np.ndarray, "f"]]:

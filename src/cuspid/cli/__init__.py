@@ -5,7 +5,9 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Callable, Mapping
-from typing import Any
+from functools import wraps
+from inspect import signature
+from typing import Any, get_type_hints
 
 import tyro
 
@@ -26,6 +28,7 @@ from cuspid.cli.studies import sweep
 from cuspid.cli.surveys import measure, shape
 from cuspid.cli.view import view
 from cuspid.errors import CuspidError
+from cuspid.options import check
 
 COMMANDS: Mapping[str, Callable[..., Any]] = {
     "run": run,
@@ -55,6 +58,18 @@ COMMANDS: Mapping[str, Callable[..., Any]] = {
 }
 
 
+def _checked(name: str, verb: Callable[..., None]) -> Callable[..., None]:
+    """A verb that checks its own numbers before it begins."""
+
+    @wraps(verb)
+    def checked(*given: object, **options: object) -> None:
+        check(name, verb, signature(verb).bind(*given, **options).arguments)
+        verb(*given, **options)
+
+    checked.__annotations__ = get_type_hints(verb, include_extras=True)  # as text they would be looked up here
+    return checked
+
+
 class _Notes(logging.Handler):
     """What the code has to say while it runs, a line each."""
 
@@ -70,7 +85,7 @@ def main(arguments: list[str] | None = None) -> None:
     log.handlers = [_Notes()]
     try:
         tyro.extras.subcommand_cli_from_dict(
-            dict(COMMANDS),
+            {name: _checked(name, verb) for name, verb in COMMANDS.items()},
             prog="cuspid",
             description="Passive intra-oral 3D scanning: simulate, reconstruct, and prove the accuracy.",
             args=arguments,

@@ -16,6 +16,7 @@ from cuspid.anatomy.mouth import MouthOptions, room_mm, study_mouths
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
 from cuspid.errors import InputError
+from cuspid.options import WORKERS, Range
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.reporting.figures.comparison import Curve, save_comparison_picture, save_surface_shares_picture
 from cuspid.simulation.appearance import Preset
@@ -47,9 +48,9 @@ def compare(
     out: Path,
     options: Annotated[ComparisonOptions, Flat] = ComparisonOptions(),
     texture: Preset = "artificial",
-    supersampling: int = 1,
+    supersampling: Annotated[int, Range(1, 16)] = 1,
     reconstruction: ReconstructionOptions = ReconstructionOptions(),
-    workers: int | None = None,
+    workers: Annotated[int | None, WORKERS] = None,
     cluster: str | None = None,
 ) -> None:
     """Compare handpieces on the same teeth: size, images, time, error, completeness; six cameras turned against twelve.

@@ -21,6 +21,7 @@ from cuspid.handpiece.optics import Optics
 from cuspid.handpiece.precision import NoiseModel, PrecisionMap
 from cuspid.handpiece.presets import PRESETS
 from cuspid.jaw import Jaw
+from cuspid.options import SEED, TOOTH, Range
 from cuspid.reporting.figures.precision import save_precision_picture
 from cuspid.reporting.figures.visibility import save_counts_picture, save_surfaces_picture
 from cuspid.simulation.path.scan import ScanPathOptions
@@ -33,9 +34,9 @@ VIEWS = {"occlusal": (0.0, 90.0), "from the cheek": (0.0, 15.0), "from the tongu
 
 def optics(
     *,
-    distance_mm: float = 5.0,
-    blur_px: float = 2.0,
-    baseline_mm: float = 2.5,
+    distance_mm: Annotated[float, Range(0.01, 100_000)] = 5.0,
+    blur_px: Annotated[float, Range(0.01, 1000)] = 2.0,
+    baseline_mm: Annotated[float, Range(0.001, 10_000)] = 2.5,
     out: Path | None = None,
 ) -> None:
     """Compare miniature cameras: footprint, um per px, depth of field, diffraction, overlap of a parallel pair.
@@ -82,7 +83,7 @@ def visibility(
     source: Annotated[Source, Flat] = Source(),
     probe: Annotated[Probe, Flat] = Probe(),
     path: Annotated[ScanPathOptions, Flat] = ScanPathOptions(),
-    seed: int = 0,
+    seed: Annotated[int, SEED] = 0,
     options: Annotated[VisibilityOptions, Flat] = VisibilityOptions(),
 ) -> None:
     """Tell what of each surface a handpiece sees along its scan path, camera by camera.
@@ -110,11 +111,11 @@ def visibility(
 def precision(
     jaw: Annotated[Path | None, Positional, arg(metavar="[JAW]")] = None,
     *,
-    tooth: int,
+    tooth: Annotated[int, TOOTH],
     out: Path,
     source: Annotated[Source, Flat] = Source(),
     probe: Annotated[Probe, Flat] = Probe(),
-    turns: int = 1,
+    turns: Annotated[int, Range(1, 99)] = 1,
     noise: Annotated[NoiseModel, Flat] = NoiseModel(),
     visibility: VisibilityOptions = VisibilityOptions(),
 ) -> None:

@@ -13,6 +13,7 @@ from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
 from cuspid.handpiece.brief import read_brief
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.handpiece.optimise import SearchOptions, handpiece_outline, optimise_handpiece
+from cuspid.options import TOOTH
 from cuspid.reporting.figures.design import save_design_picture
 from cuspid.studies.forecast import room_for, sections_of
 
@@ -41,7 +42,7 @@ def design(
     out: Path,
     jaw: Path | None = None,
     source: Annotated[Source, Flat] = Source(),
-    teeth: tuple[int, ...] = (46, 41),
+    teeth: Annotated[tuple[int, ...], TOOTH] = (46, 41),
     mouth: MouthOptions = MouthOptions(),
     search: Annotated[SearchOptions, Flat] = SearchOptions(),
 ) -> None:

@@ -27,6 +27,7 @@ from cuspid.anatomy.shape.boxed import boxed
 from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
 from cuspid.errors import InputError
 from cuspid.jaw import Jaw
+from cuspid.options import TOOTH, Range
 from cuspid.reporting.figures.drawing import save_picture
 from cuspid.reporting.figures.preparation import save_preparation_picture
 
@@ -36,7 +37,7 @@ def phantom(
     out: Path,
     options: Annotated[PhantomOptions, Flat] = PhantomOptions(),
     group: GroupName | None = None,
-    count: int = 10,
+    count: Annotated[int, Range(1, 10_000)] = 10,
     spheres: bool = False,
     sphere: SphereArchOptions = SphereArchOptions(),
 ) -> None:
@@ -76,7 +77,7 @@ def prepare(
     out: Path,
     source: Annotated[Source, Flat] = Source(),
     preset_name: Annotated[Literal["thesis-reference"] | None, arg(name="preset")] = None,
-    tooth: int | None = None,
+    tooth: Annotated[int | None, TOOTH] = None,
     how: OmitSubcommandPrefixes[
         Annotated[None, subcommand("as-preset")]
         | Annotated[CrackOptions, subcommand("crack")]

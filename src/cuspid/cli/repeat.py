@@ -14,6 +14,7 @@ from cuspid import storage
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress
 from cuspid.errors import InputError
+from cuspid.options import WORKERS
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.reporting.figures.repeat import save_repeat_picture
 from cuspid.studies.grid import check_workers
@@ -30,7 +31,7 @@ def repeat(
     probe: Annotated[Probe, Flat] = Probe(),
     simulation: Annotated[SimulationOptions, Flat, OmitArgPrefixes] = SimulationOptions(),
     reconstruction: ReconstructionOptions = ReconstructionOptions(),
-    workers: int | None = None,
+    workers: Annotated[int | None, WORKERS] = None,
     cluster: str | None = None,
     retry_failed: bool = False,
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Annotated
 
 from rich.console import Console
 from rich.markup import escape
@@ -13,6 +14,7 @@ from rich.table import Table
 from cuspid import storage
 from cuspid.cli.shared import console, show_progress
 from cuspid.errors import CuspidError, InputError
+from cuspid.options import WORKERS
 from cuspid.reporting.pages.page import photo_uri
 from cuspid.reporting.pages.reproduction import Page, html, markdown
 from cuspid.studies.grid import check_workers
@@ -31,7 +33,7 @@ def reproduce(
     results: Path | None = None,
     images: Path | None = None,
     run: bool = True,
-    workers: int | None = None,
+    workers: Annotated[int | None, WORKERS] = None,
 ) -> None:
     """Set every table, figure and equation of the thesis beside ours: reproduction.md and reproduction.html.
 

@@ -22,6 +22,7 @@ from cuspid.evaluation.margin import MarginError, margin_errors
 from cuspid.evaluation.spheres import SphereReport, evaluate_spheres
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
+from cuspid.options import Range
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.reconstruction import Reconstruction
 from cuspid.reporting.figures.drawing import deviation_colors, save_deviation_picture
@@ -73,7 +74,7 @@ def reconstruct(
     *,
     out: Path,
     handpiece: Path | None = None,
-    working_distance_mm: float | None = None,
+    working_distance_mm: Annotated[float | None, Range(0.1, 100_000)] = None,
     from_poses: Path | None = None,
     reconstruction: Annotated[ReconstructionOptions, Flat] = ReconstructionOptions(),
 ) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
@@ -17,9 +17,9 @@ from cuspid import storage
 from cuspid.anatomy.jaw_files import load_jaw
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
-from cuspid.errors import InputError
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.jaw import Arch, Jaw
+from cuspid.options import SEED, Options, Range
 from cuspid.progress import Progress
 from cuspid.rig import Handpiece
 
@@ -30,32 +30,28 @@ Flat = arg(name="")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Source:
+class Source(Options):
     """What is scanned."""
 
     unit: storage.Unit = "mm"
     """Length unit of the mesh file."""
     arch: Arch | None = None
     """Which jaw the file holds, where its teeth are to be numbered; of the phantom: lower unless said otherwise."""
-    jaw_seed: int = 0
+    jaw_seed: Annotated[int, SEED] = 0
     """Individual of the built-in phantom."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Probe:
+class Probe(Options):
     """What scans it."""
 
     design: Literal["two", "four", "six", "twelve"] = "twelve"
     """Built-in design: a stereo pair, the essential four cameras, six (give --turns 3), or the twelve."""
     handpiece: Path | None = None
     """A handpiece.json, or COLMAP's rig_config.json, of your own, instead of a built-in design."""
-    working_distance_mm: float | None = None
+    working_distance_mm: Annotated[float | None, Range(0.1, 100_000)] = None
     """From the cameras to the teeth: of a design (5 unless given), or of a rig_config.json, which does not have it
     (guessed unless given)."""
-
-    def __post_init__(self) -> None:
-        if self.working_distance_mm is not None and not self.working_distance_mm > 0:
-            raise InputError(f"probe: the working distance {self.working_distance_mm:g} mm must be positive")
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from cuspid import storage
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
 from cuspid.errors import InputError
+from cuspid.options import WORKERS
 from cuspid.reporting.figures.sweep import SweepMap, save_sweep_picture
 from cuspid.studies.camera_sweep import TERMS, Best, Setting, SweepOptions, Term, best_setting, values_of
 from cuspid.studies.camera_sweep import sweep as run_sweep
@@ -36,7 +37,7 @@ def sweep(
     out: Path,
     source: Annotated[Source, Flat] = Source(),
     options: Annotated[SweepOptions, Flat] = SweepOptions(),
-    workers: int | None = None,
+    workers: Annotated[int | None, WORKERS] = None,
     cluster: str | None = None,
     retry_failed: bool = False,
 ) -> None:

@@ -11,6 +11,7 @@ from tyro.conf import Positional
 from cuspid import storage
 from cuspid.cli.shared import console
 from cuspid.errors import InputError
+from cuspid.options import Range
 from cuspid.reporting.live_view import serve
 
 
@@ -20,7 +21,7 @@ def view(
     reference: Path | None = None,
     unit: storage.Unit = "mm",
     host: str = "127.0.0.1",
-    port: int = 8080,
+    port: Annotated[int, Range(1, 65_535)] = 8080,
 ) -> None:
     """Show a scan or a shape model in the browser, with all its faces, until Ctrl-C. Needs the extra: cuspid[view].
 

@@ -22,6 +22,7 @@ was left out by each rule.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -34,6 +35,7 @@ from cuspid.evaluation.teeth import CANINES, LEAST_SAMPLES, MOLARS, distance_err
 from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
+from cuspid.options import SHARE, Options, Range
 from cuspid.trueness import DeviationStatistics, Trueness
 
 _LEAST_TOOTH_PCT = 30.0
@@ -41,20 +43,20 @@ _LEAST_TOOTH_PCT = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluationOptions:
+class EvaluationOptions(Options):
     """How a scan is compared with its reference."""
 
     align: bool = True
     """Align the scan rigidly first, from any pose; off if it lies in the frame of the reference."""
     registration: RegistrationOptions = field(default_factory=RegistrationOptions)
     """How it is aligned."""
-    samples: int = 200_000
+    samples: Annotated[int, Range(100, 20_000_000)] = 200_000
     """Points on each of the two surfaces, even by area."""
-    margin_mm: float = 0.5
+    margin_mm: Annotated[float, Range(0, 1000)] = 0.5
     """A point of the scan over surface that is not evaluated is left out only within this distance."""
-    crop_mm: float | None = None
+    crop_mm: Annotated[float | None, Range(0.001, 1000)] = None
     """Reference surface farther than this from the scan is regarded as not scanned; by default all is evaluated."""
-    min_openness: float = 0.0
+    min_openness: Annotated[float, SHARE] = 0.0
     """Without a mask: share of the directions above the occlusal plane that must be free for a face to be evaluated.
     0.05 leaves out the hidden insides and the base of a model; 0 evaluates everything."""
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -22,6 +23,7 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, axes_about, lengths_along
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
+from cuspid.options import Options, Range
 
 _FINE_MM = 0.01
 """Spacing of the points of a section."""
@@ -32,25 +34,26 @@ _STRAIGHT = 0.93
 
 
 @dataclass(frozen=True, kw_only=True)
-class MarginOptions:
+class MarginOptions(Options):
     """How edges are looked for."""
 
-    step_mm: float = 0.1
+    step_mm: Annotated[float, Range(0.001, 10)] = 0.1
     """Distance between sections along the line."""
-    reach_mm: float = 0.4
+    reach_mm: Annotated[float, Range(0.001, 10)] = 0.4
     """An edge farther than this from the line is not found."""
-    flank_from_mm: float = 0.08
+    flank_from_mm: Annotated[float, Range(0, 10)] = 0.08
     """The straight flanks begin this far from the edge, measured along the section."""
-    flank_to_mm: float = 0.3
+    flank_to_mm: Annotated[float, Range(0, 10)] = 0.3
     """The flanks end this far from the edge."""
-    least_bend_deg: float = 25.0
+    least_bend_deg: Annotated[float, Range(0, 180)] = 25.0
     """Least angle by which the flanks differ in direction."""
-    most_floor_um: float = 20.0
+    most_floor_um: Annotated[float, Range(0.001, 10_000)] = 20.0
     """A section is evaluated only if the edge of the reference itself is found within this distance of the line."""
 
     def __post_init__(self) -> None:
-        if not (self.step_mm > 0 and 0 <= self.flank_from_mm < self.flank_to_mm and self.reach_mm > 0):
-            raise InputError("margin: step and reach must be positive, and the flanks must end after they begin")
+        super().__post_init__()
+        if not self.flank_from_mm < self.flank_to_mm:
+            raise InputError("margin: the flanks must end after they begin")
 
 
 @dataclass(frozen=True, kw_only=True)

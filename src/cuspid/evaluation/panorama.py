@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
@@ -28,6 +28,7 @@ from skimage.metrics import structural_similarity
 from cuspid.camera import OPENCV_PIXEL_OFFSET
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, best_similarity
+from cuspid.options import Options, Range
 from cuspid.panorama import Panorama
 from cuspid.trueness import NOTHING, GroundTruth, ReferenceRender
 
@@ -46,27 +47,21 @@ _FEATURES = 6000
 
 
 @dataclass(frozen=True, kw_only=True)
-class PanoramaEvaluationOptions:
+class PanoramaEvaluationOptions(Options):
     """How a panorama is evaluated, and when it is taken for failed."""
 
-    samples: int = 200_000
+    samples: Annotated[int, Range(1000, 20_000_000)] = 200_000
     """Pixels of the panorama that are followed to the true jaw, at most, evenly spread."""
-    complete_pct: float = 90.0
+    complete_pct: Annotated[float, Range(0, 100)] = 90.0
     """The arch is complete where this share of each tooth is shown, of what the frames saw of it."""
-    fewest_frames_pct: float = 10.0
+    fewest_frames_pct: Annotated[float, Range(0, 100)] = 10.0
     """A panorama of a smaller share of the frames failed."""
-    largest_scale: float = 2.0
+    largest_scale: Annotated[float, Range(1.01, 100)] = 2.0
     """A panorama whose millimetres are wrong by more than this factor failed."""
-    coarsest_mm: float = 0.5
+    coarsest_mm: Annotated[float, Range(0.001, 10)] = 0.5
     """A panorama in whose pixels more than this many millimetres lie collapsed."""
-    worst_median_mm: float = 5.0
+    worst_median_mm: Annotated[float, Range(0.01, 100)] = 5.0
     """A panorama whose median error is larger shows no arch."""
-
-    def __post_init__(self) -> None:
-        if self.samples < 1000:
-            raise InputError(f"evaluation: at least 1000 samples are needed, not {self.samples}")
-        if not self.largest_scale > 1:
-            raise InputError(f"evaluation: the largest scale must exceed 1, not {self.largest_scale:g}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,6 +7,7 @@ Tukey's weights, to convergence. Never with scale: the best similarity's scale i
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +17,7 @@ from cuspid.evaluation.distance import ClosestPoints, SignedDistance
 from cuspid.evaluation.search import SearchOptions, find_poses
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
+from cuspid.options import Options, Range
 
 _WIDEST_MM = 2.0
 """Upper bound of the distance at which a sample loses its weight."""
@@ -25,18 +27,18 @@ _FEW = 2000
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegistrationOptions:
+class RegistrationOptions(Options):
     """How a scan is aligned with its reference."""
 
     search: SearchOptions = field(default_factory=SearchOptions)
     """How densely poses are tried."""
-    samples: int = 60_000
+    samples: Annotated[int, Range(100, 10_000_000)] = 60_000
     """Points of the scan, even by area, on which the alignment rests."""
-    outlier_mm: float = 0.3
+    outlier_mm: Annotated[float, Range(0.0001, 100)] = 0.3
     """Samples farther off than this (or than six robust standard deviations, if that is more) have no weight."""
-    tolerance_um: float = 0.01
+    tolerance_um: Annotated[float, Range(1e-06, 1000)] = 0.01
     """The alignment has converged when no sample moves more than this in a step."""
-    iterations: int = 100
+    iterations: Annotated[int, Range(1, 100_000)] = 100
     """Upper bound of the steps."""
 
 

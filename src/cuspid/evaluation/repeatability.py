@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -27,6 +28,7 @@ from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions, refine
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
+from cuspid.options import Options, Range
 from cuspid.trueness import DeviationStatistics
 
 LIMIT_FACTOR = 2.8
@@ -34,16 +36,16 @@ LIMIT_FACTOR = 2.8
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairOptions:
+class PairOptions(Options):
     """How scans are compared with each other."""
 
     align: bool = True
     """Lay one on the other first; off for what lies in a common frame already."""
     registration: RegistrationOptions = field(default_factory=RegistrationOptions)
     """How."""
-    samples: int = 100_000
+    samples: Annotated[int, Range(100, 20_000_000)] = 100_000
     """Points on each surface, even by area."""
-    farthest_mm: float = 0.5
+    farthest_mm: Annotated[float, Range(0.0001, 1000)] = 0.5
     """A point farther than this from the other scan shows something that the other one does not."""
 
 

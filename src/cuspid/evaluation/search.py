@@ -11,7 +11,7 @@ Frames: ``fixed`` and ``moving``. A batch of poses ``fixed_from_moving`` is an a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import no_type_check
+from typing import Annotated, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from cuspid.geometry import Rigid3, axes_about, unit
 from cuspid.mesh import Mesh
+from cuspid.options import Options, Range
 from cuspid.workers import map_in_threads
 
 _MAX_VOXELS = 1e6
@@ -32,18 +33,18 @@ _AGREE = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchOptions:
+class SearchOptions(Options):
     """How densely poses are tried."""
 
-    anchors: int = 12
+    anchors: Annotated[int, Range(1, 1000)] = 12
     """Points of the moving surface that are laid on the fixed one."""
-    targets: int = 5000
+    targets: Annotated[int, Range(10, 100_000)] = 5000
     """Points of the fixed surface on which each anchor is laid."""
-    turn_step_deg: float = 10.0
+    turn_step_deg: Annotated[float, Range(1, 90)] = 10.0
     """Step of the turn about the normal."""
-    candidates: int = 600
+    candidates: Annotated[int, Range(1, 100_000)] = 600
     """Poses that are refined."""
-    finalists: int = 8
+    finalists: Annotated[int, Range(1, 1000)] = 8
     """Distinct poses that are returned, at most."""
 
 

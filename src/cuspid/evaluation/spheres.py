@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -29,6 +30,7 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, read_only
 from cuspid.jaw import Jaw, Sphere
 from cuspid.mesh import Mesh
+from cuspid.options import Options, Range
 
 _ROUNDS = 30
 """Choices of points after which a sphere that has not settled is given up."""
@@ -48,25 +50,19 @@ _SIDES = (("3", "4"), ("1", "2"))
 
 
 @dataclass(frozen=True, kw_only=True)
-class SphereOptions:
+class SphereOptions(Options):
     """Which points of a scan make a sphere, and when it counts as measured."""
 
-    band_mm: float = 0.5
+    band_mm: Annotated[float, Range(0.0001, 100)] = 0.5
     """Points nearer than this to the surface of the sphere belong to it; more than the scan is wrong by."""
-    polar_deg: float = 100.0
+    polar_deg: Annotated[float, Range(1, 180)] = 100.0
     """Points within this angle of the occlusal direction belong to it; the rest is too near to what it stands in."""
-    outlier_sigmas: float = 5.0
+    outlier_sigmas: Annotated[float, Range(0.01, 1000)] = 5.0
     """Points farther from the fitted sphere than this many robust standard deviations are left out of the fit."""
-    least_points: int = 200
+    least_points: Annotated[int, Range(4, 10_000_000)] = 200
     """A sphere with fewer points is not measured."""
-    least_coverage_pct: float = 50.0
+    least_coverage_pct: Annotated[float, Range(0, 100)] = 50.0
     """A sphere of which less of the cap within ``polar_deg`` has points is not measured."""
-
-    def __post_init__(self) -> None:
-        if not (self.band_mm > 0 and self.outlier_sigmas > 0):
-            raise InputError("spheres: band_mm and outlier_sigmas must be positive")
-        if not 0 < self.polar_deg <= 180:
-            raise InputError(f"spheres: polar_deg is {self.polar_deg:g}; it must lie in 0-180")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -17,57 +17,46 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
 from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.holder import HolderOptions, with_holder
+from cuspid.options import Options, Range
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, depth_of_field_mm
 
 
 @dataclass(frozen=True, kw_only=True)
-class DesignOptions:
+class DesignOptions(Options):
     """What the designs of the thesis have in common."""
 
-    width_px: int = 500
+    width_px: Annotated[int, Range(16, 10_000)] = 500
     """Image width in px."""
-    height_px: int = 500
+    height_px: Annotated[int, Range(16, 10_000)] = 500
     """Image height in px."""
-    field_of_view_deg: float = 62.0
+    field_of_view_deg: Annotated[float, Range(1, 170)] = 62.0
     """Full horizontal angle of view."""
-    working_distance_mm: float = 5.0
+    working_distance_mm: Annotated[float, Range(0.1, 1000)] = 5.0
     """From the cameras to the surface that they look at."""
-    baseline_across_mm: float = 2.5
+    baseline_across_mm: Annotated[float, Range(0.01, 1000)] = 2.5
     """Between the two cameras across the arch (up and down the tooth for the side groups)."""
-    baseline_along_mm: float = 1.5
+    baseline_along_mm: Annotated[float, Range(0.01, 1000)] = 1.5
     """Between the two cameras along the curve of Spee."""
-    side_tilt_deg: float = 60.0
+    side_tilt_deg: Annotated[float, Range(-90, 90)] = 60.0
     """Angle between the occlusal axis and the axes of the buccal and lingual groups (twelve cameras only)."""
-    side_offset_mm: float = 4.5
+    side_offset_mm: Annotated[float, Range(-1000, 1000)] = 4.5
     """From the middle of the crown to where the side groups' axes meet its side (twelve cameras only)."""
-    side_depth_mm: float = 2.5
+    side_depth_mm: Annotated[float, Range(-1000, 1000)] = 2.5
     """From the cusp tips down to where the side groups' axes meet the side (twelve cameras only)."""
-    outer_distance_mm: float = 2.0
+    outer_distance_mm: Annotated[float, Range(0.01, 1000)] = 2.0
     """From the outer of the four cameras across the arch to the one more on either side (six cameras only)."""
-    outer_tilt_deg: float = 0.0
+    outer_tilt_deg: Annotated[float, Range(-89, 89)] = 0.0
     """How far the axes of these two lean towards the middle of the tooth (six cameras only)."""
     holder: HolderOptions = field(default_factory=HolderOptions)
     """What carries cameras and LEDs."""
-
-    def __post_init__(self) -> None:
-        if not self.working_distance_mm > 0:
-            raise InputError(f"design: the working distance {self.working_distance_mm:g} mm must be positive")
-        if min(self.width_px, self.height_px) < 1:
-            raise InputError(f"design: images of {self.width_px} x {self.height_px} px have no pixel")
-        if not (self.baseline_across_mm > 0 and self.baseline_along_mm > 0):
-            raise InputError("design: the baselines must be positive")
-        if not (self.outer_distance_mm > 0 and -90 < self.outer_tilt_deg < 90):
-            raise InputError("design: the outer cameras' distance must be positive and their tilt within -90 to 90 deg")
-        if not 0 < self.field_of_view_deg < 180:
-            raise InputError(f"design: field of view {self.field_of_view_deg} deg must lie between 0 and 180")
 
 
 def stereo_pair(options: DesignOptions = DesignOptions()) -> Handpiece:

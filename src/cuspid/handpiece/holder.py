@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
 from cuspid.body import CAMERA_MM, LED_MM, Body, Box, module
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.options import Options, Range
 from cuspid.rig import Handpiece
 
 _ALIKE_DEG = 20.0
@@ -22,27 +23,22 @@ _ALIKE_DEG = 20.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class HolderOptions:
+class HolderOptions(Options):
     """What carries cameras and LEDs."""
 
-    camera_mm: tuple[float, float, float] = CAMERA_MM
+    camera_mm: Annotated[tuple[float, float, float], Range(0.01, 1000)] = CAMERA_MM
     """Width, height and depth of a camera module, from its lens backwards."""
-    led_mm: tuple[float, float, float] = LED_MM
+    led_mm: Annotated[tuple[float, float, float], Range(0.01, 1000)] = LED_MM
     """The same of an LED."""
-    wall_mm: float = 0.8
+    wall_mm: Annotated[float, Range(0.01, 100)] = 0.8
     """Thickness of the plates and bars."""
-    bar_mm: float = 3.0
+    bar_mm: Annotated[float, Range(0.01, 1000)] = 3.0
     """Width of the bars that join the plates."""
-    neck_mm: float = 0.0
+    neck_mm: Annotated[float, Range(0, 1000)] = 0.0
     """Length of a neck that leaves the middle of the holder backwards along the path; 0 leaves it out, for where the
     handpiece leaves the mouth is not known."""
-    neck_width_mm: float = 6.0
+    neck_width_mm: Annotated[float, Range(0.01, 1000)] = 6.0
     """Width and height of the neck."""
-
-    def __post_init__(self) -> None:
-        lengths = (*self.camera_mm, *self.led_mm, self.wall_mm, self.bar_mm, self.neck_width_mm)
-        if min(lengths) <= 0 or self.neck_mm < 0:
-            raise InputError("holder: sizes of modules, walls, bars and neck must be positive")
 
 
 def with_holder(handpiece: Handpiece, options: HolderOptions = HolderOptions()) -> Handpiece:

@@ -7,44 +7,35 @@ the right of the image, +Y towards the cheek and up in the image, +Z out of the 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
 from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.handpiece.designs import looking_at
 from cuspid.handpiece.holder import HolderOptions, with_holder
+from cuspid.options import Options, Range
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 
 
 @dataclass(frozen=True, kw_only=True)
-class IntraOralOptions:
+class IntraOralOptions(Options):
     """A video camera that is held over the teeth."""
 
-    width_px: int = 640
+    width_px: Annotated[int, Range(16, 10_000)] = 640
     """Image width in px."""
-    height_px: int = 480
+    height_px: Annotated[int, Range(16, 10_000)] = 480
     """Image height in px."""
-    field_of_view_deg: float = 62.0
+    field_of_view_deg: Annotated[float, Range(1, 170)] = 62.0
     """Full horizontal angle of view."""
-    working_distance_mm: float = 14.0
+    working_distance_mm: Annotated[float, Range(0.1, 1000)] = 14.0
     """From the camera to the cusp tips."""
-    leds: int = 4
+    leds: Annotated[int, Range(1, 100)] = 4
     """LEDs around the lens."""
-    led_ring_mm: float = 3.0
+    led_ring_mm: Annotated[float, Range(0, 1000)] = 3.0
     """Radius of the ring of LEDs."""
     holder: HolderOptions = field(default_factory=HolderOptions)
     """What carries the camera and the LEDs."""
-
-    def __post_init__(self) -> None:
-        if self.width_px < 1 or self.height_px < 1:
-            raise InputError(f"camera: an image of {self.width_px} x {self.height_px} px shows nothing")
-        if not 0 < self.field_of_view_deg < 180:
-            raise InputError(f"camera: field of view {self.field_of_view_deg:g} deg must lie between 0 and 180")
-        if not self.working_distance_mm > 0:
-            raise InputError(f"camera: working distance {self.working_distance_mm:g} mm must be positive")
-        if self.leds < 1 or self.led_ring_mm < 0:
-            raise InputError("camera: at least one LED is needed, on a ring whose radius is not negative")
 
 
 def intra_oral_camera(options: IntraOralOptions = IntraOralOptions()) -> Handpiece:

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -30,6 +31,7 @@ from cuspid.handpiece.holder import with_holder
 from cuspid.handpiece.optics import Optics
 from cuspid.handpiece.precision import NoiseModel, bound_rms_um, noise_px, projection_jacobian
 from cuspid.mesh import Mesh
+from cuspid.options import SEED, Options, Range
 from cuspid.pairing import PairingOptions, stereo_pairs
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, MountedCamera
@@ -47,7 +49,7 @@ _BOUND_UM = 20.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchOptions:
+class SearchOptions(Options):
     """How long and how finely is searched."""
 
     noise: NoiseModel = field(default_factory=lambda: NoiseModel(sigma_px=0.5, convergence_deg=25.0))
@@ -56,20 +58,16 @@ class SearchOptions:
     """When a camera sees a face."""
     pairing: PairingOptions = field(default_factory=PairingOptions)
     """Which cameras depth is measured from."""
-    points: int = 80
+    points: Annotated[int, Range(1, 100_000)] = 80
     """Faces of each section at which the bound is asked."""
-    samples: int = 4
+    samples: Annotated[int, Range(0, 64)] = 4
     """Shapes drawn for each layout, beside the thesis' own."""
-    finalists: int = 3
+    finalists: Annotated[int, Range(1, 1000)] = 3
     """Layouts whose shape is refined."""
-    evaluations: int = 80
+    evaluations: Annotated[int, Range(1, 1_000_000)] = 80
     """Designs tried while a shape is refined."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """Chooses the drawn shapes."""
-
-    def __post_init__(self) -> None:
-        if min(self.points, self.finalists, self.evaluations) < 1 or self.samples < 0:
-            raise InputError("design: points, finalists and evaluations must be positive, samples not negative")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

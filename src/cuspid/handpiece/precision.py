@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -26,31 +27,24 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, read_only
 from cuspid.handpiece.optics import Optics
 from cuspid.mesh import Mesh
+from cuspid.options import Options, Range
 from cuspid.rig import Handpiece, MountedCamera
 from cuspid.visibility import VisibilityOptions, survey_visibility
 
 
 @dataclass(frozen=True, kw_only=True)
-class NoiseModel:
+class NoiseModel(Options):
     """Standard deviation of a matched image point, as its circumstances make it worse; the terms add up."""
 
-    sigma_px: float = 0.5
+    sigma_px: Annotated[float, Range(1e-06, 1000)] = 0.5
     """In each image and each direction, on matching a sharp point that all cameras see squarely."""
-    convergence_deg: float | None = None
+    convergence_deg: Annotated[float | None, Range(0.001, 1000)] = None
     """Convergence that doubles the variance: sigma^2 (1 + (gamma / this)^4); None: no influence."""
-    deformation: float | None = None
+    deformation: Annotated[float | None, Range(1e-06, 1000)] = None
     """Deformation (no unit) that doubles the variance: sigma^2 (1 + (g / this)^2). Needs the normals of the surface;
     None: no influence."""
-    blur_px: float | None = None
+    blur_px: Annotated[float | None, Range(1e-06, 1000)] = None
     """Diameter of the blur disc that doubles the variance: sigma^2 (1 + (c / this)^2); None: no influence."""
-
-    def __post_init__(self) -> None:
-        terms = (self.convergence_deg, self.deformation, self.blur_px)
-        if not self.sigma_px > 0 or any(term is not None and not term > 0 for term in terms):
-            raise InputError(
-                f"noise model: sigma ({self.sigma_px:g} px) and what doubles the variance (convergence, deformation, "
-                f"blur: {terms}) must be larger than 0"
-            )
 
 
 def projection_jacobian(

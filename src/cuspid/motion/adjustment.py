@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -44,6 +44,7 @@ from cuspid.motion.normal_equations import (
     settle,
     substitute,
 )
+from cuspid.options import Options, Range
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
 from cuspid.sparse_model import SparseModel
@@ -58,25 +59,25 @@ _CHANCE = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
-class AdjustmentOptions:
+class AdjustmentOptions(Options):
     """How the bundle adjustment weighs and rejects observations and when it stops."""
 
-    sigma_px: float = 0.4
+    sigma_px: Annotated[float, Range(0.0001, 100)] = 0.4
     """Standard deviation of a keypoint to start with, px; the adjustment estimates it anew in each round."""
-    huber_sigmas: float = 2.0
+    huber_sigmas: Annotated[float, Range(0.01, 1000)] = 2.0
     """Residual length, in standard deviations, beyond which an observation counts less."""
-    outlier_sigmas: float = 4.0
+    outlier_sigmas: Annotated[float, Range(0.1, 1000)] = 4.0
     """Residual length, in standard deviations, beyond which an observation is dropped after a round."""
-    start_px: float = 20.0
+    start_px: Annotated[float, Range(0.01, 100_000)] = 20.0
     """Residual length beyond which an observation is dropped before the first round, px."""
-    rounds: int = 3
+    rounds: Annotated[int, Range(1, 1000)] = 3
     """Number of times that the minimum is sought, with outliers dropped in between."""
-    iterations: int = 30
+    iterations: Annotated[int, Range(1, 100_000)] = 30
     """Most steps in a round."""
-    tolerance: float = 0.01
+    tolerance: Annotated[float, Range(1e-12, 1000)] = 0.01
     """A round ends when the cost, in squared standard deviations, would fall by less than this: all unknowns together
     are then within the root of it of their best values, measured in their standard deviations."""
-    minimum_angle_deg: float = 1.0
+    minimum_angle_deg: Annotated[float, Range(0, 90)] = 1.0
     """Points whose rays meet at less than this angle are dropped."""
 
 

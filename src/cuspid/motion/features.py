@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from jaxtyping import Float, Int, UInt8
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET
 from cuspid.capture import Capture, Frame
+from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.storage.files import write_arrays
 from cuspid.storage.stages import Stage
@@ -27,16 +29,16 @@ DESCRIPTOR_NORM = 512.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class FeatureOptions:
+class FeatureOptions(Options):
     """Which keypoints are taken from an image."""
 
-    count: int = 2000
+    count: Annotated[int, Range(10, 1_000_000)] = 2000
     """Most keypoints in an image; the strongest of each cell come first."""
-    contrast: float = 0.02
+    contrast: Annotated[float, Range(0, 1)] = 0.02
     """Least contrast of a keypoint, share of the grey range (OpenCV's ``contrastThreshold``)."""
-    edge: float = 10.0
+    edge: Annotated[float, Range(1, 1000000.0)] = 10.0
     """Largest ratio of the curvatures of a keypoint (OpenCV's ``edgeThreshold``); more takes in points on edges."""
-    cell_px: int = 25
+    cell_px: Annotated[int, Range(1, 10_000)] = 25
     """Size of the cells over which keypoints are spread."""
     upright: bool = True
     """Descriptors along the image's axes; False estimates an orientation for each keypoint, for free-hand turns of

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,6 +18,7 @@ from cuspid.motion.adjustment import AdjustmentOptions, adjust_model
 from cuspid.motion.features import Features
 from cuspid.motion.pairs import MatchingOptions, View, make_view, match_guided
 from cuspid.motion.tracks import intersect_rays, join
+from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Tracks
 from cuspid.sparse_model import SparseModel
@@ -29,21 +31,21 @@ _NEIGHBOURS = 5
 
 
 @dataclass(frozen=True, kw_only=True)
-class GuidedOptions:
+class GuidedOptions(Options):
     """How the first poses are refined."""
 
-    steps: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 8)
+    steps: Annotated[tuple[int, ...], Range(1, 100_000)] = (1, 2, 3, 4, 5, 6, 8)
     """A frame is matched with those so many frames later."""
-    tolerances_px: tuple[float, ...] = (8.0, 4.0, 4.0)
+    tolerances_px: Annotated[tuple[float, ...], Range(0.01, 1000)] = (8.0, 4.0, 4.0)
     """Largest distance of a match from the epipolar line in each round."""
-    depth_shares: tuple[float, ...] = (0.28, 0.12, 0.06)
+    depth_shares: Annotated[tuple[float, ...], Range(0.001, 10)] = (0.28, 0.12, 0.06)
     """A point's depth is looked for within this share of the depth that its neighbours have, in each round: along edges
     there are keypoints enough to match a wrong one farther off."""
     matching: MatchingOptions = field(default_factory=lambda: MatchingOptions(ratio=0.8, similarity=0.85))
     """What else counts as a match."""
-    minimum_views: int = 4
+    minimum_views: Annotated[int, Range(2, 1000)] = 4
     """Shorter tracks are left out, but where a frame would lose all."""
-    start_px: float = 12.0
+    start_px: Annotated[float, Range(0.01, 10_000)] = 12.0
     """Residual beyond which an observation is dropped before the first adjustment; half of it later."""
     adjustment: AdjustmentOptions = field(
         default_factory=lambda: AdjustmentOptions(sigma_px=0.5, outlier_sigmas=3.0, rounds=4, iterations=60)
@@ -51,6 +53,7 @@ class GuidedOptions:
     """The adjustment."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.tolerances_px or len(self.tolerances_px) != len(self.depth_shares):
             raise InputError(
                 f"guided matching: {len(self.tolerances_px)} tolerances and {len(self.depth_shares)} depth shares; "

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -30,6 +31,7 @@ from cuspid.motion.odometry import (
 )
 from cuspid.motion.pairs import MatchingOptions, frame_pairs, make_view, match_guided
 from cuspid.motion.tracks import intersect_rays, join, thin
+from cuspid.options import SEED, SHARE, Options, Range
 from cuspid.pairing import PairingOptions, resolved_mm, stereo_pairs
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, Tracks
@@ -38,7 +40,7 @@ from cuspid.workers import map_in_threads
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotionOptions:
+class MotionOptions(Options):
     """How the handpiece's way is found from features."""
 
     features: FeatureOptions = field(default_factory=FeatureOptions)
@@ -51,18 +53,18 @@ class MotionOptions:
     """First poses."""
     across_frames: MatchingOptions = field(default_factory=lambda: MatchingOptions(tolerance_px=3.0))
     """Matching of a camera with itself across frames (motion stereo), once the poses are known about."""
-    reach: int = 3
+    reach: Annotated[int, Range(1, 1000)] = 3
     """A camera is matched with itself at +1 to +reach frames."""
-    depth_slack: float = 8.3
+    depth_slack: Annotated[float, Range(0, 100_000)] = 8.3
     """Uncertainty of the depth of a point triangulated within a frame, when it is looked for in another, in resolutions
     of the handpiece (0.1 mm at 12 um)."""
-    cell_px: float = 35.0
+    cell_px: Annotated[float, Range(0, 10_000)] = 35.0
     """Every cell of this size of an image keeps its longest track for the adjustment; 0 keeps all tracks."""
-    minimum_located: float = 0.5
+    minimum_located: Annotated[float, SHARE] = 0.5
     """Least share (0 to 1) of the frames that must be located for a result."""
     adjustment: AdjustmentOptions = field(default_factory=AdjustmentOptions)
     """The final refinement."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """Of the random samples of the pose estimation."""
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 import pycolmap
@@ -23,6 +24,7 @@ from cuspid.motion.features import Features, spread
 from cuspid.motion.normal_equations import pose_equations
 from cuspid.motion.pairs import MatchingOptions, View, match_guided, match_unguided
 from cuspid.motion.tracks import intersect_rays, join
+from cuspid.options import SHARE, Options, Range
 from cuspid.rig import Handpiece, Rig
 from cuspid.workers import map_in_threads
 
@@ -36,18 +38,18 @@ _DECIMALS = 9
 
 
 @dataclass(frozen=True, kw_only=True)
-class OdometryOptions:
+class OdometryOptions(Options):
     """How a frame is placed relative to its neighbours."""
 
-    reach: int = 3
+    reach: Annotated[int, Range(1, 1000)] = 3
     """Frames are tied to those at +1, where that fails to those at +2, and so on up to this."""
-    minimum_matches: int = 15
+    minimum_matches: Annotated[int, Range(4, 100_000)] = 15
     """Fewest consistent matches that place a frame."""
-    minimum_share: float = 0.15
+    minimum_share: Annotated[float, SHARE] = 0.15
     """Least share (0 to 1) of the matches to a neighbour that must be consistent."""
-    error_px: float = 4.0
+    error_px: Annotated[float, Range(0.01, 1000)] = 4.0
     """Largest reprojection error of a consistent match, px."""
-    most_per_camera: int = 200
+    most_per_camera: Annotated[int, Range(4, 1_000_000)] = 200
     """Points of a frame that are looked for in a camera of another; those that most cameras saw come first."""
     unguided: MatchingOptions = field(default_factory=lambda: MatchingOptions(ratio=0.8))
     """Matching where nothing is known of the motion."""

@@ -10,7 +10,7 @@ field the bounds; across frames the odometry gives the pose, and a point that is
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import no_type_check
+from typing import Annotated, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,6 +19,7 @@ from numba import njit
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.motion.features import DESCRIPTOR_NORM, Features
+from cuspid.options import SHARE, Options, Range
 
 _CELL_PX = 12.0
 _NEAREST_SHARE = 0.01
@@ -26,16 +27,16 @@ _NEAREST_SHARE = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
-class MatchingOptions:
+class MatchingOptions(Options):
     """What counts as a match."""
 
-    tolerance_px: float = 2.0
+    tolerance_px: Annotated[float, Range(0.01, 1000)] = 2.0
     """Largest distance from the epipolar segment, px."""
-    similarity: float = 0.8
+    similarity: Annotated[float, SHARE] = 0.8
     """Least cosine between two descriptors, 0 to 1."""
-    ratio: float = 0.85
+    ratio: Annotated[float, Range(0.01, 1)] = 0.85
     """Largest ratio of the distance to the best descriptor over that to the second best elsewhere."""
-    apart_px: float = 3.0
+    apart_px: Annotated[float, Range(0, 1000)] = 3.0
     """A second-best keypoint nearer than this to the best one, px, does not count as elsewhere."""
 
 

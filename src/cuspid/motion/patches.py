@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple, no_type_check
+from typing import Annotated, NamedTuple, no_type_check
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from numba import njit
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET
+from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Tracks
 from cuspid.sparse_model import SparseModel
@@ -31,24 +32,24 @@ _STILL_PX = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
-class PatchOptions:
+class PatchOptions(Options):
     """Which patches are followed, and what counts as found."""
 
-    radius_px: int = 7
+    radius_px: Annotated[int, Range(1, 100)] = 7
     """Half the width of a patch."""
-    blur_px: float = 1.0
+    blur_px: Annotated[float, Range(0, 100)] = 1.0
     """Standard deviation of the Gaussian filter before."""
-    reach: int = 12
+    reach: Annotated[int, Range(1, 10_000)] = 12
     """A patch is looked for so many frames before and after its own."""
-    turn_deg: float = 40.0
+    turn_deg: Annotated[float, Range(0, 180)] = 40.0
     """Not in frames that look at it from a direction that differs by more."""
-    limit_px: float = 3.0
+    limit_px: Annotated[float, Range(0.01, 1000)] = 3.0
     """Farthest from where it should be."""
-    correlation: float = 0.85
+    correlation: Annotated[float, Range(-1, 1)] = 0.85
     """Least correlation (-1 to 1) of the patch with where it is found."""
-    iterations: int = 15
+    iterations: Annotated[int, Range(1, 10_000)] = 15
     """Most steps of an alignment."""
-    minimum_views: int = 4
+    minimum_views: Annotated[int, Range(2, 1000)] = 4
     """Points that are found in fewer frames are left as they were."""
 
 

@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -27,6 +28,7 @@ from cuspid.motion.features import FeatureOptions, Features, detect
 from cuspid.motion.guided import GuidedOptions, refine
 from cuspid.motion.pairs import MatchingOptions, match_unguided
 from cuspid.motion.patches import PatchOptions, lengthen
+from cuspid.options import SEED, SHARE, Options, Range
 from cuspid.panorama import FrameUse
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Tracks
@@ -48,40 +50,40 @@ _WINDOW = 15
 
 
 @dataclass(frozen=True, kw_only=True)
-class SingleOptions:
+class SingleOptions(Options):
     """How the trajectory of one camera is found."""
 
     features: FeatureOptions = field(default_factory=lambda: FeatureOptions(count=2500, contrast=0.004, edge=30.0))
     """Keypoints of the contrast-normalised frames; plain enamel needs a low threshold."""
-    clahe_clip: float = 1.5
+    clahe_clip: Annotated[float, Range(0.01, 1000)] = 1.5
     """Clip limit of the contrast normalisation (CLAHE)."""
-    clahe_tiles: int = 4
+    clahe_tiles: Annotated[int, Range(1, 100)] = 4
     """Tiles of the contrast normalisation along each side."""
     matching: MatchingOptions = field(default_factory=lambda: MatchingOptions(ratio=0.85))
     """First matching, when nothing is known of the motion."""
-    steps: tuple[int, ...] = (1, 2, 3, 4, 6)
+    steps: Annotated[tuple[int, ...], Range(1, 100_000)] = (1, 2, 3, 4, 6)
     """A frame is matched with those so many frames later."""
     guided: GuidedOptions = field(default_factory=GuidedOptions)
     """How the mapper's poses are refined."""
     patches: PatchOptions = field(default_factory=PatchOptions)
     """How points are followed into more frames at the end."""
-    focal_share: float = 0.03
+    focal_share: Annotated[float, Range(0.0001, 10)] = 0.03
     """Without a calibration: standard deviation of the mapper's focal length, as a share (0 to 1) of it."""
-    bridge_steps: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 8, 10)
+    bridge_steps: Annotated[tuple[int, ...], Range(1, 100_000)] = (1, 2, 3, 4, 5, 6, 8, 10)
     """Where the model broke: frames to match with instead, at a looser ratio."""
-    bridge_ratio: float = 0.95
+    bridge_ratio: Annotated[float, Range(0.01, 1)] = 0.95
     """Ratio test of the matching where the model broke."""
-    error_px: float = 2.0
+    error_px: Annotated[float, Range(0.01, 1000)] = 2.0
     """Largest distance of a match from its epipolar line, px."""
-    minimum_matches: int = 15
+    minimum_matches: Annotated[int, Range(4, 100_000)] = 15
     """Fewest consistent matches that verify a pair of frames, or place a frame in the model."""
-    minimum_share: float = 0.3
+    minimum_share: Annotated[float, SHARE] = 0.3
     """Least share (0 to 1) of the matches of two frames that must be consistent."""
-    blurred_share: float = 0.4
+    blurred_share: Annotated[float, SHARE] = 0.4
     """A frame with less than this share (0 to 1) of the sharpness of its neighbours is left out."""
-    field_of_view_deg: float = 60.0
+    field_of_view_deg: Annotated[float, Range(1, 170)] = 60.0
     """First guess of the horizontal angle of view where there is no calibration."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """Of the random samples."""
 
 

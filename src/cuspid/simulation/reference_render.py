@@ -7,12 +7,14 @@ the thesis assumes of the frames. Pixels: see :class:`cuspid.trueness.ReferenceR
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int16
 
 from cuspid.errors import InputError
 from cuspid.mesh import RayHits
+from cuspid.options import Options, Range
 from cuspid.simulation.raycast import BRIGHT_LEVEL, BRIGHT_PERCENTILE, Lamps, Scene, radiance_along
 from cuspid.simulation.sensor import expose
 from cuspid.trueness import NOTHING, ReferenceRender
@@ -26,19 +28,15 @@ _ROWS = 64
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReferenceRenderOptions:
+class ReferenceRenderOptions(Options):
     """How the jaw is rendered from above."""
 
-    mm_per_px: float = 0.05
+    mm_per_px: Annotated[float, Range(0.001, 10)] = 0.05
     """Millimetres a pixel, in the occlusal plane."""
-    margin_mm: float = 2.0
+    margin_mm: Annotated[float, Range(0, 1000)] = 2.0
     """Room around the jaw."""
-    camera_height_mm: float | None = None
+    camera_height_mm: Annotated[float | None, Range(0.1, 100_000)] = None
     """Of the camera and its light above the occlusal plane; None for an orthographic view."""
-
-    def __post_init__(self) -> None:
-        if not self.mm_per_px > 0 or self.margin_mm < 0:
-            raise InputError("reference render: mm per px must be positive and the margin not negative")
 
 
 def render_reference(scene: Scene, options: ReferenceRenderOptions = ReferenceRenderOptions()) -> ReferenceRender:

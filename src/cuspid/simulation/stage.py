@@ -6,14 +6,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from cuspid.capture import Capture, ImageFolder
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
+from cuspid.options import SEED, Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece
 from cuspid.simulation.appearance import APPEARANCES, Preset
@@ -33,23 +33,17 @@ from cuspid.workers import usable_cores
 
 
 @dataclass(frozen=True, kw_only=True)
-class RenderOptions:
+class RenderOptions(Options):
     """What the images of a simulation look like."""
 
     texture: Preset = "artificial"
     """Surface: artificial (strong matte texture, the thesis' condition), powder (weak speckle), enamel (plain, wet)."""
     renderer: Literal["embree", "blender"] = "embree"
     """Embree rays (default), or Blender Cycles with subsurface scattering (needs an environment of its own)."""
-    supersampling: int = 2
+    supersampling: Annotated[int, Range(1, 16)] = 2
     """Rays through a pixel along each side."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """Chooses texture, hand jitter and sensor noise."""
-
-    def __post_init__(self) -> None:
-        if self.supersampling < 1:
-            raise InputError(f"simulation: --supersampling is {self.supersampling}; at least 1 is needed")
-        if self.seed < 0:
-            raise InputError(f"simulation: --seed is {self.seed}; it must not be negative")
 
 
 @dataclass(frozen=True, kw_only=True)

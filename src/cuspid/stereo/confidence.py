@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -16,30 +17,31 @@ from jaxtyping import Bool, Float, Int
 
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
+from cuspid.options import Options, Range
 
 
 @dataclass(frozen=True, kw_only=True)
-class ConfidenceOptions:
+class ConfidenceOptions(Options):
     """What is kept of the measured depth and how it is weighted."""
 
-    pair_agreement: float = 0.9
+    pair_agreement: Annotated[float, Range(0, 100)] = 0.9
     """The same where only two cameras look, whom no third one contradicts."""
-    agreement: float = 2.5
+    agreement: Annotated[float, Range(0.01, 1000)] = 2.5
     """Depths of two cameras agree within this many resolutions (0.03 mm at 12 um), or within three standard deviations
     where that is more."""
-    largest_sigma: float = 5 / 6
+    largest_sigma: Annotated[float, Range(0.001, 1000)] = 5 / 6
     """A depth with a standard deviation of more resolutions (0.01 mm at 12 um) is dropped."""
-    best_sigma: float = 1 / 6
+    best_sigma: Annotated[float, Range(0.0001, 100)] = 1 / 6
     """Standard deviation, in resolutions at the working distance (0.002 mm at 12 um), that has confidence 1; the
     confidence falls with its inverse square."""
-    border_px: int = 2
+    border_px: Annotated[int, Range(0, 1000)] = 2
     """Of two cameras, pixels so near to the border of a surface that lies before another one are dropped: no third
     camera looks past it."""
-    border_jump: float = 2.0
+    border_jump: Annotated[float, Range(0, 1000)] = 2.0
     """How far the other one lies behind, in resolutions, to be another one."""
-    speckle_px: int = 100
+    speckle_px: Annotated[int, Range(0, 1_000_000)] = 100
     """Connected pieces of fewer depth pixels are dropped."""
-    speckle_jump: float = 5.0
+    speckle_jump: Annotated[float, Range(0.01, 10_000)] = 5.0
     """Neighbours that differ by more resolutions (0.06 mm at 12 um), in proportion to their depth, are not
     connected."""
 

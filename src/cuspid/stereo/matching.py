@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from jaxtyping import Float, Int, UInt8
 
 from cuspid.camera import Camera
 from cuspid.errors import InputError
+from cuspid.options import Options, Range
 from cuspid.pairing import PairingOptions, camera_groups, resolved_mm, stereo_pairs
 from cuspid.reconstruction import DepthMap
 from cuspid.rig import Handpiece, Rig
@@ -33,12 +35,12 @@ from cuspid.stereo.seeds import PairMatcher, seed_pairs, seed_points, semi_globa
 
 
 @dataclass(frozen=True, kw_only=True)
-class StereoOptions:
+class StereoOptions(Options):
     """Depth within one frame."""
 
-    spacing_px: int = 3
+    spacing_px: Annotated[int, Range(1, 100)] = 3
     """Depth is measured at every so many pixels."""
-    seed_scale: float = 0.5
+    seed_scale: Annotated[float, Range(0.05, 1)] = 0.5
     """Resolution of the first matching relative to the images."""
     pairing: PairingOptions = field(default_factory=PairingOptions)
     """Which cameras make a group."""

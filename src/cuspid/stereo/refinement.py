@@ -15,12 +15,14 @@ taken to be occluded and left out. Pixels are OpenCV's here: the first centre is
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, no_type_check
+from typing import Annotated, NamedTuple, no_type_check
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
+
+from cuspid.options import Options, Range
 
 Q, Q_U, Q_V, SCORE, VARIANCE, SUPPORT = range(6)
 """Channels of a refined field: the plane, mean ZNCC of the cameras used, variance of q, how many cameras."""
@@ -31,29 +33,29 @@ FAST = {"cache": True, "nogil": True, "fastmath": {"contract", "reassoc", "arcp"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefinementOptions:
+class RefinementOptions(Options):
     """Multi-camera refinement of depth."""
 
-    radius_px: int = 3
+    radius_px: Annotated[int, Range(1, 50)] = 3
     """Half the side of the window (3: 7 x 7 px)."""
-    window_sigma_px: float = 2.0
+    window_sigma_px: Annotated[float, Range(0.1, 100)] = 2.0
     """Width of the Gaussian weight over the window."""
-    iterations: int = 10
+    iterations: Annotated[int, Range(0, 1000)] = 10
     """Most Gauss-Newton steps."""
-    converged_px: float = 0.06
+    converged_px: Annotated[float, Range(1e-06, 10)] = 0.06
     """A step below this many px of disparity ends the iterations."""
-    camera_zncc: float = 0.5
+    camera_zncc: Annotated[float, Range(-1, 1)] = 0.5
     """A camera below this correlation is taken to be occluded."""
-    camera_zncc_lag: float = 0.25
+    camera_zncc_lag: Annotated[float, Range(0, 2)] = 0.25
     """A camera that falls this much behind the best is taken to be occluded."""
-    accept_zncc: float = 0.75
+    accept_zncc: Annotated[float, Range(-1, 1)] = 0.75
     """Mean correlation from which a plane is kept and handed to neighbours, where the texture drowns the noise."""
-    weak_zncc: float = 0.6
+    weak_zncc: Annotated[float, Range(-1, 1)] = 0.6
     """The same at most where it does not: noise of standard deviation n leaves of the correlation of a texture of
     standard deviation c the share c^2 / (c^2 + n^2)."""
-    least_contrast: float = 1.2
+    least_contrast: Annotated[float, Range(0, 1000)] = 1.2
     """Standard deviation of a window, in those of the noise, below which it carries no texture."""
-    propagations: int = 1
+    propagations: Annotated[int, Range(0, 100)] = 1
     """How often planes are propagated to neighbours without one, in each direction."""
 
 

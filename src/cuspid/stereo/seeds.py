@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from cuspid.options import Options, Range
 from cuspid.rig import Rig
 from cuspid.stereo.rectification import RectifiedPair
 
@@ -24,18 +26,18 @@ second image) to the disparity at each pixel of the first, NaN where unknown. fl
 
 
 @dataclass(frozen=True, kw_only=True)
-class SemiGlobalOptions:
+class SemiGlobalOptions(Options):
     """Semi-global matching (OpenCV's StereoSGBM)."""
 
-    block_px: int = 5
+    block_px: Annotated[int, Range(1, 101)] = 5
     """Side of the matched block."""
-    small_jump_penalty: int = 8
+    small_jump_penalty: Annotated[int, Range(0, 10_000)] = 8
     """Penalty for a disparity change of 1 px between neighbours, per pixel of the block."""
-    large_jump_penalty: int = 32
+    large_jump_penalty: Annotated[int, Range(0, 10_000)] = 32
     """Penalty for a larger change, per pixel of the block."""
-    uniqueness_percent: int = 5
+    uniqueness_percent: Annotated[int, Range(0, 100)] = 5
     """By how much the best cost must beat the second best."""
-    left_right_tolerance_px: float = 1.0
+    left_right_tolerance_px: Annotated[float, Range(0, 1000)] = 1.0
     """Largest difference between the disparities found in the two directions."""
 
 

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import UInt8
 
 from cuspid.geometry import Rigid3
+from cuspid.options import SHARE, Options, Range
 from cuspid.pairing import resolved_mm, stereo_pairs
 from cuspid.reconstruction import DepthMap
 from cuspid.rig import Handpiece, MountedCamera, Rig
@@ -21,16 +23,16 @@ from cuspid.stereo.matching import DepthEstimator, StereoOptions
 
 
 @dataclass(frozen=True, kw_only=True)
-class TemporalOptions:
+class TemporalOptions(Options):
     """Temporal stereo of consecutive frames."""
 
     enabled: bool = True
     """Whether to measure it at all."""
-    confidence_share: float = 0.05
+    confidence_share: Annotated[float, SHARE] = 0.05
     """Its confidence relative to depth from one frame."""
-    least_baseline_share: float = 0.08
+    least_baseline_share: Annotated[float, Range(0, 10)] = 0.08
     """Smallest movement of a camera relative to the working distance."""
-    largest_turn_deg: float = 20.0
+    largest_turn_deg: Annotated[float, Range(0, 180)] = 20.0
     """Largest turn of the handpiece between the frames."""
     stereo: StereoOptions = field(default_factory=StereoOptions)
     """Matching and checks, as within a frame."""

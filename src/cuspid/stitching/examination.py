@@ -11,31 +11,26 @@ which cannot be meant as printed (the translation may be 10 % by the test before
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.errors import InputError
+from cuspid.options import Options, Range
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExaminationOptions:
+class ExaminationOptions(Options):
     """What the homography between consecutive frames may do; the defaults are those of the thesis."""
 
-    smallest_angle_deg: float = 80.0
+    smallest_angle_deg: Annotated[float, Range(0, 90)] = 80.0
     """Smallest inner angle at a warped corner."""
-    largest_angle_deg: float = 110.0
+    largest_angle_deg: Annotated[float, Range(90, 180)] = 110.0
     """Largest inner angle at a warped corner."""
-    largest_translation: float = 0.10
+    largest_translation: Annotated[float, Range(0.001, 100)] = 0.10
     """Shift of the frame's centre as a share (0 to 1) of the fixed frame's width, and of its height."""
-    smallest_scale: float = 0.85
+    smallest_scale: Annotated[float, Range(0.001, 0.999)] = 0.85
     """Scale (root of the ratio of areas); the largest is 1 over this."""
-
-    def __post_init__(self) -> None:
-        if not self.smallest_angle_deg < 90 < self.largest_angle_deg:
-            raise InputError("examination: 90 deg must lie between the smallest and the largest angle")
-        if not (self.largest_translation > 0 and 0 < self.smallest_scale < 1):
-            raise InputError("examination: the translation must be positive, and the smallest scale between 0 and 1")
 
 
 def frame_corners(size: tuple[int, int]) -> Float[np.ndarray, "4 2"]:

@@ -9,9 +9,12 @@ tops of highlights do not pull the gains down.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+from cuspid.options import Options, Range
 
 _ROUNDS = 12
 _STRIDE = 3
@@ -19,16 +22,16 @@ _STRIDE = 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class GainOptions:
+class GainOptions(Options):
     """How brightness is evened out."""
 
     gains: bool = True
     """Whether each frame has its own gain."""
     falloff: bool = True
     """Whether the falloff of the light is taken out."""
-    gain_sd: float = 0.2
+    gain_sd: Annotated[float, Range(0.0001, 100)] = 0.2
     """Prior standard deviation of the logarithm of the gains."""
-    noise_sd: float = 0.1
+    noise_sd: Annotated[float, Range(0.0001, 100)] = 0.1
     """Standard deviation of the logarithm of a sample: shading and highlights."""
 
 

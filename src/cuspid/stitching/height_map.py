@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import no_type_check
+from typing import Annotated, no_type_check
 
 import cv2
 import numpy as np
@@ -19,8 +19,8 @@ from scipy.ndimage import gaussian_filter, grey_dilation
 from scipy.spatial import KDTree
 from skimage.morphology import remove_small_holes
 
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.options import Options, Range
 from cuspid.sparse_model import SparseModel
 
 NOMINAL_MM = 14.0
@@ -53,27 +53,23 @@ _CROWN_MM = 1.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScaleOptions:
+class ScaleOptions(Options):
     """What one camera cannot know: how large things are."""
 
-    working_distance_mm: float | None = None
+    working_distance_mm: Annotated[float | None, Range(0.1, 10_000)] = None
     """Median height of the camera over the tips of the cusps; None takes it from the calibration file, and where that
     does not say it, no millimetres are claimed."""
-    width_mm: float | None = None
+    width_mm: Annotated[float | None, Range(1, 1000)] = None
     """Known greatest width of the arch over the teeth, left to right; goes before the working distance."""
-
-    def __post_init__(self) -> None:
-        if min(self.working_distance_mm or 1.0, self.width_mm or 1.0) <= 0:
-            raise InputError("scale: working distance and width must be positive, in mm")
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeightMapOptions:
+class HeightMapOptions(Options):
     """How coarse the surface is."""
 
-    cell_mm: float = 0.4
+    cell_mm: Annotated[float, Range(0.01, 10)] = 0.4
     """Spacing of the height map."""
-    smoothing_mm: float = 0.5
+    smoothing_mm: Annotated[float, Range(0, 100)] = 0.5
     """Standard deviation of the Gaussian filter over the height map."""
 
 

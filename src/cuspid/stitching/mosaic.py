@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from skimage.morphology import remove_small_objects
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.geometry import Rigid3
+from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.gain_compensation import Compensation, GainOptions, Samples, balance
@@ -43,14 +45,14 @@ BURNT, DARK = 245, 20
 
 
 @dataclass(frozen=True, kw_only=True)
-class MosaicOptions:
+class MosaicOptions(Options):
     """How frames become one picture."""
 
-    mm_per_px: float | None = None
+    mm_per_px: Annotated[float | None, Range(0.001, 10)] = None
     """Size of a pixel in mm; None for that of the frames where they look straight down."""
-    border_px: int = 6
+    border_px: Annotated[int, Range(0, 10_000)] = 6
     """This much at the border of the frames is not used."""
-    bands_px: tuple[float, ...] = (1.5, 6.0, 24.0)
+    bands_px: Annotated[tuple[float, ...], Range(0.1, 1000)] = (1.5, 6.0, 24.0)
     """Standard deviations in px of the Gaussians between the bands of frequencies."""
     seams: SeamOptions = field(default_factory=SeamOptions)
     """How the frame of each pixel is chosen."""

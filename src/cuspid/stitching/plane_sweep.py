@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple, no_type_check
+from typing import Annotated, NamedTuple, no_type_check
 
 import cv2
 import numpy as np
@@ -27,6 +27,7 @@ from skimage.restoration import inpaint_biharmonic
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera, undistortion_maps
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.height_map import HOLE_MM2, HeightMap
@@ -59,41 +60,39 @@ _DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1,
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlaneSweepOptions:
+class PlaneSweepOptions(Options):
     """The dense surface."""
 
     enabled: bool = True
     """Whether to look for it; else a smooth surface through the sparse points of the motion serves."""
-    cell_mm: float = 0.1
+    cell_mm: Annotated[float, Range(0.01, 10)] = 0.1
     """Spacing of the places at which frames are compared, if it is not less than a pixel; the height map has twice as
     much."""
-    step_mm: float = 0.2
+    step_mm: Annotated[float, Range(0.01, 10)] = 0.2
     """Distance of the planes, if from one to the next what is compared shifts by half a pixel at least."""
-    depth_mm: float = 11.0
+    depth_mm: Annotated[float, Range(0.1, 100)] = 11.0
     """The lowest plane lies so far below the occlusal one."""
-    window: int = 5
+    window: Annotated[int, Range(3, 101)] = 5
     """Side of the window that is compared, in cells."""
-    detail_px: float = 4.0
+    detail_px: Annotated[float, Range(0.1, 1000)] = 4.0
     """Fine detail is what a Gaussian filter of this standard deviation takes from a frame, px."""
-    baseline_share: float = 0.2
+    baseline_share: Annotated[float, Range(0.001, 10)] = 0.2
     """Frames are compared that lie about this share of the distance to the teeth apart."""
-    small_jump: float = 0.03
+    small_jump: Annotated[float, Range(0, 1000)] = 0.03
     """Penalty of a height that differs by one plane from its neighbour's; the ZNCC costs 1 to 0."""
-    large_jump: float = 0.5
+    large_jump: Annotated[float, Range(0, 1000)] = 0.5
     """Penalty of a height that differs by more."""
-    smoothing_mm: float = 0.24
+    smoothing_mm: Annotated[float, Range(0.001, 100)] = 0.24
     """Standard deviation of the Gaussian filter over the heights."""
-    agreement: float = 0.15
+    agreement: Annotated[float, Range(-1, 1)] = 0.15
     """Places with a lower mean ZNCC (0 to 1) at their height show nothing that is known."""
 
     def __post_init__(self) -> None:
-        lengths = (self.cell_mm, self.step_mm, self.depth_mm, self.detail_px, self.baseline_share, self.smoothing_mm)
-        if min(lengths) <= 0 or self.window < 3 or self.window % 2 == 0:
-            raise InputError("plane sweep: lengths and shares must be positive, and the window an odd number from 3")
-        if not 0 <= self.small_jump <= self.large_jump:
-            raise InputError(
-                "plane sweep: a small jump must cost something and a large one no less: 0 <= small <= large"
-            )
+        super().__post_init__()
+        if self.window % 2 == 0:
+            raise InputError(f"plane sweep: --window is {self.window}; it must be odd")
+        if not self.small_jump <= self.large_jump:
+            raise InputError("plane sweep: a large jump must cost no less than a small one")
 
 
 # --- which frames are compared -----------------------------------------------------------------------------------

@@ -7,30 +7,33 @@ and V = seam + jump |colour(c, l_c) - colour(d, l_d)| across a seam; by iterated
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int, Int16
+
+from cuspid.options import Options, Range
 
 _ROUNDS = 10
 
 
 @dataclass(frozen=True, kw_only=True)
-class SeamOptions:
+class SeamOptions(Options):
     """What makes a frame a good choice for a place, and what a seam costs."""
 
-    candidates: int = 4
+    candidates: Annotated[int, Range(1, 1000)] = 4
     """Best frames that are kept for each cell."""
-    oblique: float = 1.0
+    oblique: Annotated[float, Range(0, 1000000.0)] = 1.0
     """Cost of looking at 45 degrees instead of straight down; it grows with the square of the tangent."""
-    glare: float = 2.0
+    glare: Annotated[float, Range(0, 1000000.0)] = 2.0
     """Cost of a place that is burnt out by a highlight, or lies in the dark."""
-    border_px: float = 20.0
+    border_px: Annotated[float, Range(0.01, 10_000)] = 20.0
     """Distance from the border of a frame over which its cost falls to a third."""
-    border: float = 0.1
+    border: Annotated[float, Range(0, 1000000.0)] = 0.1
     """Cost at the border of a frame."""
-    seam: float = 0.02
+    seam: Annotated[float, Range(0, 1000000.0)] = 0.02
     """Cost of a seam along the side of one cell."""
-    jump: float = 0.002
+    jump: Annotated[float, Range(0, 1000000.0)] = 0.002
     """Cost of each grey level by which the colours differ across a seam."""
 
     def cost(

@@ -22,7 +22,7 @@ the falloff of the light and the choice of differences are ours.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import no_type_check
+from typing import Annotated, no_type_check
 
 import cv2
 import numpy as np
@@ -30,30 +30,24 @@ from jaxtyping import Bool, Float, UInt8
 from numba import njit
 
 from cuspid.camera import Camera
-from cuspid.errors import InputError
+from cuspid.options import Options, Range
 
 _COARSEST_PX = 60
 """The iteration starts on an image whose shorter side has at least this many px, and doubles it."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShadingOptions:
+class ShadingOptions(Options):
     """Shape from shading of one image."""
 
-    iterations: int = 40
+    iterations: Annotated[int, Range(1, 100_000)] = 40
     """Jacobi iterations at each size of the image."""
-    smoothing_px: float = 1.5
+    smoothing_px: Annotated[float, Range(0.01, 1000)] = 1.5
     """Standard deviation in px of the Gaussian over the image before."""
-    gamma: float = 2.2
+    gamma: Annotated[float, Range(0.01, 100)] = 2.2
     """Light is the grey level to this power."""
-    dark: int = 20
+    dark: Annotated[int, Range(1, 254)] = 20
     """Grey levels below this one show nothing."""
-
-    def __post_init__(self) -> None:
-        if self.iterations < 1 or self.smoothing_px <= 0 or self.gamma <= 0 or not 0 < self.dark < 255:
-            raise InputError(
-                "shading: at least one iteration, a positive smoothing and gamma, and a dark level from 1 to 254"
-            )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -8,6 +8,7 @@ cross-section, and to the buccal or lingual zone beyond.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -16,20 +17,21 @@ from scipy.ndimage import gaussian_filter1d
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET
 from cuspid.geometry import lengths_along, unit
+from cuspid.options import Options, Range
 from cuspid.panorama import ZONES, Panorama, Strip
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.height_map import HeightMap
 
 
 @dataclass(frozen=True, kw_only=True)
-class StripOptions:
+class StripOptions(Options):
     """The unrolled strip."""
 
-    half_width_mm: float = 8.0
+    half_width_mm: Annotated[float, Range(0.1, 100)] = 8.0
     """The strip reaches so far to either side of the arch curve."""
-    smoothing_mm: float = 5.0
+    smoothing_mm: Annotated[float, Range(0.01, 1000)] = 5.0
     """Standard deviation of the Gaussian filter along the arch curve."""
-    occlusal_mm: float = 2.5
+    occlusal_mm: Annotated[float, Range(0, 100)] = 2.5
     """The occlusal zone ends where the surface lies this much below the ridge of the cross-section."""
 
 

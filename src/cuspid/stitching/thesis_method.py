@@ -13,14 +13,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int16, UInt8
 
 from cuspid.camera import Camera
-from cuspid.errors import InputError, ReconstructionError
+from cuspid.errors import ReconstructionError
 from cuspid.image_sequence import ImageSequence
+from cuspid.options import Options, Range
 from cuspid.panorama import FrameUse, Panorama
 from cuspid.progress import Progress, silent
 from cuspid.stitching.examination import ExaminationOptions, examine, frame_corners, scale_of, warp
@@ -42,31 +44,25 @@ from cuspid.workers import map_in_threads
 
 
 @dataclass(frozen=True, kw_only=True)
-class ThesisOptions:
+class ThesisOptions(Options):
     """The method of chapter 4 of the thesis."""
 
     shading: ShadingOptions = field(default_factory=ShadingOptions)
     """Shape from shading."""
-    mean_px: int = 9
+    mean_px: Annotated[int, Range(1, 1001)] = 9
     """Width in px of the mean filter over the rectified normals."""
     warps: WarpOptions = field(default_factory=WarpOptions)
     """Features, matches, warps."""
     limits: ExaminationOptions = field(default_factory=ExaminationOptions)
     """The examination of frames."""
-    patience: int = 5
+    patience: Annotated[int, Range(1, 10_000)] = 5
     """After so many frames in a row that cannot be used, the panorama breaks, and a new part begins with them."""
-    largest_stretch: float = 10.0
+    largest_stretch: Annotated[float, Range(1.01, 1000000.0)] = 10.0
     """Where the chain lengthens or shortens a frame more than this, it has collapsed: a new part begins."""
-    largest_canvas_mpx: float = 25.0
+    largest_canvas_mpx: Annotated[float, Range(0.01, 1000)] = 25.0
     """Nor may the panorama grow larger than this, in millions of px."""
-    field_of_view_deg: float = 60.0
+    field_of_view_deg: Annotated[float, Range(1, 170)] = 60.0
     """Horizontal angle of view where there is no calibration."""
-
-    def __post_init__(self) -> None:
-        if self.mean_px < 1 or self.patience < 1:
-            raise InputError("thesis: the mean filter and the patience must be at least 1")
-        if not (self.largest_stretch > 1 and self.largest_canvas_mpx > 0):
-            raise InputError("thesis: the largest stretch must exceed 1, and the largest canvas 0")
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ segments without features to the homography of the whole frame.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -20,40 +21,34 @@ from jaxtyping import Float, Int, Int16
 from skimage.segmentation import felzenszwalb
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET
-from cuspid.errors import InputError
+from cuspid.options import Options, Range
 
 SEGMENT_PX = 4
 """Segments are found on a normal map that is smaller by this factor."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class WarpOptions:
+class WarpOptions(Options):
     """Features, matches and warps."""
 
-    kaze_threshold: float = 1e-4
+    kaze_threshold: Annotated[float, Range(1e-09, 1)] = 1e-4
     """Detector response from which KAZE takes a point of the grey normal map."""
-    features: int = 2000
+    features: Annotated[int, Range(10, 1_000_000)] = 2000
     """Features of a frame, at most, the strongest."""
-    ratio: float = 0.8
+    ratio: Annotated[float, Range(0.01, 1)] = 0.8
     """A match must be nearer than the second best by this factor."""
-    error_px: float = 3.0
+    error_px: Annotated[float, Range(0.01, 1000)] = 3.0
     """Distance in px within which a match agrees with a homography."""
-    fewest_inliers: int = 12
+    fewest_inliers: Annotated[int, Range(5, 100_000)] = 12
     """Matches that must agree."""
-    near_px: float = 40.0
+    near_px: Annotated[float, Range(0.01, 100_000)] = 40.0
     """A match counts fully up to this distance from a segment's centroid, beyond it inversely to the distance."""
-    floor: float = 0.05
+    floor: Annotated[float, Range(1e-06, 1)] = 0.05
     """No match counts less than this (1 makes every segment follow the homography of the frame)."""
-    segment_px: int = 2500
+    segment_px: Annotated[int, Range(1, 100_000_000)] = 2500
     """Smallest area of a segment of the normal map, px."""
-    segment_scale: float = 100.0
+    segment_scale: Annotated[float, Range(0.01, 1000000.0)] = 100.0
     """Larger values make larger segments (Felzenszwalb and Huttenlocher 2004)."""
-
-    def __post_init__(self) -> None:
-        if not (self.kaze_threshold > 0 and 0 < self.ratio <= 1 and self.error_px > 0 and self.near_px > 0):
-            raise InputError("warps: threshold, error and distance must be positive, the ratio between 0 and 1")
-        if self.fewest_inliers < 5 or not 0 < self.floor <= 1:
-            raise InputError("warps: at least 5 inliers are needed, and a floor above 0 and up to 1")
 
 
 @dataclass(frozen=True, eq=False)

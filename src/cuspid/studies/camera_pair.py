@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from types import MappingProxyType
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -37,6 +37,7 @@ from cuspid.handpiece.precision import (
 from cuspid.handpiece.presets import PRESETS
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
+from cuspid.options import TOOTH, Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.rig import MountedCamera, Rig
 from cuspid.visibility import VisibilityOptions, visible_faces
@@ -74,20 +75,20 @@ _CLEARANCE_MM = 0.3
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraPairOptions:
+class CameraPairOptions(Options):
     """The grid of pairs and how they are evaluated."""
 
-    tooth: int = 47
+    tooth: Annotated[int, TOOTH] = 47
     """FDI number of the tooth."""
     facing: tuple[str, ...] = _FACED
     """Surfaces that the pair looks at squarely, each in turn: occlusal, buccal, lingual."""
     direction: Direction = "across"
     """How the baseline lies."""
-    baselines_mm: tuple[float, ...] = (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
+    baselines_mm: Annotated[tuple[float, ...], Range(0.01, 1000)] = (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
     """Distances between the projection centres."""
-    axis_angles_deg: tuple[float, ...] = (0.0, 10.0, 20.0, 30.0, 40.0)
+    axis_angles_deg: Annotated[tuple[float, ...], Range(-179, 179)] = (0.0, 10.0, 20.0, 30.0, 40.0)
     """Angles between the optical axes; positive turns the cameras to each other."""
-    distances_mm: tuple[float, ...] = (3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0)
+    distances_mm: Annotated[tuple[float, ...], Range(0.1, 1000)] = tuple(map(float, range(3, 14)))
     """From the middle of the pair to the middle of the surface."""
     sensor: str = "thesis"
     """Name of the optics (a preset), of which the image and the angle of view count."""
@@ -95,20 +96,17 @@ class CameraPairOptions:
     """Whose noise counts."""
     visibility: VisibilityOptions = field(default_factory=VisibilityOptions)
     """When a face counts as seen by a camera; both must see it."""
-    budget_um: float = 10.0
+    budget_um: Annotated[float, Range(0.001, 100_000)] = 10.0
     """RMS error that a point may have."""
 
     def __post_init__(self) -> None:
-        if not (self.baselines_mm and self.distances_mm and min(*self.baselines_mm, *self.distances_mm, 1.0) > 0):
-            raise InputError("camera pair: baselines and distances must be given and positive")
-        if not self.axis_angles_deg or max(map(abs, self.axis_angles_deg)) >= 180:
-            raise InputError("camera pair: axis angles must be given and lie between -180 and 180 deg")
+        super().__post_init__()
+        if not (self.baselines_mm and self.distances_mm and self.axis_angles_deg):
+            raise InputError("camera pair: baselines, distances and axis angles must be given")
         if not self.facing or set(self.facing) - set(_FACED):
             raise InputError(f"camera pair: it can face {', '.join(_FACED)}, not {', '.join(self.facing) or 'nothing'}")
         if self.sensor not in PRESETS:
             raise InputError(f"camera pair: no sensor {self.sensor!r}; there are {', '.join(PRESETS)}")
-        if not self.budget_um > 0:
-            raise InputError(f"camera pair: the budget must be positive, not {self.budget_um:g} um")
 
 
 def camera_pair(baseline_mm: float, axis_angle_deg: float, camera: Camera) -> Rig:

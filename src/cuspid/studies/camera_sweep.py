@@ -19,7 +19,7 @@ from functools import partial
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -33,6 +33,7 @@ from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DesignOptions
 from cuspid.jaw import Jaw
 from cuspid.motion.location import MotionOptions
+from cuspid.options import TOOTH, Options, Range
 from cuspid.pairing import PairingOptions
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.progress import Progress, silent
@@ -68,34 +69,34 @@ _ANY_DISTANCE_MM = 1e3
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepOptions:
+class SweepOptions(Options):
     """The grid, the pair and how it moves."""
 
     surface: str = "occlusal"
     """Named surface of the tooth: occlusal, incisal, buccal, labial, lingual, mesial, distal or gingival (the gum on
     the outer side)."""
-    tooth: int | None = None
+    tooth: Annotated[int | None, TOOTH] = None
     """FDI number; None for 41 with incisal and labial, and 47 with the others."""
-    baseline_mm: tuple[float, ...] = (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
+    baseline_mm: Annotated[tuple[float, ...], Range(0.01, 1000)] = (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
     """Distances between the projection centres."""
-    angle_deg: tuple[float, ...] = (0.0, 3.0, 6.0, 9.0)
+    angle_deg: Annotated[tuple[float, ...], Range(-89, 89)] = (0.0, 3.0, 6.0, 9.0)
     """Angles between the optical axes; positive turns the cameras to each other."""
     direction: Direction | None = None
     """How the baseline lies: along the arch, or across it (for a side of a tooth: up and down); None for along with
     incisal and across with the others, as in the thesis."""
-    distance_mm: float = 5.0
+    distance_mm: Annotated[float, Range(0.1, 1000)] = 5.0
     """From the middle of the pair to the middle of the surface."""
-    depth_of_field_mm: float = 5.0
+    depth_of_field_mm: Annotated[float, Range(0.01, 1000)] = 5.0
     """Depth that is in focus, half of it before and half behind the distance."""
-    image_px: int = 512
+    image_px: Annotated[int, Range(32, 10_000)] = 512
     """Width and height of an image."""
-    field_of_view_deg: float = 62.0
+    field_of_view_deg: Annotated[float, Range(1, 170)] = 62.0
     """Full angle of view along the width."""
-    supersampling: int = 1
+    supersampling: Annotated[int, Range(1, 16)] = 1
     """Rays through a pixel along each side; more cost time and change little here (docs/sweep.md)."""
-    path_mm: float = 5.0
+    path_mm: Annotated[float, Range(0.1, 1000)] = 5.0
     """Length of the path along the arch."""
-    frames: int = 6
+    frames: Annotated[int, Range(2, 100_000)] = 6
     """Positions of the pair on it; consecutive images must overlap by more than 75 %."""
     texture: Preset = "artificial"
     """Surface of the teeth: artificial (the thesis' condition), powder, enamel."""
@@ -104,28 +105,17 @@ class SweepOptions:
     behind it."""
     temporal: bool = False
     """Also measure depth from consecutive frames, which shows less of what the pair itself can do."""
-    contenders: int = 2
+    contenders: Annotated[int, Range(1, 1000)] = 2
     """So many settings that are best by completeness, and as many by accuracy, are repeated, and that of the thesis."""
-    repeats: int = 2
+    repeats: Annotated[int, Range(0, 1000)] = 2
     """How often: with other textures, hands and noise. 0 leaves the noise of the study unknown."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.surface not in SURFACES:
             raise InputError(f"sweep: no surface {self.surface!r}; there are {', '.join(SURFACES)}")
-        if not self.baseline_mm or min(self.baseline_mm) <= 0:
-            raise InputError("sweep: --baseline-mm needs one or more positive lengths")
-        if not self.angle_deg or max(map(abs, self.angle_deg)) >= 90:
-            raise InputError("sweep: --angle-deg needs one or more angles between -90 and 90")
-        if min(self.distance_mm, self.depth_of_field_mm, self.path_mm) <= 0:
-            raise InputError("sweep: distance, depth of field and path must be positive")
-        if self.image_px < 32 or not 0 < self.field_of_view_deg < 180:
-            raise InputError("sweep: --image-px must be 32 or more, --field-of-view-deg between 0 and 180")
-        if self.supersampling < 1:
-            raise InputError(f"sweep: --supersampling is {self.supersampling}; one at least is needed")
-        if self.frames < 2:
-            raise InputError(f"sweep: --frames is {self.frames}; two at least are needed")
-        if self.contenders < 1 or self.repeats < 0:
-            raise InputError("sweep: --contenders must be positive and --repeats not negative")
+        if not (self.baseline_mm and self.angle_deg):
+            raise InputError("sweep: --baseline-mm and --angle-deg need one or more values")
 
     @property
     def chosen_tooth(self) -> int:

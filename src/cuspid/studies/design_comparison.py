@@ -22,6 +22,7 @@ from functools import partial
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -30,7 +31,7 @@ from cuspid import pipeline, storage
 from cuspid.anatomy.jaw_files import load_jaw
 from cuspid.anatomy.mouth import MouthOptions, fit_pct, room_mm, study_mouths
 from cuspid.anatomy.phantom.build import build_phantom
-from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.anatomy.phantom.options import COARSEST_MM, PhantomOptions
 from cuspid.anatomy.phantom.population import draw_population
 from cuspid.anatomy.preparation.prepare import prepare, preset
 from cuspid.anatomy.shape.boxed import boxed
@@ -44,6 +45,7 @@ from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.handpiece.optimise import handpiece_outline
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
+from cuspid.options import SEED, TOOTH, Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, Rig
 from cuspid.simulation.path.scan import ScanPathOptions, steady_poses
@@ -63,51 +65,46 @@ _MEAN_COUNT, _MEAN_EDGE_MM = 5, 0.4
 
 
 @dataclass(frozen=True, kw_only=True)
-class ComparisonOptions:
+class ComparisonOptions(Options):
     """What is compared."""
 
     designs: tuple[str, ...] = ("twelve", "six")
     """Built-in designs (two, four, six, twelve) and handpiece.json files, named after their file."""
     turned: tuple[str, ...] = ("four", "six")
     """Designs that are also turned, by name; the others are only moved along the teeth."""
-    turns: tuple[int, ...] = (1, 3, 5)
+    turns: Annotated[tuple[int, ...], Range(1, 99)] = (1, 3, 5)
     """Numbers of passes for the designs that are turned: odd."""
     jaws: tuple[str, ...] = ("phantom",)
     """phantom, thesis-reference (its prepared teeth), boxed-mean (a box of each crown of the mean of five phantoms),
     and files of jaws with tooth labels."""
-    tooth: tuple[int, ...] = (46,)
+    tooth: Annotated[tuple[int, ...], TOOTH] = (46,)
     """FDI numbers of the teeth, each scanned by itself."""
-    seeds: tuple[int, ...] = (0,)
+    seeds: Annotated[tuple[int, ...], SEED] = (0,)
     """Each chooses texture, hand and noise of a scan."""
-    edge_mm: float = 0.3
+    edge_mm: Annotated[float, Range(0.05, COARSEST_MM)] = 0.3
     """Length of the edges of the phantom."""
-    image_scale: float = 1.0
+    image_scale: Annotated[float, Range(0.01, 1)] = 1.0
     """All images are made smaller by this factor: 0.5 takes a quarter of the time, but more than doubles the errors and
     loses steep faces."""
-    minimum_openness: float = LEAST_OPENNESS
+    minimum_openness: Annotated[float, Range(0, 0.99)] = LEAST_OPENNESS
     """A face is evaluated for completeness if so large a share of the directions above the occlusal plane is free."""
-    samples: int = 60_000
+    samples: Annotated[int, Range(1, 20_000_000)] = 60_000
     """Points on the tooth at which completeness is asked."""
-    enough_pct: float = 0.5
+    enough_pct: Annotated[float, Range(0, 100)] = 0.5
     """More turns are no gain where completeness grows by less than so many points."""
-    thickness_mm: float = 7.0
+    thickness_mm: Annotated[float, Range(0.01, 1000)] = 7.0
     """Of the holder behind the cameras."""
-    frame_rate_hz: float = 30.0
+    frame_rate_hz: Annotated[float, Range(0.001, 100_000)] = 30.0
     """Positions of the handpiece that are taken in a second."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         given = {"designs": self.designs, "jaws": self.jaws, "tooth": self.tooth, "seeds": self.seeds}
         for name, values in {**given, "turns": self.turns}.items():
             if not values or len(set(values)) < len(values):
                 raise InputError(f"compare: --{name} is empty or names something twice")
         for number in self.turns:
             ScanPathOptions(turns=number)
-        if not (self.frame_rate_hz > 0 and self.thickness_mm > 0 and self.samples > 0):
-            raise InputError("compare: the frame rate, the thickness and the samples must be positive")
-        if not 0 < self.image_scale <= 1:
-            raise InputError(f"compare: the scale of the images is {self.image_scale:g}; it must be above 0, at most 1")
-        if not 0 <= self.minimum_openness < 1:
-            raise InputError(f"compare: the least openness is {self.minimum_openness:g}; it must lie in 0-1")
 
 
 # --- what is compared -------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
@@ -24,6 +24,7 @@ from cuspid.geometry import Rigid3
 from cuspid.handpiece.precision import deformation
 from cuspid.handpiece.presets import PRESETS
 from cuspid.jaw import Jaw
+from cuspid.options import SEED, TOOTH, Options, Range
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera
 from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.raycast import Scene, auto_gain, render_image
@@ -48,30 +49,30 @@ _LED_MM = 1.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class MatchingNoiseOptions:
+class MatchingNoiseOptions(Options):
     """The rendered pairs."""
 
-    tooth: int = 47
+    tooth: Annotated[int, TOOTH] = 47
     """FDI number of the tooth, seen from the occlusal side."""
-    baselines_mm: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)
+    baselines_mm: Annotated[tuple[float, ...], Range(0.01, 1000)] = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)
     """Distances between the projection centres; the axes meet on the tooth."""
-    distance_mm: float = 5.0
+    distance_mm: Annotated[float, Range(0.1, 1000)] = 5.0
     """From the pair to the middle of the occlusal surface."""
     sensor: str = "thesis"
     """Name of the optics."""
     texture: Preset = "artificial"
     """Appearance of the tooth."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """Of texture and noise."""
-    spacing_px: int = 4
+    spacing_px: Annotated[int, Range(1, 1000)] = 4
     """Every so many pixels a point is matched."""
-    start_px: float = 1.0
+    start_px: Annotated[float, Range(0, 1000)] = 1.0
     """Standard deviation of the start along the epipolar line."""
-    window_px: int = 7
+    window_px: Annotated[int, Range(3, 1001)] = 7
     """Side of the upright window; the slanted one is as large."""
-    largest_error_px: float = 1.0
+    largest_error_px: Annotated[float, Range(0.01, 1000)] = 1.0
     """A match farther off than this has failed and does not count as noise."""
-    maximum_incidence_deg: float = 75.0
+    maximum_incidence_deg: Annotated[float, Range(1, 90)] = 75.0
     """Points seen flatter than this by a camera are not asked for."""
 
 

@@ -13,18 +13,19 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Bool
 
 from cuspid import pipeline, storage
 from cuspid.capture import Capture
-from cuspid.errors import CuspidError, InputError, ReconstructionError
+from cuspid.errors import CuspidError, ReconstructionError
 from cuspid.evaluation.repeatability import PairOptions, Spread, compare_pair, spread
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
+from cuspid.options import Options, Range
 from cuspid.pipeline import SimulationOptions
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece
@@ -40,23 +41,17 @@ PRECISION = ("mean_abs_um", "rms_um", "p95_um", "common_pct")
 
 
 @dataclass(frozen=True, kw_only=True)
-class RepeatOptions:
+class RepeatOptions(Options):
     """How a scan is repeated."""
 
-    scans: int = 5
+    scans: Annotated[int, Range(2, 10_000)] = 5
     """How many times."""
     new_texture: bool = False
     """Each scan has another texture, too, as powder that is sprayed again; off: the object stays the same."""
-    farthest_mm: float = 0.5
+    farthest_mm: Annotated[float, Range(0.0001, 1000)] = 0.5
     """Of two scans, what is farther apart than this is not regarded as the same surface."""
-    pair_samples: int = 100_000
+    pair_samples: Annotated[int, Range(100, 20_000_000)] = 100_000
     """Points on each scan of a pair."""
-
-    def __post_init__(self) -> None:
-        if self.scans < 2:
-            raise InputError(f"repeat: --scans is {self.scans}; at least two are needed to see how they agree")
-        if not self.farthest_mm > 0 or self.pair_samples < 100:
-            raise InputError("repeat: --farthest-mm must be positive, --pair-samples at least 100")
 
     @property
     def pairs(self) -> PairOptions:

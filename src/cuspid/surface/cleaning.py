@@ -6,23 +6,25 @@ Faces are *connected* across edges that exactly two of them share.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cuspid.graph import parts_of
 from cuspid.mesh import Mesh
+from cuspid.options import Options, Range
 
 
 @dataclass(frozen=True, kw_only=True)
-class CleaningOptions:
+class CleaningOptions(Options):
     """Cleaning of a fused mesh. Lengths count in resolutions of the handpiece, 12 um for the built-in ones."""
 
-    least_piece_width: float = 0.283
+    least_piece_width: Annotated[float, Range(0, 1000)] = 0.283
     """Connected pieces of less area than a square of so many working distances (2 mm2 at 5 mm) are removed."""
-    least_piece_share: float = 0.005
+    least_piece_share: Annotated[float, Range(0, 1)] = 0.005
     """Connected pieces of a smaller share of the whole area are removed."""
-    ghost_depth: float = 0.1
+    ghost_depth: Annotated[float, Range(0, 1000)] = 0.1
     """A face that looks at the back of another one within so many working distances (0.5 mm at 5 mm) is removed."""
 
 

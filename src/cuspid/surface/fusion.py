@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import no_type_check
+from typing import Annotated, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -19,6 +19,7 @@ from numba import njit
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
+from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import DepthMap
 from cuspid.surface.evidence import Evidence, colors_of, observe
@@ -28,21 +29,21 @@ from cuspid.workers import map_slices
 
 
 @dataclass(frozen=True, kw_only=True)
-class FusionOptions:
+class FusionOptions(Options):
     """Fusion of depth maps into a mesh."""
 
-    voxel_mm: float | None = None
+    voxel_mm: Annotated[float | None, Range(0.001, 1000)] = None
     """Spacing of the grid, about the spacing of the mesh's vertices; by default 4.16 resolutions of the handpiece, 0.05
     mm for the built-in ones."""
-    truncation_voxels: float = 3.0
+    truncation_voxels: Annotated[float, Range(1, 100)] = 3.0
     """Distance from a surface, in voxels, up to which it is blended."""
-    largest_jump: float = 12.5
+    largest_jump: Annotated[float, Range(0.01, 10_000)] = 12.5
     """Neighbouring depths that differ by more resolutions (0.15 mm at 12 um) do not belong to one surface."""
-    least_weight: float = 0.01
+    least_weight: Annotated[float, Range(0, 1000000.0)] = 0.01
     """Weight (sum of confidences) from which a voxel counts as observed."""
-    agreement: float = 6.65
+    agreement: Annotated[float, Range(0.01, 10_000)] = 6.65
     """A depth map confirms a vertex within this many resolutions (0.08 mm at 12 um); nearer ones count more."""
-    least_maps: int = 2
+    least_maps: Annotated[int, Range(1, 10_000)] = 2
     """Number of depth maps that must confirm a vertex."""
 
     def voxel_for(self, resolution_mm: float) -> float:

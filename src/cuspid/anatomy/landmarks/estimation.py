@@ -18,6 +18,7 @@ the edge length of the mesh, and how far the point moves when the jaw is tilted 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -30,6 +31,7 @@ from cuspid.anatomy.teeth.dentition import QUADRANTS
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Arch, Jaw, Landmark
 from cuspid.mesh import Mesh, edges_of
+from cuspid.options import Options, Range
 
 Point = Float[np.ndarray, "3"]
 Points = Float[np.ndarray, "n 3"]
@@ -93,14 +95,14 @@ and that shows in the spread alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class LandmarkingOptions:
+class LandmarkingOptions(Options):
     """How landmarks are estimated from a labelled surface."""
 
-    grid_mm: float = 0.1
+    grid_mm: Annotated[float, Range(0.01, 5)] = 0.1
     """Spacing of the height field of a tooth."""
-    smoothing_mm: float = 0.2
+    smoothing_mm: Annotated[float, Range(0, 10)] = 0.2
     """Standard deviation of the smoothing of the height field before cusps are looked for."""
-    tilt_deg: float = 4.0
+    tilt_deg: Annotated[float, Range(0, 45)] = 4.0
     """Tilt of the jaw by which the uncertainty is tried."""
 
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import trimesh
@@ -26,6 +27,7 @@ from cuspid.errors import InputError
 from cuspid.geometry import lengths_along
 from cuspid.jaw import GUM, Arch, Jaw, Sphere
 from cuspid.mesh import Mesh
+from cuspid.options import Options, Range
 
 _POSITIONS = 7
 """Spheres of a quadrant."""
@@ -44,30 +46,28 @@ _LONGEST_EDGE = 1.26
 
 
 @dataclass(frozen=True, kw_only=True)
-class SphereArchOptions:
+class SphereArchOptions(Options):
     """Size of the sphere arch, and how finely it is meshed."""
 
-    radius_mm: float = 2.5
+    radius_mm: Annotated[float, Range(0.1, 20)] = 2.5
     """Radius of the spheres."""
-    edge_mm: float = 0.11
+    edge_mm: Annotated[float, Range(0.01, 5)] = 0.11
     """Longest edge of the spheres' faces. A face lies inside the sphere by edge^2 / (6 radius) at most: 0.8 um."""
-    rise_mm: float = 1.25
+    rise_mm: Annotated[float, Range(0, 20)] = 1.25
     """Height of the centres above the ridge: 0 leaves a hemisphere free, the radius all of it but a point."""
-    depth_mm: float = 41.0
+    depth_mm: Annotated[float, Range(1, 200)] = 41.0
     """Depth of the arch form, from the front to the line between the second molars (chosen, not measured)."""
-    spee_mm: float = 1.5
+    spee_mm: Annotated[float, Range(-20, 20)] = 1.5
     """Depth of the curve of Spee that the centres follow, so that they do not lie in a plane."""
-    ridge_mm: float = 8.0
+    ridge_mm: Annotated[float, Range(0.1, 100)] = 8.0
     """Height of the ridge below the lowest sphere's foot."""
 
     def __post_init__(self) -> None:
-        for name in ("radius_mm", "edge_mm", "depth_mm", "ridge_mm"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"sphere arch: {name} is {getattr(self, name):g}; it must be positive")
-        if not 0 <= self.rise_mm < self.radius_mm:
+        super().__post_init__()
+        if not self.rise_mm < self.radius_mm:
             raise InputError(
-                f"sphere arch: rise_mm is {self.rise_mm:g}; it must be at least 0 and below the radius, "
-                f"{self.radius_mm:g} mm, for the spheres to stand in the ridge"
+                f"sphere arch: --rise-mm is {self.rise_mm:g}; it must be below the radius, {self.radius_mm:g} mm, for "
+                "the spheres to stand in the ridge"
             )
 
     @property

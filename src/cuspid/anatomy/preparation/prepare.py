@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -36,116 +36,95 @@ from cuspid.errors import InputError
 from cuspid.graph import parts_of
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
+from cuspid.options import Options, Range
 
 _OVERLAP_MM = 0.005
 
 
-def _within(kind: str, name: str, value: float | int, low: float | int, high: float | int) -> None:
-    if not low <= value <= high:
-        raise InputError(f"{kind}: {name} is {value:g}; it must lie in {low:g} to {high:g}")
-
-
 @dataclass(frozen=True, kw_only=True)
-class CrackOptions:
+class CrackOptions(Options):
     """A V-shaped crack that runs mesiodistally over the occlusal surface and over one marginal ridge."""
 
-    width_um: float = 150.0
+    width_um: Annotated[float, Range(20, 1000)] = 150.0
     """Width at the surface. Cracks below 100 um are reported to escape conventional diagnosis; this one is visible."""
-    depth_um: float = 1000.0
+    depth_um: Annotated[float, Range(50, 3000)] = 1000.0
     """Depth along the axis of the tooth (assumption: within the enamel of a molar's occlusal surface)."""
     ridge: Literal["mesial", "distal"] = "mesial"
     """The marginal ridge that it crosses."""
 
-    def __post_init__(self) -> None:
-        _within("crack", "width_um", self.width_um, 20.0, 1000.0)
-        _within("crack", "depth_um", self.depth_um, 50.0, 3000.0)
-
 
 @dataclass(frozen=True, kw_only=True)
-class CrownOptions:
+class CrownOptions(Options):
     """A preparation for an all-ceramic crown."""
 
-    occlusal_reduction_mm: float = 1.5
+    occlusal_reduction_mm: Annotated[float, Range(0.3, 4)] = 1.5
     """Reduction of the occlusal surface, or of the incisal edge, along the axis."""
-    axial_reduction_mm: float = 1.2
+    axial_reduction_mm: Annotated[float, Range(0.2, 3)] = 1.2
     """Least distance of the walls from the former surface, from 1.2 mm above the finish line upwards."""
-    taper_deg: float = 6.0
+    taper_deg: Annotated[float, Range(1, 20)] = 6.0
     """Lean of each axial wall: half of the total occlusal convergence."""
     finish_line: Literal["shoulder", "chamfer"] = "shoulder"
     """Form of the finish line: a level shoulder with a rounded inner edge, or a chamfer that rises by 30 degrees."""
-    finish_width_mm: float = 1.0
+    finish_width_mm: Annotated[float, Range(0.2, 2)] = 1.0
     """Width of the finish line: from the margin inwards, square to it, to the line of the axial wall at its height."""
-    above_gum_mm: float = 0.5
+    above_gum_mm: Annotated[float, Range(0.2, 3)] = 0.5
     """Height of the finish line above the gum margin. Towards the contacts it rises no more than the cervical line of
     such a tooth; there the papilla is cut back (as it is retracted in the mouth), so that the line can be seen."""
-    edge_radius_mm: float = 0.5
+    edge_radius_mm: Annotated[float, Range(0.1, 1)] = 0.5
     """Rounding between the axial walls and the occlusal surface."""
-
-    def __post_init__(self) -> None:
-        _check_crown("crown", self)
 
 
 @dataclass(frozen=True, kw_only=True)
-class FullContourCrownOptions:
+class FullContourCrownOptions(Options):
     """A preparation for a full-contour (monolithic) crown: thinner, following the form of the tooth."""
 
-    occlusal_reduction_mm: float = 1.0
+    occlusal_reduction_mm: Annotated[float, Range(0.3, 4)] = 1.0
     """As for `CrownOptions`."""
-    axial_reduction_mm: float = 0.5
+    axial_reduction_mm: Annotated[float, Range(0.2, 3)] = 0.5
     """As for `CrownOptions`."""
-    taper_deg: float = 7.5
+    taper_deg: Annotated[float, Range(1, 20)] = 7.5
     """As for `CrownOptions`."""
     finish_line: Literal["shoulder", "chamfer"] = "chamfer"
     """As for `CrownOptions`."""
-    finish_width_mm: float = 0.5
+    finish_width_mm: Annotated[float, Range(0.2, 2)] = 0.5
     """As for `CrownOptions`."""
-    above_gum_mm: float = 0.5
+    above_gum_mm: Annotated[float, Range(0.2, 3)] = 0.5
     """As for `CrownOptions`."""
-    edge_radius_mm: float = 0.3
+    edge_radius_mm: Annotated[float, Range(0.1, 1)] = 0.3
     """As for `CrownOptions`."""
-
-    def __post_init__(self) -> None:
-        _check_crown("full_contour_crown", self)
 
 
 @dataclass(frozen=True, kw_only=True)
-class InlayOptions:
+class InlayOptions(Options):
     """A preparation for a mesio-occluso-distal inlay."""
 
-    isthmus_width_mm: float = 2.2
+    isthmus_width_mm: Annotated[float, Range(0.8, 6)] = 2.2
     """Buccolingual width of the slot at its floor."""
-    pulpal_depth_mm: float = 1.8
+    pulpal_depth_mm: Annotated[float, Range(0.5, 4)] = 1.8
     """Depth of the slot's floor below the central groove."""
-    box_width_mm: float = 4.0
+    box_width_mm: Annotated[float, Range(0.8, 8)] = 4.0
     """Buccolingual width of the boxes at their gingival floor; wide enough to clear the contact."""
-    gingival_floor_mm: float = 1.2
+    gingival_floor_mm: Annotated[float, Range(0.5, 3)] = 1.2
     """Mesiodistal width of the gingival floor, from the proximal surface to the axial wall."""
-    box_depth_mm: float = 1.2
+    box_depth_mm: Annotated[float, Range(0.3, 4)] = 1.2
     """Height of the axial wall: from the pulpal to the gingival floor."""
-    divergence_deg: float = 8.0
+    divergence_deg: Annotated[float, Range(0, 20)] = 8.0
     """Lean of each wall: they diverge towards occlusal."""
-    edge_radius_mm: float = 0.3
+    edge_radius_mm: Annotated[float, Range(0.05, 2)] = 0.3
     """Rounding of the internal edges between walls and floors."""
 
     def __post_init__(self) -> None:
-        _within("inlay", "isthmus_width_mm", self.isthmus_width_mm, 0.8, 6.0)
-        _within("inlay", "pulpal_depth_mm", self.pulpal_depth_mm, 0.5, 4.0)
-        _within("inlay", "box_width_mm", self.box_width_mm, self.isthmus_width_mm, 8.0)
-        _within("inlay", "gingival_floor_mm", self.gingival_floor_mm, 0.5, 3.0)
-        _within("inlay", "box_depth_mm", self.box_depth_mm, 0.3, 4.0)
-        _within("inlay", "divergence_deg", self.divergence_deg, 0.0, 20.0)
-        _within("inlay", "edge_radius_mm", self.edge_radius_mm, 0.05, self.isthmus_width_mm / 3)
-
-
-def _check_crown(name: str, options: CrownOptions | FullContourCrownOptions) -> None:
-    _within(name, "occlusal_reduction_mm", options.occlusal_reduction_mm, 0.3, 4.0)
-    _within(name, "axial_reduction_mm", options.axial_reduction_mm, 0.2, 3.0)
-    _within(name, "taper_deg", options.taper_deg, 1.0, 20.0)
-    _within(name, "finish_width_mm", options.finish_width_mm, 0.2, 2.0)
-    _within(name, "above_gum_mm", options.above_gum_mm, 0.2, 3.0)
-    _within(name, "edge_radius_mm", options.edge_radius_mm, 0.1, 1.0)
-    if options.finish_line not in ("shoulder", "chamfer"):
-        raise InputError(f"{name}: finish_line is {options.finish_line!r}; choose shoulder or chamfer")
+        super().__post_init__()
+        if self.box_width_mm < self.isthmus_width_mm:
+            raise InputError(
+                f"inlay: --box-width-mm is {self.box_width_mm:g}; it must not be less than the isthmus, "
+                f"{self.isthmus_width_mm:g} mm"
+            )
+        if self.edge_radius_mm > self.isthmus_width_mm / 3:
+            raise InputError(
+                f"inlay: --edge-radius-mm is {self.edge_radius_mm:g}; it must not exceed a third of the isthmus, "
+                f"{self.isthmus_width_mm / 3:.2f} mm"
+            )
 
 
 PreparationOptions = CrackOptions | CrownOptions | FullContourCrownOptions | InlayOptions

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import manifold3d
 import numpy as np
@@ -20,6 +21,7 @@ from cuspid.anatomy.booleans import closed, solid_of
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
+from cuspid.options import Options, Range
 
 _ARCH_ORDER = (*range(48, 40, -1), *range(31, 39), *range(18, 10, -1), *range(21, 29))
 """FDI numbers along the lower and the upper arch."""
@@ -30,19 +32,13 @@ _CLEARANCE_MM = 0.002
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoxOptions:
+class BoxOptions(Options):
     """What the boxes look like."""
 
-    edge_mm: float = 0.3
+    edge_mm: Annotated[float, Range(0.01, 100)] = 0.3
     """Longest side of the right-angled faces that the sides of a box are divided into."""
-    sink_mm: float = 0.0
+    sink_mm: Annotated[float, Range(0, 100)] = 0.0
     """How far a box goes on into the gum below the lowest point of the crown."""
-
-    def __post_init__(self) -> None:
-        if self.edge_mm <= 0 or self.sink_mm < 0:
-            raise InputError(
-                f"boxed jaw: edge_mm ({self.edge_mm:g}) must be positive and sink_mm ({self.sink_mm:g}) not negative"
-            )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -22,6 +23,7 @@ from scipy.stats import binom
 from cuspid.anatomy.shape.procrustes import dimension
 from cuspid.jaw import GUM
 from cuspid.mesh import Mesh, edges_of
+from cuspid.options import Options, Range
 
 _ON_BORDER = 0.7
 """A partner on the rim of a patch counts only if the line to it leaves the patch at least this steeply (sine)."""
@@ -37,14 +39,14 @@ Border = tuple[int, int]
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitOptions:
+class FitOptions(Options):
     """How a warped template is drawn onto a sample."""
 
-    smoothing_mm: tuple[float, ...] = (2.0, 1.0, 0.5, 0.25)
+    smoothing_mm: Annotated[tuple[float, ...], Range(0.001, 100)] = (2.0, 1.0, 0.5, 0.25)
     """Smoothing of the displacements in each round, as the standard deviation of a Gaussian over the surface, mm."""
-    reach_mm: float = 3.0
+    reach_mm: Annotated[float, Range(0.01, 100)] = 3.0
     """A nearest point farther off is no partner."""
-    least_cosine: float = 0.5
+    least_cosine: Annotated[float, Range(-1, 1)] = 0.5
     """A nearest point whose normal differs by more than this allows is no partner."""
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -26,6 +26,7 @@ from cuspid.anatomy.shape.procrustes import Superposition, dimension, superpose
 from cuspid.errors import InputError
 from cuspid.jaw import Jaw, Landmark
 from cuspid.mesh import Mesh
+from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.shape_model import MeanStep, ShapeModel
 from cuspid.workers import map_in_threads
@@ -35,7 +36,7 @@ _NO_VARIANCE = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True)
-class MeanShapeOptions:
+class MeanShapeOptions(Options):
     """How the mean of a set of jaws is found."""
 
     scale: bool = False
@@ -45,11 +46,11 @@ class MeanShapeOptions:
     correspondence: Literal["surface", "landmarks"] = "surface"
     """``surface``: thin-plate spline, then onto the surface. ``landmarks``: the thin-plate spline alone, as in the
     thesis; its mean keeps the detail of the first sample."""
-    tolerance_um: float = 5.0
+    tolerance_um: Annotated[float, Range(0.001, 10_000)] = 5.0
     """The mean has converged when its surface moves less than this, root mean square."""
-    most_rounds: int = 10
+    most_rounds: Annotated[int, Range(1, 1000)] = 10
     """The iteration ends after this many rounds, converged or not."""
-    modes: int = 10
+    modes: Annotated[int, Range(1, 1000)] = 10
     """How many modes are kept at most."""
     fit: FitOptions = field(default_factory=FitOptions)
     """How the warped mean is drawn onto a sample."""

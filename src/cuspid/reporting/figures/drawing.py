@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 
 from cuspid.errors import InputError
 from cuspid.mesh import Mesh, RayHits
+from cuspid.options import Options, Range
 from cuspid.storage import whole_file
 from cuspid.trueness import Trueness
 
@@ -34,17 +35,18 @@ _INK = "#333333"
 
 
 @dataclass(frozen=True, kw_only=True)
-class FigureOptions:
+class FigureOptions(Options):
     """How deviations are drawn."""
 
-    range_um: float = 100.0
+    range_um: Annotated[float, Range(0.01, 1000000.0)] = 100.0
     """Ends of the colour bar; the range is fixed and symmetric so that pictures can be compared."""
-    tolerance_um: float = 25.0
+    tolerance_um: Annotated[float, Range(0.001, 1000000.0)] = 25.0
     """Green within this deviation to either side."""
-    width_px: int = 1000
+    width_px: Annotated[int, Range(100, 20_000)] = 1000
     """Width of the main view."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 0 < self.tolerance_um < self.range_um:
             raise InputError(
                 f"figure: the tolerance ({self.tolerance_um:g} um) must be positive and below the range "

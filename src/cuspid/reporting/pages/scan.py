@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
+from cuspid.options import Options, Range
 from cuspid.reporting.figures.drawing import (
     RANGES_UM,
     FigureOptions,
@@ -51,25 +52,19 @@ _THUMBNAIL_PX = 240
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReportOptions:
+class ReportOptions(Options):
     """What a page shows."""
 
-    most_faces: int = 300_000
+    most_faces: Annotated[int, Range(100, 10_000_000)] = 300_000
     """Faces of the shown surface; a finer one is simplified, and the page says so."""
-    most_reference_faces: int = 120_000
+    most_reference_faces: Annotated[int, Range(100, 10_000_000)] = 120_000
     """The same of the reference."""
-    range_um: float | None = None
+    range_um: Annotated[float | None, Range(0.01, 100_000)] = None
     """Ends of the colour bar; None for the smallest of 5, 10, 25 ... that is 2.5 times the 95th percentile."""
-    frames: int = 4
+    frames: Annotated[int, Range(0, 100)] = 4
     """So many frames are shown as pictures, evenly spaced."""
-    worst: int = 8
+    worst: Annotated[int, Range(0, 100)] = 8
     """So many of the worst places are listed."""
-
-    def __post_init__(self) -> None:
-        if min(self.most_faces, self.most_reference_faces) < 100:
-            raise InputError("report: --most-faces and --most-reference-faces must be at least 100")
-        if self.frames < 0 or self.worst < 0 or (self.range_um is not None and not self.range_um > 0):
-            raise InputError("report: --frames and --worst must not be negative, --range-um must be positive")
 
 
 def scan_page(result: ScanResult, options: ReportOptions = ReportOptions()) -> str:

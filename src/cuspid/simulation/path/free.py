@@ -12,6 +12,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +21,7 @@ from scipy.ndimage import gaussian_filter1d
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
+from cuspid.options import SHARE, Options, Range
 from cuspid.rig import Handpiece
 from cuspid.room import room_about
 from cuspid.simulation.path.arch import arch_curve
@@ -32,42 +34,31 @@ REACH = 2.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class FreePathOptions:
+class FreePathOptions(Options):
     """How a hand moves a camera over the arch; the defaults are a full shake."""
 
-    frames: int = 120
+    frames: Annotated[int, Range(2, 10_000)] = 120
     """Frames from the first crown to the last."""
-    shake: float = 1.0
+    shake: Annotated[float, Range(0, 20)] = 1.0
     """Multiplies all standard deviations below: 1 is a full shake, 0 a steady hand at an even speed."""
-    position_mm: float = 1.0
+    position_mm: Annotated[float, Range(0, 100)] = 1.0
     """Standard deviation of the shift along and across the arch."""
-    distance_mm: float = 1.5
+    distance_mm: Annotated[float, Range(0, 100)] = 1.5
     """Standard deviation of the distance to the teeth."""
-    tilt_deg: float = 6.0
+    tilt_deg: Annotated[float, Range(0, 90)] = 6.0
     """Standard deviation of the tilt along and across the arch."""
-    turn_deg: float = 8.0
+    turn_deg: Annotated[float, Range(0, 180)] = 8.0
     """Standard deviation of the turn about the viewing axis."""
-    speed: float = 0.35
+    speed: Annotated[float, Range(0, 0.95)] = 0.35
     """Standard deviation of the logarithm of the speed."""
-    drift_frames: float = 6.0
+    drift_frames: Annotated[float, Range(0.1, 10_000)] = 6.0
     """Frames over which the drift changes (standard deviation of its Gaussian filter)."""
-    tremor_frames: float = 1.0
+    tremor_frames: Annotated[float, Range(0.1, 10_000)] = 1.0
     """Frames over which the tremor changes, likewise."""
-    tremor: float = 0.15
+    tremor: Annotated[float, SHARE] = 0.15
     """Share of the standard deviation that is tremor."""
-    clearance_mm: float = 2.0
+    clearance_mm: Annotated[float, Range(0, 100)] = 2.0
     """Camera and lights keep this distance from the jaw; the hand lifts them where they would not."""
-
-    def __post_init__(self) -> None:
-        if self.frames < 2:
-            raise InputError(f"free path: at least 2 frames are needed, not {self.frames}")
-        spreads = (self.shake, self.position_mm, self.distance_mm, self.tilt_deg, self.turn_deg, self.speed)
-        if min(spreads) < 0:
-            raise InputError("free path: the shake and its standard deviations must not be negative")
-        if not 0 <= self.tremor <= 1:
-            raise InputError(f"free path: the share of tremor must lie between 0 and 1, not {self.tremor:g}")
-        if not (self.drift_frames > 0 and self.tremor_frames > 0):
-            raise InputError("free path: drift and tremor must change over more than 0 frames")
 
 
 def plan_free_path(

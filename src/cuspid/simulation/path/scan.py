@@ -14,7 +14,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -23,6 +23,7 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
+from cuspid.options import TOOTH, Options, Range
 from cuspid.rig import Handpiece
 from cuspid.room import check_clearance, room_about
 from cuspid.simulation.path.arch import ArchCurve, arch_curve
@@ -54,53 +55,41 @@ _LOG = logging.getLogger("cuspid")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScanPathOptions:
+class ScanPathOptions(Options):
     """How the jaw is scanned."""
 
-    tooth: int | None = None
+    tooth: Annotated[int | None, TOOTH] = None
     """FDI number of the one tooth to scan; None for the whole arch, or what the mesh has of one."""
-    frames: int | None = None
+    frames: Annotated[int | None, Range(2, 100_000)] = None
     """Positions of the handpiece; None for 10 over a tooth, 100 over an arch and one per millimetre over a part of one,
     or more where the overlap needs it."""
-    length_mm: float | None = None
+    length_mm: Annotated[float | None, Range(0.1, 1000)] = None
     """Length of the path over the middle of the tooth or arch; None for 9 mm over a tooth (the images see 3 mm farther
     on both sides) and from the first crown to the last over an arch."""
-    jitter_mm: float = 0.15
+    jitter_mm: Annotated[float, Range(0, 20)] = 0.15
     """Standard deviation of the hand's drift along each axis."""
-    jitter_deg: float = 1.5
+    jitter_deg: Annotated[float, Range(0, 90)] = 1.5
     """Standard deviation of the hand's turning about each axis."""
-    jitter_length_mm: float = 6.0
+    jitter_length_mm: Annotated[float, Range(0.01, 10_000)] = 6.0
     """Length of path over which the hand's drift changes."""
-    minimum_overlap: float = 0.75
+    minimum_overlap: Annotated[float, Range(0, 0.99)] = 0.75
     """Share (0 to 1) of the surface in the images of a frame that the next frame must see, by the same cameras."""
-    clearance_mm: float = 0.5
+    clearance_mm: Annotated[float, Range(0, 100)] = 0.5
     """The body of the handpiece keeps this distance from the jaw; where it does not fit, it is lifted, shifted and
     tilted."""
-    turns: int = 1
+    turns: Annotated[int, Range(1, 99)] = 1
     """Passes over the teeth, an odd number: 1 looks down only, 3 look from the cheek, down and from the tongue, more
     look in finer steps between."""
-    turn_deg: float = 60.0
+    turn_deg: Annotated[float, Range(0.1, 89)] = 60.0
     """How far the handpiece is rolled to either side in the first and the last pass."""
     passes: Literal["turns", "auto"] | None = None
     """turns: those that --turns says; auto: also others, rolled differently, over what two cameras did not see; a note
     tells how many frames they take. None for auto over a whole arch of which nothing else is said, else turns."""
 
     def __post_init__(self) -> None:
-        if self.turns < 1 or self.turns % 2 == 0:
+        super().__post_init__()
+        if self.turns % 2 == 0:
             raise InputError(f"scan path: the number of turns must be odd (1, 3, 5 ...), not {self.turns}")
-        if not 0 < self.turn_deg < 90:
-            raise InputError(f"scan path: --turn-deg must lie between 0 and 90, not {self.turn_deg:g}")
-        if self.frames is not None and self.frames < 2:
-            raise InputError(f"scan path: --frames is {self.frames}; at least 2 are needed")
-        if self.length_mm is not None and not self.length_mm > 0:
-            raise InputError(f"scan path: --length-mm must be positive, not {self.length_mm:g}")
-        if not 0 <= self.minimum_overlap < 1:
-            raise InputError(f"scan path: --minimum-overlap must lie between 0 and 1, not {self.minimum_overlap:g}")
-        if min(self.jitter_mm, self.jitter_deg, self.clearance_mm) < 0 or not self.jitter_length_mm > 0:
-            raise InputError(
-                "scan path: --jitter-mm, --jitter-deg and --clearance-mm must not be negative, --jitter-length-mm "
-                "must be positive"
-            )
 
     @property
     def rolls_deg(self) -> tuple[float, ...]:
