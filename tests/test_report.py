@@ -5,7 +5,9 @@ import gzip
 import json
 import re
 import shutil
+import socket
 import sys
+from importlib.metadata import version
 
 import numpy as np
 import pytest
@@ -381,6 +383,43 @@ def test_the_live_view_starts_and_stops(scan_folder):
     try:
         with urlopen(f"http://127.0.0.1:{server.get_port()}", timeout=20) as answer:
             assert answer.status == 200
+    finally:
+        server.stop()
+
+
+def asked(port: int, **headers: str) -> str:
+    """The first line of what the live view answers to a request for its WebSocket."""
+    wanted = {
+        "Upgrade": "websocket",
+        "Connection": "Upgrade",
+        "Sec-WebSocket-Key": "x" * 22 + "==",
+        "Sec-WebSocket-Version": "13",
+        "Sec-WebSocket-Protocol": f"viser-v{version('viser')}",
+        **headers,
+    }
+    lines = ["GET / HTTP/1.1", *(f"{name}: {value}" for name, value in wanted.items()), "", ""]
+    with socket.create_connection(("127.0.0.1", port), timeout=20) as connection:
+        connection.sendall("\r\n".join(lines).encode())
+        return connection.recv(100).split(b"\r\n")[0].decode()
+
+
+def test_the_live_view_answers_its_own_pages_alone(scan_folder):
+    """Another page in the same browser gets nothing, be it by its Origin or under a name of its own."""
+    pytest.importorskip("viser", reason="viser is not installed: pip install 'cuspid[view]'")
+    server = live_view.serve(storage.read_result(scan_folder), "127.0.0.1", 18090)
+    port = server.get_port()
+    try:
+        for name in ("127.0.0.1", "localhost"):
+            assert " 101 " in asked(port, Host=f"{name}:{port}", Origin=f"http://{name}:{port}")
+        assert " 101 " in asked(port, Host=f"127.0.0.1:{port}")
+        for host, origin in (
+            (f"127.0.0.1:{port}", "http://evil.example"),
+            (f"127.0.0.1:{port}", f"http://127.0.0.1:{port + 1}"),
+            (f"127.0.0.1:{port}", "null"),
+            (f"evil.example:{port}", f"http://evil.example:{port}"),
+            ("", f"http://127.0.0.1:{port}"),
+        ):
+            assert " 403 " in asked(port, Host=host, Origin=origin)
     finally:
         server.stop()
 

@@ -10,7 +10,6 @@ from tyro.conf import Positional
 
 from cuspid import storage
 from cuspid.cli.shared import console
-from cuspid.errors import InputError
 from cuspid.options import Range
 from cuspid.reporting.live_view import serve
 
@@ -32,8 +31,6 @@ def view(
         host: Address to listen at; 0.0.0.0 lets other machines in.
         port: Port; the next free one is taken where it is busy.
     """
-    if not 0 < port < 65536:
-        raise InputError(f"view: --port is {port}; give one from 1 to 65535")
     server = serve(storage.read_result(folder, reference, unit), host, port)
     console.print(f"http://{host}:{server.get_port()} shows {folder}; Ctrl-C ends it", highlight=False, soft_wrap=True)
     try:

@@ -23,6 +23,7 @@ from cuspid.reporting.pages.scene import (
     poses_from,
     shown_frame,
 )
+from cuspid.reporting.same_origin import only_own_pages
 from cuspid.shape_model import ShapeModel
 from cuspid.storage import Result, ScanResult, ShapeResult
 
@@ -35,7 +36,8 @@ _GAMMA = 2.2
 
 
 def serve(result: Result, host: str, port: int) -> Server:
-    """A server that shows a scan or a shape model until it is stopped; it takes the next free port.
+    """A server that shows a scan or a shape model until it is stopped, to its own pages alone; it takes the next free
+    port.
 
     Raises MissingDependencyError without viser, InputError where there is nothing to show in 3-D.
     """
@@ -44,7 +46,8 @@ def serve(result: Result, host: str, port: int) -> Server:
     except ImportError as error:
         raise MissingDependencyError("view needs viser: pip install 'cuspid[view]'") from error
     show = _what_to_show(result)
-    server = viser.ViserServer(host=host, port=port, label="cuspid", verbose=False)
+    with only_own_pages(host):
+        server = viser.ViserServer(host=host, port=port, label="cuspid", verbose=False)
     server.scene.set_up_direction("+z")
     _light(server)
     show(server)
