@@ -125,7 +125,7 @@ def test_points_without_a_place_are_passed_over_and_told_but_locked_ones_count(t
     ("points", "message"),
     [
         ([control_point("33.cusp_tip", [1.0, 2.0])], "33.cusp_tip.*three finite numbers"),
-        ([control_point("33.cusp_tip", [1.0, 2.0, float("nan")])], "33.cusp_tip.*three finite numbers"),
+        ([control_point("33.cusp_tip", [1.0, 2.0, float("nan")])], "position.*finite"),
         ([control_point("33.cusp_tip", [1.0, 2.0, "3"])], "33.cusp_tip.*three finite numbers"),
         ([control_point("33.cusp_tip", None)], "33.cusp_tip.*three finite numbers"),
         ([control_point("papilla", [0, 0, 0]), control_point("papilla", [0, 0, 1])], "'papilla' occurs more than once"),

@@ -280,7 +280,7 @@ def test_a_body_changes_no_reconstruction(tmp_path):
     [
         ({"size_mm": [1, 2]}, r"bar: size_mm is \[1, 2\]; it must be 3 numbers"),
         ({"size_mm": [1, 2, 0]}, "bar: size_mm"),
-        ({"size_mm": [1, 2, float("nan")]}, "bar: size_mm"),
+        ({"size_mm": [1, 2, None]}, "bar: size_mm"),
         ({"size_mm": [1, 2, True]}, "bar: size_mm"),
         ({"size_mm": "big"}, "bar: size_mm"),
         ({"half_mm": [1, 2, 3]}, "bar: a box has the fields box_from_rig and size_mm"),
@@ -403,7 +403,7 @@ def test_arrays_return_and_damaged_ones_are_told_with_what_to_do(tmp_path):
     with pytest.raises(InputError, match=r"arrays\.npz: damaged .*; make it again"):
         read_arrays(path, remedy="make it again")
     path.unlink()
-    with pytest.raises(InputError, match=r"arrays\.npz: cannot be read .*; make it again"):
+    with pytest.raises(InputError, match=r"arrays\.npz: no such file; make it again"):
         read_arrays(path, remedy="make it again")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -14,8 +15,12 @@ from jaxtyping import UInt8
 from PIL import Image, UnidentifiedImageError
 
 from cuspid.errors import InputError
+from cuspid.inputs import require_file
 from cuspid.rig import Handpiece
-from cuspid.values import checked_name
+from cuspid.values import checked_name, one_line
+
+# Large is not hostile: what is too large is refused, and up to there nothing need be said.
+warnings.simplefilter("ignore", Image.DecompressionBombWarning)
 
 PNG_END = b"IEND\xaeB`\x82"
 """The last bytes of a whole PNG file."""
@@ -33,14 +38,20 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height in px, from the header. Raises InputError where the file is missing, no image, or cut short."""
     try:
-        with path.open("rb") as stream:
+        with require_file(path, "image").open("rb") as stream:
             size = Image.open(stream).size
             stream.seek(max(0, path.stat().st_size - len(PNG_END)))
             end = stream.read()
+    except Image.DecompressionBombError as error:
+        raise InputError(f"{path}: too many pixels; at most {2 * (Image.MAX_IMAGE_PIXELS or 0):,} are read") from error
     except UnidentifiedImageError as error:
         raise InputError(f"{path}: not an image, or truncated; copy the image again") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); put the image back") from error
+    except InputError as error:
+        raise InputError(f"{error}; put the image back") from error
+    except Exception as error:  # a reader of Pillow raises whatever its format makes of the header
+        raise InputError(f"{path}: damaged ({one_line(error)}); copy the image again") from error
     if path.suffix.lower() == ".png" and end != PNG_END:
         raise InputError(f"{path}: truncated PNG; copy the image again")
     return size

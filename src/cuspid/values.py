@@ -90,7 +90,12 @@ def covariance(what: str, value: Any, size: int) -> Float[np.ndarray, "n n"]:
     return found
 
 
-def shown(value: object) -> str:
+def one_line(error: BaseException) -> str:
+    """What a library says, cut to one short line."""
+    return shown(" ".join(str(error).split()), longest=120)[1:-1]
+
+
+def shown(value: object, *, longest: int = _SHOWN) -> str:
     """A value for a message: short, on one line, without control characters."""
     text = repr(value if not isinstance(value, np.ndarray) else value.tolist()).replace("\n", " ")
-    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
+    return text if len(text) <= longest else f"{text[: longest - 3]}..."

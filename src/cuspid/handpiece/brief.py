@@ -44,7 +44,10 @@ from cuspid.errors import InputError
 from cuspid.handpiece.holder import HolderOptions
 from cuspid.handpiece.optics import Optics
 from cuspid.handpiece.presets import PRESETS
+from cuspid.inputs import read_text
 
+_LARGEST = 1e6
+"""No figure is larger; NaN is none."""
 _FARTHEST_MM = 15.0
 """End of the depth range where a lens is sharp up to infinity."""
 
@@ -168,11 +171,10 @@ class DesignBrief:
 
 def read_brief(path: Path) -> DesignBrief:
     """Read and check a TOML file. Raises InputError with the file and the first condition that fails."""
+    text = read_text(path)
     try:
-        return parse_brief(tomllib.loads(path.read_text(encoding="utf-8")))
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        return parse_brief(tomllib.loads(text))
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read as TOML: {error}") from error
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
@@ -246,7 +248,9 @@ def _check_keys(values: Mapping[str, Any], kind: type, where: str) -> None:
 
 
 def _are_numbers(values: object) -> bool:
-    return isinstance(values, list) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
+    return isinstance(values, list) and all(
+        isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= _LARGEST for v in values
+    )
 
 
 def _is_whole(value: object) -> bool:

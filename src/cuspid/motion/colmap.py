@@ -25,6 +25,7 @@ from cuspid.camera import Camera
 from cuspid.capture import Capture, Dropped, Frame, ImageFolder, image_name
 from cuspid.errors import InputError, OutputError, ReconstructionError
 from cuspid.geometry import Rigid3
+from cuspid.inputs import read_bytes
 from cuspid.motion.adjustment import residuals_px
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import Rig
@@ -243,7 +244,7 @@ def _read(folder: Path) -> pycolmap.Reconstruction:
     folder = _model_folder(folder)
     for name, after in _AFTER.items():
         file = folder / f"{name}.bin"
-        if file.is_file() and not _is_whole(file.read_bytes(), after):
+        if file.is_file() and not _is_whole(read_bytes(file, "arrays"), after):
             raise InputError(f"{file}: truncated or damaged; copy the COLMAP model again")
     try:
         return pycolmap.Reconstruction(folder)

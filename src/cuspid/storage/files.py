@@ -6,18 +6,21 @@ import dataclasses
 import errno
 import hashlib
 import json
+import math
 import os
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import ZipFile
 
 import numpy as np
 
 import cuspid
 from cuspid.errors import CuspidError, InputError, OutputError
+from cuspid.inputs import LARGEST_MIB, read_text, require_file
+from cuspid.values import one_line
 
 PART = ".part-"
 """How the names of unfinished files begin; a killed run leaves them behind, and nothing reads them."""
@@ -96,12 +99,16 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], *, compressed: bo
 def read_arrays(path: Path, *, remedy: str) -> dict[str, np.ndarray]:
     """The arrays of an ``.npz`` by name. Raises InputError, which names the remedy, where it is missing or damaged."""
     try:
+        require_file(path, "arrays")
+        with ZipFile(path) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > LARGEST_MIB["arrays"] << 20:
+                raise ValueError("more than it can hold")
         with np.load(path, allow_pickle=False) as stored:
             return {name: stored[name] for name in stored}
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); {remedy}") from error
-    except (ValueError, EOFError, BadZipFile) as error:
-        raise InputError(f"{path}: damaged ({error}); {remedy}") from error
+    except InputError as error:
+        raise InputError(f"{error}; {remedy}") from error
+    except Exception as error:  # zipfile and NumPy raise whatever they meet, from KeyError to MemoryError
+        raise InputError(f"{path}: damaged ({type(error).__name__}: {one_line(error)}); {remedy}") from error
 
 
 def to_plain(value: Any) -> Any:
@@ -124,11 +131,26 @@ def to_plain(value: Any) -> Any:
 def read_json(path: Path) -> Any:
     """Parse a JSON file. Raises InputError where it is missing or broken."""
     try:
-        return json.loads(path.read_text())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        value = json.loads(read_text(path))
     except ValueError as error:
         raise InputError(f"{path}: not valid JSON ({error})") from error
+    except RecursionError as error:
+        raise InputError(f"{path}: not valid JSON (nested too deep)") from error
+    _require_finite(path, value)
+    return value
+
+
+def _require_finite(path: Path, value: object) -> None:
+    """Python reads NaN, the infinities and 1e999, which are no numbers of JSON."""
+    left = [("", value)]
+    while left:
+        where, each = left.pop()
+        if isinstance(each, dict):
+            left += [(f"{where}.{key}", inner) for key, inner in each.items()]
+        elif isinstance(each, list):
+            left += [(f"{where}[{k}]", inner) for k, inner in enumerate(each)]
+        elif isinstance(each, float) and not math.isfinite(each):
+            raise InputError(f"{path}: {where[1:]} is {each}; a number must be finite")
 
 
 @contextmanager
@@ -150,11 +172,9 @@ def digest_of(value: object) -> str:
 
 
 def hash_file(path: Path) -> str:
-    """SHA-256 of a file's contents."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
+    """SHA-256 of a file's contents. Raises InputError where it is no regular file or cannot be read."""
     try:
-        with path.open("rb") as stream:
+        with require_file(path, "video").open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error

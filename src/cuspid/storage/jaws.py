@@ -5,14 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from jaxtyping import Int, UInt8
 
 from cuspid.errors import InputError
+from cuspid.inputs import require_file
 from cuspid.jaw import FDI_FROM_UNIVERSAL, Arch, Jaw, Landmark, Sphere
 from cuspid.mesh import Mesh
 from cuspid.storage.files import read_json, reading, write_json
 from cuspid.storage.meshes import MESH_SUFFIXES, Unit, read_triangles, write_mesh
+from cuspid.values import one_line
 
+_LARGEST_LABEL = 10_000
 OCCLUSAL = "occlusal"
 """Name of the frame of a jaw in its JSON file."""
 
@@ -30,19 +34,34 @@ def read_labelled_mesh(
     colors = None
     if loaded.visual.kind == "face":
         colors = np.asarray(loaded.visual.face_colors, dtype=np.uint8)[:, :3]
-    beside = path.with_name(f"{path.stem}_facelabels.npy")
-    if beside.exists():
-        try:
-            labels = np.load(beside, allow_pickle=False).astype(np.int64).reshape(-1)
-        except (ValueError, OSError) as error:
-            raise InputError(f"{beside}: not a readable array of labels ({error})") from error
-    else:
-        raw = loaded.metadata.get("_ply_raw", {}).get("face", {}).get("data")
-        names = raw.dtype.names if raw is not None and getattr(raw, "dtype", None) is not None else ()
-        labels = np.asarray(raw["label"], dtype=np.int64).reshape(-1) if names and "label" in names else None
+    labels = _labels_of(path, loaded)
     if labels is not None and len(labels) != len(mesh.faces):
         raise InputError(f"{path}: {len(labels)} labels for {len(mesh.faces)} faces; one for each is needed")
     return mesh, None if labels is None else _fdi_labels(labels, path), colors
+
+
+def _labels_of(path: Path, loaded: trimesh.Trimesh) -> Int[np.ndarray, "f"] | None:
+    beside = path.with_name(f"{path.stem}_facelabels.npy")
+    if beside.exists():
+        return _whole(beside, _read_array(beside))
+    raw = loaded.metadata.get("_ply_raw", {}).get("face", {}).get("data")
+    names = raw.dtype.names if raw is not None and getattr(raw, "dtype", None) is not None else ()
+    return _whole(path, raw["label"]) if names and "label" in names else None
+
+
+def _read_array(path: Path) -> np.ndarray:
+    try:
+        return np.asarray(np.load(require_file(path, "arrays"), allow_pickle=False))
+    except InputError:
+        raise
+    except Exception as error:  # NumPy raises whatever it meets, up to MemoryError
+        raise InputError(f"{path}: not a readable array of labels ({one_line(error)})") from error
+
+
+def _whole(path: Path, labels: np.ndarray) -> Int[np.ndarray, "f"]:
+    if labels.dtype.kind not in "iuf" or not np.all(np.abs(labels) < _LARGEST_LABEL) or np.any(labels % 1):
+        raise InputError(f"{path}: tooth labels must be whole numbers")
+    return labels.astype(np.int64).reshape(-1)
 
 
 def _fdi_labels(labels: Int[np.ndarray, "f"], path: Path) -> Int[np.ndarray, "f"]:

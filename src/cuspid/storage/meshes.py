@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -12,14 +13,18 @@ import trimesh
 from jaxtyping import Float, Int, UInt8
 
 from cuspid.errors import InputError
+from cuspid.inputs import read_bytes
 from cuspid.mesh import Mesh
 from cuspid.storage.files import write_bytes
+from cuspid.values import LONGEST_MM, one_line
 
 Unit = Literal["mm", "cm", "m", "in", "um"]
 MM_PER_UNIT: Mapping[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "um": 0.001}
 """Length units that a mesh file may be in."""
 
 _PLACE_AND_COLOR = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"}
+_PLY_ELEMENT = re.compile(rb"^element\s+(\w+)\s+(\d{1,400})\s*$", re.MULTILINE)
+_LONGEST_HEADER = 1 << 16
 MESH_SUFFIXES = (".stl", ".ply", ".obj")
 
 
@@ -35,18 +40,23 @@ def read_triangles(path: Path, unit: Unit) -> tuple[Mesh, trimesh.Trimesh]:
     """As :func:`read_mesh`, with what trimesh loaded, which holds what else the file says."""
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(f"{path}: not a mesh file that cuspid reads; give an STL, PLY or OBJ file")
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
+    declared = _declared_faces(path)
     try:
         loaded = trimesh.load(path, process=False, force="mesh", skip_materials=True)
     except Exception as error:  # trimesh's loaders raise whatever the parser met
-        raise InputError(f"{path}: not a mesh ({type(error).__name__}: {error}); export it again") from error
+        raise InputError(f"{path}: not a mesh ({type(error).__name__}: {one_line(error)}); export it again") from error
     vertices = np.asarray(getattr(loaded, "vertices", np.empty((0, 3))), dtype=np.float64)
     faces = np.asarray(getattr(loaded, "faces", np.empty((0, 3))), dtype=np.int64)
     if len(vertices) == 0 or len(faces) == 0:
         raise InputError(f"{path}: the mesh is empty (no triangles); export the surface, not a point cloud")
+    if len(faces) < declared:
+        raise InputError(
+            f"{path}: {len(faces)} of {declared} faces could be read; the file is truncated, copy it again"
+        )
     if not np.isfinite(vertices).all():
         raise InputError(f"{path}: some coordinates are not finite numbers; repair the mesh and export it again")
+    if np.abs(vertices).max() * MM_PER_UNIT[unit] > LONGEST_MM:
+        raise InputError(f"{path}: coordinates beyond {LONGEST_MM / 1000:g} m; repair the mesh, or give its --unit")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"{path}: faces name vertices that do not exist; export the mesh again")
     colors = _vertex_colors(loaded)
@@ -57,6 +67,23 @@ def read_triangles(path: Path, unit: Unit) -> tuple[Mesh, trimesh.Trimesh]:
         None if colors is None else colors[first],
     )
     return mesh, loaded
+
+
+def _declared_faces(path: Path) -> int:
+    """How many faces the file says that it has; 0 where it does not say. Raises InputError where it is too short for
+    what it says."""
+    suffix, data = path.suffix.lower(), read_bytes(path, "mesh")
+    if suffix == ".ply":
+        header = data[:_LONGEST_HEADER].partition(b"end_header")[0]
+        counts = {name: int(count) for name, count in _PLY_ELEMENT.findall(header)}
+        if sum(counts.values()) > len(data):  # an element takes a byte at least
+            raise InputError(f"{path}: too short for its {sum(counts.values())} elements; copy the file again")
+        return counts.get(b"face", 0)
+    if suffix == ".stl" and data.lstrip()[:5].lower() == b"solid":
+        if b"facet" in data[:_LONGEST_HEADER] and b"endsolid" not in data[-_LONGEST_HEADER:]:
+            raise InputError(f"{path}: truncated, it does not end with 'endsolid'; copy the file again")
+        return data.count(b"facet normal")
+    return 0
 
 
 def _vertex_colors(loaded: trimesh.Trimesh) -> UInt8[np.ndarray, "v 3"] | None:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from cuspid.errors import InputError, OutputError
+from cuspid.inputs import read_text
 from cuspid.panorama import ZONES, FrameUse, Panorama, Strip
 from cuspid.storage.files import read_arrays, read_json, reading, write_arrays, write_bytes, write_json
 from cuspid.storage.tables import write_table
@@ -80,10 +81,7 @@ def read_panorama(folder: Path) -> Panorama:
 
 
 def _read_frames(path: Path) -> tuple[FrameUse, ...]:
-    try:
-        text = path.read_text()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    text = read_text(path)
     with reading(path):
         return tuple(
             FrameUse(

@@ -6,16 +6,14 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
 from cuspid.capture import Dropped
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.reconstruction import DepthMap, Reconstruction, Tracks
 from cuspid.rig import Handpiece
-from cuspid.storage.files import read_json, reading, to_plain, write_arrays, write_json
+from cuspid.storage.files import read_arrays, read_json, reading, to_plain, write_arrays, write_json
 from cuspid.storage.handpieces import (
     camera_from_json,
     camera_to_json,
@@ -88,11 +86,9 @@ _TRACKS = [field.name for field in dataclasses.fields(Tracks)]
 
 
 def _read_tracks(path: Path) -> Tracks:
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return Tracks(**{name: arrays[name] for name in _TRACKS})
-    except (OSError, ValueError, KeyError, BadZipFile) as error:
-        raise InputError(f"{path}: missing or damaged; delete the folder and locate the frames again") from error
+    arrays = read_arrays(path, remedy="delete the folder and locate the frames again")
+    with reading(path):
+        return Tracks(**{name: arrays[name] for name in _TRACKS})
 
 
 def write_depth_maps(path: Path, depth_maps: Sequence[DepthMap]) -> None:
@@ -117,8 +113,9 @@ def write_depth_maps(path: Path, depth_maps: Sequence[DepthMap]) -> None:
 
 
 def read_depth_maps(path: Path) -> tuple[DepthMap, ...]:
-    """Read what :func:`write_depth_maps` wrote."""
-    with np.load(path, allow_pickle=False) as arrays:
+    """Read what :func:`write_depth_maps` wrote. Raises InputError."""
+    arrays = read_arrays(path, remedy="run the same command again, it is made anew")
+    with reading(path):
         header = json.loads(arrays["header"].tobytes())
         return tuple(
             DepthMap(

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from cuspid.capture import Capture
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.inputs import read_text
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.panorama import Panorama
@@ -282,7 +283,7 @@ def _rows(folder: Path) -> list[Mapping[str, str]]:
     """The table of a study, or what is known before it is complete."""
     table = folder / "results.csv"
     if table.exists():
-        return list(csv.DictReader(table.read_text().splitlines()))
+        return list(csv.DictReader(read_text(table).splitlines()))
     found: list[Mapping[str, str]] = []
     for path in sorted((folder / "cases").glob("*.json")):
         entry = read_json(path)

@@ -14,6 +14,7 @@ from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.capture import ImageFolder, image_size
 from cuspid.errors import InputError
 from cuspid.image_sequence import ImageSequence
+from cuspid.inputs import read_text, require_file
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, Rig
 from cuspid.storage.captures import IMAGE_SUFFIXES, read_capture, write_image
@@ -147,8 +148,7 @@ def _with_camera(sequence: ImageSequence, camera: Camera, path: Path) -> ImageSe
 
 def _read_opencv(path: Path) -> Camera:
     """OpenCV's calibration: camera_matrix, distortion_coefficients (k1 k2 p1 p2 [k3 = 0]), image_width and _height."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
+    require_file(path, "text")
     try:
         file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     except (cv2.error, SystemError) as error:
@@ -171,10 +171,9 @@ def _read_opencv(path: Path) -> Camera:
 
 def _read_cameras_txt(path: Path) -> Camera:
     """COLMAP's cameras.txt with one camera: id, model, width, height, parameters."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
+    text = read_text(path)
     with reading(path):
-        rows = [line.split() for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
+        rows = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
         if len(rows) != 1:
             raise InputError(f"{path}: {len(rows)} cameras; the calibration of one is needed")
         _, model, width, height, *parameters = rows[0]

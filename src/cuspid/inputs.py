@@ -1,0 +1,52 @@
+"""Files from outside: regular ones, of a size that can be held, and text that is text.
+
+A pipe, a device or a file that never ends is refused before it is opened.
+"""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Literal
+
+from cuspid.errors import InputError
+
+Kind = Literal["text", "image", "mesh", "arrays", "video"]
+LARGEST_MIB: Mapping[Kind, int] = MappingProxyType(
+    {"text": 64, "image": 1024, "mesh": 4096, "arrays": 8192, "video": 1 << 20}
+)
+"""No file of a kind is larger."""
+
+
+def require_file(path: Path, kind: Kind) -> Path:
+    """The path again. Raises InputError where it is no regular file, or one that is too large for its kind."""
+    try:
+        found = path.stat()
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file") from error
+    except (OSError, ValueError) as error:  # a name with a NUL is no OSError
+        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+    if not stat.S_ISREG(found.st_mode):
+        what = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe or a device"
+        raise InputError(f"{path}: is {what}; give a file")
+    if found.st_size > LARGEST_MIB[kind] << 20:
+        raise InputError(f"{path}: {found.st_size >> 20} MiB are too much for {kind}; at most {LARGEST_MIB[kind]} MiB")
+    return path
+
+
+def read_bytes(path: Path, kind: Kind) -> bytes:
+    """The contents of a file. Raises InputError, as :func:`require_file` and where it cannot be read."""
+    try:
+        return require_file(path, kind).read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+def read_text(path: Path) -> str:
+    """A file of text in UTF-8. Raises InputError."""
+    try:
+        return read_bytes(path, "text").decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a file of text in UTF-8") from error
