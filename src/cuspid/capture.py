@@ -7,39 +7,52 @@ import warnings
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from cuspid.errors import InputError
 from cuspid.inputs import require_file
 from cuspid.rig import Handpiece
 from cuspid.values import checked_name, one_line
 
-# Large is not hostile: what is too large is refused, and up to there nothing need be said.
+# What is too large or damaged is refused; short of that nothing need be said.
 warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+warnings.filterwarnings("ignore", module=r"PIL\.")
 
 PNG_END = b"IEND\xaeB`\x82"
 """The last bytes of a whole PNG file."""
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    """An 8-bit RGB image. Raises InputError where the file is missing or cannot be decoded whole."""
+    """An 8-bit RGB image, upright. Raises InputError where the file is missing or cannot be decoded whole."""
+    return _decoded(path, "RGB")
+
+
+def read_rgba(path: Path) -> UInt8[np.ndarray, "h w 4"]:
+    """As :func:`read_image`, with how opaque each pixel is; 255 where the file does not say."""
+    return _decoded(path, "RGBA")
+
+
+def _decoded(path: Path, mode: Literal["RGB", "RGBA"]) -> UInt8[np.ndarray, "h w c"]:
     image_size(path)
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
-    if image is None:
-        raise InputError(f"{path}: not an image that can be decoded; copy the image again")
-    return np.asarray(image, dtype=np.uint8)
+    try:
+        with Image.open(path) as image:
+            upright = ImageOps.exif_transpose(image)
+            if upright.mode.startswith("I;16"):
+                upright = Image.fromarray((np.asarray(upright) >> 8).astype(np.uint8))
+            return np.asarray(upright.convert(mode))
+    except Exception as error:  # as in image_size
+        raise InputError(f"{path}: cannot be decoded ({one_line(error)}); copy the image again") from error
 
 
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height in px, from the header. Raises InputError where the file is missing, no image, or cut short."""
     try:
         with require_file(path, "image").open("rb") as stream:
-            size = Image.open(stream).size
+            width, height = _upright_size(Image.open(stream))
             stream.seek(max(0, path.stat().st_size - len(PNG_END)))
             end = stream.read()
     except Image.DecompressionBombError as error:
@@ -54,7 +67,13 @@ def image_size(path: Path) -> tuple[int, int]:
         raise InputError(f"{path}: damaged ({one_line(error)}); copy the image again") from error
     if path.suffix.lower() == ".png" and end != PNG_END:
         raise InputError(f"{path}: truncated PNG; copy the image again")
-    return size
+    return width, height
+
+
+def _upright_size(image: Image.Image) -> tuple[int, int]:
+    """A camera that is held on its side keeps its image lying and says so; PNG would be decoded to be asked."""
+    lying = image.format != "PNG" and image.getexif().get(ExifTags.Base.Orientation) in (5, 6, 7, 8)
+    return (image.height, image.width) if lying else image.size
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import cv2
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional
 
 from cuspid import storage
+from cuspid.capture import read_rgba
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console
 from cuspid.errors import InputError
@@ -57,15 +57,14 @@ def stitch_eval(
 
 def read_picture(path: Path) -> Panorama:
     """A picture that nothing is known of. Raises InputError where it cannot be read or shows nothing."""
-    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
-    if pixels is None or pixels.dtype != np.uint8 or pixels.ndim != 3:
-        raise InputError(f"{path}: neither a folder of cuspid stitch nor a colour picture of 8 bits")
-    covered = pixels[..., 3] > 0 if pixels.shape[2] == 4 else pixels.max(axis=2) > 0
+    pixels = read_rgba(path)
+    opaque = pixels[..., 3] > 0
+    covered = opaque & (pixels[..., :3].max(axis=2) > 0) if opaque.all() else opaque
     if not covered.any():
         raise InputError(f"{path}: the picture is black or transparent everywhere; give a panorama")
     frames: tuple[FrameUse, ...] = ()
     return Panorama(
-        image=np.ascontiguousarray(pixels[..., 2::-1]),
+        image=np.ascontiguousarray(pixels[..., :3]),
         covered=covered,
         frame_index=np.full(covered.shape, -1, dtype=np.int16),
         frame_pixel=np.full((*covered.shape, 2), np.nan, dtype=np.float32),

@@ -32,6 +32,7 @@ def report(
         unit: Length unit of the reference.
     """
     path = out or folder / "report.html"
-    page = report_page(storage.read_result(folder, reference, unit), options)
+    with storage.reading(folder):
+        page = report_page(storage.read_result(folder, reference, unit), options)
     storage.write_bytes(path, page.encode())
     console.print(f"{path}: {path.stat().st_size / 1e6:.1f} MB", highlight=False)

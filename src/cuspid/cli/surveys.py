@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
@@ -58,7 +60,7 @@ def measure(
     files = jaw_files(jaws)
     if landmarks is not None and len(files) > 1:
         raise InputError(f"{landmarks}: one file of landmarks for {len(files)} jaws; put one beside each mesh instead")
-    hashes = {path.name: storage.hash_file(path) for path in files}
+    hashes = {path.name: storage.hash_file(path) for path in _of_different_names(files)}
     with storage.claimed_folder(out, "measure", {"arch": arch}, hashes, replace=True), show_progress() as progress:
 
         def load(number: int, path: Path) -> tuple[Jaw, tuple[str, ...]]:
@@ -73,6 +75,14 @@ def measure(
         storage.write_table(out / "groups.csv", group_rows(found), digits=3)
         storage.write_json(out / "measure.json", found)
     _print_survey(found)
+
+
+def _of_different_names(files: Sequence[Path]) -> Sequence[Path]:
+    """The files, whose results are named after them."""
+    for one, other in pairwise(sorted(files, key=lambda path: path.stem)):
+        if one.stem == other.stem:
+            raise InputError(f"{one}: {other.name} beside it has the same name; rename one of them")
+    return files
 
 
 def _save_pictures(out: Path, name: str, jaw: Jaw) -> None:
@@ -133,7 +143,7 @@ def shape(
         arch: Which jaws they are, where the files do not say.
     """
     files = jaw_files(jaws)
-    hashes = {path.name: storage.hash_file(path) for path in files}
+    hashes = {path.name: storage.hash_file(path) for path in _of_different_names(files)}
     with storage.claimed_folder(out, "shape", {"shape": options}, hashes, replace=True), show_progress() as progress:
         samples = {path.stem: load_landmarked_jaw(path, unit=unit, arch=arch)[0] for path in files}
         model = mean_shape(samples, options, progress=progress)

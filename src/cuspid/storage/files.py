@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import errno
 import hashlib
@@ -22,6 +23,7 @@ from cuspid.errors import CuspidError, InputError, OutputError
 from cuspid.inputs import LARGEST_MIB, read_text, require_file
 from cuspid.values import one_line
 
+_UNUSABLE = (ValueError, TypeError, AttributeError, IndexError, OverflowError, csv.Error, np.linalg.LinAlgError)
 PART = ".part-"
 """How the names of unfinished files begin; a killed run leaves them behind, and nothing reads them."""
 
@@ -155,15 +157,23 @@ def _require_finite(path: Path, value: object) -> None:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turn what a malformed value in a parsed file raises into one clear line."""
+    """Turn what a malformed value in a parsed file, or in the files of a folder, raises into one clear line."""
     try:
         yield
     except CuspidError:
         raise
     except KeyError as error:
         raise InputError(f"{path}: the field {error} is missing; see docs/formats.md") from error
-    except (ValueError, TypeError, AttributeError, IndexError, np.linalg.LinAlgError) as error:
-        raise InputError(f"{path}: a value cannot be used ({error}); see docs/formats.md") from error
+    except (
+        ValueError,
+        TypeError,
+        AttributeError,
+        IndexError,
+        OverflowError,
+        csv.Error,
+        np.linalg.LinAlgError,
+    ) as error:
+        raise InputError(f"{path}: a value cannot be used ({one_line(error)}); see docs/formats.md") from error
 
 
 def digest_of(value: object) -> str:

@@ -25,6 +25,7 @@ from jaxtyping import Float
 from cuspid.errors import InputError
 from cuspid.jaw import Landmark
 from cuspid.storage.files import read_json, write_json
+from cuspid.values import shown
 
 LandmarkFrame = Literal["occlusal", "mesh"]
 """What the positions of a landmark file are relative to."""
@@ -37,6 +38,8 @@ _SCHEMA = (
 )
 _FROM_SYSTEM: Mapping[str, tuple[float, float, float]] = MappingProxyType({"LPS": (1, 1, 1), "RAS": (-1, -1, 1)})
 _MM_PER: Mapping[str, float] = MappingProxyType({"mm": 1.0, "um": 0.001})
+_FARTHEST = 1e9
+"""No coordinate is larger, whatever its unit; NaN is none."""
 _SIGMA = re.compile(r"sigma (\S+) mm")
 
 
@@ -178,18 +181,22 @@ def _one_of(value: Any, allowed: tuple[Any, ...], name: str, path: Path) -> Any:
 
 def _position(value: Any, label: str, path: Path) -> Float[np.ndarray, "3"]:
     if not isinstance(value, list) or len(value) != 3 or not all(_is_finite(number) for number in value):
-        raise InputError(f"{path}: the position of landmark '{label}' must be three finite numbers, it is {value!r}")
+        raise InputError(
+            f"{path}: the position of landmark '{label}' must be three finite numbers, it is {shown(value)}"
+        )
     return np.array(value, dtype=np.float64)
 
 
 def _sigma(value: Any, label: str, path: Path) -> float | None:
     if value is None or (_is_finite(value) and value >= 0):
         return None if value is None else float(value)
-    raise InputError(f"{path}: estimated_sigma_mm of landmark '{label}' must be a number from 0 up, it is {value!r}")
+    raise InputError(
+        f"{path}: estimated_sigma_mm of landmark '{label}' must be a number from 0 up, it is {shown(value)}"
+    )
 
 
 def _is_finite(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _FARTHEST
 
 
 def _unique(entries: Iterable[tuple[str, Landmark]], path: Path) -> dict[str, Landmark]:

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from cuspid.capture import read_rgba
 from cuspid.errors import InputError, OutputError
 from cuspid.inputs import read_text
 from cuspid.panorama import ZONES, FrameUse, Panorama, Strip
@@ -65,9 +66,7 @@ def read_panorama(folder: Path) -> Panorama:
     """Read what :func:`write_panorama` wrote. Raises InputError where a file is missing or damaged."""
     path = folder / "panorama.json"
     value = read_json(path)
-    rgba = cv2.imread(str(folder / "panorama.png"), cv2.IMREAD_UNCHANGED)
-    if rgba is None or rgba.ndim != 3 or rgba.shape[2] != 4:
-        raise InputError(f"{folder / 'panorama.png'}: missing, or not a panorama's image; run cuspid stitch again")
+    rgba = read_rgba(folder / "panorama.png")
     frames = _read_frames(folder / "frames.csv")
     arrays = read_arrays(folder / "source.npz", remedy="run cuspid stitch again")
     with reading(path):
@@ -76,7 +75,7 @@ def read_panorama(folder: Path) -> Panorama:
         header: dict[str, Any] = {name: value[name] for name in _HEADER}
         header |= {"origin_px": np.array(value["origin_px"], dtype=np.float64), "notes": tuple(value["notes"])}
         source: dict[str, Any] = {name: arrays[name] for name in _SOURCE if name in arrays}
-        image = np.asarray(cv2.cvtColor(rgba, cv2.COLOR_BGRA2RGB), dtype=np.uint8)
+        image = np.ascontiguousarray(rgba[..., :3])
         return Panorama(image=image, covered=rgba[..., 3] > 0, frames=frames, **header, **source)
 
 

@@ -19,7 +19,7 @@ from types import MappingProxyType
 import numpy as np
 
 from cuspid.anatomy.landmarks.scheme import teeth_named
-from cuspid.errors import CuspidError, InputError
+from cuspid.errors import CuspidError, InputError, OutputError
 from cuspid.jaw import Arch, Jaw, Landmark
 
 DIMENSIONS = ("a", "b", "c", "f", "f_first")
@@ -183,14 +183,20 @@ def measure(name: str, jaw: Jaw, notes: tuple[str, ...] = ()) -> MeasuredJaw:
 def survey(jaws: Mapping[str, Callable[[], tuple[Jaw, tuple[str, ...]]]]) -> Survey:
     """Measure jaws that are loaded one after the other, each with notes on it.
 
-    A jaw that cannot be loaded or measured is listed with the reason and does not stop the others.
+    A jaw that cannot be loaded or measured is listed with the reason and does not stop the others. Raises InputError
+    where none can, OutputError where something cannot be written.
     """
     measured, failures = [], {}
     for name, load in jaws.items():
         try:
             measured.append(measure(name, *load()))
+        except OutputError:
+            raise
         except CuspidError as error:
             failures[name] = str(error)
+    if not measured:
+        first, reason = next(iter(failures.items()))
+        raise InputError(f"none of {len(failures)} jaws can be measured; {first}: {reason}")
     return Survey(jaws=tuple(measured), groups=group_statistics(measured), failures=failures)
 
 

@@ -1,0 +1,439 @@
+"""A fuzzer: small inputs that are read well, damaged in ways that happen and in ways that are meant.
+
+A scenario makes a folder and does something with it. What it may do with a damaged one is to succeed, or to say in one
+line what is wrong: no traceback, no hang, no gigabytes, no noise of libraries, no file outside of ``out``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import resource
+import shutil
+import signal
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import cv2
+import numpy as np
+import trimesh
+
+from builders import write_frames
+from cuspid import cli, pipeline, storage
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.capture import read_image
+from cuspid.errors import CuspidError
+from cuspid.evaluation.deviation import EvaluationOptions
+from cuspid.handpiece.brief import read_brief
+from cuspid.handpiece.designs import DESIGNS
+from cuspid.jaw import Jaw, Landmark
+from cuspid.motion.colmap import read_model
+from report_folders import TOOTH, write_comparison, write_evaluation, write_scan, write_score, write_shape
+from test_cli_stitch import picture, write_calibration
+from test_colmap import make_capture, make_found, without_rig, write
+from test_panorama import small_panorama
+
+LONGEST_S = 10.0
+"""Of work; waiting may take more on a busy machine."""
+LONGEST_WAIT_S = 60.0
+MOST_BYTES = 2 << 30
+_NOISE = re.compile(r"Traceback|Warning:|corrupt|libpng|\[ ?WARN|\[ERROR|OpenCV|Exception|glog|\*\*\*", re.IGNORECASE)
+_OUT = "out"
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Something that is done with files."""
+
+    make: Callable[[Path], None]
+    """Writes good files into a folder."""
+    use: Callable[[Path], object]
+    """Reads them; what it writes goes to ``out`` in the folder."""
+
+
+# --- scenarios ----------------------------------------------------------------------------------------------------
+
+
+def small_jaw() -> Jaw:
+    """A molar with its neighbours, in big faces."""
+    jaw = build_phantom(PhantomOptions(edge_mm=1.0))
+    near = (
+        np.linalg.norm(jaw.mesh.face_centres - jaw.mesh.face_centres[jaw.tooth_faces(TOOTH)].mean(axis=0), axis=1) < 12
+    )
+    return Jaw(
+        mesh=jaw.mesh.submesh(near),
+        face_labels=None if jaw.face_labels is None else jaw.face_labels[near],
+        arch=jaw.arch,
+        landmarks={"46.buccal_groove": Landmark(np.array([1.0, 2.0, 3.0]), None)},
+    )
+
+
+def verb(*arguments: str) -> Callable[[Path], None]:
+    """A verb on the folder; ``@name`` stands for a file in it."""
+
+    def use(folder: Path) -> None:
+        cli.main([str(folder / each[1:]) if each.startswith("@") else each for each in arguments])
+
+    return use
+
+
+def _handpiece(folder: Path) -> None:
+    storage.write_handpiece(folder / "handpiece.json", DESIGNS["four"]())
+    storage.write_rig_config(folder / "rig_config.json", DESIGNS["two"]().rig)
+
+
+def _meshes(folder: Path) -> None:
+    jaw = small_jaw()
+    storage.write_jaw(folder / "jaw.ply", jaw)
+    storage.write_mesh(folder / "binary.stl", jaw.mesh)
+    storage.write_mesh(folder / "mesh.obj", jaw.mesh)
+    loaded = trimesh.Trimesh(jaw.mesh.vertices, jaw.mesh.faces, process=False)
+    (folder / "text.ply").write_bytes(loaded.export(file_type="ply", encoding="ascii"))
+    (folder / "text.stl").write_text(str(loaded.export(file_type="stl_ascii")))
+    np.save(folder / "text_facelabels.npy", np.full(len(jaw.mesh.faces), 46))
+
+
+def _read_meshes(folder: Path) -> None:
+    for path in sorted(folder.glob("*.*")):
+        if path.suffix in storage.MESH_SUFFIXES:
+            storage.read_labelled_mesh(path)
+    storage.read_jaw(folder / "jaw.ply")
+
+
+def _evaluate(folder: Path) -> None:
+    """As the verb does, but for its pictures, which take the most time."""
+    scan, against = storage.read_mesh(folder / "binary.stl"), pipeline.load_reference(folder / "text.ply")
+    pipeline.evaluate(scan, against.jaw, EvaluationOptions(align=False, samples=2000))
+
+
+def _landmarks(folder: Path) -> None:
+    points = small_jaw().landmarks
+    storage.write_landmarks(folder / "own.json", points, "mesh")
+    storage.write_landmarks(folder / "slicer.mrk.json", points, "mesh")
+
+
+def _brief(folder: Path) -> None:
+    (folder / "brief.toml").write_text(
+        'name = "probe"\nsensor = "thesis"\nthickness_mm = 7.0\nworking_distance_mm = [4.5, 5.5]\n'
+        "[mouth]\ntooth = 7\npeople = 0.95\n[surfaces]\nocclusal = 0.98\nbuccal = 0.9\n[cameras]\nmost = 12\n"
+        "[motion]\nturns = 1\nturn_deg = 60.0\n[weights]\ncoverage = 1.0\nprecision = 1.0\ncameras = 0.3\n"
+    )
+
+
+def _scan(folder: Path) -> None:
+    write_scan(folder / "scan", small_jaw())
+
+
+def _read_scan(folder: Path) -> None:
+    scan = folder / "scan"
+    capture = storage.read_capture(scan / "capture")
+    for frame in capture.frames:
+        capture.images(frame)
+    storage.hash_capture(capture)
+    storage.read_reconstruction(scan / "motion")
+    storage.read_jaw(scan / "truth" / "jaw.ply")
+
+
+def _images(folder: Path) -> None:
+    rng = np.random.default_rng(0)
+    write_frames(folder / "frames", [rng.integers(0, 255, (48, 64, 3), dtype=np.uint8) for _ in range(2)])
+    for suffix in ("jpg", "bmp", "tiff"):
+        (folder / suffix).mkdir()
+        for number in range(2):
+            cv2.imwrite(str(folder / suffix / f"{number}.{suffix}"), rng.integers(0, 255, (48, 64, 3), dtype=np.uint8))
+
+
+def _calibrations(folder: Path) -> None:
+    write_frames(folder / "frames", [picture(seed) for seed in range(2)])
+    for kind in ("json", "colmap", "opencv"):
+        write_calibration(folder, kind)
+
+
+def _read_calibrations(folder: Path) -> None:
+    for name in ("camera.json", "cameras.txt", "camera.yml"):
+        storage.read_sequence(folder / "frames", folder / _OUT, calibration=folder / name)
+
+
+def _read_images(folder: Path) -> None:
+    for name in ("frames", "jpg", "bmp", "tiff"):
+        sequence = storage.read_sequence(folder / name, folder / _OUT)
+        for path in sequence.paths:
+            read_image(path)
+
+
+def _panorama(folder: Path) -> None:
+    storage.write_panorama(folder / "panorama", small_panorama())
+
+
+def _colmap(folder: Path) -> None:
+    found = make_found()
+    make_capture(folder / "capture", found)
+    write(without_rig(found), folder / "model")
+
+
+def _shape(folder: Path) -> None:
+    write_shape(folder / "shape", small_jaw())
+
+
+def _evaluation(folder: Path) -> None:
+    write_evaluation(folder / "evaluation", small_jaw())
+    storage.write_mesh(folder / "reference.ply", small_jaw().mesh)
+
+
+def _studies(folder: Path) -> None:
+    write_comparison(folder / "comparison", 3)
+    write_score(folder / "score")
+
+
+def _arrays(folder: Path) -> None:
+    storage.files.write_arrays(folder / "a.npz", {"one": np.arange(300), "other": np.eye(9)}, compressed=True)
+
+
+SCENARIOS: Mapping[str, Scenario] = {
+    "handpiece": Scenario(_handpiece, lambda folder: storage.read_handpiece(folder / "handpiece.json")),
+    "rig config": Scenario(_handpiece, lambda folder: storage.read_handpiece(folder / "rig_config.json", 5.0)),
+    "meshes": Scenario(_meshes, _read_meshes),
+    "landmarks": Scenario(_landmarks, lambda folder: [storage.read_landmarks(each) for each in folder.glob("*.json")]),
+    "brief": Scenario(_brief, lambda folder: read_brief(folder / "brief.toml")),
+    "scan": Scenario(_scan, _read_scan),
+    "images": Scenario(_images, _read_images),
+    "calibrations": Scenario(_calibrations, _read_calibrations),
+    "panorama": Scenario(_panorama, lambda folder: storage.read_panorama(folder / "panorama")),
+    "colmap": Scenario(_colmap, lambda folder: read_model(folder / "model", storage.read_capture(folder / "capture"))),
+    "shape": Scenario(_shape, lambda folder: storage.read_shape_model(folder / "shape")),
+    "arrays": Scenario(_arrays, lambda folder: storage.files.read_arrays(folder / "a.npz", remedy="make it again")),
+    "report of a scan": Scenario(_scan, verb("report", "@scan")),
+    "report of an evaluation": Scenario(_evaluation, verb("report", "@evaluation", "--reference", "@reference.ply")),
+    "report of a panorama": Scenario(_panorama, verb("report", "@panorama")),
+    "report of a study": Scenario(_studies, verb("report", "@comparison")),
+    "report of a score": Scenario(_studies, verb("report", "@score")),
+    "report of a shape": Scenario(_shape, verb("report", "@shape")),
+    "evaluate": Scenario(_meshes, _evaluate),
+    "measure": Scenario(_meshes, verb("measure", "@jaw.ply", "--out", f"@{_OUT}")),
+    "reconstruct": Scenario(_scan, verb("reconstruct", "@scan/capture", "--out", f"@{_OUT}")),
+    "stitch": Scenario(_images, verb("stitch", "@frames", "--out", f"@{_OUT}")),
+    "stitch-eval": Scenario(_panorama, verb("stitch-eval", "@panorama", "@panorama", "--out", f"@{_OUT}")),
+}
+
+
+# --- damage -------------------------------------------------------------------------------------------------------
+
+
+NUMBERS = ("0", "-1", "1e9", "1e30", "1e999", "-1e308", "nan", "inf", "4000000000", "9" * 400, "0.5", "1e-300")
+VALUES: tuple[Any, ...] = (
+    *(None, True, "", "x", "../../x", "/etc/x", "a\nb", "\x00", "\x1b[31m", [], {}, [[]], {"a": 1}, -1, 0, 0.5),
+    *(1e9, 1e30, 1e308, 10**30, 10**400, float("nan"), float("inf"), [1, 2], [[1, 2], [3]], "1", [None] * 3),
+)
+
+
+def damaged(data: bytes, rng: np.random.Generator, suffix: str) -> bytes:
+    """Contents with one to three things wrong."""
+    for _ in range(int(rng.integers(1, 4))):
+        ways: list[Callable[[bytes, np.random.Generator], bytes]] = [_flipped, _cut, _removed, _inserted, _repeated]
+        if suffix in (".json", ".toml", ".txt", ".yml", ".csv", ".obj", ".stl", ".ply", ".jsonl"):
+            ways += 4 * [_renumbered]
+        if suffix == ".json":
+            ways += 9 * [_revalued]
+        data = ways[rng.integers(len(ways))](data, rng)
+    return data
+
+
+def _flipped(data: bytes, rng: np.random.Generator) -> bytes:
+    changed = np.frombuffer(data, np.uint8).copy()
+    # Headers are short and mean the most.
+    reach = len(changed) if rng.random() < 0.5 else min(len(changed), 200)
+    for at in rng.integers(0, max(1, reach), int(rng.integers(1, 9))) if reach else ():
+        changed[at] ^= 1 << rng.integers(8) if rng.random() < 0.5 else rng.integers(256)
+    return changed.tobytes()
+
+
+def _cut(data: bytes, rng: np.random.Generator) -> bytes:
+    return data[: int(rng.integers(0, len(data) + 1))]
+
+
+def _removed(data: bytes, rng: np.random.Generator) -> bytes:
+    first, last = np.sort(rng.integers(0, len(data) + 1, 2))
+    return data[:first] + data[min(last, first + 300) :]
+
+
+def _inserted(data: bytes, rng: np.random.Generator) -> bytes:
+    at = int(rng.integers(0, len(data) + 1))
+    new = (b"\0" * 40, b"\xff" * 40, b"[" * 200_000, rng.bytes(40), b"\n", b" 1e999 ", "\u202e\x1b[31m".encode())
+    return data[:at] + new[rng.integers(len(new))] + data[at:]
+
+
+def _repeated(data: bytes, rng: np.random.Generator) -> bytes:
+    first, last = np.sort(rng.integers(0, len(data) + 1, 2))
+    return data[:last] + data[first : min(last, first + 2000)] + data[last:]
+
+
+def _renumbered(data: bytes, rng: np.random.Generator) -> bytes:
+    found = list(re.finditer(rb"-?\d+(?:\.\d+)?(?:e-?\d+)?", data[:20_000]))
+    if not found:
+        return data
+    one = found[rng.integers(len(found))]
+    return data[: one.start()] + NUMBERS[rng.integers(len(NUMBERS))].encode() + data[one.end() :]
+
+
+def _revalued(data: bytes, rng: np.random.Generator) -> bytes:
+    """One place of a JSON value replaced, removed or renamed."""
+    try:
+        value = json.loads(data)
+    except (ValueError, RecursionError):
+        return data
+    places: list[tuple[Any, Any]] = []
+    left = [value]
+    while left:
+        each = left.pop()
+        inner = list(each.items()) if isinstance(each, dict) else []
+        inner = list(enumerate(each)) if isinstance(each, list) else inner
+        places += [(each, key) for key, _ in inner]
+        left += [item for _, item in inner]
+    if not places:
+        return json.dumps(VALUES[rng.integers(len(VALUES))]).encode()
+    holder, key = places[rng.integers(len(places))]
+    way = rng.random()
+    if way < 0.15:
+        del holder[key]
+    elif way < 0.3 and isinstance(holder, dict):
+        holder[str(VALUES[rng.integers(len(VALUES))])] = holder.pop(key)
+    else:
+        holder[key] = VALUES[rng.integers(len(VALUES))]
+    return json.dumps(value).encode()
+
+
+def damage(folder: Path, rng: np.random.Generator) -> str:
+    """Damage one file of a folder, or put something else in its place; what was done."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    path = files[rng.integers(len(files))]
+    way = rng.random()
+    if way < 0.9:
+        path.write_bytes(damaged(path.read_bytes(), rng, path.suffix))
+        return f"damaged {path.relative_to(folder)}"
+    other = files[rng.integers(len(files))].read_bytes()
+    path.unlink()
+    if way < 0.92:
+        return f"removed {path.relative_to(folder)}"
+    if way < 0.94:
+        path.mkdir()
+    elif way < 0.95:
+        os.mkfifo(path)
+    elif way < 0.97:
+        path.symlink_to("/dev/zero")
+    else:
+        path.write_bytes(other)
+    return f"replaced {path.relative_to(folder)}"
+
+
+# --- what came of it ----------------------------------------------------------------------------------------------
+
+
+class Hung(BaseException):
+    """Not an Exception, so that nothing takes it for an error of a file."""
+
+
+@contextlib.contextmanager
+def limited() -> Iterator[None]:
+    """Ends what takes too long or too much memory."""
+
+    def hung(number: int, frame: FrameType | None) -> None:
+        raise Hung
+
+    held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    before = {each: signal.signal(each, hung) for each in (signal.SIGALRM, signal.SIGPROF)}
+    resource.setrlimit(resource.RLIMIT_AS, (held + MOST_BYTES, hard))
+    signal.setitimer(signal.ITIMER_REAL, LONGEST_WAIT_S)
+    signal.setitimer(signal.ITIMER_PROF, LONGEST_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+@contextlib.contextmanager
+def captured(into: Path) -> Iterator[None]:
+    """What is printed, by C libraries too, goes to a file."""
+    saved = os.dup(1), os.dup(2)
+    with into.open("wb") as stream:
+        os.dup2(stream.fileno(), 1)
+        os.dup2(stream.fileno(), 2)
+        try:
+            with (
+                contextlib.redirect_stdout(open(1, "w", closefd=False)),
+                contextlib.redirect_stderr(open(2, "w", closefd=False)),
+            ):
+                yield
+        finally:
+            for number, old in enumerate(saved, start=1):
+                os.dup2(old, number)
+                os.close(old)
+
+
+def wrong_with(use: Callable[[], object], said: Path) -> str | None:
+    """What is wrong with how damaged input was taken; None where nothing is."""
+    message, status = "", 0
+    try:
+        with captured(said), limited():
+            try:
+                use()
+            except CuspidError as error:
+                message = str(error)
+            except SystemExit as ended:
+                status = ended.code if isinstance(ended.code, int) else 9
+    except Hung:
+        return f"more than {LONGEST_S:g} s"
+    except BaseException as error:
+        return f"{type(error).__name__}: {error}"[:300]
+    printed = said.read_text(errors="replace")
+    lines = [line for line in printed.splitlines() if line.startswith("cuspid: ")]
+    if noise := _NOISE.search(printed):
+        return f"noise: {printed[max(0, noise.start() - 80) : noise.end() + 80]!r}"
+    if status not in (0, 1) or (status == 1 and len(lines) != 1):
+        return f"status {status} and {len(lines)} lines: {printed[-300:]!r}"
+    for line in (message, *lines):
+        if not line.isprintable() or len(line) > 500:
+            return f"not one short line: {line[:600]!r}"
+    return None
+
+
+class Fuzzer:
+    """Makes the good folders once, and a damaged copy for each case."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def good(self, name: str) -> Path:
+        """The undamaged files of a scenario."""
+        there = self.folder / "good" / name
+        if not there.exists():
+            there.mkdir(parents=True)
+            SCENARIOS[name].make(there)
+        return there
+
+    def case(self, name: str, seed: int) -> tuple[str, str | None]:
+        """What was done to the files, and what is wrong with what came of it."""
+        good = self.good(name)
+        with tempfile.TemporaryDirectory(dir=self.folder, prefix="case-") as made:
+            inner = Path(made) / "a" / "b"
+            shutil.copytree(good, inner)
+            what = damage(inner, np.random.default_rng([seed, *name.encode()]))
+            before = set(Path(made).rglob("*"))
+            wrong = wrong_with(lambda: SCENARIOS[name].use(inner), Path(made) / "said.txt")
+            new = set(Path(made).rglob("*")) - before - {Path(made) / "said.txt"}
+            outside = [path for path in new if not path.is_relative_to(inner)]
+            unfinished = [path for path in new if path.name.startswith(storage.PART)]
+            if wrong is None and (outside or unfinished):
+                wrong = f"left {[str(path) for path in (*outside, *unfinished)][:3]}"
+            return what, wrong
