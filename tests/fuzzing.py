@@ -401,7 +401,7 @@ def wrong_with(use: Callable[[], object], said: Path) -> str | None:
     if noise := _NOISE.search(printed):
         return f"noise: {printed[max(0, noise.start() - 80) : noise.end() + 80]!r}"
     if status not in (0, 1) or (status == 1 and len(lines) != 1):
-        return f"status {status} and {len(lines)} lines: {printed[-300:]!r}"
+        return f"status {status} and {len(lines)} lines: {printed[-3000:]!r}"
     for line in (message, *lines):
         if not line.isprintable() or len(line) > 500:
             return f"not one short line: {line[:600]!r}"

@@ -145,5 +145,5 @@ def test_what_cannot_be_boxed_is_refused(coarse_phantom: Jaw) -> None:
     flipped = Mesh(coarse_phantom.mesh.vertices, coarse_phantom.mesh.faces[:, ::-1])
     with pytest.raises(InputError, match="inside out"):
         boxed(replace(coarse_phantom, mesh=flipped))
-    with pytest.raises(InputError, match="edge_mm"):
+    with pytest.raises(InputError, match="edge-mm"):
         BoxOptions(edge_mm=0.0)

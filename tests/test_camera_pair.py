@@ -150,9 +150,9 @@ def test_a_camera_in_the_tooth_sees_nothing(coarse_phantom):
     ("wrong", "says"),
     [
         ({"facing": ("mesial",)}, "can face"),
-        ({"baselines_mm": (0.0,)}, "positive"),
+        ({"baselines_mm": (0.0,)}, "baselines-mm is 0"),
         ({"distances_mm": ()}, "given"),
-        ({"axis_angles_deg": (190.0,)}, "axis angles"),
+        ({"axis_angles_deg": (190.0,)}, "axis-angles-deg"),
         ({"sensor": "iphone"}, "no sensor"),
         ({"budget_um": 0.0}, "budget"),
     ],

@@ -68,7 +68,7 @@ def test_a_prepared_jaw_keeps_labels_and_has_its_line(tmp_path, phantom_file):
         (("--tooth", "48", "crown"), "no tooth 48"),
         (("--tooth", "46"), "give either --preset"),
         (("--preset", "thesis-reference", "--tooth", "46", "crown"), "give either --preset"),
-        (("--tooth", "46", "crown", "--taper-deg", "50.0"), "taper_deg is 50"),
+        (("--tooth", "46", "crown", "--taper-deg", "50.0"), "--taper-deg is 50"),
     ],
 )
 def test_preparations_that_cannot_be(tmp_path, capsys, phantom_file, arguments, message):
@@ -128,5 +128,5 @@ def test_a_mouth_takes_the_size_of_a_handpiece(tmp_path, capsys):
 
 
 def test_a_mouth_that_cannot_be(tmp_path, capsys):
-    assert "thickness_mm" in refused(capsys, "mouth", "--thickness-mm", "-1.0", "--out", tmp_path / "mouth")
+    assert "--thickness-mm" in refused(capsys, "mouth", "--thickness-mm", "-1.0", "--out", tmp_path / "mouth")
     assert not (tmp_path / "mouth").exists()

@@ -66,7 +66,7 @@ def test_a_working_distance_is_not_given_twice(tmp_path, phantom_file, capsys):
     run("handpiece", "--design", "two", "--out", tmp_path)
     command = ("visibility", phantom_file, "--handpiece", tmp_path / "handpiece.json", "--out", tmp_path / "seen")
     assert "has a working distance of its own" in refused(capsys, *command, "--working-distance-mm", 8)
-    assert "must be positive" in refused(capsys, *command, "--working-distance-mm", 0)
+    assert "must lie between" in refused(capsys, *command, "--working-distance-mm", 0)
 
 
 def test_precision_of_a_tooth_follows_the_noise(tmp_path, phantom_file):

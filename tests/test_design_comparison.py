@@ -257,7 +257,7 @@ def test_the_verb_shows_what_is_done_without_scanning_again(files, tmp_path, cap
         (["--designs", "nine"], "no design 'nine'"),
         (["--jaws", "nowhere.ply"], "no jaw 'nowhere.ply'"),
         (["--turns", "2"], "must be odd"),
-        (["--workers", "0"], "at least one is needed"),
+        (["--workers", "0"], "--workers is 0"),
     ],
 )
 def test_what_cannot_be_compared_is_refused_in_one_line(tmp_path, capsys, arguments, reason):

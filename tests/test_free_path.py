@@ -50,7 +50,7 @@ def test_the_leds_stand_around_the_lens(leds: int, ring: float, distance: float)
     "wrong", [{"width_px": 0}, {"field_of_view_deg": 180.0}, {"working_distance_mm": 0.0}, {"leds": 0}]
 )
 def test_impossible_cameras_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(InputError, match="camera"):
+    with pytest.raises(InputError, match="intra oral: --"):
         IntraOralOptions(**wrong)
 
 

@@ -254,7 +254,7 @@ def test_nothing_fits_everybody_and_too_much_fits_nobody() -> None:
 @pytest.mark.parametrize(
     ("options", "word"),
     [
-        ({"thickness_mm": -1.0}, "thickness_mm"),
+        ({"thickness_mm": -1.0}, "thickness-mm"),
         ({"people": 0}, "people"),
         ({"correlation": 2.0}, "correlation"),
         ({"held": 1.2}, "held"),

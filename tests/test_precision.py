@@ -203,7 +203,7 @@ def test_the_map_of_a_wall_is_the_bound_of_its_points_in_the_world():
     "terms", [{"sigma_px": 0.0}, {"deformation": -0.1}, {"blur_px": 0.0}, {"convergence_deg": 0.0}]
 )
 def test_noise_must_be_positive(terms):
-    with pytest.raises(InputError, match="larger than 0"):
+    with pytest.raises(InputError, match="noise model: --"):
         NoiseModel(**terms)
 
 

@@ -219,8 +219,8 @@ def test_options_are_checked_and_named() -> None:
         options_of("veneer")
     with pytest.raises(InputError, match="thesis-reference"):
         preset("thesis")
-    with pytest.raises(InputError, match="taper_deg"):
+    with pytest.raises(InputError, match="taper-deg"):
         CrownOptions(taper_deg=45.0)
-    with pytest.raises(InputError, match="width_um"):
+    with pytest.raises(InputError, match="width-um"):
         CrackOptions(width_um=0.0)
     assert isinstance(preset("thesis-reference")[42], FullContourCrownOptions)

@@ -223,7 +223,7 @@ def test_the_report_of_repeated_scans(tmp_path):
 
 def test_bad_input_of_repeat(tmp_path, capsys, phantom_file):
     for arguments, message in (
-        (["--scans", "1"], "at least two"),
+        (["--scans", "1"], "--scans is 1"),
         (["--tooth", "16"], "no tooth 16"),
         (["--tooth", "46", "--workers", "0"], "--workers is 0"),
         (["--tooth", "46", "--jitter-mm", "-1"], "--jitter-mm"),

@@ -425,7 +425,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capsys):
         "no results in it": ["--results", str(empty)],
         "not valid JSON": ["--results", str(broken)],
         "--images": ["--images", str(tmp_path / "nowhere")],
-        "at least one": ["--workers", "0"],
+        "--workers is 0": ["--workers", "0"],
     }
     for expected, arguments in cases.items():
         assert expected in refused(capsys, "reproduce", *out, "--no-run", *arguments, alone=True)

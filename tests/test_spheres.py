@@ -109,9 +109,9 @@ def test_the_twelve_cameras_can_scan_it_like_a_jaw(coarse_arch: Jaw) -> None:
     ("options", "word"),
     [
         ({"radius_mm": 3.2}, "apart"),
-        ({"rise_mm": 2.5}, "rise_mm"),
-        ({"edge_mm": 0.0}, "edge_mm"),
-        ({"depth_mm": -1.0}, "depth_mm"),
+        ({"rise_mm": 2.5}, "rise-mm"),
+        ({"edge_mm": 0.0}, "edge-mm"),
+        ({"depth_mm": -1.0}, "depth-mm"),
     ],
 )
 def test_impossible_options_are_refused_in_one_line(options: dict[str, float], word: str) -> None:
@@ -282,7 +282,7 @@ def test_what_cannot_be_measured_is_refused_in_one_line(coarse_arch: Jaw) -> Non
     with pytest.raises(InputError, match="0 of 14") as caught:
         evaluate_spheres(coarse_arch.mesh, coarse_arch, far)
     assert "\n" not in str(caught.value)
-    with pytest.raises(InputError, match="polar_deg"):
+    with pytest.raises(InputError, match="polar-deg"):
         SphereOptions(polar_deg=0.0)
 
 

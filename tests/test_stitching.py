@@ -328,7 +328,7 @@ def test_a_known_width_sets_the_scale() -> None:
     assert found.tracks is not None
     teeth = found.tracks.points[np.abs(found.tracks.points[:, 2]) < 3]
     assert np.ptp(teeth[:, 0]) == pytest.approx(58.0, rel=0.03)
-    with pytest.raises(InputError, match="positive"):
+    with pytest.raises(InputError, match="width-mm"):
         ScaleOptions(width_mm=-1.0)
 
 

@@ -170,5 +170,5 @@ def test_a_jaw_that_does_not_tell_how_its_arch_runs_is_refused(labels: list[int]
 
 
 def test_options_that_make_no_sense_are_refused() -> None:
-    with pytest.raises(InputError, match="must be positive"):
+    with pytest.raises(InputError, match="must lie between"):
         SurfaceOptions(gingival_mm=0.0)

@@ -156,7 +156,7 @@ def test_the_limits_of_the_examination_are_options() -> None:
     for homography in (about_centre([[1, 0.4], [0, 1]]), about_centre([[0.8, 0], [0, 0.8]], (200, 0))):
         assert examine(homography, SIZE, ExaminationOptions())
         assert not examine(homography, SIZE, lenient)
-    with pytest.raises(InputError, match="90 deg"):
+    with pytest.raises(InputError, match="angle-deg"):
         ExaminationOptions(smallest_angle_deg=95.0)
 
 

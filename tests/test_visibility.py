@@ -225,7 +225,7 @@ def test_a_working_distance_out_of_focus_is_refused() -> None:
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"cameras": 0}, "at least 1 camera"), ({"maximum_incidence_deg": 95.0}, "0-90 deg, not 95")],
+    [({"cameras": 0}, "--cameras is 0"), ({"maximum_incidence_deg": 95.0}, "deg is 95")],
 )
 def test_options_that_see_nothing_or_backs_are_refused(change: dict[str, float], message: str) -> None:
     with pytest.raises(InputError, match=message):

@@ -70,6 +70,9 @@ def _checked(name: str, verb: Callable[..., None]) -> Callable[..., None]:
     return checked
 
 
+_CHECKED = {name: _checked(name, verb) for name, verb in COMMANDS.items()}
+
+
 class _Notes(logging.Handler):
     """What the code has to say while it runs, a line each."""
 
@@ -85,7 +88,7 @@ def main(arguments: list[str] | None = None) -> None:
     log.handlers = [_Notes()]
     try:
         tyro.extras.subcommand_cli_from_dict(
-            {name: _checked(name, verb) for name, verb in COMMANDS.items()},
+            _CHECKED,
             prog="cuspid",
             description="Passive intra-oral 3D scanning: simulate, reconstruct, and prove the accuracy.",
             args=arguments,

@@ -68,7 +68,7 @@ class AdjustmentOptions(Options):
     """Residual length, in standard deviations, beyond which an observation counts less."""
     outlier_sigmas: Annotated[float, Range(0.1, 1000)] = 4.0
     """Residual length, in standard deviations, beyond which an observation is dropped after a round."""
-    start_px: Annotated[float, Range(0.01, 100_000)] = 20.0
+    start_px: Annotated[float, Range(0.01, 1_000_000_000)] = 20.0
     """Residual length beyond which an observation is dropped before the first round, px."""
     rounds: Annotated[int, Range(1, 1000)] = 3
     """Number of times that the minimum is sought, with outliers dropped in between."""

@@ -22,6 +22,7 @@ from markupsafe import Markup
 
 import cuspid
 from cuspid.capture import read_image
+from cuspid.inputs import read_bytes
 from cuspid.storage.files import to_plain
 
 JPEG_QUALITY = 85
@@ -74,7 +75,9 @@ def data_uri(data: bytes, kind: str) -> str:
 
 def picture_uri(path: Path) -> str:
     """A picture file as it is."""
-    return data_uri(path.read_bytes(), "image/jpeg" if path.suffix.lower() in (".jpg", ".jpeg") else "image/png")
+    return data_uri(
+        read_bytes(path, "image"), "image/jpeg" if path.suffix.lower() in (".jpg", ".jpeg") else "image/png"
+    )
 
 
 def jpeg_uri(image: UInt8[np.ndarray, "h w 3"], *, widest_px: int = 1600) -> str:

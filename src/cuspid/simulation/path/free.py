@@ -37,7 +37,7 @@ REACH = 2.5
 class FreePathOptions(Options):
     """How a hand moves a camera over the arch; the defaults are a full shake."""
 
-    frames: Annotated[int, Range(2, 10_000)] = 120
+    frames: Annotated[int, Range(2, 100_000)] = 120
     """Frames from the first crown to the last."""
     shake: Annotated[float, Range(0, 20)] = 1.0
     """Multiplies all standard deviations below: 1 is a full shake, 0 a steady hand at an even speed."""

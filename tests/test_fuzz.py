@@ -1,0 +1,58 @@
+"""Damaged input is read or refused in one line: some hundred cases here, thousands in benchmarks/fuzz.py."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from fuzzing import SCENARIOS, Fuzzer, wrong_with
+
+CASES = 14
+"""Of each scenario."""
+FEWER = {"measure": 4, "evaluate": 6}
+"""Of those that take longest."""
+
+
+@pytest.fixture(scope="module")
+def fuzzer(tmp_path_factory: pytest.TempPathFactory) -> Fuzzer:
+    return Fuzzer(tmp_path_factory.mktemp("fuzz"))
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_damaged_input_is_read_or_refused_in_one_line(fuzzer: Fuzzer, name: str) -> None:
+    wrong = {seed: found for seed in range(FEWER.get(name, CASES)) if (found := fuzzer.case(name, seed))[1] is not None}
+    assert not wrong
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_undamaged_input_is_taken_as_it_should_be(fuzzer: Fuzzer, name: str, tmp_path: Path) -> None:
+    """Otherwise the damage would be refused for another reason."""
+    assert wrong_with(lambda: SCENARIOS[name].use(fuzzer.good(name)), tmp_path / "said.txt") is None
+
+
+def test_the_fuzzer_sees_what_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A traceback, a hang, noise, two lines, too much memory."""
+    monkeypatch.setattr("fuzzing.LONGEST_S", 0.2)
+
+    def busy() -> None:
+        end = time.process_time() + 5
+        while time.process_time() < end:
+            pass
+
+    def two_lines() -> None:
+        raise SystemExit(1)
+
+    def says(text: str):
+        import os
+
+        return lambda: os.write(2, text.encode())
+
+    said = tmp_path / "said.txt"
+    assert "ZeroDivisionError" in wrong_with(lambda: 1 // 0, said)
+    assert "more than" in wrong_with(busy, said)
+    assert "noise" in wrong_with(says("libpng error: bad"), said)
+    assert "status 1" in wrong_with(two_lines, said)
+    assert "MemoryError" in wrong_with(lambda: bytearray(5 << 30), said)
+    assert wrong_with(lambda: None, said) is None
