@@ -90,6 +90,11 @@ def covariance(what: str, value: Any, size: int) -> Float[np.ndarray, "n n"]:
     return found
 
 
+def printable(text: str) -> str:
+    """Text whose control characters, and bytes that are no text, are written out: ``\\x1b``."""
+    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
+
+
 def one_line(error: BaseException) -> str:
     """What a library says, cut to one short line."""
     return shown(" ".join(str(error).split()), longest=120)[1:-1]

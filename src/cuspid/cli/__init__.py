@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from collections.abc import Callable, Mapping
 from functools import wraps
@@ -78,7 +79,7 @@ class _Notes(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print it."""
-        console.print(f"note: {record.getMessage()}", soft_wrap=True, markup=False, highlight=False)
+        console.print(f"note: {record.getMessage()}", soft_wrap=True, highlight=False)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -87,15 +88,25 @@ def main(arguments: list[str] | None = None) -> None:
     log.setLevel(logging.INFO)
     log.handlers = [_Notes()]
     try:
+        _run(arguments)
+    except CuspidError as error:
+        console.print(f"cuspid: {error}", style="red", soft_wrap=True, highlight=False)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        console.print("cuspid: interrupted; the same command goes on where it stopped")
+        sys.exit(130)
+    except BrokenPipeError:  # what reads us, as ``head`` does, has had enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+
+
+def _run(arguments: list[str] | None) -> None:
+    try:
         tyro.extras.subcommand_cli_from_dict(
             _CHECKED,
             prog="cuspid",
             description="Passive intra-oral 3D scanning: simulate, reconstruct, and prove the accuracy.",
             args=arguments,
         )
-    except CuspidError as error:
-        console.print(f"cuspid: {error}", style="red", soft_wrap=True, markup=False, highlight=False)
-        sys.exit(1)
-    except KeyboardInterrupt:
-        console.print("cuspid: interrupted; the same command goes on where it stopped")
-        sys.exit(130)
+    finally:
+        sys.stdout.flush()

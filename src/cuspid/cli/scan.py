@@ -22,6 +22,7 @@ from cuspid.evaluation.margin import MarginError, margin_errors
 from cuspid.evaluation.spheres import SphereReport, evaluate_spheres
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
+from cuspid.motion.colmap import hash_model
 from cuspid.options import Range
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.reconstruction import Reconstruction
@@ -126,7 +127,7 @@ def _simulate(mesh: Path | None, out: Path, source: Source, probe: Probe, option
 
 def _reconstruct(capture: Capture, out: Path, options: ReconstructionOptions, model: Path | None) -> None:
     settings = {"reconstruction": options, "from_poses": model}
-    inputs = storage.hash_capture(capture)
+    inputs = storage.hash_capture(capture) | ({} if model is None else {"poses": hash_model(model)})
     with storage.claimed_folder(out, "reconstruct", settings, inputs), show_progress() as progress:
         reconstruction, mesh = pipeline.reconstruct(capture, out, options, colmap_model=model, progress=progress)
     _print_located(reconstruction, capture)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
@@ -22,8 +22,18 @@ from cuspid.jaw import Arch, Jaw
 from cuspid.options import SEED, Options, Range
 from cuspid.progress import Progress
 from cuspid.rig import Handpiece
+from cuspid.values import printable
 
-console = Console(stderr=True)
+
+class _Messages(Console):
+    """For people, on stderr. What is printed may hold the name of a file: nothing in it steers the terminal."""
+
+    def print(self, *objects: Any, **how: Any) -> None:
+        """As rich does."""
+        super().print(*(printable(each) if isinstance(each, str) else each for each in objects), **how)
+
+
+console = _Messages(stderr=True, markup=False, emoji=False)
 
 Flat = arg(name="")
 """The fields of a nested options value appear without a prefix."""

@@ -10,7 +10,7 @@ import json
 import math
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -113,18 +113,18 @@ def read_arrays(path: Path, *, remedy: str) -> dict[str, np.ndarray]:
         raise InputError(f"{path}: damaged ({type(error).__name__}: {one_line(error)}); {remedy}") from error
 
 
-def to_plain(value: Any) -> Any:
-    """A value as JSON knows it; numbers that are not finite become null."""
+def to_plain(value: Any, path: Callable[[Path], str | None] = str) -> Any:
+    """A value as JSON knows it; numbers that are not finite become null, paths what ``path`` makes of them."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: to_plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {field.name: to_plain(getattr(value, field.name), path) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
-        return {str(key): to_plain(item) for key, item in value.items()}
+        return {str(key): to_plain(item, path) for key, item in value.items()}
     if isinstance(value, np.ndarray | list | tuple):
-        return [to_plain(item) for item in value]
+        return [to_plain(item, path) for item in value]
     if isinstance(value, np.generic):
         return to_plain(value.item())
     if isinstance(value, Path):
-        return str(value)
+        return path(value)
     if isinstance(value, float) and not np.isfinite(value):
         return None
     return value
@@ -204,12 +204,16 @@ def claim_folder(
 ) -> None:
     """Make ``folder`` the home of one run of a stage, or find that it is already.
 
-    ``run.json`` keeps for each stage the version, the settings and the hashes of the inputs. Raises OutputError where
-    the folder holds files that no run of cuspid wrote, or the same stage made from something else (unless it may be
-    replaced, since it is made anew as a whole).
+    ``run.json`` keeps for each stage the version, the settings and the hashes of the inputs. Of files that the settings
+    name only the contents count, which are among the inputs. Raises OutputError where the folder holds files that no
+    run of cuspid wrote, or the same stage made from something else (unless it may be replaced, since it is made anew as
+    a whole).
     """
     manifest_path = folder / "run.json"
-    entry = to_plain({"cuspid": cuspid.__version__, "settings": settings, "inputs_sha256": inputs})
+    plain = to_plain(settings, path=lambda _: None)
+    entry = {"cuspid": cuspid.__version__, "settings": plain, "inputs_sha256": to_plain(inputs)}
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder}: is a file; give a folder as --out")
     manifest = read_manifest(folder)
     if not manifest and folder.exists() and finished(folder):
         raise OutputError(f"{folder}: holds files that are not from cuspid; give an empty or new folder as --out")

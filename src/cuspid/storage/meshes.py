@@ -25,6 +25,8 @@ MM_PER_UNIT: Mapping[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25
 _PLACE_AND_COLOR = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"}
 _PLY_ELEMENT = re.compile(rb"^element\s+(\w+)\s+(\d{1,400})\s*$", re.MULTILINE)
 _LONGEST_HEADER = 1 << 16
+_LEAST_AREA = 1e-9
+"""Of the square of its extent: less is a line."""
 MESH_SUFFIXES = (".stl", ".ply", ".obj")
 
 
@@ -59,6 +61,7 @@ def read_triangles(path: Path, unit: Unit) -> tuple[Mesh, trimesh.Trimesh]:
         raise InputError(f"{path}: coordinates beyond {LONGEST_MM / 1000:g} m; repair the mesh, or give its --unit")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"{path}: faces name vertices that do not exist; export the mesh again")
+    _require_area(path, vertices, faces)
     colors = _vertex_colors(loaded)
     merged, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
     mesh = Mesh(
@@ -67,6 +70,13 @@ def read_triangles(path: Path, unit: Unit) -> tuple[Mesh, trimesh.Trimesh]:
         None if colors is None else colors[first],
     )
     return mesh, loaded
+
+
+def _require_area(path: Path, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> None:
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    area, extent = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2, np.ptp(vertices, axis=0).max()
+    if not area > _LEAST_AREA * extent**2:
+        raise InputError(f"{path}: its triangles have no area; export the surface again")
 
 
 def _declared_faces(path: Path) -> int:

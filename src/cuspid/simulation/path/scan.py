@@ -232,7 +232,7 @@ def _with_frames(
     frames = usual
     while True:
         path = _even_path(mesh, handpiece, steady, pose_at, frames)
-        if path.minimum_overlap > options.minimum_overlap:
+        if path.minimum_overlap >= options.minimum_overlap:
             return path
         needed = _needed(frames, path, options)
         shortfall = (

@@ -1,0 +1,53 @@
+"""The command line as a process: how it ends when it is told to, and what a terminal gets to see."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from verbs import refused
+
+CUSPID = (sys.executable, "-m", "cuspid")
+
+
+@pytest.mark.parametrize(("how", "after_s"), [(signal.SIGINT, 0.5), (signal.SIGINT, 1.2), (signal.SIGTERM, 8.0)])
+def test_it_ends_at_once_and_without_a_trace_of_where_it_was(tmp_path: Path, how: signal.Signals, after_s: float):
+    """While it loads, and while libraries work that have handlers of their own."""
+    begun = subprocess.Popen(
+        [*CUSPID, "simulate", "--out", str(tmp_path / "scan")], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+    time.sleep(after_s)
+    begun.send_signal(how)
+    said = begun.communicate(timeout=60)[0].decode()
+    assert begun.returncode in (-how, 130)
+    assert not any(word in said for word in ("Traceback", "***", "@     0x", 'File "'))
+
+
+def test_whoever_reads_it_may_stop_reading():
+    """As ``cuspid run --help | head -1`` does."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    begun = subprocess.run([*CUSPID, "run", "--help"], stdout=writer, stderr=subprocess.PIPE, timeout=120)
+    os.close(writer)
+    assert begun.returncode == 1
+    assert begun.stderr == b""
+
+
+@pytest.mark.parametrize("name", ["a\nb.stl", "\x1b[31mred.stl", "[/bold].stl", os.fsdecode(b"\xff.stl")])
+def test_a_name_of_a_file_steers_no_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str):
+    line = refused(capsys, "evaluate", tmp_path / name, tmp_path / name, "--out", tmp_path / "out", alone=True)
+    assert line.isprintable()
+    assert line.endswith(".stl: no such file")
+    assert ("[/bold]" in line) == ("[/bold]" in name)
+
+
+def test_out_may_not_be_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "out").write_text("mine")
+    assert "is a file" in refused(capsys, "simulate", "--tooth", "46", "--out", tmp_path / "out")
+    assert (tmp_path / "out").read_text() == "mine"
