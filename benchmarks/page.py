@@ -1,12 +1,13 @@
 """Make docs/benchmarks.md from the JSON files in benchmarks/results.
 
-python benchmarks/page.py
+python benchmarks/page.py [--mixed]
 """
 
 from __future__ import annotations
 
+import argparse
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,33 +46,44 @@ TIME, MEMORY = ("images_to_mesh", "wall_s"), ("images_to_mesh", "peak_gib")
 MEAN, P95 = ("trueness", "mean_abs_um"), ("trueness", "p95_um")
 WITHIN_50 = ("trueness", "completeness_pct", "50")
 
+_ONE_TOOTH = (
+    Bar(name="mean abs. deviation um", path=MEAN, limit=8),
+    Bar(name="P95 um", path=P95, limit=25),
+    Bar(name="complete within 50 um, %", path=WITHIN_50, limit=96, at_least=True),
+    Bar(name="images to mesh, s", path=TIME, limit=75),
+    Bar(name="peak memory, GiB", path=MEMORY, limit=6),
+)
+_WHOLE_ARCH = (
+    Bar(name="mean abs. deviation um", path=MEAN, limit=15),
+    Bar(name="P95 um", path=P95, limit=45),
+    Bar(name="complete within 50 um, %", path=WITHIN_50, limit=92, at_least=True),
+    Bar(name="inter-molar error um", path=("trueness", "inter_molar_error_um"), limit=25),
+    Bar(name="images to mesh, s", path=TIME, limit=720),
+    Bar(name="peak memory, GiB", path=MEMORY, limit=6),
+)
 BARS: Mapping[str, tuple[Bar, ...]] = {
-    "molar": (
-        Bar(name="mean abs. deviation um", path=MEAN, limit=8),
-        Bar(name="P95 um", path=P95, limit=25),
-        Bar(name="complete within 50 um, %", path=WITHIN_50, limit=96, at_least=True),
-        Bar(name="images to mesh, s", path=TIME, limit=75),
-        Bar(name="peak memory, GiB", path=MEMORY, limit=6),
-    ),
-    "arch": (
-        Bar(name="mean abs. deviation um", path=MEAN, limit=15),
-        Bar(name="P95 um", path=P95, limit=45),
-        Bar(name="complete within 50 um, %", path=WITHIN_50, limit=92, at_least=True),
-        Bar(name="inter-molar error um", path=("trueness", "inter_molar_error_um"), limit=25),
-        Bar(name="images to mesh, s", path=TIME, limit=720),
-        Bar(name="peak memory, GiB", path=MEMORY, limit=6),
-    ),
+    "molar": _ONE_TOOTH,
+    "arch": _WHOLE_ARCH,
     "real-arch": (
         Bar(name="mean abs. deviation um", path=MEAN, limit=20),
         Bar(name="images to mesh, s", path=TIME, limit=720),
         Bar(name="peak memory, GiB", path=MEMORY, limit=6),
     ),
+    "spheres": (
+        Bar(name="mean abs. deviation um", path=MEAN, limit=15),
+        Bar(name="sphere-spacing error, RMS, um", path=("spheres", "spacing_rms_um"), limit=25),
+        Bar(name="images to mesh, s", path=TIME, limit=720),
+        Bar(name="peak memory, GiB", path=MEMORY, limit=6),
+    ),
+    "prepared-arch": _WHOLE_ARCH,
+    "prepared": _ONE_TOOTH,
 }
+"""By the beginning of the name of a case, the longer one first."""
 
 
-def bars_of(case: str) -> tuple[Bar, ...]:
-    """The bars that a case stands under."""
-    return next((bars for name, bars in BARS.items() if case.startswith(name)), ())
+def group_of(case: str) -> str:
+    """The bars that a case stands under; empty where there are none."""
+    return next((name for name in BARS if case.startswith(name)), "")
 
 
 def cell(bar: Bar, result: Result) -> str:
@@ -84,7 +96,7 @@ def cell(bar: Bar, result: Result) -> str:
 
 def table(results: list[Result]) -> str:
     """Figures of cases that share their bars, a row each, the bar on top."""
-    bars = bars_of(results[0]["case"])
+    bars = BARS[group_of(results[0]["case"])]
     lines = [
         "| case | " + " | ".join(bar.name for bar in bars) + " |",
         "|---" * (len(bars) + 1) + "|",
@@ -153,6 +165,21 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
 """Title and text for each file of results that is not of scans, by its stem."""
 
 
+def commits(loaded: Iterable[Result]) -> list[str]:
+    """Of which the results are."""
+    return sorted({str(result["commit"]) for result in loaded if "commit" in result})
+
+
+def _mix(known: list[str]) -> list[str]:
+    if len(known) < 2:
+        return []
+    return [
+        f"**These results are of {len(known)} commits**, not of one: each says below of which. What is newer than a "
+        "result may have changed it.",
+        "",
+    ]
+
+
 def page(results: list[Result], motions: list[Result], others: Mapping[str, Result], panoramas: list[Result]) -> str:
     """The whole page."""
     parts = [
@@ -163,11 +190,13 @@ def page(results: list[Result], motions: list[Result], others: Mapping[str, Resu
         "Conditions of the thesis: texture `artificial`, twelve cameras with exact calibration, noise 1.5 DN in each "
         "colour channel, 120 images for a tooth and 1200 or more for an arch. Trueness is scan to reference over the "
         "surface that two cameras of one frame could see (rule: `cuspid.visibility`). Times are wall "
-        "seconds of `cuspid reconstruct` on 2 cores with numba's compiled code cached.",
+        "seconds of `cuspid reconstruct` on 2 cores with numba's compiled code cached. Whole arches are scanned in one "
+        "pass (`--passes turns`).",
         "",
+        *_mix(commits([*results, *motions, *others.values(), *panoramas])),
     ]
     for group in BARS:
-        chosen = [result for result in results if result["case"].split("-seed")[0] == group]
+        chosen = [result for result in results if group_of(result["case"]) == group]
         if chosen:
             parts += [f"## {group}", "", table(chosen), ""]
     sphere_scans = [result for result in results if "spheres" in result]
@@ -189,11 +218,17 @@ def page(results: list[Result], motions: list[Result], others: Mapping[str, Resu
 
 
 def main() -> None:
-    """Read the results, write the page."""
+    """Read the results, write the page. Results of several commits are refused unless they are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--mixed", action="store_true", help="take results of several commits, and say so on the page")
+    mixed = parser.parse_args().mixed
     loaded = {path.stem: json.loads(path.read_text()) for path in sorted((HERE / "results").glob("*.json"))}
     scans = [value for value in loaded.values() if "images_to_mesh" in value]
     motions = [value for stem, value in loaded.items() if stem.startswith("motion-")]
     panoramas = [json.loads(path.read_text()) for path in sorted((HERE / "results" / "panorama").glob("*.json"))]
+    known = commits([*loaded.values(), *panoramas])
+    if len(known) > 1 and not mixed:
+        raise SystemExit(f"results of {len(known)} commits: {', '.join(known)}; run them anew at one, or give --mixed")
     (HERE.parent / "docs" / "benchmarks.md").write_text(page(scans, motions, loaded, panoramas))
 
 

@@ -93,9 +93,12 @@ def commit() -> str | None:
 
 
 def conditions() -> dict[str, object]:
-    """What a figure depends on besides the code."""
+    """What a figure depends on besides the code; the load is that of the minutes before."""
+    package = Path(cuspid.__file__).parent
     return {
         "commit": commit(),
+        "load": [round(each, 2) for each in os.getloadavg()],
+        "compiled": any(package.rglob("*.nbi")),
         "python": platform.python_version(),
         "versions": {name: version(name) for name in PACKAGES},
         "processor": platform.processor() or platform.machine(),
