@@ -20,6 +20,7 @@ from cuspid.errors import InputError
 from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.evaluation.margin import MarginError, margin_errors
 from cuspid.evaluation.spheres import SphereReport, evaluate_spheres
+from cuspid.evaluation.trajectory import trajectory_error
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.motion.colmap import hash_model
@@ -145,11 +146,26 @@ def _evaluate(mesh: Path, reference: Path, out: Path, source: Source, options: E
         save_deviation_picture(out / "deviation.png", scan, trueness)
         storage.write_trueness(out / "trueness.json", trueness)
     _print_trueness(trueness)
+    _evaluate_trajectory(mesh.parent, reference, trueness, out)
     if known.spheres:
         _evaluate_spheres(scan, known, trueness, out)
     if known.lines:
         _evaluate_margins(scan, known, trueness, out)
     report(out, reference=reference, unit=source.unit)
+
+
+def _evaluate_trajectory(scan: Path, truth: Path, trueness: Trueness, out: Path) -> None:
+    """The poses that a scan was made with, where they lie beside it and the true ones are known."""
+    found, true = scan / "motion" / "poses.json", truth / "poses.json"
+    if not (found.is_file() and true.is_file()):
+        return
+    error = trajectory_error(storage.read_poses(found), storage.read_poses(true), trueness.reference_from_scan)
+    storage.write_json(out / "trajectory.json", error)
+    console.print(
+        f"trajectory of {error.frames} frames, RMSE: absolute pose error {error.ape_um.rmse:.1f} µm and "
+        f"{error.ape_deg.rmse:.4f} deg, relative from frame to frame {error.rpe_um.rmse:.1f} µm and "
+        f"{error.rpe_deg.rmse:.4f} deg"
+    )
 
 
 def _evaluate_spheres(scan: Mesh, reference: Jaw, trueness: Trueness, out: Path) -> None:

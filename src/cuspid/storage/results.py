@@ -71,6 +71,8 @@ class ScanResult(_Result):
     """``margins.json``."""
     spheres: Mapping[str, Any] | None
     """``spheres.json``."""
+    trajectory: Mapping[str, Any] | None
+    """``trajectory.json``."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -185,6 +187,7 @@ def _read_scan(folder: Path, run: Mapping[str, Any], reference: Path | None, uni
         cleaning=_optional_json(folder / "mesh.json"),
         margins=_optional_json(folder / "margins.json"),
         spheres=_optional_json(folder / "spheres.json"),
+        trajectory=_optional_json(folder / "trajectory.json"),
         pictures=_pictures(folder, {"spheres.png": "The spheres, measured without a best fit"}),
     )
 

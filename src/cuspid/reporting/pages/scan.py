@@ -200,6 +200,8 @@ def _tiles(result: ScanResult) -> list[tuple[str, str, str]]:
     if result.reconstruction is not None:
         located, dropped = len(result.reconstruction.frames), len(result.reconstruction.dropped)
         tiles.append(("frames located", f"{located}", f"of {located + dropped}" if dropped else ""))
+    if result.trajectory is not None:
+        tiles.append(("position of the handpiece, RMSE", f"{result.trajectory['ape_um']['rmse']:.1f}", "µm"))
     if result.capture is not None:
         tiles.append(("images", f"{len(result.capture.frames) * len(result.capture.handpiece.rig.names)}", ""))
     return tiles

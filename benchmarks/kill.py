@@ -1,0 +1,137 @@
+"""Kill runs at random moments, let the same command go on, and compare what it leaves with an undisturbed run.
+
+    python benchmarks/kill.py [--kills 100] [--seed 0] [--only stitch] [--work build/kill]
+
+Signals are KILL, TERM and INT in turns, sent to the program alone, once to three times before it may finish. Files must
+be equal byte for byte, but for the times that a stage took and the keys of what was kept. Writes
+benchmarks/results/kill.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from run import conditions
+
+from cuspid.storage import write_json
+
+HERE = Path(__file__).parent
+CUSPID = (sys.executable, "-m", "cuspid")
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+SCAN = ("--tooth", "46", "--frames", "6", "--length-mm", "3", "--supersampling", "1")
+KEYS = {"made.jsonl"}
+"""Files of nothing but the keys of results."""
+
+
+def verbs(work: Path) -> dict[str, tuple[str, ...]]:
+    """What is killed, without ``--out``."""
+    probe = ("--handpiece", str(work / "probe" / "handpiece.json"))
+    return {
+        "run": ("run", *probe, *SCAN),
+        "reconstruct": ("reconstruct", str(work / "scan" / "capture")),
+        "stitch": ("stitch", str(work / "film" / "capture" / "images" / "camera")),
+        "repeat": ("repeat", *probe, *SCAN, "--scans", "2", "--workers", "1"),
+    }
+
+
+def cuspid(*arguments: str) -> None:
+    """Run a verb to its end."""
+    subprocess.run([*CUSPID, *arguments], check=True, capture_output=True)
+
+
+def prepare(work: Path) -> None:
+    """What the verbs take: a handpiece with small images, a scan, a film."""
+    cuspid("handpiece", "--design", "four", "--width-px", "160", "--height-px", "160", "--out", str(work / "probe"))
+    cuspid("simulate", "--handpiece", str(work / "probe" / "handpiece.json"), *SCAN, "--out", str(work / "scan"))
+    camera = ("--camera.width-px", "320", "--camera.height-px", "240")
+    cuspid("film", *camera, "--frames", "40", "--shake", "0.3", "--texture", "artificial", "--out", str(work / "film"))
+
+
+def killed(arguments: tuple[str, ...], how: signal.Signals, after_s: float) -> bool:
+    """Whether a run was still going when its time came."""
+    begun = subprocess.Popen([*CUSPID, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        begun.wait(after_s)
+        return False
+    except subprocess.TimeoutExpired:
+        begun.send_signal(how)
+        begun.wait(60)
+        return True
+
+
+def differences(one: Path, other: Path) -> list[str]:
+    """Files that only one folder has or that differ, times and keys aside."""
+    names = {path.relative_to(root) for root in (one, other) for path in root.rglob("*") if path.is_file()}
+    unlike = (name for name in sorted(names) if name.name not in KEYS and "cache" not in name.parts)
+    return [str(name) for name in unlike if not _same(one / name, other / name)]
+
+
+def _same(one: Path, other: Path) -> bool:
+    if one.name.startswith(".part-") or other.name.startswith(".part-"):
+        return True  # what a killed run left, which nothing reads
+    if not (one.is_file() and other.is_file()):
+        return False
+    if one.suffix == ".json":
+        return bool(_without_times(json.loads(one.read_text())) == _without_times(json.loads(other.read_text())))
+    if one.suffix == ".html":
+        return True  # a page of what is compared itself, with the times
+    return one.read_bytes() == other.read_bytes()
+
+
+def _without_times(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_times(each) for key, each in value.items() if not key.endswith(("_s", "seconds"))}
+    return [_without_times(each) for each in value] if isinstance(value, list) else value
+
+
+def main() -> None:
+    """Kill the verbs in turns."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", default="")
+    parser.add_argument("--work", type=Path, default=Path("build/kill"))
+    arguments = parser.parse_args()
+    work, rng = arguments.work.resolve(), np.random.default_rng(arguments.seed)
+    shutil.rmtree(work, ignore_errors=True)
+    prepare(work)
+    whole: dict[str, float] = {}
+    chosen = {name: command for name, command in verbs(work).items() if arguments.only in name}
+    for name, command in chosen.items():
+        begin = time.perf_counter()
+        cuspid(*command, "--out", str(work / "whole" / name))
+        whole[name] = time.perf_counter() - begin
+        print(f"{name}: {whole[name]:.0f} s undisturbed", flush=True)
+    kills, wrong, runs = dict.fromkeys(chosen, 0), [], 0
+    while sum(kills.values()) < arguments.kills:
+        name = list(chosen)[runs % len(chosen)]
+        out, sent = work / "killed", []
+        shutil.rmtree(out, ignore_errors=True)
+        command = (*chosen[name], "--out", str(out))
+        for _ in range(int(rng.integers(1, 4))):
+            how, after_s = SIGNALS[sum(kills.values()) % 3], float(rng.uniform(0.2, whole[name]))
+            if killed(command, how, after_s):
+                kills[name] += 1
+                sent.append([how.name, round(after_s, 2)])
+        ended = subprocess.run([*CUSPID, *command], capture_output=True, text=True, check=False)
+        unlike = differences(work / "whole" / name, out) if ended.returncode == 0 else [ended.stderr[-300:]]
+        if unlike:
+            wrong.append({"verb": name, "sent": sent, "unlike": unlike[:10]})
+            print(f"{name} {sent}: {unlike[:5]}", flush=True)
+        runs += 1
+    print(f"{sum(kills.values())} kills in {runs} runs, {len(wrong)} wrong")
+    found = {"kills": kills, "runs": runs, "undisturbed_s": whole, "wrong": wrong}
+    write_json(HERE / "results" / "kill.json", {**found, **conditions()})
+
+
+if __name__ == "__main__":
+    main()
