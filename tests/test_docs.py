@@ -5,12 +5,12 @@ import ast
 import functools
 import importlib
 import importlib.util
-import inspect
 import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 
@@ -190,8 +190,8 @@ def test_the_command_line_has_a_page_for_every_verb(monkeypatch):
 
 def own_options(command) -> list[str]:
     """Arguments of a verb that are plain values."""
-    plain = (str, "int", "int | None", "bool", "str | None")
-    return [each.name for each in inspect.signature(command).parameters.values() if each.annotation in plain]
+    plain = (str, int, int | None, float, float | None, bool, str | None)
+    return [name for name, hint in get_type_hints(command).items() if hint in plain]
 
 
 def test_every_public_module_has_its_docstrings_on_a_page(monkeypatch):

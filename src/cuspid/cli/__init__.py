@@ -71,9 +71,6 @@ def _checked(name: str, verb: Callable[..., None]) -> Callable[..., None]:
     return checked
 
 
-_CHECKED = {name: _checked(name, verb) for name, verb in COMMANDS.items()}
-
-
 class _Notes(logging.Handler):
     """What the code has to say while it runs, a line each."""
 
@@ -103,7 +100,7 @@ def main(arguments: list[str] | None = None) -> None:
 def _run(arguments: list[str] | None) -> None:
     try:
         tyro.extras.subcommand_cli_from_dict(
-            _CHECKED,
+            {name: _checked(name, verb) for name, verb in COMMANDS.items()},
             prog="cuspid",
             description="Passive intra-oral 3D scanning: simulate, reconstruct, and prove the accuracy.",
             args=arguments,
