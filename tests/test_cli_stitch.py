@@ -40,6 +40,12 @@ def test_two_sizes_name_the_frame(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "001.png: 80 x 120 px, but most frames have 160 x 120 px" in line
 
 
+def test_frames_of_a_pixel_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_frames(tmp_path / "frames", [picture(seed)[:1, :1] for seed in range(3)])
+    assert "frames of 1 x 1 px" in refused(capsys, "stitch", tmp_path / "frames", "--out", tmp_path / "pan")
+    assert not (tmp_path / "pan").exists()
+
+
 def test_a_truncated_frame_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_frames(tmp_path / "frames", map(picture, range(3)))
     (folder / "002.png").write_bytes((folder / "002.png").read_bytes()[:-40])

@@ -22,6 +22,8 @@ from cuspid.storage.files import finished, read_json, reading
 from cuspid.storage.handpieces import camera_from_colmap, camera_from_json, read_handpiece, read_rig_config
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm")
+LEAST_PX = 32
+"""Side of a frame that shows something."""
 MOST_FRAMES = 300
 """A longer video is thinned evenly to about as many frames."""
 
@@ -64,7 +66,7 @@ def _of_capture(folder: Path) -> ImageSequence:
 
 
 def _common_size(folder: Path, paths: list[Path]) -> tuple[int, int]:
-    """Raises InputError where there are fewer than two frames or they are not of one size."""
+    """Raises InputError where there are fewer than two frames, or they are tiny or not of one size."""
     if len(paths) < 2:
         raise InputError(f"{folder}: {len(paths)} image(s); a panorama needs a sequence of overlapping frames")
     sizes = {path: image_size(path) for path in paths}
@@ -75,6 +77,8 @@ def _common_size(folder: Path, paths: list[Path]) -> tuple[int, int]:
             f"{odd[0]}: {sizes[odd[0]][0]} x {sizes[odd[0]][1]} px, but most frames have {usual[0]} x {usual[1]} px "
             f"({len(odd)} of {len(paths)} differ); take them out, or stitch each size for itself"
         )
+    if min(usual) < LEAST_PX:
+        raise InputError(f"{folder}: frames of {usual[0]} x {usual[1]} px show too little; {LEAST_PX} px are the least")
     return usual
 
 
