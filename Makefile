@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: demo test lint format docs benchmarks clean
+.PHONY: demo test lint format docs wheel benchmarks clean
 
 demo: $(STAMP)
 	$(BIN)/cuspid run --tooth 46 --out demo
@@ -27,6 +27,16 @@ format: $(STAMP)
 docs: $(STAMP).docs
 	$(BIN)/sphinx-build --quiet --fail-on-warning --doctree-dir build/doctrees docs build/docs
 	@echo "build/docs/index.html"
+
+# As users get it: in an environment of its own, far from the sources.
+wheel: $(STAMP)
+	rm -rf build/wheel
+	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir build/wheel .
+	$(PYTHON) -m venv build/wheel/venv
+	build/wheel/venv/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt build/wheel/*.whl
+	cd build/wheel && venv/bin/cuspid handpiece --design four --width-px 160 --height-px 160 --out probe
+	cd build/wheel && venv/bin/cuspid run --handpiece probe/handpiece.json --tooth 46 --frames 6 --length-mm 3 --out scan
+	test -s build/wheel/scan/report.html
 
 benchmarks: $(STAMP)
 	$(BIN)/python benchmarks/run.py --out benchmarks/results
