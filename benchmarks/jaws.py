@@ -4,8 +4,9 @@
 
 FOLDER holds meshes of jaws, ``lower`` or ``upper`` in their names; those of fewer than 30,000 faces are also scanned
 after two Loop subdivisions, for their facets are larger than teeth are smooth. Quadrants, single teeth and jaws with
-gaps are cut from labelled ones, with 3 mm of what is around them, turned at random and without their labels. ``--plan``
-only plans the paths. Finished scans are kept in the work folder and not run again.
+gaps are cut from labelled ones, with 3 mm of what is around them, turned at random and without their labels; where
+teeth are taken out of an arch the gum around them stays, as in a mouth. ``--plan`` only plans the paths. Finished scans
+are kept in the work folder and not run again.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ def jaw_of(file: str, part: str, smooth: bool) -> Jaw:
         return jaw
     with tempfile.TemporaryDirectory(prefix="cuspid-part-") as folder:
         path = Path(folder) / f"{part}.ply"
-        cut = cut_out(jaw, PARTS[part][1])
+        cut = cut_out(jaw, PARTS[part][1], gaps=part.startswith("gaps"))
         trimesh.Trimesh(cut.vertices, cut.faces, process=False).export(path)
         return load_jaw(path, arch=jaw.arch)[0]
 
@@ -108,12 +109,13 @@ def _manifold(mesh: Mesh) -> Mesh:
     return mesh.submesh(np.asarray(alone.all(axis=1)))
 
 
-def cut_out(jaw: Jaw, teeth: tuple[int, ...]) -> Mesh:
-    """Teeth with 3 mm of gum, in any pose."""
+def cut_out(jaw: Jaw, teeth: tuple[int, ...], *, gaps: bool) -> Mesh:
+    """Teeth with 3 mm of gum, also around teeth that are taken out where these leave gaps, in any pose."""
     if jaw.face_labels is None:
         raise SystemExit("parts are cut from labelled jaws")
     wanted = np.isin(jaw.face_labels, teeth)
-    distance, _, _ = jaw.mesh.submesh(wanted).closest(jaw.mesh.face_centres)
+    around = jaw.face_labels != GUM if gaps else wanted
+    distance, _, _ = jaw.mesh.submesh(around).closest(jaw.mesh.face_centres)
     part = jaw.mesh.submesh(wanted | ((jaw.face_labels == GUM) & (distance < 3.0)))
     rng = np.random.default_rng(len(teeth))
     return part.transformed(Rigid3(Rotation.random(rng=rng).as_matrix(), rng.normal(0, 50, 3)))
