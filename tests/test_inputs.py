@@ -15,10 +15,10 @@ from PIL import Image
 from builders import sphere
 from cuspid import storage
 from cuspid.capture import image_size, read_image
-from cuspid.errors import InputError
+from cuspid.errors import InputError, OutputError
 from cuspid.handpiece.designs import DESIGNS
 from cuspid.inputs import LARGEST_MIB, read_text, require_file
-from verbs import refused, run
+from verbs import refused
 
 
 @pytest.mark.parametrize("device", ["/dev/zero", "/dev/urandom", "fifo", "folder", "missing"])
@@ -172,19 +172,16 @@ def test_jaws_of_one_name_are_told_apart_by_the_user(
     assert not (tmp_path / "out").exists()
 
 
-def test_of_a_file_the_contents_count_not_where_it_lies(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_of_a_file_the_contents_count_not_where_it_lies(tmp_path: Path) -> None:
     """A run goes on with the same handpiece from elsewhere, and does not with another one from the same place."""
     for name in ("here", "there"):
         storage.write_handpiece(tmp_path / f"{name}.json", DESIGNS["four"]())
-    command = ("visibility", "--tooth", "46", "--out", tmp_path / "out")
-    run(*command, "--handpiece", tmp_path / "here.json")
+    same = {"handpiece": storage.hash_file(tmp_path / "there.json")}
+    storage.claim_folder(tmp_path / "out", "simulate", {"handpiece": tmp_path / "here.json"}, same)
     entry = storage.read_json(tmp_path / "out" / "run.json")
-    run(*command, "--handpiece", tmp_path / "there.json")
+    storage.claim_folder(tmp_path / "out", "simulate", {"handpiece": tmp_path / "there.json"}, same)
     assert storage.read_json(tmp_path / "out" / "run.json") == entry
     storage.write_handpiece(tmp_path / "here.json", DESIGNS["six"]())
-    settings = {"a": tmp_path / "here.json"}
-    hashes = [{"a": storage.hash_file(tmp_path / f"{name}.json")} for name in ("here", "there")]
-    storage.claim_folder(tmp_path / "other", "simulate", settings, hashes[0])
-    storage.claim_folder(tmp_path / "other", "simulate", {"a": tmp_path / "moved.json"}, hashes[0])
-    with pytest.raises(storage.files.OutputError, match=r"inputs_sha256\.a differs"):
-        storage.claim_folder(tmp_path / "other", "simulate", settings, hashes[1])
+    other = {"handpiece": storage.hash_file(tmp_path / "here.json")}
+    with pytest.raises(OutputError, match=r"inputs_sha256\.handpiece differs"):
+        storage.claim_folder(tmp_path / "out", "simulate", {"handpiece": tmp_path / "here.json"}, other)
