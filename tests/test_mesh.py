@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given
 
-from builders import sphere
+from builders import any_pose, sphere
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import FDI_FROM_UNIVERSAL, UNIVERSAL_FROM_FDI, Jaw
@@ -105,3 +106,14 @@ def test_a_jaw_knows_its_teeth():
         jaw.tooth_faces(11)
     with pytest.raises(InputError, match="labels for"):
         Jaw(mesh=mesh, face_labels=labels[1:])
+
+
+@pytest.mark.parametrize("most", [700, 20_000])
+def test_a_simplified_mesh_has_no_more_faces_and_the_same_surface(most: int) -> None:
+    """Also where much of it is flat, in any pose, on which the library gives up early."""
+    box = trimesh.creation.box((20, 14, 6)).subdivide_to_size(0.4)
+    mesh = Mesh(np.asarray(box.vertices), np.asarray(box.faces)).transformed(any_pose(3, 10.0))
+    found = mesh.simplified(most)
+    assert 0.5 * min(most, len(mesh.faces)) < len(found.faces) <= most
+    np.testing.assert_allclose(found.face_areas.sum(), mesh.face_areas.sum(), rtol=0.02)
+    assert (found is mesh) == (len(mesh.faces) <= most)

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from cuspid.errors import InputError
 from cuspid.geometry import read_only
+from cuspid.values import shown
 
 OPENCV_PIXEL_OFFSET = 0.5
 """COLMAP's pixel coordinate minus OpenCV's for the same place in an image."""
@@ -85,7 +86,7 @@ class Camera:
                 f"{self.focal_px} px"
             )
         if not np.isfinite(self.parameters).all():
-            raise InputError(f"camera: its parameters are not finite: {self.parameters}")
+            raise InputError(f"camera: its parameters are not finite: {shown(self.parameters)}")
 
     @staticmethod
     def from_field_of_view(width: int, height: int, horizontal_fov_deg: float) -> Camera:

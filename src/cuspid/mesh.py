@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import fast_simplification
 import igl
 import numpy as np
 from embreex import rtcore_scene
@@ -173,6 +174,17 @@ class Mesh:
         tree = igl.AABB()
         tree.init(self.vertices, self.faces)
         return tree
+
+    def simplified(self, most_faces: int) -> Mesh:
+        """With at most so many faces, by collapsing edges where it matters least (quadric error metric, Garland and
+        Heckbert 1997); itself where it has no more. Colours are lost."""
+        vertices, faces = self.vertices.astype(np.float64), self.faces.astype(np.int32)
+        while len(faces) > most_faces:
+            before = len(faces)
+            vertices, faces = fast_simplification.simplify(vertices, faces, target_count=most_faces)
+            if len(faces) > 0.95 * before:  # it may give up early, and go on when it is asked again
+                break
+        return self if faces.shape == self.faces.shape else Mesh(vertices, faces)
 
     def closest(
         self, points: Float[np.ndarray, "n 3"]

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import fast_simplification
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import maximum_filter
@@ -92,12 +91,7 @@ def crowns_by_shape(mesh: Mesh) -> Bool[np.ndarray, "f"]:
 def _simplified(mesh: Mesh, face_mm2: float) -> Mesh:
     """With faces of that mean area, or the mesh itself where its own are about as large."""
     wanted = max(int(mesh.face_areas.sum() / face_mm2), 100)
-    if len(mesh.faces) <= 1.3 * wanted:
-        return mesh
-    vertices, faces = fast_simplification.simplify(
-        mesh.vertices.astype(np.float64), mesh.faces.astype(np.int32), target_count=wanted
-    )
-    return Mesh(vertices, faces)
+    return mesh if len(mesh.faces) <= 1.3 * wanted else mesh.simplified(wanted)
 
 
 # --- how places look --------------------------------------------------------------------------------------------------

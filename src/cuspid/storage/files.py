@@ -160,6 +160,8 @@ def reading(path: Path) -> Iterator[None]:
     """Turn what a malformed value in a parsed file, or in the files of a folder, raises into one clear line."""
     try:
         yield
+    except InputError as error:
+        raise error if str(path) in str(error) else InputError(f"{path}: {error}") from error
     except CuspidError:
         raise
     except KeyError as error:

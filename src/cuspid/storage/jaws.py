@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -10,11 +11,11 @@ from jaxtyping import Int, UInt8
 
 from cuspid.errors import InputError
 from cuspid.inputs import require_file
-from cuspid.jaw import FDI_FROM_UNIVERSAL, Arch, Jaw, Landmark, Sphere
+from cuspid.jaw import ARCHES, FDI_FROM_UNIVERSAL, Arch, Jaw, Landmark, Sphere
 from cuspid.mesh import Mesh
 from cuspid.storage.files import read_json, reading, write_json
 from cuspid.storage.meshes import MESH_SUFFIXES, Unit, read_triangles, write_mesh
-from cuspid.values import one_line
+from cuspid.values import LONGEST_MM, number, numbers, one_line, shown
 
 _LARGEST_LABEL = 10_000
 OCCLUSAL = "occlusal"
@@ -115,17 +116,29 @@ def read_jaw(path: Path) -> Jaw:
     extra = read_json(beside)
     with reading(beside):
         arch: Arch | None = extra["arch"]
+        if arch not in (*ARCHES, None):
+            raise ValueError(f"arch is {shown(arch)}")
         return Jaw(
             mesh=mesh,
             face_labels=labels,
             arch=arch,
             landmarks={
-                label: Landmark(np.array(point["position_mm"], dtype=np.float64), point["estimated_sigma_mm"])
+                label: Landmark(_places(point["position_mm"], 3), _length(point["estimated_sigma_mm"]))
                 for label, point in extra["landmarks"].items()
             },
-            lines={label: np.array(line, dtype=np.float64) for label, line in extra["lines_mm"].items()},
+            lines={label: _places(line, len(line), 3) for label, line in extra["lines_mm"].items()},
             spheres={
-                label: Sphere(np.array(sphere["centre_mm"], dtype=np.float64), sphere["radius_mm"])
+                label: Sphere(
+                    _places(sphere["centre_mm"], 3), number("radius_mm", sphere["radius_mm"], 1e-6, LONGEST_MM)
+                )
                 for label, sphere in extra["spheres"].items()
             },
         )
+
+
+def _places(value: Any, *shape: int) -> np.ndarray:
+    return numbers("a place", value, shape, -LONGEST_MM, LONGEST_MM)
+
+
+def _length(value: Any) -> float | None:
+    return None if value is None else number("estimated_sigma_mm", value, 0.0, LONGEST_MM)

@@ -44,7 +44,8 @@ def read_triangles(path: Path, unit: Unit) -> tuple[Mesh, trimesh.Trimesh]:
         raise InputError(f"{path}: not a mesh file that cuspid reads; give an STL, PLY or OBJ file")
     declared = _declared_faces(path)
     try:
-        loaded = trimesh.load(path, process=False, force="mesh", skip_materials=True)
+        with np.errstate(all="ignore"):  # what is not finite is told below
+            loaded = trimesh.load(path, process=False, force="mesh", skip_materials=True)
     except Exception as error:  # trimesh's loaders raise whatever the parser met
         raise InputError(f"{path}: not a mesh ({type(error).__name__}: {one_line(error)}); export it again") from error
     vertices = np.asarray(getattr(loaded, "vertices", np.empty((0, 3))), dtype=np.float64)

@@ -157,8 +157,11 @@ def _read_opencv(path: Path) -> Camera:
         file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     except (cv2.error, SystemError) as error:
         raise InputError(f"{path}: not OpenCV's calibration") from error
-    matrix, distortion = file.getNode("camera_matrix").mat(), file.getNode("distortion_coefficients").mat()
-    width, height = (int(file.getNode(name).real()) for name in ("image_width", "image_height"))
+    with reading(path):
+        matrix, distortion = (
+            _small_matrix(file.getNode(name)) for name in ("camera_matrix", "distortion_coefficients")
+        )
+        width, height = (int(file.getNode(name).real()) for name in ("image_width", "image_height"))
     if matrix is None or matrix.shape != (3, 3) or not width or not height:
         raise InputError(f"{path}: needs camera_matrix, image_width and image_height, as OpenCV's calibration writes")
     coefficients = np.zeros(5) if distortion is None else np.pad(distortion.ravel().astype(np.float64), (0, 5))
@@ -171,6 +174,18 @@ def _read_opencv(path: Path) -> Camera:
         principal_point_px=matrix[:2, 2] + OPENCV_PIXEL_OFFSET,
         distortion=coefficients[:4],
     )
+
+
+def _small_matrix(node: cv2.FileNode) -> np.ndarray | None:
+    """Raises ValueError for what is no matrix or, as it says itself, a large one."""
+    if not node.isMap():
+        return None
+    if not 0 < node.getNode("rows").real() * node.getNode("cols").real() < 100:
+        raise ValueError("a matrix of no such size")
+    try:
+        return np.asarray(node.mat())
+    except cv2.error as error:
+        raise ValueError("a matrix that cannot be read") from error
 
 
 def _read_cameras_txt(path: Path) -> Camera:

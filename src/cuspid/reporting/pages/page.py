@@ -17,13 +17,15 @@ from typing import Any
 import cv2
 import numpy as np
 from jaxtyping import Shaped, UInt8
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, UndefinedError
 from markupsafe import Markup
 
 import cuspid
 from cuspid.capture import read_image
+from cuspid.errors import InputError
 from cuspid.inputs import read_bytes
 from cuspid.storage.files import to_plain
+from cuspid.values import one_line
 
 JPEG_QUALITY = 85
 LARGEST_PAGE_BYTES = 15_000_000
@@ -32,7 +34,10 @@ LARGEST_PAGE_BYTES = 15_000_000
 
 def render_page(template: str, **values: Any) -> str:
     """The HTML of a page. ``values`` are those of the template; what it lacks is an error."""
-    return _environment().get_template(template).render(version=cuspid.__version__, **values)
+    try:
+        return _environment().get_template(template).render(version=cuspid.__version__, **values)
+    except UndefinedError as error:
+        raise InputError(f"report: what it shows is incomplete ({one_line(error)}); make it again") from error
 
 
 @cache

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import fast_simplification
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
@@ -49,10 +48,7 @@ def simplified(mesh: Mesh, most_faces: int) -> ShownMesh:
     full = len(mesh.faces)
     if full <= most_faces:
         return ShownMesh(mesh=mesh, nearest=np.arange(len(mesh.vertices)), full_faces=full, off_um=0.0)
-    vertices, faces = fast_simplification.simplify(
-        mesh.vertices.astype(np.float64), mesh.faces.astype(np.int32), target_count=most_faces
-    )
-    shown = Mesh(vertices, faces)
+    shown = mesh.simplified(most_faces)
     nearest = cKDTree(mesh.vertices).query(shown.vertices)[1]
     distances, _, _ = shown.closest(mesh.vertices[:: 1 + len(mesh.vertices) // _PROBES])
     return ShownMesh(
