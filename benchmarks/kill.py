@@ -124,9 +124,10 @@ def main() -> None:
                 sent.append([how.name, round(after_s, 2)])
         ended = subprocess.run([*CUSPID, *command], capture_output=True, text=True, check=False)
         unlike = differences(work / "whole" / name, out) if ended.returncode == 0 else [ended.stderr[-300:]]
+        print(f"{sum(kills.values())} kills: {name} {sent}", flush=True)
         if unlike:
             wrong.append({"verb": name, "sent": sent, "unlike": unlike[:10]})
-            print(f"{name} {sent}: {unlike[:5]}", flush=True)
+            print(f"  wrong: {unlike[:5]}", flush=True)
         runs += 1
     print(f"{sum(kills.values())} kills in {runs} runs, {len(wrong)} wrong")
     found = {"kills": kills, "runs": runs, "undisturbed_s": whole, "wrong": wrong}
