@@ -7,11 +7,13 @@ import sys
 import numpy as np
 import pytest
 
-from builders import box_mesh, handpiece, image_path, make_capture
+from builders import box_mesh, handpiece, image_path, make_capture, shifted, sphere
 from cuspid import cli, storage
+from cuspid.cli.scan import _evaluate_trajectory
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
-from verbs import refused
+from report_folders import known_trueness
+from verbs import refused, run
 
 
 @pytest.mark.parametrize("verb", sorted(cli.COMMANDS))
@@ -110,3 +112,34 @@ def test_evaluate_works_on_meshes_that_cuspid_never_saw(tmp_path, capsys, jaw_li
 def test_the_module_runs():
     done = subprocess.run([sys.executable, "-m", "cuspid", "--help"], capture_output=True, text=True, check=True)
     assert all(verb in done.stdout for verb in cli.COMMANDS)
+
+
+def test_an_evaluation_keeps_nothing_of_another_one(tmp_path):
+    """Of another mesh, errors of poses, spheres and margins would look like those of this one."""
+    mesh, out = tmp_path / "scan.stl", tmp_path / "out"
+    storage.write_mesh(mesh, sphere(8.0, 3))
+    run("evaluate", mesh, mesh, "--out", out, "--no-align", "--samples", 2000)
+    for name in ("trajectory.json", "spheres.json", "margins.json"):
+        (out / name).write_text("{}")
+    run("evaluate", mesh, mesh, "--out", out, "--no-align", "--samples", 2000)
+    assert not [path for path in out.iterdir() if path.stem in ("trajectory", "spheres", "margins")]
+
+
+def test_the_trajectory_is_that_of_the_mesh_that_it_made(tmp_path, capsys):
+    """Not of any mesh that lies beside it; and of a frame alone there is none."""
+    trueness, truth = known_trueness(np.zeros(3)), tmp_path / "truth"
+    poses = {f"{k:05d}": shifted(float(k)) for k in range(3)}
+    storage.write_poses(truth / "poses.json", poses)
+    found = {name: pose @ trueness.reference_from_scan for name, pose in poses.items()}
+    storage.write_poses(tmp_path / "motion" / "poses.json", found)
+    _evaluate_trajectory(tmp_path / "other.ply", truth, trueness, tmp_path)
+    assert not (tmp_path / "trajectory.json").exists()
+    _evaluate_trajectory(tmp_path / "mesh.ply", truth, trueness, tmp_path)
+    error = storage.read_json(tmp_path / "trajectory.json")
+    assert error["frames"] == 3
+    assert error["ape_um"]["max"] < 1e-6
+    (tmp_path / "trajectory.json").unlink()
+    storage.write_poses(tmp_path / "motion" / "poses.json", {"00001": found["00001"]})
+    _evaluate_trajectory(tmp_path / "mesh.ply", truth, trueness, tmp_path)
+    assert "note: trajectory: 1 of 3 true poses" in capsys.readouterr().err
+    assert not (tmp_path / "trajectory.json").exists()

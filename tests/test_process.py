@@ -29,6 +29,19 @@ def test_it_ends_at_once_and_without_a_trace_of_where_it_was(tmp_path: Path, how
     assert not any(word in said for word in ("Traceback", "***", "@     0x", 'File "'))
 
 
+def test_an_interrupt_that_is_passed_over_stays_so(tmp_path: Path) -> None:
+    """As a shell has it for what runs in the background."""
+    begun = subprocess.Popen(
+        [*CUSPID, "optics", "--out", str(tmp_path / "optics.csv")],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
+    )
+    time.sleep(0.7)
+    begun.send_signal(signal.SIGINT)
+    assert begun.wait(60) == 0
+
+
 def test_whoever_reads_it_may_stop_reading():
     """As ``cuspid run --help | head -1`` does."""
     reader, writer = os.pipe()

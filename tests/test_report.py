@@ -418,6 +418,7 @@ def test_the_live_view_answers_its_own_pages_alone(scan_folder):
             (f"127.0.0.1:{port}", "null"),
             (f"evil.example:{port}", f"http://evil.example:{port}"),
             ("", f"http://127.0.0.1:{port}"),
+            (f"[::1:{port}", f"http://[::1:{port}"),
         ):
             assert " 403 " in asked(port, Host=host, Origin=origin)
     finally:

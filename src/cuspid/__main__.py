@@ -7,19 +7,28 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def _signals_of_our_own() -> Iterator[None]:
+    """What is loaded in the block leaves no handlers behind: those of some libraries print where they were."""
+    interrupt, terminate = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    if interrupt is signal.default_int_handler:  # otherwise whoever began it wants it passed over
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGINT, signal.default_int_handler if interrupt is None else interrupt)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL if terminate is None else terminate)
 
 
 def main() -> None:
-    """Load the command line and run a verb."""
-    ours = threading.current_thread() is threading.main_thread()
-    if ours:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    """Load the command line and run a verb; signals are the main thread's."""
+    if threading.current_thread() is threading.main_thread():
+        with _signals_of_our_own():
+            import cuspid.cli  # noqa: F401
     from cuspid import cli
 
-    if ours:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        # A library has its own, which prints where it was.
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
     cli.main()
 
 

@@ -61,8 +61,8 @@ def image_size(path: Path) -> tuple[int, int]:
         raise InputError(f"{path}: not an image, or truncated; copy the image again") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); put the image back") from error
-    except InputError as error:
-        raise InputError(f"{error}; put the image back") from error
+    except InputError:
+        raise
     except Exception as error:  # a reader of Pillow raises whatever its format makes of the header
         raise InputError(f"{path}: damaged ({one_line(error)}); copy the image again") from error
     if path.suffix.lower() == ".png" and end != PNG_END:

@@ -13,11 +13,11 @@ from typing import Literal
 
 from cuspid.errors import InputError
 
-Kind = Literal["text", "image", "mesh", "arrays", "video"]
+Kind = Literal["text", "image", "mesh", "arrays", "file"]
 LARGEST_MIB: Mapping[Kind, int] = MappingProxyType(
-    {"text": 64, "image": 1024, "mesh": 4096, "arrays": 8192, "video": 1 << 20}
+    {"text": 64, "image": 1024, "mesh": 4096, "arrays": 8192, "file": 1 << 20}
 )
-"""No file of a kind is larger."""
+"""No file of a kind is larger; ``file`` is any other, such as a video."""
 
 
 def require_file(path: Path, kind: Kind) -> Path:

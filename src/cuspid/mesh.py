@@ -176,8 +176,8 @@ class Mesh:
         return tree
 
     def simplified(self, most_faces: int) -> Mesh:
-        """With at most so many faces, by collapsing edges where it matters least (quadric error metric, Garland and
-        Heckbert 1997); itself where it has no more. Colours are lost."""
+        """With at most so many faces, or as few as can be, by collapsing edges where it matters least (quadric error
+        metric, Garland and Heckbert 1997); itself where it has no more. Colours are lost."""
         vertices, faces = self.vertices.astype(np.float64), self.faces.astype(np.int32)
         while len(faces) > most_faces:
             before = len(faces)

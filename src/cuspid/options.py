@@ -33,8 +33,6 @@ SEED = Range(0, 2**31 - 1)
 SHARE = Range(0, 1)
 TOOTH = Range(11, 48)
 """FDI number; whether a jaw has the tooth is found out later."""
-
-
 WORKERS = Range(1, 1024)
 """Processes that share the work."""
 Choices = tuple[object, ...]

@@ -141,12 +141,14 @@ def _evaluate(mesh: Path, reference: Path, out: Path, source: Source, options: E
     known, hashes = against.jaw, {**against.hashes, "mesh": storage.hash_file(mesh)}
     with storage.claimed_folder(out, "evaluate", {"evaluation": options}, hashes, replace=True):
         trueness = pipeline.evaluate(scan, known, options, scannable=against.scannable, crown=against.crown)
+        for name in _FURTHER:  # of another mesh or reference they would be shown as of this one
+            (out / name).unlink(missing_ok=True)
         coloured = replace(scan, colors=deviation_colors(trueness.deviation_um))
         storage.write_mesh(out / "deviation.ply", coloured, values={"deviation_um": trueness.deviation_um})
         save_deviation_picture(out / "deviation.png", scan, trueness)
         storage.write_trueness(out / "trueness.json", trueness)
     _print_trueness(trueness)
-    _evaluate_trajectory(mesh.parent, reference, trueness, out)
+    _evaluate_trajectory(mesh, reference, trueness, out)
     if known.spheres:
         _evaluate_spheres(scan, known, trueness, out)
     if known.lines:
@@ -154,12 +156,20 @@ def _evaluate(mesh: Path, reference: Path, out: Path, source: Source, options: E
     report(out, reference=reference, unit=source.unit)
 
 
-def _evaluate_trajectory(scan: Path, truth: Path, trueness: Trueness, out: Path) -> None:
-    """The poses that a scan was made with, where they lie beside it and the true ones are known."""
-    found, true = scan / "motion" / "poses.json", truth / "poses.json"
-    if not (found.is_file() and true.is_file()):
+_FURTHER = ("trajectory.json", "spheres.json", "spheres.png", "margins.json")
+"""What only some scans have."""
+
+
+def _evaluate_trajectory(mesh: Path, truth: Path, trueness: Trueness, out: Path) -> None:
+    """The poses that a reconstruction made its mesh with, where the true ones are known."""
+    found, true = mesh.parent / "motion" / "poses.json", truth / "poses.json"
+    if mesh.stem != "mesh" or not (found.is_file() and true.is_file()):
         return
-    error = trajectory_error(storage.read_poses(found), storage.read_poses(true), trueness.reference_from_scan)
+    try:
+        error = trajectory_error(storage.read_poses(found), storage.read_poses(true), trueness.reference_from_scan)
+    except InputError as reason:
+        console.print(f"note: {reason}")
+        return
     storage.write_json(out / "trajectory.json", error)
     console.print(
         f"trajectory of {error.frames} frames, RMSE: absolute pose error {error.ape_um.rmse:.1f} µm and "

@@ -41,9 +41,9 @@ class TrajectoryError:
     ape_deg: ErrorStatistics
     """Absolute pose error, rotation part: angle to the true orientation."""
     rpe_um: ErrorStatistics
-    """Relative pose error of consecutive frames, translation part: how far the motion from one to the next is off."""
+    """Relative pose error, translation part: how far the motion from one of these frames to the next is off."""
     rpe_deg: ErrorStatistics
-    """Relative pose error of consecutive frames, rotation part."""
+    """Relative pose error, rotation part."""
 
 
 def trajectory_error(

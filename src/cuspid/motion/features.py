@@ -36,7 +36,7 @@ class FeatureOptions(Options):
     """Most keypoints in an image; the strongest of each cell come first."""
     contrast: Annotated[float, Range(0, 1)] = 0.02
     """Least contrast of a keypoint, share of the grey range (OpenCV's ``contrastThreshold``)."""
-    edge: Annotated[float, Range(1, 1000000.0)] = 10.0
+    edge: Annotated[float, Range(1, 1_000_000)] = 10.0
     """Largest ratio of the curvatures of a keypoint (OpenCV's ``edgeThreshold``); more takes in points on edges."""
     cell_px: Annotated[int, Range(1, 10_000)] = 25
     """Size of the cells over which keypoints are spread."""

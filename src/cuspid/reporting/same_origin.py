@@ -28,9 +28,11 @@ def is_own(host: str | None, origin: str | None, bound: str) -> bool:
     Host must be an address, ``localhost``, this machine's name, or what the server is bound to: not a name that others
     hand out. Origin, which browsers tell for every WebSocket, must be the same host and port.
     """
-    if host is None or not _is_local(urlsplit(f"//{host}").hostname, bound):
+    try:
+        name, page = urlsplit(f"//{host or ''}").hostname, urlsplit(origin or "").netloc
+    except ValueError:  # brackets of an address that do not close
         return False
-    return origin is None or urlsplit(origin).netloc.lower() == host.lower()
+    return host is not None and _is_local(name, bound) and (origin is None or page.lower() == host.lower())
 
 
 def _is_local(name: str | None, bound: str) -> bool:

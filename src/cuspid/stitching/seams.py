@@ -23,17 +23,17 @@ class SeamOptions(Options):
 
     candidates: Annotated[int, Range(1, 1000)] = 4
     """Best frames that are kept for each cell."""
-    oblique: Annotated[float, Range(0, 1000000.0)] = 1.0
+    oblique: Annotated[float, Range(0, 1_000_000)] = 1.0
     """Cost of looking at 45 degrees instead of straight down; it grows with the square of the tangent."""
-    glare: Annotated[float, Range(0, 1000000.0)] = 2.0
+    glare: Annotated[float, Range(0, 1_000_000)] = 2.0
     """Cost of a place that is burnt out by a highlight, or lies in the dark."""
     border_px: Annotated[float, Range(0.01, 10_000)] = 20.0
     """Distance from the border of a frame over which its cost falls to a third."""
-    border: Annotated[float, Range(0, 1000000.0)] = 0.1
+    border: Annotated[float, Range(0, 1_000_000)] = 0.1
     """Cost at the border of a frame."""
-    seam: Annotated[float, Range(0, 1000000.0)] = 0.02
+    seam: Annotated[float, Range(0, 1_000_000)] = 0.02
     """Cost of a seam along the side of one cell."""
-    jump: Annotated[float, Range(0, 1000000.0)] = 0.002
+    jump: Annotated[float, Range(0, 1_000_000)] = 0.002
     """Cost of each grey level by which the colours differ across a seam."""
 
     def cost(

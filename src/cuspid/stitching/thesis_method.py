@@ -57,7 +57,7 @@ class ThesisOptions(Options):
     """The examination of frames."""
     patience: Annotated[int, Range(1, 10_000)] = 5
     """After so many frames in a row that cannot be used, the panorama breaks, and a new part begins with them."""
-    largest_stretch: Annotated[float, Range(1.01, 1000000.0)] = 10.0
+    largest_stretch: Annotated[float, Range(1.01, 1_000_000)] = 10.0
     """Where the chain lengthens or shortens a frame more than this, it has collapsed: a new part begins."""
     largest_canvas_mpx: Annotated[float, Range(0.01, 1000)] = 25.0
     """Nor may the panorama grow larger than this, in millions of px."""

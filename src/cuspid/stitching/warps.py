@@ -47,7 +47,7 @@ class WarpOptions(Options):
     """No match counts less than this (1 makes every segment follow the homography of the frame)."""
     segment_px: Annotated[int, Range(1, 100_000_000)] = 2500
     """Smallest area of a segment of the normal map, px."""
-    segment_scale: Annotated[float, Range(0.01, 1000000.0)] = 100.0
+    segment_scale: Annotated[float, Range(0.01, 1_000_000)] = 100.0
     """Larger values make larger segments (Felzenszwalb and Huttenlocher 2004)."""
 
 

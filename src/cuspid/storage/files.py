@@ -24,6 +24,7 @@ from cuspid.inputs import LARGEST_MIB, read_text, require_file
 from cuspid.values import one_line
 
 _UNUSABLE = (ValueError, TypeError, AttributeError, IndexError, OverflowError, csv.Error, np.linalg.LinAlgError)
+"""What is raised where a parsed value is of another kind than it should be."""
 PART = ".part-"
 """How the names of unfinished files begin; a killed run leaves them behind, and nothing reads them."""
 
@@ -161,20 +162,14 @@ def reading(path: Path) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise error if str(path) in str(error) else InputError(f"{path}: {error}") from error
+        if str(path) in str(error):
+            raise
+        raise InputError(f"{path}: {error}") from error
     except CuspidError:
         raise
     except KeyError as error:
         raise InputError(f"{path}: the field {error} is missing; see docs/formats.md") from error
-    except (
-        ValueError,
-        TypeError,
-        AttributeError,
-        IndexError,
-        OverflowError,
-        csv.Error,
-        np.linalg.LinAlgError,
-    ) as error:
+    except _UNUSABLE as error:
         raise InputError(f"{path}: a value cannot be used ({one_line(error)}); see docs/formats.md") from error
 
 
@@ -186,7 +181,7 @@ def digest_of(value: object) -> str:
 def hash_file(path: Path) -> str:
     """SHA-256 of a file's contents. Raises InputError where it is no regular file or cannot be read."""
     try:
-        with require_file(path, "video").open("rb") as stream:
+        with require_file(path, "file").open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error

@@ -39,7 +39,7 @@ class FusionOptions(Options):
     """Distance from a surface, in voxels, up to which it is blended."""
     largest_jump: Annotated[float, Range(0.01, 10_000)] = 12.5
     """Neighbouring depths that differ by more resolutions (0.15 mm at 12 um) do not belong to one surface."""
-    least_weight: Annotated[float, Range(0, 1000000.0)] = 0.01
+    least_weight: Annotated[float, Range(0, 1_000_000)] = 0.01
     """Weight (sum of confidences) from which a voxel counts as observed."""
     agreement: Annotated[float, Range(0.01, 10_000)] = 6.65
     """A depth map confirms a vertex within this many resolutions (0.08 mm at 12 um); nearer ones count more."""

@@ -38,9 +38,9 @@ _INK = "#333333"
 class FigureOptions(Options):
     """How deviations are drawn."""
 
-    range_um: Annotated[float, Range(0.01, 1000000.0)] = 100.0
+    range_um: Annotated[float, Range(0.01, 1_000_000)] = 100.0
     """Ends of the colour bar; the range is fixed and symmetric so that pictures can be compared."""
-    tolerance_um: Annotated[float, Range(0.001, 1000000.0)] = 25.0
+    tolerance_um: Annotated[float, Range(0.001, 1_000_000)] = 25.0
     """Green within this deviation to either side."""
     width_px: Annotated[int, Range(100, 20_000)] = 1000
     """Width of the main view."""
