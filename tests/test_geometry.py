@@ -3,6 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, axes_about, best_similarity, lengths_along, unit
 from strategies import points, rigid3s, vectors
 
@@ -30,6 +31,27 @@ def test_every_parametrisation_returns(a):
     np.testing.assert_allclose(again.matrix, a.matrix, atol=1e-12)
     assert np.deg2rad(a.angle_deg) == pytest.approx(np.linalg.norm(a.rotation_vector))
     assert a.quaternion[0] >= 0
+
+
+@given(rigid3s(), st.integers(0, 11), st.sampled_from([np.nan, np.inf, 1e-3, 1e9]))
+def test_a_motion_is_rigid_and_finite(a, place, error):
+    """Whatever one of its numbers is off by, unless it is a length that may be so."""
+    matrix = a.matrix[:3].copy()
+    matrix.flat[place] += error
+    if place % 4 == 3 and np.isfinite(error):
+        assert Rigid3.from_matrix(matrix).translation[place // 4] == matrix.flat[place]
+    else:
+        with pytest.raises(InputError, match="rigid motion: "):
+            Rigid3.from_matrix(matrix)
+
+
+@pytest.mark.parametrize(
+    ("rotation", "translation"),
+    [(np.diag([1.0, 1.0, -1.0]), np.zeros(3)), (2 * np.eye(3), np.zeros(3)), (np.eye(2), np.zeros(3)), (np.eye(3), 0)],
+)
+def test_a_motion_neither_mirrors_nor_scales(rotation, translation):
+    with pytest.raises(InputError, match="rigid motion: "):
+        Rigid3(rotation, translation)
 
 
 def test_known_rotation():

@@ -14,7 +14,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from cuspid.errors import InputError
+from cuspid.values import shown
+
 _Array = TypeVar("_Array", bound=np.ndarray)
+_ROUNDING = 1e-6
+"""How far rotations of files that were written with few digits may be off."""
 
 
 def read_only(array: _Array) -> _Array:
@@ -41,6 +46,12 @@ def axes_about(directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3
     return np.stack([first, np.cross(directions, first), directions], axis=-2)
 
 
+def _is_rotation(matrix: np.ndarray) -> bool:
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        return False
+    return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() < _ROUNDING and np.linalg.det(matrix) > 0)
+
+
 @dataclass(frozen=True, eq=False)
 class Rigid3:
     """A rotation followed by a translation."""
@@ -51,8 +62,13 @@ class Rigid3:
     """Translation in mm."""
 
     def __post_init__(self) -> None:
+        """Raises InputError unless the rotation is proper and orthonormal and all is finite."""
         object.__setattr__(self, "rotation", read_only(np.asarray(self.rotation, dtype=np.float64)))
         object.__setattr__(self, "translation", read_only(np.asarray(self.translation, dtype=np.float64)))
+        if not _is_rotation(self.rotation):
+            raise InputError(f"rigid motion: {shown(self.rotation)} is not a rotation, a 3 x 3 matrix without scale")
+        if self.translation.shape != (3,) or not np.isfinite(self.translation).all():
+            raise InputError(f"rigid motion: its translation is {shown(self.translation)}; it must be 3 finite numbers")
 
     @staticmethod
     def identity() -> Rigid3:
