@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise, product
 
 import numpy as np
@@ -104,20 +105,23 @@ def _fitting(
     room: Room, crowns: CrownPoints, handpiece: Handpiece, pose: Rigid3
 ) -> tuple[Float[np.ndarray, "k 5"], Float[np.ndarray, "k"]]:
     """The best candidates at a station that fit, and what each costs by itself."""
-    fits = room.fits(pose, _MOTIONS)
+    fits = room.fits(pose, _motions())
     if not fits.any():
         raise InputError(
             "scan path: the handpiece does not fit over the jaw even when it is lifted by "
             f"{max(_LIFTS_MM):g} mm; is the jaw in its occlusal frame, or the body of the handpiece too large?"
         )
     candidates = _CANDIDATES[fits]
-    motions = [motion for motion, fit in zip(_MOTIONS, fits, strict=True) if fit]
+    motions = [motion for motion, fit in zip(_motions(), fits, strict=True) if fit]
     costs = _OFF * np.sum((candidates / _UNITS) ** 2, axis=1) + _MISSED * _missed(crowns, handpiece, pose, motions)
     best = np.argsort(costs, kind="stable")[:_KEPT]
     return candidates[best], costs[best]
 
 
-_MOTIONS = [_changed(candidate) for candidate in _CANDIDATES]
+@cache
+def _motions() -> list[Rigid3]:
+    """Those of the candidates; 2,000 take a while to make, and few paths need them."""
+    return [_changed(candidate) for candidate in _CANDIDATES]
 
 
 def _missed(crowns: CrownPoints, handpiece: Handpiece, pose: Rigid3, motions: list[Rigid3]) -> Float[np.ndarray, "k"]:
