@@ -8,6 +8,7 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
+from builders import sphere
 from cuspid.errors import InputError
 from cuspid.evaluation.crown import OpenCrown, open_parts, openness
 from cuspid.evaluation.deviation import EvaluationOptions, evaluate, statistics
@@ -81,6 +82,24 @@ def test_what_lies_past_a_border_is_told_from_what_lies_over_it():
     np.testing.assert_allclose(closest.signed_mm[:2], [0.3, -0.3])
     assert closest.on_border.tolist() == [False, False, True, True, True]
     assert closest.past_border.tolist() == [False, False, True, False, True]
+
+
+def test_an_edge_of_one_face_is_a_border_and_of_three_none():
+    fins = np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]])
+    surface = SignedDistance(Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0.5, 1, 0], [0.5, -1, 0], [0.5, 0, 1]]), fins))
+    closest = surface.closest_points(np.array([[0.5, 0, -0.2], [0.5, 0.2, -0.2], [0.5, 1.1, 0.0], [0.2, 0.9, 0.0]]))
+    assert closest.on_border.tolist() == [False, False, True, True]
+
+
+def test_many_points_are_answered_as_each_of_them_is(monkeypatch):
+    surface = SignedDistance(sphere(5.0, subdivisions=2).submesh(np.arange(320) % 5 > 0))
+    points = np.random.default_rng(0).uniform(-6, 6, (50, 3))
+    whole = surface.closest_points(points)
+    monkeypatch.setattr("cuspid.evaluation.distance._BLOCK", 7)
+    blocks = surface.closest_points(points)
+    for name in ("signed_mm", "faces", "directions", "on_border", "past_border"):
+        np.testing.assert_array_equal(getattr(blocks, name), getattr(whole, name))
+    assert len(surface.closest_points(np.empty((0, 3))).faces) == 0
 
 
 # Statistics

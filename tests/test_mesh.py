@@ -117,3 +117,20 @@ def test_a_simplified_mesh_has_no_more_faces_and_the_same_surface(most: int) -> 
     assert 0.5 * min(most, len(mesh.faces)) < len(found.faces) <= most
     np.testing.assert_allclose(found.face_areas.sum(), mesh.face_areas.sum(), rtol=0.02)
     assert (found is mesh) == (len(mesh.faces) <= most)
+
+
+def test_a_mesh_of_many_faces_is_joined_before_it_is_collapsed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As fine as it would have to be for the collapse alone, and as good."""
+    monkeypatch.setattr("cuspid.mesh._MOST_COLLAPSED", 10_000)
+    ball = sphere(10.0, subdivisions=6)
+    found = ball.simplified(2000)
+    assert 1000 < len(found.faces) <= 2000
+    np.testing.assert_allclose(np.linalg.norm(found.vertices, axis=1), 10.0, atol=0.05)
+    np.testing.assert_allclose(found.face_areas.sum(), ball.face_areas.sum(), rtol=0.01)
+    assert np.sum(found.face_normals * found.face_centres, axis=1).min() > 0
+
+
+def test_some_normals_are_those_of_all() -> None:
+    mesh = sphere(10.0, subdivisions=2)
+    some = np.array([3, 100, 3, 7])
+    np.testing.assert_array_equal(mesh.normals_of(some), mesh.face_normals[some])

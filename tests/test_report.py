@@ -362,9 +362,9 @@ def test_values_of_vertices_are_read_as_they_were_written(tmp_path_factory, seed
     values[3] = np.nan
     path = tmp_path_factory.mktemp("mesh") / "mesh.ply"
     storage.write_mesh(path, Mesh(vertices, rng.permutation(20)[:18].reshape(6, 3)), values={"deviation_um": values})
-    mesh, found = storage.read_vertex_values(path)
-    order = [int(np.argmin(np.linalg.norm(vertices - vertex, axis=1))) for vertex in mesh.vertices]
-    np.testing.assert_allclose(found["deviation_um"], values[order], rtol=1e-6)
+    file = storage.read_mesh_file(path)
+    order = [int(np.argmin(np.linalg.norm(vertices - vertex, axis=1))) for vertex in file.mesh.vertices]
+    np.testing.assert_allclose(file.vertex_values["deviation_um"], values[order], rtol=1e-6)
 
 
 def test_an_array_is_packed_with_its_type():

@@ -136,6 +136,11 @@ def _reconstruct(capture: Capture, out: Path, options: ReconstructionOptions, mo
 
 
 def _evaluate(mesh: Path, reference: Path, out: Path, source: Source, options: EvaluationOptions) -> None:
+    _measure_trueness(mesh, reference, out, source, options)  # and let go of the surfaces, which the report reads again
+    report(out, reference=reference, unit=source.unit)
+
+
+def _measure_trueness(mesh: Path, reference: Path, out: Path, source: Source, options: EvaluationOptions) -> None:
     scan = storage.read_mesh(mesh, source.unit)
     against = pipeline.load_reference(reference, unit=source.unit, arch=source.arch)
     known, hashes = against.jaw, {**against.hashes, "mesh": storage.hash_file(mesh)}
@@ -153,7 +158,6 @@ def _evaluate(mesh: Path, reference: Path, out: Path, source: Source, options: E
         _evaluate_spheres(scan, known, trueness, out)
     if known.lines:
         _evaluate_margins(scan, known, trueness, out)
-    report(out, reference=reference, unit=source.unit)
 
 
 _FURTHER = ("trajectory.json", "spheres.json", "spheres.png", "margins.json")

@@ -52,8 +52,10 @@ class OpenCrown:
 
 def open_parts(mesh: Mesh, parts: Int[np.ndarray, "f"]) -> Int[np.ndarray, "f"]:
     """The parts of crowns of a mesh with +Z out of the gum, as in :class:`OpenCrown`; 0 where a face is not open."""
-    is_open = [open_faces(mesh, parts == part, LEAST_OPENNESS) for part in np.unique(parts) if part != GUM]
-    return np.where(np.any(is_open, axis=0), parts, GUM) if is_open else parts
+    is_open = np.zeros(len(parts), dtype=bool)
+    for part in np.unique(parts[parts != GUM]):
+        is_open |= open_faces(mesh, parts == part, LEAST_OPENNESS)
+    return np.where(is_open, parts, GUM)
 
 
 def pieces(mesh: Mesh, crown: Bool[np.ndarray, "f"]) -> Int[np.ndarray, "f"]:
@@ -134,7 +136,8 @@ def _in_reach(aligned: Mesh, crown: OpenCrown, scannable: Bool[np.ndarray, "f"] 
     if scannable is not None:
         reached = scannable[faces]
     else:
-        reached = aligned.closest(crown.mesh.face_centres[faces])[0] <= _IN_REACH_MM
+        centres = Mesh(crown.mesh.vertices, crown.mesh.faces[faces]).face_centres
+        reached = aligned.closest(centres)[0] <= _IN_REACH_MM
     return {
         int(part): float(areas[(owners == part) & reached].sum() / areas[owners == part].sum())
         for part in np.unique(owners)

@@ -129,6 +129,7 @@ def evaluate(
     alignment = _align(scan, surface, options, rng)
     aligned = scan.transformed(alignment.reference_from_scan)
     labels = reference.face_labels if reference.face_labels is not None else np.full(len(reference.mesh.faces), GUM)
+    deviation_um = _deviation_um(aligned, surface, rules)
     from_scan, everything = _samples_of_scan(aligned, surface, labels, rules, options, rng)
     from_reference, counted_pct = _samples_of_reference(aligned, reference.mesh, labels, rules, options, rng)
     completeness_by_tooth = from_reference.within_pct_by_tooth()
@@ -138,7 +139,6 @@ def evaluate(
         if within["200"] >= _LEAST_TOOTH_PCT
     }
     teeth = find_teeth(from_scan.points, from_scan.labels, centroids, surface, options.registration)
-    at_vertices = surface.closest_points(aligned.vertices)
     return Trueness(
         accuracy=statistics(from_scan.signed_mm),
         everything=everything,
@@ -157,7 +157,7 @@ def evaluate(
         inter_canine_error_um=distance_error_um(teeth, CANINES),
         drift_um=drift_um(teeth, surface),
         reference_from_scan=alignment.reference_from_scan,
-        deviation_um=np.where(rules.evaluated(at_vertices), 1000 * at_vertices.signed_mm, np.nan),
+        deviation_um=deviation_um,
         notes=(*alignment.notes, rules.note, from_scan.left_out, from_reference.left_out),
     )
 
@@ -214,6 +214,12 @@ def _align(scan: Mesh, surface: SignedDistance, options: EvaluationOptions, rng:
     return Alignment(reference_from_scan=Rigid3.identity(), scale=scale, rms_um=0.0, overlap=1.0, notes=notes)
 
 
+def _deviation_um(aligned: Mesh, surface: SignedDistance, rules: _Rules) -> Float[np.ndarray, "v"]:
+    """Of each vertex, NaN where it is not evaluated."""
+    closest = surface.closest_points(aligned.vertices)
+    return np.where(rules.evaluated(closest), 1000 * closest.signed_mm, np.nan)
+
+
 def _samples_of_scan(
     aligned: Mesh,
     surface: SignedDistance,
@@ -254,7 +260,8 @@ def _samples_of_reference(
         raise InputError(
             "evaluation: no face of the reference is left to evaluate; check the scannable mask and --min-openness"
         )
-    points, picks = Mesh(reference.vertices, reference.faces[indices]).sample(options.samples, rng)
+    asked = reference if rules.faces.all() else Mesh(reference.vertices, reference.faces[indices])
+    points, picks = asked.sample(options.samples, rng)
     faces = indices[picks]
     distances, _, positions = aligned.closest(points)
     signs = np.where(np.sum((positions - points) * reference.face_normals[faces], axis=1) < 0, -1.0, 1.0)

@@ -7,9 +7,10 @@ over the surface, not where it lies past its edge: such points are told apart.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
+import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -17,6 +18,8 @@ from cuspid.mesh import Mesh
 
 _ON_EDGE = 1e-7
 """Barycentric weight below which a point of a face lies on the opposite edge."""
+_BLOCK = 1 << 18
+"""Points that are reckoned at once: of millions, what is on the way to the result would take gigabytes."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -43,41 +46,56 @@ class SignedDistance:
     """The surface, outward normals counter-clockwise."""
 
     @cached_property
-    def _edges(self) -> tuple[Int[np.ndarray, "f 3"], Int[np.ndarray, "e"]]:
-        """For each face the number of the edge opposite to each corner, and how many faces share each edge."""
-        faces = self.mesh.faces
-        ends = np.sort(np.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], axis=1), axis=2)
-        keys = ends[..., 0] * len(self.mesh.vertices) + ends[..., 1]
-        _, numbers, counts = np.unique(keys.ravel(), return_inverse=True, return_counts=True)
-        return numbers.reshape(-1, 3), counts
+    def _edges(self) -> tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]]:
+        """The key of each edge of each face, in order, and the face."""
+        keys = self._edge_keys(
+            np.repeat(np.arange(len(self.mesh.faces)), 3), np.tile(np.arange(3), len(self.mesh.faces))
+        )
+        order = np.argsort(keys, kind="stable")
+        return keys[order], (order // 3).astype(np.int32)
 
-    @cached_property
-    def _border(self) -> Bool[np.ndarray, "f 3"]:
-        numbers, counts = self._edges
-        return np.asarray(counts[numbers] == 1)
+    def _edge_keys(self, faces: Int[np.ndarray, "n"], opposite: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+        """A number for the edge of each face opposite to one of its corners, the same in all faces that share it."""
+        one, other = (self.mesh.faces[faces, (opposite + step) % 3] for step in (1, 2))
+        return np.minimum(one, other) * len(self.mesh.vertices) + np.maximum(one, other)
+
+    def _shared(self, keys: Int[np.ndarray, "n"]) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+        """Where the faces of each edge begin among all, and how many there are."""
+        ordered, _ = self._edges
+        begin = np.searchsorted(ordered, keys)
+        return begin, np.searchsorted(ordered, keys, side="right") - begin
 
     @cached_property
     def _border_vertices(self) -> Bool[np.ndarray, "v"]:
+        keys, counts = np.unique(self._edges[0], return_counts=True)
         flags = np.zeros(len(self.mesh.vertices), dtype=bool)
-        for corner in range(3):
-            at = self._border[:, corner]
-            flags[self.mesh.faces[at][:, [(corner + 1) % 3, (corner + 2) % 3]]] = True
+        for ends in np.divmod(keys[counts == 1], len(self.mesh.vertices)):
+            flags[ends] = True
         return flags
 
     @cached_property
-    def _edge_normals(self) -> Float[np.ndarray, "e 3"]:
-        numbers, counts = self._edges
-        return _summed(numbers, np.repeat(self.mesh.face_normals[:, None], 3, axis=1), len(counts))
-
-    @cached_property
     def _corner_normals(self) -> Float[np.ndarray, "v 3"]:
-        corners = self.mesh.vertices[self.mesh.faces]
-        after, before = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
-        angles = np.arctan2(np.linalg.norm(np.cross(after, before), axis=2), np.sum(after * before, axis=2))
-        return _summed(self.mesh.faces, angles[..., None] * self.mesh.face_normals[:, None], len(self.mesh.vertices))
+        by_angle = igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE
+        return igl.per_vertex_normals(self.mesh.vertices, self.mesh.faces, by_angle, self.mesh.face_normals)
+
+    def _edge_normals(self, keys: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
+        """Sums of the normals of the faces that share each edge."""
+        (begin, counts), faces = self._shared(keys), self._edges[1]
+        summed = np.zeros((len(keys), 3))
+        for turn in range(counts.max(initial=0)):
+            more = turn < counts
+            summed[more] += self.mesh.face_normals[faces[begin[more] + turn]]
+        return summed
 
     def closest_points(self, points: Float[np.ndarray, "n 3"]) -> ClosestPoints:
         """Closest points of the surface to ``points`` (mm)."""
+        blocks = [self._closest(points[begin : begin + _BLOCK]) for begin in range(0, max(len(points), 1), _BLOCK)]
+        if len(blocks) == 1:
+            return blocks[0]
+        names = [field.name for field in fields(ClosestPoints)]
+        return ClosestPoints(**{name: np.concatenate([getattr(block, name) for block in blocks]) for name in names})
+
+    def _closest(self, points: Float[np.ndarray, "n 3"]) -> ClosestPoints:
         distances, faces, positions = self.mesh.closest(points)
         on_edge = _barycentric(self.mesh.vertices[self.mesh.faces[faces]], positions) < _ON_EDGE
         offsets = points - positions
@@ -102,23 +120,17 @@ class SignedDistance:
         normals = self.mesh.face_normals[faces].copy()
         touching = on_edge.sum(axis=1)
         edge, corner = touching == 1, touching >= 2
-        normals[edge] = self._edge_normals[self._edges[0][faces[edge], np.argmax(on_edge[edge], axis=1)]]
+        normals[edge] = self._edge_normals(self._edge_keys(faces[edge], np.argmax(on_edge[edge], axis=1)))
         normals[corner] = self._corner_normals[self.mesh.faces[faces[corner], np.argmin(on_edge[corner], axis=1)]]
         return normals
 
     def _on_border(self, faces: Int[np.ndarray, "n"], on_edge: Bool[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-        at_edge = np.any(on_edge & self._border[faces], axis=1)
         corner = self.mesh.faces[faces, np.argmin(on_edge, axis=1)]
-        return np.asarray(at_edge | ((on_edge.sum(axis=1) >= 2) & self._border_vertices[corner]))
-
-
-def _summed(
-    indices: Int[np.ndarray, "f 3"], vectors: Float[np.ndarray, "f 3 3"], length: int
-) -> Float[np.ndarray, "length 3"]:
-    """Sum of the vectors that carry the same index."""
-    return np.stack(
-        [np.bincount(indices.ravel(), vectors[..., axis].ravel(), minlength=length) for axis in range(3)], axis=1
-    )
+        at_border = (on_edge.sum(axis=1) >= 2) & self._border_vertices[corner]
+        points, opposite = np.nonzero(on_edge)
+        _, counts = self._shared(self._edge_keys(faces[points], opposite))
+        at_border[points[counts == 1]] = True
+        return np.asarray(at_border)
 
 
 def _barycentric(corners: Float[np.ndarray, "n 3 3"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

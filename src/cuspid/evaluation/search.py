@@ -93,7 +93,7 @@ def find_poses(moving: Mesh, fixed: Mesh, options: SearchOptions, *, rng: np.ran
 def _cloud(mesh: Mesh, count: int, smoothing_mm: float, rng: np.random.Generator) -> _Cloud:
     points, faces = mesh.sample(count, rng)
     order = rng.permutation(count)
-    points, normals = points[order], mesh.face_normals[faces[order]]
+    points, normals = points[order], mesh.normals_of(faces[order])
     a, b = cKDTree(points).query_pairs(smoothing_mm, output_type="ndarray").T
     alike = np.sum(normals[a] * normals[b], axis=1) > 0
     a, b = np.concatenate([a[alike], b[alike]]), np.concatenate([b[alike], a[alike]])

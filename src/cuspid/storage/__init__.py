@@ -25,7 +25,7 @@ from cuspid.storage.files import (
 from cuspid.storage.handpieces import read_handpiece, read_rig_config, write_handpiece, write_rig_config
 from cuspid.storage.jaws import is_jaw, read_jaw, read_labelled_mesh, write_jaw
 from cuspid.storage.landmarks import MARKUPS_SUFFIX, LandmarkFile, LandmarkFrame, read_landmarks, write_landmarks
-from cuspid.storage.meshes import MESH_SUFFIXES, MM_PER_UNIT, Unit, read_mesh, read_vertex_values, write_mesh
+from cuspid.storage.meshes import MESH_SUFFIXES, MM_PER_UNIT, MeshFile, Unit, read_mesh, read_mesh_file, write_mesh
 from cuspid.storage.panoramas import read_panorama, write_panorama, write_strip
 from cuspid.storage.reconstructions import (
     read_depth_maps,
@@ -60,6 +60,7 @@ __all__ = [
     "PART",
     "LandmarkFile",
     "LandmarkFrame",
+    "MeshFile",
     "PanoramaResult",
     "Result",
     "ScanResult",
@@ -81,6 +82,7 @@ __all__ = [
     "read_labelled_mesh",
     "read_landmarks",
     "read_mesh",
+    "read_mesh_file",
     "read_panorama",
     "read_poses",
     "read_reconstruction",
@@ -90,7 +92,6 @@ __all__ = [
     "read_sequence",
     "read_shape_model",
     "read_truth",
-    "read_vertex_values",
     "reading",
     "trueness_summary",
     "whole_file",

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 from jaxtyping import Int, UInt8
 
 from cuspid.errors import InputError
@@ -14,7 +13,7 @@ from cuspid.inputs import require_file
 from cuspid.jaw import ARCHES, FDI_FROM_UNIVERSAL, Arch, Jaw, Landmark, Sphere
 from cuspid.mesh import Mesh
 from cuspid.storage.files import read_json, reading, write_json
-from cuspid.storage.meshes import MESH_SUFFIXES, Unit, read_triangles, write_mesh
+from cuspid.storage.meshes import MESH_SUFFIXES, MeshFile, Unit, read_mesh_file, write_mesh
 from cuspid.values import LONGEST_MM, number, numbers, one_line, shown
 
 _LARGEST_LABEL = 10_000
@@ -31,23 +30,18 @@ def read_labelled_mesh(
     Labels are the PLY face property ``label``, or a file ``<name>_facelabels.npy`` beside it, in FDI or Universal
     numbers (recognised by their range). Raises InputError where their number is not that of the faces.
     """
-    mesh, loaded = read_triangles(path, unit)
-    colors = None
-    if loaded.visual.kind == "face":
-        colors = np.asarray(loaded.visual.face_colors, dtype=np.uint8)[:, :3]
-    labels = _labels_of(path, loaded)
-    if labels is not None and len(labels) != len(mesh.faces):
-        raise InputError(f"{path}: {len(labels)} labels for {len(mesh.faces)} faces; one for each is needed")
-    return mesh, None if labels is None else _fdi_labels(labels, path), colors
+    file = read_mesh_file(path, unit)
+    labels = _labels_of(path, file)
+    if labels is not None and len(labels) != len(file.mesh.faces):
+        raise InputError(f"{path}: {len(labels)} labels for {len(file.mesh.faces)} faces; one for each is needed")
+    return file.mesh, None if labels is None else _fdi_labels(labels, path), file.face_colors
 
 
-def _labels_of(path: Path, loaded: trimesh.Trimesh) -> Int[np.ndarray, "f"] | None:
+def _labels_of(path: Path, file: MeshFile) -> Int[np.ndarray, "f"] | None:
     beside = path.with_name(f"{path.stem}_facelabels.npy")
     if beside.exists():
         return _whole(beside, _read_array(beside))
-    raw = loaded.metadata.get("_ply_raw", {}).get("face", {}).get("data")
-    names = raw.dtype.names if raw is not None and getattr(raw, "dtype", None) is not None else ()
-    return _whole(path, raw["label"]) if names and "label" in names else None
+    return _whole(path, file.face_values["label"]) if "label" in file.face_values else None
 
 
 def _read_array(path: Path) -> np.ndarray:

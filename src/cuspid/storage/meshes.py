@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
@@ -30,54 +32,91 @@ _LEAST_AREA = 1e-9
 MESH_SUFFIXES = (".stl", ".ply", ".obj")
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MeshFile:
+    """What a mesh file holds."""
+
+    mesh: Mesh
+    """In mm, with coincident vertices joined."""
+    face_colors: UInt8[np.ndarray, "f 3"] | None
+    """sRGB colour per face, where the file has them."""
+    vertex_values: Mapping[str, Float[np.ndarray, "v"]]
+    """Properties of the vertices beside place and colour (PLY), by name."""
+    face_values: Mapping[str, np.ndarray]
+    """Properties of the faces (PLY), by name."""
+
+
 def read_mesh(path: Path, unit: Unit = "mm") -> Mesh:
     """A mesh from an STL, PLY or OBJ file, in mm, with coincident vertices joined.
 
     Raises InputError where the file is missing, not a mesh, empty, or has coordinates that are not finite.
     """
-    return read_triangles(path, unit)[0]
+    return read_mesh_file(path, unit).mesh
 
 
-def read_triangles(path: Path, unit: Unit) -> tuple[Mesh, trimesh.Trimesh]:
-    """As :func:`read_mesh`, with what trimesh loaded, which holds what else the file says."""
+def read_mesh_file(path: Path, unit: Unit = "mm") -> MeshFile:
+    """As :func:`read_mesh`, with what else the file says."""
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(f"{path}: not a mesh file that cuspid reads; give an STL, PLY or OBJ file")
     declared = _declared_faces(path)
     try:
         with np.errstate(all="ignore"):  # what is not finite is told below
-            loaded = trimesh.load(path, process=False, force="mesh", skip_materials=True)
+            scene = trimesh.load_scene(path, process=False, skip_materials=True)
+            parts = list(scene.geometry.values())
+            loaded = parts[0] if len(parts) == 1 else scene.to_mesh()
     except Exception as error:  # trimesh's loaders raise whatever the parser met
         raise InputError(f"{path}: not a mesh ({type(error).__name__}: {one_line(error)}); export it again") from error
-    vertices = np.asarray(getattr(loaded, "vertices", np.empty((0, 3))), dtype=np.float64)
-    faces = np.asarray(getattr(loaded, "faces", np.empty((0, 3))), dtype=np.int64)
-    if len(vertices) == 0 or len(faces) == 0:
-        raise InputError(f"{path}: the mesh is empty (no triangles); export the surface, not a point cloud")
+    with _let_go(loaded, *parts):
+        if not isinstance(loaded, trimesh.Trimesh) or len(loaded.vertices) == 0 or len(loaded.faces) == 0:
+            raise InputError(f"{path}: the mesh is empty (no triangles); export the surface, not a point cloud")
+        return _checked(path, loaded, declared, MM_PER_UNIT[unit])
+
+
+@contextmanager
+def _let_go(*meshes: trimesh.parent.Geometry) -> Iterator[None]:
+    """Free meshes after the block: their parts refer to them and they to their parts, and of millions of faces a
+    gigabyte would stay until the garbage is collected."""
+    try:
+        yield
+    finally:
+        for mesh in meshes:
+            vars(mesh).clear()
+
+
+def _checked(path: Path, loaded: trimesh.Trimesh, declared: int, mm_per_unit: float) -> MeshFile:
+    vertices, faces = np.asarray(loaded.vertices, dtype=np.float64), np.asarray(loaded.faces, dtype=np.int64)
     if len(faces) < declared:
         raise InputError(
             f"{path}: {len(faces)} of {declared} faces could be read; the file is truncated, copy it again"
         )
     if not np.isfinite(vertices).all():
         raise InputError(f"{path}: some coordinates are not finite numbers; repair the mesh and export it again")
-    if np.abs(vertices).max() * MM_PER_UNIT[unit] > LONGEST_MM:
+    if np.abs(vertices).max() * mm_per_unit > LONGEST_MM:
         raise InputError(f"{path}: coordinates beyond {LONGEST_MM / 1000:g} m; repair the mesh, or give its --unit")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"{path}: faces name vertices that do not exist; export the mesh again")
-    _require_area(path, vertices, faces)
-    colors = _vertex_colors(loaded)
     merged, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
-    mesh = Mesh(
-        merged * MM_PER_UNIT[unit],
-        inverse.reshape(-1)[faces],
-        None if colors is None else colors[first],
-    )
-    return mesh, loaded
-
-
-def _require_area(path: Path, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> None:
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    area, extent = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2, np.ptp(vertices, axis=0).max()
-    if not area > _LEAST_AREA * extent**2:
+    colors = _colors(loaded, "vertex")
+    mesh = Mesh(merged * mm_per_unit, inverse.reshape(-1)[faces], None if colors is None else colors[first])
+    if not mesh.face_areas.sum() > _LEAST_AREA * np.ptp(mesh.bounds, axis=0).max() ** 2:
         raise InputError(f"{path}: its triangles have no area; export the surface again")
+    values = _ply_values(loaded, "vertex")
+    return MeshFile(
+        mesh=mesh,
+        face_colors=_colors(loaded, "face"),
+        vertex_values={
+            name: each[first].astype(np.float64).reshape(-1)
+            for name, each in values.items()
+            if name not in _PLACE_AND_COLOR
+        },
+        face_values=_ply_values(loaded, "face"),
+    )
+
+
+def _ply_values(loaded: trimesh.Trimesh, element: str) -> dict[str, np.ndarray]:
+    raw = loaded.metadata.get("_ply_raw", {}).get(element, {}).get("data")
+    names = getattr(getattr(raw, "dtype", None), "names", None) or ()
+    return {name: raw[name].copy() for name in names if raw[name].dtype.names is None}
 
 
 def _declared_faces(path: Path) -> int:
@@ -97,10 +136,10 @@ def _declared_faces(path: Path) -> int:
     return 0
 
 
-def _vertex_colors(loaded: trimesh.Trimesh) -> UInt8[np.ndarray, "v 3"] | None:
-    if loaded.visual.kind != "vertex":
+def _colors(loaded: trimesh.Trimesh, kind: Literal["vertex", "face"]) -> UInt8[np.ndarray, "n 3"] | None:
+    if loaded.visual.kind != kind:
         return None
-    return np.asarray(loaded.visual.vertex_colors, dtype=np.uint8)[:, :3]
+    return np.array(getattr(loaded.visual, f"{kind}_colors"), dtype=np.uint8)[:, :3]
 
 
 def write_mesh(
@@ -113,18 +152,10 @@ def write_mesh(
     """Write a mesh in mm: binary PLY (with colour, labels and values of the vertices by name), binary STL or OBJ, by
     the file's suffix. CloudCompare shows such values as scalar fields."""
     exported = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
-    for name, each in values.items():
-        exported.vertex_attributes[name] = each.astype(np.float32)
-    if face_labels is not None:
-        exported.face_attributes["label"] = face_labels.astype(np.int32)
-    data = exported.export(file_type=path.suffix.lower().lstrip("."))
+    with _let_go(exported):
+        for name, each in values.items():
+            exported.vertex_attributes[name] = each.astype(np.float32)
+        if face_labels is not None:
+            exported.face_attributes["label"] = face_labels.astype(np.int32)
+        data = exported.export(file_type=path.suffix.lower().lstrip("."))
     write_bytes(path, data.encode() if isinstance(data, str) else data)
-
-
-def read_vertex_values(path: Path) -> tuple[Mesh, dict[str, Float[np.ndarray, "v"]]]:
-    """As :func:`read_mesh`, with the values of the vertices by name, which :func:`write_mesh` wrote to a PLY file."""
-    mesh, loaded = read_triangles(path, "mm")
-    raw = loaded.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
-    names = [] if raw is None else [name for name in raw.dtype.names or () if name not in _PLACE_AND_COLOR]
-    _, first = np.unique(np.asarray(loaded.vertices, dtype=np.float64), axis=0, return_index=True)
-    return mesh, {name: np.asarray(raw[name], dtype=np.float64).reshape(-1)[first] for name in names}

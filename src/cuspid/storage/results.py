@@ -27,7 +27,7 @@ from cuspid.shape_model import ShapeModel
 from cuspid.storage.captures import read_capture
 from cuspid.storage.files import hash_file, read_json, read_manifest, reading
 from cuspid.storage.jaws import is_jaw, read_jaw, read_labelled_mesh
-from cuspid.storage.meshes import Unit, read_mesh, read_vertex_values
+from cuspid.storage.meshes import Unit, read_mesh, read_mesh_file
 from cuspid.storage.panoramas import read_panorama
 from cuspid.storage.reconstructions import read_reconstruction
 from cuspid.storage.shapes import read_shape_model
@@ -194,8 +194,8 @@ def _read_scan(folder: Path, run: Mapping[str, Any], reference: Path | None, uni
 
 def _surface(folder: Path, missing: list[str]) -> tuple[Mesh | None, Float[np.ndarray, "v"] | None]:
     if (folder / "deviation.ply").exists():
-        mesh, values = read_vertex_values(folder / "deviation.ply")
-        return mesh, values.get("deviation_um")
+        file = read_mesh_file(folder / "deviation.ply")
+        return file.mesh, file.vertex_values.get("deviation_um")
     if (folder / "mesh.ply").exists():
         return read_mesh(folder / "mesh.ply"), None
     missing.append("the surface: the run is not complete; give the same command again, it goes on where it stopped")
@@ -277,9 +277,9 @@ def _repeated(folder: Path) -> tuple[Jaw | None, dict[str, Float[np.ndarray, "v"
     """The reference of repeated scans, and what is known at its vertices."""
     if not (folder / "repeat.ply").exists():
         return None, {}
-    mesh, values = read_vertex_values(folder / "repeat.ply")
+    file = read_mesh_file(folder / "repeat.ply")
     scanned = _optional_json(folder / "reference.json")
-    return Jaw(mesh=mesh, arch=None if scanned is None else scanned["arch"]), values
+    return Jaw(mesh=file.mesh, arch=None if scanned is None else scanned["arch"]), dict(file.vertex_values)
 
 
 def _rows(folder: Path) -> list[Mapping[str, str]]:

@@ -209,11 +209,11 @@ def _keep(
 
 def _kept(folder: Path, name: str) -> Mesh:
     """The part of a scan that is evaluated: where the reference could be seen."""
-    mesh, values = storage.read_vertex_values(folder / "scans" / f"{name}.ply")
-    evaluated = np.isfinite(values["deviation_um"])[mesh.faces].all(axis=1)
+    file = storage.read_mesh_file(folder / "scans" / f"{name}.ply")
+    evaluated = np.isfinite(file.vertex_values["deviation_um"])[file.mesh.faces].all(axis=1)
     if not evaluated.any():
         raise ReconstructionError(f"{name}: nothing of the scan can be evaluated; see its row in results.csv")
-    return mesh.submesh(evaluated)
+    return file.mesh.submesh(evaluated)
 
 
 def compare_scans(*, first: str, second: str, folder: Path, options: RepeatOptions) -> dict[str, Value]:
@@ -231,5 +231,5 @@ def _spread_of(folder: Path, names: Sequence[str], options: RepeatOptions) -> Sp
     for name in names:
         bits = np.frombuffer((folder / "scans" / f"{name}.scannable").read_bytes(), dtype=np.uint8)
         asked &= np.unpackbits(bits, count=len(reference.faces)).astype(bool)
-    scans = [storage.read_vertex_values(folder / "scans" / f"{name}.ply")[0] for name in names]
+    scans = [storage.read_mesh(folder / "scans" / f"{name}.ply") for name in names]
     return spread(reference, asked, scans, options.pairs, rng=np.random.default_rng(0))

@@ -136,7 +136,7 @@ def _lit(mesh: Mesh, hits: RayHits, axes: Float[np.ndarray, "3 3"]) -> Float32[n
     weights = hits.barycentric[hit]
     normals = np.einsum("nk,nkd->nd", weights, mesh.vertex_normals[corners]) @ axes.T
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    back = mesh.face_normals[hits.faces[hit]] @ axes[2] < 0
+    back = mesh.normals_of(hits.faces[hit]) @ axes[2] < 0
     normals[back] *= -1
     key = np.clip(normals @ (np.array([-0.45, 0.60, 0.66])), 0, 1)
     shade = 0.46 + 0.38 * key + 0.22 * np.clip(normals[:, 2], 0, 1)
@@ -209,7 +209,7 @@ def _draw_views(figure: Figure, mesh: Mesh, bottom: float, *, width_px: int) -> 
 
 def _outward(mesh: Mesh) -> tuple[float, tuple[str, str]]:
     """Azimuth from which to look at the outer side, and what the two sides are called."""
-    x, y, _ = np.average(mesh.face_centres, axis=0, weights=mesh.face_areas)
+    x, y, _ = np.average(mesh.vertices, axis=0, weights=mesh.vertex_areas)
     if np.hypot(x, y) > 0.35 * np.ptp(mesh.vertices[:, :2], axis=0).max():
         return float(np.rad2deg(np.arctan2(y, x))), ("from outside", "from inside")
     return 90.0, ("from the front", "from behind")
