@@ -18,7 +18,7 @@ from cuspid.body import CAMERA_MM, LED_MM, Body, module
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, axes_about, read_only, unit
-from cuspid.values import checked_name
+from cuspid.values import checked_name, one_line
 
 _NO_SIDE = 1e-3
 """Length of the mean of unit vectors that have no direction in common."""
@@ -221,7 +221,7 @@ class Handpiece:
         object.__setattr__(self, "lights", MappingProxyType(dict(self.lights)))
         unknown = {light for lighting in self.lightings for light in lighting.lights} - set(self.lights)
         if unknown:
-            raise InputError(f"handpiece: lighting patterns name unknown lights {', '.join(sorted(unknown))}")
+            raise InputError(f"handpiece: lighting patterns name unknown lights {one_line(', '.join(sorted(unknown)))}")
         near, far = self.depth_range_mm
         if not 0 < near < self.working_distance_mm < far:
             raise InputError(

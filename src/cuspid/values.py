@@ -95,9 +95,9 @@ def printable(text: str) -> str:
     return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
 
 
-def one_line(error: BaseException) -> str:
-    """What a library says, cut to one short line."""
-    return shown(" ".join(str(error).split()), longest=120)[1:-1]
+def one_line(said: object) -> str:
+    """What a library or a file says, cut to one short line."""
+    return shown(" ".join(str(said).split()), longest=120)[1:-1]
 
 
 def shown(value: object, *, longest: int = _SHOWN) -> str:

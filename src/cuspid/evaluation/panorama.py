@@ -31,6 +31,7 @@ from cuspid.geometry import Rigid3, best_similarity
 from cuspid.options import Options, Range
 from cuspid.panorama import Panorama
 from cuspid.trueness import NOTHING, GroundTruth, ReferenceRender
+from cuspid.values import shown
 
 FEWEST_TEETH_PX = 200
 """Of the sampled pixels must show teeth, for an alignment by geometry."""
@@ -238,8 +239,8 @@ def _poses_of(panorama: Panorama, truth: GroundTruth) -> list[Rigid3]:
         return list(known.values())
     unknown = next(name for name in names if name not in known)
     raise InputError(
-        f"truth: no frame {unknown!r} in it, and it has {len(known)} frames where the panorama has {len(names)}; give "
-        "the truth of the film that was stitched"
+        f"truth: no frame {shown(unknown)} in it, and it has {len(known)} frames where the panorama has {len(names)}; "
+        "give the truth of the film that was stitched"
     )
 
 

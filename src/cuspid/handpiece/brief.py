@@ -45,6 +45,7 @@ from cuspid.handpiece.holder import HolderOptions
 from cuspid.handpiece.optics import Optics
 from cuspid.handpiece.presets import PRESETS
 from cuspid.inputs import read_text
+from cuspid.values import one_line, shown
 
 _LARGEST = 1e6
 """No figure is larger; NaN is none."""
@@ -125,7 +126,7 @@ class DesignBrief:
         _check(self.thickness_mm > 0, f"thickness_mm is {self.thickness_mm:g}; it must be positive")
         _check(len(self.surfaces) > 0, "[surfaces] is empty; name at least one that must be seen")
         for surface, share in self.surfaces.items():
-            _check(0 < share <= 1, f"the share of surface {surface!r} is {share:g}; it must lie in 0-1")
+            _check(0 < share <= 1, f"the share of surface {shown(surface)} is {share:g}; it must lie in 0-1")
         _check(self.cameras.most >= 2, f"cameras.most is {self.cameras.most}; two cameras at least measure depth")
         _check(
             self.cameras.spacing_mm >= self.sensor.sensor_width_mm,
@@ -206,14 +207,14 @@ def _sensor(given: object) -> Optics:
     if "preset" not in own:
         return Optics(**{"name": "own sensor", **_figures(own, complete=True)})
     preset = own.pop("preset")
-    _check(preset in PRESETS, f"unknown sensor {preset!r}; there are {', '.join(PRESETS)}")
+    _check(preset in PRESETS, f"unknown sensor {shown(preset)}; there are {', '.join(PRESETS)}")
     return replace(PRESETS[preset], **_figures(own, complete=False))
 
 
 def _figures(own: dict[str, Any], *, complete: bool) -> dict[str, Any]:
     known = {each.name for each in fields(Optics)}
     needed = {each.name for each in fields(Optics) if each.default is MISSING} - {"name"} if complete else set()
-    _check(not set(own) - known, f"sensor: unknown {', '.join(sorted(set(own) - known))}")
+    _check(not set(own) - known, f"sensor: unknown {one_line(', '.join(sorted(set(own) - known)))}")
     _check(not needed - set(own), f"sensor: {', '.join(sorted(needed - set(own)))} missing; or name a preset")
     return _typed(own, Optics, "sensor.")
 
@@ -243,7 +244,7 @@ def _check_keys(values: Mapping[str, Any], kind: type, where: str) -> None:
     known = {each.name for each in fields(kind)}
     needed = {each.name for each in fields(kind) if each.default is MISSING and each.default_factory is MISSING}
     unknown, missing = sorted(set(values) - known), sorted(needed - set(values))
-    _check(not unknown, f"{where}: unknown {', '.join(unknown)}; there are {', '.join(sorted(known))}")
+    _check(not unknown, f"{where}: unknown {one_line(', '.join(unknown))}; there are {', '.join(sorted(known))}")
     _check(not missing, f"{where}: {', '.join(missing)} missing")
 
 

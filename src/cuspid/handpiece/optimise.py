@@ -36,6 +36,7 @@ from cuspid.pairing import PairingOptions, stereo_pairs
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, MountedCamera
 from cuspid.room import FAR_MM, Room
+from cuspid.values import shown
 from cuspid.visibility import VisibilityOptions, visible_faces
 
 _REACH_MM = 11.0
@@ -232,7 +233,7 @@ def _check_surfaces(brief: DesignBrief, sections: Sequence[Section]) -> None:
     for name in brief.surfaces:
         if name not in there:
             raise InputError(
-                f"brief: the surface {name!r} must be seen, but the teeth given have only "
+                f"brief: the surface {shown(name)} must be seen, but the teeth given have only "
                 f"{', '.join(sorted(there)) or 'none'}"
             )
 

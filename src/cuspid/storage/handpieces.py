@@ -171,7 +171,7 @@ def read_handpiece(path: Path, working_distance_mm: float | None = None) -> Hand
     with reading(path):
         strange = sorted(set(value) - _FIELDS)
         if strange:
-            raise InputError(f"{path}: the field {strange[0]!r} is not known; it has {', '.join(sorted(_FIELDS))}")
+            raise InputError(f"{path}: the field {shown(strange[0])} is not known; it has {', '.join(sorted(_FIELDS))}")
         cameras = {
             checked_name(f"{path}: cameras", key): _mounted_from_json(camera, f"{path}: camera {shown(key)}")
             for key, camera in value["cameras"].items()

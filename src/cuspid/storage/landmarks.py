@@ -175,7 +175,7 @@ def _labelled(value: Any, name: str, path: Path) -> Iterable[tuple[str, Mapping[
 
 def _one_of(value: Any, allowed: tuple[Any, ...], name: str, path: Path) -> Any:
     if not isinstance(value, str) or value not in allowed:
-        raise InputError(f"{path}: '{name}' is {value!r}; it must be {' or '.join(allowed)}")
+        raise InputError(f"{path}: '{name}' is {shown(value)}; it must be {' or '.join(allowed)}")
     return value
 
 

@@ -16,6 +16,7 @@ from typing import Any, Literal
 from cuspid.errors import InputError
 from cuspid.thesis.results import CHECKED
 from cuspid.thesis.rules import RULES, Equals, Rule
+from cuspid.values import shown
 
 Kind = Literal["figure", "table", "equation"]
 _KINDS: Mapping[str, tuple[Kind, str]] = {
@@ -192,7 +193,7 @@ def _item(entry: Any, source: str) -> Item:
 
 def _picture(pair: Any, where: str) -> tuple[str, str]:
     if not (isinstance(pair, list) and len(pair) == 2 and all(isinstance(each, str) for each in pair)):
-        raise InputError(f"{where}: a picture is a file and what is in it, not {pair!r}")
+        raise InputError(f"{where}: a picture is a file and what is in it, not {shown(pair)}")
     return pair[0], pair[1]
 
 
@@ -256,13 +257,13 @@ def _printed(entry: Any, where: str) -> TruenessRow:
 def _check(entry: object, known: Keys, required: Collection[str], where: str) -> None:
     """Raise InputError where an entry is no table, has an unknown key or a value of another kind, or lacks a key."""
     if not isinstance(entry, dict):
-        raise InputError(f"{where}: {entry!r} is not a table")
+        raise InputError(f"{where}: {shown(entry)} is not a table")
     for key, value in entry.items():
         if key not in known:
             near = get_close_matches(key, known, n=1)
-            raise InputError(f"{where}: unknown key '{key}'" + (f"; did you mean {near[0]}?" if near else ""))
+            raise InputError(f"{where}: unknown key {shown(key)}" + (f"; did you mean {near[0]}?" if near else ""))
         if not isinstance(value, known[key]):
-            raise InputError(f"{where}: {key} cannot be {value!r}")
+            raise InputError(f"{where}: {key} cannot be {shown(value)}")
     for key in required:
         if key not in entry:
             raise InputError(f"{where}: {key} is missing")

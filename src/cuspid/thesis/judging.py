@@ -19,6 +19,7 @@ from cuspid.thesis.catalogue import ITEMS, Item, Note, Row
 from cuspid.thesis.computed import FIGURES, ROWS, TABLES
 from cuspid.thesis.results import Result, Results, at, in_words
 from cuspid.thesis.rules import Comparison, Verdict, least_favourable
+from cuspid.values import shown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +87,7 @@ def _compared(row: Row, item: Item, results: Results) -> Comparison:
         found = (None if result is None else look(result)) or {}
         words = in_words(row.shown, result or {}, found) if found else ""
     except (KeyError, TypeError, IndexError, AttributeError, StopIteration) as error:
-        raise InputError(f"results {source}.json: not what is expected there ({error!r}); run it again") from error
+        raise InputError(f"results {source}.json: not what is expected there ({shown(error)}); run it again") from error
     return Comparison(
         quantity=row.quantity,
         unit=row.unit,

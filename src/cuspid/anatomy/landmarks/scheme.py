@@ -18,6 +18,7 @@ from typing import Literal
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import UNIVERSAL_FROM_FDI, Landmark
+from cuspid.values import shown
 
 ToothKind = Literal["incisor", "canine", "premolar", "molar"]
 
@@ -75,7 +76,7 @@ def validate(landmarks: Iterable[str], teeth: Collection[int] = (), *, source: s
     scheme = labels_of(UNIVERSAL_FROM_FDI)
     for label in landmarks:
         if label not in scheme:
-            raise InputError(f"{source}: unknown landmark '{label}'; {_advice(label, scheme)}")
+            raise InputError(f"{source}: unknown landmark {shown(label)}; {_advice(label, scheme)}")
         if teeth and not set(teeth_named([label])) <= set(teeth):
             has = ", ".join(map(str, sorted(teeth)))
             raise InputError(f"{source}: landmark '{label}' is of no tooth of this jaw; it has {has} (FDI)")
