@@ -1,10 +1,9 @@
 """Kill runs at random moments, let the same command go on, and compare what it leaves with an undisturbed run.
 
-    python benchmarks/kill.py [--kills 100] [--seed 0] [--only stitch] [--work build/kill]
+    python benchmarks/kill.py [--kills 100] [--seed 0] [--only stitch] [--work build/kill] [--out results/kill.json]
 
 Signals are KILL, TERM and INT in turns, sent to the program alone, once to three times before it may finish. Files must
-be equal byte for byte, but for the times that a stage took and the keys of what was kept. Writes
-benchmarks/results/kill.json.
+be equal byte for byte, but for the times that a stage took and the keys of what was kept.
 """
 
 from __future__ import annotations
@@ -35,11 +34,12 @@ KEYS = {"made.jsonl"}
 def verbs(work: Path) -> dict[str, tuple[str, ...]]:
     """What is killed, without ``--out``."""
     probe = ("--handpiece", str(work / "probe" / "handpiece.json"))
+    jaw = str(work / "jaw.ply")
     return {
-        "run": ("run", *probe, *SCAN),
+        "run": ("run", jaw, *probe, *SCAN),
         "reconstruct": ("reconstruct", str(work / "scan" / "capture")),
         "stitch": ("stitch", str(work / "film" / "capture" / "images" / "camera")),
-        "repeat": ("repeat", *probe, *SCAN, "--scans", "2", "--workers", "1"),
+        "repeat": ("repeat", jaw, *probe, *SCAN, "--scans", "2", "--workers", "1"),
     }
 
 
@@ -49,11 +49,15 @@ def cuspid(*arguments: str) -> None:
 
 
 def prepare(work: Path) -> None:
-    """What the verbs take: a handpiece with small images, a scan, a film."""
+    """What the verbs take: a handpiece with small images, a jaw, a scan, a film."""
     cuspid("handpiece", "--design", "four", "--width-px", "160", "--height-px", "160", "--out", str(work / "probe"))
-    cuspid("simulate", "--handpiece", str(work / "probe" / "handpiece.json"), *SCAN, "--out", str(work / "scan"))
+    jaw, probe = str(work / "jaw.ply"), str(work / "probe" / "handpiece.json")
+    cuspid("phantom", "--edge-mm", "0.5", "--out", jaw)
+    cuspid("simulate", jaw, "--handpiece", probe, *SCAN, "--out", str(work / "scan"))
     camera = ("--camera.width-px", "320", "--camera.height-px", "240")
-    cuspid("film", *camera, "--frames", "40", "--shake", "0.3", "--texture", "artificial", "--out", str(work / "film"))
+    cuspid(
+        "film", jaw, *camera, "--frames", "40", "--shake", "0.3", "--texture", "artificial", "--out", str(work / "film")
+    )
 
 
 def killed(arguments: tuple[str, ...], how: signal.Signals, after_s: float) -> bool:
@@ -100,6 +104,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="")
     parser.add_argument("--work", type=Path, default=Path("build/kill"))
+    parser.add_argument("--out", type=Path, default=HERE / "results" / "kill.json")
     arguments = parser.parse_args()
     work, rng = arguments.work.resolve(), np.random.default_rng(arguments.seed)
     shutil.rmtree(work, ignore_errors=True)
@@ -131,7 +136,7 @@ def main() -> None:
         runs += 1
     print(f"{sum(kills.values())} kills in {runs} runs, {len(wrong)} wrong")
     found = {"kills": kills, "runs": runs, "undisturbed_s": whole, "wrong": wrong}
-    write_json(HERE / "results" / "kill.json", {**found, **conditions()})
+    write_json(arguments.out, {**found, **conditions()})
 
 
 if __name__ == "__main__":

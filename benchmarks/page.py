@@ -15,6 +15,7 @@ from typing import Any
 import anatomy_sections
 import handpiece_sections
 import panorama_sections
+import trust_sections
 
 HERE = Path(__file__).parent
 
@@ -161,6 +162,9 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
     "jaws_full": ("Real jaws at full size", anatomy_sections.jaws),
     "jaws_full_auto": ("Real jaws at full size, with further passes", anatomy_sections.jaws),
     "grid": ("Running many", handpiece_sections.grid),
+    "fuzz": ("Damaged input", trust_sections.fuzz),
+    "kill": ("Killed runs", trust_sections.kill),
+    "large": ("A mesh of 5 million faces", trust_sections.large),
 }
 """Title and text for each file of results that is not of scans, by its stem."""
 

@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 import trimesh
 
-from builders import write_frames
+from builders import image_path, write_frames
 from cuspid import cli, pipeline, storage
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
@@ -33,12 +33,16 @@ from cuspid.errors import CuspidError
 from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.handpiece.brief import read_brief
 from cuspid.handpiece.designs import DESIGNS
+from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
 from cuspid.jaw import Jaw, Landmark
 from cuspid.motion.colmap import read_model
+from cuspid.pipeline import RenderOptions, take_images
+from cuspid.simulation.path.arch import arch_curve
 from report_folders import TOOTH, write_comparison, write_evaluation, write_scan, write_score, write_shape
 from test_cli_stitch import picture, write_calibration
 from test_colmap import make_capture, make_found, without_rig, write
 from test_panorama import small_panorama
+from test_panorama_evaluation import known_film, write_truth
 
 LONGEST_S = 10.0
 """Of work; waiting may take more on a busy machine."""
@@ -174,7 +178,12 @@ def _panorama(folder: Path) -> None:
 
 def _colmap(folder: Path) -> None:
     found = make_found()
-    make_capture(folder / "capture", found)
+    capture = make_capture(folder / "capture", found)
+    for name, mounted in found.rig.cameras.items():
+        black = np.zeros((mounted.camera.height, mounted.camera.width, 3), dtype=np.uint8)
+        for frame in capture.frames:
+            storage.write_image(image_path(capture, frame.name, name), black)
+    storage.write_capture(folder / "capture", capture)
     write(without_rig(found), folder / "model")
 
 
@@ -183,8 +192,11 @@ def _shape(folder: Path) -> None:
 
 
 def _evaluation(folder: Path) -> None:
+    reference = folder / "reference.ply"
+    storage.write_mesh(reference, small_jaw().mesh)
     write_evaluation(folder / "evaluation", small_jaw())
-    storage.write_mesh(folder / "reference.ply", small_jaw().mesh)
+    hashes = {"reference": storage.hash_file(reference)}
+    storage.claim_folder(folder / "evaluation", "evaluate", {"evaluation": {"samples": 100}}, hashes, replace=True)
 
 
 def _studies(folder: Path) -> None:
@@ -194,6 +206,39 @@ def _studies(folder: Path) -> None:
 
 def _arrays(folder: Path) -> None:
     storage.files.write_arrays(folder / "a.npz", {"one": np.arange(300), "other": np.eye(9)}, compressed=True)
+
+
+def _probe(folder: Path) -> None:
+    """A labelled jaw, and a handpiece with small images to scan it with."""
+    storage.write_jaw(folder / "jaw.ply", small_jaw())
+    verb("handpiece", "--design", "four", "--width-px", "96", "--height-px", "96", "--out", "@.")(folder)
+
+
+PROBE = ("--handpiece", "@handpiece.json", "--tooth", str(TOOTH))
+SCAN = ("--frames", "3", "--length-mm", "1.5", "--supersampling", "1")
+
+
+def _textured_scan(folder: Path) -> None:
+    _probe(folder)
+    verb("simulate", "@jaw.ply", *PROBE, *SCAN, "--out", "@scan")(folder)
+
+
+def _arch(folder: Path) -> None:
+    storage.write_jaw(folder / "jaw.ply", build_phantom(PhantomOptions(edge_mm=1.2)))
+
+
+def _film(folder: Path) -> None:
+    """Some small frames along the teeth."""
+    jaw = build_phantom(PhantomOptions(edge_mm=0.8))
+    camera, curve = intra_oral_camera(IntraOralOptions(width_px=160, height_px=120)), arch_curve(jaw)
+    poses = {f"{k:03d}": curve.rig_from_world(16.0 + 0.8 * k) for k in range(5)}
+    take_images(jaw, camera, poses, folder / "film", RenderOptions(texture="artificial", supersampling=1))
+
+
+def _score(folder: Path) -> None:
+    known = known_film(small_jaw())
+    write_truth(known, folder)
+    storage.write_panorama(folder / "panorama", known.panorama)
 
 
 SCENARIOS: Mapping[str, Scenario] = {
@@ -216,10 +261,13 @@ SCENARIOS: Mapping[str, Scenario] = {
     "report of a score": Scenario(_studies, verb("report", "@score")),
     "report of a shape": Scenario(_shape, verb("report", "@shape")),
     "evaluate": Scenario(_meshes, _evaluate),
-    "measure": Scenario(_meshes, verb("measure", "@jaw.ply", "--out", f"@{_OUT}")),
-    "reconstruct": Scenario(_scan, verb("reconstruct", "@scan/capture", "--out", f"@{_OUT}")),
-    "stitch": Scenario(_images, verb("stitch", "@frames", "--out", f"@{_OUT}")),
-    "stitch-eval": Scenario(_panorama, verb("stitch-eval", "@panorama", "@panorama", "--out", f"@{_OUT}")),
+    "measure": Scenario(_arch, verb("measure", "@jaw.ply", "--out", f"@{_OUT}")),
+    "simulate": Scenario(_probe, verb("simulate", "@jaw.ply", *PROBE, *SCAN, "--out", f"@{_OUT}")),
+    "precision": Scenario(_probe, verb("precision", "@jaw.ply", *PROBE, "--out", f"@{_OUT}")),
+    "mouth": Scenario(_probe, verb("mouth", "--handpiece", "@handpiece.json", "--out", f"@{_OUT}")),
+    "reconstruct": Scenario(_textured_scan, verb("reconstruct", "@scan/capture", "--out", f"@{_OUT}")),
+    "stitch": Scenario(_film, verb("stitch", "@film/capture/images/camera", "--out", f"@{_OUT}")),
+    "stitch-eval": Scenario(_score, verb("stitch-eval", "@panorama", "@truth", "--out", f"@{_OUT}")),
 }
 
 
@@ -419,12 +467,14 @@ class Fuzzer:
         there = self.folder / "good" / name
         if not there.exists():
             there.mkdir(parents=True)
-            SCENARIOS[name].make(there)
-            with tempfile.TemporaryDirectory(dir=self.folder, prefix="first-") as made:
+            with (
+                tempfile.TemporaryDirectory(dir=self.folder, prefix="first-") as made,
+                captured(Path(made) / "said.txt"),
+            ):
+                SCENARIOS[name].make(there)
                 first = Path(made) / name
                 shutil.copytree(there, first)
-                with captured(Path(made) / "said.txt"):
-                    SCENARIOS[name].use(first)
+                SCENARIOS[name].use(first)
         return there
 
     def case(self, name: str, seed: int) -> tuple[str, str | None]:

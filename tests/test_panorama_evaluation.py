@@ -50,12 +50,16 @@ class Known:
 
 @pytest.fixture(scope="module")
 def known(coarse_phantom: Jaw) -> Known:
+    return known_film(coarse_phantom)
+
+
+def known_film(jaw: Jaw) -> Known:
     handpiece = intra_oral_camera(IntraOralOptions(working_distance_mm=1000.0, field_of_view_deg=5.4))
     poses = {
         f"{k:05d}": Rigid3.from_rotation_vector(np.array([0, 0, 0.1 * k]), np.array([k, 0, 0.0])) for k in range(2)
     }
-    truth = GroundTruth(jaw=coarse_phantom, handpiece=handpiece, rig_from_world=poses)
-    scene = Scene(jaw=coarse_phantom, handpiece=handpiece, appearance=APPEARANCES["enamel"], supersampling=1)
+    truth = GroundTruth(jaw=jaw, handpiece=handpiece, rig_from_world=poses)
+    scene = Scene(jaw=jaw, handpiece=handpiece, appearance=APPEARANCES["enamel"], supersampling=1)
     view = render_reference(scene, ReferenceRenderOptions(mm_per_px=STEP_MM))
     shot = render_reference(scene, ReferenceRenderOptions(mm_per_px=STEP_MM, camera_height_mm=300.0))
     return Known(truth=truth, view=view, shot=shot, panorama=perfect(truth, view))
