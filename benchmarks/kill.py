@@ -106,6 +106,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=Path("build/kill"))
     parser.add_argument("--out", type=Path, default=HERE / "results" / "kill.json")
     arguments = parser.parse_args()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have it passed over in the background
     work, rng = arguments.work.resolve(), np.random.default_rng(arguments.seed)
     shutil.rmtree(work, ignore_errors=True)
     prepare(work)

@@ -24,6 +24,7 @@ import numpy as np
 import trimesh
 from run import conditions
 from websockets.sync.client import connect
+from websockets.typing import Origin
 
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
@@ -80,7 +81,7 @@ def take_all(said: str) -> None:
     address = re.search(r"http://(\S+)", said)
     assert address is not None, said
     taken = 0
-    with connect(f"ws://{address[1]}", origin=f"http://{address[1]}", max_size=None) as client:
+    with connect(f"ws://{address[1]}", origin=Origin(f"http://{address[1]}"), max_size=None) as client:
         try:
             while True:
                 taken += len(client.recv(timeout=QUIET_S))
@@ -95,6 +96,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, default=Path("build/large"))
     work = parser.parse_args().work.resolve()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have it passed over in the background
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     faces, scan, scored = make(work), str(work / "scan.ply"), str(work / "scored")

@@ -25,7 +25,7 @@ def fuzz(result: Result) -> str:
         [
             "Small inputs, damaged by a seed: bytes, lines, numbers and names changed, files cut, emptied, left out or "
             "swapped, and nonsense of formats' own (`tests/fuzzing.py`). Right is success, or one short line and "
-            "status 1 or 2. Wrong are tracebacks, more than 10 CPU seconds or 2 GiB, noise of libraries, and whatever is "
+            "status 1 or 2. Wrong are tracebacks, more than 10 CPU seconds or 2 GiB, noise of libraries, whatever is "
             "left half-written or outside of `--out`. Bar: 0 of 10,000.",
             "",
             markdown_table(("what reads them", "cases", "wrong", "slowest, s"), rows),

@@ -20,7 +20,10 @@ CUSPID = (sys.executable, "-m", "cuspid")
 def test_it_ends_at_once_and_without_a_trace_of_where_it_was(tmp_path: Path, how: signal.Signals, after_s: float):
     """While it loads, and while libraries work that have handlers of their own."""
     begun = subprocess.Popen(
-        [*CUSPID, "simulate", "--out", str(tmp_path / "scan")], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        [*CUSPID, "simulate", "--out", str(tmp_path / "scan")],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # also where the tests run in the background
     )
     time.sleep(after_s)
     begun.send_signal(how)
