@@ -25,9 +25,12 @@ def test_it_ends_at_once_and_without_a_trace_of_where_it_was(tmp_path: Path, how
         stderr=subprocess.STDOUT,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # also where the tests run in the background
     )
-    time.sleep(after_s)
-    begun.send_signal(how)
-    said = begun.communicate(timeout=60)[0].decode()
+    try:
+        time.sleep(after_s)
+        begun.send_signal(how)
+        said = begun.communicate(timeout=60)[0].decode()
+    finally:
+        begun.kill()
     assert begun.returncode in (-how, 130)
     assert not any(word in said for word in ("Traceback", "***", "@     0x", 'File "'))
 
