@@ -9,6 +9,7 @@ be equal byte for byte, but for the times that a stage took and the keys of what
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import shutil
 import signal
@@ -86,9 +87,16 @@ def _same(one: Path, other: Path) -> bool:
         return False
     if one.suffix == ".json":
         return bool(_without_times(json.loads(one.read_text())) == _without_times(json.loads(other.read_text())))
+    if one.suffix == ".csv":
+        return _rows(one) == _rows(other)
     if one.suffix == ".html":
         return True  # a page of what is compared itself, with the times
     return one.read_bytes() == other.read_bytes()
+
+
+def _rows(path: Path) -> list[Any]:
+    with path.open(newline="") as stream:
+        return [_without_times(row) for row in csv.DictReader(stream)]
 
 
 def _without_times(value: Any) -> Any:

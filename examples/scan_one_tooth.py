@@ -16,8 +16,8 @@ from cuspid.visibility import VisibilityOptions
 
 folder = Path(sys.argv[1])
 
-jaw = build_phantom(PhantomOptions(arch="lower"))
-handpiece = DESIGNS["four"](DesignOptions(width_px=320, height_px=320))  # the default, 500 px, takes twice the time
+jaw = build_phantom(PhantomOptions(arch="lower", edge_mm=0.4))  # the default, 0.2 mm, takes longer to make
+handpiece = DESIGNS["four"](DesignOptions(width_px=240, height_px=240))  # the default, 500 px, takes thrice the time
 path = ScanPathOptions(tooth=46)
 capture, truth = pipeline.simulate(jaw, handpiece, folder, pipeline.SimulationOptions(path=path))
 

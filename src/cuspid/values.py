@@ -15,6 +15,8 @@ from cuspid.errors import InputError
 
 LONGEST_MM = 1e5
 """No place, distance or size of a handpiece or of a jaw is farther than this."""
+MOST_PX = 65_535
+"""Sides of an image; what PNG and JPEG files of cameras stay below."""
 _LONGEST_NAME = 100
 _NOT_IN_FILES = '/\\:*?"<>|'
 _SHOWN = 40

@@ -13,16 +13,19 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 from zipfile import ZipFile
 
 import numpy as np
+from jaxtyping import jaxtyped
 
 import cuspid
 from cuspid.errors import CuspidError, InputError, OutputError
 from cuspid.inputs import LARGEST_MIB, read_text, require_file
-from cuspid.values import one_line
+from cuspid.values import one_line, shown
 
+_Made = TypeVar("_Made")
 _UNUSABLE = (ValueError, TypeError, AttributeError, IndexError, OverflowError, csv.Error, np.linalg.LinAlgError)
 """What is raised where a parsed value is of another kind than it should be."""
 PART = ".part-"
@@ -245,3 +248,28 @@ def _first_difference(old: Any, new: Any, name: str = "") -> str:
             if old.get(key) != new.get(key):
                 return _first_difference(old.get(key), new.get(key), f"{name}.{key}" if name else key)
     return name or "it"
+
+
+@jaxtyped(typechecker=None)
+def as_declared(kind: Callable[..., _Made], /, **values: Any) -> _Made:
+    """A value of a class of ours from what a file holds. Raises InputError where a field is not of the type that the
+    class declares for it, or an array not of the shape: axes of one name are alike."""
+    hints = get_type_hints(kind)
+    for name, value in values.items():
+        if not _fits(value, hints[name]):
+            found = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else shown(value)
+            raise InputError(f"the field '{name}' cannot be {found}; see docs/formats.md")
+    return kind(**values)
+
+
+def _fits(value: object, hint: Any) -> bool:
+    """Whether a value is of an annotated type; numbers must be finite, and whole ones may stand for others."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        return any(_fits(value, each) for each in arguments)
+    if origin is tuple:
+        return isinstance(value, tuple) and all(_fits(each, arguments[0]) for each in value)
+    if hint in (int, float):
+        whole = isinstance(value, int) and not isinstance(value, bool)
+        return whole or (hint is float and isinstance(value, float) and math.isfinite(value))
+    return isinstance(value, origin or hint)

@@ -17,10 +17,8 @@ from cuspid.geometry import Rigid3
 from cuspid.pairing import guess_working_distance_mm
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor, depth_of_field_mm
 from cuspid.storage.files import digest_of, read_json, reading, write_json
-from cuspid.values import LONGEST_MM, checked_name, covariance, number, numbers, shown, whole
+from cuspid.values import LONGEST_MM, MOST_PX, checked_name, covariance, number, numbers, shown, whole
 
-MOST_PX = 65_535
-"""Sides of an image; what PNG and JPEG files of cameras stay below."""
 _MOST_DISTORTION = 1e3
 _BRIGHTEST, _NARROWEST_LOBE = 1e6, 1e4
 _SHORTEST_QUATERNION = 1e-6

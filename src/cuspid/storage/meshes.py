@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -60,7 +61,7 @@ def read_mesh_file(path: Path, unit: Unit = "mm") -> MeshFile:
         raise InputError(f"{path}: not a mesh file that cuspid reads; give an STL, PLY or OBJ file")
     declared = _declared_faces(path)
     try:
-        with np.errstate(all="ignore"):  # what is not finite is told below
+        with np.errstate(all="ignore"), _in_silence():  # what cannot be used is told below
             scene = trimesh.load_scene(path, process=False, skip_materials=True)
             parts = list(scene.geometry.values())
             loaded = parts[0] if len(parts) == 1 else scene.to_mesh()
@@ -70,6 +71,17 @@ def read_mesh_file(path: Path, unit: Unit = "mm") -> MeshFile:
         if not isinstance(loaded, trimesh.Trimesh) or len(loaded.vertices) == 0 or len(loaded.faces) == 0:
             raise InputError(f"{path}: the mesh is empty (no triangles); export the surface, not a point cloud")
         return _checked(path, loaded, declared, MM_PER_UNIT[unit])
+
+
+@contextmanager
+def _in_silence() -> Iterator[None]:
+    """trimesh logs what it could not read of a file, with where it was, and goes on."""
+    log = logging.getLogger("trimesh")
+    before, log.disabled = log.disabled, True
+    try:
+        yield
+    finally:
+        log.disabled = before
 
 
 @contextmanager

@@ -19,8 +19,9 @@ from cuspid.capture import read_rgba
 from cuspid.errors import InputError, OutputError
 from cuspid.inputs import read_text
 from cuspid.panorama import ZONES, FrameUse, Panorama, Strip
-from cuspid.storage.files import read_arrays, read_json, reading, write_arrays, write_bytes, write_json
+from cuspid.storage.files import as_declared, read_arrays, read_json, reading, write_arrays, write_bytes, write_json
 from cuspid.storage.tables import write_table
+from cuspid.values import LONGEST_MM, MOST_PX, number, numbers
 
 _HEADER = ("method", "mm_per_px", "origin_px", "part", "parts", "notes")
 _SOURCE = ("frame_index", "frame_pixel", "height_mm")
@@ -73,10 +74,13 @@ def read_panorama(folder: Path) -> Panorama:
         if len(frames) != value["frames"]:
             raise InputError(f"{folder / 'frames.csv'}: truncated; run cuspid stitch again")
         header: dict[str, Any] = {name: value[name] for name in _HEADER}
-        header |= {"origin_px": np.array(value["origin_px"], dtype=np.float64), "notes": tuple(value["notes"])}
+        header["origin_px"] = numbers("origin_px", value["origin_px"], (2,), -MOST_PX, MOST_PX)
+        header["notes"] = tuple(value["notes"])
+        if header["mm_per_px"] is not None:
+            number("mm_per_px", header["mm_per_px"], 1e-6, LONGEST_MM)
         source: dict[str, Any] = {name: arrays[name] for name in _SOURCE if name in arrays}
         image = np.ascontiguousarray(rgba[..., :3])
-        return Panorama(image=image, covered=rgba[..., 3] > 0, frames=frames, **header, **source)
+        return as_declared(Panorama, image=image, covered=rgba[..., 3] > 0, frames=frames, **header, **source)
 
 
 def _read_frames(path: Path) -> tuple[FrameUse, ...]:

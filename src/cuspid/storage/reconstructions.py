@@ -13,7 +13,7 @@ from cuspid.capture import Dropped
 from cuspid.geometry import Rigid3
 from cuspid.reconstruction import DepthMap, Reconstruction, Tracks
 from cuspid.rig import Handpiece
-from cuspid.storage.files import read_arrays, read_json, reading, to_plain, write_arrays, write_json
+from cuspid.storage.files import as_declared, read_arrays, read_json, reading, to_plain, write_arrays, write_json
 from cuspid.storage.handpieces import (
     camera_from_json,
     camera_to_json,
@@ -70,11 +70,12 @@ def read_reconstruction(folder: Path) -> Reconstruction:
     value = read_json(path)
     with reading(path):
         covariance = value["pose_covariance_rotation_rad_translation_mm"]
-        return Reconstruction(
+        return as_declared(
+            Reconstruction,
             rig=read_handpiece(folder / "handpiece.json").rig,
             rig_from_world=read_poses(folder / "poses.json"),
             tracks=_read_tracks(tracks) if value["points"] else None,
-            dropped=tuple(Dropped(**entry) for entry in value["frames_dropped"]),
+            dropped=tuple(as_declared(Dropped, **entry) for entry in value["frames_dropped"]),
             pose_covariance=None if covariance is None else np.array(covariance, dtype=np.float64),
             reprojection_rms_px=value["reprojection_rms_px"],
             log=value["log"],
@@ -88,7 +89,7 @@ _TRACKS = [field.name for field in dataclasses.fields(Tracks)]
 def _read_tracks(path: Path) -> Tracks:
     arrays = read_arrays(path, remedy="delete the folder and locate the frames again")
     with reading(path):
-        return Tracks(**{name: arrays[name] for name in _TRACKS})
+        return as_declared(Tracks, **{name: arrays[name] for name in _TRACKS})
 
 
 def write_depth_maps(path: Path, depth_maps: Sequence[DepthMap]) -> None:
@@ -118,7 +119,8 @@ def read_depth_maps(path: Path) -> tuple[DepthMap, ...]:
     with reading(path):
         header = json.loads(arrays["header"].tobytes())
         return tuple(
-            DepthMap(
+            as_declared(
+                DepthMap,
                 frame=entry["frame"],
                 camera_name=entry["camera_name"],
                 camera=camera_from_json(entry["camera"]),

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from cuspid.capture import read_image
 from cuspid.errors import InputError
 from cuspid.storage.captures import write_image
-from cuspid.storage.files import read_arrays, read_json, reading, write_arrays, write_json
+from cuspid.storage.files import as_declared, read_arrays, read_json, reading, write_arrays, write_json
 from cuspid.trueness import ReferenceRender
+from cuspid.values import LONGEST_MM, MOST_PX, number, numbers
 
 REFERENCE_RENDER_FILES = ("picture.png", "surface.npz", "view.json")
 """What :func:`write_reference_render` writes."""
@@ -20,8 +19,9 @@ def write_reference_render(folder: Path, view: ReferenceRender) -> None:
     """Write a reference render; ``view.json`` comes last, so that what has one is whole."""
     write_image(folder / "picture.png", view.image)
     write_arrays(folder / "surface.npz", {"labels": view.labels, "height_mm": view.height_mm}, compressed=True)
-    numbers = {name: getattr(view, name) for name in ("mm_per_px", "origin_px", "camera_height_mm")}
-    write_json(folder / "view.json", numbers)
+    write_json(
+        folder / "view.json", {name: getattr(view, name) for name in ("mm_per_px", "origin_px", "camera_height_mm")}
+    )
 
 
 def read_reference_render(folder: Path) -> ReferenceRender:
@@ -32,11 +32,13 @@ def read_reference_render(folder: Path) -> ReferenceRender:
     value = read_json(path)
     surface = read_arrays(folder / "surface.npz", remedy="run cuspid film again")
     with reading(path):
-        return ReferenceRender(
+        height_mm = value["camera_height_mm"]
+        return as_declared(
+            ReferenceRender,
             image=read_image(folder / "picture.png"),
-            mm_per_px=value["mm_per_px"],
-            origin_px=np.array(value["origin_px"], dtype=np.float64),
-            camera_height_mm=value["camera_height_mm"],
+            mm_per_px=number("mm_per_px", value["mm_per_px"], 1e-6, LONGEST_MM),
+            origin_px=numbers("origin_px", value["origin_px"], (2,), -MOST_PX, MOST_PX),
+            camera_height_mm=None if height_mm is None else number("camera_height_mm", height_mm, 1e-3, LONGEST_MM),
             labels=surface["labels"],
             height_mm=surface["height_mm"],
         )

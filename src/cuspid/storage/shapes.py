@@ -11,7 +11,7 @@ from jaxtyping import Float
 from cuspid.errors import InputError
 from cuspid.mesh import Mesh
 from cuspid.shape_model import MeanStep, ShapeModel
-from cuspid.storage.files import read_arrays, read_json, reading, write_arrays, write_json
+from cuspid.storage.files import as_declared, read_arrays, read_json, reading, write_arrays, write_json
 from cuspid.storage.jaws import read_jaw, write_jaw
 
 
@@ -53,7 +53,8 @@ def read_shape_model(folder: Path) -> ShapeModel:
     if len(mesh.faces) != len(mean.mesh.faces) or landmark_modes.shape[1] != len(mean.landmarks):
         raise InputError(f"{folder / 'modes.npz'}: not the modes of mean.ply beside it; make the shape model again")
     with reading(summary_path):
-        return ShapeModel(
+        return as_declared(
+            ShapeModel,
             mean=replace(mean, mesh=mesh),
             modes=modes,
             landmark_modes=landmark_modes,
@@ -66,7 +67,7 @@ def read_shape_model(folder: Path) -> ShapeModel:
             first=summary["first"],
             correspondence=summary["correspondence"],
             converged=summary["converged"],
-            log=tuple(MeanStep(**step) for step in summary["log"]),
+            log=tuple(as_declared(MeanStep, **step) for step in summary["log"]),
             notes=tuple(summary["notes"]),
         )
 
