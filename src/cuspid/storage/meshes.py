@@ -77,11 +77,12 @@ def read_mesh_file(path: Path, unit: Unit = "mm") -> MeshFile:
 def _in_silence() -> Iterator[None]:
     """trimesh logs what it could not read of a file, with where it was, and goes on."""
     log = logging.getLogger("trimesh")
-    before, log.disabled = log.disabled, True
+    before = log.level
+    log.setLevel(logging.CRITICAL + 1)
     try:
         yield
     finally:
-        log.disabled = before
+        log.setLevel(before)
 
 
 @contextmanager

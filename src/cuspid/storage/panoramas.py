@@ -74,7 +74,7 @@ def read_panorama(folder: Path) -> Panorama:
         if len(frames) != value["frames"]:
             raise InputError(f"{folder / 'frames.csv'}: truncated; run cuspid stitch again")
         header: dict[str, Any] = {name: value[name] for name in _HEADER}
-        header["origin_px"] = numbers("origin_px", value["origin_px"], (2,), -MOST_PX, MOST_PX)
+        header["origin_px"] = numbers("origin_px", value["origin_px"], (2,), -float(MOST_PX), float(MOST_PX))
         header["notes"] = tuple(value["notes"])
         if header["mm_per_px"] is not None:
             number("mm_per_px", header["mm_per_px"], 1e-6, LONGEST_MM)

@@ -37,7 +37,7 @@ def read_reference_render(folder: Path) -> ReferenceRender:
             ReferenceRender,
             image=read_image(folder / "picture.png"),
             mm_per_px=number("mm_per_px", value["mm_per_px"], 1e-6, LONGEST_MM),
-            origin_px=numbers("origin_px", value["origin_px"], (2,), -MOST_PX, MOST_PX),
+            origin_px=numbers("origin_px", value["origin_px"], (2,), -float(MOST_PX), float(MOST_PX)),
             camera_height_mm=None if height_mm is None else number("camera_height_mm", height_mm, 1e-3, LONGEST_MM),
             labels=surface["labels"],
             height_mm=surface["height_mm"],
