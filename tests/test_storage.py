@@ -18,8 +18,10 @@ from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw, Landmark, Sphere
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import MountedCamera, Rig
-from cuspid.storage.files import read_arrays, whole_files, write_arrays
+from cuspid.shape_model import MeanStep
+from cuspid.storage.files import as_declared, read_arrays, whole_files, write_arrays
 from cuspid.storage.handpieces import hash_handpiece
+from cuspid.trueness import ReferenceRender
 from strategies import cameras, rigid3s
 
 
@@ -432,3 +434,50 @@ def test_a_film_that_the_disk_cannot_hold_is_no_film(tmp_path, monkeypatch):
     with pytest.raises(OutputError, match="0 of 2 frames were written"):
         storage.write_video(tmp_path / "broken.mp4", capture)
     assert not (tmp_path / "broken.mp4").exists()
+
+
+# What files say is of the type that its class declares
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("mm_per_px", "0.1"),
+        ("mm_per_px", True),
+        ("mm_per_px", float("nan")),
+        ("camera_height_mm", [1.0]),
+        ("labels", np.zeros((2, 3), dtype=np.float64)),
+        ("labels", np.zeros((3, 2), dtype=np.int16)),
+        ("origin_px", np.zeros(3)),
+        ("image", None),
+    ],
+)
+def test_a_value_of_another_kind_than_declared_is_refused_by_its_name(name, value):
+    fitting = {
+        "image": np.zeros((2, 3, 3), dtype=np.uint8),
+        "labels": np.zeros((2, 3), dtype=np.int16),
+        "height_mm": np.zeros((2, 3), dtype=np.float32),
+        "mm_per_px": 1,
+        "origin_px": np.zeros(2),
+        "camera_height_mm": None,
+    }
+    assert as_declared(ReferenceRender, **fitting).mm_per_px == 1
+    with pytest.raises(InputError, match=f"'{name}' cannot be"):
+        as_declared(ReferenceRender, **fitting | {name: value})
+
+
+def test_a_list_of_values_is_looked_through():
+    round_of = {"change_um": 1.0, "surface_change_um": 1, "largest_change_um": 0.0, "covered_pct": 99.0}
+    assert as_declared(MeanStep, **round_of).surface_change_um == 1
+    with pytest.raises(InputError, match="'covered_pct' cannot be 'all'"):
+        as_declared(MeanStep, **round_of | {"covered_pct": "all"})
+    with pytest.raises(InputError, match="'notes' cannot be"):
+        as_declared(Reconstruction, rig=handpiece("a", "b").rig, rig_from_world={}, notes=("one", 2))
+
+
+def test_libraries_log_nothing_of_a_damaged_mesh(tmp_path, caplog):
+    """Normals that cannot be read are not needed."""
+    normal, corners = "facet normal 0 x1 1\nouter loop\n", "vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
+    (tmp_path / "jaw.stl").write_text(f"solid jaw\n{normal}{corners}endloop\nendfacet\nendsolid jaw\n")
+    assert len(storage.read_mesh(tmp_path / "jaw.stl").faces) == 1
+    assert not caplog.records

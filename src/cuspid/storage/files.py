@@ -259,6 +259,8 @@ def as_declared(kind: Callable[..., _Made], /, **values: Any) -> _Made:
         if not _fits(value, hints[name]):
             found = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else shown(value)
             raise InputError(f"the field '{name}' cannot be {found}; see docs/formats.md")
+        if isinstance(value, int) and float in (hints[name], *get_args(hints[name])):
+            values[name] = float(value)
     return kind(**values)
 
 
