@@ -198,3 +198,10 @@ def test_a_camera_of_a_rig_has_a_whole_place(tmp_path, missing):
 def test_the_reference_sensor_is_the_rig(tmp_path):
     place = {"ref_sensor": True, "cam_from_rig_rotation": [1, 0, 0, 0], "cam_from_rig_translation": [-2, 0, 0]}
     assert rig_config(tmp_path, **place)["b"].centre_in_rig.tolist() == [0, 0, 0]
+
+
+def test_a_word_longer_than_any_name_is_cut_in_a_message():
+    path = "/".join(["a" * 255] * 4)
+    assert str(InputError(f"{path}: no camera '{'x' * 400}'; give another")) == (
+        f"{path}: no camera '{'x' * 40}...'; give another"
+    )

@@ -11,9 +11,17 @@ The command line prints the message of a ``CuspidError`` on one line and exits w
 
 from __future__ import annotations
 
+import re
+
+_OVERLONG = re.compile(r"[^\s/\\'\"]{260,}")
+"""No name of a file or folder is as long: what a damaged file says."""
+
 
 class CuspidError(Exception):
-    """Root of the family. ``str(error)`` is the one line shown to the user."""
+    """Root of the family. ``str(error)`` is the one line shown to the user, with words longer than any name cut."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(_OVERLONG.sub(lambda word: f"{word[0][:40]}...", message))
 
 
 class InputError(CuspidError):

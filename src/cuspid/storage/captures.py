@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from cuspid.capture import Capture, Dropped, Frame, ImageFolder
 from cuspid.errors import InputError, OutputError
 from cuspid.rig import Handpiece, Rig
-from cuspid.storage.files import digest_of, finished, read_json, reading, write_bytes, write_json
+from cuspid.storage.files import as_declared, digest_of, finished, read_json, reading, write_bytes, write_json
 from cuspid.storage.handpieces import hash_handpiece, read_handpiece, write_handpiece, write_rig_config
 from cuspid.workers import map_in_threads
 
@@ -75,7 +75,7 @@ def _listed(folder: Path, handpiece: Handpiece, stems: Mapping[str, set[str]]) -
         return [Frame(name=stem, cameras=handpiece.rig.names, lighting=lighting) for stem in every]
     value = read_json(manifest)
     with reading(manifest):
-        listed = [Frame(**{**frame, "cameras": tuple(frame["cameras"])}) for frame in value["frames"]]
+        listed = [as_declared(Frame, **{**frame, "cameras": tuple(frame["cameras"])}) for frame in value["frames"]]
         for frame in listed:
             for name in frame.cameras:
                 handpiece.rig[name]

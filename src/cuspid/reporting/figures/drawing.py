@@ -11,13 +11,14 @@ from typing import Annotated, Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 
 from cuspid.errors import InputError
+from cuspid.geometry import unit
 from cuspid.mesh import Mesh, RayHits
 from cuspid.options import Options, Range
 from cuspid.storage import whole_file
@@ -131,19 +132,25 @@ def render(
 
 def _lit(mesh: Mesh, hits: RayHits, axes: Float[np.ndarray, "3 3"]) -> Float32[np.ndarray, "n 3"]:
     """Colour of each hit under a soft light from the upper left, mild enough to be read off a colour bar."""
-    hit = hits.faces >= 0
-    corners = mesh.faces[hits.faces[hit]]
-    weights = hits.barycentric[hit]
-    normals = np.einsum("nk,nkd->nd", weights, mesh.vertex_normals[corners]) @ axes.T
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    back = mesh.normals_of(hits.faces[hit]) @ axes[2] < 0
+    faces, weights = hits.faces[hits.faces >= 0], hits.barycentric[hits.faces >= 0].astype(np.float32)
+    corners = mesh.faces[faces]
+    normals = unit(_interpolated(mesh.vertex_normals @ axes.T, corners, weights))
+    back = (mesh.face_cross @ axes[2] < 0)[faces]
     normals[back] *= -1
-    key = np.clip(normals @ (np.array([-0.45, 0.60, 0.66])), 0, 1)
+    key = np.clip(normals @ np.array([-0.45, 0.60, 0.66], dtype=np.float32), 0, 1)
     shade = 0.46 + 0.38 * key + 0.22 * np.clip(normals[:, 2], 0, 1)
     colors = np.broadcast_to(PLASTER, mesh.vertices.shape) if mesh.colors is None else mesh.colors
-    albedo = np.einsum("nk,nkd->nd", weights, colors[corners] / 255)
+    albedo = _interpolated(colors / 255, corners, weights)
     albedo[back] = _BACK
-    return (albedo * shade[:, None]).astype(np.float32)
+    return albedo * shade[:, None]
+
+
+def _interpolated(
+    values: Float[np.ndarray, "v 3"], corners: Int[np.ndarray, "n 3"], weights: Float32[np.ndarray, "n 3"]
+) -> Float32[np.ndarray, "n 3"]:
+    """Values of the vertices at places in their faces."""
+    single = values.astype(np.float32)
+    return np.asarray(sum(weights[:, k, None] * single[corners[:, k]] for k in range(3)))
 
 
 def _crevices(depth_mm: Float[np.ndarray, "h w"], step_mm: float) -> Float[np.ndarray, "h w"]:
