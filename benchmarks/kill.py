@@ -1,9 +1,10 @@
 """Kill runs at random moments, let the same command go on, and compare what it leaves with an undisturbed run.
 
-    python benchmarks/kill.py [--kills 100] [--seed 0] [--only stitch] [--work build/kill] [--out results/kill.json]
+    python benchmarks/kill.py [--kills 100] [--seed 0] [--only stitch] [--work build/kill] [--add]
 
-Signals are KILL, TERM and INT in turns, sent to the program alone, once to three times before it may finish. Files must
-be equal byte for byte, but for the times that a stage took and the keys of what was kept.
+Signals are KILL, TERM and INT, each once at most, sent to the program alone before it may finish. Files must be equal
+byte for byte, but for the times that a stage took and the keys of what was kept. Writes benchmarks/results/kill.json
+after each run; ``--add`` goes on with it.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import Any
 import numpy as np
 from run import conditions
 
-from cuspid.storage import write_json
+from cuspid.storage import read_json, write_json
 
 HERE = Path(__file__).parent
 CUSPID = (sys.executable, "-m", "cuspid")
@@ -113,9 +114,10 @@ def main() -> None:
     parser.add_argument("--only", default="")
     parser.add_argument("--work", type=Path, default=Path("build/kill"))
     parser.add_argument("--out", type=Path, default=HERE / "results" / "kill.json")
+    parser.add_argument("--add", action="store_true", help="go on with the runs that the file holds")
     arguments = parser.parse_args()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have it passed over in the background
-    work, rng = arguments.work.resolve(), np.random.default_rng(arguments.seed)
+    work = arguments.work.resolve()
     shutil.rmtree(work, ignore_errors=True)
     prepare(work)
     whole: dict[str, float] = {}
@@ -125,27 +127,41 @@ def main() -> None:
         cuspid(*command, "--out", str(work / "whole" / name))
         whole[name] = time.perf_counter() - begin
         print(f"{name}: {whole[name]:.0f} s undisturbed", flush=True)
-    kills, wrong, runs = dict.fromkeys(chosen, 0), [], 0
-    while sum(kills.values()) < arguments.kills:
-        name = list(chosen)[runs % len(chosen)]
-        out, sent = work / "killed", []
-        shutil.rmtree(out, ignore_errors=True)
-        command = (*chosen[name], "--out", str(out))
-        for _ in range(int(rng.integers(1, 4))):
-            how, after_s = SIGNALS[sum(kills.values()) % 3], float(rng.uniform(0.2, whole[name]))
-            if killed(command, how, after_s):
-                kills[name] += 1
-                sent.append([how.name, round(after_s, 2)])
-        ended = subprocess.run([*CUSPID, *command], capture_output=True, text=True, check=False)
-        unlike = differences(work / "whole" / name, out) if ended.returncode == 0 else [ended.stderr[-300:]]
-        print(f"{sum(kills.values())} kills: {name} {sent}", flush=True)
+    found: dict[str, Any] = {"kills": dict.fromkeys(chosen, 0), "runs": 0, "wrong": []}
+    if arguments.add:
+        found = read_json(arguments.out)
+    if found.get("commit", conditions()["commit"]) != conditions()["commit"]:
+        raise SystemExit(f"the runs so far are of commit {found['commit']}: run all anew")
+    while sum(found["kills"].values()) < arguments.kills:
+        name = list(chosen)[found["runs"] % len(chosen)]
+        rng = np.random.default_rng([arguments.seed, found["runs"]])
+        sent = kill_and_finish(chosen[name], work / "killed", whole[name], rng)
+        unlike = differences(work / "whole" / name, work / "killed")
+        found["kills"][name] += len(sent)
+        found["runs"] += 1
+        print(f"{sum(found['kills'].values())} kills: {name} {sent}", flush=True)
         if unlike:
-            wrong.append({"verb": name, "sent": sent, "unlike": unlike[:10]})
+            found["wrong"].append({"verb": name, "sent": sent, "unlike": unlike[:10]})
             print(f"  wrong: {unlike[:5]}", flush=True)
-        runs += 1
-    print(f"{sum(kills.values())} kills in {runs} runs, {len(wrong)} wrong")
-    found = {"kills": kills, "runs": runs, "undisturbed_s": whole, "wrong": wrong}
-    write_json(arguments.out, {**found, **conditions()})
+        write_json(arguments.out, {**found, "undisturbed_s": whole, **conditions()})
+    print(f"{sum(found['kills'].values())} kills in {found['runs']} runs, {len(found['wrong'])} wrong")
+
+
+def kill_and_finish(
+    command: tuple[str, ...], out: Path, whole_s: float, rng: np.random.Generator
+) -> list[tuple[str, float]]:
+    """Kill a run once to three times and let it finish; what was sent when. A run that then fails leaves no folder."""
+    shutil.rmtree(out, ignore_errors=True)
+    command, sent = (*command, "--out", str(out)), []
+    for how in rng.permutation(np.array(SIGNALS))[: int(rng.integers(1, 4))]:
+        after_s = float(rng.uniform(0.2, whole_s))
+        if killed(command, signal.Signals(how), after_s):
+            sent.append((signal.Signals(how).name, round(after_s, 2)))
+    ended = subprocess.run([*CUSPID, *command], capture_output=True, text=True, check=False)
+    if ended.returncode != 0:
+        print(ended.stderr[-500:], flush=True)
+        shutil.rmtree(out, ignore_errors=True)
+    return sent
 
 
 if __name__ == "__main__":

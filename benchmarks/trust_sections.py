@@ -42,7 +42,7 @@ def kill(result: Result) -> str:
     rows.append(("all", "", sum(result["kills"].values()), mark(len(result["wrong"]), 0, 0)))
     return "\n".join(
         [
-            "Runs of a small scan and a small film are ended by KILL, TERM and INT in turns at random moments, up to "
+            "Runs of a small scan and a small film are ended by KILL, TERM and INT at random moments, up to "
             f"three times each, and then finish ({result['runs']} runs). All files must equal those of an undisturbed "
             "run, times and keys of results aside. Bar: 0 of 100.",
             "",
