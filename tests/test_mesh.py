@@ -128,6 +128,8 @@ def test_a_mesh_of_many_faces_is_joined_before_it_is_collapsed(monkeypatch: pyte
     np.testing.assert_allclose(np.linalg.norm(found.vertices, axis=1), 10.0, atol=0.05)
     np.testing.assert_allclose(found.face_areas.sum(), ball.face_areas.sum(), rtol=0.01)
     assert np.sum(found.face_normals * found.face_centres, axis=1).min() > 0
+    assert 5_000 < len(ball.thinned(10_000).faces) < 15_000
+    assert ball.thinned(len(ball.faces)) is ball
 
 
 def test_some_normals_are_those_of_all() -> None:

@@ -199,13 +199,11 @@ class Mesh:
         metric, Garland and Heckbert 1997); itself where it has no more. Colours are lost.
 
         Of a mesh of millions of faces, vertices that lie nearer together than those of the result will are joined
-        first: the collapse takes 300 bytes a face, and keeps them.
+        first: the collapse takes 300 bytes a face, which its library keeps.
         """
         if len(self.faces) <= most_faces:
             return self
-        start = self
-        if len(self.faces) > (most := max(_MOST_COLLAPSED, 4 * most_faces)):
-            start = self._clustered(float(np.sqrt(2 * self.face_areas.sum() / most)))
+        start = self.thinned(max(_MOST_COLLAPSED, 4 * most_faces))
         vertices, faces = start.vertices.astype(np.float64), start.faces.astype(np.int32)
         while len(faces) > most_faces:
             before = len(faces)
@@ -214,15 +212,19 @@ class Mesh:
                 break
         return Mesh(vertices, faces)
 
-    def _clustered(self, cell_mm: float) -> Mesh:
-        """With the vertices in each cell of a grid joined in their mean (J. Rossignac, P. Borrel, 1993)."""
+    def thinned(self, about_faces: int) -> Mesh:
+        """With about so many faces, by joining the vertices in each cell of a grid in their mean (J. Rossignac,
+        P. Borrel, 1993); itself where it has no more. Quick, for where a rough surface will do. Colours are lost."""
+        if len(self.faces) <= about_faces:
+            return self
+        cell_mm = float(np.sqrt(2 * self.face_areas.sum() / about_faces))
         cells = np.floor((self.vertices - self.bounds[0]) / cell_mm).astype(np.int64)
         _, joined, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
         joined = joined.reshape(-1)
         sums = [np.bincount(joined, self.vertices[:, axis]) for axis in range(3)]
         faces = joined[self.faces]
         whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-        return Mesh(np.stack(sums, axis=1) / counts[:, None], faces[whole])
+        return Mesh(np.stack(sums, axis=1) / counts[:, None], faces[whole]) if whole.any() else self
 
     def closest(
         self, points: Float[np.ndarray, "n 3"]

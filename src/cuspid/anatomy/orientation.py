@@ -40,7 +40,7 @@ _PART_MM = 9.0
 """What is smaller is not a tooth, but may be a jaw in cm."""
 _NARROW_MM = 32.0
 """What is narrower across is part of an arch."""
-_ENOUGH_FACES = 400_000
+_ENOUGH_FACES = 500_000
 """More say no more of how a jaw lies."""
 _TILT_MM = 6.0
 """Tips that spread less than this say little of a tilt."""
@@ -87,7 +87,7 @@ class _Relief:
 
 def find_occlusal_frame(mesh: Mesh) -> OcclusalFrame:
     """The occlusal frame of a jaw in any orientation, in mm; says so where it is unsure."""
-    mesh = mesh.simplified(_ENOUGH_FACES)
+    mesh = mesh.thinned(_ENOUGH_FACES)
     upright, notes_up = _upright(mesh)
     level = _level(mesh, upright)
     relief = _relief(mesh, level)
