@@ -8,7 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from cuspid import storage
 from cuspid.errors import OutputError
+from cuspid.handpiece.designs import DesignOptions, twelve_cameras
+from cuspid.jaw import Jaw
+from cuspid.pipeline import RenderOptions, take_images
+from cuspid.simulation.path.arch import arch_curve
+from cuspid.storage.captures import hash_capture
 from cuspid.storage.stages import RECORD, Stage, code_version
 
 
@@ -100,3 +106,11 @@ def test_the_version_of_the_code_tells_its_parts_apart() -> None:
     parts = [(), ("stereo",), ("motion",), ("motion/features.py",), ("stereo", "motion")]
     assert len({code_version(*each) for each in parts}) == len(parts)
     assert code_version("stereo") == code_version("stereo")
+
+
+def test_a_capture_is_the_same_in_memory_as_on_disk(tmp_path: Path, coarse_phantom: Jaw) -> None:
+    """Whose rotations change in their last bit when they are written: a scan would be made anew by the next command."""
+    handpiece = twelve_cameras(DesignOptions(width_px=64, height_px=64))
+    poses = {"00000": arch_curve(coarse_phantom).rig_from_world(30.0)}
+    capture, _ = take_images(coarse_phantom, handpiece, poses, tmp_path, RenderOptions(supersampling=1))
+    assert hash_capture(capture) == hash_capture(storage.read_capture(tmp_path / "capture"))

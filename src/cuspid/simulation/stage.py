@@ -25,6 +25,7 @@ from cuspid.simulation.raycast import Scene, lit_frames, render_capture
 from cuspid.simulation.reference_render import ReferenceRenderOptions, render_reference
 from cuspid.storage.captures import write_capture, write_image
 from cuspid.storage.files import digest_of, hash_file
+from cuspid.storage.handpieces import read_handpiece
 from cuspid.storage.reference_renders import REFERENCE_RENDER_FILES, write_reference_render
 from cuspid.storage.stages import Stage
 from cuspid.storage.truths import write_path, write_truth
@@ -125,7 +126,8 @@ def take_images(
     write_capture(folder / "capture", capture)
     for done, total in _render(folder, capture, truth, options):
         progress("images", done, total)
-    return capture, truth
+    # As it will be read: a rotation may differ in its last bit once it was written, and results go by that.
+    return replace(capture, handpiece=read_handpiece(folder / "capture" / "handpiece.json")), truth
 
 
 def _render(folder: Path, capture: Capture, truth: GroundTruth, options: RenderOptions) -> Iterator[tuple[int, int]]:
