@@ -12,7 +12,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from builders import sphere
+from builders import sphere, write_frames
 from cuspid import storage
 from cuspid.capture import image_size, read_image
 from cuspid.errors import InputError, OutputError
@@ -185,3 +185,12 @@ def test_of_a_file_the_contents_count_not_where_it_lies(tmp_path: Path) -> None:
     other = {"handpiece": storage.hash_file(tmp_path / "here.json")}
     with pytest.raises(OutputError, match=r"inputs_sha256\.handpiece differs"):
         storage.claim_folder(tmp_path / "out", "simulate", {"handpiece": tmp_path / "here.json"}, other)
+
+
+@pytest.mark.parametrize("opening", ["[", "{a: ", "- ", "<a>"])
+def test_a_calibration_that_is_nested_without_end_is_refused(tmp_path, opening):
+    """OpenCV's readers end the program by it."""
+    write_frames(tmp_path / "frames", [np.zeros((48, 64, 3), dtype=np.uint8)] * 2)
+    (tmp_path / "camera.yml").write_text(f"%YAML:1.0\n---\ncamera_matrix: {100_000 * opening}")
+    with pytest.raises(InputError, match="nested more than"):
+        storage.read_sequence(tmp_path / "frames", tmp_path / "out", calibration=tmp_path / "camera.yml")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.capture import ImageFolder, image_size
 from cuspid.errors import InputError
 from cuspid.image_sequence import ImageSequence
-from cuspid.inputs import read_text, require_file
+from cuspid.inputs import read_text
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, Rig
 from cuspid.storage.captures import IMAGE_SUFFIXES, read_capture, write_image
@@ -26,6 +27,11 @@ LEAST_PX = 32
 """Side of a frame that shows something."""
 MOST_FRAMES = 300
 """A longer video is thinned evenly to about as many frames."""
+
+_DEEPEST = 32
+_STEPS = re.compile(r"</|<(?=\w)|[\[\]{}]")
+_DASHES = re.compile(rf"(?:-[ \t]+){{{_DEEPEST}}}|^[ \t]{{{10 * _DEEPEST}}}", re.MULTILINE)
+"""Lists of lists in a line of YAML, or a line that stands far to the right."""
 
 
 def read_sequence(
@@ -152,7 +158,8 @@ def _with_camera(sequence: ImageSequence, camera: Camera, path: Path) -> ImageSe
 
 def _read_opencv(path: Path) -> Camera:
     """OpenCV's calibration: camera_matrix, distortion_coefficients (k1 k2 p1 p2 [k3 = 0]), image_width and _height."""
-    require_file(path, "text")
+    if _is_nested_deeply(read_text(path)):
+        raise InputError(f"{path}: not OpenCV's calibration, nested more than {_DEEPEST} deep")
     try:
         file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     except (cv2.error, SystemError) as error:
@@ -174,6 +181,12 @@ def _read_opencv(path: Path) -> Camera:
         principal_point_px=matrix[:2, 2] + OPENCV_PIXEL_OFFSET,
         distortion=coefficients[:4],
     )
+
+
+def _is_nested_deeply(text: str) -> bool:
+    """Whether OpenCV's readers of YAML, JSON and XML, which call themselves for each level, would end the program."""
+    steps = [1 if step[0] in "[{<" and step[1:] != "/" else -1 for step in _STEPS.findall(text)]
+    return bool(np.cumsum([0, *steps]).max() > _DEEPEST or _DASHES.search(text))
 
 
 def _small_matrix(node: cv2.FileNode) -> np.ndarray | None:
