@@ -9,18 +9,18 @@ import cv2
 import numpy as np
 import pytest
 
-from builders import folder_capture, image_path, mottled
+from builders import CAMERA, folder_capture, image_path, mottled
 from cuspid.camera import Camera
 from cuspid.capture import Capture
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.motion import MotionOptions, locate
 from cuspid.motion.features import DESCRIPTOR_NORM, Features
-from cuspid.motion.location import locate_features
+from cuspid.motion.location import _loose_notes, locate_features, stereo_ties
 from cuspid.motion.odometry import Edge, OdometryOptions, chain, polish, triangulate_frame
 from cuspid.motion.pairs import MatchingOptions, make_view
 from cuspid.pairing import stereo_pairs
-from cuspid.reconstruction import Reconstruction
+from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import Handpiece, MountedCamera, Rig
 
 SIGMA_PX = 0.2
@@ -322,3 +322,25 @@ def test_images_are_located(tmp_path: Path) -> None:
     assert 0 < found.reprojection_rms_px < 0.5
     assert list(dict.fromkeys(stages)) == ["features", "triangulation", "matching"]
     assert {"features_s", "odometry_s", "adjustment_s", "observations"} <= set(found.log)
+
+
+def test_what_single_cameras_tie_is_told():
+    """Points seen in stereo in frames 0 to 1 and 2 to 3; between them by one camera each, which fixes no length."""
+    rows = [(p, f, c) for p in range(20) for f in (0, 1) for c in (0, 1)]
+    rows += [(p, f, c) for p in range(20, 40) for f in (2, 3) for c in (0, 1)]
+    rows += [(p, f, p % 2) for p in range(40, 90) for f in (1, 2)]
+    point, frame, camera = np.array(rows).T
+    tracks = Tracks(
+        points=np.zeros((90, 3)),
+        colors=np.zeros((90, 3), dtype=np.uint8),
+        point_index=point,
+        frame_index=frame,
+        camera_index=camera,
+        pixels=np.zeros((len(rows), 2)),
+    )
+    assert stereo_ties(tracks, 4).tolist() == [20, 0, 20]
+    rig = Rig({"a": MountedCamera(CAMERA, Rigid3.identity()), "b": MountedCamera(CAMERA, Rigid3.identity())})
+    poses = {f"{k:05d}": Rigid3.identity() for k in range(4)}
+    (note,) = _loose_notes(Reconstruction(rig=rig, rig_from_world=poses, tracks=tracks), 15)
+    assert "tie frames 00001 and 00002 (0): the parts" in note
+    assert _loose_notes(Reconstruction(rig=rig, rig_from_world=poses, tracks=tracks), 0) == ()

@@ -272,7 +272,35 @@ def locate_features(
         poses=list(trajectory.rig_from_world.values()),
     )
     adjusted = _adjusted(start, scan, options, log, progress)
-    return replace(adjusted.with_cameras_as(given), log={**log, **adjusted.log})
+    notes = (*adjusted.notes, *_loose_notes(adjusted, options.odometry.minimum_matches))
+    return replace(adjusted.with_cameras_as(given), log={**log, **adjusted.log}, notes=notes)
+
+
+def _loose_notes(found: Reconstruction, least: int) -> tuple[str, ...]:
+    """Where too few points that two cameras saw at once before a place in the scan were so seen behind it: images of
+    single cameras tie the two, and what lies behind may lie elsewhere, however well it fits."""
+    if found.tracks is None:
+        return ()
+    ties = stereo_ties(found.tracks, len(found.frames))
+    loose = [f"{found.frames[k]} and {found.frames[k + 1]} ({ties[k]})" for k in np.flatnonzero(ties < least)]
+    if not loose:
+        return ()
+    return (
+        f"motion: fewer than {least} points seen in stereo on both sides tie frames {', '.join(loose[:5])}"
+        f"{', ...' if len(loose) > 5 else ''}: the parts of the scan may be displaced; scan there again, slower",
+    )
+
+
+def stereo_ties(tracks: Tracks, frames: int) -> Int[np.ndarray, "k"]:
+    """For each frame but the last: points that two cameras see at once in it or before, and again in a later one."""
+    seen = np.unique(np.stack([tracks.point_index, tracks.frame_index, tracks.camera_index], axis=1), axis=0)
+    sightings, cameras = np.unique(seen[:, :2], axis=0, return_counts=True)
+    point, frame = sightings[cameras >= 2].T
+    first, last = np.full(len(tracks.points), frames), np.full(len(tracks.points), -1)
+    np.minimum.at(first, point, frame)
+    np.maximum.at(last, point, frame)
+    at = np.arange(frames - 1)[:, None]
+    return np.asarray(((first <= at) & (at < last)).sum(axis=1))
 
 
 def _adjusted(
