@@ -471,6 +471,8 @@ def test_a_list_of_values_is_looked_through():
     assert as_declared(MeanStep, **round_of).surface_change_um == 1
     with pytest.raises(InputError, match="'covered_pct' cannot be 'all'"):
         as_declared(MeanStep, **round_of | {"covered_pct": "all"})
+    with pytest.raises(InputError, match="'round' is not known"):
+        as_declared(MeanStep, **round_of, round=1)
     with pytest.raises(InputError, match="'notes' cannot be"):
         as_declared(Reconstruction, rig=handpiece("a", "b").rig, rig_from_world={}, notes=("one", 2))
 

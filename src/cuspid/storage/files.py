@@ -256,6 +256,8 @@ def as_declared(kind: Callable[..., _Made], /, **values: Any) -> _Made:
     class declares for it, or an array not of the shape: axes of one name are alike."""
     hints = get_type_hints(kind)
     for name, value in values.items():
+        if name not in hints:
+            raise InputError(f"the field '{name}' is not known; see docs/formats.md")
         if not _fits(value, hints[name]):
             found = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else shown(value)
             raise InputError(f"the field '{name}' cannot be {found}; see docs/formats.md")
