@@ -54,12 +54,19 @@ def words(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def see(
-    handpiece: Handpiece, path: dict[str, Rigid3], *, seed: int = 0, points: int = 900, length_mm: float = 9.0
+    handpiece: Handpiece,
+    path: dict[str, Rigid3],
+    *,
+    seed: int = 0,
+    points: int = 900,
+    length_mm: float = 9.0,
+    scale: float = 1.0,
 ) -> Keypoints:
-    """Keypoints of a wavy surface: noisy places and descriptors, in random order."""
+    """Keypoints of a wavy surface (``scale`` times as far, and as large): noisy places and descriptors, in random
+    order."""
     rng = np.random.default_rng(seed)
     xy = rng.uniform([-4, -4], [length_mm, 5], (points, 2))
-    surface = np.column_stack([xy, 5 + 0.5 * np.sin(1.3 * xy[:, 0]) * np.cos(xy[:, 1])])
+    surface = scale * np.column_stack([xy, 5 + 0.5 * np.sin(1.3 * xy[:, 0]) * np.cos(xy[:, 1])])
     dictionary, seen = words(rng, points), {}
     for frame, pose in path.items():
         for name, mounted in handpiece.rig.cameras.items():
@@ -132,6 +139,31 @@ def test_tracks_lie_on_the_surface() -> None:
     assert set(np.unique(tracks.frame_index)) == set(range(4))
     assert set(np.unique(tracks.camera_index)) == set(range(4))
     assert np.all(tracks.colors[np.unique(tracks.point_index)] == 200)
+
+
+def test_what_lies_behind_the_depth_of_field_is_not_taken_for_nearer() -> None:
+    """A scan goes on over a gap, where nothing is in focus but what is far away; farther, it moves less."""
+    handpiece, path = make_handpiece(), make_path(4)
+    assert handpiece.depth_range_mm[1] < 3.5 * 4.5
+    seen = see(handpiece, path, points=1500, scale=3.5)
+    found = locate_features(handpiece, seen, list(path), MotionOptions())
+    assert found.frames == tuple(path)
+    assert 0 < np.abs(errors(found, path)[:, 3:]).max() < 0.03
+
+
+def test_a_motion_with_which_few_matches_agree_is_none() -> None:
+    """Of matches to what is not there, many may agree by chance or by what they have in common."""
+    handpiece, path = make_handpiece(), make_path(2)
+    seen, names = see(handpiece, path), list(path)
+    rng = np.random.default_rng(0)
+    for key in seen:
+        if key[0] == names[1]:
+            mixed = rng.permutation(len(seen[key].pixels))[: int(0.7 * len(seen[key].pixels))]
+            pixels = seen[key].pixels.copy()
+            pixels[mixed] = rng.permutation(pixels[mixed])
+            seen[key] = replace(seen[key], pixels=pixels)
+    with pytest.raises(ReconstructionError, match="of its matches to its neighbours agree; too few of all"):
+        locate_features(handpiece, seen, names, MotionOptions())
 
 
 def test_result_is_repeatable() -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
@@ -170,6 +171,32 @@ def test_a_handpiece_that_would_touch_the_jaw_is_lifted(coarse_phantom: Jaw, cap
 def test_what_sees_nothing_where_it_fits_is_refused(coarse_phantom: Jaw) -> None:
     with pytest.raises(InputError, match="no camera sees the jaw in focus"):
         plan(coarse_phantom, replace(STILL, clearance_mm=11.0), essential_four())
+
+
+def with_gap(jaw: Jaw, teeth: tuple[int, ...], ridge_mm: float) -> Jaw:
+    """Teeth and the gum around them cut off at a height."""
+    gone = np.unique(jaw.mesh.faces[np.isin(jaw.face_labels, teeth)])
+    vertices = jaw.mesh.vertices.copy()
+    distance, _ = KDTree(vertices[gone, :2]).query(vertices[:, :2])
+    vertices[distance < 1.5, 2] = np.minimum(vertices[distance < 1.5, 2], ridge_mm)
+    return Jaw(mesh=Mesh(vertices, jaw.mesh.faces), arch=jaw.arch)
+
+
+def test_the_handpiece_follows_the_gum_where_teeth_are_missing(
+    coarse_phantom: Jaw, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Held up, it would see nothing in focus there, and the scan would break."""
+    ridge = coarse_phantom.mesh.bounds[1, 2] - 11.0
+    options = ScanPathOptions(passes="turns", jitter_mm=0.0, jitter_deg=0.0)
+    whole = plan(replace(coarse_phantom, face_labels=None), options)
+    with caplog.at_level("INFO", logger="cuspid"):
+        path = plan(with_gap(coarse_phantom, (34, 35, 36), ridge), options)
+    assert not whole.steady.sinks_mm.any()
+    assert 5.0 < path.steady.sinks_mm.max() < 11.0
+    assert 15.0 < np.count_nonzero(path.steady.sinks_mm) < 35.0, "over the gap alone"
+    assert np.isfinite(path.overlap).sum(axis=1).min() >= 2
+    assert "teeth are missing; there the handpiece sinks by up to" in caplog.text
+    assert "fewer than two cameras see the jaw in focus" not in caplog.text
 
 
 # --- the hand -----------------------------------------------------------------------------------------------------

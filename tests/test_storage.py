@@ -83,6 +83,7 @@ def test_labels_beside_the_mesh_may_be_universal(tmp_path):
             "jaw.ply: (not a mesh|the mesh is empty)",
         ),
         ("jaw.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "jaw.obj: (not a mesh|the mesh is empty)"),
+        ("jaw.obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "jaw.obj: its vertices are not three coordinates each"),
         ("jaw.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "jaw.obj: (not a mesh|some coordinates are not finite)"),
     ],
 )

@@ -205,3 +205,7 @@ def test_a_word_longer_than_any_name_is_cut_in_a_message():
     assert str(InputError(f"{path}: no camera '{'x' * 400}'; give another")) == (
         f"{path}: no camera '{'x' * 40}...'; give another"
     )
+
+
+def test_control_characters_are_written_out_in_a_message():
+    assert str(InputError("landmark 'a\0b\n\x1b[31m' is not 'ö'")) == r"landmark 'a\x00b\n\x1b[31m' is not 'ö'"

@@ -18,10 +18,12 @@ _OVERLONG = re.compile(r"[^\s/\\'\"]{260,}")
 
 
 class CuspidError(Exception):
-    """Root of the family. ``str(error)`` is the one line shown to the user, with words longer than any name cut."""
+    """Root of the family. ``str(error)`` is the one line shown to the user, with words longer than any name cut and
+    control characters written out."""
 
     def __init__(self, message: str) -> None:
-        super().__init__(_OVERLONG.sub(lambda word: f"{word[0][:40]}...", message))
+        cut = _OVERLONG.sub(lambda word: f"{word[0][:40]}...", message)
+        super().__init__("".join(each if each.isprintable() else repr(each)[1:-1] for each in cut))
 
 
 class InputError(CuspidError):

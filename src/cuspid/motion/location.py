@@ -27,6 +27,7 @@ from cuspid.motion.odometry import (
     chain,
     find_edges,
     rays_in_rig,
+    searched_mm,
     triangulate_frame,
 )
 from cuspid.motion.pairs import MatchingOptions, frame_pairs, make_view, match_guided
@@ -131,12 +132,17 @@ class _Scan:
         return self.handpiece.rig[camera].cam_from_rig @ self.poses[frame]
 
     def depth_bounds(self, image: Image, slack_mm: float) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-        """Least and greatest depth of each keypoint: about that of its point, else the depth of field."""
+        """Least and greatest depth of each keypoint: about that of its point, else all that is searched.
+
+        The slack is that at the working distance; behind it grows with the square of the depth, as in all stereo.
+        """
         frame, camera = image
         depth = self.clouds[frame].depths(self.handpiece.rig, camera)
-        near, far = self.handpiece.depth_range_mm
+        near, far = searched_mm(self.handpiece, self.frames[frame][camera])
+        slack = slack_mm * np.maximum(1.0, (depth / self.handpiece.working_distance_mm) ** 2)
+        slack = np.minimum(slack, depth / 2)
         known = np.isfinite(depth)
-        return np.where(known, depth - slack_mm, near), np.where(known, depth + slack_mm, far)
+        return np.where(known, depth - slack, near), np.where(known, depth + slack, far)
 
     def match(self, one: Image, other: Image, options: MotionOptions) -> Int[np.ndarray, "k 2"]:
         """Matches of two images, as numbers of keypoints."""

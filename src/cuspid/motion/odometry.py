@@ -31,6 +31,9 @@ from cuspid.workers import map_in_threads
 Views = Mapping[str, View]
 """Keypoints of one frame by camera."""
 
+_SEARCHED = 8.0
+"""Matches are sought up to so many times the far end of the depth of field. A camera sees the jaw beyond it as well,
+and where its match lies out of reach, a wrong one is found within: such points look consistent, and move too little."""
 _CELL_PX = 40
 _POLISHING_ROUNDS = 12
 _DECIMALS = 9
@@ -45,7 +48,7 @@ class OdometryOptions(Options):
     """Frames are tied to those at +1, where that fails to those at +2, and so on up to this."""
     minimum_matches: Annotated[int, Range(4, 100_000)] = 15
     """Fewest consistent matches that place a frame."""
-    minimum_share: Annotated[float, SHARE] = 0.15
+    minimum_share: Annotated[float, SHARE] = 0.4
     """Least share (0 to 1) of the matches to a neighbour that must be consistent."""
     error_px: Annotated[float, Range(0.01, 1000)] = 4.0
     """Largest reprojection error of a consistent match, px."""
@@ -92,12 +95,10 @@ class Trajectory:
     """The other frames."""
 
 
-def _full_range(
-    view: View, depth_range_mm: tuple[float, float]
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """The depth of field as bounds of every keypoint."""
-    near, far = depth_range_mm
-    return np.full(len(view.features), near), np.full(len(view.features), far)
+def searched_mm(handpiece: Handpiece, view: View) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Least and greatest depth at which each keypoint is sought where nothing is known of it."""
+    near, far = handpiece.depth_range_mm
+    return np.full(len(view.features), near), np.full(len(view.features), _SEARCHED * far)
 
 
 def _consistent(
@@ -134,14 +135,14 @@ def triangulate_frame(
     handpiece: Handpiece, pairs: Sequence[tuple[str, str]], views: Views, options: MatchingOptions
 ) -> Cloud:
     """Match the camera pairs of one frame along their epipolar lines and triangulate."""
-    rig, bounds = handpiece.rig, handpiece.depth_range_mm
-    matches = []
+    rig, matches = handpiece.rig, []
     for first, second in pairs:
         if first not in views or second not in views:
             continue
         a, b = views[first], views[second]
         second_from_first = rig[second].cam_from_rig @ rig[first].cam_from_rig.inverse()
-        found = match_guided(a, b, second_from_first, _full_range(a, bounds), _full_range(b, bounds), options)
+        bounds = searched_mm(handpiece, a), searched_mm(handpiece, b)
+        found = match_guided(a, b, second_from_first, *bounds, options)
         matches.append((first, second, found))
     sizes = [len(view.features) for view in views.values()]
     starts = dict(zip(views, np.concatenate([[0], np.cumsum(sizes)]), strict=False))

@@ -102,6 +102,8 @@ def _checked(path: Path, loaded: trimesh.Trimesh, declared: int, mm_per_unit: fl
         raise InputError(
             f"{path}: {len(faces)} of {declared} faces could be read; the file is truncated, copy it again"
         )
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+        raise InputError(f"{path}: its vertices are not three coordinates each; export the mesh again")
     if not np.isfinite(vertices).all():
         raise InputError(f"{path}: some coordinates are not finite numbers; repair the mesh and export it again")
     if np.abs(vertices).max() * mm_per_unit > LONGEST_MM:

@@ -93,6 +93,7 @@ def scan_page(result: ScanResult, options: ReportOptions = ReportOptions()) -> s
         views=[view["name"] for view in scene["views"]],
         shown=sizes,
         tiles=_tiles(result),
+        warnings=() if result.reconstruction is None else result.reconstruction.notes,
         trueness=result.trueness,
         rows=_table(result.trueness),
         histogram=None if result.deviation_um is None else histogram(scan, result.deviation_um, range_um),

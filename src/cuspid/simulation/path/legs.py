@@ -1,8 +1,8 @@
 """The trajectory of a steady hand: passes along the arch, each with its roll, and the turns between them.
 
 A handpiece with few cameras is also rolled about the tangent of the arch (thesis 3.5.3), to scan a cross-section from
-several sides. ``hold`` is the rig frame of a handpiece held upright; a roll is positive when the cameras turn to the
-cheek. The *travel* is the length of it, passes and turns, in mm.
+several sides. ``hold`` is the rig frame of a handpiece held upright, which sinks where teeth are missing; a roll is
+positive when the cameras turn to the cheek. The *travel* is the length of it, passes and turns, in mm.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d, maximum_filter
 
 from cuspid.geometry import Rigid3
@@ -31,6 +31,12 @@ _FAR_MM = 8.0
 """Whence these rays come, from the place that the handpiece looks at; they end as far behind it."""
 _LIFT_MM = 3.0
 """The nominal crown is corrected by this much at most."""
+_GAP_MM = 2.0
+"""A surface that lies so far below the cusp tips is still seen well; below that the handpiece follows it down."""
+_GAP_PATCH_MM = 3.0
+"""Half the width, across the arch, of the strip in which it is looked for."""
+_GAP_NEAR_MM = 5.0
+"""The handpiece keeps up while a tooth is nearer than half of this."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +71,8 @@ class SteadyPath:
     """The rolls, ascending, for which it was."""
     lifts_mm: Float[np.ndarray, "r s"]
     """How far the surface there lies outside of the nominal crown."""
+    sinks_mm: Float[np.ndarray, "s"]
+    """How far the handpiece sinks there, for teeth are missing."""
 
     @property
     def span_mm(self) -> tuple[float, float]:
@@ -80,7 +88,8 @@ class SteadyPath:
     def rig_from_world(self, travel_mm: float) -> Rigid3:
         """The handpiece without the drift of a hand."""
         length, roll = self.place(travel_mm)
-        hold_from_world = self.curve.rig_from_world(length)
+        sink = float(np.interp(length, self.stations_mm, self.sinks_mm))
+        hold_from_world = Rigid3(np.eye(3), np.array([0, 0, sink])) @ self.curve.rig_from_world(length)
         if self.legs == (Leg(roll_deg=0.0, start_mm=self.legs[0].start_mm, end_mm=self.legs[0].end_mm),):
             return hold_from_world
         at_rolls = [np.interp(length, self.stations_mm, lifts) for lifts in self.lifts_mm]
@@ -107,6 +116,7 @@ def steady_path(mesh: Mesh, curve: ArchCurve, legs: tuple[Leg, ...]) -> SteadyPa
         stations_mm=stations,
         rolls_deg=rolls,
         lifts_mm=np.array([_lifts(mesh, curve, stations, float(roll)) for roll in rolls]),
+        sinks_mm=_sinks(mesh, curve, stations),
     )
 
 
@@ -152,6 +162,30 @@ def _lifts(
         hits = mesh.cast(world_from_rig.apply(patch), np.broadcast_to(-world_from_rig.rotation[:, 2], patch.shape))
         heights = _FAR_MM - hits.distances[hits.distances < 2 * _FAR_MM]
         lifts[index] = np.median(heights) if len(heights) else 0.0
-    highest = maximum_filter(lifts, size=round(NEAR_MM / _STATION_MM), mode="nearest")
-    smooth = gaussian_filter1d(highest, NEAR_MM / 2 / _STATION_MM, mode="nearest")
-    return np.asarray(np.clip(smooth, -_LIFT_MM, _LIFT_MM))
+    return np.asarray(np.clip(_followed(lifts, NEAR_MM), -_LIFT_MM, _LIFT_MM))
+
+
+def _sinks(mesh: Mesh, curve: ArchCurve, stations_mm: Float[np.ndarray, "s"]) -> Float[np.ndarray, "s"]:
+    """How far an upright handpiece sinks between two teeth, so that what lies there instead of teeth is in focus."""
+    along, across = np.linspace(-_PATCH_MM, _PATCH_MM, 5), np.linspace(-_GAP_PATCH_MM, _GAP_PATCH_MM, 9)
+    strip = np.stack(np.meshgrid(along, across, _FAR_MM), axis=-1).reshape(-1, 3)
+    heights = np.zeros(len(stations_mm))
+    for index, length in enumerate(stations_mm):
+        world_from_hold = curve.rig_from_world(float(length)).inverse()
+        down = np.broadcast_to(-world_from_hold.rotation[:, 2], strip.shape)
+        highest = _FAR_MM - float(mesh.cast(world_from_hold.apply(strip), down).distances.min())
+        heights[index] = highest if np.isfinite(highest) else 0.0
+    between = np.logical_and(*(_any_before(heights > -_GAP_MM, order) for order in (1, -1)))
+    heights[~between] = 0.0
+    return np.asarray(np.maximum(-_followed(heights, _GAP_NEAR_MM) - _GAP_MM, 0.0))
+
+
+def _any_before(which: Bool[np.ndarray, "s"], order: int) -> Bool[np.ndarray, "s"]:
+    """Where one is true before, or, of order -1, behind."""
+    return np.asarray(np.logical_or.accumulate(which[::order])[::order])
+
+
+def _followed(heights_mm: Float[np.ndarray, "s"], near_mm: float) -> Float[np.ndarray, "s"]:
+    """Heights at the stations as a hand follows them: what stands out most nearby, smoothly."""
+    highest = maximum_filter(heights_mm, size=round(near_mm / _STATION_MM), mode="nearest")
+    return np.asarray(gaussian_filter1d(highest, near_mm / 2 / _STATION_MM, mode="nearest"))

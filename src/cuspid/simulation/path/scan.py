@@ -14,6 +14,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Annotated, Literal
 
 import numpy as np
@@ -158,7 +159,8 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
             "it; use a narrower one, a larger depth of field or a smaller --clearance-mm"
         )
     path = replace(path, seen=_seen(crowns, handpiece, path, options.tooth))
-    for note in (*_detour_notes(jaw, steady, detour), *_further_pass_notes(steady, first, path), *_unseen_notes(path)):
+    notes = (_gap_notes(steady), _detour_notes(jaw, steady, detour), _further_pass_notes(steady, first, path))
+    for note in chain(*notes, _blind_notes(path), _unseen_notes(path)):
         _LOG.info(note)
     return path
 
@@ -279,6 +281,25 @@ def _even_path(mesh: Mesh, handpiece: Handpiece, steady: SteadyPath, pose_at: Po
 
 
 # --- what a user should know ------------------------------------------------------------------------------------------
+
+
+def _gap_notes(steady: SteadyPath) -> tuple[str, ...]:
+    """How the handpiece follows the gum where teeth are missing."""
+    if not steady.sinks_mm.any():
+        return ()
+    return (f"scan path: teeth are missing; there the handpiece sinks by up to {steady.sinks_mm.max():.1f} mm",)
+
+
+def _blind_notes(path: ScanPath) -> tuple[str, ...]:
+    """Frames of which next to nothing can be measured."""
+    seeing = np.isfinite(path.overlap).sum(axis=1)
+    blind = np.array(list(path.rig_from_world))[np.flatnonzero(seeing < 2)]
+    if len(blind) == 0:
+        return ()
+    return (
+        f"scan path: in {len(blind)} frames ({', '.join(blind[:5])}{', ...' if len(blind) > 5 else ''}) fewer than two "
+        "cameras see the jaw in focus; that may break the scan there",
+    )
 
 
 def _detour_notes(jaw: Jaw, steady: SteadyPath, detour: Detour) -> tuple[str, ...]:
