@@ -7,6 +7,7 @@ import re
 import shutil
 import socket
 import sys
+from dataclasses import replace
 from importlib.metadata import version
 
 import numpy as np
