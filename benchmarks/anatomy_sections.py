@@ -221,6 +221,7 @@ _JAW_COLUMNS = {
     "least overlap %": "minimum_overlap_pct",
     "open crown that two cameras see %": "seen_pct",
     "frames located": "located",
+    "trajectory, RMSE um": "trajectory_um",
     "mean um": "mean_um",
     "P95 um": "p95_um",
     "mean of everything um": "everything_mean_um",
@@ -236,16 +237,18 @@ def jaws(result: Result) -> str:
     planned = [scan for scan in scans.values() if scan["failure"] is None]
     heads = [head for head, key in _JAW_COLUMNS.items() if any(key in scan for scan in planned)]
     rows = [
-        (name, *(_jaw_figure(scan, _JAW_COLUMNS[head]) for head in heads), scan["failure"] or "")
+        (name, *(_jaw_figure(scan, _JAW_COLUMNS[head]) for head in heads), scan["failure"] or scan.get("notes") or "")
         for name, scan in scans.items()
     ]
+    commits = sorted({str(scan["commit"]) for scan in planned})
+    of = f"commit {commits[0]}" if len(commits) == 1 else f"commits {', '.join(commits)}"
     return "\n".join(
         [
-            f"{len(planned)} of {len(scans)} came to the end. A name with *smooth* is a coarse jaw after two Loop "
-            "subdivisions; quadrants, single teeth and jaws with gaps are cut from smooth ones, turned at random and "
+            f"{len(scans)} of {result['cases']} were tried (at {of}); {len(planned)} came to the end. A name with "
+            "*smooth* is a coarse jaw after two Loop subdivisions; quadrants, single teeth and jaws with gaps are cut from smooth ones, turned at random and "
             "without labels. Twelve cameras; `python benchmarks/jaws.py`.",
             "",
-            markdown_table(("jaw", *heads, "failed because"), rows),
+            markdown_table(("jaw", *heads, "failed because, or note"), rows),
         ]
     )
 

@@ -1,12 +1,14 @@
 """Scan real jaws and parts of them, each without options of its own.
 
     python benchmarks/jaws.py FOLDER [--work build/jaws] [--size half] [--passes auto] [--only 001 quadrant] [--plan]
+                              [--add]
 
 FOLDER holds meshes of jaws, ``lower`` or ``upper`` in their names; those of fewer than 30,000 faces are also scanned
 after two Loop subdivisions, for their facets are larger than teeth are smooth. Quadrants, single teeth and jaws with
 gaps are cut from labelled ones, with 3 mm of what is around them, turned at random and without their labels; where
 teeth are taken out of an arch the gum around them stays, as in a mouth. ``--plan`` only plans the paths. Finished scans
-are kept in the work folder and not run again.
+are kept in the work folder and not run again; ``--add`` keeps those of the result file, too, each with the commit that
+it is of.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from scipy.spatial.transform import Rotation
 from cuspid import pipeline
 from cuspid.anatomy.jaw_files import load_jaw
 from cuspid.evaluation.deviation import EvaluationOptions
+from cuspid.evaluation.trajectory import trajectory_error
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
 from cuspid.jaw import ARCHES, GUM, Arch, Jaw
@@ -35,8 +38,9 @@ from cuspid.mesh import Mesh, edges_of
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.rig import Handpiece
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
-from cuspid.storage import read_json, write_json
+from cuspid.storage import read_json, read_poses, write_json
 from cuspid.studies.grid import Case, Value, run_grid
+from cuspid.studies.scan_cases import commit
 
 HERE = Path(__file__).parent
 COARSE = 30_000
@@ -129,6 +133,7 @@ def judge(*, file: str, part: str, smooth: bool, pixels: int, passes: str, plan_
     begin, begin_cpu = time.perf_counter(), time.process_time()
     path = plan_scan_path(jaw, handpiece, path_options, np.random.default_rng([0, 1]))
     planned: dict[str, Value] = {
+        "commit": commit(),
         "faces": len(jaw.mesh.faces),
         "frames": len(path.rig_from_world),
         "plan_s": time.perf_counter() - begin,
@@ -153,9 +158,14 @@ def scanned(jaw: Jaw, handpiece: Handpiece, folder: Path, path: ScanPathOptions)
         mesh, reference.jaw, EvaluationOptions(), scannable=reference.scannable, crown=reference.crown
     )
     crown = found.crown
+    trajectory = trajectory_error(
+        reconstruction.rig_from_world, read_poses(folder / "truth" / "poses.json"), found.reference_from_scan
+    )
     return {
         "images": len(list((folder / "capture" / "images").rglob("*.png"))),
         "located": len(reconstruction.frames),
+        "trajectory_um": trajectory.ape_um.rmse,
+        "notes": "; ".join(reconstruction.notes),
         "mean_um": found.accuracy.mean_abs_um,
         "p95_um": found.accuracy.p95_um,
         "everything_mean_um": None if found.everything is None else found.everything.mean_abs_um,
@@ -179,6 +189,7 @@ def asked() -> argparse.Namespace:
     parser.add_argument("--passes", choices=("turns", "auto"), default="turns")
     parser.add_argument("--only", nargs="*", help="names of cases or parts of them; default: all")
     parser.add_argument("--plan", action="store_true", help="only plan the paths")
+    parser.add_argument("--add", action="store_true", help="to what the result file holds of other jaws")
     return parser.parse_args()
 
 
@@ -197,8 +208,12 @@ def main() -> None:
         workers=1,
         progress=lambda stage, done, total: print(f"{stage}: {done} of {total}", flush=True),
     )
-    scans = {each.case.name: {**each.figures, "failure": each.failure} for each in outcomes}
-    write_json(arguments.out or HERE / "results" / f"jaws_{kind}.json", {"kind": kind, "scans": scans, **conditions()})
+    out = arguments.out or HERE / "results" / f"jaws_{kind}.json"
+    before = read_json(out)["scans"] if arguments.add and out.exists() else {}
+    scans = before | {each.case.name: {**each.figures, "failure": each.failure} for each in outcomes}
+    ordered = {each.name: scans[each.name] for each in cases(files) if each.name in scans}
+    asked_for = len(list(cases(files)))
+    write_json(out, {"kind": kind, "cases": asked_for, "scans": ordered, **conditions()})
 
 
 if __name__ == "__main__":
