@@ -245,8 +245,8 @@ def jaws(result: Result) -> str:
     return "\n".join(
         [
             f"{len(scans)} of {result['cases']} were tried (at {of}); {len(planned)} came to the end. A name with "
-            "*smooth* is a coarse jaw after two Loop subdivisions; quadrants, single teeth and jaws with gaps are cut from smooth ones, turned at random and "
-            "without labels. Twelve cameras; `python benchmarks/jaws.py`.",
+            "*smooth* is a coarse jaw after two Loop subdivisions; quadrants, single teeth and jaws with gaps are cut "
+            "from smooth ones, turned at random and without labels. Twelve cameras; `python benchmarks/jaws.py`.",
             "",
             markdown_table(("jaw", *heads, "failed because, or note"), rows),
         ]
