@@ -1,9 +1,10 @@
 """Damage small inputs in thousands of ways and see how readers and verbs take it (tests/fuzzing.py).
 
-    python benchmarks/fuzz.py [--cases 10000] [--first 0] [--only report] [--add]
+    OPENBLAS_NUM_THREADS=1 python benchmarks/fuzz.py [--cases 10000] [--first 0] [--only report] [--add]
 
 Prints what is wrong and writes benchmarks/results/fuzz.json: cases of each scenario, and all that is wrong, with the
-seed that shows it again (``--only SCENARIO --first SEED --cases 1``).
+seed that shows it again (``--only SCENARIO --first SEED --cases 1``). More threads of BLAS wait for one another where
+the machine has other work, and their waiting would count as work.
 """
 
 from __future__ import annotations
