@@ -27,7 +27,6 @@ from cuspid.motion.odometry import (
     chain,
     find_edges,
     rays_in_rig,
-    searched_mm,
     triangulate_frame,
 )
 from cuspid.motion.pairs import MatchingOptions, frame_pairs, make_view, match_guided
@@ -132,13 +131,13 @@ class _Scan:
         return self.handpiece.rig[camera].cam_from_rig @ self.poses[frame]
 
     def depth_bounds(self, image: Image, slack_mm: float) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-        """Least and greatest depth of each keypoint: about that of its point, else all that is searched.
+        """Least and greatest depth of each keypoint: about that of its point, else the depth of field.
 
         The slack is that at the working distance; behind it grows with the square of the depth, as in all stereo.
         """
         frame, camera = image
         depth = self.clouds[frame].depths(self.handpiece.rig, camera)
-        near, far = searched_mm(self.handpiece, self.frames[frame][camera])
+        near, far = self.handpiece.depth_range_mm
         slack = slack_mm * np.maximum(1.0, (depth / self.handpiece.working_distance_mm) ** 2)
         slack = np.minimum(slack, depth / 2)
         known = np.isfinite(depth)

@@ -32,8 +32,9 @@ Views = Mapping[str, View]
 """Keypoints of one frame by camera."""
 
 _SEARCHED = 8.0
-"""Matches are sought up to so many times the far end of the depth of field. A camera sees the jaw beyond it as well,
-and where its match lies out of reach, a wrong one is found within: such points look consistent, and move too little."""
+"""Within a frame, matches are sought up to so many times the far end of the depth of field. A camera sees the jaw beyond
+it as well, and where its match lies out of reach, a wrong one is found within: such points look consistent, and move
+too little."""
 _CELL_PX = 40
 _POLISHING_ROUNDS = 12
 _DECIMALS = 9
@@ -95,7 +96,7 @@ class Trajectory:
     """The other frames."""
 
 
-def searched_mm(handpiece: Handpiece, view: View) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+def _searched_mm(handpiece: Handpiece, view: View) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Least and greatest depth at which each keypoint is sought where nothing is known of it."""
     near, far = handpiece.depth_range_mm
     return np.full(len(view.features), near), np.full(len(view.features), _SEARCHED * far)
@@ -141,7 +142,7 @@ def triangulate_frame(
             continue
         a, b = views[first], views[second]
         second_from_first = rig[second].cam_from_rig @ rig[first].cam_from_rig.inverse()
-        bounds = searched_mm(handpiece, a), searched_mm(handpiece, b)
+        bounds = _searched_mm(handpiece, a), _searched_mm(handpiece, b)
         found = match_guided(a, b, second_from_first, *bounds, options)
         matches.append((first, second, found))
     sizes = [len(view.features) for view in views.values()]
