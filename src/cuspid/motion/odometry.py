@@ -33,8 +33,8 @@ Views = Mapping[str, View]
 
 _SEARCHED = 8.0
 """Within a frame, matches are sought up to so many times the far end of the depth of field. A camera sees the jaw beyond
-it as well, and where its match lies out of reach, a wrong one is found within: such points look consistent, and move
-too little."""
+as well; where the true match lies out of reach, a wrong one is found, and such points look consistent and move too
+little."""
 _CELL_PX = 40
 _POLISHING_ROUNDS = 12
 _DECIMALS = 9
