@@ -32,9 +32,10 @@ Views = Mapping[str, View]
 """Keypoints of one frame by camera."""
 
 _SEARCHED = 8.0
-"""Within a frame, matches are sought up to so many times the far end of the depth of field. A camera sees the jaw beyond
-as well; where the true match lies out of reach, a wrong one is found, and such points look consistent and move too
-little."""
+"""Within a frame, matches are sought up to so many times the far end of the depth of field. A camera sees the jaw
+beyond as well; where the true match lies out of reach, a wrong one is found, and such points look consistent and move
+too little.
+"""
 _CELL_PX = 40
 _POLISHING_ROUNDS = 12
 _DECIMALS = 9
