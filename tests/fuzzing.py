@@ -44,7 +44,7 @@ from test_colmap import make_capture, make_found, without_rig, write
 from test_panorama import small_panorama
 from test_panorama_evaluation import known_film, write_truth
 
-LONGEST_S = 20.0
+LONGEST_S = 10.0
 """Of work; waiting may take more on a busy machine."""
 LONGEST_WAIT_S = 60.0
 MOST_BYTES = 2 << 30
