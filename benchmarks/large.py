@@ -18,13 +18,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import trimesh
 from run import conditions
 from websockets.sync.client import connect
-from websockets.typing import Origin
+from websockets.typing import Origin, Subprotocol
 
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
@@ -56,13 +57,13 @@ def make(work: Path) -> int:
 
 
 def measured(arguments: tuple[str, ...], during: Callable[[str], None] | None = None) -> dict[str, float]:
-    """Wall time and peak memory of a verb. ``during``: what is done when it has printed its first line, after which it
-    is ended. Raises CalledProcessError where it fails."""
+    """Wall time and peak memory of a verb. ``during``: what is done with the address that it prints, after which it is
+    ended. Raises CalledProcessError where it fails."""
     begin = time.perf_counter()
     begun = subprocess.Popen([*CUSPID, *arguments], stdout=subprocess.PIPE, text=True)
     assert begun.stdout is not None
     if during is not None:
-        during(begun.stdout.readline())
+        during(next(found[1] for line in begun.stdout if (found := re.search(r"http://(\S+)", line))))
         begun.send_signal(signal.SIGINT)
     begun.stdout.read()
     _, status, used = os.wait4(begun.pid, 0)
@@ -76,19 +77,18 @@ def measured(arguments: tuple[str, ...], during: Callable[[str], None] | None = 
     }
 
 
-def take_all(said: str) -> None:
+def take_all(address: str) -> None:
     """Receive what a live view sends."""
-    address = re.search(r"http://(\S+)", said)
-    assert address is not None, said
-    taken = 0
-    with connect(f"ws://{address[1]}", origin=Origin(f"http://{address[1]}"), max_size=None) as client:
+    taken, spoken = 0, [Subprotocol(f"viser-v{version('viser')}")]
+    origin = Origin(f"http://{address}")
+    with connect(f"ws://{address}", origin=origin, subprotocols=spoken, max_size=None) as client:
         try:
             while True:
                 taken += len(client.recv(timeout=QUIET_S))
         except TimeoutError:
             pass
     print(f"view: {taken / 1e6:.0f} MB taken", flush=True)
-    assert taken > 1e7, said
+    assert taken > 1e7, f"only {taken} bytes came"
 
 
 def main() -> None:
