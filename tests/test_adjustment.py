@@ -288,6 +288,18 @@ def test_a_gauge_moves_nothing_that_is_held() -> None:
 # --- closed loops ------------------------------------------------------------------------------------------------
 
 
+def test_a_point_behind_a_camera_holds_up_no_other() -> None:
+    """Its rays hardly meet, so that a small step may throw it there; then no step at all could be taken."""
+    state, observations, _ = disturbed_state(0, make_rig())
+    thrown = state.points + 0.01
+    thrown[[3, 7]] *= -1
+    found = adjustment._in_front(state._replace(points=thrown), state.points, observations)
+    assert np.flatnonzero(np.any(found.points != thrown, axis=1)).tolist() == [3, 7]
+    np.testing.assert_array_equal(found.points[[3, 7]], state.points[[3, 7]])
+    assert np.isfinite(normal_equations.residual_vectors(found, observations)).all()
+    assert not np.isfinite(normal_equations.residual_vectors(state._replace(points=thrown), observations)).all()
+
+
 def test_perfect_observations_give_the_truth() -> None:
     """Without noise the truth is the minimum, and it is found from a rough start."""
     scene = make_scene()

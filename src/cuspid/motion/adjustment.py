@@ -198,7 +198,19 @@ def _moved(state: State, observations: Observations, weighting: Weighting, prior
     )
     if weighting.calibrated:
         moved = _with_calibration(moved, prior, state.whitened + step[size:].reshape(state.whitened.shape))
-    return settle(moved, observations, weighting)
+    return _in_front(settle(moved, observations, weighting), state.points, observations)
+
+
+def _in_front(state: State, before: Float[np.ndarray, "p 3"], observations: Observations) -> State:
+    """A state in which points that went behind a camera are where they were before: one such point, whose rays hardly
+    meet, must not hold up the others."""
+    lost = ~np.isfinite(residual_vectors(state, observations)).all(axis=1)
+    if not lost.any():
+        return state
+    points = state.points.copy()
+    which = np.unique(np.repeat(np.arange(len(points)), np.diff(observations.start))[lost])
+    points[which] = before[which]
+    return state._replace(points=points)
 
 
 # --- minimisation ------------------------------------------------------------------------------------------------
