@@ -201,6 +201,18 @@ def test_the_handpiece_follows_the_gum_where_teeth_are_missing(
     assert "fewer than two cameras see the jaw in focus" not in caplog.text
 
 
+def test_a_rolled_handpiece_keeps_its_distance_over_a_gap_too(coarse_phantom: Jaw) -> None:
+    jaw = with_gap(coarse_phantom, (34, 35, 36), coarse_phantom.mesh.bounds[1, 2] - 11.0)
+    curve = arch_curve(jaw)
+    steady = steady_path(jaw.mesh, curve, there_and_back((30.0,), 0.0, float(curve.lengths_mm[-1])))
+    middle = float(steady.stations_mm[int(steady.sinks_mm.argmax())])
+    world_from_rig = steady.rig_from_world(middle).inverse()
+    ticks = np.linspace(-1.5, 1.5, 5)
+    above = np.stack(np.meshgrid(ticks, ticks, 8.0), axis=-1).reshape(-1, 3)
+    hits = jaw.mesh.cast(world_from_rig.apply(above), np.broadcast_to(-world_from_rig.rotation[:, 2], above.shape))
+    assert abs(8.0 - np.median(hits.distances)) < 1.0, "the surface lies where it looks"
+
+
 # --- the hand -----------------------------------------------------------------------------------------------------
 
 

@@ -89,7 +89,7 @@ class SteadyPath:
         """The handpiece without the drift of a hand."""
         length, roll = self.place(travel_mm)
         sink = float(np.interp(length, self.stations_mm, self.sinks_mm))
-        hold_from_world = Rigid3(np.eye(3), np.array([0, 0, sink])) @ self.curve.rig_from_world(length)
+        hold_from_world = _hold_from_world(self.curve, length, sink)
         if self.legs == (Leg(roll_deg=0.0, start_mm=self.legs[0].start_mm, end_mm=self.legs[0].end_mm),):
             return hold_from_world
         at_rolls = [np.interp(length, self.stations_mm, lifts) for lifts in self.lifts_mm]
@@ -109,14 +109,16 @@ def steady_path(mesh: Mesh, curve: ArchCurve, legs: tuple[Leg, ...]) -> SteadyPa
     low, high = (pick(at for leg in legs for at in (leg.start_mm, leg.end_mm)) for pick in (min, max))
     stations = np.linspace(low, high, max(2, round((high - low) / _STATION_MM)))
     rolls = np.unique([leg.roll_deg for leg in legs])
+    sinks = _sinks(mesh, curve, stations)
+    holds = [_hold_from_world(curve, float(at), float(sink)) for at, sink in zip(stations, sinks, strict=True)]
     return SteadyPath(
         curve=curve,
         legs=legs,
         travel_mm=_travel(legs),
         stations_mm=stations,
         rolls_deg=rolls,
-        lifts_mm=np.array([_lifts(mesh, curve, stations, float(roll)) for roll in rolls]),
-        sinks_mm=_sinks(mesh, curve, stations),
+        lifts_mm=np.array([_lifts(mesh, holds, float(roll)) for roll in rolls]),
+        sinks_mm=sinks,
     )
 
 
@@ -128,6 +130,10 @@ def _travel(legs: tuple[Leg, ...]) -> Float[np.ndarray, "k"]:
         at.append(at[-1] + float(np.hypot(turn, leg.start_mm - before.end_mm)))
         at.append(at[-1] + leg.length_mm)
     return np.array(at)
+
+
+def _hold_from_world(curve: ArchCurve, length_mm: float, sink_mm: float) -> Rigid3:
+    return Rigid3(np.eye(3), np.array([0, 0, sink_mm])) @ curve.rig_from_world(length_mm)
 
 
 def _rig_from_hold(roll_deg: float, lift_mm: float) -> Rigid3:
@@ -144,21 +150,19 @@ def _rig_from_hold(roll_deg: float, lift_mm: float) -> Rigid3:
     return Rigid3(rotation, -rotation @ (np.array([0, across, -down]) + lift_mm * outward))
 
 
-def _lifts(
-    mesh: Mesh, curve: ArchCurve, stations_mm: Float[np.ndarray, "s"], roll_deg: float
-) -> Float[np.ndarray, "s"]:
+def _lifts(mesh: Mesh, hold_from_world: Sequence[Rigid3], roll_deg: float) -> Float[np.ndarray, "s"]:
     """How far a rolled handpiece must move out, or in (negative), for its working distance to be kept.
 
     Rays on a patch square before it find the surface. What stands out most nearby counts, so that the handpiece does
     not dive behind the last crown; then smoothed along the arch, for a hand does not follow each crown.
     """
     if roll_deg == 0:
-        return np.zeros(len(stations_mm))
+        return np.zeros(len(hold_from_world))
     ticks = np.linspace(-_PATCH_MM, _PATCH_MM, 5)
     patch = np.stack(np.meshgrid(ticks, ticks, _FAR_MM), axis=-1).reshape(-1, 3)
-    lifts = np.zeros(len(stations_mm))
-    for index, length in enumerate(stations_mm):
-        world_from_rig = (_rig_from_hold(roll_deg, 0.0) @ curve.rig_from_world(float(length))).inverse()
+    lifts = np.zeros(len(hold_from_world))
+    for index, hold in enumerate(hold_from_world):
+        world_from_rig = (_rig_from_hold(roll_deg, 0.0) @ hold).inverse()
         hits = mesh.cast(world_from_rig.apply(patch), np.broadcast_to(-world_from_rig.rotation[:, 2], patch.shape))
         heights = _FAR_MM - hits.distances[hits.distances < 2 * _FAR_MM]
         lifts[index] = np.median(heights) if len(heights) else 0.0
