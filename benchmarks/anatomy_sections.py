@@ -214,6 +214,7 @@ def mouth(result: Result) -> str:
     )
 
 
+_LONGEST_PLAN_S = 60.0
 _JAW_COLUMNS = {
     "faces": "faces",
     "frames": "frames",
@@ -225,6 +226,7 @@ _JAW_COLUMNS = {
     "mean um": "mean_um",
     "P95 um": "p95_um",
     "mean of everything um": "everything_mean_um",
+    "what could be seen within 50 um %": "seen_complete_50_um_pct",
     "open crown within 50 um %": "crown_complete_50_um_pct",
     "images to mesh, CPU s": "reconstruction_cpu_s",
     "peak GB": "peak_gb",
@@ -246,7 +248,8 @@ def jaws(result: Result) -> str:
         [
             f"{len(scans)} of {result['cases']} were tried (at {of}); {len(planned)} came to the end. A name with "
             "*smooth* is a coarse jaw after two Loop subdivisions; quadrants, single teeth and jaws with gaps are cut "
-            "from smooth ones, turned at random and without labels. Twelve cameras; `python benchmarks/jaws.py`.",
+            "from smooth ones, turned at random and without labels. Twelve cameras, seed 0; bar of planning: "
+            f"{_LONGEST_PLAN_S:g} s; load of the machine at the end: {result['load'][0]:g}. `python benchmarks/jaws.py`.",
             "",
             markdown_table(("jaw", *heads, "failed because, or note"), rows),
         ]
@@ -257,4 +260,6 @@ def _jaw_figure(scan: Result, key: str) -> str:
     value = scan.get(key)
     if value is None:
         return ""
+    if key == "plan_s":
+        return mark(value, _LONGEST_PLAN_S, 1)
     return f"{value:,}" if isinstance(value, int) else f"{value:.1f}"

@@ -21,12 +21,14 @@ def fuzz(result: Result) -> str:
     rows.append(
         ("all", sum(result["cases"].values()), mark(len(wrong), 0, 0), f"{max(result['slowest_s'].values()):.1f}")
     )
+    seeds = ", ".join(f"{first} to {last}" for first, last in result["seeds"])
     return "\n".join(
         [
             "Small inputs, damaged by a seed: bytes, lines, numbers and names changed, files cut, emptied, left out or "
             "swapped, and nonsense of formats' own (`tests/fuzzing.py`). Right is success, or one short line and "
             "status 1 or 2. Wrong are tracebacks, more than 10 CPU seconds or 2 GiB, noise of libraries, whatever is "
-            "left half-written or outside of `--out`. Bar: 0 of 10,000.",
+            "left half-written or outside of `--out`. Bar: 0 of 10,000. "
+            f"`OPENBLAS_NUM_THREADS=1 python benchmarks/fuzz.py`, seeds {seeds}.",
             "",
             markdown_table(("what reads them", "cases", "wrong", "slowest, s"), rows),
         ]
@@ -44,7 +46,7 @@ def kill(result: Result) -> str:
         [
             "Runs of a small scan and a small film are ended by KILL, TERM and INT at random moments, up to "
             f"three times each, and then finish ({result['runs']} runs). All files must equal those of an undisturbed "
-            "run, times and keys of results aside. Bar: 0 of 100.",
+            "run, times and keys of results aside. Bar: 0 of 100. `python benchmarks/kill.py`.",
             "",
             markdown_table(("verb", "undisturbed, s", "kills", "runs that differ"), rows),
         ]
@@ -64,7 +66,7 @@ def large(result: Result) -> str:
     return "\n".join(
         [
             f"A jaw of {result['faces']:,} faces. `evaluate` lays it on itself, without labels; from `view` a client "
-            f"takes all that is shown. Bar: {MOST_GIB:g} GiB.",
+            f"takes all that is shown. Bar: {MOST_GIB:g} GiB. `python benchmarks/large.py`.",
             "",
             markdown_table(("verb", "peak memory, GiB", "wall s", "CPU s"), rows),
         ]
