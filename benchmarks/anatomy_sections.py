@@ -249,7 +249,8 @@ def jaws(result: Result) -> str:
             f"{len(scans)} of {result['cases']} were tried (at {of}); {len(planned)} came to the end. A name with "
             "*smooth* is a coarse jaw after two Loop subdivisions; quadrants, single teeth and jaws with gaps are cut "
             "from smooth ones, turned at random and without labels. Twelve cameras, seed 0; bar of planning: "
-            f"{_LONGEST_PLAN_S:g} s; load of the machine at the end: {result['load'][0]:g}. `python benchmarks/jaws.py`.",
+            f"{_LONGEST_PLAN_S:g} s; load of the machine at the end: {result['load'][0]:g}. "
+            "`python benchmarks/jaws.py`.",
             "",
             markdown_table(("jaw", *heads, "failed because, or note"), rows),
         ]
