@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from builders import box_mesh, handpiece, image_path, make_capture, shifted, sphere
-from cuspid import cli, storage
+from cuspid import __version__, cli, storage
 from cuspid.cli.scan import _evaluate_trajectory
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
@@ -112,6 +112,19 @@ def test_evaluate_works_on_meshes_that_cuspid_never_saw(tmp_path, capsys, jaw_li
 def test_the_module_runs():
     done = subprocess.run([sys.executable, "-m", "cuspid", "--help"], capture_output=True, text=True, check=True)
     assert all(verb in done.stdout for verb in cli.COMMANDS)
+
+
+def test_the_version(capsys):
+    run("--version")
+    assert capsys.readouterr().out == f"cuspid {__version__}\n"
+
+
+@pytest.mark.parametrize(("asked", "modules"), [(["view"], {"shared", "view"}), (["--version"], {"shared"})])
+def test_only_what_is_asked_for_is_loaded(asked, modules):
+    """To load everything takes seconds."""
+    code = f"import sys; from cuspid import cli; cli.commands({asked}); print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert {name.split(".")[2] for name in loaded if name.startswith("cuspid.cli.")} == modules
 
 
 def test_an_evaluation_keeps_nothing_of_another_one(tmp_path):

@@ -6,6 +6,7 @@ It takes seconds to load. Ctrl-C ends it then without a word; what is loaded mig
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,10 +24,12 @@ def _signals_of_our_own() -> Iterator[None]:
 
 
 def main() -> None:
-    """Load the command line and run a verb; signals are the main thread's."""
+    """Load what the verb needs and run it; signals are the main thread's."""
     if threading.current_thread() is threading.main_thread():
         with _signals_of_our_own():
-            import cuspid.cli  # noqa: F401
+            from cuspid import cli
+
+            cli.commands(sys.argv[1:])
     from cuspid import cli
 
     cli.main()

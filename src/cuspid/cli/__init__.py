@@ -5,58 +5,76 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import wraps
+from importlib import import_module
 from inspect import signature
 from typing import Any, get_type_hints
 
 import tyro
 
-from cuspid.cli.comparison import compare
-from cuspid.cli.film import film
-from cuspid.cli.forecasts import optics, precision, visibility
-from cuspid.cli.handpieces import design, handpiece
-from cuspid.cli.jaws import box, phantom, prepare
-from cuspid.cli.mouth import mouth
-from cuspid.cli.panorama import stitch
-from cuspid.cli.panorama_evaluation import stitch_eval
-from cuspid.cli.repeat import repeat
-from cuspid.cli.report import report
-from cuspid.cli.reproduction import reproduce
-from cuspid.cli.scan import evaluate, reconstruct, run, simulate
+from cuspid import __version__
 from cuspid.cli.shared import console
-from cuspid.cli.studies import sweep
-from cuspid.cli.surveys import measure, shape
-from cuspid.cli.view import view
 from cuspid.errors import CuspidError
 from cuspid.options import check
 
-COMMANDS: Mapping[str, Callable[..., Any]] = {
-    "run": run,
-    "phantom": phantom,
-    "measure": measure,
-    "shape": shape,
-    "prepare": prepare,
-    "box": box,
-    "mouth": mouth,
-    "handpiece": handpiece,
-    "design": design,
-    "optics": optics,
-    "visibility": visibility,
-    "precision": precision,
-    "compare": compare,
-    "sweep": sweep,
-    "simulate": simulate,
-    "film": film,
-    "stitch-eval": stitch_eval,
-    "reconstruct": reconstruct,
-    "evaluate": evaluate,
-    "stitch": stitch,
-    "reproduce": reproduce,
-    "repeat": repeat,
-    "report": report,
-    "view": view,
-}
+DESCRIPTION = (
+    f"cuspid {__version__}: passive intra-oral 3D scanning: simulate, reconstruct, and prove the accuracy. "
+    "What a verb does and takes: cuspid VERB --help."
+)
+
+
+class _Verbs(Mapping[str, Callable[..., Any]]):
+    """The function of each verb. Its module is loaded when it is asked for: to load them all takes seconds."""
+
+    def __init__(self, modules: Mapping[str, str]) -> None:
+        self._modules = modules
+
+    def __getitem__(self, verb: str) -> Callable[..., Any]:
+        return getattr(import_module(f"cuspid.cli.{self._modules[verb]}"), verb.replace("-", "_"))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._modules)
+
+    def __len__(self) -> int:
+        return len(self._modules)
+
+
+COMMANDS: Mapping[str, Callable[..., Any]] = _Verbs(
+    {
+        "run": "scan",
+        "phantom": "jaws",
+        "measure": "surveys",
+        "shape": "surveys",
+        "prepare": "jaws",
+        "box": "jaws",
+        "mouth": "mouth",
+        "handpiece": "handpieces",
+        "design": "handpieces",
+        "optics": "forecasts",
+        "visibility": "forecasts",
+        "precision": "forecasts",
+        "compare": "comparison",
+        "sweep": "studies",
+        "simulate": "scan",
+        "film": "film",
+        "stitch-eval": "panorama_evaluation",
+        "reconstruct": "scan",
+        "evaluate": "scan",
+        "stitch": "panorama",
+        "reproduce": "reproduction",
+        "repeat": "repeat",
+        "report": "report",
+        "view": "view",
+    }
+)
+
+
+def commands(arguments: Sequence[str]) -> dict[str, Callable[..., None]]:
+    """The verb that the arguments begin with, none for ``--version``, or else all; what they need is loaded."""
+    first = arguments[0] if arguments else ""
+    named = [first] if first in COMMANDS else [] if first == "--version" else COMMANDS
+    return {verb: _checked(verb, COMMANDS[verb]) for verb in named}
 
 
 def _checked(name: str, verb: Callable[..., None]) -> Callable[..., None]:
@@ -85,7 +103,7 @@ def main(arguments: list[str] | None = None) -> None:
     log.setLevel(logging.INFO)
     log.handlers = [_Notes()]
     try:
-        _run(arguments)
+        _run(sys.argv[1:] if arguments is None else arguments)
     except CuspidError as error:
         console.print(f"cuspid: {error}", style="red", soft_wrap=True, highlight=False)
         sys.exit(1)
@@ -97,13 +115,15 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(1)
 
 
-def _run(arguments: list[str] | None) -> None:
+def _run(arguments: Sequence[str]) -> None:
+    verbs = commands(arguments)
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            {name: _checked(name, verb) for name, verb in COMMANDS.items()},
-            prog="cuspid",
-            description="Passive intra-oral 3D scanning: simulate, reconstruct, and prove the accuracy.",
-            args=arguments,
-        )
+        if not verbs:
+            print(f"cuspid {__version__}")
+        elif len(verbs) == 1:
+            ((name, verb),) = verbs.items()
+            tyro.cli(verb, prog=f"cuspid {name}", args=arguments[1:])
+        else:
+            tyro.extras.subcommand_cli_from_dict(verbs, prog="cuspid", description=DESCRIPTION, args=arguments)
     finally:
         sys.stdout.flush()
