@@ -18,7 +18,7 @@ from cuspid.motion import MotionOptions, locate
 from cuspid.motion.features import DESCRIPTOR_NORM, Features
 from cuspid.motion.location import _loose_notes, locate_features, stereo_ties
 from cuspid.motion.odometry import Edge, OdometryOptions, chain, polish, triangulate_frame
-from cuspid.motion.pairs import MatchingOptions, make_view
+from cuspid.motion.pairs import MatchingOptions, index_features
 from cuspid.pairing import stereo_pairs
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import Handpiece, MountedCamera, Rig
@@ -279,7 +279,7 @@ def test_a_frame_is_triangulated_in_the_rig_frame() -> None:
     """Points of one frame are where they are, seen by two or more cameras of the group only."""
     handpiece, path = make_handpiece(), make_path(1)
     seen = see(handpiece, path)
-    views = {c: make_view(seen["00000", c], m.camera) for c, m in handpiece.rig.cameras.items()}
+    views = {c: index_features(seen["00000", c], m.camera) for c, m in handpiece.rig.cameras.items()}
     cloud = triangulate_frame(handpiece, stereo_pairs(handpiece.rig, 5.0), views, MatchingOptions())
     x, y, z = cloud.points.T
     assert len(z) > 100

@@ -13,7 +13,14 @@ from hypothesis.extra.numpy import arrays
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.motion.features import DESCRIPTOR_NORM, Features
-from cuspid.motion.pairs import MatchingOptions, View, frame_pairs, make_view, match_guided, match_unguided
+from cuspid.motion.pairs import (
+    IndexedFeatures,
+    MatchingOptions,
+    frame_pairs,
+    index_features,
+    match_guided,
+    match_unguided,
+)
 from cuspid.motion.tracks import intersect_rays, join, thin
 
 B_FROM_A = Rigid3.from_rotation_vector(np.array([0.02, -0.05, 0.03]), np.array([-1.2, 0.3, 0.1]))
@@ -25,17 +32,19 @@ def descriptors(rng: np.random.Generator, count: int) -> np.ndarray:
     return np.minimum(DESCRIPTOR_NORM * np.sqrt(raw / raw.sum(axis=1, keepdims=True)), 255).astype(np.uint8)
 
 
-def view_of(pixels: np.ndarray, words: np.ndarray, camera: Camera) -> View:
+def view_of(pixels: np.ndarray, words: np.ndarray, camera: Camera) -> IndexedFeatures:
     """Keypoints at given places."""
-    return make_view(Features(pixels=pixels, descriptors=words, colors=np.zeros((len(pixels), 3), np.uint8)), camera)
+    return index_features(
+        Features(pixels=pixels, descriptors=words, colors=np.zeros((len(pixels), 3), np.uint8)), camera
+    )
 
 
-def full_range(view: View) -> tuple[np.ndarray, np.ndarray]:
+def full_range(view: IndexedFeatures) -> tuple[np.ndarray, np.ndarray]:
     """A generous depth of field."""
     return np.full(len(view.features), 2.0), np.full(len(view.features), 10.0)
 
 
-def scene(seed: int, count: int = 60) -> tuple[View, View, np.ndarray]:
+def scene(seed: int, count: int = 60) -> tuple[IndexedFeatures, IndexedFeatures, np.ndarray]:
     """Two distorted views of points, and the depth of the points in the first."""
     rng = np.random.default_rng(seed)
     camera = Camera.from_field_of_view(500, 500, 62.0)
@@ -183,6 +192,6 @@ def test_ambiguous_matches_are_refused(ratio: float) -> None:
         colors=np.repeat(features.colors, 2, axis=0),
     )
     wide = MatchingOptions(ratio=ratio, tolerance_px=20.0)
-    twice = make_view(double, Camera.from_field_of_view(500, 500, 62.0))
+    twice = index_features(double, Camera.from_field_of_view(500, 500, 62.0))
     assert len(match_guided(a, b, B_FROM_A, full_range(a), full_range(b), wide)) == 1
     assert len(match_guided(a, twice, B_FROM_A, full_range(a), full_range(twice), wide)) == 0

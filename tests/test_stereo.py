@@ -25,10 +25,10 @@ from cuspid.stereo.confidence import (
     confidence,
     without_speckle,
 )
+from cuspid.stereo.initial_depth import initial_pairs, semi_global
 from cuspid.stereo.matching import DepthEstimator, StereoOptions, coarser, group_geometry
 from cuspid.stereo.rectification import IdealView, rectify
 from cuspid.stereo.refinement import image_noise
-from cuspid.stereo.seeds import seed_pairs, semi_global
 from synthetic_scene import cast_depth, diamond, height_field, render
 
 HILLS = height_field(lambda x, y: 5 + 0.25 * np.sin(1.8 * x) * np.cos(1.5 * y))
@@ -243,7 +243,7 @@ def test_semi_global_matching_finds_a_known_shift() -> None:
 def test_each_camera_gets_its_widest_partner() -> None:
     handpiece = diamond()
     group = camera_groups(handpiece.rig, 5.0)[0]
-    assert set(seed_pairs(handpiece.rig, group, stereo_pairs(handpiece.rig, 5.0))) == {
+    assert set(initial_pairs(handpiece.rig, group, stereo_pairs(handpiece.rig, 5.0))) == {
         ("west", "east"),
         ("north", "south"),
     }

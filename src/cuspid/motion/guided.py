@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from cuspid.errors import InputError
 from cuspid.motion.adjustment import AdjustmentOptions, adjust_model
 from cuspid.motion.features import Features
-from cuspid.motion.pairs import MatchingOptions, View, make_view, match_guided
+from cuspid.motion.pairs import IndexedFeatures, MatchingOptions, index_features, match_guided
 from cuspid.motion.tracks import intersect_rays, join
 from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
@@ -74,7 +74,7 @@ def refine(
     """
     model = _rescaled(model)
     for number, (tolerance_px, share) in enumerate(zip(options.tolerances_px, options.depth_shares, strict=True)):
-        views = [make_view(each, model.camera) for each in features]
+        views = [index_features(each, model.camera) for each in features]
         matching = replace(options.matching, tolerance_px=tolerance_px)
         track, image_of = _tracks(model, views, matching, share, options.steps)
         limit_px = options.start_px / (1 if number == 0 else 2)
@@ -104,7 +104,7 @@ def _bounds(
 
 
 def _tracks(
-    model: SparseModel, views: Sequence[View], matching: MatchingOptions, share: float, steps: Sequence[int]
+    model: SparseModel, views: Sequence[IndexedFeatures], matching: MatchingOptions, share: float, steps: Sequence[int]
 ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
     """Track and frame of every keypoint of all frames, one after the other."""
     poses = list(model.cam_from_world.values())
@@ -127,7 +127,7 @@ def _tracks(
 def _triangulated(
     model: SparseModel,
     features: Sequence[Features],
-    views: Sequence[View],
+    views: Sequence[IndexedFeatures],
     track: Int[np.ndarray, "n"],
     image_of: Int[np.ndarray, "n"],
     limit_px: float,

@@ -21,15 +21,15 @@ from cuspid.motion.closure import Image, closing_pairs
 from cuspid.motion.features import FeatureOptions, Features, detect_all
 from cuspid.motion.odometry import (
     Cloud,
+    FrameFeatures,
     OdometryOptions,
     Trajectory,
-    Views,
     chain,
     find_edges,
     rays_in_rig,
     triangulate_frame,
 )
-from cuspid.motion.pairs import MatchingOptions, frame_pairs, make_view, match_guided
+from cuspid.motion.pairs import MatchingOptions, frame_pairs, index_features, match_guided
 from cuspid.motion.tracks import intersect_rays, join, thin
 from cuspid.options import SEED, SHARE, Options, Range
 from cuspid.pairing import PairingOptions, resolved_mm, stereo_pairs
@@ -88,7 +88,7 @@ class _Numbering:
     """Index of the camera of each keypoint."""
 
     @staticmethod
-    def of(frames: Sequence[Views], rig: Rig) -> _Numbering:
+    def of(frames: Sequence[FrameFeatures], rig: Rig) -> _Numbering:
         """Number the keypoints of frames."""
         sizes = {(f, name): len(view.features) for f, views in enumerate(frames) for name, view in views.items()}
         counts = list(sizes.values())
@@ -106,7 +106,7 @@ class _Scan:
     """The located frames."""
 
     handpiece: Handpiece
-    frames: Sequence[Views]
+    frames: Sequence[FrameFeatures]
     clouds: Sequence[Cloud]
     poses: Sequence[Rigid3]
 
@@ -251,7 +251,11 @@ def locate_features(
     rig, log = handpiece.rig, dict[str, float]()
     options = _loosened(options, 2 * calibration_sigma_px(rig, handpiece.working_distance_mm))
     frames = [
-        {c: make_view(features[name, c], mounted.camera) for c, mounted in rig.cameras.items() if (name, c) in features}
+        {
+            c: index_features(features[name, c], mounted.camera)
+            for c, mounted in rig.cameras.items()
+            if (name, c) in features
+        }
         for name in names
     ]
     with _timed(log, "triangulation"):

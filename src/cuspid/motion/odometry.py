@@ -22,13 +22,13 @@ from cuspid.graph import graph_of, parts_of
 from cuspid.motion.colmap import colmap_camera, colmap_rigid, rigid_from_colmap
 from cuspid.motion.features import Features, spread
 from cuspid.motion.normal_equations import pose_equations
-from cuspid.motion.pairs import MatchingOptions, View, match_guided, match_unguided
+from cuspid.motion.pairs import IndexedFeatures, MatchingOptions, match_guided, match_unguided
 from cuspid.motion.tracks import intersect_rays, join
 from cuspid.options import SHARE, Options, Range
 from cuspid.rig import Handpiece, Rig
 from cuspid.workers import map_in_threads
 
-Views = Mapping[str, View]
+FrameFeatures = Mapping[str, IndexedFeatures]
 """Keypoints of one frame by camera."""
 
 _SEARCHED = 8.0
@@ -97,7 +97,7 @@ class Trajectory:
     """The other frames."""
 
 
-def _searched_mm(handpiece: Handpiece, view: View) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+def _searched_mm(handpiece: Handpiece, view: IndexedFeatures) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Least and greatest depth at which each keypoint is sought where nothing is known of it."""
     near, far = handpiece.depth_range_mm
     return np.full(len(view.features), near), np.full(len(view.features), _SEARCHED * far)
@@ -105,7 +105,7 @@ def _searched_mm(handpiece: Handpiece, view: View) -> tuple[Float[np.ndarray, "n
 
 def _consistent(
     rig: Rig,
-    views: Views,
+    views: FrameFeatures,
     points: Float[np.ndarray, "p 3"],
     track: Mapping[str, Int[np.ndarray, "_"]],
     limit_px: float,
@@ -122,7 +122,7 @@ def _consistent(
     return good
 
 
-def rays_in_rig(rig: Rig, views: Views) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+def rays_in_rig(rig: Rig, views: FrameFeatures) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Centre and direction, in the rig frame, of every keypoint of a frame, camera after camera."""
     centres, directions = [], []
     for camera, view in views.items():
@@ -134,7 +134,7 @@ def rays_in_rig(rig: Rig, views: Views) -> tuple[Float[np.ndarray, "n 3"], Float
 
 
 def triangulate_frame(
-    handpiece: Handpiece, pairs: Sequence[tuple[str, str]], views: Views, options: MatchingOptions
+    handpiece: Handpiece, pairs: Sequence[tuple[str, str]], views: FrameFeatures, options: MatchingOptions
 ) -> Cloud:
     """Match the camera pairs of one frame along their epipolar lines and triangulate."""
     rig, matches = handpiece.rig, []
@@ -172,7 +172,7 @@ def _subset(features: Features, indices: Int[np.ndarray, "k"]) -> Features:
     )
 
 
-def _best_known(cloud: Cloud, view: View, camera: str, count: int) -> Int[np.ndarray, "k"]:
+def _best_known(cloud: Cloud, view: IndexedFeatures, camera: str, count: int) -> Int[np.ndarray, "k"]:
     """Keypoints that have a point, well spread, those whose points most cameras saw first."""
     known = np.flatnonzero(cloud.point_of[camera] >= 0)
     sightings = np.bincount(np.concatenate([p[p >= 0] for p in cloud.point_of.values()]), minlength=1)
@@ -181,7 +181,7 @@ def _best_known(cloud: Cloud, view: View, camera: str, count: int) -> Int[np.nda
 
 
 def _sightings(
-    rig: Rig, cloud: Cloud, source: Views, target: Views, options: OdometryOptions
+    rig: Rig, cloud: Cloud, source: FrameFeatures, target: FrameFeatures, options: OdometryOptions
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 2"], Int[np.ndarray, "k"]]:
     """Points of a cloud, where the cameras of another frame see them (px), and the index of that camera in the rig."""
     points, pixels, cameras = [np.zeros((0, 3))], [np.zeros((0, 2))], [np.zeros(0, np.int64)]
@@ -225,7 +225,9 @@ def polish(
     return Rigid3.from_rotation_vector(pose.rotation_vector.round(_DECIMALS), rounded_mm)
 
 
-def relative_pose(rig: Rig, cloud: Cloud, source: Views, target: Views, options: OdometryOptions, seed: int) -> Edge:
+def relative_pose(
+    rig: Rig, cloud: Cloud, source: FrameFeatures, target: FrameFeatures, options: OdometryOptions, seed: int
+) -> Edge:
     """Pose of the target frame relative to the frame of the cloud."""
     points, pixels, cameras = _sightings(rig, cloud, source, target, options)
     if len(points) < options.minimum_matches:
@@ -257,7 +259,7 @@ def _parts(edges: Mapping[tuple[int, int], Edge], count: int) -> Int[np.ndarray,
 
 
 def find_edges(
-    rig: Rig, frames: Sequence[Views], clouds: Sequence[Cloud], options: OdometryOptions, seed: int
+    rig: Rig, frames: Sequence[FrameFeatures], clouds: Sequence[Cloud], options: OdometryOptions, seed: int
 ) -> dict[tuple[int, int], Edge]:
     """Relative poses at +1 and, between parts that are still apart, at +2 and farther."""
 

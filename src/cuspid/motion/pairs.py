@@ -41,8 +41,8 @@ class MatchingOptions(Options):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class View:
-    """Keypoints of an image, ready for guided matching."""
+class IndexedFeatures:
+    """Keypoints of an image, sorted into cells for guided matching."""
 
     features: Features
     """The keypoints."""
@@ -58,7 +58,7 @@ class View:
     """Ideal coordinates of the grid's corner, px, and its number of columns and rows."""
 
 
-def make_view(features: Features, camera: Camera) -> View:
+def index_features(features: Features, camera: Camera) -> IndexedFeatures:
     """Undistort the keypoints and sort them into cells."""
     ideal = camera.rays(features.pixels)[:, :2]
     focal = float(np.mean(camera.focal_px))
@@ -67,7 +67,7 @@ def make_view(features: Features, camera: Camera) -> View:
     columns, rows = (cells.max(axis=0, initial=0) + 1).tolist()
     flat = cells[:, 1] * columns + cells[:, 0]
     order = np.argsort(flat, kind="stable")
-    return View(
+    return IndexedFeatures(
         features=features,
         ideal=ideal,
         focal_px=focal,
@@ -183,8 +183,8 @@ def _match_one_way(a, b, low, high, rotation, translation, options):
 
 
 def _guided(
-    a: View,
-    b: View,
+    a: IndexedFeatures,
+    b: IndexedFeatures,
     b_from_a: Rigid3,
     bounds_mm: tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]],
     options: MatchingOptions,
@@ -210,8 +210,8 @@ def _mutual(forward: Int[np.ndarray, "n"], backward: Int[np.ndarray, "m"]) -> In
 
 
 def match_guided(
-    a: View,
-    b: View,
+    a: IndexedFeatures,
+    b: IndexedFeatures,
     b_from_a: Rigid3,
     bounds_a_mm: tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]],
     bounds_b_mm: tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]],

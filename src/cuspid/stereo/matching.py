@@ -29,9 +29,9 @@ from cuspid.stereo.confidence import (
     sure_enough,
     without_speckle,
 )
+from cuspid.stereo.initial_depth import PairMatcher, initial_pairs, initial_points, semi_global
 from cuspid.stereo.rectification import IdealView, RectifiedPair, rectify
 from cuspid.stereo.refinement import SCORE, VARIANCE, GroupGeometry, Q, RefinementOptions, image_noise, refine
-from cuspid.stereo.seeds import PairMatcher, seed_pairs, seed_points, semi_global
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,8 +40,8 @@ class StereoOptions(Options):
 
     spacing_px: Annotated[int, Range(1, 100)] = 3
     """Depth is measured at every so many pixels."""
-    seed_scale: Annotated[float, Range(0.05, 1)] = 0.5
-    """Resolution of the first matching relative to the images."""
+    initial_scale: Annotated[float, Range(0.05, 1)] = 0.5
+    """Resolution of the initial matching relative to the images."""
     pairing: PairingOptions = field(default_factory=PairingOptions)
     """Which cameras make a group."""
     refinement: RefinementOptions = field(default_factory=RefinementOptions)
@@ -57,7 +57,7 @@ class Group:
     views: tuple[IdealView, ...]
     """The cameras without distortion."""
     pairs: tuple[RectifiedPair, ...]
-    """Pairs that give the first depths."""
+    """Pairs that give the initial depths."""
     geometry: tuple[GroupGeometry, ...]
     """For each camera as the reference."""
     grids: tuple[Camera, ...]
@@ -91,7 +91,7 @@ def group_geometry(views: Sequence[IdealView], reference: int) -> GroupGeometry:
     return GroupGeometry(np.array(infinite), np.array(parallax) / scale, scale, np.array(others))
 
 
-def seed_layer(points_in_rig: Float[np.ndarray, "n 3"], view: IdealView, grid: Camera) -> Float[np.ndarray, "h w"]:
+def initial_layer(points_in_rig: Float[np.ndarray, "n 3"], view: IdealView, grid: Camera) -> Float[np.ndarray, "h w"]:
     """Depth of the nearest point in each pixel of the grid, NaN where there is none."""
     in_cam = view.cam_from_rig.apply(points_in_rig)
     pixels = grid.project(in_cam)
@@ -157,10 +157,10 @@ class DepthEstimator:
     def _prepare(self, rig: Rig, names: tuple[str, ...]) -> Group:
         views = tuple(IdealView.of(name, rig[name]) for name in names)
         possible = stereo_pairs(rig, self.handpiece.working_distance_mm, self.options.pairing)
-        pairs = seed_pairs(rig, names, possible)
+        pairs = initial_pairs(rig, names, possible)
         return Group(
             views=views,
-            pairs=tuple(rectify(pair, rig[pair[0]], rig[pair[1]], self.options.seed_scale) for pair in pairs),
+            pairs=tuple(rectify(pair, rig[pair[0]], rig[pair[1]], self.options.initial_scale) for pair in pairs),
             geometry=tuple(group_geometry(views, index) for index in range(len(views))),
             grids=tuple(coarser(view.camera, self.options.spacing_px) for view in views),
         )
@@ -180,9 +180,9 @@ class DepthEstimator:
     ) -> list[DepthMap]:
         gray = {view.name: _gray(images[view.name]) for view in group.views}
         depth_range = self.handpiece.depth_range_mm
-        seeds = [seed_points(pair, gray, self.matcher, depth_range) for pair in group.pairs]
+        initial = [initial_points(pair, gray, self.matcher, depth_range) for pair in group.pairs]
         stack, sizes = stack_images([view.resample(gray[view.name]) for view in group.views])
-        measured = [self._measure_reference(group, index, seeds, stack, sizes) for index in range(len(group.views))]
+        measured = [self._measure_reference(group, index, initial, stack, sizes) for index in range(len(group.views))]
         return [
             self._depth_map(measured, index, view, images[view.name], frame) for index, view in enumerate(group.views)
         ]
@@ -191,12 +191,12 @@ class DepthEstimator:
         self,
         group: Group,
         index: int,
-        seeds: Sequence[Float[np.ndarray, "_ 3"]],
+        initial: Sequence[Float[np.ndarray, "_ 3"]],
         stack: Float[np.ndarray, "c h w"],
         sizes: Int[np.ndarray, "c 2"],
     ) -> Measured:
         view, grid, geometry = group.views[index], group.grids[index], group.geometry[index]
-        layers = np.stack([seed_layer(points, view, grid) for points in seeds])
+        layers = np.stack([initial_layer(points, view, grid) for points in initial])
         planes = refine(
             stack,
             sizes,

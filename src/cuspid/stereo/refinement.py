@@ -361,8 +361,8 @@ def _best_start(view, limits, buffers, u, v, count):
 
 @njit(**FAST)
 @no_type_check
-def _gather_candidates(field, seeds, row, column, direction, spacing, candidates):
-    """Planes of neighbours that were visited before, carried on to this pixel, and seeds that none of them explains."""
+def _gather_candidates(field, initial, row, column, direction, spacing, candidates):
+    """Planes of neighbours that were visited before, carried on to this pixel, and initial ones that differ."""
     rows, columns = field.shape[:2]
     count = 0
     for dr, dc in ((0, -1), (-1, 0), (-1, -1), (-1, 1)):
@@ -374,26 +374,26 @@ def _gather_candidates(field, seeds, row, column, direction, spacing, candidates
             if count == 0 or abs(plane[0] - candidates[0, 0]) > 0.3:
                 count += 1
     explained = count
-    for layer in range(seeds.shape[0]):
-        seed = seeds[layer, row, column]
-        fresh = seed > 0
+    for layer in range(initial.shape[0]):
+        q = initial[layer, row, column]
+        fresh = q > 0
         for k in range(explained):
-            fresh = fresh and abs(candidates[k, 0] - seed) > 1.0
+            fresh = fresh and abs(candidates[k, 0] - q) > 1.0
         if fresh:
-            candidates[count, 0], candidates[count, 1], candidates[count, 2] = seed, 0.0, 0.0
+            candidates[count, 0], candidates[count, 1], candidates[count, 2] = q, 0.0, 0.0
             count += 1
     return count
 
 
 @njit(**FAST)
 @no_type_check
-def _visit(view, limits, buffers, seeds, field, row, column, direction):
+def _visit(view, limits, buffers, initial, field, row, column, direction):
     """Refine a pixel from the best of its candidates; writes the field where it correlates as well as it should."""
     u, v = view.spacing // 2 + column * view.spacing, view.spacing // 2 + row * view.spacing
     height, width = view.sizes[view.reference]
     if not (view.radius <= u < width - view.radius and view.radius <= v < height - view.radius):
         return
-    count = _gather_candidates(field, seeds, row, column, direction, view.spacing, buffers.candidates)
+    count = _gather_candidates(field, initial, row, column, direction, view.spacing, buffers.candidates)
     if count == 0:
         return
     contrast = _load_template(view, u, v, buffers.template)
@@ -410,9 +410,9 @@ def _visit(view, limits, buffers, seeds, field, row, column, direction):
 
 @njit(**FAST)
 @no_type_check
-def _refine_field(view, limits, buffers, seeds, propagations):
+def _refine_field(view, limits, buffers, initial, propagations):
     """Visit the pixels that have no plane yet, in raster order and against it, ``propagations`` times."""
-    rows, columns = seeds.shape[1:]
+    rows, columns = initial.shape[1:]
     field = np.zeros((rows, columns, 6))
     for number in range(2 * propagations):
         direction = 1 - 2 * (number % 2)
@@ -421,7 +421,7 @@ def _refine_field(view, limits, buffers, seeds, propagations):
             for k in range(columns):
                 column = k if direction > 0 else columns - 1 - k
                 if field[row, column, SCORE] == 0:
-                    _visit(view, limits, buffers, seeds, field, row, column, direction)
+                    _visit(view, limits, buffers, initial, field, row, column, direction)
     return field
 
 
@@ -430,7 +430,7 @@ def refine(
     sizes: Int[np.ndarray, "c 2"],
     reference: int,
     geometry: GroupGeometry,
-    seeds_mm: Float[np.ndarray, "l rows columns"],
+    initial_mm: Float[np.ndarray, "l rows columns"],
     depth_range_mm: tuple[float, float],
     spacing_px: int,
     noise_dn: float,
@@ -439,7 +439,7 @@ def refine(
     """Refined planes on a grid of every ``spacing_px``-th pixel; SCORE is 0 where nothing was found.
 
     ``images`` are grey values 0 to 255 in float32, padded to one size; ``sizes`` are their true heights and widths.
-    ``seeds_mm`` are layers of first depths on the grid, NaN where there is none; ``noise_dn`` is the noise of the
+    ``initial_mm`` are layers of initial depths on the grid, NaN where there is none; ``noise_dn`` is the noise of the
     reference image.
     """
     window = patch_window(options)
@@ -468,9 +468,9 @@ def refine(
         least_contrast=options.least_contrast * noise_dn,
         effective=float(1 / np.sum(window[2].astype(np.float64) ** 2)),
     )
-    buffers = _new_buffers(window.shape[1], len(geometry.others), len(seeds_mm))
-    seeds = np.nan_to_num(geometry.scale / seeds_mm).astype(np.float64)
-    return np.asarray(_refine_field(view, limits, buffers, seeds, options.propagations))
+    buffers = _new_buffers(window.shape[1], len(geometry.others), len(initial_mm))
+    initial = np.nan_to_num(geometry.scale / initial_mm).astype(np.float64)
+    return np.asarray(_refine_field(view, limits, buffers, initial, options.propagations))
 
 
 def _new_buffers(samples: int, others: int, layers: int) -> _Buffers:

@@ -114,8 +114,8 @@ def _to_border(px: Float[np.ndarray, "h w 2"], camera: Camera) -> Float[np.ndarr
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """One frame over the canvas."""
+class PlacedFrame:
+    """Where on the canvas a frame lies."""
 
     camera: Camera
     cam_from_world: Rigid3
@@ -154,16 +154,16 @@ def make_canvas(motion: SparseModel, camera: Camera, mm_per_px: float | None) ->
     return Canvas(origin_px=np.array([-low[0], high[1]]) / size, mm_per_px=size, width=width, height=height)
 
 
-def place(canvas: Canvas, camera: Camera, cam_from_world: Rigid3) -> View:
+def place(canvas: Canvas, camera: Camera, cam_from_world: Rigid3) -> PlacedFrame:
     """The part of the canvas that a frame can see, in whole cells."""
     corners = canvas.pixels(footprint(camera, cam_from_world, 0.0))
     limits = np.array([canvas.width, canvas.height])
     low = np.clip(np.floor(corners.min(axis=0) / CELL_PX) * CELL_PX, 0, limits - CELL_PX).astype(int)
     high = np.clip(np.ceil(corners.max(axis=0) / CELL_PX) * CELL_PX, low + CELL_PX, limits).astype(int)
-    return View(camera, cam_from_world, *low.tolist(), *(high - low).tolist())
+    return PlacedFrame(camera, cam_from_world, *low.tolist(), *(high - low).tolist())
 
 
-def positions(canvas: Canvas, view: View, surface: HeightMap, step: int) -> Float[np.ndarray, "r c 3"]:
+def positions(canvas: Canvas, view: PlacedFrame, surface: HeightMap, step: int) -> Float[np.ndarray, "r c 3"]:
     """World places on the surface at the middle of every block of ``step`` px of a view."""
     columns, rows = -(-view.width // step), -(-view.height // step)
     u, v = np.meshgrid(
@@ -174,7 +174,7 @@ def positions(canvas: Canvas, view: View, surface: HeightMap, step: int) -> Floa
     return np.concatenate([xy, surface.at(xy)[..., None]], axis=-1)
 
 
-def frame_map(canvas: Canvas, view: View, surface: HeightMap) -> Float[np.ndarray, "h w 2"]:
+def frame_map(canvas: Canvas, view: PlacedFrame, surface: HeightMap) -> Float[np.ndarray, "h w 2"]:
     """Where in the frame each pixel of a view lies, px (COLMAP's origin). float32."""
     world = positions(canvas, view, surface, _GRID_PX)
     px = view.camera.project(view.cam_from_world.apply(world)).astype(np.float32)
@@ -197,7 +197,7 @@ class _Glance:
 
 
 def glance(
-    canvas: Canvas, view: View, surface: HeightMap, image: UInt8[np.ndarray, "h w 3"], options: MosaicOptions
+    canvas: Canvas, view: PlacedFrame, surface: HeightMap, image: UInt8[np.ndarray, "h w 3"], options: MosaicOptions
 ) -> _Glance:
     """What a frame is worth in each cell: infinite where it does not see it."""
     world = positions(canvas, view, surface, CELL_PX)
@@ -223,7 +223,7 @@ def glance(
     return _Glance(cost.astype(np.float32), color, seen & bright, falloff.astype(np.float32))
 
 
-def _cells(view: View) -> tuple[slice, slice]:
+def _cells(view: PlacedFrame) -> tuple[slice, slice]:
     rows, columns = view.window
     return slice(rows.start // CELL_PX, rows.stop // CELL_PX), slice(columns.start // CELL_PX, columns.stop // CELL_PX)
 
@@ -337,7 +337,7 @@ def compose(
 
 def _survey(
     canvas: Canvas,
-    views: list[View],
+    views: list[PlacedFrame],
     names: tuple[str, ...],
     surface: HeightMap,
     read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
@@ -369,7 +369,7 @@ def _evened(best: _Best, compensation: Compensation) -> Float[np.ndarray, "k r c
 
 def _render(
     canvas: Canvas,
-    views: list[View],
+    views: list[PlacedFrame],
     names: tuple[str, ...],
     surface: HeightMap,
     read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
@@ -394,7 +394,7 @@ def _render(
     shown = (frame >= 0) & ~unlit(image)
     nothing = ~remove_small_objects(shown, max_size=round(_SPECK_MM2 / canvas.mm_per_px**2))
     image[nothing], frame[nothing], frame_pixel[nothing] = 0, -1, np.nan
-    whole = View(views[0].camera, views[0].cam_from_world, 0, 0, canvas.width, canvas.height)
+    whole = PlacedFrame(views[0].camera, views[0].cam_from_world, 0, 0, canvas.width, canvas.height)
     heights = cv2.resize(positions(canvas, whole, surface, CELL_PX)[..., 2].astype(np.float32), shape[::-1])
     return Mosaic(
         canvas=canvas, image=image, frame=frame, frame_pixel=frame_pixel, height_mm=heights, overlaps=overlaps
@@ -411,7 +411,7 @@ def unlit(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
 def _put(
     bands: _Bands,
     canvas: Canvas,
-    view: View,
+    view: PlacedFrame,
     surface: HeightMap,
     px: Float[np.ndarray, "h w 2"],
     image: UInt8[np.ndarray, "a b 3"],

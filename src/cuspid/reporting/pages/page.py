@@ -131,7 +131,7 @@ def provenance(run: Mapping[str, Any]) -> dict[str, Any]:
             (f"{stage}: {name}", value)
             for stage, rows in stages.items()
             for name, value in rows
-            if "seed" in name.split(".")[-1] and "seed_scale" not in name
+            if "seed" in name.split(".")[-1]
         ],
         "hashes": [
             (f"{stage}: {name}", digest)

@@ -1,4 +1,4 @@
-"""A first depth for each pixel: semi-global matching of rectified pairs at half resolution, checked both ways.
+"""An initial depth for each pixel: semi-global matching of rectified pairs at half resolution, checked both ways.
 
 A *pair matcher* is any function from two rectified images and a range of disparities to the disparity of the first
 image's pixels; :func:`semi_global` is one. Matching by something else than grey values stands beside it.
@@ -81,7 +81,7 @@ def _semi_global_one_way(
     return np.where(known, disparity, np.nan).astype(np.float32)
 
 
-def seed_pairs(rig: Rig, group: Sequence[str], pairs: Sequence[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
+def initial_pairs(rig: Rig, group: Sequence[str], pairs: Sequence[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
     """For each camera of a group the partner with the widest baseline among the stereo pairs; no pair twice."""
     chosen: dict[frozenset[str], tuple[str, str]] = {}
     for name in group:
@@ -96,7 +96,7 @@ def _baseline_mm(rig: Rig, pair: tuple[str, str]) -> float:
     return float(np.linalg.norm(rig[pair[0]].centre_in_rig - rig[pair[1]].centre_in_rig))
 
 
-def seed_points(
+def initial_points(
     pair: RectifiedPair,
     images: Mapping[str, UInt8[np.ndarray, "h w"]],
     matcher: PairMatcher,
