@@ -19,8 +19,9 @@ OPENCV_PIXEL_OFFSET = 0.5
 """COLMAP's pixel coordinate minus OpenCV's for the same place in an image."""
 
 
-def distort(normalized: Float[np.ndarray, "*n 2"], distortion: Float[np.ndarray, "4"]) -> Float[np.ndarray, "*n 2"]:
-    """Ideal normalised coordinates to distorted ones: COLMAP's OPENCV model (k1, k2, p1, p2)."""
+def distort(normalized: Float[np.ndarray, "*n 2"], distortion: Float[np.ndarray, "4 ..."]) -> Float[np.ndarray, "*n 2"]:
+    """Ideal normalised coordinates to distorted ones: COLMAP's OPENCV model (k1, k2, p1, p2), one lens for all or one
+    for each."""
     k1, k2, p1, p2 = distortion
     x, y = normalized[..., 0], normalized[..., 1]
     r2 = x * x + y * y

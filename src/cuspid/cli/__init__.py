@@ -51,6 +51,8 @@ COMMANDS: Mapping[str, Callable[..., Any]] = _Verbs(
         "mouth": "mouth",
         "handpiece": "handpieces",
         "design": "handpieces",
+        "target": "calibration",
+        "calibrate": "calibration",
         "optics": "forecasts",
         "visibility": "forecasts",
         "precision": "forecasts",

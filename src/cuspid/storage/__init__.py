@@ -45,7 +45,7 @@ from cuspid.storage.results import (
     StudyResult,
     read_result,
 )
-from cuspid.storage.sequences import read_sequence
+from cuspid.storage.sequences import hash_source, read_sequence, rig_sources
 from cuspid.storage.shapes import read_shape_model, write_shape_model
 from cuspid.storage.tables import csv_table, write_table
 from cuspid.storage.trueness import trueness_summary, write_trueness
@@ -73,6 +73,7 @@ __all__ = [
     "csv_table",
     "hash_capture",
     "hash_file",
+    "hash_source",
     "is_jaw",
     "read_capture",
     "read_depth_maps",
@@ -93,6 +94,7 @@ __all__ = [
     "read_shape_model",
     "read_truth",
     "reading",
+    "rig_sources",
     "trueness_summary",
     "whole_file",
     "write_bytes",

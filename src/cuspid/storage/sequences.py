@@ -19,8 +19,9 @@ from cuspid.inputs import read_text
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, Rig
 from cuspid.storage.captures import IMAGE_SUFFIXES, read_capture, write_image
-from cuspid.storage.files import finished, read_json, reading
+from cuspid.storage.files import digest_of, finished, hash_file, read_json, reading
 from cuspid.storage.handpieces import camera_from_colmap, camera_from_json, read_handpiece, read_rig_config
+from cuspid.values import checked_name
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm")
 LEAST_PX = 32
@@ -53,6 +54,31 @@ def read_sequence(
     return found if calibration is None else _calibrated(found, calibration)
 
 
+def rig_sources(folder: Path) -> dict[str, Path]:
+    """For each camera of a rig, by name, its folder of images or its video, all in one folder or in ``images`` in it.
+
+    Raises InputError where there is none, or two have one name.
+    """
+    home = folder / "images" if (folder / "images").is_dir() else folder
+    if not home.is_dir():
+        raise InputError(f"{folder}: no such folder")
+    sources = sorted(path for path in finished(home) if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES)
+    if not sources:
+        raise InputError(f"{home}: no folder of images and no video; each camera needs one")
+    named = {checked_name(f"{home}: cameras", path.name if path.is_dir() else path.stem): path for path in sources}
+    if len(named) < len(sources):
+        raise InputError(f"{home}: two of the folders and videos have one name; each camera needs a name of its own")
+    return named
+
+
+def hash_source(source: Path) -> str:
+    """SHA-256 of a video, or of the images of a folder and their names."""
+    if source.is_file():
+        return hash_file(source)
+    images = sorted(path for path in finished(source) if path.suffix.lower() in IMAGE_SUFFIXES)
+    return digest_of({path.name: hash_file(path) for path in images})
+
+
 def _of_folder(folder: Path) -> ImageSequence:
     paths = sorted(path for path in finished(folder) if path.suffix.lower() in IMAGE_SUFFIXES)
     return ImageSequence(source=folder, paths=tuple(paths), size=_common_size(folder, paths))
@@ -74,7 +100,7 @@ def _of_capture(folder: Path) -> ImageSequence:
 def _common_size(folder: Path, paths: list[Path]) -> tuple[int, int]:
     """Raises InputError where there are fewer than two frames, or they are tiny or not of one size."""
     if len(paths) < 2:
-        raise InputError(f"{folder}: {len(paths)} image(s); a panorama needs a sequence of overlapping frames")
+        raise InputError(f"{folder}: {len(paths)} image(s); a sequence needs two at least")
     sizes = {path: image_size(path) for path in paths}
     usual = Counter(sizes.values()).most_common(1)[0][0]
     odd = [path for path, size in sizes.items() if size != usual]

@@ -1,0 +1,111 @@
+"""Flat boards with known corners: what cameras are calibrated from.
+
+Frame: ``board``: +X along a row of squares, +Y down the columns, +Z into the board; the origin is its top left corner.
+Corners are where four squares meet, numbered along the rows as OpenCV does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from cuspid.errors import InputError
+from cuspid.options import Options, Range
+
+Dictionary = Literal[
+    "4X4_50", "4X4_100", "4X4_250", "4X4_1000", "5X5_50", "5X5_100", "5X5_250", "5X5_1000",
+    "6X6_50", "6X6_100", "6X6_250", "6X6_1000", "7X7_50", "7X7_100", "7X7_250", "7X7_1000",
+]  # fmt: skip
+"""Families of markers: bits, and how many there are (OpenCV's predefined ones)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Board(Options):
+    """A ChArUco board (a chessboard with a marker in each light square) or a plain chessboard."""
+
+    kind: Literal["charuco", "chessboard"] = "charuco"
+    """With markers, which tell the corners apart and may be seen in part, or without."""
+    columns: Annotated[int, Range(3, 100)] = 8
+    """Squares in a row."""
+    rows: Annotated[int, Range(3, 100)] = 11
+    """Squares in a column."""
+    square_mm: Annotated[float, Range(0.001, 10_000)] = 1.0
+    """Side of a square, as measured on the printed board."""
+    marker_share: Annotated[float, Range(0.1, 0.95)] = 0.75
+    """Side of a marker, as a share of that of its square."""
+    dictionary: Dictionary = "4X4_1000"
+    """The markers; their numbers begin at 0."""
+    legacy: bool = False
+    """Boards of even rows of OpenCV before 4.6, with a marker in the first corner."""
+    inverted: bool = False
+    """Light where others are dark."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        markers, needed = int(self.dictionary.split("_")[1]), self.columns * self.rows // 2
+        if self.kind == "charuco" and markers < needed:
+            raise InputError(f"board: {needed} markers are needed, but the dictionary {self.dictionary} has {markers}")
+
+    @property
+    def size_mm(self) -> tuple[float, float]:
+        """Width and height."""
+        return self.columns * self.square_mm, self.rows * self.square_mm
+
+    @property
+    def corners(self) -> Float[np.ndarray, "n 3"]:
+        """Where four squares meet, mm."""
+        column, row = np.meshgrid(np.arange(1.0, self.columns), np.arange(1.0, self.rows))
+        return self.square_mm * np.stack([column, row, 0 * row], axis=-1).reshape(-1, 3)
+
+    @cached_property
+    def orders(self) -> Int[np.ndarray, "k n"]:
+        """The ways to number the corners that an image of the board does not tell apart, the usual one first: turned
+        by half a turn where it has no markers, and by a quarter where it is square."""
+        usual = np.arange((self.columns - 1) * (self.rows - 1)).reshape(self.rows - 1, self.columns - 1)
+        turns = 1 if self.kind == "charuco" else 4 if self.columns == self.rows else 2
+        return np.stack([np.rot90(usual, k * (4 // turns)).ravel() for k in range(turns)])
+
+    @cached_property
+    def opencv(self) -> cv2.aruco.CharucoBoard:
+        """The same board of OpenCV's. Raises InputError for a chessboard."""
+        if self.kind != "charuco":
+            raise InputError("board: a chessboard has no markers")
+        markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
+        side = self.marker_share * self.square_mm
+        board = cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_mm, side, markers)
+        board.setLegacyPattern(self.legacy)
+        return board
+
+    @cached_property
+    def dark(self) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
+        """The printed squares: the top left corner (mm) and the side of each."""
+        row, column = np.indices((self.rows, self.columns))
+        corners = np.argwhere((row + column) % 2 == self._first_dark)[:, ::-1]
+        places, sides = [corners * self.square_mm], [np.full(len(corners), self.square_mm)]
+        if self.kind == "charuco":
+            for place, bits in self._markers():
+                bit = self.marker_share * self.square_mm / len(bits)
+                row, column = np.nonzero(~bits)
+                places.append(place + bit * np.stack([column, row], axis=-1))
+                sides.append(np.full(len(row), bit))
+        return np.concatenate(places), np.concatenate(sides)
+
+    @property
+    def _first_dark(self) -> int:
+        """0 where the first square is dark, 1 where it holds a marker."""
+        return int(self.kind == "charuco" and self.legacy and self.rows % 2 == 0)
+
+    def _markers(self) -> list[tuple[Float[np.ndarray, "2"], Bool[np.ndarray, "b b"]]]:
+        """For each marker its top left corner, mm, and its light bits, with the dark border."""
+        board = self.opencv
+        dictionary = board.getDictionary()
+        bits = dictionary.markerSize + 2
+        return [
+            (np.asarray(corners)[0, :2].astype(np.float64), cv2.aruco.generateImageMarker(dictionary, int(k), bits) > 0)
+            for k, corners in zip(board.getIds(), board.getObjPoints(), strict=True)
+        ]

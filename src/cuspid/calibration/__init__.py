@@ -1,0 +1,1 @@
+"""Calibration of the cameras of a handpiece from images of a board."""

@@ -1,0 +1,426 @@
+"""One adjustment of cameras, of the places of the board, and of its bending.
+
+A corner X of the board is seen by camera c at instant i at ``project(c, cam_from_rig[c] @ rig_from_board[i] @ X)``.
+Unknowns and how a step changes them: of each camera (fx, fy, cx, cy, k1, k2, p1, p2) by addition, and its place by a
+small motion (rotation vector rad, translation mm) on the left of ``cam_from_rig``; the place of the board at each
+instant by one on the left of ``rig_from_board``; and three numbers of a board that is not quite flat: out of its plane
+by b1 u^2 + b2 u v + b3 v^2 mm at the distances u and v, in units of half its diagonal, from its middle.
+
+The rig is where the first camera is; for the covariance it is where the cameras are on the whole (inner constraints,
+Triggs et al. 2000, section 9.2), so that no camera counts as exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import csr_array
+
+from cuspid.board import Board
+from cuspid.calibration.corners import Views
+from cuspid.camera import Camera, distort
+from cuspid.epipolar import skew
+from cuspid.errors import ReconstructionError
+from cuspid.geometry import Rigid3
+from cuspid.rig import MountedCamera
+
+_INTRINSICS, _PLACE, _BENDING = 8, 6, 3
+_DISTORTION_SIGMA = np.array([0.5, 0.5, 0.01, 0.01])
+"""Standard deviation of (k1, k2, p1, p2) about 0, of lenses as they are made: it decides where the images do not."""
+_CENTRE_SHARE = 0.05
+"""Standard deviation of the principal point about the middle of the image, as a share of its width."""
+_BENDING_SHARE = 0.01
+"""Standard deviation of the bending, as a share of half the diagonal of the board."""
+_KNEE = 2.5
+"""Residuals, in standard deviations, beyond which they count less (Huber)."""
+_STEPS, _SETTLED = 100, 0.01
+"""Most steps; and the fall of the cost, in squared standard deviations, that is not worth another one."""
+_LEAST_SIGMA_PX = 1e-6
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BoardScene:
+    """Cameras, and where the board was."""
+
+    cameras: Mapping[str, Camera]
+    """By name; the first one is where the rig is."""
+    cam_from_rig: Mapping[str, Rigid3]
+    """Their places."""
+    rig_from_board: Mapping[str, Rigid3]
+    """Of the board at each instant."""
+    bending_mm: Float[np.ndarray, "3"]
+    """Out of the plane, of u^2, u v and v^2."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Adjusted:
+    """What an adjustment found."""
+
+    scene: BoardScene
+    """The best one."""
+    sigma_px: float
+    """Standard deviation of a coordinate of a corner."""
+    residuals: Mapping[tuple[str, str], Float[np.ndarray, "n 2"]]
+    """Seen minus projected, px, by camera and instant."""
+    covariance: Float[np.ndarray, "k k"]
+    """Of the cameras: the parameters of each in order, then the motion of each."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Observations:
+    """All corners that were seen, as arrays."""
+
+    camera: Int[np.ndarray, "n"]
+    instant: Int[np.ndarray, "n"]
+    points: Float[np.ndarray, "n 3"]
+    """On the flat board, mm."""
+    basis: Float[np.ndarray, "n 3"]
+    """What each number of the bending lifts them by."""
+    pixels: Float[np.ndarray, "n 2"]
+    keys: tuple[tuple[str, str], ...]
+    starts: Int[np.ndarray, "k"]
+
+    @staticmethod
+    def of(views: Views, board: Board, cameras: Sequence[str], instants: Sequence[str]) -> _Observations:
+        """In the order of the views."""
+        keys = tuple(views)
+        counts = [len(views[key].corner) for key in keys]
+        corner = np.concatenate([views[key].corner for key in keys])
+        points = board.corners[corner]
+        u, v = bending_coordinates(board, points).T
+        return _Observations(
+            np.repeat([cameras.index(camera) for camera, _ in keys], counts),
+            np.repeat([instants.index(instant) for _, instant in keys], counts),
+            points,
+            np.stack([u * u, u * v, v * v], axis=1),
+            np.concatenate([views[key].pixels for key in keys]),
+            keys,
+            np.cumsum([0, *counts]),
+        )
+
+
+def bending_coordinates(board: Board, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    """u and v of places on a board."""
+    size = np.array(board.size_mm)
+    return np.asarray((points[:, :2] - size / 2) / (np.linalg.norm(size) / 2))
+
+
+# --- one step ----------------------------------------------------------------------------------------------------
+
+
+def _project(
+    scene: BoardScene, seen: _Observations
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 2"]]:
+    """The corners in the rig and in the camera, and their residuals; NaN behind a camera."""
+    points = seen.points + (seen.basis @ scene.bending_mm)[:, None] * [0.0, 0.0, 1.0]
+    boards, places = list(scene.rig_from_board.values()), list(scene.cam_from_rig.values())
+    in_rig = _moved(boards, seen.instant, points)
+    in_cam = _moved(places, seen.camera, in_rig)
+    parameters = np.stack([camera.parameters for camera in scene.cameras.values()])[seen.camera]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ideal = np.where(in_cam[:, 2:] > 0, in_cam[:, :2] / in_cam[:, 2:], np.nan)
+    image = distort(ideal, parameters[:, 4:].T) * parameters[:, :2] + parameters[:, 2:4]
+    return in_rig, in_cam, seen.pixels - image
+
+
+def _moved(
+    motions: Sequence[Rigid3], which: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    rotations, translations = (
+        np.stack([motion.rotation for motion in motions]),
+        np.stack([motion.translation for motion in motions]),
+    )
+    return np.asarray(np.einsum("nij,nj->ni", rotations[which], points) + translations[which])
+
+
+def _jacobian(
+    scene: BoardScene, seen: _Observations, in_rig: Float[np.ndarray, "n 3"], in_cam: Float[np.ndarray, "n 3"]
+) -> csr_array:
+    """Derivative of the projections by all unknowns: cameras, their motions, those of the board, the bending."""
+    parameters = np.stack([camera.parameters for camera in scene.cameras.values()])[seen.camera]
+    ideal = in_cam[:, :2] / in_cam[:, 2:]
+    by_point = _by_point(ideal, in_cam[:, 2], parameters)
+    turn = np.stack([place.rotation for place in scene.cam_from_rig.values()])[seen.camera]
+    by_rig = by_point @ turn
+    out_of_plane = np.stack([pose.rotation[:, 2] for pose in scene.rig_from_board.values()])[seen.instant]
+    blocks = [
+        _by_parameters(ideal, parameters),
+        _by_motion(by_point, in_cam),
+        _by_motion(by_rig, in_rig),
+        np.einsum("nij,nj->ni", by_rig, out_of_plane)[:, :, None] * seen.basis[:, None],
+    ]
+    count, boards = len(scene.cameras), _INTRINSICS + _PLACE
+    columns = [
+        _INTRINSICS * seen.camera[:, None] + np.arange(_INTRINSICS),
+        _INTRINSICS * count + _PLACE * seen.camera[:, None] + np.arange(_PLACE),
+        boards * count + _PLACE * seen.instant[:, None] + np.arange(_PLACE),
+        boards * count + _PLACE * len(scene.rig_from_board) + np.zeros((len(ideal), 1), int) + np.arange(_BENDING),
+    ]
+    values, column = np.concatenate(blocks, axis=2), np.concatenate(columns, axis=1)
+    width = values.shape[2]
+    return csr_array(
+        (values.ravel(), np.repeat(column, 2, axis=0).ravel(), width * np.arange(2 * len(ideal) + 1)),
+        shape=(2 * len(ideal), boards * count + _PLACE * len(scene.rig_from_board) + _BENDING),
+    )
+
+
+def _by_point(
+    ideal: Float[np.ndarray, "n 2"], depth: Float[np.ndarray, "n"], parameters: Float[np.ndarray, "n 8"]
+) -> Float[np.ndarray, "n 2 3"]:
+    """Derivative of the pixel by the point in the camera."""
+    (x, y), (k1, k2, p1, p2) = ideal.T, parameters[:, 4:].T
+    r2 = x * x + y * y
+    radial, slope = 1 + k1 * r2 + k2 * r2 * r2, 2 * k1 + 4 * k2 * r2
+    mixed = x * y * slope + 2 * p1 * x + 2 * p2 * y
+    by_ideal = np.stack(
+        [
+            np.stack([radial + x * x * slope + 2 * p1 * y + 6 * p2 * x, mixed], axis=-1),
+            np.stack([mixed, radial + y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=-1),
+        ],
+        axis=-2,
+    )
+    one, none = np.ones_like(x), np.zeros_like(x)
+    ideal_by_point = np.stack([np.stack([one, none, -x], axis=-1), np.stack([none, one, -y], axis=-1)], axis=-2)
+    return np.asarray(parameters[:, :2, None] * (by_ideal @ ideal_by_point) / depth[:, None, None])
+
+
+def _by_parameters(ideal: Float[np.ndarray, "n 2"], parameters: Float[np.ndarray, "n 8"]) -> Float[np.ndarray, "n 2 8"]:
+    """Derivative of the pixel by (fx, fy, cx, cy, k1, k2, p1, p2)."""
+    (x, y), focal = ideal.T, parameters[:, :2]
+    r2 = x * x + y * y
+    out = np.zeros((len(x), 2, _INTRINSICS))
+    out[:, [0, 1], [0, 1]] = distort(ideal, parameters[:, 4:].T)
+    out[:, [0, 1], [2, 3]] = 1
+    out[:, :, 4] = focal * ideal * r2[:, None]
+    out[:, :, 5] = focal * ideal * (r2 * r2)[:, None]
+    out[:, :, 6] = focal * np.stack([2 * x * y, r2 + 2 * y * y], axis=1)
+    out[:, :, 7] = focal * np.stack([r2 + 2 * x * x, 2 * x * y], axis=1)
+    return out
+
+
+def _by_motion(by_point: Float[np.ndarray, "n 2 3"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 6"]:
+    """Derivative by a small motion (rotation vector, translation) of the points."""
+    turning = np.cross(points[:, None], by_point)
+    return np.concatenate([turning, by_point], axis=2)
+
+
+# --- minimisation ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Free:
+    """Which of the unknowns may move, and the prior that holds them."""
+
+    columns: Int[np.ndarray, "k"]
+    precision: Float[np.ndarray, "k"]
+
+    @staticmethod
+    def of(scene: BoardScene, board: Board, *, only_boards: bool) -> _Free:
+        """All but the place of the first camera, which is the rig; or the places of the board alone."""
+        cameras, instants = len(scene.cameras), len(scene.rig_from_board)
+        first = (_INTRINSICS + _PLACE) * cameras
+        if only_boards:
+            return _Free(first + np.arange(_PLACE * instants), np.zeros(_PLACE * instants))
+        half_mm = float(np.linalg.norm(board.size_mm)) / 2
+        precision = np.concatenate(
+            [
+                *(_lens_precision(camera) for camera in scene.cameras.values()),
+                np.zeros(_PLACE * (cameras + instants)),
+                np.full(_BENDING, (_BENDING_SHARE * half_mm) ** -2.0),
+            ]
+        )
+        place = _INTRINSICS * cameras
+        columns = np.delete(np.arange(len(precision)), np.arange(place, place + _PLACE))
+        return _Free(columns, precision[columns])
+
+
+def adjust_board(start: BoardScene, views: Views, board: Board, *, only_boards: bool = False) -> Adjusted:
+    """The scene under which the corners are seen where they were, and how well that is known (Levenberg-Marquardt on
+    Huber's loss; its scale is found from the residuals). With ``only_boards`` the cameras and the bending stay.
+
+    Raises ReconstructionError where the images leave something open, as the focal length of a camera that always saw
+    the board from the front.
+    """
+    seen = _Observations.of(views, board, list(start.cameras), list(start.rig_from_board))
+    free = _Free.of(start, board, only_boards=only_boards)
+    scene, damping, steps = start, 1e-4, 0
+    in_rig, in_cam, residuals = _project(scene, seen)
+    sigma = _scale(residuals)
+    cost = _cost(scene, residuals, sigma, free)
+    while steps < _STEPS and damping < 1e8:
+        steps += 1
+        matrix, gradient = _normal(scene, seen, in_rig, in_cam, residuals, sigma, free)
+        step = _solved(matrix + damping * np.diag(np.diag(matrix)), gradient)
+        candidate = _stepped(scene, free, step)
+        if candidate is None:
+            damping *= 10
+            continue
+        there = _project(candidate, seen)
+        if not _cost(candidate, there[2], sigma, free) <= cost:
+            damping *= 10
+            continue
+        done = float(step @ gradient) < _SETTLED
+        scene, (in_rig, in_cam, residuals) = candidate, there
+        sigma, damping = _scale(residuals), max(damping / 10, 1e-12)
+        cost = _cost(scene, residuals, sigma, free)
+        if done:
+            break
+    matrix, _ = _normal(scene, seen, in_rig, in_cam, residuals, sigma, free)
+    pieces = np.split(residuals, seen.starts[1:-1])
+    covariance = np.zeros((0, 0)) if only_boards else _camera_covariance(matrix, scene, free)
+    return Adjusted(
+        scene=scene, sigma_px=sigma, residuals=dict(zip(seen.keys, pieces, strict=True)), covariance=covariance
+    )
+
+
+def _scale(residuals: Float[np.ndarray, "n 2"]) -> float:
+    """Standard deviation of a coordinate, from the median of the lengths (Rayleigh)."""
+    lengths = np.linalg.norm(residuals, axis=1)
+    return max(float(np.median(lengths[np.isfinite(lengths)])) / np.sqrt(2 * np.log(2)), _LEAST_SIGMA_PX)
+
+
+def _cost(scene: BoardScene, residuals: Float[np.ndarray, "n 2"], sigma_px: float, free: _Free) -> float:
+    """Huber loss of the residuals, and the prior; infinite where a corner lies behind a camera."""
+    lengths = np.linalg.norm(residuals, axis=1) / sigma_px
+    if not np.isfinite(lengths).all():
+        return np.inf
+    loss = np.where(lengths <= _KNEE, lengths**2, 2 * _KNEE * lengths - _KNEE**2)
+    return float(loss.sum() + (free.precision * _held(scene)[free.columns] ** 2).sum())
+
+
+def _lens_precision(camera: Camera) -> Float[np.ndarray, "8"]:
+    """Of the prior of a camera's parameters."""
+    centre = np.full(2, _CENTRE_SHARE * camera.width)
+    return np.concatenate([[0.0, 0.0], centre**-2.0, _DISTORTION_SIGMA**-2.0])
+
+
+def _held(scene: BoardScene) -> Float[np.ndarray, "k"]:
+    """How far all unknowns are from where the prior holds them; 0 where it does not."""
+    lenses = [
+        np.concatenate([[0, 0], camera.principal_point_px - [camera.width / 2, camera.height / 2], camera.distortion])
+        for camera in scene.cameras.values()
+    ]
+    places = np.zeros(_PLACE * (len(scene.cameras) + len(scene.rig_from_board)))
+    return np.concatenate([*lenses, places, scene.bending_mm])
+
+
+def _normal(
+    scene: BoardScene,
+    seen: _Observations,
+    in_rig: Float[np.ndarray, "n 3"],
+    in_cam: Float[np.ndarray, "n 3"],
+    residuals: Float[np.ndarray, "n 2"],
+    sigma_px: float,
+    free: _Free,
+) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k"]]:
+    """Of the free unknowns: the matrix of the normal equations, and the gradient."""
+    lengths = np.linalg.norm(residuals, axis=1) / sigma_px
+    weights = np.repeat(np.minimum(1, _KNEE / np.maximum(lengths, 1e-12)) / sigma_px**2, 2)
+    jacobian = _jacobian(scene, seen, in_rig, in_cam)[:, free.columns]
+    weighted = (jacobian * weights[:, None]).T
+    matrix = (weighted @ jacobian).toarray() + np.diag(free.precision)
+    return matrix, weighted @ residuals.ravel() - free.precision * _held(scene)[free.columns]
+
+
+def _solved(matrix: Float[np.ndarray, "k k"], gradient: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
+    """Raises ReconstructionError where the matrix is singular to rounding."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    try:
+        factor = cho_factor(matrix * scale[:, None] * scale, lower=True)
+    except np.linalg.LinAlgError as error:
+        raise ReconstructionError(
+            "calibration: the images leave something open; show the board from more sides, tilted by 20 to 50 degrees"
+        ) from error
+    return np.asarray(scale * cho_solve(factor, scale * gradient))
+
+
+def _stepped(scene: BoardScene, free: _Free, step: Float[np.ndarray, "k"]) -> BoardScene | None:
+    """None where a camera would be turned inside out."""
+    cameras, instants = len(scene.cameras), len(scene.rig_from_board)
+    whole = np.zeros((_INTRINSICS + _PLACE) * cameras + _PLACE * instants + _BENDING)
+    whole[free.columns] = step
+    lenses, places, boards, bending = np.split(
+        whole, np.cumsum([_INTRINSICS * cameras, _PLACE * cameras, _PLACE * instants])
+    )
+    parameters = [
+        camera.parameters + shift
+        for camera, shift in zip(scene.cameras.values(), lenses.reshape(-1, _INTRINSICS), strict=True)
+    ]
+    if not np.all(np.array(parameters)[:, :2] > 0):
+        return None
+    return BoardScene(
+        cameras={
+            name: camera.with_parameters(each)
+            for (name, camera), each in zip(scene.cameras.items(), parameters, strict=True)
+        },
+        cam_from_rig=_all_moved(scene.cam_from_rig, places),
+        rig_from_board=_all_moved(scene.rig_from_board, boards),
+        bending_mm=scene.bending_mm + bending,
+    )
+
+
+def _all_moved(poses: Mapping[str, Rigid3], motions: Float[np.ndarray, "k"]) -> dict[str, Rigid3]:
+    return {
+        name: Rigid3.from_rotation_vector(motion[:3], motion[3:]) @ pose
+        for (name, pose), motion in zip(poses.items(), motions.reshape(-1, _PLACE), strict=True)
+    }
+
+
+# --- how well it is known ----------------------------------------------------------------------------------------
+
+
+def _camera_covariance(matrix: Float[np.ndarray, "k k"], scene: BoardScene, free: _Free) -> Float[np.ndarray, "m m"]:
+    """Of the parameters and the motions of all cameras, in the frame in which these sum up to nothing."""
+    size = (_INTRINSICS + _PLACE) * len(scene.cameras)
+    known = free.columns < size
+    unknowns = np.eye(len(matrix))[:, known]
+    inverse = np.stack([_solved(matrix, column) for column in unknowns.T], axis=1)[known]
+    whole = np.zeros((size, size))
+    whole[np.ix_(free.columns[known], free.columns[known])] = inverse
+    project = np.eye(size)
+    places = _INTRINSICS * len(scene.cameras)
+    project[places:, places:] = _without_common_motion(scene)
+    return np.asarray(project @ whole @ project.T)
+
+
+def common_free(scene: BoardScene, motions: Sequence[Float[np.ndarray, "6"]]) -> Float[np.ndarray, "c 6"]:
+    """Small motions of the cameras without what the rig as a whole has of them."""
+    return np.asarray((_without_common_motion(scene) @ np.concatenate(motions)).reshape(-1, _PLACE))
+
+
+def _without_common_motion(scene: BoardScene) -> Float[np.ndarray, "m m"]:
+    """Takes from motions of the cameras that of the rig as a whole which is nearest to them."""
+    places = list(scene.cam_from_rig.values())
+    common = np.concatenate([_adjoint(place) for place in places])
+    lengths = np.linalg.norm([place.translation for place in places], axis=1).mean() or 1.0
+    weights = np.tile([lengths, lengths, lengths, 1, 1, 1], len(places))[:, None]  # a turn by the arc that it makes
+    return np.asarray(np.eye(len(common)) - common @ np.linalg.pinv(weights * common) * weights.T)
+
+
+def _adjoint(target_from_source: Rigid3) -> Float[np.ndarray, "6 6"]:
+    """A small motion in the source, as one of the target."""
+    turn = target_from_source.rotation
+    return np.block([[turn, np.zeros((3, 3))], [skew(target_from_source.translation) @ turn, turn]])
+
+
+def mounted_cameras(found: Adjusted) -> dict[str, MountedCamera]:
+    """The cameras with their covariances."""
+    count, mounted = len(found.scene.cameras), {}
+    for index, (name, camera) in enumerate(found.scene.cameras.items()):
+        lens = slice(_INTRINSICS * index, _INTRINSICS * (index + 1))
+        first = _INTRINSICS * count + _PLACE * index
+        place = slice(first, first + _PLACE)
+        mounted[name] = MountedCamera(
+            replace(camera, covariance=_symmetric(found.covariance[lens, lens])),
+            found.scene.cam_from_rig[name],
+            _symmetric(found.covariance[place, place]),
+        )
+    return mounted
+
+
+def _symmetric(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    return (matrix + matrix.T) / 2

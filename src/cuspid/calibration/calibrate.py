@@ -1,0 +1,249 @@
+"""From views of a board to a rig that knows how well it is known: start, adjust, leave out what does not fit, and
+try the result on views that it was not made from."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float
+
+from cuspid.board import Board
+from cuspid.calibration.bundle import Adjusted, BoardScene, adjust_board, common_free, mounted_cameras
+from cuspid.calibration.corners import Views
+from cuspid.calibration.start import LEAST_VIEWS, first_camera, joined
+from cuspid.errors import ReconstructionError
+from cuspid.options import Options, Range
+from cuspid.rig import MountedCamera, Rig
+
+_DOUBTFUL = 2.0
+"""Standard deviations between two halves that chance hardly explains."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationOptions(Options):
+    """What is left out."""
+
+    outlier_sigmas: Annotated[float, Range(2, 1000)] = 4.0
+    """A view whose residuals have an RMS beyond this, in standard deviations of all or of its camera's, is left out."""
+    rounds: Annotated[int, Range(1, 100)] = 5
+    """Number of times that views are left out, at most."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraCheck:
+    """How a camera did."""
+
+    views: int
+    """Of the board that were used."""
+    corners: int
+    """In them."""
+    rms_px: float
+    """Of the residuals."""
+    held_out_px: float | None
+    """RMS in views that the calibration was not made from; None where there were too few to make two."""
+    parameters_apart: float | None
+    """Difference of the parameters from two halves of the instants, in the standard deviations that both state; about
+    1 where these are true."""
+    place_apart: float | None
+    """The same of the place in the rig."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RigCalibration:
+    """A rig, and how well its images of the board agree with it."""
+
+    rig: Rig
+    """With covariances, in the frame of its first camera."""
+    sigma_px: float
+    """Standard deviation of a coordinate of a corner."""
+    bending_mm: Float[np.ndarray, "3"]
+    """Of the board, see :mod:`cuspid.calibration.bundle`."""
+    cameras: Mapping[str, CameraCheck]
+    """By name."""
+    pixels: Mapping[str, Float[np.ndarray, "n 2"]]
+    """Where each camera saw corners."""
+    residuals: Mapping[str, Float[np.ndarray, "n 2"]]
+    """Seen minus projected, px."""
+    distance_mm: float
+    """Median distance of the board from the cameras."""
+    notes: tuple[str, ...]
+    """What was left out and why, a line each."""
+
+
+def calibrate_rig(
+    views: Views, sizes: Mapping[str, tuple[int, int]], board: Board, options: CalibrationOptions = CalibrationOptions()
+) -> RigCalibration:
+    """Calibrate the cameras named in ``sizes`` (width and height, px) from their views of a board.
+
+    Raises ReconstructionError for cameras with too few views, or that never saw the board together.
+    """
+    few = [name for name in sizes if sum(camera == name for camera, _ in views) < LEAST_VIEWS]
+    if few:
+        raise ReconstructionError(
+            f"calibration: {', '.join(few)} saw the board at fewer than {LEAST_VIEWS} instants; check that columns, "
+            "rows, dictionary and kind of the board are those of the images"
+        )
+    cameras = {
+        name: first_camera([view for (camera, _), view in views.items() if camera == name], board, size)
+        for name, size in sizes.items()
+    }
+    start, chosen = joined(views, board, cameras, sorted({instant for _, instant in views}))
+    found, notes = _without_outliers(start, chosen, board, options)
+    kept = {key: chosen[key] for key in found.residuals}
+    return _described(found, kept, board, notes)
+
+
+def _without_outliers(
+    scene: BoardScene, views: Views, board: Board, options: CalibrationOptions
+) -> tuple[Adjusted, tuple[str, ...]]:
+    """Adjust, leave out the views that do not fit, and again."""
+    notes: list[str] = []
+    for _ in range(options.rounds):
+        found = adjust_board(scene, views, board)
+        bad = _odd_ones(found, options)
+        if not bad:
+            return found, tuple(notes)
+        notes += [
+            f"camera {camera}, {instant}: left out, {rms:.2f} px RMS where {usual:.2f} px is usual; it is "
+            "blurred, or was not taken when the others were"
+            for (camera, instant), (rms, usual) in bad.items()
+        ]
+        views = {key: view for key, view in views.items() if key not in bad}
+        _require_views(views, scene)
+        scene = _of_instants(found.scene, {instant for _, instant in views})
+    return adjust_board(scene, views, board), tuple(notes)
+
+
+def _odd_ones(found: Adjusted, options: CalibrationOptions) -> dict[tuple[str, str], tuple[float, float]]:
+    """Views that do not fit: their RMS, and what is usual over all or for their camera, px."""
+    rms = {key: _rms(residuals) for key, residuals in found.residuals.items()}
+    usual = {
+        name: max(found.sigma_px, float(np.median([each for (camera, _), each in rms.items() if camera == name])))
+        for name in found.scene.cameras
+    }
+    return {key: (each, usual[key[0]]) for key, each in rms.items() if each > options.outlier_sigmas * usual[key[0]]}
+
+
+def _require_views(views: Views, scene: BoardScene) -> None:
+    counts = Counter(camera for camera, _ in views)
+    few = [name for name in scene.cameras if counts[name] < LEAST_VIEWS]
+    if few:
+        raise ReconstructionError(
+            f"calibration: what {', '.join(few)} saw does not fit what the others saw at the same instants; check that "
+            "the cameras were triggered together, and that the files' names say so"
+        )
+
+
+def _of_instants(scene: BoardScene, instants: set[str]) -> BoardScene:
+    return replace(
+        scene, rig_from_board={name: pose for name, pose in scene.rig_from_board.items() if name in instants}
+    )
+
+
+def _rms(residuals: Float[np.ndarray, "n 2"]) -> float:
+    """Of a coordinate."""
+    return float(np.sqrt(np.mean(residuals**2)))
+
+
+# --- what it is worth --------------------------------------------------------------------------------------------
+
+
+def _described(found: Adjusted, views: Views, board: Board, notes: tuple[str, ...]) -> RigCalibration:
+    names = list(found.scene.cameras)
+    of = {name: [key for key in views if key[0] == name] for name in names}
+    pixels = {name: np.concatenate([views[key].pixels for key in of[name]]) for name in names}
+    residuals = {name: np.concatenate([found.residuals[key] for key in of[name]]) for name in names}
+    held_out, apart = _cross_validated(found, views, board)
+    distances = [
+        np.linalg.norm((found.scene.cam_from_rig[camera] @ found.scene.rig_from_board[instant]).translation)
+        for camera, instant in views
+    ]
+    checks = {
+        name: CameraCheck(
+            views=len(of[name]),
+            corners=len(pixels[name]),
+            rms_px=_rms(residuals[name]),
+            held_out_px=held_out.get(name),
+            parameters_apart=apart[name][0] if name in apart else None,
+            place_apart=apart[name][1] if name in apart else None,
+        )
+        for name in names
+    }
+    return RigCalibration(
+        rig=Rig({name: _widened(mounted, checks[name]) for name, mounted in mounted_cameras(found).items()}),
+        sigma_px=found.sigma_px,
+        bending_mm=found.scene.bending_mm,
+        cameras=checks,
+        pixels=pixels,
+        residuals=residuals,
+        distance_mm=float(np.median(distances)),
+        notes=(*notes, *_doubts(checks)),
+    )
+
+
+def _widened(mounted: MountedCamera, check: CameraCheck) -> MountedCamera:
+    """With covariances that account for how far two halves of the images are apart."""
+    lens, place = (max(1.0, apart or 0.0) ** 2 for apart in (check.parameters_apart, check.place_apart))
+    camera = replace(mounted.camera, covariance=lens * _known(mounted.camera.covariance))
+    return replace(mounted, camera=camera, covariance=place * _known(mounted.covariance))
+
+
+def _doubts(checks: Mapping[str, CameraCheck]) -> tuple[str, ...]:
+    """Where the lens or the board is not what the model says, or the cameras were not triggered together."""
+    return tuple(
+        f"camera {name}: calibrations from two halves of the images differ by {worst:.1f} of their standard "
+        "deviations; its covariance is widened by that; look for a pattern in residuals.png"
+        for name, check in checks.items()
+        if (worst := max(check.parameters_apart or 0.0, check.place_apart or 0.0)) > _DOUBTFUL
+    )
+
+
+def _cross_validated(
+    found: Adjusted, views: Views, board: Board
+) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+    """Of two halves of the instants, each calibrated for itself: the residuals in the other one, and how far they are
+    from each other. Nothing where a half is too small."""
+    instants = list(found.scene.rig_from_board)
+    halves = [{key: view for key, view in views.items() if key[1] in set(instants[k::2])} for k in range(2)]
+    counts = [Counter(camera for camera, _ in half) for half in halves]
+    if any(count[name] < LEAST_VIEWS for count in counts for name in found.scene.cameras):
+        return {}, {}
+    parts = [adjust_board(_of_instants(found.scene, {key[1] for key in half}), half, board) for half in halves]
+    squares: dict[str, list[Float[np.ndarray, "n 2"]]] = {name: [] for name in found.scene.cameras}
+    for part, other, other_views in zip(parts, parts[::-1], halves[::-1], strict=True):
+        start = replace(part.scene, rig_from_board=other.scene.rig_from_board)
+        for (camera, _), residuals in adjust_board(start, other_views, board, only_boards=True).residuals.items():
+            squares[camera].append(residuals)
+    return {name: _rms(np.concatenate(each)) for name, each in squares.items()}, _apart(*parts)
+
+
+def _apart(one: Adjusted, other: Adjusted) -> dict[str, tuple[float, float]]:
+    """Differences of parameters and of places, in standard deviations of the difference, RMS over the numbers."""
+    between = [one.scene.cam_from_rig[name] @ pose.inverse() for name, pose in other.scene.cam_from_rig.items()]
+    motions = common_free(one.scene, [np.array([*m.rotation_vector, *m.translation]) for m in between])
+    ours, theirs = mounted_cameras(one), mounted_cameras(other)
+    found = {}
+    for name, motion in zip(ours, motions, strict=True):
+        a, b = ours[name], theirs[name]
+        shift = a.camera.parameters - b.camera.parameters
+        found[name] = (
+            _in_sigmas(shift, _known(a.camera.covariance) + _known(b.camera.covariance)),
+            _in_sigmas(motion, _known(a.covariance) + _known(b.covariance)),
+        )
+    return found
+
+
+def _known(covariance: Float[np.ndarray, "n n"] | None) -> Float[np.ndarray, "n n"]:
+    """Of a camera that was calibrated here, which always has one."""
+    if covariance is None:
+        raise ValueError("a calibration without covariance")
+    return covariance
+
+
+def _in_sigmas(difference: Float[np.ndarray, "n"], covariance: Float[np.ndarray, "n n"]) -> float:
+    """RMS of a difference, each direction in its standard deviations."""
+    return float(np.sqrt(difference @ np.linalg.pinv(covariance, hermitian=True) @ difference / len(difference)))

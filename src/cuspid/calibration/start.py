@@ -1,0 +1,125 @@
+"""Where the adjustment begins: each camera for itself, then the cameras joined by what they saw at once.
+
+A plain chessboard looks the same from two sides, or four. Each camera numbers its corners as it comes; the numbering
+is chosen under which the places of any two cameras agree from instant to instant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+
+import cv2
+import numpy as np
+
+from cuspid.board import Board
+from cuspid.calibration.bundle import BoardScene
+from cuspid.calibration.corners import BoardView, Views
+from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
+from cuspid.errors import ReconstructionError
+from cuspid.geometry import Rigid3
+
+LEAST_VIEWS = 3
+"""A camera that saw the board at fewer instants cannot be calibrated."""
+_MOST_VIEWS = 40
+"""From which a camera is calibrated to begin with: more take long, and the adjustment uses all."""
+_AGREE_DEG, _AGREE_SHARE = 5.0, 0.1
+"""Places of a camera beside another one, from two instants, that may be the same: the turn between them, and the
+distance as a share of that of the board."""
+
+
+def first_camera(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> Camera:
+    """A camera from its views of the board (Z. Zhang, IEEE PAMI 22, 2000), with the first term of distortion alone."""
+    spread = np.unique(np.linspace(0, len(views) - 1, _MOST_VIEWS).astype(int))
+    chosen = [views[k] for k in spread]
+    flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_ASPECT_RATIO
+    _, matrix, distortion, _, _ = cv2.calibrateCamera(
+        [board.corners[view.corner].astype(np.float32) for view in chosen],
+        [(view.pixels - OPENCV_PIXEL_OFFSET).astype(np.float32)[:, None] for view in chosen],
+        size,
+        np.diag([float(max(size)), float(max(size)), 1.0]),
+        np.zeros(5),
+        flags=flags,
+    )
+    return Camera(
+        width=size[0],
+        height=size[1],
+        focal_px=np.diag(matrix)[:2],
+        principal_point_px=matrix[:2, 2] + OPENCV_PIXEL_OFFSET,
+        distortion=distortion.ravel()[:4],
+    )
+
+
+def board_pose(view: BoardView, board: Board, camera: Camera) -> Rigid3:
+    """``cam_from_board`` of one view (T. Collins, A. Bartoli, IJCV 109, 2014)."""
+    points, ideal = board.corners[view.corner], camera.rays(view.pixels)[:, None, :2]
+    found = cv2.solvePnPGeneric(points, np.ascontiguousarray(ideal), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+    _, turns, shifts, _ = found
+    turn, shift = cv2.solvePnPRefineLM(points, np.ascontiguousarray(ideal), np.eye(3), None, turns[0], shifts[0])
+    return Rigid3.from_rotation_vector(turn.ravel(), shift.ravel())
+
+
+def joined(
+    views: Views, board: Board, cameras: Mapping[str, Camera], instants: Sequence[str]
+) -> tuple[BoardScene, dict[tuple[str, str], BoardView]]:
+    """The cameras in the frame of the first one, the board at each instant, and the views under one numbering.
+
+    Raises ReconstructionError where two groups of cameras never saw the board at once.
+    """
+    numbered = {key: [view.renumbered(order) for order in board.orders] for key, view in views.items()}
+    poses = {key: [board_pose(each, board, cameras[key[0]]) for each in numbered[key]] for key in views}
+    cam_from_rig = _chained(poses, list(cameras))
+    rig_from_board, chosen = {}, {}
+    for instant in instants:
+        seeing = [name for name in cameras if (name, instant) in views]
+        first = seeing[0]
+        rig_from_board[instant] = cam_from_rig[first].inverse() @ poses[first, instant][0]
+        for name in seeing:
+            expected = cam_from_rig[name] @ rig_from_board[instant]
+            best = min(range(len(board.orders)), key=lambda k: _apart(poses[name, instant][k], expected)[0])
+            chosen[name, instant] = numbered[name, instant][best]
+    scene = BoardScene(
+        cameras=cameras, cam_from_rig=cam_from_rig, rig_from_board=rig_from_board, bending_mm=np.zeros(3)
+    )
+    return scene, {key: chosen[key] for key in views}
+
+
+Poses = Mapping[tuple[str, str], Sequence[Rigid3]]
+"""By camera and instant, ``cam_from_board`` under each numbering of the corners."""
+
+
+def _chained(poses: Poses, cameras: Sequence[str]) -> dict[str, Rigid3]:
+    """Each camera beside the first, along the pairs that saw the board together most often (a spanning tree)."""
+    seen = {name: {instant for camera, instant in poses if camera == name} for name in cameras}
+    common = sorted(combinations(cameras, 2), key=lambda pair: -len(seen[pair[0]] & seen[pair[1]]))
+    placed, waiting = {cameras[0]: Rigid3.identity()}, set(cameras[1:])
+    while waiting:
+        pair = next((pair for pair in common if len({*pair} & waiting) == 1 and seen[pair[0]] & seen[pair[1]]), None)
+        if pair is None:
+            raise ReconstructionError(
+                f"calibration: {', '.join(placed)} and {', '.join(sorted(waiting))} never saw the board at once; show "
+                "it to cameras of both groups together"
+            )
+        known, new = pair if pair[1] in waiting else pair[::-1]
+        placed[new] = _beside(poses, known, new, sorted(seen[known] & seen[new])) @ placed[known]
+        waiting.remove(new)
+    return {name: placed[name] for name in cameras}
+
+
+def _beside(poses: Poses, known: str, new: str, instants: Sequence[str]) -> Rigid3:
+    """``new_from_known``: of what each instant and numbering says, what the most instants agree with."""
+    said = [[pose @ poses[known, instant][0].inverse() for pose in poses[new, instant]] for instant in instants]
+    distance_mm = float(np.median([np.linalg.norm(poses[new, instant][0].translation) for instant in instants]))
+
+    def support(candidate: Rigid3) -> tuple[int, float]:
+        nearest = [min(_apart(each, candidate) for each in options) for options in said]
+        agreeing = [turn for turn, shift in nearest if turn < _AGREE_DEG and shift < _AGREE_SHARE * distance_mm]
+        return len(agreeing), -float(np.median([turn for turn, _ in nearest]))
+
+    return max((each for options in said for each in options), key=support)
+
+
+def _apart(one: Rigid3, other: Rigid3) -> tuple[float, float]:
+    """The turn between two motions, degrees, and the distance, mm."""
+    between = one @ other.inverse()
+    return between.angle_deg, float(np.linalg.norm(one.translation - other.translation))

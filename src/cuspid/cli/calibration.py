@@ -1,0 +1,130 @@
+"""Boards to print, and the calibration of a rig from images of one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import cv2
+from rich.table import Table
+from tyro.conf import Positional
+
+from cuspid import storage
+from cuspid.board import Board
+from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, calibrate_rig
+from cuspid.calibration.corners import BoardView, find_corners
+from cuspid.cli.shared import Flat, console, show_progress
+from cuspid.image_sequence import ImageSequence
+from cuspid.options import Range
+from cuspid.progress import Progress
+from cuspid.reporting.figures.calibration import save_board, save_residuals_picture
+from cuspid.rig import Handpiece, depth_of_field_mm
+from cuspid.workers import map_in_threads
+
+
+def target(*, out: Path, board: Annotated[Board, Flat] = Board()) -> None:
+    """Draw a ChArUco board or a chessboard in its true size, to print.
+
+    Args:
+        out: PDF, SVG or PNG file.
+    """
+    save_board(out, board)
+    width, height = board.size_mm
+    console.print(f"{out}: {width:g} x {height:g} mm; measure the ruler on the print, and give its length over squares")
+
+
+def calibrate(
+    images: Annotated[Path, Positional],
+    *,
+    out: Path,
+    board: Annotated[Board, Flat] = Board(),
+    working_distance_mm: Annotated[float | None, Range(0.1, 100_000)] = None,
+    options: Annotated[CalibrationOptions, Flat] = CalibrationOptions(),
+) -> None:
+    """Calibrate the cameras of a rig from images of a board: handpiece.json with the covariance of every number.
+
+    Args:
+        images: Folder with a folder of images, or a video, for each camera; what was taken at once has one name.
+        out: Folder for handpiece.json, rig_config.json, calibration.json (how each camera did) and residuals.png.
+        working_distance_mm: From the cameras to the teeth; without it the median distance of the board.
+    """
+    settings = {"board": board, "options": options, "working_distance_mm": working_distance_mm}
+    sources = storage.rig_sources(images)
+    hashes = {name: storage.hash_source(path) for name, path in sources.items()}
+    with (
+        storage.claimed_folder(out, "frames", {}, hashes),
+        storage.claimed_folder(out, "calibrate", settings, hashes, replace=True),
+        show_progress() as progress,
+    ):
+        decoded = out / "frames"
+        sequences = {
+            name: storage.read_sequence(path, decoded / name, progress=progress) for name, path in sources.items()
+        }
+        views = _views(sequences, board, progress)
+        found = calibrate_rig(views, {name: each.size for name, each in sequences.items()}, board, options)
+        handpiece = _handpiece(found, working_distance_mm)
+        storage.write_handpiece(out / "handpiece.json", handpiece)
+        storage.write_rig_config(out / "rig_config.json", handpiece.rig)
+        storage.write_json(out / "calibration.json", _figures(found))
+        cameras = {name: mounted.camera for name, mounted in handpiece.rig.cameras.items()}
+        save_residuals_picture(out / "residuals.png", cameras, found.pixels, found.residuals, title="residuals")
+    _print(found, out)
+
+
+def _views(
+    sequences: Mapping[str, ImageSequence], board: Board, progress: Progress
+) -> dict[tuple[str, str], BoardView]:
+    """The board in every image that shows it."""
+    images = [(camera, index) for camera, sequence in sequences.items() for index in range(len(sequence))]
+
+    def find(image: tuple[str, int]) -> BoardView | None:
+        camera, index = image
+        return find_corners(cv2.cvtColor(sequences[camera].image(index), cv2.COLOR_RGB2GRAY), board)
+
+    found = map_in_threads(find, images, stage="corners", progress=progress)
+    return {
+        (camera, sequences[camera].names[index]): view
+        for (camera, index), view in zip(images, found, strict=True)
+        if view is not None
+    }
+
+
+def _handpiece(found: RigCalibration, working_distance_mm: float | None) -> Handpiece:
+    distance_mm = found.distance_mm if working_distance_mm is None else working_distance_mm
+    return Handpiece(
+        rig=found.rig.over_surface(distance_mm),
+        working_distance_mm=distance_mm,
+        depth_range_mm=depth_of_field_mm(distance_mm),
+        name="calibrated",
+    )
+
+
+def _figures(found: RigCalibration) -> dict[str, object]:
+    return {
+        "sigma_px": found.sigma_px,
+        "board_bending_mm": found.bending_mm,
+        "board_distance_mm": found.distance_mm,
+        "cameras": {name: asdict(each) for name, each in found.cameras.items()},
+        "notes": found.notes,
+    }
+
+
+def _print(found: RigCalibration, out: Path) -> None:
+    for note in found.notes:
+        console.print(f"note: {note}")
+    table = Table(title="Calibration")
+    for heading in ("camera", "views", "corners", "RMS px", "held out px", "halves apart: lens, place (sigmas)"):
+        table.add_column(heading, justify="left" if heading == "camera" else "right")
+    for name, each in found.cameras.items():
+        apart = [_shown(value, 1) for value in (each.parameters_apart, each.place_apart)]
+        table.add_row(
+            name, str(each.views), str(each.corners), _shown(each.rms_px), _shown(each.held_out_px), ", ".join(apart)
+        )
+    console.print(table)
+    console.print(f"{out / 'handpiece.json'}: {len(found.cameras)} cameras, corners to {found.sigma_px:.2f} px")
+
+
+def _shown(value: float | None, digits: int = 2) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,104 @@
+"""Boards to print, and pictures of a calibration: where each camera saw corners, and what was left over there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
+
+from cuspid.board import Board
+from cuspid.camera import Camera
+from cuspid.errors import InputError
+from cuspid.reporting.figures.drawing import new_figure, save_figure
+
+BOARD_SUFFIXES = (".pdf", ".svg", ".png")
+_MM_PER_INCH = 25.4
+_MARGIN_MM, _RULER_MM = 5.0, 7.0
+_INK = "#333333"
+_LONGEST = 0.1
+"""Line of the largest residual, as a share of the width of an image."""
+
+
+def save_board(path: Path, board: Board) -> None:
+    """PDF, SVG or PNG of a board in its true size, with a ruler that shows whether the printer kept it.
+
+    Raises InputError for another kind of file.
+    """
+    if path.suffix.lower() not in BOARD_SUFFIXES:
+        raise InputError(f"{path}: a board is written as {', '.join(BOARD_SUFFIXES)}")
+    (width, height), margin = board.size_mm, max(_MARGIN_MM, board.square_mm / 2)
+    page = np.array([width + 2 * margin, height + 2 * margin + _RULER_MM])
+    figure = Figure(figsize=tuple(page / _MM_PER_INCH), dpi=600, facecolor="white")
+    FigureCanvasAgg(figure)
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.set_xlim(-margin, width + margin)
+    axes.set_ylim(height + margin + _RULER_MM, -margin)
+    axes.set_axis_off()
+    places, sides = board.dark
+    if board.inverted:
+        ground = np.array([[-margin / 2, -margin / 2]])
+        axes.add_collection(_squares(ground, np.array([[width + margin, height + margin]]), "black"))
+    axes.add_collection(_squares(places, np.stack([sides, sides], axis=1), "white" if board.inverted else "black"))
+    _draw_ruler(figure, board, height + margin)
+    save_figure(figure, path)
+
+
+def _squares(places: Float[np.ndarray, "n 2"], sizes: Float[np.ndarray, "n 2"], colour: str) -> PolyCollection:
+    corners = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    return PolyCollection(
+        places[:, None] + sizes[:, None] * corners, facecolors=colour, edgecolors="none", antialiased=False
+    )
+
+
+def _draw_ruler(figure: Figure, board: Board, top_mm: float) -> None:
+    """As many whole squares, or millimetres, as are wide; and what they must measure."""
+    axes, length = figure.axes[0], board.size_mm[0]
+    axes.plot([0, length], [top_mm, top_mm], color="black", linewidth=0.5, solid_capstyle="butt")
+    for x in board.square_mm * np.arange(board.columns + 1):
+        axes.plot([x, x], [top_mm - 1, top_mm + 1], color="black", linewidth=0.5, solid_capstyle="butt")
+    size = min(8.0, 72 / _MM_PER_INCH * length / 30)
+    axes.text(0, top_mm + 1.5, f"{length:g} mm, {_named(board)}", fontsize=size, va="top", color="black")
+
+
+def _named(board: Board) -> str:
+    markers = f", {board.dictionary}, markers {board.marker_share:g}" if board.kind == "charuco" else ""
+    return f"{board.kind} {board.columns} x {board.rows} x {board.square_mm:g} mm{markers}"
+
+
+def save_residuals_picture(
+    path: Path,
+    cameras: Mapping[str, Camera],
+    pixels: Mapping[str, Float[np.ndarray, "n 2"]],
+    residuals: Mapping[str, Float[np.ndarray, "n 2"]],
+    *,
+    title: str = "",
+) -> None:
+    """PNG with an image frame for each camera: where corners were seen, and the residual of each as a line."""
+    columns = min(4, len(cameras))
+    rows = -(-len(cameras) // columns)
+    figure = new_figure(3.4 * columns, 0.5 + 3.0 * rows, dpi=130)
+    largest = max(float(np.linalg.norm(each, axis=1).max()) for each in residuals.values())
+    for index, (name, camera) in enumerate(cameras.items()):
+        axes = figure.add_subplot(rows, columns, index + 1)
+        _draw_residuals(axes, camera, pixels[name], residuals[name] * _LONGEST * camera.width / largest)
+        rms = float(np.sqrt(np.mean(residuals[name] ** 2)))
+        axes.set_title(f"{name}: {rms:.2f} px RMS", fontsize=10, color=_INK)
+    figure.suptitle(f"{title}\nthe longest line is {largest:.2g} px", fontsize=11, color=_INK)
+    figure.tight_layout()
+    save_figure(figure, path)
+
+
+def _draw_residuals(axes: Axes, camera: Camera, at: Float[np.ndarray, "n 2"], drawn: Float[np.ndarray, "n 2"]) -> None:
+    lines = np.stack([at, at + drawn], axis=1)
+    axes.add_collection(LineCollection(lines.tolist(), colors="#d1603d", linewidths=0.6))
+    axes.plot(*at.T, ".", color="#1f5fd6", markersize=1.2)
+    axes.set_xlim(0, camera.width)
+    axes.set_ylim(camera.height, 0)
+    axes.set_aspect("equal")
+    axes.tick_params(labelsize=7, colors=_INK)

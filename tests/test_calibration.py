@@ -1,0 +1,358 @@
+"""Calibration from views of a board: closed loops from known cameras, and what is refused."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cuspid import storage
+from cuspid.board import Board
+from cuspid.calibration import bundle
+from cuspid.calibration.bundle import BoardScene, adjust_board
+from cuspid.calibration.calibrate import RigCalibration, calibrate_rig
+from cuspid.calibration.corners import BoardView, find_corners
+from cuspid.calibration.start import first_camera
+from cuspid.camera import Camera
+from cuspid.errors import InputError, ReconstructionError
+from cuspid.geometry import Rigid3
+from verbs import refused, run
+
+BOARD = Board(columns=9, rows=7, square_mm=2.0)
+CHESS = Board(kind="chessboard", columns=8, rows=8, square_mm=2.0)
+SIZE = (640, 480)
+
+
+def looking_at(middle: np.ndarray, centre: np.ndarray, roll_deg: float) -> Rigid3:
+    """``cam_from_world`` of a camera at a place that looks at another."""
+    forward = (middle - centre) / np.linalg.norm(middle - centre)
+    right = np.cross([0.0, 1.0, 0.0], forward)
+    right /= np.linalg.norm(right)
+    turn = Rotation.from_rotvec(np.deg2rad(roll_deg) * np.array([0, 0, 1.0])).as_matrix()
+    rotation = turn @ np.stack([right, np.cross(forward, right), forward])
+    return Rigid3(rotation, -rotation @ centre)
+
+
+def scene(seed: int, board: Board = BOARD, cameras: int = 3, instants: int = 16, scale: float = 1.0) -> BoardScene:
+    """Cameras side by side over a board that is turned and tilted before them."""
+    rng = np.random.default_rng(seed)
+    lenses, places = {}, {}
+    for k in range(cameras):
+        lenses[f"cam{k}"] = Camera(
+            width=SIZE[0],
+            height=SIZE[1],
+            focal_px=rng.uniform(480, 560) * np.array([1.0, rng.uniform(0.99, 1.01)]),
+            principal_point_px=np.array(SIZE) / 2 + rng.normal(0, 8, 2),
+            distortion=rng.normal(0, [0.1, 0.05, 0.002, 0.002]),
+        )
+        centre = np.array([4.0 * k, rng.normal(0, 1), rng.normal(0, 1)])
+        places[f"cam{k}"] = looking_at(np.array([2.0 * (cameras - 1), 0, 24.0]), centre, rng.normal(0, 5))
+    first = places["cam0"]
+    poses = {}
+    for i in range(instants):
+        tilt = Rotation.from_euler("xyz", rng.uniform(-40, 40, 3), degrees=True).as_matrix()
+        middle = np.array([2.0 * (cameras - 1), 0, 24.0]) + rng.normal(0, [2, 2, 3])
+        in_world = Rigid3(tilt, middle - tilt @ np.array([*board.size_mm, 0]) / 2)
+        poses[f"{i:02d}"] = first @ in_world
+    return BoardScene(
+        cameras=lenses,
+        cam_from_rig={name: scaled(place @ first.inverse(), scale) for name, place in places.items()},
+        rig_from_board={name: scaled(pose, scale) for name, pose in poses.items()},
+        bending_mm=scale * np.array([0.05, -0.03, 0.04]),
+    )
+
+
+def scaled(pose: Rigid3, scale: float) -> Rigid3:
+    return Rigid3(pose.rotation, scale * pose.translation)
+
+
+def undistorted(camera: Camera) -> Camera:
+    return replace(camera, distortion=np.zeros(4))
+
+
+def views_of(truth: BoardScene, board: Board, noise_px: float, rng: np.random.Generator) -> dict:
+    """What the cameras see of the board, with noise; corners beyond the image are missing."""
+    u, v = bundle.bending_coordinates(board, board.corners).T
+    bent = board.corners + np.outer(np.stack([u * u, u * v, v * v], 1) @ truth.bending_mm, [0, 0, 1.0])
+    views = {}
+    for camera, lens in truth.cameras.items():
+        for instant, pose in truth.rig_from_board.items():
+            pixels = lens.project((truth.cam_from_rig[camera] @ pose).apply(bent))
+            seen = np.flatnonzero(lens.contains(pixels))
+            if len(seen) >= 12 and (board.kind == "charuco" or len(seen) == len(bent)):
+                views[camera, instant] = BoardView(seen, pixels[seen] + rng.normal(0, noise_px, (len(seen), 2)))
+    return views
+
+
+def calibrated(truth: BoardScene, views: dict, board: Board = BOARD) -> RigCalibration:
+    return calibrate_rig(views, dict.fromkeys(truth.cameras, SIZE), board)
+
+
+def lens_error(found: RigCalibration, truth: BoardScene, name: str) -> float:
+    """Of the parameters, in stated standard deviations (RMS)."""
+    camera = found.rig[name].camera
+    difference = camera.parameters - truth.cameras[name].parameters
+    return float(np.sqrt(difference @ np.linalg.solve(camera.covariance, difference) / 8))
+
+
+def between(found: RigCalibration, truth: BoardScene, name: str) -> Rigid3:
+    """The place of a camera beside the first one as found, over the true one."""
+    ours = found.rig[name].cam_from_rig @ found.rig["cam0"].cam_from_rig.inverse()
+    return ours @ truth.cam_from_rig[name].inverse()
+
+
+# --- boards ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+@pytest.mark.parametrize(("columns", "rows"), [(5, 7), (4, 6), (5, 6), (4, 5)])
+def test_a_board_is_the_one_of_opencv(columns, rows, legacy):
+    board = Board(columns=columns, rows=rows, square_mm=10.0, marker_share=0.6, legacy=legacy)
+    picture = np.full((40 * rows, 40 * columns), 255, np.uint8)
+    for (x, y), side in zip(*board.dark, strict=True):
+        picture[round(4 * y) : round(4 * (y + side)), round(4 * x) : round(4 * (x + side))] = 0
+    assert np.array_equal(picture, board.opencv.generateImage((40 * columns, 40 * rows), marginSize=0))
+    assert np.allclose(board.opencv.getChessboardCorners(), board.corners)
+
+
+def test_a_chessboard_is_numbered_in_as_many_ways_as_it_looks_alike():
+    assert len(BOARD.orders) == 1
+    assert len(Board(kind="chessboard", columns=8, rows=6).orders) == 2
+    assert len(CHESS.orders) == 4
+    for order in CHESS.orders:  # a turn: distances on the board stay
+        turned = CHESS.corners[order]
+        assert np.allclose(
+            np.linalg.norm(turned[1:] - turned[:-1], axis=1), np.linalg.norm(np.diff(CHESS.corners, axis=0), axis=1)
+        )
+
+
+def test_too_many_markers_are_refused():
+    with pytest.raises(InputError, match="75 markers are needed, but the dictionary 4X4_50 has 50"):
+        Board(columns=10, rows=15, dictionary="4X4_50")
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+@pytest.mark.parametrize("kind", ["charuco", "chessboard"])
+def test_a_drawn_board_is_found_where_it_was_drawn(tmp_path, kind, inverted):
+    board = Board(kind=kind, columns=7, rows=6, square_mm=2.0, inverted=inverted)
+    run("target", "--out", tmp_path / "board.png", *options(board))
+    gray = cv2.imread(str(tmp_path / "board.png"), cv2.IMREAD_GRAYSCALE)
+    found = find_corners(gray, board)
+    px_per_mm = 600 / 25.4
+    expected = [(board.corners[order, :2] + 5.0) * px_per_mm for order in board.orders]
+    assert len(found.corner) == 30
+    assert min(np.abs(found.pixels - each[found.corner]).max() for each in expected) < 1.0
+
+
+@pytest.mark.parametrize("square_mm", [0.5, 3.0, 25.0])
+def test_a_page_is_as_large_as_it_says(tmp_path, square_mm):
+    board = Board(columns=6, rows=5, square_mm=square_mm)
+    for suffix in ("pdf", "svg"):
+        run("target", "--out", tmp_path / f"board.{suffix}", *options(board))
+    margin = max(5.0, square_mm / 2)
+    width, height = 6 * square_mm + 2 * margin, 5 * square_mm + 2 * margin + 7
+    page = (tmp_path / "board.pdf").read_bytes().split(b"/MediaBox [ 0 0 ")[1].split(b"]")[0]
+    assert np.allclose([float(each) for each in page.split()], np.array([width, height]) * 72 / 25.4, atol=0.01)
+    svg = (tmp_path / "board.svg").read_text()
+    assert f'width="{width * 72 / 25.4:.6f}'[:12] in svg
+
+
+# --- closed loops ------------------------------------------------------------------------------------------------
+
+
+def test_jacobian_agrees_with_finite_differences():
+    truth = scene(0, cameras=2, instants=3)
+    views = views_of(truth, BOARD, 1.0, np.random.default_rng(0))
+    seen = bundle._Observations.of(views, BOARD, list(truth.cameras), list(truth.rig_from_board))
+    free = bundle._Free.of(truth, BOARD, only_boards=False)
+    in_rig, in_cam, _ = bundle._project(truth, seen)
+    jacobian = bundle._jacobian(truth, seen, in_rig, in_cam)[:, free.columns].toarray()
+    for column in range(len(free.columns)):
+        step = np.zeros(len(free.columns))
+        step[column] = 1e-6
+        ahead, back = (bundle._project(bundle._stepped(truth, free, sign * step), seen)[2] for sign in (1, -1))
+        numeric = -(ahead - back).ravel() / 2e-6
+        assert np.allclose(jacobian[:, column], numeric, atol=1e-4 * max(1, np.abs(numeric).max())), column
+
+
+def test_without_noise_the_cameras_are_found_exactly():
+    truth = replace(scene(1), bending_mm=np.zeros(3))
+    middle = np.array(SIZE) / 2  # where the prior has it
+    lenses = {n: replace(undistorted(camera), principal_point_px=middle) for n, camera in truth.cameras.items()}
+    truth = replace(truth, cameras=lenses)
+    found = calibrated(truth, views_of(truth, BOARD, 0.0, np.random.default_rng(0)))
+    for name, camera in truth.cameras.items():
+        assert np.allclose(found.rig[name].camera.parameters, camera.parameters, atol=1e-3)
+        assert np.linalg.norm(between(found, truth, name).translation) < 1e-4
+    assert found.notes == ()
+
+
+def test_errors_are_what_the_covariance_states():
+    """Over ten rigs: of the lenses, and what is left over is the noise."""
+    errors, held_out, apart = [], [], []
+    for seed in range(10):
+        truth = scene(seed)
+        found = calibrated(truth, views_of(truth, BOARD, 0.1, np.random.default_rng(seed)))
+        assert 0.09 < found.sigma_px < 0.11
+        errors += [lens_error(found, truth, name) for name in truth.cameras]
+        held_out += [check.held_out_px for check in found.cameras.values()]
+        apart += [check.parameters_apart for check in found.cameras.values()]
+    assert 0.8 < np.sqrt(np.mean(np.square(errors))) < 1.2
+    assert 0.8 < np.sqrt(np.mean(np.square(apart))) < 1.25
+    assert 0.1 < np.mean(held_out) < 0.11
+
+
+@pytest.mark.parametrize("scale", [0.01, 50.0])
+def test_a_larger_board_gives_a_larger_rig(scale):
+    found = []
+    for each in (1.0, scale):
+        board, truth = replace(BOARD, square_mm=2 * each), scene(2, scale=each)
+        found.append(calibrated(truth, views_of(truth, board, 0.1, np.random.default_rng(0)), board))
+    for name in found[0].rig.names:
+        assert np.allclose(found[0].rig[name].camera.parameters, found[1].rig[name].camera.parameters, atol=0.02)
+        assert np.allclose(
+            scale * found[0].rig[name].centre_in_rig, found[1].rig[name].centre_in_rig, atol=0.01 * scale
+        )
+
+
+def test_cameras_that_saw_it_one_after_the_other_are_chained():
+    """Each pair of neighbours at instants of its own."""
+    truth = scene(3, cameras=4, instants=24)
+    views = views_of(truth, BOARD, 0.1, np.random.default_rng(0))
+    names, instants = list(truth.cameras), list(truth.rig_from_board)
+    shown = {instant: names[k % 3 : k % 3 + 2] for k, instant in enumerate(instants)}
+    found = calibrated(truth, {key: view for key, view in views.items() if key[0] in shown[key[1]]})
+    assert all(np.linalg.norm(between(found, truth, name).translation) < 0.15 for name in names)
+    apart = {key: view for key, view in views.items() if (key[0] in names[:2]) == (int(key[1]) % 2 == 0)}
+    with pytest.raises(ReconstructionError, match="cam0, cam1 and cam2, cam3 never saw the board at once"):
+        calibrated(truth, apart)
+
+
+def test_a_chessboard_is_numbered_alike_in_all_cameras():
+    truth = scene(4, CHESS)
+    rng = np.random.default_rng(0)
+    views = views_of(truth, CHESS, 0.05, rng)
+    turned = {}
+    for key, view in views.items():
+        order = CHESS.orders[rng.integers(4)]
+        turned[key] = BoardView(np.arange(len(order)), view.pixels[order])
+    found = calibrated(truth, turned, CHESS)
+    assert found.sigma_px < 0.06
+    assert all(np.linalg.norm(between(found, truth, name).translation) < 0.05 for name in truth.cameras)
+
+
+def test_a_view_of_another_instant_is_left_out_and_named():
+    truth = scene(5)
+    views = views_of(truth, BOARD, 0.1, np.random.default_rng(0))
+    shifted = views["cam1", "03"]
+    views["cam1", "03"] = BoardView(shifted.corner, shifted.pixels + [3.0, -2.0])
+    found = calibrated(truth, views)
+    assert len(found.notes) == 1
+    assert found.notes[0].startswith("camera cam1, 03: left out")
+    assert max(lens_error(found, truth, name) for name in truth.cameras) < 2.5
+
+
+def test_a_lens_that_the_model_does_not_have_is_doubted():
+    truth = scene(6)
+    views = views_of(truth, BOARD, 0.02, np.random.default_rng(0))
+    middle = np.array(SIZE) / 2
+    for key, view in views.items():
+        if key[0] == "cam0":
+            away = (view.pixels - middle) / middle
+            bent = view.pixels + 2.0 * np.sin(9 * away[:, :1]) * np.array([0.0, 1.0])
+            views[key] = BoardView(view.corner, bent)
+    found = calibrated(truth, views)
+    assert any(note.startswith("camera cam0: calibrations from two halves") for note in found.notes)
+
+
+def test_too_few_views_are_refused():
+    truth = scene(7)
+    views = views_of(truth, BOARD, 0.1, np.random.default_rng(0))
+    few = {key: view for key, view in views.items() if key[0] != "cam2" or key[1] in ("00", "01")}
+    with pytest.raises(ReconstructionError, match="cam2 saw the board at fewer than 3 instants"):
+        calibrated(truth, few)
+
+
+def test_boards_alone_are_placed_in_a_known_rig():
+    truth = scene(8)
+    views = views_of(truth, BOARD, 0.1, np.random.default_rng(0))
+    push = Rigid3.from_rotation_vector(np.array([0.02, -0.01, 0.03]), np.array([0.3, -0.2, 0.4]))
+    start = replace(truth, rig_from_board={name: push @ pose for name, pose in truth.rig_from_board.items()})
+    found = adjust_board(start, views, BOARD, only_boards=True)
+    assert found.scene.cameras == truth.cameras or all(
+        np.array_equal(found.scene.cameras[n].parameters, truth.cameras[n].parameters) for n in truth.cameras
+    )
+    off = [(found.scene.rig_from_board[name] @ pose.inverse()).angle_deg for name, pose in truth.rig_from_board.items()]
+    assert max(off) < 0.1
+
+
+def test_one_camera_begins_near_the_truth():
+    truth = scene(9, cameras=1)
+    views = views_of(truth, BOARD, 0.1, np.random.default_rng(0))
+    start = first_camera(list(views.values()), BOARD, SIZE)
+    assert np.abs(start.focal_px / truth.cameras["cam0"].focal_px - 1).max() < 0.05
+
+
+# --- from images -------------------------------------------------------------------------------------------------
+
+
+def options(board: Board) -> list[object]:
+    given = ["--kind", board.kind, "--columns", board.columns, "--rows", board.rows, "--square-mm", board.square_mm]
+    return given + ["--inverted"] * board.inverted
+
+
+def photographs(folder, truth: BoardScene, board: Board) -> None:
+    """The board as the cameras see it, without distortion."""
+    px_per_mm = 40.0
+    size = np.rint(np.array(board.size_mm) * px_per_mm).astype(int)
+    picture = np.full((size[1], size[0]), 230, np.uint8)
+    for (x, y), side in zip(*(px_per_mm * each for each in board.dark), strict=True):
+        picture[round(y) : round(y + side), round(x) : round(x + side)] = 25
+    finer = np.array([[4, 0, 1.5], [0, 4, 1.5], [0, 0, 1.0]])
+    picture = cv2.copyMakeBorder(picture, 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=230)
+    for name, camera in truth.cameras.items():
+        for instant, pose in truth.rig_from_board.items():
+            cam_from_board = truth.cam_from_rig[name] @ pose
+            plane = np.column_stack([cam_from_board.rotation[:, :2] / px_per_mm, cam_from_board.translation])
+            to_board = np.array([[1, 0, 0.5 - 40], [0, 1, 0.5 - 40], [0, 0, 1.0]])
+            homography = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]]) @ camera.matrix @ plane @ to_board
+            fine = cv2.warpPerspective(picture, finer @ homography, (4 * SIZE[0], 4 * SIZE[1]), borderValue=128)
+            image = cv2.resize(fine, SIZE, interpolation=cv2.INTER_AREA)
+            storage.write_image(folder / name / f"{instant}.png", np.repeat(image[..., None], 3, axis=2))
+
+
+@pytest.mark.parametrize("kind", ["charuco", "chessboard"])
+def test_photographs_of_a_board_become_a_handpiece(tmp_path, capsys, kind):
+    board = Board(kind=kind, columns=8, rows=8, square_mm=2.0)
+    flat = replace(scene(10, board, cameras=2, instants=10), bending_mm=np.zeros(3))
+    truth = replace(flat, cameras={name: undistorted(camera) for name, camera in flat.cameras.items()})
+    photographs(tmp_path / "images", truth, board)
+    run("calibrate", tmp_path / "images", "--out", tmp_path / "rig", *options(board))
+    handpiece = storage.read_handpiece(tmp_path / "rig" / "handpiece.json")
+    checks = storage.read_json(tmp_path / "rig" / "calibration.json")["cameras"]
+    assert set(handpiece.rig.names) == {"cam0", "cam1"}
+    assert all(check["rms_px"] < 0.1 and check["held_out_px"] < 0.1 for check in checks.values())
+    for name, camera in truth.cameras.items():
+        assert np.abs(handpiece.rig[name].camera.focal_px / camera.focal_px - 1).max() < 0.01
+        assert handpiece.rig[name].covariance is not None
+    ours, true = (
+        np.linalg.norm(places["cam1"].inverse().translation - places["cam0"].inverse().translation)
+        for places in ({n: m.cam_from_rig for n, m in handpiece.rig.cameras.items()}, truth.cam_from_rig)
+    )
+    assert abs(ours - true) < 0.05
+    assert (tmp_path / "rig" / "residuals.png").stat().st_size > 5_000
+    assert "Calibration" in capsys.readouterr().err
+
+
+def test_what_cannot_be_calibrated_is_one_line(tmp_path, capsys):
+    out = tmp_path / "rig"
+    assert "no such folder" in refused(capsys, "calibrate", tmp_path / "none", "--out", out)
+    (tmp_path / "empty").mkdir()
+    assert "each camera needs one" in refused(capsys, "calibrate", tmp_path / "empty", "--out", out)
+    for index in range(3):
+        storage.write_image(tmp_path / "gray" / "left" / f"{index}.png", np.full((64, 64, 3), 128, np.uint8))
+    message = refused(capsys, "calibrate", tmp_path / "gray", "--out", out)
+    assert "left saw the board at fewer than 3 instants" in message
+    assert not out.exists()
+    assert "a board is written as .pdf" in refused(capsys, "target", "--out", tmp_path / "board.txt")
