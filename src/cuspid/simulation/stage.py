@@ -19,6 +19,7 @@ from cuspid.rig import Handpiece
 from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.blender import render_with_blender
 from cuspid.simulation.lights import lit
+from cuspid.simulation.manufacturing import ManufacturingOptions, built, with_tolerances
 from cuspid.simulation.path.free import FreePathOptions, plan_free_path
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 from cuspid.simulation.raycast import Scene, lit_frames, render_capture
@@ -53,6 +54,8 @@ class SimulationOptions(RenderOptions):
 
     path: ScanPathOptions = field(default_factory=ScanPathOptions)
     """How the handpiece moves."""
+    manufacturing: ManufacturingOptions = field(default_factory=ManufacturingOptions)
+    """How far the handpiece that takes the images is from the one that reconstruction is told of."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,13 +77,15 @@ def simulate(
 ) -> tuple[Capture, GroundTruth]:
     """Scan a jaw: images to ``folder/capture``, what only the simulator knows to ``folder/truth``.
 
-    A handpiece without lights is given one beside each camera (:func:`cuspid.simulation.lights.lit`).
+    A handpiece without lights is given one beside each camera (:func:`cuspid.simulation.lights.lit`). Where it is not
+    built as it was drawn, the capture has the drawn one with its tolerances, and the truth the built one.
     Images that are there already are kept; a run that goes on gives the same bits as one that was not interrupted.
     """
     handpiece = lit(handpiece)
     path = plan_scan_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
     write_path(folder / "truth" / "path.json", path.minimum_overlap, path.mean_overlap, path.seen)
-    return take_images(jaw, handpiece, path.rig_from_world, folder, options, progress=progress)
+    true, told = built(handpiece, options.manufacturing), with_tolerances(handpiece, options.manufacturing)
+    return take_images(jaw, true, path.rig_from_world, folder, options, told=told, progress=progress)
 
 
 def film(
@@ -115,14 +120,16 @@ def take_images(
     folder: Path,
     options: RenderOptions,
     *,
+    told: Handpiece | None = None,
     progress: Progress = silent,
 ) -> tuple[Capture, GroundTruth]:
-    """As :func:`simulate`, from given poses of the handpiece, by the name of the frame."""
+    """As :func:`simulate`, from given poses of the handpiece, by the name of the frame. The capture has the handpiece
+    that is ``told``, the true one unless given."""
     handpiece = lit(handpiece)
     frames, poses = lit_frames(handpiece, rig_from_world)
     truth = GroundTruth(jaw=jaw, handpiece=handpiece, rig_from_world=poses)
     write_truth(folder / "truth", truth)
-    capture = Capture(handpiece=handpiece, frames=frames, source=ImageFolder(folder / "capture"))
+    capture = Capture(handpiece=told or handpiece, frames=frames, source=ImageFolder(folder / "capture"))
     write_capture(folder / "capture", capture)
     for done, total in _render(folder, capture, truth, options):
         progress("images", done, total)
