@@ -1,11 +1,11 @@
 """Scan with handpieces that are not what their files say: held as drawn, and refined within their tolerances.
 
-    python benchmarks/manufacturing.py [--work FOLDER] [--out benchmarks/results/manufacturing.json] [--jaw JAW --tooth T]
-                                       [--seeds 0 1 2] [--only fine usual] [--size half]
+    python benchmarks/manufacturing.py [--jaw JAW --tooth T] [--seeds 0 1 2] [--only fine usual] [--size half]
+                                       [--work FOLDER] [--out benchmarks/results/manufacturing.json]
 
 Twelve cameras, artificial texture, the molar 46 of the phantom, or a jaw of your own (all of it in one pass unless a
-tooth is given). Each handpiece of a row is another one that was built to the same tolerances. Finished scans are kept in
-the work folder and not run again.
+tooth is given). Each handpiece of a row is another one that was built to the same tolerances. Finished scans are kept
+in the work folder and not run again.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from cuspid.studies.grid import Case, Value, run_grid
 from cuspid.studies.scan_cases import commit
 
 HERE = Path(__file__).parent
-LENSES = {"manufacturing_focal_pct": 0.3, "manufacturing_centre_px": 1.0, "manufacturing_k1": 0.01}
+LENSES = ManufacturingOptions(manufacturing_focal_pct=0.3, manufacturing_centre_px=1.0, manufacturing_k1=0.01)
 TOLERANCES = {
     "none": ManufacturingOptions(),
     "fine": ManufacturingOptions(manufacturing_um=3.0, manufacturing_deg=0.02),
-    "usual": ManufacturingOptions(manufacturing_um=10.0, manufacturing_deg=0.05, **LENSES),
-    "rough": ManufacturingOptions(manufacturing_um=30.0, manufacturing_deg=0.2, **LENSES),
+    "usual": replace(LENSES, manufacturing_um=10.0, manufacturing_deg=0.05),
+    "rough": replace(LENSES, manufacturing_um=30.0, manufacturing_deg=0.2),
 }
 
 
