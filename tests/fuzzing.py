@@ -15,7 +15,7 @@ import shutil
 import signal
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -24,10 +24,12 @@ import cv2
 import numpy as np
 import trimesh
 
+from boards import photographs, scene, undistorted
 from builders import image_path, write_frames
 from cuspid import cli, pipeline, storage
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.board import Board
 from cuspid.capture import read_image
 from cuspid.errors import CuspidError
 from cuspid.evaluation.deviation import EvaluationOptions
@@ -235,6 +237,21 @@ def _film(folder: Path) -> None:
     take_images(jaw, camera, poses, folder / "film", RenderOptions(texture="artificial", supersampling=1))
 
 
+def _photographs(folder: Path) -> None:
+    whole = scene(0, Board(columns=6, rows=5, square_mm=3.0), cameras=2, instants=4)
+    halved = {
+        name: replace(
+            undistorted(camera),
+            width=camera.width // 2,
+            height=camera.height // 2,
+            focal_px=camera.focal_px / 2,
+            principal_point_px=camera.principal_point_px / 2,
+        )
+        for name, camera in whole.cameras.items()
+    }
+    photographs(folder / "photos", replace(whole, cameras=halved), Board(columns=6, rows=5, square_mm=3.0))
+
+
 def _score(folder: Path) -> None:
     known = known_film(small_jaw())
     write_truth(known, folder)
@@ -266,6 +283,10 @@ SCENARIOS: Mapping[str, Scenario] = {
     "precision": Scenario(_probe, verb("precision", "@jaw.ply", *PROBE, "--out", f"@{_OUT}")),
     "mouth": Scenario(_probe, verb("mouth", "--handpiece", "@handpiece.json", "--out", f"@{_OUT}")),
     "reconstruct": Scenario(_textured_scan, verb("reconstruct", "@scan/capture", "--out", f"@{_OUT}")),
+    "calibrate": Scenario(
+        _photographs,
+        verb("calibrate", "@photos", "--columns", "6", "--rows", "5", "--square-mm", "3", "--out", f"@{_OUT}"),
+    ),
     "stitch": Scenario(_film, verb("stitch", "@film/capture/images/camera", "--out", f"@{_OUT}")),
     "stitch-eval": Scenario(_score, verb("stitch-eval", "@panorama", "@truth", "--out", f"@{_OUT}")),
 }

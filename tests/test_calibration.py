@@ -5,8 +5,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
+from boards import BOARD, SIZE, options, photographs, scene, undistorted, views_of
 from cuspid import storage
 from cuspid.board import Board
 from cuspid.calibration import bundle
@@ -14,75 +14,11 @@ from cuspid.calibration.bundle import BoardScene, adjust_board
 from cuspid.calibration.calibrate import RigCalibration, calibrate_rig
 from cuspid.calibration.corners import BoardView, find_corners
 from cuspid.calibration.start import first_camera
-from cuspid.camera import Camera
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
 from verbs import refused, run
 
-BOARD = Board(columns=9, rows=7, square_mm=2.0)
 CHESS = Board(kind="chessboard", columns=8, rows=8, square_mm=2.0)
-SIZE = (640, 480)
-
-
-def looking_at(middle: np.ndarray, centre: np.ndarray, roll_deg: float) -> Rigid3:
-    """``cam_from_world`` of a camera at a place that looks at another."""
-    forward = (middle - centre) / np.linalg.norm(middle - centre)
-    right = np.cross([0.0, 1.0, 0.0], forward)
-    right /= np.linalg.norm(right)
-    turn = Rotation.from_rotvec(np.deg2rad(roll_deg) * np.array([0, 0, 1.0])).as_matrix()
-    rotation = turn @ np.stack([right, np.cross(forward, right), forward])
-    return Rigid3(rotation, -rotation @ centre)
-
-
-def scene(seed: int, board: Board = BOARD, cameras: int = 3, instants: int = 16, scale: float = 1.0) -> BoardScene:
-    """Cameras side by side over a board that is turned and tilted before them."""
-    rng = np.random.default_rng(seed)
-    lenses, places = {}, {}
-    for k in range(cameras):
-        lenses[f"cam{k}"] = Camera(
-            width=SIZE[0],
-            height=SIZE[1],
-            focal_px=rng.uniform(480, 560) * np.array([1.0, rng.uniform(0.99, 1.01)]),
-            principal_point_px=np.array(SIZE) / 2 + rng.normal(0, 8, 2),
-            distortion=rng.normal(0, [0.1, 0.05, 0.002, 0.002]),
-        )
-        centre = np.array([4.0 * k, rng.normal(0, 1), rng.normal(0, 1)])
-        places[f"cam{k}"] = looking_at(np.array([2.0 * (cameras - 1), 0, 24.0]), centre, rng.normal(0, 5))
-    first = places["cam0"]
-    poses = {}
-    for i in range(instants):
-        tilt = Rotation.from_euler("xyz", rng.uniform(-40, 40, 3), degrees=True).as_matrix()
-        middle = np.array([2.0 * (cameras - 1), 0, 24.0]) + rng.normal(0, [2, 2, 3])
-        in_world = Rigid3(tilt, middle - tilt @ np.array([*board.size_mm, 0]) / 2)
-        poses[f"{i:02d}"] = first @ in_world
-    return BoardScene(
-        cameras=lenses,
-        cam_from_rig={name: scaled(place @ first.inverse(), scale) for name, place in places.items()},
-        rig_from_board={name: scaled(pose, scale) for name, pose in poses.items()},
-        bending_mm=scale * np.array([0.05, -0.03, 0.04]),
-    )
-
-
-def scaled(pose: Rigid3, scale: float) -> Rigid3:
-    return Rigid3(pose.rotation, scale * pose.translation)
-
-
-def undistorted(camera: Camera) -> Camera:
-    return replace(camera, distortion=np.zeros(4))
-
-
-def views_of(truth: BoardScene, board: Board, noise_px: float, rng: np.random.Generator) -> dict:
-    """What the cameras see of the board, with noise; corners beyond the image are missing."""
-    u, v = bundle.bending_coordinates(board, board.corners).T
-    bent = board.corners + np.outer(np.stack([u * u, u * v, v * v], 1) @ truth.bending_mm, [0, 0, 1.0])
-    views = {}
-    for camera, lens in truth.cameras.items():
-        for instant, pose in truth.rig_from_board.items():
-            pixels = lens.project((truth.cam_from_rig[camera] @ pose).apply(bent))
-            seen = np.flatnonzero(lens.contains(pixels))
-            if len(seen) >= 12 and (board.kind == "charuco" or len(seen) == len(bent)):
-                views[camera, instant] = BoardView(seen, pixels[seen] + rng.normal(0, noise_px, (len(seen), 2)))
-    return views
 
 
 def calibrated(truth: BoardScene, views: dict, board: Board = BOARD) -> RigCalibration:
@@ -295,31 +231,6 @@ def test_one_camera_begins_near_the_truth():
 
 
 # --- from images -------------------------------------------------------------------------------------------------
-
-
-def options(board: Board) -> list[object]:
-    given = ["--kind", board.kind, "--columns", board.columns, "--rows", board.rows, "--square-mm", board.square_mm]
-    return given + ["--inverted"] * board.inverted
-
-
-def photographs(folder, truth: BoardScene, board: Board) -> None:
-    """The board as the cameras see it, without distortion."""
-    px_per_mm = 40.0
-    size = np.rint(np.array(board.size_mm) * px_per_mm).astype(int)
-    picture = np.full((size[1], size[0]), 230, np.uint8)
-    for (x, y), side in zip(*(px_per_mm * each for each in board.dark), strict=True):
-        picture[round(y) : round(y + side), round(x) : round(x + side)] = 25
-    finer = np.array([[4, 0, 1.5], [0, 4, 1.5], [0, 0, 1.0]])
-    picture = cv2.copyMakeBorder(picture, 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=230)
-    for name, camera in truth.cameras.items():
-        for instant, pose in truth.rig_from_board.items():
-            cam_from_board = truth.cam_from_rig[name] @ pose
-            plane = np.column_stack([cam_from_board.rotation[:, :2] / px_per_mm, cam_from_board.translation])
-            to_board = np.array([[1, 0, 0.5 - 40], [0, 1, 0.5 - 40], [0, 0, 1.0]])
-            homography = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]]) @ camera.matrix @ plane @ to_board
-            fine = cv2.warpPerspective(picture, finer @ homography, (4 * SIZE[0], 4 * SIZE[1]), borderValue=128)
-            image = cv2.resize(fine, SIZE, interpolation=cv2.INTER_AREA)
-            storage.write_image(folder / name / f"{instant}.png", np.repeat(image[..., None], 3, axis=2))
 
 
 @pytest.mark.parametrize("kind", ["charuco", "chessboard"])
