@@ -267,3 +267,17 @@ def test_what_cannot_be_calibrated_is_one_line(tmp_path, capsys):
     assert "left saw the board at fewer than 3 instants" in message
     assert not out.exists()
     assert "a board is written as .pdf" in refused(capsys, "target", "--out", tmp_path / "board.txt")
+
+
+def test_a_calibration_that_fails_leaves_the_one_before(tmp_path, capsys):
+    board = Board(columns=8, rows=8, square_mm=2.0)
+    flat = replace(scene(11, board, cameras=1, instants=4), bending_mm=np.zeros(3))
+    truth = replace(flat, cameras={name: undistorted(camera) for name, camera in flat.cameras.items()})
+    photographs(tmp_path / "photos", truth, board)
+    run("calibrate", tmp_path / "photos", "--out", tmp_path / "rig", *options(board))
+    before = {path.name: path.read_bytes() for path in (tmp_path / "rig").iterdir()}
+    other = options(replace(board, kind="chessboard", columns=5))
+    assert "fewer than 3 instants" in refused(
+        capsys, "calibrate", tmp_path / "photos", "--out", tmp_path / "rig", *other
+    )
+    assert {path.name: path.read_bytes() for path in (tmp_path / "rig").iterdir()} == before

@@ -14,7 +14,7 @@ from tyro.conf import Positional
 from cuspid import storage
 from cuspid.board import Board
 from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, calibrate_rig
-from cuspid.calibration.corners import BoardView, find_corners
+from cuspid.calibration.corners import BoardView, Views, find_corners
 from cuspid.cli.shared import Flat, console, show_progress
 from cuspid.image_sequence import ImageSequence
 from cuspid.options import Range
@@ -53,29 +53,28 @@ def calibrate(
     settings = {"board": board, "options": options, "working_distance_mm": working_distance_mm}
     sources = storage.rig_sources(images)
     hashes = {name: storage.hash_source(path) for name, path in sources.items()}
-    with (
-        storage.claimed_folder(out, "frames", {}, hashes),
-        storage.claimed_folder(out, "calibrate", settings, hashes, replace=True),
-        show_progress() as progress,
-    ):
-        decoded = out / "frames"
+    with storage.claimed_folder(out, "frames", {}, hashes), show_progress() as progress:
         sequences = {
-            name: storage.read_sequence(path, decoded / name, progress=progress) for name, path in sources.items()
+            name: storage.read_sequence(path, out / "frames" / name, progress=progress)
+            for name, path in sources.items()
         }
         views = _views(sequences, board, progress)
         found = calibrate_rig(views, {name: each.size for name, each in sequences.items()}, board, options)
-        handpiece = _handpiece(found, working_distance_mm)
-        storage.write_handpiece(out / "handpiece.json", handpiece)
-        storage.write_rig_config(out / "rig_config.json", handpiece.rig)
-        storage.write_json(out / "calibration.json", _figures(found))
-        cameras = {name: mounted.camera for name, mounted in handpiece.rig.cameras.items()}
-        save_residuals_picture(out / "residuals.png", cameras, found.pixels, found.residuals, title="residuals")
+    with storage.claimed_folder(out, "calibrate", settings, hashes, replace=True):
+        _write(found, out, working_distance_mm)
     _print(found, out)
 
 
-def _views(
-    sequences: Mapping[str, ImageSequence], board: Board, progress: Progress
-) -> dict[tuple[str, str], BoardView]:
+def _write(found: RigCalibration, out: Path, working_distance_mm: float | None) -> None:
+    handpiece = _handpiece(found, working_distance_mm)
+    storage.write_handpiece(out / "handpiece.json", handpiece)
+    storage.write_rig_config(out / "rig_config.json", handpiece.rig)
+    storage.write_json(out / "calibration.json", _figures(found))
+    cameras = {name: mounted.camera for name, mounted in handpiece.rig.cameras.items()}
+    save_residuals_picture(out / "residuals.png", cameras, found.pixels, found.residuals, title="residuals")
+
+
+def _views(sequences: Mapping[str, ImageSequence], board: Board, progress: Progress) -> Views:
     """The board in every image that shows it."""
     images = [(camera, index) for camera, sequence in sequences.items() for index in range(len(sequence))]
 
