@@ -16,6 +16,7 @@ from cuspid.calibration.corners import BoardView, find_corners
 from cuspid.calibration.start import first_camera
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
+from cuspid.rig import Rig
 from verbs import refused, run
 
 CHESS = Board(kind="chessboard", columns=8, rows=8, square_mm=2.0)
@@ -50,6 +51,20 @@ def test_a_board_is_the_one_of_opencv(columns, rows, legacy):
         picture[round(4 * y) : round(4 * (y + side)), round(4 * x) : round(4 * (x + side))] = 0
     assert np.array_equal(picture, board.opencv.generateImage((40 * columns, 40 * rows), marginSize=0))
     assert np.allclose(board.opencv.getChessboardCorners(), board.corners)
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+@pytest.mark.parametrize("legacy", [False, True])
+@pytest.mark.parametrize("kind", ["charuco", "chessboard"])
+def test_ink_is_where_the_squares_are(kind, legacy, inverted):
+    board = Board(kind=kind, columns=5, rows=6, square_mm=3.0, marker_share=0.6, legacy=legacy, inverted=inverted)
+    places, sides = board.dark
+    assert board.is_dark(places + sides[:, None] * [0.5, 0.5]).all() != inverted
+    points = np.random.default_rng(0).uniform([-1, -1], [16, 19], (5000, 2))
+    printed = np.zeros(len(points), dtype=bool)
+    for place, side in zip(places, sides, strict=True):
+        printed |= ((points >= place) & (points < place + side)).all(axis=1)
+    assert np.array_equal(board.is_dark(points), printed ^ inverted)
 
 
 def test_a_chessboard_is_numbered_in_as_many_ways_as_it_looks_alike():
@@ -281,3 +296,31 @@ def test_a_calibration_that_fails_leaves_the_one_before(tmp_path, capsys):
         capsys, "calibrate", tmp_path / "photos", "--out", tmp_path / "rig", *other
     )
     assert {path.name: path.read_bytes() for path in (tmp_path / "rig").iterdir()} == before
+
+
+def test_a_rehearsed_calibration_finds_the_handpiece_that_was_built(tmp_path):
+    """Four cameras of an intra-oral size, off from the drawn ones, with lenses that distort."""
+    board = ("--columns", 9, "--rows", 7, "--square-mm", 0.7)
+    run("handpiece", "--design", "four", "--width-px", 320, "--height-px", 320, "--out", tmp_path / "drawn")
+    run(
+        *("photograph", tmp_path / "drawn" / "handpiece.json", "--out", tmp_path / "photos", *board),
+        *("--instants", 14, "--supersampling", 2, "--manufacturing-um", 30, "--manufacturing-deg", 0.3),
+        *("--manufacturing-focal-pct", 1, "--manufacturing-centre-px", 3, "--manufacturing-k1", 0.05),
+    )
+    run("calibrate", tmp_path / "photos", "--out", tmp_path / "rig", *board, "--working-distance-mm", 5)
+    drawn, true, found = (
+        storage.read_handpiece(tmp_path / folder / "handpiece.json").rig for folder in ("drawn", "photos/truth", "rig")
+    )
+    errors = []
+    for name, mounted in found.cameras.items():
+        off = mounted.camera.parameters - true[name].camera.parameters
+        errors.append(off @ np.linalg.solve(mounted.camera.covariance, off) / 8)
+    assert 0.3 < np.sqrt(np.mean(errors)) < 1.7
+    assert apart_um(found, true) < 0.2 * apart_um(drawn, true)
+
+
+def apart_um(one: Rig, other: Rig) -> float:
+    """RMS difference of the distances between the cameras."""
+    centres = (np.array([each.centre_in_rig for each in rig.cameras.values()]) for rig in (one, other))
+    ours, theirs = (np.linalg.norm(each[:, None] - each, axis=2) for each in centres)
+    return float(1000 * np.sqrt(np.mean((ours - theirs) ** 2)))

@@ -88,24 +88,44 @@ class Board(Options):
         corners = np.argwhere((row + column) % 2 == self._first_dark)[:, ::-1]
         places, sides = [corners * self.square_mm], [np.full(len(corners), self.square_mm)]
         if self.kind == "charuco":
-            for place, bits in self._markers():
-                bit = self.marker_share * self.square_mm / len(bits)
-                row, column = np.nonzero(~bits)
-                places.append(place + bit * np.stack([column, row], axis=-1))
-                sides.append(np.full(len(row), bit))
+            row, column, down, across = np.nonzero(~self._bits)
+            bit, margin = self.marker_share / self._bits.shape[-1], (1 - self.marker_share) / 2
+            corners = np.stack([column + margin + bit * across, row + margin + bit * down], axis=-1)
+            places.append(corners * self.square_mm)
+            sides.append(np.full(len(corners), bit * self.square_mm))
         return np.concatenate(places), np.concatenate(sides)
+
+    def is_dark(self, points: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
+        """Whether it is dark at places on the board, mm; beside it, it is as between the squares."""
+        squares = points / self.square_mm
+        column, row = np.floor(squares).astype(np.int64).T
+        inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
+        dark = inside & ((row + column) % 2 == self._first_dark)
+        if self.kind == "charuco":
+            light = np.flatnonzero(inside & ~dark)
+            dark[light] = self._in_marker(squares[light] % 1, self._bits[row[light], column[light]])
+        return dark ^ self.inverted
+
+    def _in_marker(self, within: Float[np.ndarray, "n 2"], bits: Bool[np.ndarray, "n b b"]) -> Bool[np.ndarray, "n"]:
+        """Whether a place in a square (0 to 1) is on a dark bit of its marker."""
+        count = bits.shape[1]
+        place = np.floor(((within - 0.5) / self.marker_share + 0.5) * count).astype(np.int64)
+        on = ((place >= 0) & (place < count)).all(axis=1)
+        column, row = np.clip(place, 0, count - 1).T
+        return on & ~bits[np.arange(len(bits)), row, column]
+
+    @cached_property
+    def _bits(self) -> Bool[np.ndarray, "rows columns b b"]:
+        """The light bits of the marker in each square, with its dark border; all light where there is none."""
+        dictionary = self.opencv.getDictionary()
+        count = dictionary.markerSize + 2
+        bits = np.ones((self.rows, self.columns, count, count), dtype=bool)
+        for number, corners in zip(self.opencv.getIds(), self.opencv.getObjPoints(), strict=True):
+            column, row = (np.asarray(corners)[0, :2] // self.square_mm).astype(int)
+            bits[row, column] = cv2.aruco.generateImageMarker(dictionary, int(number), count) > 0
+        return bits
 
     @property
     def _first_dark(self) -> int:
         """0 where the first square is dark, 1 where it holds a marker."""
         return int(self.kind == "charuco" and self.legacy and self.rows % 2 == 0)
-
-    def _markers(self) -> list[tuple[Float[np.ndarray, "2"], Bool[np.ndarray, "b b"]]]:
-        """For each marker its top left corner, mm, and its light bits, with the dark border."""
-        board = self.opencv
-        dictionary = board.getDictionary()
-        bits = dictionary.markerSize + 2
-        return [
-            (np.asarray(corners)[0, :2].astype(np.float64), cv2.aruco.generateImageMarker(dictionary, int(k), bits) > 0)
-            for k, corners in zip(board.getIds(), board.getObjPoints(), strict=True)
-        ]

@@ -52,6 +52,7 @@ COMMANDS: Mapping[str, Callable[..., Any]] = _Verbs(
         "handpiece": "handpieces",
         "design": "handpieces",
         "target": "calibration",
+        "photograph": "calibration",
         "calibrate": "calibration",
         "optics": "forecasts",
         "visibility": "forecasts",

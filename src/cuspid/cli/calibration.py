@@ -21,6 +21,8 @@ from cuspid.options import Range
 from cuspid.progress import Progress
 from cuspid.reporting.figures.calibration import save_board, save_residuals_picture
 from cuspid.rig import Handpiece, depth_of_field_mm
+from cuspid.simulation.board_images import PhotographOptions, photographs
+from cuspid.simulation.manufacturing import ManufacturingOptions, built
 from cuspid.workers import map_in_threads
 
 
@@ -33,6 +35,32 @@ def target(*, out: Path, board: Annotated[Board, Flat] = Board()) -> None:
     save_board(out, board)
     width, height = board.size_mm
     console.print(f"{out}: {width:g} x {height:g} mm; measure the ruler on the print, and give its length over squares")
+
+
+def photograph(
+    handpiece: Annotated[Path, Positional],
+    *,
+    out: Path,
+    board: Annotated[Board, Flat] = Board(),
+    options: Annotated[PhotographOptions, Flat] = PhotographOptions(),
+    manufacturing: Annotated[ManufacturingOptions, Flat] = ManufacturingOptions(),
+) -> None:
+    """Photograph a board with a handpiece in simulation, to rehearse its calibration.
+
+    Args:
+        handpiece: A handpiece.json, or COLMAP's rig_config.json.
+        out: Folder for images/, which cuspid calibrate takes, and truth/handpiece.json, the one that took them.
+    """
+    settings = {"board": board, "options": options, "manufacturing": manufacturing}
+    hashes = {"handpiece": storage.hash_file(handpiece)}
+    true = built(storage.read_handpiece(handpiece), manufacturing)
+    total = options.instants * len(true.rig.names)
+    with storage.claimed_folder(out, "photograph", settings, hashes), show_progress() as progress:
+        storage.write_handpiece(out / "truth" / "handpiece.json", true)
+        for done, (camera, instant, image) in enumerate(photographs(true, board, options), start=1):
+            storage.write_image(out / "images" / camera / f"{instant}.png", image)
+            progress("photographs", done, total)
+    console.print(f"{out / 'images'}: {options.instants} instants of {len(true.rig.names)} cameras")
 
 
 def calibrate(

@@ -1,0 +1,89 @@
+"""Photographs of a board with a handpiece, in simulation: to rehearse a calibration, and to try one against the truth.
+
+The board lies before one camera after the other, at about its working distance, tilted and turned at random, and all
+cameras take it at once. Light is even: no shading, no blur.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from scipy.spatial.transform import Rotation
+
+from cuspid.board import Board
+from cuspid.camera import Camera
+from cuspid.geometry import Rigid3
+from cuspid.options import SEED, Options, Range
+from cuspid.rig import Handpiece
+from cuspid.simulation.raycast import pixel_rays
+from cuspid.simulation.sensor import expose
+
+_LIGHT, _DARK = 0.75, 0.03
+"""Linear light of paper and of ink; full scale is 1."""
+_NEAR, _FAR = 0.9, 1.3
+"""Distance of the board, in working distances."""
+_ASIDE = 0.15
+"""How far the middle of the board is from the axis of the camera, in working distances (standard deviation)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotographOptions(Options):
+    """How a board is shown to a handpiece."""
+
+    instants: Annotated[int, Range(1, 10_000)] = 36
+    """How many times."""
+    most_tilt_deg: Annotated[float, Range(0, 70)] = 40.0
+    """Of the board, from facing the camera."""
+    supersampling: Annotated[int, Range(1, 16)] = 3
+    """Rays through a pixel along each side."""
+    seed: Annotated[int, SEED] = 0
+    """Chooses how the board is held, and the sensor noise."""
+
+
+def board_poses(handpiece: Handpiece, board: Board, options: PhotographOptions) -> list[Rigid3]:
+    """``rig_from_board`` at each instant."""
+    rng = np.random.default_rng([options.seed, 4])
+    cameras = list(handpiece.rig.cameras.values())
+    return [
+        cameras[k % len(cameras)].cam_from_rig.inverse() @ _held(handpiece.working_distance_mm, board, options, rng)
+        for k in range(options.instants)
+    ]
+
+
+def _held(distance_mm: float, board: Board, options: PhotographOptions, rng: np.random.Generator) -> Rigid3:
+    """``cam_from_board`` of a board before a camera."""
+    towards, turn = rng.uniform(-np.pi, np.pi, 2)
+    tilt = np.deg2rad(options.most_tilt_deg) * np.sqrt(rng.uniform())
+    axis = np.array([np.cos(towards), np.sin(towards), 0])
+    rotation = (Rotation.from_rotvec(tilt * axis) * Rotation.from_euler("z", turn)).as_matrix()
+    middle = distance_mm * np.array([*rng.normal(0, _ASIDE, 2), rng.uniform(_NEAR, _FAR)])
+    return Rigid3(rotation, middle - rotation @ np.array([*board.size_mm, 0.0]) / 2)
+
+
+def photographs(
+    handpiece: Handpiece, board: Board, options: PhotographOptions
+) -> Iterator[tuple[str, str, UInt8[np.ndarray, "h w 3"]]]:
+    """Camera, instant and image, one after the other."""
+    digits = len(str(options.instants - 1))
+    for k, rig_from_board in enumerate(board_poses(handpiece, board, options)):
+        for index, (name, mounted) in enumerate(handpiece.rig.cameras.items()):
+            light = board_light(board, mounted.camera, mounted.cam_from_rig @ rig_from_board, options.supersampling)
+            rng = np.random.default_rng([options.seed, 5, k, index])
+            yield name, f"{k:0{digits}d}", expose(light, 1.0, handpiece.sensor, rng)
+
+
+def board_light(board: Board, camera: Camera, cam_from_board: Rigid3, supersampling: int) -> Float[np.ndarray, "h w 3"]:
+    """Linear light of each pixel that looks at a board; paper where it looks past it or at its back."""
+    rays = pixel_rays(camera, supersampling) @ cam_from_board.rotation
+    eye = cam_from_board.inverse().translation
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = -eye[2] / rays[:, 2]
+    before = (eye[2] < 0) & (reach > 0) & np.isfinite(reach)
+    dark = np.zeros(len(rays), dtype=bool)
+    dark[before] = board.is_dark(eye[:2] + reach[before, None] * rays[before, :2])
+    ink = dark.reshape(camera.height, camera.width, -1).mean(axis=2)
+    return np.repeat((_LIGHT + (_DARK - _LIGHT) * ink)[..., None], 3, axis=2)
