@@ -301,7 +301,7 @@ def test_a_calibration_that_fails_leaves_the_one_before(tmp_path, capsys):
 def test_a_rehearsed_calibration_finds_the_handpiece_that_was_built(tmp_path):
     """Four cameras of an intra-oral size, off from the drawn ones, with lenses that distort."""
     board = ("--columns", 9, "--rows", 7, "--square-mm", 0.7)
-    run("handpiece", "--design", "four", "--width-px", 320, "--height-px", 320, "--out", tmp_path / "drawn")
+    run("handpiece", "--design", "four", "--width-px", 240, "--height-px", 240, "--out", tmp_path / "drawn")
     run(
         *("photograph", tmp_path / "drawn" / "handpiece.json", "--out", tmp_path / "photos", *board),
         *("--instants", 14, "--supersampling", 2, "--manufacturing-um", 30, "--manufacturing-deg", 0.3),

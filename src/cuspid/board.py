@@ -103,16 +103,17 @@ class Board(Options):
         dark = inside & ((row + column) % 2 == self._first_dark)
         if self.kind == "charuco":
             light = np.flatnonzero(inside & ~dark)
-            dark[light] = self._in_marker(squares[light] % 1, self._bits[row[light], column[light]])
+            dark[light] = self._in_marker(squares[light] % 1, row[light], column[light])
         return dark ^ self.inverted
 
-    def _in_marker(self, within: Float[np.ndarray, "n 2"], bits: Bool[np.ndarray, "n b b"]) -> Bool[np.ndarray, "n"]:
+    def _in_marker(
+        self, within: Float[np.ndarray, "n 2"], row: Int[np.ndarray, "n"], column: Int[np.ndarray, "n"]
+    ) -> Bool[np.ndarray, "n"]:
         """Whether a place in a square (0 to 1) is on a dark bit of its marker."""
-        count = bits.shape[1]
+        count = self._bits.shape[-1]
         place = np.floor(((within - 0.5) / self.marker_share + 0.5) * count).astype(np.int64)
-        on = ((place >= 0) & (place < count)).all(axis=1)
-        column, row = np.clip(place, 0, count - 1).T
-        return on & ~bits[np.arange(len(bits)), row, column]
+        across, down = np.clip(place, 0, count - 1).T
+        return ((place >= 0) & (place < count)).all(axis=1) & ~self._bits[row, column, down, across]
 
     @cached_property
     def _bits(self) -> Bool[np.ndarray, "rows columns b b"]:
