@@ -69,16 +69,20 @@ def photographs(
 ) -> Iterator[tuple[str, str, UInt8[np.ndarray, "h w 3"]]]:
     """Camera, instant and image, one after the other."""
     digits = len(str(options.instants - 1))
+    rays = {name: pixel_rays(each.camera, options.supersampling) for name, each in handpiece.rig.cameras.items()}
     for k, rig_from_board in enumerate(board_poses(handpiece, board, options)):
         for index, (name, mounted) in enumerate(handpiece.rig.cameras.items()):
-            light = board_light(board, mounted.camera, mounted.cam_from_rig @ rig_from_board, options.supersampling)
+            light = board_light(board, mounted.camera, rays[name], mounted.cam_from_rig @ rig_from_board)
             rng = np.random.default_rng([options.seed, 5, k, index])
             yield name, f"{k:0{digits}d}", expose(light, 1.0, handpiece.sensor, rng)
 
 
-def board_light(board: Board, camera: Camera, cam_from_board: Rigid3, supersampling: int) -> Float[np.ndarray, "h w 3"]:
-    """Linear light of each pixel that looks at a board; paper where it looks past it or at its back."""
-    rays = pixel_rays(camera, supersampling) @ cam_from_board.rotation
+def board_light(
+    board: Board, camera: Camera, rays_in_cam: Float[np.ndarray, "n 3"], cam_from_board: Rigid3
+) -> Float[np.ndarray, "h w 3"]:
+    """Linear light of each pixel that looks at a board; paper where it looks past it or at its back. The rays
+    of a pixel follow each other (:func:`cuspid.simulation.raycast.pixel_rays`)."""
+    rays = rays_in_cam @ cam_from_board.rotation
     eye = cam_from_board.inverse().translation
     with np.errstate(divide="ignore", invalid="ignore"):
         reach = -eye[2] / rays[:, 2]
