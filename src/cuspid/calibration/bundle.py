@@ -21,7 +21,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
 from cuspid.board import Board
-from cuspid.calibration.corners import Views
+from cuspid.calibration.corners import BoardView, Views
 from cuspid.camera import Camera, distort
 from cuspid.epipolar import skew
 from cuspid.errors import ReconstructionError
@@ -39,6 +39,8 @@ _KNEE = 2.5
 """Residuals, in standard deviations, beyond which they count less (Huber)."""
 _STEPS, _SETTLED = 100, 0.01
 """Most steps; and the fall of the cost, in squared standard deviations, that is not worth another one."""
+_MOST_DAMPING = 1e8
+"""Of a step, as a share of the diagonal of the normal equations."""
 _LEAST_SIGMA_PX = 1e-6
 
 
@@ -68,6 +70,8 @@ class Adjusted:
     """Seen minus projected, px, by camera and instant."""
     covariance: Float[np.ndarray, "k k"]
     """Of the cameras: the parameters of each in order, then the motion of each."""
+    settled: bool
+    """Whether the search for the best one came to its end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +113,12 @@ def bending_coordinates(board: Board, points: Float[np.ndarray, "n 3"]) -> Float
     return np.asarray((points[:, :2] - size / 2) / (np.linalg.norm(size) / 2))
 
 
+def of_instants(scene: BoardScene, instants: set[str]) -> BoardScene:
+    """With the board at these instants alone."""
+    kept = {name: pose for name, pose in scene.rig_from_board.items() if name in instants}
+    return replace(scene, rig_from_board=kept)
+
+
 # --- one step ----------------------------------------------------------------------------------------------------
 
 
@@ -130,11 +140,9 @@ def _project(
 def _moved(
     motions: Sequence[Rigid3], which: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    rotations, translations = (
-        np.stack([motion.rotation for motion in motions]),
-        np.stack([motion.translation for motion in motions]),
-    )
-    return np.asarray(np.einsum("nij,nj->ni", rotations[which], points) + translations[which])
+    rotations = np.stack([motion.rotation for motion in motions])[which]
+    translations = np.stack([motion.translation for motion in motions])[which]
+    return np.asarray(np.einsum("nij,nj->ni", rotations, points) + translations)
 
 
 def _jacobian(
@@ -242,45 +250,56 @@ def adjust_board(start: BoardScene, views: Views, board: Board, *, only_boards: 
     """The scene under which the corners are seen where they were, and how well that is known (Levenberg-Marquardt on
     Huber's loss; its scale is found from the residuals). With ``only_boards`` the cameras and the bending stay.
 
-    Raises ReconstructionError where the images leave something open, as the focal length of a camera that always saw
-    the board from the front.
+    Raises ReconstructionError where the images leave something open to rounding, or a corner lies behind a camera.
     """
     seen = _Observations.of(views, board, list(start.cameras), list(start.rig_from_board))
     free = _Free.of(start, board, only_boards=only_boards)
-    scene, damping, steps = start, 1e-4, 0
+    scene, settled = _minimised(start, seen, free)
     in_rig, in_cam, residuals = _project(scene, seen)
-    sigma = _scale(residuals)
-    cost = _cost(scene, residuals, sigma, free)
-    while steps < _STEPS and damping < 1e8:
+    sigma_px = _scale(residuals)
+    matrix, _ = _normal(scene, seen, in_rig, in_cam, residuals, sigma_px, free)
+    pieces = np.split(residuals, seen.starts[1:-1])
+    return Adjusted(
+        scene=scene,
+        sigma_px=sigma_px,
+        residuals=dict(zip(seen.keys, pieces, strict=True)),
+        covariance=np.zeros((0, 0)) if only_boards else _camera_covariance(matrix, scene, free),
+        settled=settled,
+    )
+
+
+def in_front(scene: BoardScene, views: Views, board: Board) -> dict[tuple[str, str], BoardView]:
+    """The views of which every corner lies before the camera."""
+    seen = _Observations.of(views, board, list(scene.cameras), list(scene.rig_from_board))
+    residuals = np.split(_project(scene, seen)[2], seen.starts[1:-1])
+    return {key: views[key] for key, each in zip(seen.keys, residuals, strict=True) if np.isfinite(each).all()}
+
+
+def _minimised(scene: BoardScene, seen: _Observations, free: _Free) -> tuple[BoardScene, bool]:
+    """The best scene, and whether another step would not have been worth it."""
+    in_rig, in_cam, residuals = _project(scene, seen)
+    if not np.isfinite(residuals).all():
+        raise ReconstructionError("calibration: a corner of the board lies behind a camera that saw it")
+    damping, settled, steps = 1e-4, False, 0
+    while not settled and steps < _STEPS and damping < _MOST_DAMPING:
         steps += 1
-        matrix, gradient = _normal(scene, seen, in_rig, in_cam, residuals, sigma, free)
+        sigma_px = _scale(residuals)
+        cost = _cost(scene, residuals, sigma_px, free)
+        matrix, gradient = _normal(scene, seen, in_rig, in_cam, residuals, sigma_px, free)
         step = _solved(matrix + damping * np.diag(np.diag(matrix)), gradient)
         candidate = _stepped(scene, free, step)
-        if candidate is None:
+        there = None if candidate is None else _project(candidate, seen)
+        if candidate is None or there is None or not _cost(candidate, there[2], sigma_px, free) <= cost:
             damping *= 10
             continue
-        there = _project(candidate, seen)
-        if not _cost(candidate, there[2], sigma, free) <= cost:
-            damping *= 10
-            continue
-        done = float(step @ gradient) < _SETTLED
-        scene, (in_rig, in_cam, residuals) = candidate, there
-        sigma, damping = _scale(residuals), max(damping / 10, 1e-12)
-        cost = _cost(scene, residuals, sigma, free)
-        if done:
-            break
-    matrix, _ = _normal(scene, seen, in_rig, in_cam, residuals, sigma, free)
-    pieces = np.split(residuals, seen.starts[1:-1])
-    covariance = np.zeros((0, 0)) if only_boards else _camera_covariance(matrix, scene, free)
-    return Adjusted(
-        scene=scene, sigma_px=sigma, residuals=dict(zip(seen.keys, pieces, strict=True)), covariance=covariance
-    )
+        settled = float(step @ gradient) < _SETTLED
+        scene, (in_rig, in_cam, residuals), damping = candidate, there, max(damping / 10, 1e-12)
+    return scene, settled
 
 
 def _scale(residuals: Float[np.ndarray, "n 2"]) -> float:
     """Standard deviation of a coordinate, from the median of the lengths (Rayleigh)."""
-    lengths = np.linalg.norm(residuals, axis=1)
-    return max(float(np.median(lengths[np.isfinite(lengths)])) / np.sqrt(2 * np.log(2)), _LEAST_SIGMA_PX)
+    return max(float(np.median(np.linalg.norm(residuals, axis=1))) / np.sqrt(2 * np.log(2)), _LEAST_SIGMA_PX)
 
 
 def _cost(scene: BoardScene, residuals: Float[np.ndarray, "n 2"], sigma_px: float, free: _Free) -> float:
@@ -326,16 +345,16 @@ def _normal(
     return matrix, weighted @ residuals.ravel() - free.precision * _held(scene)[free.columns]
 
 
-def _solved(matrix: Float[np.ndarray, "k k"], gradient: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
+def _solved(matrix: Float[np.ndarray, "k k"], right: Float[np.ndarray, "k *m"]) -> Float[np.ndarray, "k *m"]:
     """Raises ReconstructionError where the matrix is singular to rounding."""
     scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     try:
         factor = cho_factor(matrix * scale[:, None] * scale, lower=True)
-    except np.linalg.LinAlgError as error:
+    except (np.linalg.LinAlgError, ValueError) as error:  # not positive, or not finite
         raise ReconstructionError(
             "calibration: the images leave something open; show the board from more sides, tilted by 20 to 50 degrees"
         ) from error
-    return np.asarray(scale * cho_solve(factor, scale * gradient))
+    return np.asarray((scale * cho_solve(factor, (scale * right.T).T).T).T)
 
 
 def _stepped(scene: BoardScene, free: _Free, step: Float[np.ndarray, "k"]) -> BoardScene | None:
@@ -377,8 +396,7 @@ def _camera_covariance(matrix: Float[np.ndarray, "k k"], scene: BoardScene, free
     """Of the parameters and the motions of all cameras, in the frame in which these sum up to nothing."""
     size = (_INTRINSICS + _PLACE) * len(scene.cameras)
     known = free.columns < size
-    unknowns = np.eye(len(matrix))[:, known]
-    inverse = np.stack([_solved(matrix, column) for column in unknowns.T], axis=1)[known]
+    inverse = _solved(matrix, np.eye(len(matrix))[:, known])[known]
     whole = np.zeros((size, size))
     whole[np.ix_(free.columns[known], free.columns[known])] = inverse
     project = np.eye(size)

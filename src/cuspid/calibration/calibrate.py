@@ -4,7 +4,7 @@ try the result on views that it was not made from."""
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -12,15 +12,27 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.board import Board
-from cuspid.calibration.bundle import Adjusted, BoardScene, adjust_board, common_free, mounted_cameras
+from cuspid.calibration.bundle import (
+    Adjusted,
+    BoardScene,
+    adjust_board,
+    common_free,
+    in_front,
+    mounted_cameras,
+    of_instants,
+)
 from cuspid.calibration.corners import Views
-from cuspid.calibration.start import LEAST_VIEWS, first_camera, joined
+from cuspid.calibration.start import LEAST_VIEWS, calibrated_alone, groups, joined, require_one_group
 from cuspid.errors import ReconstructionError
 from cuspid.options import Options, Range
 from cuspid.rig import MountedCamera, Rig
 
 _DOUBTFUL = 2.0
 """Standard deviations between two halves that chance hardly explains."""
+_MUCH_MORE = 3.0
+"""Residuals together with other cameras, over those alone."""
+_OPEN_SHARE = 0.01
+"""Standard deviation of a focal length, as a share of it, of which is told."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +55,8 @@ class CameraCheck:
     """In them."""
     rms_px: float
     """Of the residuals."""
+    alone_px: float
+    """Standard deviation of the residuals where the camera is calibrated from its views alone."""
     held_out_px: float | None
     """RMS in views that the calibration was not made from; None where there were too few to make two."""
     parameters_apart: float | None
@@ -79,7 +93,8 @@ def calibrate_rig(
 ) -> RigCalibration:
     """Calibrate the cameras named in ``sizes`` (width and height, px) from their views of a board.
 
-    Raises ReconstructionError for cameras with too few views, or that never saw the board together.
+    Raises ReconstructionError for cameras with too few views, whose views fit no camera, that never saw the board
+    together, or that do not agree on how it was held.
     """
     few = [name for name in sizes if sum(camera == name for camera, _ in views) < LEAST_VIEWS]
     if few:
@@ -87,21 +102,36 @@ def calibrate_rig(
             f"calibration: {', '.join(few)} saw the board at fewer than {LEAST_VIEWS} instants; check that columns, "
             "rows, dictionary and kind of the board are those of the images"
         )
-    cameras = {
-        name: first_camera([view for (camera, _), view in views.items() if camera == name], board, size)
-        for name, size in sizes.items()
-    }
+    alone = {name: _alone(name, views, board, size) for name, size in sizes.items()}
+    cameras = {name: each.scene.cameras[""] for name, each in alone.items()}
     start, chosen = joined(views, board, cameras, sorted({instant for _, instant in views}))
     found, notes = _without_outliers(start, chosen, board, options)
     kept = {key: chosen[key] for key in found.residuals}
-    return _described(found, kept, board, notes)
+    return _described(found, kept, board, {name: each.sigma_px for name, each in alone.items()}, notes)
+
+
+def _alone(name: str, views: Views, board: Board, size: tuple[int, int]) -> Adjusted:
+    try:
+        return calibrated_alone([view for (camera, _), view in views.items() if camera == name], board, size)
+    except ReconstructionError as error:
+        raise ReconstructionError(
+            f"calibration: camera {name}: {str(error).removeprefix('calibration: ')}; check columns, rows, kind and "
+            "dictionary of the board, and show it tilted by 20 to 50 degrees"
+        ) from error
 
 
 def _without_outliers(
     scene: BoardScene, views: Views, board: Board, options: CalibrationOptions
 ) -> tuple[Adjusted, tuple[str, ...]]:
     """Adjust, leave out the views that do not fit, and again."""
-    notes: list[str] = []
+    sound = in_front(scene, views, board)
+    notes = [
+        f"camera {camera}, {instant}: left out, no place of the board explains it"
+        for camera, instant in views
+        if (camera, instant) not in sound
+    ]
+    views, scene = sound, of_instants(scene, {instant for _, instant in sound})
+    _require_views(views, scene)
     for _ in range(options.rounds):
         found = adjust_board(scene, views, board)
         bad = _odd_ones(found, options)
@@ -114,7 +144,7 @@ def _without_outliers(
         ]
         views = {key: view for key, view in views.items() if key not in bad}
         _require_views(views, scene)
-        scene = _of_instants(found.scene, {instant for _, instant in views})
+        scene = of_instants(found.scene, {instant for _, instant in views})
     return adjust_board(scene, views, board), tuple(notes)
 
 
@@ -136,12 +166,7 @@ def _require_views(views: Views, scene: BoardScene) -> None:
             f"calibration: what {', '.join(few)} saw does not fit what the others saw at the same instants; check that "
             "the cameras were triggered together, and that the files' names say so"
         )
-
-
-def _of_instants(scene: BoardScene, instants: set[str]) -> BoardScene:
-    return replace(
-        scene, rig_from_board={name: pose for name, pose in scene.rig_from_board.items() if name in instants}
-    )
+    require_one_group(views, list(scene.cameras))
 
 
 def _rms(residuals: Float[np.ndarray, "n 2"]) -> float:
@@ -152,7 +177,9 @@ def _rms(residuals: Float[np.ndarray, "n 2"]) -> float:
 # --- what it is worth --------------------------------------------------------------------------------------------
 
 
-def _described(found: Adjusted, views: Views, board: Board, notes: tuple[str, ...]) -> RigCalibration:
+def _described(
+    found: Adjusted, views: Views, board: Board, alone_px: Mapping[str, float], notes: tuple[str, ...]
+) -> RigCalibration:
     names = list(found.scene.cameras)
     of = {name: [key for key in views if key[0] == name] for name in names}
     pixels = {name: np.concatenate([views[key].pixels for key in of[name]]) for name in names}
@@ -167,21 +194,23 @@ def _described(found: Adjusted, views: Views, board: Board, notes: tuple[str, ..
             views=len(of[name]),
             corners=len(pixels[name]),
             rms_px=_rms(residuals[name]),
+            alone_px=alone_px[name],
             held_out_px=held_out.get(name),
             parameters_apart=apart[name][0] if name in apart else None,
             place_apart=apart[name][1] if name in apart else None,
         )
         for name in names
     }
+    rig = Rig({name: _widened(mounted, checks[name]) for name, mounted in mounted_cameras(found).items()})
     return RigCalibration(
-        rig=Rig({name: _widened(mounted, checks[name]) for name, mounted in mounted_cameras(found).items()}),
+        rig=rig,
         sigma_px=found.sigma_px,
         bending_mm=found.scene.bending_mm,
         cameras=checks,
         pixels=pixels,
         residuals=residuals,
         distance_mm=float(np.median(distances)),
-        notes=(*notes, *_doubts(checks)),
+        notes=(*notes, *_doubts(found.settled, checks, rig)),
     )
 
 
@@ -192,27 +221,43 @@ def _widened(mounted: MountedCamera, check: CameraCheck) -> MountedCamera:
     return replace(mounted, camera=camera, covariance=place * _known(mounted.covariance))
 
 
-def _doubts(checks: Mapping[str, CameraCheck]) -> tuple[str, ...]:
-    """Where the lens or the board is not what the model says, or the cameras were not triggered together."""
-    return tuple(
-        f"camera {name}: calibrations from two halves of the images differ by {worst:.1f} of their standard "
-        "deviations; its covariance is widened by that; look for a pattern in residuals.png"
-        for name, check in checks.items()
-        if (worst := max(check.parameters_apart or 0.0, check.place_apart or 0.0)) > _DOUBTFUL
-    )
+def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Iterator[str]:
+    """Where the search did not end; where the lens or the board is not what the model says, or the cameras were not
+    triggered together; where the views leave the focal length open."""
+    if not settled:
+        yield "the adjustment did not come to its end; its numbers may be wrong"
+    for name, check in checks.items():
+        worst = max(check.parameters_apart or 0.0, check.place_apart or 0.0)
+        if worst > _DOUBTFUL:
+            yield (
+                f"camera {name}: calibrations from two halves of the images differ by {worst:.1f} of their standard "
+                "deviations; its covariance is widened by that; look for a pattern in residuals.png"
+            )
+        if check.rms_px > _MUCH_MORE * check.alone_px:
+            yield (
+                f"camera {name}: {check.rms_px:.2f} px RMS together with the others, {check.alone_px:.2f} px alone; "
+                "they may not have seen the board at the same moment, or have moved against each other"
+            )
+    for name, mounted in rig.cameras.items():
+        share = float(np.sqrt(_known(mounted.camera.covariance)[0, 0])) / mounted.camera.focal_px[0]
+        if share > _OPEN_SHARE:
+            yield f"camera {name}: its focal length is known to {share:.0%} only; show the board tilted, near and far"
 
 
 def _cross_validated(
     found: Adjusted, views: Views, board: Board
 ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
     """Of two halves of the instants, each calibrated for itself: the residuals in the other one, and how far they are
-    from each other. Nothing where a half is too small."""
+    from each other. Nothing where a half is too small, or its cameras fall into groups."""
     instants = list(found.scene.rig_from_board)
     halves = [{key: view for key, view in views.items() if key[1] in set(instants[k::2])} for k in range(2)]
     counts = [Counter(camera for camera, _ in half) for half in halves]
-    if any(count[name] < LEAST_VIEWS for count in counts for name in found.scene.cameras):
+    cameras = list(found.scene.cameras)
+    if any(count[name] < LEAST_VIEWS for count in counts for name in cameras):
         return {}, {}
-    parts = [adjust_board(_of_instants(found.scene, {key[1] for key in half}), half, board) for half in halves]
+    if any(len(groups(half, cameras)) > 1 for half in halves):
+        return {}, {}
+    parts = [adjust_board(of_instants(found.scene, {key[1] for key in half}), half, board) for half in halves]
     squares: dict[str, list[Float[np.ndarray, "n 2"]]] = {name: [] for name in found.scene.cameras}
     for part, other, other_views in zip(parts, parts[::-1], halves[::-1], strict=True):
         start = replace(part.scene, rig_from_board=other.scene.rig_from_board)

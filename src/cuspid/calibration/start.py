@@ -6,18 +6,19 @@ is chosen under which the places of any two cameras agree from instant to instan
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import combinations
 
 import cv2
 import numpy as np
 
 from cuspid.board import Board
-from cuspid.calibration.bundle import BoardScene
+from cuspid.calibration.bundle import Adjusted, BoardScene, adjust_board, in_front, of_instants
 from cuspid.calibration.corners import BoardView, Views
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
-from cuspid.errors import ReconstructionError
+from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
+from cuspid.graph import parts_of
 
 LEAST_VIEWS = 3
 """A camera that saw the board at fewer instants cannot be calibrated."""
@@ -26,6 +27,31 @@ _MOST_VIEWS = 40
 _AGREE_DEG, _AGREE_SHARE = 5.0, 0.1
 """Places of a camera beside another one, from two instants, that may be the same: the turn between them, and the
 distance as a share of that of the board."""
+_NO_FIT_SHARE = 0.01
+"""Residuals of a camera alone, as a share of the width of its images, beyond which it is no camera."""
+
+
+def calibrated_alone(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> Adjusted:
+    """One camera from its own views; how the board was held to others plays no part.
+
+    Raises ReconstructionError where the views fit no camera, or do not tell its focal length.
+    """
+    try:
+        camera = first_camera(views, board, size)
+        poses = [board_pose(view, board, camera) for view in views]
+        named = {str(k): pose for k, pose in enumerate(poses)}
+        start = BoardScene(
+            cameras={"": camera}, cam_from_rig={"": Rigid3.identity()}, rig_from_board=named, bending_mm=np.zeros(3)
+        )
+        sound = in_front(start, {("", str(k)): view for k, view in enumerate(views)}, board)
+        if len(sound) < LEAST_VIEWS:
+            raise ReconstructionError("its views of the board fit no camera")
+        found = adjust_board(of_instants(start, {instant for _, instant in sound}), sound, board)
+    except (cv2.error, InputError) as error:  # such as a focal length that is no number
+        raise ReconstructionError("its views of the board fit no camera") from error
+    if found.sigma_px > _NO_FIT_SHARE * size[0]:
+        raise ReconstructionError(f"its views of the board fit no camera, by {found.sigma_px:.0f} px")
+    return found
 
 
 def first_camera(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> Camera:
@@ -51,11 +77,15 @@ def first_camera(views: Sequence[BoardView], board: Board, size: tuple[int, int]
 
 
 def board_pose(view: BoardView, board: Board, camera: Camera) -> Rigid3:
-    """``cam_from_board`` of one view (T. Collins, A. Bartoli, IJCV 109, 2014)."""
-    points, ideal = board.corners[view.corner], camera.rays(view.pixels)[:, None, :2]
-    found = cv2.solvePnPGeneric(points, np.ascontiguousarray(ideal), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
-    _, turns, shifts, _ = found
-    turn, shift = cv2.solvePnPRefineLM(points, np.ascontiguousarray(ideal), np.eye(3), None, turns[0], shifts[0])
+    """``cam_from_board`` of one view (T. Collins, A. Bartoli, IJCV 109, 2014).
+
+    Raises InputError where there is none.
+    """
+    points, ideal = board.corners[view.corner], np.ascontiguousarray(camera.rays(view.pixels)[:, None, :2])
+    _, turns, shifts, _ = cv2.solvePnPGeneric(points, ideal, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+    if not turns:
+        raise InputError("calibration: a view of the board that no pose explains")
+    turn, shift = cv2.solvePnPRefineLM(points, ideal, np.eye(3), None, turns[0], shifts[0])
     return Rigid3.from_rotation_vector(turn.ravel(), shift.ravel())
 
 
@@ -64,7 +94,8 @@ def joined(
 ) -> tuple[BoardScene, dict[tuple[str, str], BoardView]]:
     """The cameras in the frame of the first one, the board at each instant, and the views under one numbering.
 
-    Raises ReconstructionError where two groups of cameras never saw the board at once.
+    Raises ReconstructionError where two groups of cameras never saw the board at once, or the instants do not agree on
+    where the cameras are.
     """
     numbered = {key: [view.renumbered(order) for order in board.orders] for key, view in views.items()}
     poses = {key: [board_pose(each, board, cameras[key[0]]) for each in numbered[key]] for key in views}
@@ -88,26 +119,42 @@ Poses = Mapping[tuple[str, str], Sequence[Rigid3]]
 """By camera and instant, ``cam_from_board`` under each numbering of the corners."""
 
 
+def groups(views: Collection[tuple[str, str]], cameras: Sequence[str]) -> list[list[str]]:
+    """The cameras, given who saw the board when: those of one group are joined by instants that they share."""
+    instants = sorted({instant for _, instant in views})
+    pairs = [(cameras.index(camera), len(cameras) + instants.index(instant)) for camera, instant in views]
+    part = parts_of(np.array(pairs, dtype=np.int64).reshape(-1, 2), len(cameras) + len(instants))[: len(cameras)]
+    return [[name for name, its in zip(cameras, part, strict=True) if its == each] for each in dict.fromkeys(part)]
+
+
+def require_one_group(views: Collection[tuple[str, str]], cameras: Sequence[str]) -> None:
+    """Raise ReconstructionError where two groups of cameras never saw the board at once."""
+    apart = groups(views, cameras)
+    if len(apart) > 1:
+        raise ReconstructionError(
+            f"calibration: {' and '.join(', '.join(group) for group in apart)} never saw the board at once; show it to "
+            "cameras of both groups together"
+        )
+
+
 def _chained(poses: Poses, cameras: Sequence[str]) -> dict[str, Rigid3]:
     """Each camera beside the first, along the pairs that saw the board together most often (a spanning tree)."""
+    require_one_group(poses, cameras)
     seen = {name: {instant for camera, instant in poses if camera == name} for name in cameras}
     common = sorted(combinations(cameras, 2), key=lambda pair: -len(seen[pair[0]] & seen[pair[1]]))
-    placed, waiting = {cameras[0]: Rigid3.identity()}, set(cameras[1:])
-    while waiting:
-        pair = next((pair for pair in common if len({*pair} & waiting) == 1 and seen[pair[0]] & seen[pair[1]]), None)
-        if pair is None:
-            raise ReconstructionError(
-                f"calibration: {', '.join(placed)} and {', '.join(sorted(waiting))} never saw the board at once; show "
-                "it to cameras of both groups together"
-            )
-        known, new = pair if pair[1] in waiting else pair[::-1]
+    placed = {cameras[0]: Rigid3.identity()}
+    while len(placed) < len(cameras):
+        pair = next(each for each in common if len({*each} & set(placed)) == 1 and seen[each[0]] & seen[each[1]])
+        known, new = pair if pair[0] in placed else pair[::-1]
         placed[new] = _beside(poses, known, new, sorted(seen[known] & seen[new])) @ placed[known]
-        waiting.remove(new)
     return {name: placed[name] for name in cameras}
 
 
 def _beside(poses: Poses, known: str, new: str, instants: Sequence[str]) -> Rigid3:
-    """``new_from_known``: of what each instant and numbering says, what the most instants agree with."""
+    """``new_from_known``: of what each instant and numbering says, what the most instants agree with.
+
+    Raises ReconstructionError where less than half of them do.
+    """
     said = [[pose @ poses[known, instant][0].inverse() for pose in poses[new, instant]] for instant in instants]
     distance_mm = float(np.median([np.linalg.norm(poses[new, instant][0].translation) for instant in instants]))
 
@@ -116,7 +163,13 @@ def _beside(poses: Poses, known: str, new: str, instants: Sequence[str]) -> Rigi
         agreeing = [turn for turn, shift in nearest if turn < _AGREE_DEG and shift < _AGREE_SHARE * distance_mm]
         return len(agreeing), -float(np.median([turn for turn, _ in nearest]))
 
-    return max((each for options in said for each in options), key=support)
+    best = max((each for options in said for each in options), key=support)
+    if 2 * support(best)[0] < len(instants):
+        raise ReconstructionError(
+            f"calibration: where {new} is beside {known}, only {support(best)[0]} of {len(instants)} instants agree; "
+            "check that they were triggered together, and that images of one name belong together"
+        )
+    return best
 
 
 def _apart(one: Rigid3, other: Rigid3) -> tuple[float, float]:

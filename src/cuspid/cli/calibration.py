@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -21,7 +21,7 @@ from cuspid.options import Range
 from cuspid.progress import Progress
 from cuspid.reporting.figures.calibration import save_board, save_residuals_picture
 from cuspid.rig import Handpiece, depth_of_field_mm
-from cuspid.simulation.board_images import PhotographOptions, photographs
+from cuspid.simulation.board_images import PhotographOptions, take_photographs
 from cuspid.simulation.manufacturing import ManufacturingOptions, built
 from cuspid.workers import map_in_threads
 
@@ -54,12 +54,8 @@ def photograph(
     settings = {"board": board, "options": options, "manufacturing": manufacturing}
     hashes = {"handpiece": storage.hash_file(handpiece)}
     true = built(storage.read_handpiece(handpiece), manufacturing)
-    total = options.instants * len(true.rig.names)
     with storage.claimed_folder(out, "photograph", settings, hashes), show_progress() as progress:
-        storage.write_handpiece(out / "truth" / "handpiece.json", true)
-        for done, (camera, instant, image) in enumerate(photographs(true, board, options), start=1):
-            storage.write_image(out / "images" / camera / f"{instant}.png", image)
-            progress("photographs", done, total)
+        take_photographs(true, board, out, options, progress=progress)
     console.print(f"{out / 'images'}: {options.instants} instants of {len(true.rig.names)} cameras")
 
 
@@ -88,6 +84,8 @@ def calibrate(
         }
         views = _views(sequences, board, progress)
         found = calibrate_rig(views, {name: each.size for name, each in sequences.items()}, board, options)
+    notes = (*(note for each in sequences.values() for note in each.notes), *found.notes)
+    found = replace(found, notes=notes)
     with storage.claimed_folder(out, "calibrate", settings, hashes, replace=True):
         _write(found, out, working_distance_mm)
     _print(found, out)
@@ -142,13 +140,20 @@ def _print(found: RigCalibration, out: Path) -> None:
     for note in found.notes:
         console.print(f"note: {note}")
     table = Table(title="Calibration")
-    for heading in ("camera", "views", "corners", "RMS px", "held out px", "halves apart: lens, place (sigmas)"):
+    for heading in (
+        "camera",
+        "views",
+        "corners",
+        "RMS px",
+        "alone px",
+        "held out px",
+        "halves apart: lens, place",
+    ):
         table.add_column(heading, justify="left" if heading == "camera" else "right")
     for name, each in found.cameras.items():
         apart = [_shown(value, 1) for value in (each.parameters_apart, each.place_apart)]
-        table.add_row(
-            name, str(each.views), str(each.corners), _shown(each.rms_px), _shown(each.held_out_px), ", ".join(apart)
-        )
+        pixels = [_shown(value) for value in (each.rms_px, each.alone_px, each.held_out_px)]
+        table.add_row(name, str(each.views), str(each.corners), *pixels, ", ".join(apart))
     console.print(table)
     console.print(f"{out / 'handpiece.json'}: {len(found.cameras)} cameras, corners to {found.sigma_px:.2f} px")
 

@@ -6,21 +6,26 @@ cameras take it at once. Light is even: no shading, no blur.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from cuspid.board import Board
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.options import SEED, Options, Range
+from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece
 from cuspid.simulation.raycast import pixel_rays
 from cuspid.simulation.sensor import expose
+from cuspid.storage.captures import write_image
+from cuspid.storage.files import hash_file
+from cuspid.storage.handpieces import write_handpiece
+from cuspid.storage.stages import Stage
 
 _LIGHT, _DARK = 0.75, 0.03
 """Linear light of paper and of ink; full scale is 1."""
@@ -64,17 +69,28 @@ def _held(distance_mm: float, board: Board, options: PhotographOptions, rng: np.
     return Rigid3(rotation, middle - rotation @ np.array([*board.size_mm, 0.0]) / 2)
 
 
-def photographs(
-    handpiece: Handpiece, board: Board, options: PhotographOptions
-) -> Iterator[tuple[str, str, UInt8[np.ndarray, "h w 3"]]]:
-    """Camera, instant and image, one after the other."""
-    digits = len(str(options.instants - 1))
+def take_photographs(
+    handpiece: Handpiece, board: Board, folder: Path, options: PhotographOptions, *, progress: Progress = silent
+) -> None:
+    """Photograph a board: ``folder/truth/handpiece.json`` and ``folder/images/<camera>/<instant>.png``.
+
+    Images that are there already are kept; a run that goes on gives the same bits as one that was not interrupted.
+    """
+    truth = folder / "truth" / "handpiece.json"
+    write_handpiece(truth, handpiece)
+    stage = Stage("photographs", folder, [board, options], ("simulation",))
+    key = stage.key({"handpiece": hash_file(truth)})
+    digits, names = len(str(options.instants - 1)), handpiece.rig.names
     rays = {name: pixel_rays(each.camera, options.supersampling) for name, each in handpiece.rig.cameras.items()}
     for k, rig_from_board in enumerate(board_poses(handpiece, board, options)):
         for index, (name, mounted) in enumerate(handpiece.rig.cameras.items()):
-            light = board_light(board, mounted.camera, rays[name], mounted.cam_from_rig @ rig_from_board)
-            rng = np.random.default_rng([options.seed, 5, k, index])
-            yield name, f"{k:0{digits}d}", expose(light, 1.0, handpiece.sensor, rng)
+            file = folder / "images" / name / f"{k:0{digits}d}.png"
+            if not stage.has(key, [file]):
+                light = board_light(board, mounted.camera, rays[name], mounted.cam_from_rig @ rig_from_board)
+                rng = np.random.default_rng([options.seed, 5, k, index])
+                write_image(file, expose(light, 1.0, handpiece.sensor, rng))
+                stage.record(key, [file])
+            progress("photographs", k * len(names) + index + 1, options.instants * len(names))
 
 
 def board_light(

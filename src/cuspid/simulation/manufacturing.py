@@ -59,7 +59,7 @@ def _off(mounted: MountedCamera, options: ManufacturingOptions, rng: np.random.G
     if not (motion.any() or shift.any()):
         return mounted
     place = Rigid3.from_rotation_vector(motion[:3], motion[3:]) @ mounted.cam_from_rig
-    camera = mounted.camera.with_parameters(mounted.camera.parameters + shift)
+    camera = replace(mounted.camera.with_parameters(mounted.camera.parameters + shift), covariance=None)
     return MountedCamera(camera, place)
 
 
