@@ -30,7 +30,6 @@ from cuspid.evaluation.trajectory import trajectory_error
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
 from cuspid.jaw import Jaw
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
-from cuspid.rig import Handpiece, Rig
 from cuspid.simulation.manufacturing import ManufacturingOptions
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.storage import read_poses, write_json
@@ -47,15 +46,6 @@ TOLERANCES = {
 }
 
 
-def held(handpiece: Handpiece) -> Handpiece:
-    """Without covariances: as if it had been built as it was drawn."""
-    cameras = {
-        name: replace(mounted, camera=replace(mounted.camera, covariance=None), covariance=None)
-        for name, mounted in handpiece.rig.cameras.items()
-    }
-    return replace(handpiece, rig=Rig(cameras))
-
-
 def judge(*, tolerances: str, seed: int, jaw: Jaw, path: ScanPathOptions, pixels: int) -> dict[str, Value]:
     """The figures of one handpiece, held and refined."""
     manufacturing = replace(TOLERANCES[tolerances], manufacturing_seed=seed)
@@ -64,16 +54,17 @@ def judge(*, tolerances: str, seed: int, jaw: Jaw, path: ScanPathOptions, pixels
     figures: dict[str, Value] = {"commit": commit()}
     with tempfile.TemporaryDirectory(prefix="cuspid-built-") as folder:
         capture, _ = pipeline.simulate(jaw, handpiece, Path(folder), options)
-        figures |= scanned("held", replace(capture, handpiece=held(capture.handpiece)), Path(folder))
+        figures |= scanned("held", capture, Path(folder), ReconstructionOptions(calibration="fixed"))
         if tolerances != "none":
-            figures |= scanned("refined", capture, Path(folder))
+            figures |= scanned("refined", capture, Path(folder), ReconstructionOptions())
     return figures | {"peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6}
 
 
-def scanned(how: str, capture: Capture, folder: Path) -> dict[str, Value]:
+def scanned(how: str, capture: Capture, folder: Path, options: ReconstructionOptions) -> dict[str, Value]:
     """The figures of a scan, each with ``how`` before its name."""
     begin, begin_cpu = time.perf_counter(), time.process_time()
-    reconstruction, mesh = pipeline.reconstruct(capture, folder / how, ReconstructionOptions())
+    reconstruction, mesh = pipeline.reconstruct(capture, folder / how, options)
+    refinement = reconstruction.refinement
     took, took_cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
     reference = pipeline.load_reference(folder / "truth")
     found = pipeline.evaluate(
@@ -91,6 +82,7 @@ def scanned(how: str, capture: Capture, folder: Path) -> dict[str, Value]:
         "trajectory_um": trajectory.ape_um.rmse,
         "located": len(reconstruction.frames),
         "notes": "; ".join(reconstruction.notes),
+        "scale_sigma_ppm": None if refinement is None else refinement.scale_sigma_ppm,
         "reconstruction_s": took,
         "reconstruction_cpu_s": took_cpu,
     }

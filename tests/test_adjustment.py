@@ -326,10 +326,16 @@ def test_poses_are_as_uncertain_as_their_covariance_says() -> None:
     assert 4.6 < np.mean(squares) < 7.6
 
 
+def size_of(rig: Rig) -> float:
+    """Root mean square distance of the cameras from their middle."""
+    centres = np.stack([mounted.centre_in_rig for mounted in rig.cameras.values()])
+    return float(np.sqrt(np.mean(np.sum((centres - centres.mean(axis=0)) ** 2, axis=1))))
+
+
 def test_calibration_is_as_uncertain_as_its_covariance_says() -> None:
     """Truth drawn from the priors: poses, extrinsics and intrinsics are recovered within their covariance."""
     nominal = with_priors(make_rig())
-    poses, extrinsics, parameters, before, after = [], [], [], [], []
+    poses, extrinsics, parameters, before, after, scales = [], [], [], [], [], []
     for seed in range(10):
         rng = np.random.default_rng(seed)
         scene = make_scene(rig=drawn_from_priors(nominal, rng), points=150)
@@ -342,6 +348,10 @@ def test_calibration_is_as_uncertain_as_its_covariance_says() -> None:
         poses.append(normalised_squares(errors[1:], found.pose_covariance[1:]))
         before.append(calibration_errors(nominal, scene.rig)[1])
         after.append(shifts)
+        scales.append(np.log(size_of(found.rig) / size_of(scene.rig)) / (found.refinement.scale_sigma_ppm / 1e6))
+        assert found.refinement.rms_sigmas < 1.3
+        assert set(found.refinement.camera_sigmas) == set(nominal.names)
+    assert 0.6 < np.sqrt(np.mean(np.square(scales))) < 1.5
     assert 4.5 < np.mean(poses) < 7.8
     assert 4.8 < np.mean(extrinsics) < 7.4
     assert 6.6 < np.mean(parameters) < 9.6
@@ -397,13 +407,16 @@ def test_calibration_without_prior_is_held() -> None:
             ),
         }
     )
-    found = adjust(disturbed(scene, np.random.default_rng(3), rig=nominal)).rig
+    adjusted = adjust(disturbed(scene, np.random.default_rng(3), rig=nominal))
+    found, refinement = adjusted.rig, adjusted.refinement
     _, shifts = calibration_errors(found, scene.rig)
     assert 0 < np.abs(shifts[1, :2]).max() < 1
     shifts[1, :2] = 0
     assert not shifts.any()
     np.testing.assert_array_equal(found["c0"].cam_from_rig.matrix, scene.rig["c0"].cam_from_rig.matrix)
     assert found["c0"].covariance is None
+    assert refinement.scale_sigma_ppm == 0  # no camera's place is free
+    assert refinement.camera_sigmas["c0"] == 0 < refinement.camera_sigmas["c1"]
     assert 0 < found["c1"].camera.covariance[0, 0] < 1
 
 

@@ -20,6 +20,7 @@ from cuspid.pipeline import ReconstructionOptions
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece, MountedCamera, Rig
 from cuspid.stereo import DepthEstimator
+from cuspid.tolerances import EXACT
 from synthetic_scene import diamond, height_field, render
 
 HILLS = height_field(lambda x, y: 5 + 0.25 * np.sin(1.8 * x) * np.cos(1.5 * y), half_width_mm=5.0)
@@ -102,6 +103,9 @@ def uncertain(handpiece: Handpiece) -> Handpiece:
     )
 
 
+FIXED = ReconstructionOptions(calibration="fixed")
+
+
 @cache
 def measured(factor: float = 1.0) -> tuple[DepthMap, ...]:
     capture = scan()
@@ -111,7 +115,7 @@ def measured(factor: float = 1.0) -> tuple[DepthMap, ...]:
 @cache
 def reconstructed(factor: float, folder: Path) -> tuple[Reconstruction, Mesh]:
     capture = replace(scan(), handpiece=times(scan().handpiece, factor))
-    return pipeline.reconstruct(capture, folder / f"{factor:g}", ReconstructionOptions())
+    return pipeline.reconstruct(capture, folder / f"{factor:g}", FIXED)
 
 
 @pytest.fixture(scope="module")
@@ -169,6 +173,16 @@ def test_the_same_images_of_a_larger_rig_give_a_larger_scan(factor: float, folde
     check_mesh(mesh, reference, factor)
 
 
+@pytest.mark.parametrize("factor", FACTORS)
+def test_a_larger_rig_is_taken_to_be_as_well_known_for_its_size(factor: float) -> None:
+    given, options = scan().handpiece, ReconstructionOptions()
+    found, expected = pipeline.as_known(times(given, factor), options), times(pipeline.as_known(given, options), factor)
+    for one, other in zip(found.rig.cameras.values(), expected.rig.cameras.values(), strict=True):
+        assert np.allclose(one.covariance, other.covariance, rtol=1e-12, atol=0)
+        assert np.array_equal(one.camera.covariance, other.camera.covariance)
+        assert other.covariance.any()
+
+
 def test_a_larger_rig_is_calibrated_alike() -> None:
     capture, factor = scan(), 1000.0
     given = uncertain(capture.handpiece)
@@ -179,6 +193,21 @@ def test_a_larger_rig_is_calibrated_alike() -> None:
         assert np.allclose(one.cam_from_rig.rotation, other.cam_from_rig.rotation, atol=1e-6)
         assert np.allclose(one.cam_from_rig.translation / factor, other.cam_from_rig.translation / factor, atol=1e-5)
         assert np.allclose(one.covariance, other.covariance, rtol=0.01, atol=0)
+
+
+def test_what_is_known_of_a_handpiece_decides_what_is_refined(folder: Path) -> None:
+    """Nobody has said: taken as nominal. Said to be exact, or asked to be held: as it is, and the same bits."""
+    capture = scan()
+    exact = replace(capture, handpiece=EXACT.fill(capture.handpiece))
+    nominal = pipeline.find_poses(capture, folder / "nominal", ReconstructionOptions())
+    held = pipeline.find_poses(capture, folder / "held", FIXED)
+    said = pipeline.find_poses(exact, folder / "exact", ReconstructionOptions())
+    assert held.refinement is said.refinement is None
+    assert nominal.refinement.rms_sigmas < 1
+    assert 500 < nominal.refinement.scale_sigma_ppm < 20_000
+    for name, pose in held.rig_from_world.items():
+        assert np.array_equal(said.rig_from_world[name].matrix, pose.matrix)
+        assert not np.array_equal(nominal.rig_from_world[name].matrix, pose.matrix)
 
 
 # --- order and names --------------------------------------------------------------------------------------------------
@@ -239,7 +268,7 @@ def test_order_and_names_do_not_change_the_depth(change: str) -> None:
 @pytest.mark.parametrize("change", ["reversed", "with one covered"])
 def test_order_and_names_do_not_change_the_scan(change: str, folder: Path) -> None:
     capture = CHANGES[change](scan())
-    found, mesh = pipeline.reconstruct(capture, folder / change, ReconstructionOptions())
+    found, mesh = pipeline.reconstruct(capture, folder / change, FIXED)
     expected, reference = reconstructed(1.0, folder)
     assert found.rig.names == capture.handpiece.rig.names
     check_poses(found, expected)

@@ -1,11 +1,14 @@
 """A handpiece as it was built, beside the one that was drawn."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from cuspid import storage
 from cuspid.handpiece.designs import DesignOptions, essential_four, twelve_cameras
-from cuspid.simulation.manufacturing import ManufacturingOptions, built, with_tolerances
+from cuspid.simulation.manufacturing import ManufacturingOptions, built, told
+from cuspid.tolerances import EXACT, NominalOptions, held, is_nominal
 from verbs import run
 
 ROUGH = ManufacturingOptions(
@@ -19,18 +22,55 @@ ROUGH = ManufacturingOptions(
 
 def test_without_tolerances_it_is_the_drawn_one():
     drawn = twelve_cameras(DesignOptions())
-    for same in (built(drawn, ManufacturingOptions()), with_tolerances(drawn, ManufacturingOptions())):
-        assert all(same.rig[name] is mounted for name, mounted in drawn.rig.cameras.items())
+    assert all(built(drawn, ManufacturingOptions()).rig[name] is each for name, each in drawn.rig.cameras.items())
+    for mounted in told(drawn, ManufacturingOptions()).rig.cameras.values():
+        assert not mounted.covariance.any()
+        assert not mounted.camera.covariance.any()
+
+
+def test_what_is_not_manufactured_anew_stays_as_well_known_as_it_was():
+    """A calibrated handpiece, of which only the places are off in a simulation."""
+    calibrated = ROUGH.tolerances.fill(essential_four(DesignOptions()))
+    for name, mounted in told(calibrated, ManufacturingOptions(manufacturing_um=77.0)).rig.cameras.items():
+        assert np.array_equal(mounted.camera.covariance, calibrated.rig[name].camera.covariance)
+        assert np.allclose(np.diag(mounted.covariance), [0, 0, 0, *[77e-3**2] * 3])
+
+
+def test_only_what_nobody_has_said_is_assumed():
+    drawn = essential_four(DesignOptions())
+    assumed = NominalOptions(place_um=40.0).of(drawn).fill(drawn)
+    assert is_nominal(drawn)
+    assert not is_nominal(assumed)
+    for given in (EXACT.fill(drawn), ROUGH.tolerances.fill(drawn)):
+        assert not is_nominal(given)
+        for name, mounted in NominalOptions().of(given).fill(given).rig.cameras.items():
+            assert mounted is given.rig[name]
+    for name, mounted in assumed.rig.cameras.items():
+        assert np.allclose(np.sqrt(np.diag(mounted.covariance)), [*[np.deg2rad(0.2)] * 3, *[0.04] * 3])
+        assert np.array_equal(mounted.cam_from_rig.matrix, drawn.rig[name].cam_from_rig.matrix)
+    assert is_nominal(held(assumed))
+
+
+@pytest.mark.parametrize("factor", [0.1, 100.0])
+def test_a_handpiece_of_another_size_is_as_well_known_for_its_size(factor):
+    drawn = essential_four(DesignOptions())
+    near, far = drawn.depth_range_mm
+    larger = replace(
+        drawn,
+        working_distance_mm=factor * drawn.working_distance_mm,
+        depth_range_mm=(factor * near, factor * far),
+    )
+    assert NominalOptions().of(larger).place_mm == pytest.approx(factor * NominalOptions().of(drawn).place_mm)
 
 
 def test_what_is_built_is_off_by_what_the_tolerances_say():
     """In the standard deviations of the covariances, each number for itself, over fifty handpieces."""
     drawn = twelve_cameras(DesignOptions())
-    told = with_tolerances(drawn, ROUGH)
+    known = told(drawn, ROUGH)
     places, lenses = [], []
     for seed in range(50):
         true = built(drawn, ManufacturingOptions(**{**vars(ROUGH), "manufacturing_seed": seed}))
-        for name, mounted in told.rig.cameras.items():
+        for name, mounted in known.rig.cameras.items():
             motion = true.rig[name].cam_from_rig @ mounted.cam_from_rig.inverse()
             places.append([*motion.rotation_vector, *motion.translation] / np.sqrt(np.diag(mounted.covariance)))
             shift = true.rig[name].camera.parameters - mounted.camera.parameters
@@ -55,13 +95,13 @@ def test_the_scan_is_told_of_the_drawn_one_and_the_truth_has_the_built_one(tmp_p
     tiny = ("--handpiece", tmp_path / "probe" / "handpiece.json", "--tooth", 46, "--frames", 2, "--length-mm", 1)
     run("handpiece", "--design", "four", "--width-px", 64, "--height-px", 64, "--out", tmp_path / "probe")
     run("simulate", *tiny, "--supersampling", 1, "--manufacturing-um", 20, "--out", tmp_path / "scan")
-    drawn, told, true = (
+    drawn, known, true = (
         storage.read_handpiece(tmp_path / path / "handpiece.json") for path in ("probe", "scan/capture", "scan/truth")
     )
     for name, mounted in drawn.rig.cameras.items():
-        assert np.allclose(told.rig[name].cam_from_rig.matrix, mounted.cam_from_rig.matrix, atol=1e-12)
-        assert np.allclose(told.rig[name].covariance, np.diag([0, 0, 0, 4e-4, 4e-4, 4e-4]))
-        assert told.rig[name].camera.covariance is None
+        assert np.allclose(known.rig[name].cam_from_rig.matrix, mounted.cam_from_rig.matrix, atol=1e-12)
+        assert np.allclose(known.rig[name].covariance, np.diag([0, 0, 0, 4e-4, 4e-4, 4e-4]))
+        assert not known.rig[name].camera.covariance.any()
         off_um = 1000 * np.linalg.norm((true.rig[name].cam_from_rig @ mounted.cam_from_rig.inverse()).translation)
         assert 1 < off_um < 100
         assert true.rig[name].covariance is None

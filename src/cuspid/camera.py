@@ -74,7 +74,8 @@ class Camera:
     distortion: Float[np.ndarray, "4"] = field(default_factory=lambda: np.zeros(4))
     """(k1, k2, p1, p2) of COLMAP's OPENCV model."""
     covariance: Float[np.ndarray, "8 8"] | None = None
-    """Covariance of (fx, fy, cx, cy, k1, k2, p1, p2), or None for a calibration that is held fixed."""
+    """Covariance of (fx, fy, cx, cy, k1, k2, p1, p2); zero for an exact calibration, None where nobody has said how
+    well it is known (an adjustment holds it)."""
 
     def __post_init__(self) -> None:
         for name in ("focal_px", "principal_point_px", "distortion"):

@@ -2,8 +2,8 @@
 
 handpiece            = DESIGNS["twelve"](DesignOptions())
 capture, truth       = simulate(jaw, handpiece, folder, ...)        images, and what only the simulator knows
-depths               = measure_depth(capture, folder, ...)          frame by frame, from the rig alone
 reconstruction       = locate(capture, folder, ...)                 metric poses, refined calibration
+depths               = measure_depth(capture, folder, ...)          frame by frame, from the rig alone
 mesh                 = fuse(depths, ...)
 trueness             = evaluate(mesh, truth.jaw, ...)
 panorama             = stitch(frames, ...)
@@ -37,6 +37,7 @@ from cuspid.motion.stage import MotionMethod, locate, take_poses
 from cuspid.pairing import resolved_mm
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
+from cuspid.rig import Handpiece
 from cuspid.simulation.stage import FilmOptions, RenderOptions, SimulationOptions, film, simulate, take_images
 from cuspid.stereo.matching import StereoOptions
 from cuspid.stereo.stage import measure_depth, measure_temporal_depth
@@ -46,6 +47,7 @@ from cuspid.stitching.thesis_method import ThesisOptions, stitch_as_thesis
 from cuspid.surface.cleaning import CleaningOptions
 from cuspid.surface.fusion import FusionOptions
 from cuspid.surface.stage import fuse
+from cuspid.tolerances import NominalOptions, held
 from cuspid.trueness import GroundTruth
 from cuspid.visibility import VisibilityOptions, scannable_faces
 
@@ -72,14 +74,15 @@ __all__ = [
     "take_images",
 ]
 
-_MOVED_PX = 0.02
-"""Where the refined calibration moves no image point by more, the depth measured before serves."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructionOptions:
     """How images become a mesh."""
 
+    calibration: Literal["refined", "fixed"] = "refined"
+    """refined: as the images want it, within its covariance. fixed: as if the file were exact."""
+    nominal: NominalOptions = field(default_factory=NominalOptions)
+    """What is assumed where the file does not say how well it is known."""
     motion: MotionMethod = "rig"
     """How the frames are located: rig (ours), or COLMAP's own mapper without (colmap) and with the rig (colmap-rig)."""
     stereo: StereoOptions = field(default_factory=StereoOptions)
@@ -103,20 +106,50 @@ def reconstruct(
     progress: Progress = silent,
 ) -> tuple[Reconstruction, Mesh]:
     """Images and calibration to poses and a mesh. With a COLMAP model its poses are taken instead of found."""
+    found = find_poses(capture, folder, options, colmap_model=colmap_model, progress=progress)
+    return found, surface(capture, found, folder, options, progress=progress)
+
+
+def find_poses(
+    capture: Capture,
+    folder: Path,
+    options: ReconstructionOptions,
+    *,
+    colmap_model: Path | None = None,
+    progress: Progress = silent,
+) -> Reconstruction:
+    """Where the frames were, and the calibration as the images want it (first part of :func:`reconstruct`)."""
+    handpiece = as_known(capture.handpiece, options)
+    capture = replace(capture, handpiece=handpiece)
+    if colmap_model is not None:
+        return take_poses(capture, colmap_model, folder / "motion")
+    return locate(capture, folder / "motion", options.tracking, options.motion, progress=progress)
+
+
+def surface(
+    capture: Capture,
+    found: Reconstruction,
+    folder: Path,
+    options: ReconstructionOptions,
+    *,
+    progress: Progress = silent,
+) -> Mesh:
+    """The mesh, once it is known where the frames were (second part of :func:`reconstruct`)."""
+    handpiece = held(replace(capture.handpiece, rig=found.rig))
+    capture, poses = replace(capture, handpiece=handpiece), found.rig_from_world
     depths = measure_depth(capture, folder / "depth", options.stereo, progress=progress)
-    if colmap_model is None:
-        found = locate(capture, folder / "motion", options.tracking, options.motion, progress=progress)
-    else:
-        found = take_poses(capture, colmap_model, folder / "motion")
-    handpiece, poses = capture.handpiece, found.rig_from_world
-    if handpiece.rig.largest_shift_px(found.rig, handpiece.working_distance_mm) > _MOVED_PX:
-        capture = replace(capture, handpiece=replace(handpiece, rig=found.rig))
-        depths = measure_depth(capture, folder / "depth-refined", options.stereo, progress=progress)
     if options.temporal.enabled:
         depths |= measure_temporal_depth(capture, poses, folder / "depth-temporal", options.temporal, progress=progress)
     lengths_mm = resolved_mm(handpiece), handpiece.working_distance_mm
     how = options.fusion, options.cleaning
-    return found, fuse(depths, depths.digest, poses, *lengths_mm, folder, *how, progress=progress)
+    return fuse(depths, depths.digest, poses, *lengths_mm, folder, *how, progress=progress)
+
+
+def as_known(handpiece: Handpiece, options: ReconstructionOptions) -> Handpiece:
+    """A handpiece with how well it is taken to be known."""
+    if options.calibration == "fixed":
+        return held(handpiece)
+    return options.nominal.of(handpiece).fill(handpiece)
 
 
 @dataclass(frozen=True, kw_only=True)

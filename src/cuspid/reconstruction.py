@@ -61,11 +61,40 @@ class Tracks:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Refinement:
+    """How far the images moved the calibration, and what is left open of it."""
+
+    rms_sigmas: float
+    """Of all numbers that were free, in standard deviations of the given covariance; where these are right, 1 or less:
+    what no image tells stays where it was."""
+    camera_sigmas: Mapping[str, float]
+    """The same of each camera."""
+    scale_sigma_ppm: float | None
+    """Standard deviation of the size of the cameras' arrangement, and so of all lengths in the scan; None where they
+    are all in one place."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "camera_sigmas", MappingProxyType(dict(self.camera_sigmas)))
+
+    @property
+    def summary(self) -> str:
+        """In one line."""
+        name, most = max(self.camera_sigmas.items(), key=lambda item: item[1])
+        scale = "" if self.scale_sigma_ppm is None else f"; lengths known to {self.scale_sigma_ppm / 1e4:.2g} %"
+        return (
+            f"refined, {self.rms_sigmas:.2f} of its standard deviations from the file (root mean square; camera {name} "
+            f"{most:.2f}){scale}"
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Reconstruction:
     """Located frames, in millimetres. The world frame is the rig frame of the first located frame."""
 
     rig: Rig
     """Refined calibration (the given one where it was held fixed)."""
+    refinement: Refinement | None = None
+    """What was refined of it; None where it was held fixed."""
     rig_from_world: Mapping[str, Rigid3]
     """Pose for each located frame, in the order of capture."""
     tracks: Tracks | None = None

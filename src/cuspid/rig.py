@@ -33,8 +33,8 @@ class MountedCamera:
     cam_from_rig: Rigid3
     """Extrinsic calibration."""
     covariance: Float[np.ndarray, "6 6"] | None = None
-    """Covariance of a small motion (rotation vector rad, translation mm) applied on the left of ``cam_from_rig``;
-    None for an extrinsic calibration that is held fixed."""
+    """Covariance of a small motion (rotation vector rad, translation mm) applied on the left of ``cam_from_rig``; zero
+    for an exact one, None where nobody has said how well it is known (an adjustment holds it)."""
 
     @property
     def centre_in_rig(self) -> Float[np.ndarray, "3"]:

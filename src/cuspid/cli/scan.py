@@ -29,6 +29,8 @@ from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.reconstruction import Reconstruction
 from cuspid.reporting.figures.drawing import deviation_colors, save_deviation_picture
 from cuspid.reporting.figures.sphere import save_sphere_picture
+from cuspid.rig import Handpiece
+from cuspid.tolerances import NominalOptions, is_nominal
 from cuspid.trueness import DeviationStatistics, Trueness
 
 
@@ -129,9 +131,14 @@ def _simulate(mesh: Path | None, out: Path, source: Source, probe: Probe, option
 def _reconstruct(capture: Capture, out: Path, options: ReconstructionOptions, model: Path | None) -> None:
     settings = {"reconstruction": options, "from_poses": model}
     inputs = storage.hash_capture(capture) | ({} if model is None else {"poses": hash_model(model)})
-    with storage.claimed_folder(out, "reconstruct", settings, inputs), show_progress() as progress:
-        reconstruction, mesh = pipeline.reconstruct(capture, out, options, colmap_model=model, progress=progress)
-    _print_located(reconstruction, capture)
+    with storage.claimed_folder(out, "reconstruct", settings, inputs):
+        if options.calibration == "refined" and is_nominal(capture.handpiece):
+            _print_nominal(capture.handpiece, options.nominal)
+        with show_progress() as progress:
+            found = pipeline.find_poses(capture, out, options, colmap_model=model, progress=progress)
+        _print_located(found, capture)
+        with show_progress() as progress:
+            mesh = pipeline.surface(capture, found, out, options, progress=progress)
     console.print(f"{out / 'mesh.ply'}: {len(mesh.faces):,} faces")
 
 
@@ -240,10 +247,22 @@ def _print_spheres(report: SphereReport) -> None:
         console.print(f"  not measured: {label}: {reason}")
 
 
+def _print_nominal(handpiece: Handpiece, options: NominalOptions) -> None:
+    assumed = options.of(handpiece)
+    console.print(
+        "calibration: the handpiece's file does not say how well it is known; taken as nominal, within (one sigma) "
+        f"{1000 * assumed.place_mm:.3g} µm and {assumed.turn_deg:g}° of place, {100 * assumed.focal_share:g} % of the "
+        f"focal length, {assumed.centre_px:g} px of the principal point, {assumed.k1:g} of k1; change it with "
+        "--nominal.*, or hold it with --calibration fixed"
+    )
+
+
 def _print_located(reconstruction: Reconstruction, capture: Capture) -> None:
     console.print(f"located {len(reconstruction.frames)} of {len(capture.frames)} frames")
     for dropped in reconstruction.dropped:
         console.print(f"  left out {dropped.what}: {dropped.reason}")
+    if reconstruction.refinement is not None:
+        console.print(f"calibration: {reconstruction.refinement.summary}")
     for note in reconstruction.notes:
         console.print(f"note: {note}")
 

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -45,7 +45,7 @@ from cuspid.motion.normal_equations import (
     substitute,
 )
 from cuspid.options import Options, Range
-from cuspid.reconstruction import Reconstruction, Tracks
+from cuspid.reconstruction import Reconstruction, Refinement, Tracks
 from cuspid.rig import MountedCamera, Rig
 from cuspid.sparse_model import SparseModel
 
@@ -125,6 +125,12 @@ class _Prior:
     def is_free(self) -> bool:
         """Whether anything of the calibration may move."""
         return bool(np.any(self.extrinsic_factor) or np.any(self.parameter_factor))
+
+    @property
+    def free_numbers(self) -> Int[np.ndarray, "c"]:
+        """How many numbers of each camera may move."""
+        factors = zip(self.extrinsic_factor, self.parameter_factor, strict=True)
+        return np.array([np.linalg.matrix_rank(place) + np.linalg.matrix_rank(lens) for place, lens in factors])
 
     def camera_at(self, index: int, whitened: Float[np.ndarray, "14"]) -> MountedCamera:
         """A camera whose calibration is ``whitened`` standard deviations from the given one."""
@@ -396,10 +402,18 @@ def residuals_px(reconstruction: Reconstruction) -> Float[np.ndarray, "o 2"]:
 # --- the adjustment ----------------------------------------------------------------------------------------------
 
 
-def _posterior(
-    state: State, observations: Observations, weighting: Weighting
-) -> tuple[Float[np.ndarray, "f 6 6"], Float[np.ndarray, "c 14 14"] | None]:
-    """Covariance of each pose and of each camera's calibration (motion on the left, parameters)."""
+class _Posterior(NamedTuple):
+    """Covariances of what was found."""
+
+    poses: Float[np.ndarray, "f 6 6"]
+    calibration: Float[np.ndarray, "c 14 14"] | None
+    """Of each camera (motion on the left, parameters); None where it is held."""
+    scale_sigma: float | None
+    """Of the rig, as a share of its size; None where it is held, or all cameras are in one place."""
+
+
+def _posterior(state: State, observations: Observations, weighting: Weighting) -> _Posterior:
+    """Raises LinAlgError where the observations do not determine every pose."""
     system = normal_equations(state, observations, weighting._replace(huber_sigmas=np.inf))
     inverse = cho_solve(cho_factor(system.matrix, lower=True), np.eye(len(system.matrix)))
     poses = np.zeros((len(state.frame_rotation), POSE, POSE))
@@ -407,16 +421,27 @@ def _posterior(
         at = slice(POSE * (frame - 1), POSE * frame)
         poses[frame] = inverse[at, at]
     if not weighting.calibrated:
-        return poses, None
+        return _Posterior(poses, None, None)
     start = POSE * (len(poses) - 1)
     starts = range(start, len(inverse), CALIBRATION)
     whitened = np.stack([inverse[at : at + CALIBRATION, at : at + CALIBRATION] for at in starts])
-    return poses, state.basis @ whitened @ np.swapaxes(state.basis, 1, 2)
+    calibration = state.basis @ whitened @ np.swapaxes(state.basis, 1, 2)
+    return _Posterior(poses, calibration, _scale_sigma(state, inverse[start:, start:]))
 
 
-def _known_posterior(
-    state: State, observations: Observations, weighting: Weighting
-) -> tuple[Float[np.ndarray, "f 6 6"], Float[np.ndarray, "c 14 14"] | None]:
+def _scale_sigma(state: State, covariance: Float[np.ndarray, "k k"]) -> float | None:
+    """Standard deviation of the logarithm of the size of the rig, by least squares over the places of its cameras."""
+    centres = -np.einsum("cji,cj->ci", state.camera_rotation, state.camera_translation)
+    offsets = centres - centres.mean(axis=0)
+    if not np.any(offsets):
+        return None
+    along = np.zeros((len(centres), CALIBRATION))
+    along[:, 3:POSE] = -np.einsum("cij,cj->ci", state.camera_rotation, offsets) / np.sum(offsets**2)
+    of_whitened = np.einsum("ci,cij->cj", along, state.basis).ravel()
+    return float(np.sqrt(of_whitened @ covariance @ of_whitened))
+
+
+def _known_posterior(state: State, observations: Observations, weighting: Weighting) -> _Posterior:
     """As :func:`_posterior`. Raises ReconstructionError where the observations do not determine every pose."""
     try:
         return _posterior(state, observations, weighting)
@@ -450,6 +475,7 @@ class _Adjusted:
     """What an adjustment finds."""
 
     rig: Rig
+    refinement: Refinement | None
     poses: tuple[Rigid3, ...]
     tracks: Tracks
     pose_covariance: Float[np.ndarray, "f 6 6"] | None
@@ -471,6 +497,7 @@ def adjust(reconstruction: Reconstruction, options: AdjustmentOptions | None = N
     return replace(
         reconstruction,
         rig=found.rig,
+        refinement=found.refinement,
         rig_from_world=dict(zip(reconstruction.frames, found.poses, strict=True)),
         tracks=found.tracks,
         pose_covariance=found.pose_covariance,
@@ -523,20 +550,21 @@ def _adjusted(
         sigma_px = _sigma_px(state, observations, weighting, unknowns)
         limit_px = options.outlier_sigmas * sigma_px
     weighting = Weighting(sigma_px, np.inf, prior.is_free)
-    covariance, calibration = _known_posterior(state, observations, weighting) if has_scale else (None, None)
+    posterior = _known_posterior(state, observations, weighting) if has_scale else None
+    refinement = None if posterior is None else _refinement(state, prior, posterior)
     residuals = residual_vectors(state, observations)
     return _Adjusted(
-        rig=_adjusted_rig(state, prior, calibration),
+        rig=_adjusted_rig(state, prior, None if posterior is None else posterior.calibration),
+        refinement=refinement,
         poses=tuple(map(Rigid3, state.frame_rotation, state.frame_translation)),
         tracks=_as_tracks(state, observations, colors),
-        pose_covariance=covariance,
+        pose_covariance=None if posterior is None else posterior.poses,
         reprojection_rms_px=float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))),
         notes=(*_unsettled(minimum, options), *_implausible(state, prior)),
         log={
             "observation_sigma_px": sigma_px,
             "observations": len(residuals),
             "adjustment_steps": steps,
-            "calibration_cost": float(np.sum(state.whitened**2)),
         },
     )
 
@@ -551,10 +579,20 @@ def _unsettled(minimum: _Minimum, options: AdjustmentOptions) -> tuple[str, ...]
     )
 
 
+def _refinement(state: State, prior: _Prior, posterior: _Posterior) -> Refinement | None:
+    if not prior.is_free:
+        return None
+    costs, numbers = np.sum(state.whitened**2, axis=1), np.maximum(prior.free_numbers, 1)
+    return Refinement(
+        rms_sigmas=float(np.sqrt(costs.sum() / prior.free_numbers.sum())),
+        camera_sigmas=dict(zip(prior.rig.names, np.sqrt(costs / numbers).tolist(), strict=True)),
+        scale_sigma_ppm=None if posterior.scale_sigma is None else 1e6 * posterior.scale_sigma,
+    )
+
+
 def _implausible(state: State, prior: _Prior) -> tuple[str, ...]:
     """Whether the refined calibration lies farther from the given one than its covariance allows."""
-    free = np.array([np.linalg.matrix_rank(factor) for factor in (*prior.extrinsic_factor, *prior.parameter_factor)])
-    cost, numbers = float(np.sum(state.whitened**2)), int(free.sum())
+    cost, numbers = float(np.sum(state.whitened**2)), int(prior.free_numbers.sum())
     if numbers == 0 or cost <= chdtri(numbers, _CHANCE):
         return ()
     camera = int(np.argmax(np.sum(state.whitened**2, axis=1)))

@@ -5,17 +5,15 @@ The images are those of the built one; what a user has is the drawn one, and the
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float
 
-from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.options import SEED, Options, Range
-from cuspid.rig import Handpiece, MountedCamera, Rig
+from cuspid.rig import Handpiece, MountedCamera
+from cuspid.tolerances import Tolerances, with_cameras
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,26 +34,32 @@ class ManufacturingOptions(Options):
     manufacturing_seed: Annotated[int, SEED] = 0
     """Which of the handpieces that were built."""
 
+    @property
+    def tolerances(self) -> Tolerances:
+        """The same as a value."""
+        return Tolerances(
+            place_mm=self.manufacturing_um / 1000,
+            turn_deg=self.manufacturing_deg,
+            focal_share=self.manufacturing_focal_pct / 100,
+            centre_px=self.manufacturing_centre_px,
+            k1=self.manufacturing_k1,
+        )
+
 
 def built(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:
     """One of the handpieces that are built to tolerances; the drawn one where there are none."""
     rng = np.random.default_rng([options.manufacturing_seed, 3])
-    return _with_cameras(drawn, lambda mounted: _off(mounted, options, rng))
+    return with_cameras(drawn, lambda mounted: _off(mounted, options.tolerances, rng))
 
 
-def with_tolerances(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:
-    """The drawn handpiece with the tolerances as covariances; what has none keeps what it had."""
-    return _with_cameras(drawn, lambda mounted: _tolerated(mounted, options))
+def told(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:
+    """The drawn handpiece with the tolerances as covariances; where there are none it keeps its own, or is exact."""
+    return options.tolerances.fill(with_cameras(drawn, lambda mounted: _open(mounted, options.tolerances)))
 
 
-def _with_cameras(handpiece: Handpiece, change: Callable[[MountedCamera], MountedCamera]) -> Handpiece:
-    cameras = {name: change(mounted) for name, mounted in handpiece.rig.cameras.items()}
-    return replace(handpiece, rig=Rig(cameras))
-
-
-def _off(mounted: MountedCamera, options: ManufacturingOptions, rng: np.random.Generator) -> MountedCamera:
-    motion = _place_sigma(options) * rng.standard_normal(6)
-    shift = _lens_factor(mounted.camera, options) @ rng.standard_normal(4)
+def _off(mounted: MountedCamera, tolerances: Tolerances, rng: np.random.Generator) -> MountedCamera:
+    motion = tolerances.motion_sigma * rng.standard_normal(6)
+    shift = tolerances.lens_factor(mounted.camera) @ rng.standard_normal(4)
     if not (motion.any() or shift.any()):
         return mounted
     place = Rigid3.from_rotation_vector(motion[:3], motion[3:]) @ mounted.cam_from_rig
@@ -63,22 +67,8 @@ def _off(mounted: MountedCamera, options: ManufacturingOptions, rng: np.random.G
     return MountedCamera(camera, place)
 
 
-def _tolerated(mounted: MountedCamera, options: ManufacturingOptions) -> MountedCamera:
-    place, lens = _place_sigma(options), _lens_factor(mounted.camera, options)
-    if lens.any():
-        mounted = replace(mounted, camera=replace(mounted.camera, covariance=lens @ lens.T))
-    return replace(mounted, covariance=np.diag(place**2)) if place.any() else mounted
-
-
-def _place_sigma(options: ManufacturingOptions) -> Float[np.ndarray, "6"]:
-    """Of a small motion on the left of ``cam_from_rig``: rad, mm."""
-    return np.repeat([np.deg2rad(options.manufacturing_deg), options.manufacturing_um / 1000], 3)
-
-
-def _lens_factor(camera: Camera, options: ManufacturingOptions) -> Float[np.ndarray, "8 4"]:
-    """What (focal length, cx, cy, k1) of unit deviation make of the parameters: both focal lengths go together."""
-    factor = np.zeros((8, 4))
-    factor[:2, 0] = options.manufacturing_focal_pct / 100 * camera.focal_px
-    factor[2, 1] = factor[3, 2] = options.manufacturing_centre_px
-    factor[4, 3] = options.manufacturing_k1
-    return factor
+def _open(mounted: MountedCamera, tolerances: Tolerances) -> MountedCamera:
+    """Without the covariances that tolerances take the place of."""
+    if tolerances.lens_factor(mounted.camera).any():
+        mounted = replace(mounted, camera=replace(mounted.camera, covariance=None))
+    return replace(mounted, covariance=None) if tolerances.motion_sigma.any() else mounted

@@ -19,7 +19,7 @@ from cuspid.rig import Handpiece
 from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.blender import render_with_blender
 from cuspid.simulation.lights import lit
-from cuspid.simulation.manufacturing import ManufacturingOptions, built, with_tolerances
+from cuspid.simulation.manufacturing import ManufacturingOptions, built, told
 from cuspid.simulation.path.free import FreePathOptions, plan_free_path
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 from cuspid.simulation.raycast import Scene, lit_frames, render_capture
@@ -30,6 +30,7 @@ from cuspid.storage.handpieces import read_handpiece
 from cuspid.storage.reference_renders import REFERENCE_RENDER_FILES, write_reference_render
 from cuspid.storage.stages import Stage
 from cuspid.storage.truths import write_path, write_truth
+from cuspid.tolerances import EXACT
 from cuspid.trueness import GroundTruth
 from cuspid.workers import usable_cores
 
@@ -84,8 +85,8 @@ def simulate(
     handpiece = lit(handpiece)
     path = plan_scan_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
     write_path(folder / "truth" / "path.json", path.minimum_overlap, path.mean_overlap, path.seen)
-    true, told = built(handpiece, options.manufacturing), with_tolerances(handpiece, options.manufacturing)
-    return take_images(jaw, true, path.rig_from_world, folder, options, told=told, progress=progress)
+    true, known = built(handpiece, options.manufacturing), told(handpiece, options.manufacturing)
+    return take_images(jaw, true, path.rig_from_world, folder, options, known=known, progress=progress)
 
 
 def film(
@@ -120,16 +121,16 @@ def take_images(
     folder: Path,
     options: RenderOptions,
     *,
-    told: Handpiece | None = None,
+    known: Handpiece | None = None,
     progress: Progress = silent,
 ) -> tuple[Capture, GroundTruth]:
     """As :func:`simulate`, from given poses of the handpiece, by the name of the frame. The capture has the handpiece
-    that is ``told``, the true one unless given."""
+    that is ``known``, the true one and exactly unless given."""
     handpiece = lit(handpiece)
     frames, poses = lit_frames(handpiece, rig_from_world)
     truth = GroundTruth(jaw=jaw, handpiece=handpiece, rig_from_world=poses)
     write_truth(folder / "truth", truth)
-    capture = Capture(handpiece=told or handpiece, frames=frames, source=ImageFolder(folder / "capture"))
+    capture = Capture(handpiece=known or EXACT.fill(handpiece), frames=frames, source=ImageFolder(folder / "capture"))
     write_capture(folder / "capture", capture)
     for done, total in _render(folder, capture, truth, options):
         progress("images", done, total)

@@ -11,7 +11,7 @@ import numpy as np
 
 from cuspid.capture import Dropped
 from cuspid.geometry import Rigid3
-from cuspid.reconstruction import DepthMap, Reconstruction, Tracks
+from cuspid.reconstruction import DepthMap, Reconstruction, Refinement, Tracks
 from cuspid.rig import Handpiece
 from cuspid.storage.files import as_declared, read_arrays, read_json, reading, to_plain, write_arrays, write_json
 from cuspid.storage.handpieces import (
@@ -57,6 +57,7 @@ def write_reconstruction(folder: Path, reconstruction: Reconstruction, handpiece
             "frames_dropped": reconstruction.dropped,
             "points": 0 if reconstruction.tracks is None else len(reconstruction.tracks.points),
             "reprojection_rms_px": reconstruction.reprojection_rms_px,
+            "refinement": reconstruction.refinement,
             "notes": reconstruction.notes,
             "log": reconstruction.log,
             "pose_covariance_rotation_rad_translation_mm": reconstruction.pose_covariance,
@@ -74,6 +75,7 @@ def read_reconstruction(folder: Path) -> Reconstruction:
             Reconstruction,
             rig=read_handpiece(folder / "handpiece.json").rig,
             rig_from_world=read_poses(folder / "poses.json"),
+            refinement=None if (moved := value.get("refinement")) is None else as_declared(Refinement, **moved),
             tracks=_read_tracks(tracks) if value["points"] else None,
             dropped=tuple(as_declared(Dropped, **entry) for entry in value["frames_dropped"]),
             pose_covariance=None if covariance is None else np.array(covariance, dtype=np.float64),

@@ -20,6 +20,7 @@ from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
 from cuspid.options import Options, Range
+from cuspid.reconstruction import Refinement
 from cuspid.reporting.figures.drawing import (
     RANGES_UM,
     FigureOptions,
@@ -201,11 +202,21 @@ def _tiles(result: ScanResult) -> list[tuple[str, str, str]]:
     if result.reconstruction is not None:
         located, dropped = len(result.reconstruction.frames), len(result.reconstruction.dropped)
         tiles.append(("frames located", f"{located}", f"of {located + dropped}" if dropped else ""))
+        tiles += _refinement_tiles(result.reconstruction.refinement)
     if result.trajectory is not None:
         tiles.append(("position of the handpiece, RMSE", f"{result.trajectory['ape_um']['rmse']:.1f}", "µm"))
     if result.capture is not None:
         tiles.append(("images", f"{len(result.capture.frames) * len(result.capture.handpiece.rig.names)}", ""))
     return tiles
+
+
+def _refinement_tiles(refinement: Refinement | None) -> list[tuple[str, str, str]]:
+    if refinement is None:
+        return []
+    moved = ("calibration moved by, RMS", f"{refinement.rms_sigmas:.2f}", "σ")
+    if refinement.scale_sigma_ppm is None:
+        return [moved]
+    return [moved, ("lengths known to (one σ)", f"±{refinement.scale_sigma_ppm:.0f}", "ppm")]
 
 
 def _crown_tiles(crown: Mapping[str, Any] | None) -> list[tuple[str, str, str]]:
