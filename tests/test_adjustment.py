@@ -326,6 +326,38 @@ def test_poses_are_as_uncertain_as_their_covariance_says() -> None:
     assert 4.6 < np.mean(squares) < 7.6
 
 
+def test_errors_that_hang_together_within_a_track_are_accounted_for() -> None:
+    """A keypoint slides over the surface from frame to frame, in all cameras alike: a walk for each point."""
+    scene = make_scene(frames=8, points=500)
+    tracks, squares, ignored = scene.tracks, [], []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        start = disturbed(scene, rng)
+        walks = np.cumsum(rng.normal(0, 0.4, (len(tracks.points), 8, 2)), axis=1)
+        pixels = start.tracks.pixels + walks[tracks.point_index, tracks.frame_index]
+        found = adjust(replace(start, tracks=replace(start.tracks, pixels=pixels)))
+        errors = pose_errors(found, scene.rig_from_world)[1:]
+        squares.append(normalised_squares(errors, found.pose_covariance[1:]))
+        ignored.append(normalised_squares(errors, independent(found)[1:]))
+    assert 4.5 < np.mean(squares) < 8.0
+    assert np.mean(ignored) > 10
+
+
+def independent(found: Reconstruction) -> np.ndarray:
+    """Covariance of the poses if every keypoint had an error of its own."""
+    prior = adjustment._Prior.of(found.rig)
+    observations, points = adjustment._sorted_by_point(found.tracks, np.ones(len(found.tracks.pixels), dtype=bool))
+    state = adjustment._initial_state(poses_of(found), found.tracks.points[points], prior)
+    weighting = normal_equations.Weighting(found.log["observation_sigma_px"], np.inf, False)
+    inverse = np.linalg.inv(lower_to_full(normal_equations.normal_equations(state, observations, weighting).matrix))
+    blocks = [inverse[k : k + 6, k : k + 6] for k in range(0, len(inverse), 6)]
+    return np.stack([np.zeros((6, 6)), *blocks])
+
+
+def lower_to_full(matrix: np.ndarray) -> np.ndarray:
+    return np.tril(matrix) + np.tril(matrix, -1).T
+
+
 def size_of(rig: Rig) -> float:
     """Root mean square distance of the cameras from their middle."""
     centres = np.stack([mounted.centre_in_rig for mounted in rig.cameras.values()])

@@ -41,6 +41,7 @@ from cuspid.motion.normal_equations import (
     Weighting,
     normal_equations,
     residual_vectors,
+    scatter_of_tracks,
     settle,
     substitute,
 )
@@ -299,12 +300,17 @@ def _sigma_px(state: State, observations: Observations, weighting: Weighting, un
     For a robust loss the covariance of the estimate is a / b^2 (J^T J)^-1, with a the variance of the influence
     psi(r) = w(r) r and b its mean slope (Huber, Robust Statistics, 1981, section 7.6); so sigma^2 = a / b^2.
     """
+    squares, slope = _influence(state, observations, weighting)
+    variance = squares / max(2 * len(observations.frame) - unknowns, 1)
+    return max(float(weighting.sigma_px * np.sqrt(variance) / slope), _LEAST_SIGMA_PX)
+
+
+def _influence(state: State, observations: Observations, weighting: Weighting) -> tuple[float, float]:
+    """Sum of the squares of psi(r), and the mean slope of psi."""
     lengths = np.linalg.norm(residual_vectors(state, observations), axis=1) / weighting.sigma_px
     beyond = lengths > weighting.huber_sigmas
-    influence = np.minimum(lengths, weighting.huber_sigmas)
-    variance = np.sum(influence**2) / max(2 * len(lengths) - unknowns, 1)
-    slope = np.mean(np.where(beyond, weighting.huber_sigmas / (2 * np.maximum(lengths, 1e-300)), 1.0))
-    return max(float(weighting.sigma_px * np.sqrt(variance) / slope), _LEAST_SIGMA_PX)
+    slopes = np.where(beyond, weighting.huber_sigmas / (2 * np.maximum(lengths, 1e-300)), 1.0)
+    return float(np.sum(np.minimum(lengths, weighting.huber_sigmas) ** 2)), float(np.mean(slopes))
 
 
 # --- observations ------------------------------------------------------------------------------------------------
@@ -413,16 +419,27 @@ class _Posterior(NamedTuple):
 
 
 def _posterior(state: State, observations: Observations, weighting: Weighting) -> _Posterior:
-    """Raises LinAlgError where the observations do not determine every pose."""
-    system = normal_equations(state, observations, weighting._replace(huber_sigmas=np.inf))
-    inverse = cho_solve(cho_factor(system.matrix, lower=True), np.eye(len(system.matrix)))
+    """From how the gradients of the tracks scatter, for the errors of the keypoints of one hang together (covariance of
+    an M-estimate with clusters: Huber, 5th Berkeley Symposium, 1967; Liang and Zeger, Biometrika 73, 1986).
+
+    Raises LinAlgError where the observations do not determine every pose.
+    """
     poses = np.zeros((len(state.frame_rotation), POSE, POSE))
+    start = POSE * (len(poses) - 1)
+    _, slope = _influence(state, observations, weighting)
+    hessian = slope * normal_equations(state, observations, weighting._replace(huber_sigmas=np.inf)).matrix
+    spare = 2 * len(observations.frame) - state.points.size
+    scatter = scatter_of_tracks(state, observations, weighting) * spare / max(spare - len(hessian), 1)
+    prior = np.arange(start, len(hessian))
+    hessian[prior, prior] += 1 - slope
+    scatter[prior, prior] += 1
+    factor = cho_factor(hessian, lower=True)
+    inverse = cho_solve(factor, cho_solve(factor, scatter).T)
     for frame in range(1, len(poses)):
         at = slice(POSE * (frame - 1), POSE * frame)
         poses[frame] = inverse[at, at]
     if not weighting.calibrated:
         return _Posterior(poses, None, None)
-    start = POSE * (len(poses) - 1)
     starts = range(start, len(inverse), CALIBRATION)
     whitened = np.stack([inverse[at : at + CALIBRATION, at : at + CALIBRATION] for at in starts])
     calibration = state.basis @ whitened @ np.swapaxes(state.basis, 1, 2)
@@ -487,9 +504,8 @@ class _Adjusted:
 def adjust(reconstruction: Reconstruction, options: AdjustmentOptions | None = None) -> Reconstruction:
     """Refine poses, points and free calibration together; the tracks come back without outliers.
 
-    The covariance of the poses is relative to the first frame, that of the calibration replaces its prior. It takes the
-    errors of keypoints for independent; those of one surface point in neighbouring images are not: in simulated scans
-    the poses were off by three to five times as much. Raises ReconstructionError where the observations do not
+    The covariance of the poses is relative to the first frame, that of the calibration replaces its prior. Both take
+    the tracks for independent, not the keypoints of one. Raises ReconstructionError where the observations do not
     determine every pose.
     """
     poses = tuple(reconstruction.rig_from_world.values())
@@ -549,7 +565,6 @@ def _adjusted(
         unknowns = state.points.size + POSE * (len(state.frame_rotation) - 1)
         sigma_px = _sigma_px(state, observations, weighting, unknowns)
         limit_px = options.outlier_sigmas * sigma_px
-    weighting = Weighting(sigma_px, np.inf, prior.is_free)
     posterior = _known_posterior(state, observations, weighting) if has_scale else None
     refinement = None if posterior is None else _refinement(state, prior, posterior)
     residuals = residual_vectors(state, observations)

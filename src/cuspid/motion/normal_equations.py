@@ -11,6 +11,7 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 from jaxtyping import Float
 from numba import njit
+from scipy.sparse import csr_array
 
 from cuspid.workers import map_slices
 
@@ -356,6 +357,18 @@ def _accumulate(state, observations, weighting, first, last, system):
 
 @njit(cache=True, nogil=True)
 @no_type_check
+def _scores(state, observations, weighting, first, last, out):
+    """J^T r of each observation of the points ``first`` to ``last``, by its pose and its calibration."""
+    scratch, residual, jacobian = make_scratch(), np.zeros(2), np.zeros((2, _COLUMNS))
+    for point in range(first, last):
+        for o in range(observations.start[point], observations.start[point + 1]):
+            if _weigh(state, observations, weighting, point, o, scratch, residual, jacobian):
+                for i in range(POSE + CALIBRATION):
+                    out[o, i] = jacobian[0, 3 + i] * residual[0] + jacobian[1, 3 + i] * residual[1]
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
 def _substitute(state, observations, weighting, step, first, last, moved):
     """Back-substitution: the points ``first`` to ``last`` after the reduced unknowns have made their step."""
     frames = state.frame_rotation.shape[0]
@@ -447,6 +460,31 @@ def normal_equations(state: State, observations: Observations, weighting: Weight
         diagonal[prior] += 1
         gradient[prior] += state.whitened.ravel()
     return System(matrix, gradient, diagonal)
+
+
+def scatter_of_tracks(state: State, observations: Observations, weighting: Weighting) -> Float[np.ndarray, "k k"]:
+    """Sum over the tracks of g g^T, g being the share of a track in the gradient of the reduced unknowns, where every
+    point lies where its rays meet best. It is what independent tracks make of the gradient's covariance, however the
+    errors within a track hang together."""
+    size = POSE * (len(state.frame_rotation) - 1)
+    total = size + (state.whitened.size if weighting.calibrated else 0)
+    blocks = np.zeros((len(observations.frame), POSE + CALIBRATION))
+    map_slices(
+        lambda points: _scores(state, observations, weighting, points.start, points.stop, blocks),
+        len(state.points),
+        _PARTS,
+    )
+    columns = np.concatenate(
+        [
+            POSE * (observations.frame - 1)[:, None] + np.arange(POSE),
+            size + CALIBRATION * observations.camera[:, None] + np.arange(CALIBRATION),
+        ],
+        axis=1,
+    )
+    rows = np.repeat(np.arange(len(state.points)), np.diff(observations.start))[:, None] + 0 * columns
+    free = (columns >= 0) & (columns < total)
+    shares = csr_array((blocks[free], (rows[free], columns[free])), shape=(len(state.points), total))
+    return np.asarray((shares.T @ shares).toarray())
 
 
 def substitute(
