@@ -102,6 +102,15 @@ def _shared(rig: Rig, pair: tuple[str, str], distance_mm: float) -> float:
     return min(rig.overlap(first, second, distance_mm), rig.overlap(second, first, distance_mm))
 
 
+def require_stereo(handpiece: Handpiece, options: PairingOptions) -> None:
+    """Raise InputError where no two cameras see the same surface."""
+    if not stereo_pairs(handpiece.rig, handpiece.working_distance_mm, options):
+        raise InputError(
+            f"handpiece {handpiece.name}: no two cameras see the same surface at {handpiece.working_distance_mm} mm; "
+            "check the calibration and the working distance"
+        )
+
+
 def depth_step_mm(handpiece: Handpiece) -> float:
     """Change of depth at the working distance that shifts a point by 1 px in the widest stereo pair, mm; infinite where
     no two cameras see the same surface."""

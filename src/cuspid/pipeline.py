@@ -135,7 +135,7 @@ def surface(
     progress: Progress = silent,
 ) -> Mesh:
     """The mesh, once it is known where the frames were (second part of :func:`reconstruct`)."""
-    handpiece = held(replace(capture.handpiece, rig=found.rig))
+    handpiece = replace(capture.handpiece, rig=found.rig)
     capture, poses = replace(capture, handpiece=handpiece), found.rig_from_world
     depths = measure_depth(capture, folder / "depth", options.stereo, progress=progress)
     if options.temporal.enabled:

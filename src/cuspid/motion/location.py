@@ -32,7 +32,7 @@ from cuspid.motion.odometry import (
 from cuspid.motion.pairs import MatchingOptions, frame_pairs, index_features, match_guided
 from cuspid.motion.tracks import intersect_rays, join, thin
 from cuspid.options import SEED, SHARE, Options, Range
-from cuspid.pairing import PairingOptions, resolved_mm, stereo_pairs
+from cuspid.pairing import PairingOptions, require_stereo, resolved_mm, stereo_pairs
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import Handpiece, Rig
@@ -346,6 +346,7 @@ def locate(
     Raises InputError for images that cannot be used and ReconstructionError where too few frames can be placed.
     """
     options, log = options or MotionOptions(), dict[str, float]()
+    require_stereo(capture.handpiece, options.pairing)
     with _timed(log, "features"):
         features = detect_all(capture, options.features, progress=progress, cache=cache)
     names = [frame.name for frame in capture.frames]

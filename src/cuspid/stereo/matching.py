@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.options import Options, Range
-from cuspid.pairing import PairingOptions, camera_groups, resolved_mm, stereo_pairs
+from cuspid.pairing import PairingOptions, camera_groups, require_stereo, resolved_mm, stereo_pairs
 from cuspid.reconstruction import DepthMap
 from cuspid.rig import Handpiece, Rig
 from cuspid.stereo.confidence import (
@@ -135,11 +134,7 @@ class DepthEstimator:
         self.matcher = matcher
         self.resolution = Resolution(resolution_mm or resolved_mm(handpiece), handpiece.working_distance_mm)
         self._prepared: dict[tuple[str, ...], Group] = {}
-        if not self._groups(handpiece.rig.names):
-            raise InputError(
-                f"handpiece {handpiece.name}: no two cameras see the same surface at "
-                f"{handpiece.working_distance_mm} mm; check the calibration and the working distance"
-            )
+        require_stereo(handpiece, self.options.pairing)
 
     def _groups(self, cameras: tuple[str, ...]) -> list[Group]:
         """The groups that some of the cameras make, whatever their order."""

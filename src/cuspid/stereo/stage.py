@@ -17,6 +17,7 @@ from cuspid.storage.files import digest_of
 from cuspid.storage.handpieces import hash_handpiece
 from cuspid.storage.reconstructions import read_depth_maps, write_depth_maps
 from cuspid.storage.stages import Stage
+from cuspid.tolerances import held
 from cuspid.workers import map_in_threads
 
 _CODE = ("stereo",)
@@ -105,7 +106,7 @@ def _measure_all(
     stage: Stage,
     progress: Progress,
 ) -> StoredDepthMaps:
-    handpiece = hash_handpiece(capture.handpiece)
+    handpiece = hash_handpiece(held(capture.handpiece))  # how well it is known makes no depth
     files = [stage.folder / f"{frame.name}.npz" for frame in frames]
 
     def keep(one: tuple[Frame, Path]) -> str:
