@@ -64,7 +64,7 @@ def scanned(how: str, capture: Capture, folder: Path, options: ReconstructionOpt
     """The figures of a scan, each with ``how`` before its name."""
     begin, begin_cpu = time.perf_counter(), time.process_time()
     reconstruction, mesh = pipeline.reconstruct(capture, folder / how, options)
-    refinement = reconstruction.refinement
+    expected = reconstruction.expectation
     took, took_cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
     reference = pipeline.load_reference(folder / "truth")
     found = pipeline.evaluate(
@@ -82,7 +82,7 @@ def scanned(how: str, capture: Capture, folder: Path, options: ReconstructionOpt
         "trajectory_um": trajectory.ape_um.rmse,
         "located": len(reconstruction.frames),
         "notes": "; ".join(reconstruction.notes),
-        "scale_sigma_ppm": None if refinement is None else refinement.scale_sigma_ppm,
+        "scale_sigma_ppm": None if expected is None else expected.scale_sigma_ppm,
         "reconstruction_s": took,
         "reconstruction_cpu_s": took_cpu,
     }

@@ -204,7 +204,7 @@ def test_what_is_known_of_a_handpiece_decides_what_is_refined(folder: Path) -> N
     said = pipeline.find_poses(exact, folder / "exact", ReconstructionOptions())
     assert held.refinement is said.refinement is None
     assert nominal.refinement.rms_sigmas < 1
-    assert 500 < nominal.refinement.scale_sigma_ppm < 20_000
+    assert 500 < nominal.expectation.scale_sigma_ppm < 20_000
     for name, pose in held.rig_from_world.items():
         assert np.array_equal(said.rig_from_world[name].matrix, pose.matrix)
         assert not np.array_equal(nominal.rig_from_world[name].matrix, pose.matrix)

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -37,7 +38,7 @@ RESOLUTION_MM = 0.012
 def fuse(
     maps: Iterable[DepthMap], poses: Mapping[str, Rigid3], options: FusionOptions | None = None, **progress
 ) -> Mesh:
-    return fuse_depth_maps(maps, poses, RESOLUTION_MM, options, **progress)
+    return fuse_depth_maps(maps, poses, RESOLUTION_MM, options, **progress).mesh
 
 
 def depth_maps(mesh: Mesh, poses=POSES, names=("west", "north")) -> list[DepthMap]:
@@ -61,6 +62,25 @@ def test_true_depth_fuses_to_the_surface_without_bias() -> None:
     assert 0 < np.mean(np.abs(deviation)) < 1.5
     assert np.percentile(np.abs(deviation), 95) < 4
     assert abs(deviation.mean()) < 0.5
+
+
+@pytest.mark.parametrize("noise_mm", [0.002, 0.01])
+def test_depth_is_as_uncertain_as_it_says(noise_mm: float) -> None:
+    """Each frame is off by a smooth error of its own; where all three see the surface."""
+    rng = np.random.default_rng(0)
+    noisy = []
+    for each in depth_maps(HILLS, names=("west",)):
+        error = cv2.resize(
+            rng.normal(0, noise_mm, (12, 12)), each.depth_mm.shape[::-1], interpolation=cv2.INTER_NEAREST
+        )
+        noisy.append(replace(each, depth_mm=each.depth_mm + cv2.GaussianBlur(error, (0, 0), 1.5).astype(np.float32)))
+    fused = fuse_depth_maps(noisy, POSES, RESOLUTION_MM)
+    assert len(fused.sigma_mm) == len(fused.mesh.vertices) > 3000
+    inside = np.abs(fused.mesh.vertices[:, :2] - fused.mesh.vertices[:, :2].mean(axis=0)).max(axis=1) < 1.5
+    off, said = signed_um(fused.mesh, HILLS)[inside], 1000 * fused.sigma_mm[inside]
+    assert 0.7 < np.sqrt(np.mean(said**2) / np.mean(off**2)) < 1.4
+    assert 0.55 < np.mean(np.abs(off) < said) < 0.85
+    assert 0.88 < np.mean(np.abs(off) < 2 * said) < 0.99
 
 
 def test_every_seen_place_is_covered() -> None:

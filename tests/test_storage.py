@@ -16,7 +16,7 @@ from cuspid.capture import Dropped
 from cuspid.errors import CuspidError, InputError, OutputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw, Landmark, Sphere
-from cuspid.reconstruction import DepthMap, Reconstruction, Refinement
+from cuspid.reconstruction import DepthMap, Expectation, Reconstruction, Refinement
 from cuspid.rig import MountedCamera, Rig
 from cuspid.shape_model import MeanStep
 from cuspid.storage.files import as_declared, read_arrays, whole_files, write_arrays
@@ -355,7 +355,14 @@ def test_a_reconstruction_returns(tmp_path):
     original = Reconstruction(
         rig=device.rig,
         rig_from_world={"1": Rigid3.identity(), "0": Rigid3(np.eye(3), np.ones(3))},
-        refinement=Refinement(rms_sigmas=0.5, camera_sigmas={"a": 0.4, "b": 0.6}, scale_sigma_ppm=120.0),
+        refinement=Refinement(rms_sigmas=0.5, camera_sigmas={"a": 0.4, "b": 0.6}),
+        expectation=Expectation(
+            points=np.ones((5, 3)),
+            covariance=np.stack([np.eye(3)] * 5),
+            scale_sigma_ppm=120.0,
+            span_mm=55.0,
+            span_sigma_um=8.0,
+        ),
         dropped=(Dropped(what="frame 2", reason="blank"),),
         pose_covariance=np.stack([np.eye(6)] * 2),
         reprojection_rms_px=0.3,
@@ -366,6 +373,8 @@ def test_a_reconstruction_returns(tmp_path):
     assert again.frames == ("1", "0")
     assert again.dropped == original.dropped
     assert vars(again.refinement) == vars(original.refinement)
+    for name, value in vars(original.expectation).items():
+        assert np.array_equal(getattr(again.expectation, name), value)
     np.testing.assert_array_equal(again.pose_covariance, original.pose_covariance)
     np.testing.assert_allclose(again.rig_from_world["0"].matrix, original.rig_from_world["0"].matrix)
 

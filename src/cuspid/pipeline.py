@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from cuspid import storage
 from cuspid.anatomy.crowns import crowns_of
@@ -107,7 +107,7 @@ def reconstruct(
 ) -> tuple[Reconstruction, Mesh]:
     """Images and calibration to poses and a mesh. With a COLMAP model its poses are taken instead of found."""
     found = find_poses(capture, folder, options, colmap_model=colmap_model, progress=progress)
-    return found, surface(capture, found, folder, options, progress=progress)
+    return found, surface(capture, found, folder, options, progress=progress)[0]
 
 
 def find_poses(
@@ -133,8 +133,9 @@ def surface(
     options: ReconstructionOptions,
     *,
     progress: Progress = silent,
-) -> Mesh:
-    """The mesh, once it is known where the frames were (second part of :func:`reconstruct`)."""
+) -> tuple[Mesh, Float[np.ndarray, "v"]]:
+    """The mesh, once it is known where the frames were (second part of :func:`reconstruct`), and how well each of its
+    vertices is known: standard deviation along the normal, um."""
     handpiece = replace(capture.handpiece, rig=found.rig)
     capture, poses = replace(capture, handpiece=handpiece), found.rig_from_world
     depths = measure_depth(capture, folder / "depth", options.stereo, progress=progress)
@@ -142,7 +143,7 @@ def surface(
         depths |= measure_temporal_depth(capture, poses, folder / "depth-temporal", options.temporal, progress=progress)
     lengths_mm = resolved_mm(handpiece), handpiece.working_distance_mm
     how = options.fusion, options.cleaning
-    return fuse(depths, depths.digest, poses, *lengths_mm, folder, *how, progress=progress)
+    return fuse(depths, depths.digest, poses, *lengths_mm, folder, *how, expected=found.expectation, progress=progress)
 
 
 def as_known(handpiece: Handpiece, options: ReconstructionOptions) -> Handpiece:

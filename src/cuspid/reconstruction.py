@@ -8,11 +8,15 @@ from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+from scipy.spatial import cKDTree
 
 from cuspid.camera import Camera
 from cuspid.capture import Dropped
-from cuspid.geometry import Rigid3
+from cuspid.geometry import Rigid3, read_only
 from cuspid.rig import Rig
+
+_NEAREST = 4
+"""Points that tell about a vertex."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -69,9 +73,6 @@ class Refinement:
     what no image tells stays where it was."""
     camera_sigmas: Mapping[str, float]
     """The same of each camera."""
-    scale_sigma_ppm: float | None
-    """Standard deviation of the size of the cameras' arrangement, and so of all lengths in the scan; None where they
-    are all in one place."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "camera_sigmas", MappingProxyType(dict(self.camera_sigmas)))
@@ -80,11 +81,37 @@ class Refinement:
     def summary(self) -> str:
         """In one line."""
         name, most = max(self.camera_sigmas.items(), key=lambda item: item[1])
-        scale = "" if self.scale_sigma_ppm is None else f"; lengths known to {self.scale_sigma_ppm / 1e4:.2g} %"
         return (
             f"refined, {self.rms_sigmas:.2f} of its standard deviations from the file (root mean square; camera {name} "
-            f"{most:.2f}){scale}"
+            f"{most:.2f})"
         )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Expectation:
+    """How far the surface may lie from where it is, as far as poses and calibration tell."""
+
+    points: Float[np.ndarray, "n 3"]
+    """Some of the sparse points, mm in the world frame."""
+    covariance: Float[np.ndarray, "n 3 3"]
+    """Of each, mm^2, once all of them are fitted onto the truth by a rigid motion, as an evaluation does. The error of
+    the keypoints of the point itself is not in it."""
+    scale_sigma_ppm: float
+    """Standard deviation of the scale."""
+    span_mm: float
+    """Length of the scan along its longest axis, between the middles of its two ends."""
+    span_sigma_um: float
+    """Its standard deviation."""
+
+    def __post_init__(self) -> None:
+        for name in ("points", "covariance"):
+            object.__setattr__(self, name, read_only(np.asarray(getattr(self, name), dtype=np.float64)))
+
+    def sigma_mm(self, vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v"]:
+        """Standard deviation along their normals of vertices nearby: that of the nearest points (mean variance)."""
+        _, nearest = cKDTree(self.points).query(vertices, k=min(_NEAREST, len(self.points)))
+        covariance = self.covariance[nearest.reshape(len(vertices), -1)].mean(axis=1)
+        return np.asarray(np.sqrt(np.einsum("vi,vij,vj->v", normals, covariance, normals)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -95,6 +122,8 @@ class Reconstruction:
     """Refined calibration (the given one where it was held fixed)."""
     refinement: Refinement | None = None
     """What was refined of it; None where it was held fixed."""
+    expectation: Expectation | None = None
+    """What to expect of the surface; None where the frames were not located by an adjustment of ours."""
     rig_from_world: Mapping[str, Rigid3]
     """Pose for each located frame, in the order of capture."""
     tracks: Tracks | None = None

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 from tyro.conf import OmitArgPrefixes, Positional, arg
@@ -26,7 +27,7 @@ from cuspid.mesh import Mesh
 from cuspid.motion.colmap import hash_model
 from cuspid.options import Range
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
-from cuspid.reconstruction import Reconstruction
+from cuspid.reconstruction import Expectation, Reconstruction
 from cuspid.reporting.figures.drawing import deviation_colors, save_deviation_picture
 from cuspid.reporting.figures.sphere import save_sphere_picture
 from cuspid.rig import Handpiece
@@ -138,8 +139,10 @@ def _reconstruct(capture: Capture, out: Path, options: ReconstructionOptions, mo
             found = pipeline.find_poses(capture, out, options, colmap_model=model, progress=progress)
         _print_located(found, capture)
         with show_progress() as progress:
-            mesh = pipeline.surface(capture, found, out, options, progress=progress)
+            mesh, sigma_um = pipeline.surface(capture, found, out, options, progress=progress)
     console.print(f"{out / 'mesh.ply'}: {len(mesh.faces):,} faces")
+    if found.expectation is not None:
+        _print_expected(found.expectation, sigma_um)
 
 
 def _evaluate(mesh: Path, reference: Path, out: Path, source: Source, options: EvaluationOptions) -> None:
@@ -254,6 +257,15 @@ def _print_nominal(handpiece: Handpiece, options: NominalOptions) -> None:
         f"{1000 * assumed.place_mm:.3g} µm and {assumed.turn_deg:g}° of place, {100 * assumed.focal_share:g} % of the "
         f"focal length, {assumed.centre_px:g} px of the principal point, {assumed.k1:g} of k1; change it with "
         "--nominal.*, or hold it with --calibration fixed"
+    )
+
+
+def _print_expected(expected: Expectation, sigma_um: Float[np.ndarray, "v"]) -> None:
+    middle, most = np.percentile(sigma_um, [50, 95])
+    console.print(
+        f"expected (one sigma): surface within {middle:.1f} µm (median; {most:.1f} for 95 % of it), scale within "
+        f"{expected.scale_sigma_ppm:.0f} ppm, the {expected.span_mm:.0f} mm from end to end within "
+        f"{expected.span_sigma_um:.1f} µm"
     )
 
 

@@ -46,7 +46,7 @@ from cuspid.motion.normal_equations import (
     substitute,
 )
 from cuspid.options import Options, Range
-from cuspid.reconstruction import Reconstruction, Refinement, Tracks
+from cuspid.reconstruction import Expectation, Reconstruction, Refinement, Tracks
 from cuspid.rig import MountedCamera, Rig
 from cuspid.sparse_model import SparseModel
 
@@ -55,6 +55,10 @@ _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
 """Of a step, as shares of the diagonal of the normal equations. What moves everything at once, as the scale and the
 bending of an arch, stands out so little from that diagonal that 1e-4 of it would freeze it."""
 _GAUGE_STEPS = 5
+_DRAWS, _MOST_DRAWN = 64, 2000
+"""Draws from the covariance of what was found, and points whose motion in them is followed."""
+_END = 0.02
+"""Of the length of a scan, what counts as its end."""
 _CHANCE = 1e-6
 """A calibration that would come about with less than this chance is not that of the handpiece."""
 
@@ -414,8 +418,7 @@ class _Posterior(NamedTuple):
     poses: Float[np.ndarray, "f 6 6"]
     calibration: Float[np.ndarray, "c 14 14"] | None
     """Of each camera (motion on the left, parameters); None where it is held."""
-    scale_sigma: float | None
-    """Of the rig, as a share of its size; None where it is held, or all cameras are in one place."""
+    expectation: Expectation
 
 
 def _posterior(state: State, observations: Observations, weighting: Weighting) -> _Posterior:
@@ -438,24 +441,51 @@ def _posterior(state: State, observations: Observations, weighting: Weighting) -
     for frame in range(1, len(poses)):
         at = slice(POSE * (frame - 1), POSE * frame)
         poses[frame] = inverse[at, at]
+    expectation = _expectation(state, observations, weighting, inverse)
     if not weighting.calibrated:
-        return _Posterior(poses, None, None)
+        return _Posterior(poses, None, expectation)
     starts = range(start, len(inverse), CALIBRATION)
     whitened = np.stack([inverse[at : at + CALIBRATION, at : at + CALIBRATION] for at in starts])
     calibration = state.basis @ whitened @ np.swapaxes(state.basis, 1, 2)
-    return _Posterior(poses, calibration, _scale_sigma(state, inverse[start:, start:]))
+    return _Posterior(poses, calibration, expectation)
 
 
-def _scale_sigma(state: State, covariance: Float[np.ndarray, "k k"]) -> float | None:
-    """Standard deviation of the logarithm of the size of the rig, by least squares over the places of its cameras."""
-    centres = -np.einsum("cji,cj->ci", state.camera_rotation, state.camera_translation)
-    offsets = centres - centres.mean(axis=0)
-    if not np.any(offsets):
-        return None
-    along = np.zeros((len(centres), CALIBRATION))
-    along[:, 3:POSE] = -np.einsum("cij,cj->ci", state.camera_rotation, offsets) / np.sum(offsets**2)
-    of_whitened = np.einsum("ci,cij->cj", along, state.basis).ravel()
-    return float(np.sqrt(of_whitened @ covariance @ of_whitened))
+def _expectation(
+    state: State, observations: Observations, weighting: Weighting, covariance: Float[np.ndarray, "k k"]
+) -> Expectation:
+    """What draws from the covariance make of the points."""
+    count = len(state.points)
+    some = np.unique(np.linspace(0, count - 1, min(count, _MOST_DRAWN)).astype(np.int64))
+    point = np.repeat(np.arange(count), np.diff(observations.start))
+    part, seen, _ = _select(state, observations, np.zeros((count, 3), np.uint8), np.isin(point, some))
+    steps = (
+        np.random.default_rng(0).standard_normal((_DRAWS, len(covariance)))
+        @ covariance_factor(covariance, len(covariance)).T
+    )
+    still = substitute(part, seen, weighting, np.zeros(len(covariance)))
+    moved = np.stack([substitute(part, seen, weighting, step) - still for step in steps])
+    offsets = part.points - part.points.mean(axis=0)
+    scale = np.einsum("dni,ni->d", moved, offsets) / np.sum(offsets**2)
+    by_motion = np.concatenate(
+        [np.broadcast_to(np.eye(3), (len(some), 3, 3)), -np.stack([*map(skew, offsets)])], axis=2
+    ).reshape(-1, 6)
+    flat = moved.reshape(_DRAWS, -1).T
+    left = (flat - by_motion @ np.linalg.lstsq(by_motion, flat, rcond=None)[0]).T.reshape(moved.shape)
+    along = offsets @ np.linalg.svd(offsets, full_matrices=False)[2][0]
+    ends = [along >= np.quantile(along, 1 - _END), along <= np.quantile(along, _END)]
+    span = part.points[ends[0]].mean(axis=0) - part.points[ends[1]].mean(axis=0)
+    change = (moved[:, ends[0]].mean(axis=1) - moved[:, ends[1]].mean(axis=1)) @ span / np.linalg.norm(span)
+    return Expectation(
+        points=part.points,
+        covariance=np.einsum("dni,dnj->nij", left, left) / _DRAWS,
+        scale_sigma_ppm=1e6 * _rms(scale),
+        span_mm=float(np.linalg.norm(span)),
+        span_sigma_um=1000 * _rms(change),
+    )
+
+
+def _rms(values: Float[np.ndarray, "n"]) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _known_posterior(state: State, observations: Observations, weighting: Weighting) -> _Posterior:
@@ -493,6 +523,7 @@ class _Adjusted:
 
     rig: Rig
     refinement: Refinement | None
+    expectation: Expectation | None
     poses: tuple[Rigid3, ...]
     tracks: Tracks
     pose_covariance: Float[np.ndarray, "f 6 6"] | None
@@ -514,6 +545,7 @@ def adjust(reconstruction: Reconstruction, options: AdjustmentOptions | None = N
         reconstruction,
         rig=found.rig,
         refinement=found.refinement,
+        expectation=found.expectation,
         rig_from_world=dict(zip(reconstruction.frames, found.poses, strict=True)),
         tracks=found.tracks,
         pose_covariance=found.pose_covariance,
@@ -566,11 +598,11 @@ def _adjusted(
         sigma_px = _sigma_px(state, observations, weighting, unknowns)
         limit_px = options.outlier_sigmas * sigma_px
     posterior = _known_posterior(state, observations, weighting) if has_scale else None
-    refinement = None if posterior is None else _refinement(state, prior, posterior)
     residuals = residual_vectors(state, observations)
     return _Adjusted(
         rig=_adjusted_rig(state, prior, None if posterior is None else posterior.calibration),
-        refinement=refinement,
+        refinement=None if posterior is None else _refinement(state, prior),
+        expectation=None if posterior is None else posterior.expectation,
         poses=tuple(map(Rigid3, state.frame_rotation, state.frame_translation)),
         tracks=_as_tracks(state, observations, colors),
         pose_covariance=None if posterior is None else posterior.poses,
@@ -594,14 +626,13 @@ def _unsettled(minimum: _Minimum, options: AdjustmentOptions) -> tuple[str, ...]
     )
 
 
-def _refinement(state: State, prior: _Prior, posterior: _Posterior) -> Refinement | None:
+def _refinement(state: State, prior: _Prior) -> Refinement | None:
     if not prior.is_free:
         return None
     costs, numbers = np.sum(state.whitened**2, axis=1), np.maximum(prior.free_numbers, 1)
     return Refinement(
         rms_sigmas=float(np.sqrt(costs.sum() / prior.free_numbers.sum())),
         camera_sigmas=dict(zip(prior.rig.names, np.sqrt(costs / numbers).tolist(), strict=True)),
-        scale_sigma_ppm=None if posterior.scale_sigma is None else 1e6 * posterior.scale_sigma,
     )
 
 

@@ -31,6 +31,8 @@ _LONGEST_HEADER = 1 << 16
 _LEAST_AREA = 1e-9
 """Of the square of its extent: less is a line."""
 MESH_SUFFIXES = (".stl", ".ply", ".obj")
+SIGMA = "sigma_um"
+"""Name of the standard deviation of each vertex along its normal, in a PLY file."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

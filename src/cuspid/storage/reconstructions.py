@@ -11,7 +11,7 @@ import numpy as np
 
 from cuspid.capture import Dropped
 from cuspid.geometry import Rigid3
-from cuspid.reconstruction import DepthMap, Reconstruction, Refinement, Tracks
+from cuspid.reconstruction import DepthMap, Expectation, Reconstruction, Refinement, Tracks
 from cuspid.rig import Handpiece
 from cuspid.storage.files import as_declared, read_arrays, read_json, reading, to_plain, write_arrays, write_json
 from cuspid.storage.handpieces import (
@@ -40,7 +40,7 @@ def read_poses(path: Path) -> dict[str, Rigid3]:
         }
 
 
-RECONSTRUCTION_FILES = ("poses.json", "handpiece.json", "tracks.npz", "reconstruction.json")
+RECONSTRUCTION_FILES = ("poses.json", "handpiece.json", "tracks.npz", "expectation.npz", "reconstruction.json")
 """What :func:`write_reconstruction` writes."""
 
 
@@ -49,6 +49,9 @@ def write_reconstruction(folder: Path, reconstruction: Reconstruction, handpiece
     write_poses(folder / "poses.json", reconstruction.rig_from_world)
     if reconstruction.tracks is not None:
         write_arrays(folder / "tracks.npz", {name: getattr(reconstruction.tracks, name) for name in _TRACKS})
+    if reconstruction.expectation is not None:
+        arrays = {name: getattr(reconstruction.expectation, name) for name in _EXPECTED}
+        write_arrays(folder / "expectation.npz", {name: np.asarray(each) for name, each in arrays.items()})
     write_handpiece(folder / "handpiece.json", dataclasses.replace(handpiece, rig=reconstruction.rig))
     write_json(
         folder / "reconstruction.json",
@@ -58,6 +61,7 @@ def write_reconstruction(folder: Path, reconstruction: Reconstruction, handpiece
             "points": 0 if reconstruction.tracks is None else len(reconstruction.tracks.points),
             "reprojection_rms_px": reconstruction.reprojection_rms_px,
             "refinement": reconstruction.refinement,
+            "expected": None if reconstruction.expectation is None else _expected_numbers(reconstruction.expectation),
             "notes": reconstruction.notes,
             "log": reconstruction.log,
             "pose_covariance_rotation_rad_translation_mm": reconstruction.pose_covariance,
@@ -76,6 +80,7 @@ def read_reconstruction(folder: Path) -> Reconstruction:
             rig=read_handpiece(folder / "handpiece.json").rig,
             rig_from_world=read_poses(folder / "poses.json"),
             refinement=None if (moved := value.get("refinement")) is None else as_declared(Refinement, **moved),
+            expectation=None if value.get("expected") is None else _read_expectation(folder / "expectation.npz"),
             tracks=_read_tracks(tracks) if value["points"] else None,
             dropped=tuple(as_declared(Dropped, **entry) for entry in value["frames_dropped"]),
             pose_covariance=None if covariance is None else np.array(covariance, dtype=np.float64),
@@ -86,6 +91,20 @@ def read_reconstruction(folder: Path) -> Reconstruction:
 
 
 _TRACKS = [field.name for field in dataclasses.fields(Tracks)]
+
+
+_EXPECTED = [field.name for field in dataclasses.fields(Expectation)]
+
+
+def _expected_numbers(expected: Expectation) -> dict[str, float]:
+    return {name: value for name in _EXPECTED if isinstance(value := getattr(expected, name), float)}
+
+
+def _read_expectation(path: Path) -> Expectation:
+    arrays = read_arrays(path, remedy="delete the folder and locate the frames again")
+    with reading(path):
+        values = {name: arrays[name] for name in _EXPECTED}
+        return as_declared(Expectation, **{name: each if each.ndim else each.item() for name, each in values.items()})
 
 
 def _read_tracks(path: Path) -> Tracks:

@@ -28,6 +28,17 @@ from cuspid.surface.volume import SparseVolume
 from cuspid.workers import map_slices
 
 
+@dataclass(frozen=True, eq=False)
+class Fused:
+    """A mesh, and how well its depth is known."""
+
+    mesh: Mesh
+    """In the world frame, coloured."""
+    sigma_mm: Float[np.ndarray, "v"]
+    """Standard deviation of each vertex along its normal, from how the depth maps scatter about it. The maps of one
+    frame share its images: they count as one. What all frames see alike is not in it."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class FusionOptions(Options):
     """Fusion of depth maps into a mesh."""
@@ -58,7 +69,7 @@ def fuse(
     options: FusionOptions | None = None,
     *,
     progress: Progress = silent,
-) -> Mesh:
+) -> Fused:
     """One coloured mesh in the world frame from the depth maps whose frame was located; no faces if they hold nothing.
 
     ``resolution_mm`` is what the handpiece resolves (:func:`cuspid.pairing.resolved_mm`); lengths count in it.
@@ -77,7 +88,7 @@ def fuse(
     votes = Votes.on(extract(volume, options.least_weight))
     del volume
     for depth_map, cam_from_world, done in _located(depth_maps, rig_from_world):
-        votes.collect(Evidence.of(depth_map, jump_mm), depth_map, cam_from_world, agreement_mm)
+        votes.collect(Evidence.of(depth_map, jump_mm), depth_map, cam_from_world, agreement_mm, done)
         progress("fusion", half + done, 2 * half)
     return votes.outcome(options.least_maps)
 
@@ -93,6 +104,8 @@ def _located(
             yield depth_map, depth_map.cam_from_rig @ rig_from_world[depth_map.frame], len(begun)
 
 
+_USUAL = 3
+"""The scatter of a vertex is told as if so many frames more had the usual one, for those that see it are few."""
 CHUNK = 256
 """Vertices that are tested together for being in the view of a depth map."""
 
@@ -105,12 +118,14 @@ class Votes:
     """The zero level of the volume."""
     balls: Float[np.ndarray, "c 4"]
     """Centre and radius (mm) of a ball around each chunk of consecutive vertices, which lie close together."""
-    moment: Float[np.ndarray, "v 2"]
-    """Sum of weights, and of weights times distance along the vertex normal (mm)."""
+    moment: Float[np.ndarray, "v 3"]
+    """Sum of weights, and of weights times distance along the vertex normal (mm) and its square."""
     color: Float[np.ndarray, "v 3"]
     """Sum of weights times RGB."""
     maps: Int[np.ndarray, "v"]
     """Number of depth maps that confirm the vertex."""
+    frames: Int[np.ndarray, "v 2"]
+    """Number of frames that do, and the last of them."""
 
     @staticmethod
     def on(rough: Mesh) -> Votes:
@@ -121,10 +136,13 @@ class Votes:
         for ball, chunk in zip(balls, chunks, strict=True):
             ball[:3] = (chunk.min(axis=0) + chunk.max(axis=0)) / 2
             ball[3] = np.linalg.norm(chunk - ball[:3], axis=1).max()
-        return Votes(rough, balls, np.zeros((count, 2)), np.zeros((count, 3)), np.zeros(count, dtype=np.int64))
+        whole = np.zeros((count, 2), dtype=np.int64)
+        return Votes(rough, balls, np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count, dtype=np.int64), whole)
 
-    def collect(self, evidence: Evidence, depth_map: DepthMap, cam_from_world: Rigid3, agreement_mm: float) -> None:
-        """Let one depth map vote on the vertices that it sees."""
+    def collect(
+        self, evidence: Evidence, depth_map: DepthMap, cam_from_world: Rigid3, agreement_mm: float, frame: int
+    ) -> None:
+        """Let one depth map vote on the vertices that it sees; ``frame`` is the number of its frame, from 1 on."""
         chunks = self._in_view(depth_map.camera, cam_from_world)
         colors = colors_of(depth_map)
         map_slices(
@@ -140,6 +158,8 @@ class Votes:
                 self.moment,
                 self.color,
                 self.maps,
+                self.frames,
+                frame,
             ),
             len(chunks),
         )
@@ -154,18 +174,31 @@ class Votes:
         inward /= np.linalg.norm(inward, axis=1, keepdims=True)
         return np.flatnonzero((centres @ inward.T > -radii[:, None]).all(axis=1))
 
-    def outcome(self, least_maps: int) -> Mesh:
+    def outcome(self, least_maps: int) -> Fused:
         """The mesh with its vertices on the mean of the depth maps, coloured, without what too few maps confirm."""
         total = np.maximum(self.moment[:, :1], 1e-12)
-        vertices = self.rough.vertices + self.rough.vertex_normals * self.moment[:, 1:] / total
+        vertices = self.rough.vertices + self.rough.vertex_normals * self.moment[:, 1:2] / total
         colors: UInt8[np.ndarray, "v 3"] = np.rint(self.color / total).clip(0, 255).astype(np.uint8)
         confirmed = self.maps >= least_maps
-        return Mesh(vertices, self.rough.faces, colors).submesh(confirmed[self.rough.faces].all(axis=1))
+        kept = confirmed[self.rough.faces].all(axis=1)
+        used = np.unique(self.rough.faces[kept])
+        return Fused(Mesh(vertices, self.rough.faces, colors).submesh(kept), self._sigma_mm()[used])
+
+    def _sigma_mm(self) -> Float[np.ndarray, "v"]:
+        mean, square = (self.moment[:, 1:] / np.maximum(self.moment[:, :1], 1e-12)).T
+        variance = np.maximum(square - mean**2, 0)
+        frames = np.maximum(self.frames[:, 0], 1)
+        several = frames > 1
+        told = variance[several] * frames[several] / (frames[several] - 1)
+        usual = np.median(told) if len(told) else 0.0
+        return np.asarray(np.sqrt((frames * variance + _USUAL * usual) / (frames - 1 + _USUAL) / frames))
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _vote(chunks, vertices, normals, rotation, translation, evidence, colors, agreement, moment, color, maps):
+def _vote(
+    chunks, vertices, normals, rotation, translation, evidence, colors, agreement, moment, color, maps, frames, frame
+):
     """Each vertex that a depth map sees from its outer side and near its surface gets the map's vote."""
     seen, x, normal = np.zeros(6), np.zeros(3), np.zeros(3)
     for chunk in chunks:
@@ -186,6 +219,9 @@ def _vote(chunks, vertices, normals, rotation, translation, evidence, colors, ag
             moment[n, 0] += weight
             # A vertex outside of the surface moves against its normal.
             moment[n, 1] -= weight * distance / facing
+            moment[n, 2] += weight * (distance / facing) ** 2
             for channel in range(3):
                 color[n, channel] += weight * colors[int(seen[5]), channel]
             maps[n] += 1
+            if frames[n, 1] != frame:
+                frames[n, 0], frames[n, 1] = frames[n, 0] + 1, frame

@@ -5,16 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import DepthMap
+from cuspid.reconstruction import DepthMap, Expectation
 from cuspid.storage.files import digest_of, write_json
-from cuspid.storage.meshes import read_mesh, write_mesh
+from cuspid.storage.meshes import SIGMA, read_mesh_file, write_mesh
 from cuspid.storage.stages import Stage
 from cuspid.surface.cleaning import CleaningOptions, clean
-from cuspid.surface.fusion import FusionOptions
+from cuspid.surface.fusion import Fused, FusionOptions
 from cuspid.surface.fusion import fuse as fuse_depth_maps
 
 
@@ -28,9 +32,12 @@ def fuse(
     fusion: FusionOptions,
     cleaning: CleaningOptions,
     *,
+    expected: Expectation | None = None,
     progress: Progress = silent,
-) -> Mesh:
-    """One clean mesh: ``mesh.ply`` with colour, ``mesh.stl``, and what was removed in ``mesh.json``.
+) -> tuple[Mesh, Float[np.ndarray, "v"]]:
+    """One clean mesh: ``mesh.ply`` with colour and ``sigma_um``, ``mesh.stl``, and what was removed in ``mesh.json``.
+    With the standard deviation of each vertex along its normal (um): of its depth and, where they are ``expected``, of
+    the poses and the calibration.
 
     ``made_from`` is the digest of the depth maps, which may be gone through more than once; ``resolution_mm`` is what
     the handpiece resolves, ``working_distance_mm`` how far it is held. Raises ReconstructionError where they hold
@@ -41,14 +48,23 @@ def fuse(
 
     def write() -> None:
         raw = fuse_depth_maps(depths, rig_from_world, resolution_mm, fusion, progress=progress)
-        if not len(raw.faces):
+        if not len(raw.mesh.faces):
             raise ReconstructionError(
                 "no surface: the depth maps are empty; the images need texture (spray, powder) or sharper focus"
             )
-        mesh, report = clean(raw, working_distance_mm, cleaning)
+        mesh, report = clean(raw.mesh, working_distance_mm, cleaning)
         write_json(files[0], report)
         write_mesh(files[1], mesh)
-        write_mesh(files[2], mesh)
+        write_mesh(files[2], mesh, values={SIGMA: _sigma_um(mesh, raw, expected)})
 
-    stage.make({"depths": made_from, "poses": digest_of(dict(rig_from_world))}, files, write)
-    return read_mesh(files[2])
+    inputs = {"depths": made_from, "poses": digest_of(dict(rig_from_world)), "expected": digest_of(expected)}
+    stage.make(inputs, files, write)
+    made = read_mesh_file(files[2])
+    return made.mesh, made.vertex_values[SIGMA]
+
+
+def _sigma_um(mesh: Mesh, raw: Fused, expected: Expectation | None) -> Float[np.ndarray, "v"]:
+    """Of each vertex of a mesh that was cleaned, which moves none."""
+    depth_mm = raw.sigma_mm[cKDTree(raw.mesh.vertices).query(mesh.vertices)[1]]
+    motion_mm = 0.0 if expected is None else expected.sigma_mm(mesh.vertices, mesh.vertex_normals)
+    return np.asarray(1000 * np.hypot(depth_mm, motion_mm))

@@ -20,7 +20,7 @@ from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
 from cuspid.options import Options, Range
-from cuspid.reconstruction import Refinement
+from cuspid.reconstruction import Reconstruction
 from cuspid.reporting.figures.drawing import (
     RANGES_UM,
     FigureOptions,
@@ -202,7 +202,7 @@ def _tiles(result: ScanResult) -> list[tuple[str, str, str]]:
     if result.reconstruction is not None:
         located, dropped = len(result.reconstruction.frames), len(result.reconstruction.dropped)
         tiles.append(("frames located", f"{located}", f"of {located + dropped}" if dropped else ""))
-        tiles += _refinement_tiles(result.reconstruction.refinement)
+        tiles += _expected_tiles(result.reconstruction)
     if result.trajectory is not None:
         tiles.append(("position of the handpiece, RMSE", f"{result.trajectory['ape_um']['rmse']:.1f}", "µm"))
     if result.capture is not None:
@@ -210,13 +210,15 @@ def _tiles(result: ScanResult) -> list[tuple[str, str, str]]:
     return tiles
 
 
-def _refinement_tiles(refinement: Refinement | None) -> list[tuple[str, str, str]]:
-    if refinement is None:
-        return []
-    moved = ("calibration moved by, RMS", f"{refinement.rms_sigmas:.2f}", "σ")
-    if refinement.scale_sigma_ppm is None:
-        return [moved]
-    return [moved, ("lengths known to (one σ)", f"±{refinement.scale_sigma_ppm:.0f}", "ppm")]
+def _expected_tiles(found: Reconstruction) -> list[tuple[str, str, str]]:
+    tiles = []
+    if found.refinement is not None:
+        tiles.append(("calibration refined by, RMS", f"{found.refinement.rms_sigmas:.2f}", "σ"))
+    if found.expectation is not None:
+        tiles.append(("expected scale error (one σ)", f"±{found.expectation.scale_sigma_ppm:.0f}", "ppm"))
+        span = f"expected error of {found.expectation.span_mm:.0f} mm from end to end (one σ)"
+        tiles.append((span, f"±{found.expectation.span_sigma_um:.1f}", "µm"))
+    return tiles
 
 
 def _crown_tiles(crown: Mapping[str, Any] | None) -> list[tuple[str, str, str]]:
