@@ -157,5 +157,8 @@ class Trueness:
     """The rigid alignment that was found."""
     deviation_um: Float[np.ndarray, "v"]
     """Signed deviation of each vertex of the scan; NaN where the vertex is not evaluated."""
+    within_sigmas_pct: Mapping[str, float] | None = None
+    """Share of the evaluated vertices within 1 and 2 of the standard deviations that the scan itself expected, keys "1"
+    and "2" (68 and 95 where all errors are random and accounted for); None where it expected nothing."""
     notes: tuple[str, ...] = field(default=())
     """What a reader should know, for example how the scannable surface was chosen."""

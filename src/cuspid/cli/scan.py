@@ -28,7 +28,7 @@ from cuspid.motion.colmap import hash_model
 from cuspid.options import Range
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.reconstruction import Expectation, Reconstruction
-from cuspid.reporting.figures.drawing import deviation_colors, save_deviation_picture
+from cuspid.reporting.figures.drawing import deviation_colors, save_deviation_picture, save_expected_picture
 from cuspid.reporting.figures.sphere import save_sphere_picture
 from cuspid.rig import Handpiece
 from cuspid.tolerances import NominalOptions, is_nominal
@@ -140,6 +140,7 @@ def _reconstruct(capture: Capture, out: Path, options: ReconstructionOptions, mo
         _print_located(found, capture)
         with show_progress() as progress:
             mesh, sigma_um = pipeline.surface(capture, found, out, options, progress=progress)
+        save_expected_picture(out / "expected.png", mesh, sigma_um)
     console.print(f"{out / 'mesh.ply'}: {len(mesh.faces):,} faces")
     if found.expectation is not None:
         _print_expected(found.expectation, sigma_um)
@@ -151,11 +152,14 @@ def _evaluate(mesh: Path, reference: Path, out: Path, source: Source, options: E
 
 
 def _measure_trueness(mesh: Path, reference: Path, out: Path, source: Source, options: EvaluationOptions) -> None:
-    scan = storage.read_mesh(mesh, source.unit)
+    file = storage.read_mesh_file(mesh, source.unit)
+    scan, sigma_um = file.mesh, file.vertex_values.get(storage.SIGMA)
     against = pipeline.load_reference(reference, unit=source.unit, arch=source.arch)
     known, hashes = against.jaw, {**against.hashes, "mesh": storage.hash_file(mesh)}
     with storage.claimed_folder(out, "evaluate", {"evaluation": options}, hashes, replace=True):
-        trueness = pipeline.evaluate(scan, known, options, scannable=against.scannable, crown=against.crown)
+        trueness = pipeline.evaluate(
+            scan, known, options, scannable=against.scannable, crown=against.crown, sigma_um=sigma_um
+        )
         for name in _FURTHER:  # of another mesh or reference they would be shown as of this one
             (out / name).unlink(missing_ok=True)
         coloured = replace(scan, colors=deviation_colors(trueness.deviation_um))
@@ -291,6 +295,9 @@ def _print_trueness(trueness: Trueness) -> None:
         cells = ("-" if share is None else f"{share['50']:.1f}" for share in shares)
         table.add_row(region, *(f"{figure:.1f}" for figure in figures), *cells)
     Console().print(table)
+    if trueness.within_sigmas_pct is not None:
+        one, two = trueness.within_sigmas_pct["1"], trueness.within_sigmas_pct["2"]
+        console.print(f"of the surface {one:.0f} % lies within one and {two:.0f} % within two of the expected sigmas")
     for note in trueness.notes if trueness.crown is None else (*trueness.notes, trueness.crown.note):
         console.print(f"note: {note}")
 

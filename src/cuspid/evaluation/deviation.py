@@ -115,11 +115,13 @@ def evaluate(
     *,
     scannable: Bool[np.ndarray, "f"] | None = None,
     crown: OpenCrown | None = None,
+    sigma_um: Float[np.ndarray, "v"] | None = None,
     rng: np.random.Generator | None = None,
 ) -> Trueness:
     """Compare a scan in any pose with a reference of which the faces in ``scannable`` count (None: see the module).
 
-    ``crown``: the open crown surface of the reference, whose completeness is asked, too. ``rng`` draws the samples; the
+    ``crown``: the open crown surface of the reference, whose completeness is asked, too. ``sigma_um``: the standard
+    deviation that the scan expects of each of its vertices, along its normal. ``rng`` draws the samples; the
     same ones each time where there is none. Raises InputError where the two do not belong together or nothing is left
     to compare.
     """
@@ -158,8 +160,14 @@ def evaluate(
         drift_um=drift_um(teeth, surface),
         reference_from_scan=alignment.reference_from_scan,
         deviation_um=deviation_um,
+        within_sigmas_pct=None if sigma_um is None else _within_sigmas_pct(deviation_um, sigma_um),
         notes=(*alignment.notes, rules.note, from_scan.left_out, from_reference.left_out),
     )
+
+
+def _within_sigmas_pct(deviation_um: Float[np.ndarray, "v"], sigma_um: Float[np.ndarray, "v"]) -> dict[str, float]:
+    known = np.isfinite(deviation_um)
+    return {str(k): 100 * float(np.mean(np.abs(deviation_um[known]) <= k * sigma_um[known])) for k in (1, 2)}
 
 
 def statistics(signed_mm: Float[np.ndarray, "n"]) -> DeviationStatistics:

@@ -25,7 +25,16 @@ from cuspid.storage.files import (
 from cuspid.storage.handpieces import read_handpiece, read_rig_config, write_handpiece, write_rig_config
 from cuspid.storage.jaws import is_jaw, read_jaw, read_labelled_mesh, write_jaw
 from cuspid.storage.landmarks import MARKUPS_SUFFIX, LandmarkFile, LandmarkFrame, read_landmarks, write_landmarks
-from cuspid.storage.meshes import MESH_SUFFIXES, MM_PER_UNIT, MeshFile, Unit, read_mesh, read_mesh_file, write_mesh
+from cuspid.storage.meshes import (
+    MESH_SUFFIXES,
+    MM_PER_UNIT,
+    SIGMA,
+    MeshFile,
+    Unit,
+    read_mesh,
+    read_mesh_file,
+    write_mesh,
+)
 from cuspid.storage.panoramas import read_panorama, write_panorama, write_strip
 from cuspid.storage.reconstructions import (
     read_depth_maps,
@@ -58,6 +67,7 @@ __all__ = [
     "MESH_SUFFIXES",
     "MM_PER_UNIT",
     "PART",
+    "SIGMA",
     "LandmarkFile",
     "LandmarkFrame",
     "MeshFile",

@@ -188,8 +188,14 @@ def _read_scan(folder: Path, run: Mapping[str, Any], reference: Path | None, uni
         margins=_optional_json(folder / "margins.json"),
         spheres=_optional_json(folder / "spheres.json"),
         trajectory=_optional_json(folder / "trajectory.json"),
-        pictures=_pictures(folder, {"spheres.png": "The spheres, measured without a best fit"}),
+        pictures=_pictures(folder, _SCAN_PICTURES),
     )
+
+
+_SCAN_PICTURES = {
+    "expected.png": "How well each place is expected to be known (one standard deviation along the normal)",
+    "spheres.png": "The spheres, measured without a best fit",
+}
 
 
 def _surface(folder: Path, missing: list[str]) -> tuple[Mesh | None, Float[np.ndarray, "v"] | None]:

@@ -190,6 +190,21 @@ def save_deviation_picture(
     save_figure(figure, path)
 
 
+def save_expected_picture(path: Path, mesh: Mesh, sigma_um: Float[np.ndarray, "v"], *, width_px: int = 1000) -> None:
+    """PNG of a mesh (in its own frame) coloured by the standard deviation of each vertex, with the colour bar."""
+    limit = next((each for each in RANGES_UM if each >= np.percentile(sigma_um, 95)), RANGES_UM[-1])
+    colours = ScalarMappable(Normalize(0, limit), "viridis")
+    figure = new_figure(12.0, 7.2, dpi=130)
+    colored = replace(mesh, colors=colours.to_rgba(sigma_um, bytes=True)[:, :3])
+    _draw_views(figure, colored, 0.18, width_px=width_px)
+    bar = figure.colorbar(colours, cax=figure.add_axes((0.06, 0.115, 0.50, 0.028)), orientation="horizontal")
+    bar.ax.tick_params(labelsize=11, color=_INK, labelcolor=_INK)
+    bar.outline.set_visible(False)
+    bar.set_label("expected deviation along the normal / µm (one standard deviation)", fontsize=12, color=_INK)
+    _draw_title(figure, "What to expect of the scan")
+    save_figure(figure, path)
+
+
 def new_figure(width_in: float, height_in: float, *, dpi: int, layout: Literal["constrained"] | None = None) -> Figure:
     """A white page of a size in inches, without a screen."""
     figure = Figure(figsize=(width_in, height_in), dpi=dpi, facecolor="white", layout=layout)
