@@ -145,6 +145,19 @@ def test_noise_is_measured_as_what_it_is():
     assert abs(found.accuracy.signed_mean_um) < 0.5
 
 
+def test_what_a_scan_expects_of_itself_is_held_against_it():
+    rng = np.random.default_rng(3)
+    mesh = jaw().mesh
+    sigma_um = rng.uniform(2, 10, len(mesh.vertices))
+    along = 1e-3 * sigma_um * rng.standard_normal(len(mesh.vertices))
+    noisy = replace(mesh, vertices=mesh.vertices + along[:, None] * mesh.vertex_normals)
+    for factor, (one, two) in {1.0: (68.3, 95.4), 2.0: (95.4, 100.0), 0.5: (38.3, 68.3)}.items():
+        found = evaluate(noisy, jaw(), IN_PLACE, sigma_um=factor * sigma_um).within_sigmas_pct
+        assert found["1"] == pytest.approx(one, abs=3)
+        assert found["2"] == pytest.approx(two, abs=3)
+    assert trueness(noisy).within_sigmas_pct is None
+
+
 def test_a_scaled_scan_from_any_pose_has_its_scale_error_and_nothing_is_scaled_away():
     mesh = jaw().mesh
     scan = Mesh(1.001 * mesh.vertices, mesh.faces).transformed(
