@@ -1,0 +1,279 @@
+"""A holder that can be printed: seats for cameras and LEDs, channels for their cables, a neck and a grip; one solid.
+
+Solids by exact booleans (manifold3d), in the rig frame, mm. What is printed is the union of the *shells* less the union
+of the *hollows*; every face of the result knows which of them it comes from. :mod:`cuspid.handpiece.shell` says where
+they are, :mod:`cuspid.handpiece.printability` what must hold of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+from manifold3d import Manifold, OpType
+
+from cuspid.body import Box
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
+from cuspid.handpiece.shell import Handle, Head, PrintOptions, Shell, shell_of
+from cuspid.mesh import Mesh
+from cuspid.rig import Handpiece, Light, MountedCamera
+
+_SEGMENTS = 24
+"""Of a full circle, where edges are rounded."""
+_GRIP_ROUNDED = 0.3
+"""Radius of the edges of the grip, in its widths."""
+_TAPER = 1.5
+"""Length of the taper from neck to grip, in the difference of their widths."""
+_OPEN_MM = 0.01
+"""Seats reach so far out of the front of a head, that rounding leaves no film over them."""
+_SIMPLIFIED_MM = 1e-3
+"""Slivers that joining leaves are removed as long as the surface moves by less."""
+_AROUND = 24
+"""Rays around the light of an LED."""
+_BORDER = 5
+"""Rays along an edge of an image."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Printable:
+    """A holder, and what it was made of."""
+
+    handpiece: Handpiece
+    """With the body that the holder has in a mouth: all but the grip, as boxes around it."""
+    solid: Manifold
+    """What is printed."""
+    shells: Mapping[str, Manifold]
+    """What was joined, by name."""
+    seats: Mapping[str, Manifold]
+    """Pockets by the name of their module, open in front."""
+    channels: Mapping[str, Manifold]
+    """From each seat to the duct behind it."""
+    ducts: Mapping[str, Manifold]
+    """Within heads, arms, neck and grip."""
+    mesh: Mesh
+    """The solid, with the digits that a file keeps."""
+    handle_from_rig: Rigid3
+    """Origin where the bore of the neck begins, +Y to its end, +Z as the first head looks."""
+    source: Int[np.ndarray, "f"]
+    """Of each face the index in `names`."""
+    names: tuple[str, ...]
+    """Of shells, seats, channels and ducts."""
+
+    @property
+    def hollows(self) -> dict[str, Manifold]:
+        """All that was taken away."""
+        return {**self.seats, **self.channels, **self.ducts}
+
+
+def printable(handpiece: Handpiece, options: PrintOptions = PrintOptions()) -> Printable:
+    """The holder of a handpiece; nothing of it is checked yet.
+
+    Raises InputError for a body without a box for a camera or a light, and for a rim wider than a module.
+    """
+    shell = shell_of(handpiece, options)
+    shells = _shells(handpiece, shell, options)
+    seats = {f"seat of {name}": _seat(box, options).as_original() for name, box in shell.modules.items()}
+    channels = {
+        f"channel of {name}": _channel(name, box, head, options).as_original()
+        for head in shell.heads
+        for name, box in head.modules.items()
+    }
+    ducts = {name: each.as_original() for name, each in _ducts(shell, options).items()}
+    parts = {**shells, **seats, **channels, **ducts}
+    solid = (union(shells) - union({**seats, **channels, **ducts})).simplify(_SIMPLIFIED_MM)
+    mesh, source = _mesh_of(solid, [each.original_id() for each in parts.values()])
+    return Printable(
+        handpiece=replace(handpiece, body=shell.body),
+        solid=solid,
+        shells=shells,
+        seats=seats,
+        channels=channels,
+        ducts=ducts,
+        mesh=mesh,
+        handle_from_rig=shell.handle.handle_from_rig,
+        source=source,
+        names=tuple(parts),
+    )
+
+
+def block(box: Box) -> Manifold:
+    """A box as a solid."""
+    return _placed(Manifold.cube(2 * box.half_mm, True), box.box_from_rig)
+
+
+def _shells(handpiece: Handpiece, shell: Shell, options: PrintOptions) -> dict[str, Manifold]:
+    heads = {
+        f"head {number}": rounded(head.tube.outer, options.rounding_mm) - _windows(handpiece, head, options)
+        for number, head in enumerate(shell.heads, start=1)
+    }
+    arms = {name: rounded(arm.outer, options.rounding_mm) for name, arm in shell.arms.items()}
+    handle = {"neck": _neck(shell.handle, options)}
+    if options.grip_mm:
+        handle["grip"] = _grip(shell.handle, options, inside_mm=0.0)
+    return {name: each.as_original() for name, each in {**heads, **arms, **handle}.items()}
+
+
+def _ducts(shell: Shell, options: PrintOptions) -> dict[str, Manifold]:
+    heads = {f"duct of head {number}": block(head.tube.inner) for number, head in enumerate(shell.heads, start=1)}
+    arms = {f"duct of {name}": block(arm.inner) for name, arm in shell.arms.items()}
+    beyond = options.handle_wall_mm + 1.0
+    bore = shell.handle.neck.inner
+    through = Box(
+        Rigid3(np.eye(3), np.array([0, -beyond / 2, 0])) @ bore.box_from_rig, bore.half_mm + [0, beyond / 2, 0]
+    )
+    grip = {"bore of the grip": _grip(shell.handle, options, options.handle_wall_mm)} if options.grip_mm else {}
+    return {**heads, **arms, "bore of the neck": block(through), **grip}
+
+
+def rounded(box: Box, radius_mm: float) -> Manifold:
+    """A box with rounded edges, within the box."""
+    return _placed(_rounded(box.half_mm, radius_mm), box.box_from_rig)
+
+
+def _rounded(half: Float[np.ndarray, "3"], radius_mm: float) -> Manifold:
+    radius = min(radius_mm, 0.999 * float(half.min()))
+    ball = Manifold.sphere(radius, _SEGMENTS)
+    signs = np.array(list(np.ndindex(2, 2, 2))) * 2 - 1
+    return Manifold.batch_hull([ball.translate(sign * (half - radius)) for sign in signs])
+
+
+def _placed(solid: Manifold, own_from_rig: Rigid3) -> Manifold:
+    return solid.transform(own_from_rig.inverse().matrix[:3])
+
+
+def _seat(box: Box, options: PrintOptions) -> Manifold:
+    """A module with its clearance at the sides, open in front."""
+    clearance = options.seat_clearance_mm
+    forward = Rigid3(np.eye(3), np.array([0, 0, -_OPEN_MM / 2])) @ box.box_from_rig
+    return block(Box(forward, box.half_mm + [clearance, clearance, _OPEN_MM / 2]))
+
+
+def _channel(name: str, box: Box, head: Head, options: PrintOptions) -> Manifold:
+    """From the middle of a seat backwards to the middle of the duct."""
+    width = box.half_mm[:2] - options.shoulder_mm
+    if width.min() <= 0:
+        raise InputError(
+            f"print: --shoulder-mm is {options.shoulder_mm:g}; {name} is {2 * box.half_mm[:2].min():g} mm wide, and "
+            "nothing would be left for its cable"
+        )
+    module = head.head_from_rig @ box.box_from_rig.inverse()
+    drop = module.translation[2] - (head.head_from_rig @ head.tube.inner.box_from_rig.inverse()).translation[2]
+    length = drop / module.rotation[2, 2]
+    middle = Rigid3(np.eye(3), np.array([0, 0, length / 2])) @ box.box_from_rig
+    return block(Box(middle, np.array([*width, length / 2])))
+
+
+def _windows(handpiece: Handpiece, head: Head, options: PrintOptions) -> Manifold:
+    """What must be free before modules that stand behind the front of their head."""
+    front = (head.head_from_rig @ head.tube.outer.box_from_rig.inverse()).translation[2] + head.tube.outer.half_mm[2]
+    windows = [
+        _window(handpiece, name, box, options) for name, box in head.modules.items() if _lies_behind(box, head, front)
+    ]
+    return Manifold.batch_boolean(windows, OpType.Add) if windows else Manifold()
+
+
+def _lies_behind(box: Box, head: Head, front: float) -> bool:
+    """Whether a corner of the front of a module lies behind that of its head."""
+    corners = head.head_from_rig.apply(box.corners[1::2])
+    return bool(corners[:, 2].min() < front - 1e-6)
+
+
+def _window(handpiece: Handpiece, name: str, box: Box, options: PrintOptions) -> Manifold:
+    """Around the front of a seat and all that the module sees or lights, up to the working distance."""
+    wide = replace(box, half_mm=box.half_mm + [options.seat_clearance_mm, options.seat_clearance_mm, 0])
+    origin, rays = lines_of_sight(handpiece, name, options)
+    return Manifold.hull_points(np.concatenate([wide.corners[1::2], origin + rays * handpiece.working_distance_mm]))
+
+
+def lines_of_sight(
+    handpiece: Handpiece, name: str, options: PrintOptions, rings: int = 1
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "n 3"]]:
+    """Where a camera or a light stands and rays in the rig frame, so long that they advance by 1 along its axis: around
+    the border of its image or light, and around ``rings`` - 1 smaller ones within it."""
+    kind, own = name.split(" ", 1)
+    shares = np.arange(1, rings + 1) / rings
+    if kind == "camera":
+        mounted = handpiece.rig[own]
+        return mounted.centre_in_rig, _view(mounted, shares)
+    return handpiece.lights[own].position_mm, _lobe(handpiece.lights[own], shares, options.light_half_angle_deg)
+
+
+def _view(mounted: MountedCamera, shares: Float[np.ndarray, "k"]) -> Float[np.ndarray, "n 3"]:
+    camera = mounted.camera
+    along = np.linspace(-1, 1, 4 * _BORDER + 1)[:-1]
+    ones = np.ones_like(along)
+    ring = np.concatenate(
+        [np.stack(pair, 1) for pair in ((along, -ones), (ones, along), (-along, ones), (-ones, -along))]
+    )
+    grid = (shares[:, None, None] * ring).reshape(-1, 2)
+    rays = camera.rays((grid + 1) / 2 * [camera.width, camera.height])
+    return mounted.cam_from_rig.inverse().rotate(rays)
+
+
+def _lobe(light: Light, shares: Float[np.ndarray, "k"], half_angle_deg: float) -> Float[np.ndarray, "n 3"]:
+    turns = 2 * np.pi * np.arange(_AROUND) / _AROUND
+    ring = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    sideways = (np.tan(np.deg2rad(half_angle_deg) * shares)[:, None, None] * ring).reshape(-1, 2)
+    return light.light_from_rig.inverse().rotate(np.column_stack([sideways, np.ones(len(sideways))]))
+
+
+def _neck(handle: Handle, options: PrintOptions) -> Manifold:
+    """Rounded, but flat at its end."""
+    low, high = _corners(handle)
+    longer = Box(Rigid3.identity(), (high - low) / 2 + [0, options.handle_wall_mm, 0])
+    solid = rounded(longer, options.handle_wall_mm).translate((low + high) / 2 + [0, options.handle_wall_mm, 0])
+    return _placed(solid.trim_by_plane((0, -1, 0), -options.neck_mm), handle.handle_from_rig)
+
+
+def _corners(handle: Handle) -> Float[np.ndarray, "2 3"]:
+    """Lower and upper corner of the neck in the frame of the handle."""
+    corners = handle.handle_from_rig.apply(handle.neck.outer.corners)
+    return np.stack([corners.min(axis=0), corners.max(axis=0)])
+
+
+def _grip(handle: Handle, options: PrintOptions, inside_mm: float) -> Manifold:
+    """The grip with its taper, or what lies inside of it by a wall: then open at the end."""
+    neck, width = options.neck_width_mm / 2 - inside_mm, options.grip_width_mm / 2 - inside_mm
+    taper = _TAPER * abs(options.grip_width_mm - options.neck_width_mm)
+    end = options.neck_mm + max(options.grip_mm, taper + 1.0)
+    radius = max(_GRIP_ROUNDED * options.grip_width_mm - inside_mm, 0.05 * options.grip_width_mm)
+    start = options.neck_mm + taper
+    body = _rounded(np.array([width, (end - start) / 2 + radius, width]), radius)
+    collar = _rounded(np.array([neck, 0.5, neck]), max(options.handle_wall_mm - inside_mm, 0.01))
+    whole = Manifold.batch_hull(
+        [body.translate([0, (start + end) / 2 + radius, 0]), collar.translate([0, options.neck_mm - 0.5, 0])]
+    )
+    flat = whole if inside_mm else whole.trim_by_plane((0, -1, 0), -end)
+    return _placed(flat, handle.handle_from_rig)
+
+
+def views_of(made: Printable) -> tuple[Mesh, Mesh, Mesh]:
+    """The whole, its head with a piece of the neck, and the same cut open along the neck."""
+    origin = made.handle_from_rig.inverse().translation
+    across, along, _ = made.handle_from_rig.rotation
+    shown = [box.corners for name, box in made.handpiece.solid.parts.items() if name != "neck"]
+    reach = 1.3 * float(np.linalg.norm(np.concatenate(shown) - origin, axis=1).max()) + 3.0
+    head = made.solid.trim_by_plane(-along, float(-along @ origin) - reach)
+    opened = head.trim_by_plane(-across, float(-across @ origin))
+    return made.mesh, surface(head), surface(opened)
+
+
+def surface(solid: Manifold) -> Mesh:
+    """Of a solid."""
+    made = solid.to_mesh64()
+    return Mesh(np.asarray(made.vert_properties)[:, :3], np.asarray(made.tri_verts).astype(np.int64))
+
+
+def union(solids: Mapping[str, Manifold]) -> Manifold:
+    return Manifold.batch_boolean(list(solids.values()), OpType.Add)
+
+
+def _mesh_of(solid: Manifold, ids: list[int]) -> tuple[Mesh, Int[np.ndarray, "f"]]:
+    """The surface, and of each face which of the originals it comes from."""
+    made = solid.to_mesh64()
+    lengths = np.asarray(np.diff(np.asarray(made.run_index, dtype=np.int64)) // 3, dtype=np.int64)
+    source = np.repeat([ids.index(each) for each in made.run_original_id], lengths)
+    return surface(solid), source
