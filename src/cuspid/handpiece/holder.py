@@ -18,7 +18,7 @@ from cuspid.geometry import Rigid3
 from cuspid.options import Options, Range
 from cuspid.rig import Handpiece
 
-_ALIKE_DEG = 20.0
+ALIKE_DEG = 20.0
 """Cameras whose axes differ by less share a plate."""
 
 
@@ -61,7 +61,7 @@ def alike(handpiece: Handpiece) -> list[list[str]]:
     groups: list[list[str]] = []
     for name, mounted in handpiece.rig.cameras.items():
         for group in groups:
-            if handpiece.rig[group[0]].axis_in_rig @ mounted.axis_in_rig > np.cos(np.deg2rad(_ALIKE_DEG)):
+            if handpiece.rig[group[0]].axis_in_rig @ mounted.axis_in_rig > np.cos(np.deg2rad(ALIKE_DEG)):
                 group.append(name)
                 break
         else:
@@ -75,7 +75,7 @@ def _plate(handpiece: Handpiece, group: Sequence[str], boxes: Sequence[Box], opt
     axis = handpiece.rig[group[0]].axis_in_rig
     own = [module(handpiece.rig[name].cam_from_rig, options.camera_mm) for name in group]
     reach = spans(own, group_from_rig)
-    near = [box for box in boxes if belongs(box, group_from_rig, reach, axis)]
+    near = [box for box in boxes if _belongs(box, group_from_rig, reach, axis)]
     low, high = spans([*own, *near], group_from_rig)
     back = low[2]
     centre = np.array([*(low[:2] + high[:2]) / 2, back - options.wall_mm / 2])
@@ -89,12 +89,12 @@ def spans(boxes: Sequence[Box], group_from_rig: Rigid3) -> Float[np.ndarray, "2 
     return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
 
-def belongs(box: Box, group_from_rig: Rigid3, reach: Float[np.ndarray, "2 3"], axis: Float[np.ndarray, "3"]) -> bool:
+def _belongs(box: Box, group_from_rig: Rigid3, reach: Float[np.ndarray, "2 3"], axis: Float[np.ndarray, "3"]) -> bool:
     """Whether a module looks the way a group does, and stands in its plane beside or among its cameras."""
     middle = group_from_rig.apply(box.box_from_rig.inverse().translation)
     sideways = (reach[1] - reach[0])[:2].max() / 2
     inside = np.all(middle > reach[0] - sideways) and np.all(middle < reach[1] + sideways)
-    return bool(inside and box.box_from_rig.rotation[2] @ axis > np.cos(np.deg2rad(_ALIKE_DEG)))
+    return bool(inside and box.box_from_rig.rotation[2] @ axis > np.cos(np.deg2rad(ALIKE_DEG)))
 
 
 def _bars(plates: Sequence[Box], modules: Sequence[Box], options: HolderOptions) -> list[Box]:

@@ -8,19 +8,18 @@ than 45 degrees, or a dent smaller than that spacing is missed. Edges are not wa
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import combinations, pairwise, product
 
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Int
 from manifold3d import Error, Manifold
 
-from cuspid.body import Body, Box
+from cuspid.body import Box
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.handpiece.printable import Printable, block, lines_of_sight, union
+from cuspid.handpiece.printable import Printable, block, lines_of_sight, surface, union
 from cuspid.handpiece.shell import PrintOptions, module_boxes
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
@@ -79,10 +78,10 @@ class Printability:
 
 def check_printable(made: Printable, options: PrintOptions) -> Printability:
     """Measure a holder. Raises InputError for the first rule that it breaks: what, where, what to change."""
-    check_seats(made.handpiece, made.seats, options)
+    check_seats(made, options)
     check_solid(made)
     check_insertion(made)
-    check_sight(made.mesh, made.handpiece, options)
+    check_sight(made.solid, made.handpiece, options)
     wall, web = thinnest(made, options)
     height_mm = _check_mouth(made.handpiece, options)
     size = np.ptp(made.mesh.bounds, axis=0)
@@ -95,9 +94,9 @@ def check_printable(made: Printable, options: PrintOptions) -> Printability:
     )
 
 
-def check_seats(handpiece: Handpiece, seats: Mapping[str, Manifold], options: PrintOptions) -> None:
-    """Raise InputError where two modules overlap, or leave less than a web between their seats."""
-    modules = module_boxes(handpiece)
+def check_seats(made: Printable, options: PrintOptions) -> None:
+    """Raise InputError where modules overlap or leave no web between their seats, or where a duct cuts a seat."""
+    modules = module_boxes(made.handpiece)
     blocks = {name: block(box) for name, box in modules.items()}
     for one, other in combinations(modules, 2):
         if _apart_mm(modules[one], modules[other]) > options.web_mm + 4 * options.seat_clearance_mm:
@@ -107,12 +106,18 @@ def check_seats(handpiece: Handpiece, seats: Mapping[str, Manifold], options: Pr
                 f"holder: the modules of {one} and {other} overlap; set them farther apart, or give smaller modules "
                 "(--holder.camera-mm, --holder.led-mm, or the body in handpiece.json)"
             )
-        gap = seats[f"seat of {one}"].min_gap(seats[f"seat of {other}"], 2 * options.web_mm)
+        gap = made.seats[f"seat of {one}"].min_gap(made.seats[f"seat of {other}"], 2 * options.web_mm)
         if gap < options.web_mm - 1e-6:
             raise InputError(
                 f"holder: the wall between the seats of {one} and {other} is {gap:.2f} mm thick, less than --web-mm "
                 f"{options.web_mm:g}; set them farther apart, or give smaller modules, a smaller --seat-clearance-mm "
                 "or a thinner web"
+            )
+    for (seat, pocket), (duct, hollow) in product(made.seats.items(), made.ducts.items()):
+        if (pocket ^ hollow).volume() > _NOTHING_MM3:
+            raise InputError(
+                f"holder: the {duct} runs through the {seat}; set the cameras otherwise, or make --duct-mm, "
+                "--arm-width-mm or --neck-width-mm smaller"
             )
 
 
@@ -155,35 +160,34 @@ def _where(made: Printable, piece: Manifold) -> str:
 def check_insertion(made: Printable) -> None:
     """Raise InputError where a module does not fit its seat, or not into it from the front."""
     for name, box in module_boxes(made.handpiece).items():
-        depth = box.half_mm[2]
-        ahead = Rigid3(np.eye(3), np.array([0, 0, -depth])) @ box.box_from_rig
-        if (block(Box(ahead, box.half_mm * [1, 1, 2])) ^ made.solid).volume() > _NOTHING_MM3:
+        ahead = Rigid3(np.eye(3), np.array([0, 0, -box.half_mm[2]])) @ box.box_from_rig
+        stopped = block(Box(ahead, box.half_mm * [1, 1, 2])) ^ made.solid
+        if stopped.volume() > _NOTHING_MM3:
+            by = [shell for shell, each in made.shells.items() if (stopped ^ each).volume() > _NOTHING_MM3 / 10]
             raise InputError(
-                f"holder: {name} cannot be pushed into its seat from the front; set it farther from the others"
+                f"holder: {name} cannot be pushed into its seat from the front, for {' and '.join(by)} is in the way; "
+                "set the cameras farther apart or turn them less"
             )
 
 
-def check_sight(mesh: Mesh, handpiece: Handpiece, options: PrintOptions) -> None:
-    """Raise InputError where the surface is in the way of a view or a light, up to the far end of the depth range."""
-    for name in module_boxes(handpiece):
+def check_sight(solid: Manifold, handpiece: Handpiece, options: PrintOptions) -> None:
+    """Raise InputError where a solid or a module is in the way of a view or a light, up to the far end of the depth
+    range."""
+    modules = module_boxes(handpiece)
+    mesh = surface(solid + union({name: block(box) for name, box in modules.items()}))
+    for name in modules:
         origin, rays = lines_of_sight(handpiece, name, options, rings=_RINGS)
-        hits = mesh.cast(np.broadcast_to(origin, rays.shape), rays)
+        hits = mesh.cast(origin + _INSIDE_MM * rays, rays)
         blocked = hits.distances < handpiece.depth_range_mm[1]
         if blocked.any():
             nearest = int(np.argmin(hits.distances))
             place = origin + hits.distances[nearest] * rays[nearest]
-            part = _obstacle(handpiece.solid, place)
+            part = handpiece.solid.names[int(handpiece.solid.distances(place[None])[1][0])]
             raise InputError(
-                f"holder: the {part} is in the way of {name}, {hits.distances[nearest]:.1f} mm before it, for "
-                f"{blocked.mean():.0%} of its rays; move one of them, make the {part} smaller, or ask for less light "
+                f"holder: {part} is in the way of {name}, {hits.distances[nearest]:.1f} mm before it, for "
+                f"{blocked.mean():.0%} of its rays; move one of them, make {part} smaller, or ask for less light "
                 "(--light-half-angle-deg)"
             )
-
-
-def _obstacle(body: Body, place: Float[np.ndarray, "3"]) -> str:
-    """The part that a place on the surface belongs to."""
-    parts = Body({name: box for name, box in body.parts.items() if not name.startswith(("camera ", "light "))})
-    return parts.names[int(parts.distances(place[None])[1][0])]
 
 
 def thinnest(made: Printable, options: PrintOptions) -> tuple[Wall, Wall | None]:

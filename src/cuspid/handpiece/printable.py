@@ -15,9 +15,8 @@ from jaxtyping import Float, Int
 from manifold3d import Manifold, OpType
 
 from cuspid.body import Box
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.handpiece.shell import Handle, Head, PrintOptions, Shell, shell_of
+from cuspid.handpiece.shell import Handle, Head, PrintOptions, Shell, seat_of, shell_of
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece, Light, MountedCamera
 
@@ -25,6 +24,10 @@ _SEGMENTS = 24
 """Of a full circle, where edges are rounded."""
 _GRIP_ROUNDED = 0.3
 """Radius of the edges of the grip, in its widths."""
+_COLLAR_MM = 0.1
+"""Length of the neck that the taper to the grip begins with."""
+_SHARP_MM = 0.01
+"""Radius of edges that are not rounded."""
 _TAPER = 1.5
 """Length of the taper from neck to grip, in the difference of their widths."""
 _OPEN_MM = 0.01
@@ -71,16 +74,12 @@ class Printable:
 def printable(handpiece: Handpiece, options: PrintOptions = PrintOptions()) -> Printable:
     """The holder of a handpiece; nothing of it is checked yet.
 
-    Raises InputError for a body without a box for a camera or a light, and for a rim wider than a module.
+    Raises InputError for a body without a box for a camera or a light, and for a shoulder that leaves no channel.
     """
     shell = shell_of(handpiece, options)
     shells = _shells(handpiece, shell, options)
     seats = {f"seat of {name}": _seat(box, options).as_original() for name, box in shell.modules.items()}
-    channels = {
-        f"channel of {name}": _channel(name, box, head, options).as_original()
-        for head in shell.heads
-        for name, box in head.modules.items()
-    }
+    channels = {f"channel of {name}": block(box).as_original() for name, box in shell.channels.items()}
     ducts = {name: each.as_original() for name, each in _ducts(shell, options).items()}
     parts = {**shells, **seats, **channels, **ducts}
     solid = (union(shells) - union({**seats, **channels, **ducts})).simplify(_SIMPLIFIED_MM)
@@ -145,25 +144,9 @@ def _placed(solid: Manifold, own_from_rig: Rigid3) -> Manifold:
 
 
 def _seat(box: Box, options: PrintOptions) -> Manifold:
-    """A module with its clearance at the sides, open in front."""
-    clearance = options.seat_clearance_mm
+    """The room of a module, open in front."""
     forward = Rigid3(np.eye(3), np.array([0, 0, -_OPEN_MM / 2])) @ box.box_from_rig
-    return block(Box(forward, box.half_mm + [clearance, clearance, _OPEN_MM / 2]))
-
-
-def _channel(name: str, box: Box, head: Head, options: PrintOptions) -> Manifold:
-    """From the middle of a seat backwards to the middle of the duct."""
-    width = box.half_mm[:2] - options.shoulder_mm
-    if width.min() <= 0:
-        raise InputError(
-            f"print: --shoulder-mm is {options.shoulder_mm:g}; {name} is {2 * box.half_mm[:2].min():g} mm wide, and "
-            "nothing would be left for its cable"
-        )
-    module = head.head_from_rig @ box.box_from_rig.inverse()
-    drop = module.translation[2] - (head.head_from_rig @ head.tube.inner.box_from_rig.inverse()).translation[2]
-    length = drop / module.rotation[2, 2]
-    middle = Rigid3(np.eye(3), np.array([0, 0, length / 2])) @ box.box_from_rig
-    return block(Box(middle, np.array([*width, length / 2])))
+    return block(Box(forward, seat_of(box, options).half_mm + [0, 0, _OPEN_MM / 2]))
 
 
 def _windows(handpiece: Handpiece, head: Head, options: PrintOptions) -> Manifold:
@@ -175,17 +158,18 @@ def _windows(handpiece: Handpiece, head: Head, options: PrintOptions) -> Manifol
     return Manifold.batch_boolean(windows, OpType.Add) if windows else Manifold()
 
 
-def _lies_behind(box: Box, head: Head, front: float) -> bool:
-    """Whether a corner of the front of a module lies behind that of its head."""
-    corners = head.head_from_rig.apply(box.corners[1::2])
+def _lies_behind(seat: Box, head: Head, front: float) -> bool:
+    """Whether a corner of the front of a seat lies behind that of its head."""
+    corners = head.head_from_rig.apply(seat.corners[1::2])
     return bool(corners[:, 2].min() < front - 1e-6)
 
 
 def _window(handpiece: Handpiece, name: str, box: Box, options: PrintOptions) -> Manifold:
     """Around the front of a seat and all that the module sees or lights, up to the working distance."""
-    wide = replace(box, half_mm=box.half_mm + [options.seat_clearance_mm, options.seat_clearance_mm, 0])
     origin, rays = lines_of_sight(handpiece, name, options)
-    return Manifold.hull_points(np.concatenate([wide.corners[1::2], origin + rays * handpiece.working_distance_mm]))
+    return Manifold.hull_points(
+        np.concatenate([seat_of(box, options).corners[1::2], origin + rays * handpiece.working_distance_mm])
+    )
 
 
 def lines_of_sight(
@@ -222,32 +206,30 @@ def _lobe(light: Light, shares: Float[np.ndarray, "k"], half_angle_deg: float) -
 
 def _neck(handle: Handle, options: PrintOptions) -> Manifold:
     """Rounded, but flat at its end."""
-    low, high = _corners(handle)
-    longer = Box(Rigid3.identity(), (high - low) / 2 + [0, options.handle_wall_mm, 0])
-    solid = rounded(longer, options.handle_wall_mm).translate((low + high) / 2 + [0, options.handle_wall_mm, 0])
+    width, start = options.neck_width_mm / 2, -options.handle_wall_mm
+    longer = np.array([width, (options.neck_mm - start) / 2 + options.handle_wall_mm, width])
+    solid = _rounded(longer, options.handle_wall_mm).translate([0, start + longer[1], 0])
     return _placed(solid.trim_by_plane((0, -1, 0), -options.neck_mm), handle.handle_from_rig)
 
 
-def _corners(handle: Handle) -> Float[np.ndarray, "2 3"]:
-    """Lower and upper corner of the neck in the frame of the handle."""
-    corners = handle.handle_from_rig.apply(handle.neck.outer.corners)
-    return np.stack([corners.min(axis=0), corners.max(axis=0)])
-
-
 def _grip(handle: Handle, options: PrintOptions, inside_mm: float) -> Manifold:
-    """The grip with its taper, or what lies inside of it by a wall: then open at the end."""
-    neck, width = options.neck_width_mm / 2 - inside_mm, options.grip_width_mm / 2 - inside_mm
-    taper = _TAPER * abs(options.grip_width_mm - options.neck_width_mm)
-    end = options.neck_mm + max(options.grip_mm, taper + 1.0)
-    radius = max(_GRIP_ROUNDED * options.grip_width_mm - inside_mm, 0.05 * options.grip_width_mm)
-    start = options.neck_mm + taper
-    body = _rounded(np.array([width, (end - start) / 2 + radius, width]), radius)
-    collar = _rounded(np.array([neck, 0.5, neck]), max(options.handle_wall_mm - inside_mm, 0.01))
-    whole = Manifold.batch_hull(
-        [body.translate([0, (start + end) / 2 + radius, 0]), collar.translate([0, options.neck_mm - 0.5, 0])]
-    )
-    flat = whole if inside_mm else whole.trim_by_plane((0, -1, 0), -end)
-    return _placed(flat, handle.handle_from_rig)
+    """The grip with its taper, or what lies inside of it by a wall: then it goes on at both ends."""
+    wider = options.grip_width_mm - options.neck_width_mm
+    taper = _TAPER * abs(wider)
+    start = options.neck_mm + inside_mm * np.tan(np.arctan2(wider / 2, taper) / 2)
+    end = options.neck_mm + max(options.grip_mm, taper + 1.0) + (1.0 if inside_mm else 0.0)
+    neck, grip = options.neck_width_mm / 2, options.grip_width_mm / 2
+    collar = _bar(neck - inside_mm, options.handle_wall_mm - inside_mm, start - _COLLAR_MM, start)
+    body = _bar(grip - inside_mm, _GRIP_ROUNDED * options.grip_width_mm - inside_mm, start + taper, end)
+    return _placed(Manifold.batch_hull([collar, body]), handle.handle_from_rig)
+
+
+def _bar(half_mm: float, radius_mm: float, start: float, end: float) -> Manifold:
+    """Along Y, square, with rounded edges and flat ends."""
+    radius = max(radius_mm, _SHARP_MM)
+    longer = _rounded(np.array([half_mm, (end - start) / 2 + 2 * radius, half_mm]), radius)
+    middle = longer.translate([0, (start + end) / 2, 0])
+    return middle.trim_by_plane((0, 1, 0), start).trim_by_plane((0, -1, 0), -end)
 
 
 def views_of(made: Printable) -> tuple[Mesh, Mesh, Mesh]:

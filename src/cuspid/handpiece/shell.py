@@ -10,7 +10,7 @@ a group (or of a light that stands alone), seen from behind: +Z is where it look
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -19,7 +19,7 @@ from jaxtyping import Float
 from cuspid.body import Body, Box
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, unit
-from cuspid.handpiece.holder import alike, belongs, spans
+from cuspid.handpiece.holder import ALIKE_DEG, alike, spans
 from cuspid.options import Options, Range
 from cuspid.rig import Handpiece
 
@@ -69,7 +69,7 @@ class PrintOptions(Options):
     """Width and height of the grip."""
     handle_wall_mm: Annotated[float, Range(0.05, 100)] = 1.5
     """Thickness of the walls of neck and grip."""
-    light_half_angle_deg: Annotated[float, Range(0, 85)] = 45.0
+    light_half_angle_deg: Annotated[float, Range(0, 85)] = 35.0
     """How far from its axis the light of an LED must be free."""
     mouth_opening_mm: Annotated[float | None, Range(0.1, 1000)] = None
     """Room between the teeth that there is for working distance and holder; not checked unless given."""
@@ -113,6 +113,8 @@ class Head:
     """Where it looks: +Z."""
     modules: Mapping[str, Box]
     """By the name of the part."""
+    channels: Mapping[str, Box]
+    """From the middle of the seat of each module to the middle of the duct."""
     tube: Tube
     """The block that they are let into, and its duct."""
 
@@ -144,6 +146,11 @@ class Shell:
         return {name: box for head in self.heads for name, box in head.modules.items()}
 
     @property
+    def channels(self) -> dict[str, Box]:
+        """All channels by the name of the part that they lead to."""
+        return {name: box for head in self.heads for name, box in head.channels.items()}
+
+    @property
     def body(self) -> Body:
         """What takes up room in a mouth: all but the grip."""
         heads = {f"head {number}": head.tube.outer for number, head in enumerate(self.heads, start=1)}
@@ -154,7 +161,8 @@ class Shell:
 def shell_of(handpiece: Handpiece, options: PrintOptions) -> Shell:
     """The boxes of a holder for the modules that the body of a handpiece names (where it has none, assumed ones).
 
-    Raises InputError for a body without a box for a camera or a light, or with one that looks elsewhere.
+    Raises InputError for a body without a box for a camera or a light, or with one that looks elsewhere, and for a
+    shoulder that leaves no channel.
     """
     heads = tuple(_head(frame, modules, options) for frame, modules in _groups(handpiece, module_boxes(handpiece)))
     arms: dict[str, Tube] = {}
@@ -184,27 +192,66 @@ def module_boxes(handpiece: Handpiece) -> dict[str, Box]:
 
 
 def _groups(handpiece: Handpiece, modules: Mapping[str, Box]) -> list[tuple[Rigid3, dict[str, Box]]]:
-    """Cameras that look the same way with the lights among them, then each light that stands alone."""
-    groups = []
-    lights = {name: box for name, box in modules.items() if name.startswith("light ")}
-    for names in alike(handpiece):
-        frame, axis = handpiece.rig[names[0]].cam_from_rig, handpiece.rig[names[0]].axis_in_rig
-        own = {f"camera {name}": modules[f"camera {name}"] for name in names}
-        reach = spans(list(own.values()), frame)
-        among = {name: box for name, box in lights.items() if belongs(box, frame, reach, axis)}
-        lights = {name: box for name, box in lights.items() if name not in among}
-        groups.append((frame, own | among))
-    return groups + [(box.box_from_rig, {name: box}) for name, box in lights.items()]
+    """Cameras that look the same way, with the lights that shine most nearly that way; other lights by themselves."""
+    groups: list[tuple[Rigid3, dict[str, Box]]] = [
+        (handpiece.rig[names[0]].cam_from_rig, {f"camera {name}": modules[f"camera {name}"] for name in names})
+        for names in alike(handpiece)
+    ]
+    for name in (f"light {each}" for each in handpiece.lights):
+        frame = modules[name].box_from_rig
+        cosines = [group.rotation[2] @ frame.rotation[2] for group, _ in groups]
+        nearest = int(np.argmax(cosines))
+        if cosines[nearest] > np.cos(np.deg2rad(ALIKE_DEG)):
+            groups[nearest][1][name] = modules[name]
+        else:
+            groups.append((frame, {name: modules[name]}))
+    return groups
 
 
 def _head(head_from_rig: Rigid3, modules: Mapping[str, Box], options: PrintOptions) -> Head:
-    low, high = spans(list(modules.values()), head_from_rig)
-    beside = options.wall_mm + options.seat_clearance_mm + _RIM * options.rounding_mm
-    floor = low[2] - options.wall_mm
+    boxes = list(modules.values())
+    floor = spans(boxes, head_from_rig)[0, 2] - options.wall_mm
     ceiling = floor - options.duct_mm
-    outer = _box(head_from_rig, [*(low[:2] - beside), ceiling - options.wall_mm], [*(high[:2] + beside), high[2]])
-    inner = _box(head_from_rig, [*low[:2], ceiling], [*high[:2], floor])
-    return Head(head_from_rig=head_from_rig, modules=modules, tube=Tube(outer=outer, inner=inner))
+    front = _front(head_from_rig, [seat_of(box, options) for box in boxes])
+    channels = {
+        name: _channel(name, box, head_from_rig, (floor + ceiling) / 2, options) for name, box in modules.items()
+    }
+    low, high = spans([*boxes, *channels.values()], head_from_rig)[:, :2]
+    beside = options.wall_mm + options.seat_clearance_mm + _RIM * options.rounding_mm
+    return Head(
+        head_from_rig=head_from_rig,
+        modules=modules,
+        channels=channels,
+        tube=Tube(
+            outer=_box(head_from_rig, [*(low - beside), ceiling - options.wall_mm], [*(high + beside), front]),
+            inner=_box(head_from_rig, [*low, ceiling], [*high, floor]),
+        ),
+    )
+
+
+def _channel(name: str, module: Box, head_from_rig: Rigid3, middle_mm: float, options: PrintOptions) -> Box:
+    """From the middle of a module backwards to a depth in its head."""
+    width = module.half_mm[:2] - options.shoulder_mm
+    if width.min() <= 0:
+        raise InputError(
+            f"print: --shoulder-mm is {options.shoulder_mm:g}; {name} is {2 * module.half_mm[:2].min():g} mm wide, and "
+            "nothing would be left for its cable"
+        )
+    head_from_module = head_from_rig @ module.box_from_rig.inverse()
+    length = (head_from_module.translation[2] - middle_mm) / head_from_module.rotation[2, 2]
+    return Box(Rigid3(np.eye(3), np.array([0, 0, length / 2])) @ module.box_from_rig, np.array([*width, length / 2]))
+
+
+def seat_of(module: Box, options: PrintOptions) -> Box:
+    """A module with its clearance at the sides."""
+    return replace(module, half_mm=module.half_mm + [options.seat_clearance_mm, options.seat_clearance_mm, 0])
+
+
+def _front(head_from_rig: Rigid3, seats: Sequence[Box]) -> float:
+    """Z of the front of a head: behind all lenses, but where a module would stand out by more than half its depth."""
+    fronts = [head_from_rig.apply(seat.corners[1::2])[:, 2] for seat in seats]
+    held = [front.max() - seat.half_mm[2] for front, seat in zip(fronts, seats, strict=True)]
+    return float(max(min(front.min() for front in fronts), *held))
 
 
 def _box(frame_from_rig: Rigid3, low: Sequence[float], high: Sequence[float]) -> Box:
