@@ -98,14 +98,15 @@ def check_seats(made: Printable, options: PrintOptions) -> None:
     """Raise InputError where modules overlap or leave no web between their seats, or where a duct cuts a seat."""
     modules = module_boxes(made.handpiece)
     blocks = {name: block(box) for name, box in modules.items()}
-    for one, other in combinations(modules, 2):
-        if _apart_mm(modules[one], modules[other]) > options.web_mm + 4 * options.seat_clearance_mm:
-            continue
+    reach_mm = options.web_mm + 4 * options.seat_clearance_mm
+    near = [pair for pair in combinations(modules, 2) if _apart_mm(*(modules[name] for name in pair)) < reach_mm]
+    for one, other in near:
         if (blocks[one] ^ blocks[other]).volume() > _NOTHING_MM3:
             raise InputError(
                 f"holder: the modules of {one} and {other} overlap; set them farther apart, or give smaller modules "
                 "(--holder.camera-mm, --holder.led-mm, or the body in handpiece.json)"
             )
+    for one, other in near:
         gap = made.seats[f"seat of {one}"].min_gap(made.seats[f"seat of {other}"], 2 * options.web_mm)
         if gap < options.web_mm - 1e-6:
             raise InputError(

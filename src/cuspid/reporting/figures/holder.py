@@ -21,7 +21,7 @@ from cuspid.reporting.figures.drawing import PLASTER, new_figure, save_figure
 from cuspid.rig import Handpiece
 
 _INK = "#333333"
-_WIDTH_PX = 900
+_WIDTH_PX = 600
 _CAMERA, _LED = (52, 73, 94), (242, 193, 78)
 _SIDE = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 """From the side, the grip on the left, the teeth below."""
