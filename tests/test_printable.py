@@ -119,6 +119,20 @@ def test_cameras_that_lean_within_a_head_see_past_it():
     check_printable(printable(six_cameras(DesignOptions(outer_tilt_deg=15.0))), PrintOptions())
 
 
+def test_a_camera_far_before_its_neighbours_gets_a_collar():
+    pair = BUILT_IN["two"]
+    wide = replace(
+        pair, rig=Rig({**pair.rig.cameras, "o2": shifted(pair.rig["o2"], np.array([0.0, -3.0, -1.8]))}), body=None
+    )
+    made = printable(wide)
+    assert "collar of camera o2" in made.shells
+    check_printable(made, PrintOptions())
+
+
+def shifted(mounted: MountedCamera, by_mm: np.ndarray) -> MountedCamera:
+    return replace(mounted, cam_from_rig=mounted.cam_from_rig @ Rigid3(np.eye(3), -by_mm))
+
+
 def test_a_wall_before_a_lens_is_told(four):
     axis, centre = four.handpiece.rig["o2"].axis_in_rig, four.handpiece.rig["o2"].centre_in_rig
     wall = Manifold.cube((2.0, 2.0, 0.2), True).translate(centre + 1.5 * axis)

@@ -19,7 +19,7 @@ from manifold3d import Error, Manifold
 from cuspid.body import Box
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.handpiece.printable import Printable, block, lines_of_sight, surface, union
+from cuspid.handpiece.printable import NOTHING_MM3, Printable, block, lines_of_sight, pieces, surface, union
 from cuspid.handpiece.shell import PrintOptions, module_boxes
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
@@ -31,8 +31,6 @@ _INSIDE_MM = 1e-3
 """Rays start so far below the surface."""
 _TOLERANCE = 0.02
 """Of a thickness: rounded edges are polygons."""
-_NOTHING_MM3 = 1e-6
-"""Volume that rounding may leave."""
 _RINGS = 8
 """Rays around the border of an image, and around so many smaller ones within it."""
 _G_PER_MM3 = 1.2e-3
@@ -101,7 +99,7 @@ def check_seats(made: Printable, options: PrintOptions) -> None:
     reach_mm = options.web_mm + 4 * options.seat_clearance_mm
     near = [pair for pair in combinations(modules, 2) if _apart_mm(*(modules[name] for name in pair)) < reach_mm]
     for one, other in near:
-        if (blocks[one] ^ blocks[other]).volume() > _NOTHING_MM3:
+        if (blocks[one] ^ blocks[other]).volume() > NOTHING_MM3:
             raise InputError(
                 f"holder: the modules of {one} and {other} overlap; set them farther apart, or give smaller modules "
                 "(--holder.camera-mm, --holder.led-mm, or the body in handpiece.json)"
@@ -115,7 +113,7 @@ def check_seats(made: Printable, options: PrintOptions) -> None:
                 "or a thinner web"
             )
     for (seat, pocket), (duct, hollow) in product(made.seats.items(), made.ducts.items()):
-        if (pocket ^ hollow).volume() > _NOTHING_MM3:
+        if (pocket ^ hollow).volume() > NOTHING_MM3:
             raise InputError(
                 f"holder: the {duct} runs through the {seat}; set the cameras otherwise, or make --duct-mm, "
                 "--arm-width-mm or --neck-width-mm smaller"
@@ -133,13 +131,13 @@ def check_solid(made: Printable) -> None:
     """Raise InputError unless the holder is one closed solid, also as a file stores it, and its hollows are one."""
     if made.solid.status() != Error.NoError or made.solid.volume() <= 0:
         raise InputError(f"holder: no solid came of it ({made.solid.status().name}); try other sizes")
-    pieces = sorted(made.solid.decompose(), key=lambda piece: -abs(piece.volume()))
-    if len(pieces) > 1:
+    found = pieces(made.solid)
+    if len(found) > 1:
         raise InputError(
-            f"holder: it falls into {len(pieces)} pieces, one around {_where(made, pieces[1])}; make --arm-width-mm, "
+            f"holder: it falls into {len(found)} pieces, one around {_where(made, found[1])}; make --arm-width-mm, "
             "--neck-width-mm or the walls larger, or set the cameras otherwise"
         )
-    for one, other in pairwise(sorted(union(made.hollows).decompose(), key=lambda piece: -piece.volume())):
+    for one, other in pairwise(pieces(union(made.hollows))):
         raise InputError(
             f"holder: no way for a cable leads from {_where(made, other)} to {_where(made, one)}; make --duct-mm or "
             "--arm-width-mm larger"
@@ -163,10 +161,10 @@ def check_insertion(made: Printable) -> None:
     for name, box in module_boxes(made.handpiece).items():
         ahead = Rigid3(np.eye(3), np.array([0, 0, -box.half_mm[2]])) @ box.box_from_rig
         stopped = block(Box(ahead, box.half_mm * [1, 1, 2])) ^ made.solid
-        if stopped.volume() > _NOTHING_MM3:
-            by = [shell for shell, each in made.shells.items() if (stopped ^ each).volume() > _NOTHING_MM3 / 10]
+        if stopped.volume() > NOTHING_MM3:
+            by = [shell for shell, each in made.shells.items() if (stopped ^ each).volume() > NOTHING_MM3 / 10]
             raise InputError(
-                f"holder: {name} cannot be pushed into its seat from the front, for {' and '.join(by)} is in the way; "
+                f"holder: {name} cannot be pushed into its seat from the front, past {' and '.join(by)}; "
                 "set the cameras farther apart or turn them less"
             )
 
@@ -206,12 +204,14 @@ def thinnest(made: Printable, options: PrintOptions) -> tuple[Wall, Wall | None]
 def _walls(made: Printable) -> tuple[list[Wall], list[Wall]]:
     """The thinnest place of each part of the surface: to others, and of pockets to each other."""
     pockets = np.array([name in made.seats or name in made.channels for name in made.names])
+    ducts = np.array([name in made.ducts for name in made.names])
     walls: list[Wall] = []
     webs: list[Wall] = []
     for start in np.unique(made.source):
         points, thickness, end = _across(made.mesh, made.source == start)
         across_pockets = pockets[start] & pockets[made.source[end]]
-        for found, which in ((walls, ~across_pockets), (webs, across_pockets)):
+        across_ducts = ducts[start] & ducts[made.source[end]]
+        for found, which in ((walls, ~across_pockets & ~across_ducts), (webs, across_pockets)):
             at = int(np.argmin(np.where(which, thickness, np.inf)))
             if which[at] and np.isfinite(thickness[at]):
                 between = (made.names[start], made.names[made.source[end[at]]])

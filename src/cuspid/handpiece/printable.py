@@ -16,7 +16,7 @@ from manifold3d import Manifold, OpType
 
 from cuspid.body import Box
 from cuspid.geometry import Rigid3
-from cuspid.handpiece.shell import Handle, Head, PrintOptions, Shell, seat_of, shell_of
+from cuspid.handpiece.shell import Handle, PrintOptions, Shell, seat_of, shell_of
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece, Light, MountedCamera
 
@@ -34,6 +34,8 @@ _OPEN_MM = 0.01
 """Seats reach so far out of the front of a head, that rounding leaves no film over them."""
 _SIMPLIFIED_MM = 1e-3
 """Slivers that joining leaves are removed as long as the surface moves by less."""
+NOTHING_MM3 = 1e-6
+"""Volume that rounding may leave."""
 _AROUND = 24
 """Rays around the light of an LED."""
 _BORDER = 5
@@ -77,12 +79,13 @@ def printable(handpiece: Handpiece, options: PrintOptions = PrintOptions()) -> P
     Raises InputError for a body without a box for a camera or a light, and for a shoulder that leaves no channel.
     """
     shell = shell_of(handpiece, options)
-    shells = _shells(handpiece, shell, options)
+    shells = _shells(shell, options)
     seats = {f"seat of {name}": _seat(box, options).as_original() for name, box in shell.modules.items()}
     channels = {f"channel of {name}": block(box).as_original() for name, box in shell.channels.items()}
     ducts = {name: each.as_original() for name, each in _ducts(shell, options).items()}
     parts = {**shells, **seats, **channels, **ducts}
-    solid = (union(shells) - union({**seats, **channels, **ducts})).simplify(_SIMPLIFIED_MM)
+    raw = (union(shells) - union({**seats, **channels, **ducts})).simplify(_SIMPLIFIED_MM)
+    solid = Manifold.compose(pieces(raw))
     mesh, source = _mesh_of(solid, [each.original_id() for each in parts.values()])
     return Printable(
         handpiece=replace(handpiece, body=shell.body),
@@ -103,16 +106,12 @@ def block(box: Box) -> Manifold:
     return _placed(Manifold.cube(2 * box.half_mm, True), box.box_from_rig)
 
 
-def _shells(handpiece: Handpiece, shell: Shell, options: PrintOptions) -> dict[str, Manifold]:
-    heads = {
-        f"head {number}": rounded(head.tube.outer, options.rounding_mm) - _windows(handpiece, head, options)
-        for number, head in enumerate(shell.heads, start=1)
-    }
-    arms = {name: rounded(arm.outer, options.rounding_mm) for name, arm in shell.arms.items()}
+def _shells(shell: Shell, options: PrintOptions) -> dict[str, Manifold]:
+    blocks = {name: rounded(box, options.rounding_mm) for name, box in shell.blocks.items()}
     handle = {"neck": _neck(shell.handle, options)}
     if options.grip_mm:
         handle["grip"] = _grip(shell.handle, options, inside_mm=0.0)
-    return {name: each.as_original() for name, each in {**heads, **arms, **handle}.items()}
+    return {name: each.as_original() for name, each in {**blocks, **handle}.items()}
 
 
 def _ducts(shell: Shell, options: PrintOptions) -> dict[str, Manifold]:
@@ -147,29 +146,6 @@ def _seat(box: Box, options: PrintOptions) -> Manifold:
     """The room of a module, open in front."""
     forward = Rigid3(np.eye(3), np.array([0, 0, -_OPEN_MM / 2])) @ box.box_from_rig
     return block(Box(forward, seat_of(box, options).half_mm + [0, 0, _OPEN_MM / 2]))
-
-
-def _windows(handpiece: Handpiece, head: Head, options: PrintOptions) -> Manifold:
-    """What must be free before modules that stand behind the front of their head."""
-    front = (head.head_from_rig @ head.tube.outer.box_from_rig.inverse()).translation[2] + head.tube.outer.half_mm[2]
-    windows = [
-        _window(handpiece, name, box, options) for name, box in head.modules.items() if _lies_behind(box, head, front)
-    ]
-    return Manifold.batch_boolean(windows, OpType.Add) if windows else Manifold()
-
-
-def _lies_behind(seat: Box, head: Head, front: float) -> bool:
-    """Whether a corner of the front of a seat lies behind that of its head."""
-    corners = head.head_from_rig.apply(seat.corners[1::2])
-    return bool(corners[:, 2].min() < front - 1e-6)
-
-
-def _window(handpiece: Handpiece, name: str, box: Box, options: PrintOptions) -> Manifold:
-    """Around the front of a seat and all that the module sees or lights, up to the working distance."""
-    origin, rays = lines_of_sight(handpiece, name, options)
-    return Manifold.hull_points(
-        np.concatenate([seat_of(box, options).corners[1::2], origin + rays * handpiece.working_distance_mm])
-    )
 
 
 def lines_of_sight(
@@ -247,6 +223,12 @@ def surface(solid: Manifold) -> Mesh:
     """Of a solid."""
     made = solid.to_mesh64()
     return Mesh(np.asarray(made.vert_properties)[:, :3], np.asarray(made.tri_verts).astype(np.int64))
+
+
+def pieces(solid: Manifold) -> list[Manifold]:
+    """What of a solid hangs together, largest first, without the dust that rounding leaves where surfaces touch."""
+    found = [each for each in solid.decompose() if abs(each.volume()) > NOTHING_MM3]
+    return sorted(found, key=lambda each: -abs(each.volume()))
 
 
 def union(solids: Mapping[str, Manifold]) -> Manifold:

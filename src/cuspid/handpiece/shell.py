@@ -37,6 +37,8 @@ _RIM = 0.3
 it still faces the seat (within 45 degrees: 1 - cos 45)."""
 _OVERLAP_MM = 0.1
 """Of two tubes where they meet, at least; where they bend, as much as the outer side of the bend needs."""
+_STEEP = 0.99
+"""Cosine to a duct beyond which a tube leaves it backwards."""
 _FAR_ELBOW = 3.0
 """An elbow farther from both ducts than so many times their distance is none: the tube goes straight."""
 
@@ -117,6 +119,8 @@ class Head:
     """From the middle of the seat of each module to the middle of the duct."""
     tube: Tube
     """The block that they are let into, and its duct."""
+    collars: Mapping[str, Box]
+    """Around modules that stand out of the block by more than half their depth, by the name of the part."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -153,9 +157,14 @@ class Shell:
     @property
     def body(self) -> Body:
         """What takes up room in a mouth: all but the grip."""
+        return Body({**self.modules, **self.blocks, "neck": self.handle.neck.outer})
+
+    @property
+    def blocks(self) -> dict[str, Box]:
+        """What is solid of heads and arms, before anything is taken away."""
         heads = {f"head {number}": head.tube.outer for number, head in enumerate(self.heads, start=1)}
-        arms = {name: arm.outer for name, arm in self.arms.items()}
-        return Body({**self.modules, **heads, **arms, "neck": self.handle.neck.outer})
+        collars = {f"collar of {name}": box for head in self.heads for name, box in head.collars.items()}
+        return {**heads, **collars, **{name: arm.outer for name, arm in self.arms.items()}}
 
 
 def shell_of(handpiece: Handpiece, options: PrintOptions) -> Shell:
@@ -212,7 +221,8 @@ def _head(head_from_rig: Rigid3, modules: Mapping[str, Box], options: PrintOptio
     boxes = list(modules.values())
     floor = spans(boxes, head_from_rig)[0, 2] - options.wall_mm
     ceiling = floor - options.duct_mm
-    front = _front(head_from_rig, [seat_of(box, options) for box in boxes])
+    fronts = {name: _front(head_from_rig, seat_of(box, options)) for name, box in modules.items()}
+    front = min(low for low, _ in fronts.values())
     channels = {
         name: _channel(name, box, head_from_rig, (floor + ceiling) / 2, options) for name, box in modules.items()
     }
@@ -222,6 +232,11 @@ def _head(head_from_rig: Rigid3, modules: Mapping[str, Box], options: PrintOptio
         head_from_rig=head_from_rig,
         modules=modules,
         channels=channels,
+        collars={
+            name: _collar(box, head_from_rig, front, beside)
+            for name, box in modules.items()
+            if fronts[name][1] - front > box.half_mm[2]
+        },
         tube=Tube(
             outer=_box(head_from_rig, [*(low - beside), ceiling - options.wall_mm], [*(high + beside), front]),
             inner=_box(head_from_rig, [*low, ceiling], [*high, floor]),
@@ -247,11 +262,19 @@ def seat_of(module: Box, options: PrintOptions) -> Box:
     return replace(module, half_mm=module.half_mm + [options.seat_clearance_mm, options.seat_clearance_mm, 0])
 
 
-def _front(head_from_rig: Rigid3, seats: Sequence[Box]) -> float:
-    """Z of the front of a head: behind all lenses, but where a module would stand out by more than half its depth."""
-    fronts = [head_from_rig.apply(seat.corners[1::2])[:, 2] for seat in seats]
-    held = [front.max() - seat.half_mm[2] for front, seat in zip(fronts, seats, strict=True)]
-    return float(max(min(front.min() for front in fronts), *held))
+def _front(head_from_rig: Rigid3, seat: Box) -> tuple[float, float]:
+    """Least and largest Z of the front of a seat."""
+    corners = head_from_rig.apply(seat.corners[1::2])[:, 2]
+    return float(corners.min()), float(corners.max())
+
+
+def _collar(module: Box, head_from_rig: Rigid3, front: float, beside_mm: float) -> Box:
+    """Around a module, from its own front back into the head."""
+    head_from_module = head_from_rig @ module.box_from_rig.inverse()
+    ahead = head_from_module.apply(np.array([[0, 0, module.half_mm[2]]]))[0, 2]
+    sunk = (ahead - front) / head_from_module.rotation[2, 2] + beside_mm
+    half = np.array([*(module.half_mm[:2] + beside_mm), module.half_mm[2]])
+    return _box(module.box_from_rig, [*-half[:2], half[2] - sunk], half.tolist())
 
 
 def _box(frame_from_rig: Rigid3, low: Sequence[float], high: Sequence[float]) -> Box:
@@ -292,8 +315,8 @@ def _towards(head: Head, end: Float[np.ndarray, "3"], beyond_mm: float, options:
     start = _centre(head)
     length = float(np.linalg.norm(end - start))
     along = (end - start) / length if length > 1e-9 else head.head_from_rig.rotation[0]
-    back = head.head_from_rig.rotation[2]
-    z = unit(back - (back @ along) * along)
+    _, up, back = head.head_from_rig.rotation
+    z = next(unit(each - (each @ along) * along) for each in (back, up) if abs(each @ along) < _STEEP)
     frame = _frame(start, along, z)
     half = np.array([options.arm_width_mm / 2 - options.wall_mm, 0.0, options.duct_mm / 2])
     low, high = -half, half + [0.0, length + beyond_mm, 0.0]
