@@ -21,7 +21,7 @@ from cuspid.reporting.figures.drawing import PLASTER, new_figure, save_figure
 from cuspid.rig import Handpiece
 
 _INK = "#333333"
-_WIDTH_PX = 600
+_WIDTH_PX, _WHOLE_PX = 360, 900
 _CAMERA, _LED = (52, 73, 94), (242, 193, 78)
 _SIDE = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 """From the side, the grip on the left, the teeth below."""
@@ -44,14 +44,14 @@ def save_holder_picture(
     figure.text(0.02, 0.93, "   ".join(notes), fontsize=10.5, color=_INK, va="center")
     whole, head, opened = meshes
     views = (
-        ((0.02, 0.69, 0.96, 0.19), _SIDE, whole, "from the side", False),
-        ((0.02, 0.08, 0.31, 0.56), _oblique(), head, "from the teeth", False),
-        ((0.345, 0.08, 0.31, 0.56), _TIP, head, "from the tip, with the views of the cameras", True),
-        ((0.67, 0.08, 0.31, 0.56), _SIDE, opened, "cut open along the neck", False),
+        ((0.02, 0.69, 0.96, 0.19), _SIDE, whole, _WHOLE_PX, "from the side", False),
+        ((0.02, 0.08, 0.31, 0.56), _oblique(), head, _WIDTH_PX, "from the teeth", False),
+        ((0.345, 0.08, 0.31, 0.56), _TIP, head, _WIDTH_PX, "from the tip, with the views of the cameras", True),
+        ((0.67, 0.08, 0.31, 0.56), _SIDE, opened, _WIDTH_PX, "cut open along the neck", False),
     )
-    for place, axes, mesh, name, with_views in views:
+    for place, axes, mesh, width_px, name, with_views in views:
         panel = figure.add_axes(place)
-        _draw(panel, axes @ handle_from_rig.rotation, handpiece, mesh, with_views=with_views)
+        _draw(panel, axes @ handle_from_rig.rotation, handpiece, mesh, width_px, with_views=with_views)
         panel.set_title(name, loc="left", fontsize=11, color=_INK)
     draw_legend(figure, replace(handpiece, body=None))
     save_figure(figure, path)
@@ -64,8 +64,10 @@ def _oblique() -> Float[np.ndarray, "3 3"]:
     return np.stack([right, np.cross(towards, right), towards])
 
 
-def _draw(panel: Axes, axes: Float[np.ndarray, "3 3"], handpiece: Handpiece, mesh: Mesh, *, with_views: bool) -> None:
-    draw_mesh(panel, axes, _with_modules(mesh, handpiece.solid), width_px=_WIDTH_PX)
+def _draw(
+    panel: Axes, axes: Float[np.ndarray, "3 3"], handpiece: Handpiece, mesh: Mesh, width_px: int, *, with_views: bool
+) -> None:
+    draw_mesh(panel, axes, _with_modules(mesh, handpiece.solid), width_px=width_px)
     if with_views:
         for name, mounted in handpiece.rig.cameras.items():
             draw_camera(panel, axes, mounted, handpiece.working_distance_mm, colour_of(name))
@@ -84,7 +86,7 @@ def _with_modules(mesh: Mesh, body: Body) -> Mesh:
     starts = np.cumsum([0] + [len(each.vertices) for each, _ in parts])
     return Mesh(
         np.concatenate([each.vertices for each, _ in parts]),
-        np.concatenate([each.faces + start for (each, _), start in zip(parts, starts, strict=False)]),
+        np.concatenate([each.faces + start for (each, _), start in zip(parts, starts[:-1], strict=True)]),
         np.concatenate([np.tile(np.array(colour, dtype=np.uint8), (len(each.vertices), 1)) for each, colour in parts]),
     )
 
