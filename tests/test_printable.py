@@ -14,7 +14,7 @@ from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DESIGNS, DesignOptions, six_cameras
 from cuspid.handpiece.holder import HolderOptions
 from cuspid.handpiece.intra_oral import intra_oral_camera
-from cuspid.handpiece.printability import check_printable, check_sight, check_solid, thinnest
+from cuspid.handpiece.printability import check_printable, check_seats, check_sight, check_solid, thinnest
 from cuspid.handpiece.printable import Printable, block, printable, rounded
 from cuspid.handpiece.shell import PrintOptions, module_boxes
 from cuspid.rig import Handpiece, MountedCamera, Rig
@@ -176,6 +176,12 @@ def replace_hollow(of: Printable, pit: Manifold) -> Printable:
 def test_a_holder_in_pieces_is_told(four):
     with pytest.raises(InputError, match="falls into 2 pieces"):
         check_solid(replace(four, solid=four.solid + Manifold.cube((1.0, 1.0, 1.0)).translate([0.0, 0.0, -20.0])))
+
+
+def test_a_duct_through_a_seat_is_told(four):
+    through = block(four.handpiece.solid.parts["camera o3"]).translate([0.4, 0.0, 0.0])
+    with pytest.raises(InputError, match="stray runs through the seat of camera o3"):
+        check_seats(replace(four, ducts={**four.ducts, "stray": through}), PrintOptions())
 
 
 def test_a_seat_without_a_way_out_is_told(four):

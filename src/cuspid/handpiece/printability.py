@@ -93,7 +93,7 @@ def check_printable(made: Printable, options: PrintOptions) -> Printability:
 
 
 def check_seats(made: Printable, options: PrintOptions) -> None:
-    """Raise InputError where modules overlap or leave no web between their seats, or where a duct cuts a seat."""
+    """Raise InputError where modules overlap or leave no web between their seats, or a duct or channel cuts a seat."""
     modules = module_boxes(made.handpiece)
     blocks = {name: block(box) for name, box in modules.items()}
     reach_mm = options.web_mm + 4 * options.seat_clearance_mm
@@ -112,8 +112,9 @@ def check_seats(made: Printable, options: PrintOptions) -> None:
                 f"{options.web_mm:g}; set them farther apart, or give smaller modules, a smaller --seat-clearance-mm "
                 "or a thinner web"
             )
-    for (seat, pocket), (duct, hollow) in product(made.seats.items(), made.ducts.items()):
-        if (pocket ^ hollow).volume() > NOTHING_MM3:
+    for (seat, pocket), (duct, hollow) in product(made.seats.items(), {**made.ducts, **made.channels}.items()):
+        own = duct.removeprefix("channel of ") == seat.removeprefix("seat of ")
+        if not own and (pocket ^ hollow).volume() > NOTHING_MM3:
             raise InputError(
                 f"holder: the {duct} runs through the {seat}; set the cameras otherwise, or make --duct-mm, "
                 "--arm-width-mm or --neck-width-mm smaller"
