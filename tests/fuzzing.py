@@ -216,6 +216,7 @@ def _probe(folder: Path) -> None:
     verb("handpiece", "--design", "four", "--width-px", "96", "--height-px", "96", "--out", "@.")(folder)
 
 
+HOLDER = ("--out", f"@{_OUT}", "--body", f"@{_OUT}/holder.stl")
 PROBE = ("--handpiece", "@handpiece.json", "--tooth", str(TOOTH))
 SCAN = ("--frames", "3", "--length-mm", "1.5", "--supersampling", "1")
 
@@ -282,6 +283,7 @@ SCENARIOS: Mapping[str, Scenario] = {
     "simulate": Scenario(_probe, verb("simulate", "@jaw.ply", *PROBE, *SCAN, "--out", f"@{_OUT}")),
     "precision": Scenario(_probe, verb("precision", "@jaw.ply", *PROBE, "--out", f"@{_OUT}")),
     "mouth": Scenario(_probe, verb("mouth", "--handpiece", "@handpiece.json", "--out", f"@{_OUT}")),
+    "holder": Scenario(_probe, verb("handpiece", "--handpiece", "@handpiece.json", *HOLDER)),
     "reconstruct": Scenario(_textured_scan, verb("reconstruct", "@scan/capture", "--out", f"@{_OUT}")),
     "calibrate": Scenario(
         _photographs,

@@ -13,7 +13,7 @@ CASES = 19
 """Of each scenario."""
 FEWER = {
     **{name: 8 for name in SCENARIOS if name.startswith("report")},
-    **dict.fromkeys(("evaluate", "measure", "simulate", "precision", "mouth", "reconstruct"), 4),
+    **dict.fromkeys(("evaluate", "measure", "simulate", "precision", "mouth", "holder", "reconstruct"), 4),
     **dict.fromkeys(("stitch", "stitch-eval"), 3),
 }
 """Of those that take longest."""

@@ -10,11 +10,17 @@ from tyro.conf import Positional
 from cuspid import storage
 from cuspid.anatomy.mouth import MouthOptions
 from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
+from cuspid.errors import InputError
 from cuspid.handpiece.brief import read_brief
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.handpiece.optimise import SearchOptions, handpiece_outline, optimise_handpiece
+from cuspid.handpiece.printability import check_printable
+from cuspid.handpiece.printable import printable, views_of
+from cuspid.handpiece.shell import PrintOptions
 from cuspid.options import TOOTH
 from cuspid.reporting.figures.design import save_design_picture
+from cuspid.reporting.figures.holder import save_holder_picture
+from cuspid.rig import Handpiece
 from cuspid.studies.forecast import room_for, sections_of
 
 
@@ -22,18 +28,49 @@ def handpiece(
     *,
     out: Path,
     design: Literal["two", "four", "six", "twelve"] = "twelve",
+    handpiece: Path | None = None,
+    body: Path | None = None,
     options: Annotated[DesignOptions, Flat] = DesignOptions(),
+    printing: Annotated[PrintOptions, Flat] = PrintOptions(),
 ) -> None:
-    """Write a built-in handpiece as handpiece.json and COLMAP's rig_config.json, to use or to change.
+    """Write a built-in handpiece as handpiece.json and COLMAP's rig_config.json, and its holder to be printed.
 
     Args:
         out: Folder.
         design: A stereo pair, the essential four cameras, six to be turned, or the twelve.
+        handpiece: A handpiece.json, or COLMAP's rig_config.json, of your own, instead of a built-in design.
+        body: STL, PLY or OBJ file for the holder: one solid with seats, channels for cables, neck and grip, in mm in
+            the rig frame; a picture of it goes beside it. The handpiece then has its body.
     """
-    made = DESIGNS[design](options)
+    made = DESIGNS[design](options) if handpiece is None else storage.read_handpiece(handpiece)
+    if body is not None:
+        made = _print_holder(body, made, printing)
+    elif vars(printing) != vars(PrintOptions()):
+        raise InputError("handpiece: how a holder is printed is given, but not where to; add --body holder.stl")
     storage.write_handpiece(out / "handpiece.json", made)
     storage.write_rig_config(out / "rig_config.json", made.rig)
     console.print(f"{out / 'handpiece.json'}: {len(made.rig.names)} cameras, {len(made.lights)} lights")
+
+
+def _print_holder(path: Path, handpiece: Handpiece, options: PrintOptions) -> Handpiece:
+    """Build, check and write a holder; the handpiece with its body."""
+    if path.suffix.lower() not in storage.MESH_SUFFIXES:
+        raise InputError(f"{path}: --body must end in {', '.join(storage.MESH_SUFFIXES)}")
+    made = printable(handpiece, options)
+    found = check_printable(made, options)
+    storage.write_mesh(path, made.mesh)
+    lines = (
+        f"{' x '.join(f'{side:.0f}' for side in found.size_mm)} mm, {found.volume_mm3 / 1000:.1f} cm3, about "
+        f"{found.weight_g:.0f} g in resin",
+        f"head {found.thickness_mm:.1f} mm thick, {handpiece.working_distance_mm:g} mm over the teeth",
+    )
+    picture = path.with_suffix(".png")
+    save_holder_picture(
+        picture, made.handpiece, made.handle_from_rig, views_of(made), title=handpiece.name, notes=lines
+    )
+    for line in (*lines, f"thinnest wall {found.wall}", *([f"thinnest web {found.web}"] if found.web else [])):
+        console.print(f"{path}: {line}")
+    return made.handpiece
 
 
 def design(

@@ -18,7 +18,7 @@ from cuspid.geometry import Rigid3
 from cuspid.options import Options, Range
 from cuspid.rig import Handpiece
 
-_ALIKE_DEG = 20.0
+ALIKE_DEG = 20.0
 """Cameras whose axes differ by less share a plate."""
 
 
@@ -46,7 +46,7 @@ def with_holder(handpiece: Handpiece, options: HolderOptions = HolderOptions()) 
     cameras = {name: module(each.cam_from_rig, options.camera_mm) for name, each in handpiece.rig.cameras.items()}
     lights = {name: module(each.light_from_rig, options.led_mm) for name, each in handpiece.lights.items()}
     modules = [*cameras.values(), *lights.values()]
-    plates = [_plate(handpiece, group, modules, options) for group in _alike(handpiece)]
+    plates = [_plate(handpiece, group, modules, options) for group in alike(handpiece)]
     parts: dict[str, Box] = {f"camera {name}": box for name, box in cameras.items()}
     parts |= {f"light {name}": box for name, box in lights.items()}
     parts |= {f"plate {number}": plate for number, plate in enumerate(plates, start=1)}
@@ -56,12 +56,12 @@ def with_holder(handpiece: Handpiece, options: HolderOptions = HolderOptions()) 
     return replace(handpiece, body=Body(parts))
 
 
-def _alike(handpiece: Handpiece) -> list[list[str]]:
+def alike(handpiece: Handpiece) -> list[list[str]]:
     """Cameras by the way they look, in the order of the rig."""
     groups: list[list[str]] = []
     for name, mounted in handpiece.rig.cameras.items():
         for group in groups:
-            if handpiece.rig[group[0]].axis_in_rig @ mounted.axis_in_rig > np.cos(np.deg2rad(_ALIKE_DEG)):
+            if handpiece.rig[group[0]].axis_in_rig @ mounted.axis_in_rig > np.cos(np.deg2rad(ALIKE_DEG)):
                 group.append(name)
                 break
         else:
@@ -74,16 +74,17 @@ def _plate(handpiece: Handpiece, group: Sequence[str], boxes: Sequence[Box], opt
     group_from_rig = handpiece.rig[group[0]].cam_from_rig
     axis = handpiece.rig[group[0]].axis_in_rig
     own = [module(handpiece.rig[name].cam_from_rig, options.camera_mm) for name in group]
-    reach = _spans(own, group_from_rig)
+    reach = spans(own, group_from_rig)
     near = [box for box in boxes if _belongs(box, group_from_rig, reach, axis)]
-    low, high = _spans([*own, *near], group_from_rig)
+    low, high = spans([*own, *near], group_from_rig)
     back = low[2]
     centre = np.array([*(low[:2] + high[:2]) / 2, back - options.wall_mm / 2])
     half = np.array([*(high[:2] - low[:2]) / 2, options.wall_mm / 2])
     return Box(Rigid3(np.eye(3), -centre) @ group_from_rig, half)
 
 
-def _spans(boxes: Sequence[Box], group_from_rig: Rigid3) -> Float[np.ndarray, "2 3"]:
+def spans(boxes: Sequence[Box], group_from_rig: Rigid3) -> Float[np.ndarray, "2 3"]:
+    """Lower and upper corner, in the frame of a group, of what boxes take up there."""
     corners = group_from_rig.apply(np.concatenate([box.corners for box in boxes]))
     return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
@@ -93,7 +94,7 @@ def _belongs(box: Box, group_from_rig: Rigid3, reach: Float[np.ndarray, "2 3"], 
     middle = group_from_rig.apply(box.box_from_rig.inverse().translation)
     sideways = (reach[1] - reach[0])[:2].max() / 2
     inside = np.all(middle > reach[0] - sideways) and np.all(middle < reach[1] + sideways)
-    return bool(inside and box.box_from_rig.rotation[2] @ axis > np.cos(np.deg2rad(_ALIKE_DEG)))
+    return bool(inside and box.box_from_rig.rotation[2] @ axis > np.cos(np.deg2rad(ALIKE_DEG)))
 
 
 def _bars(plates: Sequence[Box], modules: Sequence[Box], options: HolderOptions) -> list[Box]:

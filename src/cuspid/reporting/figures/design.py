@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from scipy.spatial import ConvexHull
 
@@ -63,7 +64,7 @@ def save_design_picture(
         panel.set_title(name, loc="left", fontsize=11, color=_INK)
     figure.text(0.02, 0.955, title or handpiece.name, fontsize=15, color=_INK, va="center", fontweight="bold")
     figure.text(0.02, 0.90, "   ".join(notes), fontsize=10.5, color=_INK, va="center")
-    figure.legend(handles=_legend(handpiece), loc="lower center", ncols=6, frameon=False, fontsize=10)
+    draw_legend(figure, handpiece)
     save_figure(figure, path)
 
 
@@ -75,13 +76,13 @@ def _draw_view(
     outline: Float[np.ndarray, "n 2"] | None,
 ) -> None:
     if mesh is not None:
-        _draw_mesh(panel, axes, mesh)
+        draw_mesh(panel, axes, mesh)
     if outline is not None:
         _draw_holder(panel, axes, handpiece, outline)
     if handpiece.body is not None:
         _draw_body(panel, axes, handpiece.body)
     for name, mounted in handpiece.rig.cameras.items():
-        _draw_camera(panel, axes, mounted, handpiece.working_distance_mm, _colour(name))
+        draw_camera(panel, axes, mounted, handpiece.working_distance_mm, colour_of(name))
     if handpiece.lights:
         lights = np.array([light.position_mm for light in handpiece.lights.values()]) @ axes.T
         panel.plot(lights[:, 0], lights[:, 1], "o", color=_LIGHT, markeredgecolor=_INK, markeredgewidth=0.6, ms=5)
@@ -89,11 +90,12 @@ def _draw_view(
     panel.autoscale_view()
     panel.margins(0.03)
     panel.set_axis_off()
-    _draw_scale(panel)
+    draw_scale(panel)
 
 
-def _draw_mesh(panel: Axes, axes: Float[np.ndarray, "3 3"], mesh: Mesh) -> None:
-    view = render(mesh, axes, width_px=420)
+def draw_mesh(panel: Axes, axes: Float[np.ndarray, "3 3"], mesh: Mesh, *, width_px: int = 420) -> None:
+    """A shaded picture of it, in its place."""
+    view = render(mesh, axes, width_px=width_px)
     seen = mesh.vertices @ axes.T
     # The picture is centred on the mesh across, and begins a margin above it.
     low, high = seen.min(axis=0), seen.max(axis=0)
@@ -135,7 +137,7 @@ def _turns(outline: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
     return np.sum(before * after, axis=1) < np.cos(np.deg2rad(5)) * lengths
 
 
-def _draw_camera(
+def draw_camera(
     panel: Axes, axes: Float[np.ndarray, "3 3"], mounted: MountedCamera, distance_mm: float, colour: str
 ) -> None:
     """A square for the camera, and the pyramid of its view up to the working distance."""
@@ -152,7 +154,7 @@ def _draw_camera(
     panel.add_collection(PolyCollection([body[:, :2]], facecolors=colour, edgecolors=_INK, linewidths=0.8, zorder=4))
 
 
-def _draw_scale(panel: Axes) -> None:
+def draw_scale(panel: Axes) -> None:
     """A bar of 5 mm in the lower left corner."""
     left, bottom = panel.get_xlim()[0], panel.get_ylim()[0]
     panel.plot([left, left + 5], [bottom, bottom], color=_INK, linewidth=2, solid_capstyle="butt")
@@ -161,15 +163,21 @@ def _draw_scale(panel: Axes) -> None:
     )
 
 
-def _colour(name: str) -> str:
+def colour_of(name: str) -> str:
+    """Of a camera, by the first letter of its name."""
     return GROUP_COLOURS.get(name[:1], _OTHER)
+
+
+def draw_legend(figure: Figure, handpiece: Handpiece) -> None:
+    """Below all views."""
+    figure.legend(handles=_legend(handpiece), loc="lower center", ncols=6, frameon=False, fontsize=10)
 
 
 def _legend(handpiece: Handpiece) -> list[Line2D]:
     names = {"o": "occlusal cameras", "b": "buccal cameras", "l": "lingual cameras"}
     present = dict.fromkeys(name[:1] if name[:1] in names else "" for name in handpiece.rig.names)
     marks = [
-        Line2D([], [], marker="s", color="none", markerfacecolor=_colour(letter), label=names.get(letter, "cameras"))
+        Line2D([], [], marker="s", color="none", markerfacecolor=colour_of(letter), label=names.get(letter, "cameras"))
         for letter in present
     ]
     marks += [Line2D([], [], color=_INK, linewidth=0.7, label="their views up to the working distance")]
