@@ -16,11 +16,11 @@ from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.motion import MotionOptions, locate
 from cuspid.motion.features import DESCRIPTOR_NORM, Features
-from cuspid.motion.location import _loose_notes, locate_features, stereo_ties
+from cuspid.motion.location import _advice, _loose_notes, locate_features, stereo_ties
 from cuspid.motion.odometry import Edge, OdometryOptions, chain, polish, triangulate_frame
 from cuspid.motion.pairs import MatchingOptions, index_features
 from cuspid.pairing import stereo_pairs
-from cuspid.reconstruction import Reconstruction, Tracks
+from cuspid.reconstruction import Expectation, Reconstruction, Tracks
 from cuspid.rig import Handpiece, MountedCamera, Rig
 
 SIGMA_PX = 0.2
@@ -376,3 +376,29 @@ def test_what_single_cameras_tie_is_told():
     (note,) = _loose_notes(Reconstruction(rig=rig, rig_from_world=poses, tracks=tracks), 15)
     assert "tie frames 00001 and 00002 (0): the parts" in note
     assert _loose_notes(Reconstruction(rig=rig, rig_from_world=poses, tracks=tracks), 0) == ()
+
+
+@pytest.mark.parametrize(
+    ("scale_ppm", "span_um", "told"),
+    [(100, 8.0, []), (2000, 110.0, ["the scale is known"]), (100, 40.0, ["apart from the scale"])],
+)
+def test_what_would_tell_more_is_said_where_it_is_loosely_known(
+    scale_ppm: float, span_um: float, told: list[str]
+) -> None:
+    """Over 55 mm: a scale that the calibration leaves open, and a path that may be bent."""
+    expected = Expectation(
+        points=np.zeros((1, 3)),
+        covariance=np.zeros((1, 3, 3)),
+        scale_sigma_ppm=float(scale_ppm),
+        span_mm=55.0,
+        span_sigma_um=span_um,
+    )
+    found = Reconstruction(
+        rig=Rig({"a": MountedCamera(CAMERA, Rigid3.identity())}),
+        rig_from_world={"0": Rigid3.identity()},
+        expectation=expected,
+    )
+    notes = list(_advice(found))
+    assert len(notes) == len(told)
+    assert all(words in note for words, note in zip(told, notes, strict=True))
+    assert not list(_advice(replace(found, expectation=None)))

@@ -38,6 +38,9 @@ from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import Handpiece, Rig
 from cuspid.workers import map_in_threads
 
+_LOOSE_SCALE_PPM, _LOOSE_SPAN_PPM = 1000.0, 300.0
+"""Standard deviations of the scale and, apart from it, of the length of a scan, beyond which there is advice."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class MotionOptions(Options):
@@ -281,7 +284,7 @@ def locate_features(
         poses=list(trajectory.rig_from_world.values()),
     )
     adjusted = _adjusted(start, scan, options, log, progress)
-    notes = (*adjusted.notes, *_loose_notes(adjusted, options.odometry.minimum_matches))
+    notes = (*adjusted.notes, *_loose_notes(adjusted, options.odometry.minimum_matches), *_advice(adjusted))
     return replace(adjusted.with_cameras_as(given), log={**log, **adjusted.log}, notes=notes)
 
 
@@ -298,6 +301,25 @@ def _loose_notes(found: Reconstruction, least: int) -> tuple[str, ...]:
         f"motion: fewer than {least} points seen in stereo on both sides tie frames {', '.join(loose[:5])}"
         f"{', ...' if len(loose) > 5 else ''}: the parts of the scan may be displaced; scan there again, slower",
     )
+
+
+def _advice(found: Reconstruction) -> Iterator[str]:
+    """What would tell the scale or the shape of the path better, where they are loosely known."""
+    expected = found.expectation
+    if expected is None:
+        return
+    if expected.scale_sigma_ppm > _LOOSE_SCALE_PPM:
+        yield (
+            f"expected: the scale is known within {expected.scale_sigma_ppm / 1e4:.2g} % only (one sigma), for the "
+            "calibration leaves it open; calibrate the handpiece with a board (cuspid calibrate)"
+        )
+    by_scale_um = expected.scale_sigma_ppm * expected.span_mm / 1000
+    bent_um = float(np.sqrt(max(expected.span_sigma_um**2 - by_scale_um**2, 0.0)))
+    if 1000 * bent_um > _LOOSE_SPAN_PPM * expected.span_mm:
+        yield (
+            f"expected: apart from the scale, the {expected.span_mm:.0f} mm from end to end are known within "
+            f"{bent_um:.0f} um only (one sigma); a sweep straight from one end to the other, as over the palate, helps"
+        )
 
 
 def stereo_ties(tracks: Tracks, frames: int) -> Int[np.ndarray, "k"]:
