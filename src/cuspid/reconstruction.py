@@ -97,7 +97,7 @@ class Expectation:
     """Of each, mm^2, once all of them are fitted onto the truth by a rigid motion, as an evaluation does. The error of
     the keypoints of the point itself is not in it."""
     scale_sigma_ppm: float
-    """Standard deviation of the scale."""
+    """Standard deviation of the scale; a surface that lies too far out everywhere is not in it."""
     span_mm: float
     """Length of the scan along its longest axis, between the middles of its two ends."""
     span_sigma_um: float

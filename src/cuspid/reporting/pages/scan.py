@@ -215,8 +215,8 @@ def _expected_tiles(found: Reconstruction) -> list[tuple[str, str, str]]:
     if found.refinement is not None:
         tiles.append(("calibration refined by, RMS", f"{found.refinement.rms_sigmas:.2f}", "σ"))
     if found.expectation is not None:
-        tiles.append(("expected scale error (one σ)", f"±{found.expectation.scale_sigma_ppm:.0f}", "ppm"))
-        span = f"expected error of {found.expectation.span_mm:.0f} mm from end to end (one σ)"
+        tiles.append(("scale by poses and calibration, one σ", f"±{found.expectation.scale_sigma_ppm:.0f}", "ppm"))
+        span = f"{found.expectation.span_mm:.0f} mm from end to end by them, one σ"
         tiles.append((span, f"±{found.expectation.span_sigma_um:.1f}", "µm"))
     return tiles
 
