@@ -268,8 +268,8 @@ def _print_expected(expected: Expectation, sigma_um: Float[np.ndarray, "v"]) -> 
     middle, most = np.percentile(sigma_um, [50, 95])
     console.print(
         f"expected (one sigma): surface within {middle:.1f} µm (median; {most:.1f} for 95 % of it); by poses and "
-        f"calibration, scale within {expected.scale_sigma_ppm:.0f} ppm and the {expected.span_mm:.0f} mm from end to end "
-        f"within {expected.span_sigma_um:.1f} µm"
+        f"calibration, scale within {expected.scale_sigma_ppm:.0f} ppm and the {expected.span_mm:.0f} mm from end to "
+        f"end within {expected.span_sigma_um:.1f} µm"
     )
 
 
