@@ -53,7 +53,7 @@ def import_(
     given = {"handpiece": storage.hash_file(handpiece)} | ({} if table is None else {"times": storage.hash_file(table)})
     settings = {"import": options, "development": development, "working_distance_mm": working_distance_mm}
     with show_progress() as progress:
-        with storage.claimed_folder(out, "footage", {}, hashes):
+        with storage.claimed_folder(out, "footage", {}, hashes, replace=True):
             looks = survey(films, out, development, progress)
             plan = plan_import(films, looks, known, options, taken)
         with storage.claimed_folder(out, "import", settings, {**hashes, **given}):
@@ -71,10 +71,10 @@ def _rows(plan: Plan, films: Films, looks: Mapping[str, Looks]) -> list[dict[str
             "frame": frame,
             "camera": camera,
             "source": films[camera].name(number),
-            "time_s": None if np.isnan(looks[camera].time_s[number]) else float(looks[camera].time_s[number]),
-            "level_dn": round(float(looks[camera].level_dn[number]), 2),
-            "sharpness": round(float(looks[camera].sharpness[number]), 4),
-            "change_dn": round(float(looks[camera].change_dn[number]), 3),
+            "time_s": _known(plan.times_s[camera][number], 6),
+            "level_dn": _known(looks[camera].level_dn[number], 2),
+            "sharpness": _known(looks[camera].sharpness[number], 4),
+            "change_dn": _known(looks[camera].change_dn[number], 3),
             "left_out": reasons.get((frame, camera)),
         }
         for frame, numbers in plan.numbers.items()
@@ -100,6 +100,10 @@ def _figures(plan: Plan, films: Films, looks: Mapping[str, Looks], options: Impo
         "left_out": [{"frame": each.frame, "camera": each.camera, "reason": each.reason} for each in plan.bad],
         "notes": plan.notes,
     }
+
+
+def _known(value: float, digits: int) -> float | None:
+    return round(float(value), digits) if np.isfinite(value) else None
 
 
 def _median(values: np.ndarray) -> float:

@@ -93,6 +93,8 @@ class Plan:
     """For each frame by name, and each camera that has an image of it, used or not, its number in the film."""
     bad: tuple[Bad, ...]
     """Images of these frames that are of no use."""
+    times_s: Mapping[str, Float[np.ndarray, "_"]]
+    """For each camera when its frames were taken by its own clock; NaN where that is not known."""
     starts_frames: Mapping[str, int] | None
     """How many frames after the first camera each began, where that was found."""
     apart_ms: Float[np.ndarray, "f"] | None
@@ -116,16 +118,16 @@ def plan_import(
         *_sync_notes(every, looks, times_s, clock, options.sync),
         *_depth_notes(looks),
     ]
-    together = [k for k, instant in enumerate(every) if options.sync.sync == "none" or _is_shared(instant, films)]
-    if len(together) < len(every):
-        notes.append(f"{len(every) - len(together)} of {len(every)} instants were seen by one camera alone; left out")
-    chosen = _selected(together, clock, options.selection)
+    is_kept = [options.sync.sync == "none" or len(films) == 1 or len(instant.numbers) > 1 for instant in every]
+    notes += _alone([instant for instant, kept in zip(every, is_kept, strict=True) if not kept])
+    chosen = _selected(np.flatnonzero(is_kept).tolist(), clock, options.selection)
     wrong = {camera: faults(each, options.quality) for camera, each in looks.items()}
     frames, bad = _judged([every[k] for k in chosen], [_time(clock, k) for k in chosen], wrong, handpiece)
     return Plan(
         frames=frames,
         numbers={every[k].name: every[k].numbers for k in chosen},
         bad=bad,
+        times_s=times_s,
         starts_frames=starts,
         apart_ms=None if clock is None or options.sync.sync == "none" else 1000 * clock.apart_s[chosen],
         notes=tuple(notes),
@@ -201,10 +203,6 @@ def _names(films: Films, counts: Mapping[str, int]) -> dict[str, list[str]]:
     return names
 
 
-def _is_shared(instant: Instant, films: Films) -> bool:
-    return len(instant.numbers) > 1 or len(films) == 1
-
-
 def _selected(instants: Sequence[int], clock: Clock | None, options: SelectionOptions) -> list[int]:
     """Those of the instants that are asked for. Raises InputError where none is, or times are not known."""
     if options.start_s is None and options.end_s is None:
@@ -264,6 +262,15 @@ def _film_notes(films: Films, looks: Mapping[str, Looks], handpiece: Handpiece) 
             yield f"{film.source.name}: {missing}"
     if len(set(counts.values())) > 1:
         yield f"the films have not one length: {', '.join(f'{name} {count}' for name, count in counts.items())} frames"
+
+
+def _alone(instants: Sequence[Instant]) -> Iterator[str]:
+    """Images that no other camera has one with."""
+    if instants:
+        counts = Counter(camera for instant in instants for camera in instant.numbers)
+        (camera, number), *_ = instants[0].numbers.items()
+        each = ", ".join(f"{name} {count}" for name, count in sorted(counts.items()))
+        yield f"{len(instants)} images without one of another camera are left out ({each}; first: {camera} {number})"
 
 
 def _depth_notes(looks: Mapping[str, Looks]) -> Iterator[str]:
