@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Annotated
@@ -22,6 +23,7 @@ from cuspid.footage.synchronise import (
     by_names,
     by_starts,
     by_times,
+    flash_of,
     flash_starts,
     jumps_in,
     motion_starts,
@@ -98,7 +100,7 @@ class Plan:
     starts_frames: Mapping[str, int] | None
     """How many frames after the first camera each began, where that was found."""
     apart_ms: Float[np.ndarray, "f"] | None
-    """How far the images of each frame are apart in time, where times are known."""
+    """How far the images of each frame are apart in time, where they were synchronised by that."""
     notes: tuple[str, ...]
     """What was found, one line each."""
 
@@ -129,7 +131,7 @@ def plan_import(
         bad=bad,
         times_s=times_s,
         starts_frames=starts,
-        apart_ms=None if clock is None or options.sync.sync == "none" else 1000 * clock.apart_s[chosen],
+        apart_ms=1000 * clock.apart_s[chosen] if clock is not None and options.sync.sync == "times" else None,
         notes=tuple(notes),
     )
 
@@ -297,7 +299,9 @@ def _sync_notes(
     if clock is not None and options.sync != "times":
         _require_one_rate(instants, clock)
     if options.sync != "motion":
-        yield from _doubts(instants, looks, options)
+        yield from _doubts_by_motion(instants, looks, options)
+    if options.sync != "flash":
+        yield from _doubts_by_flash(instants, looks, options)
 
 
 def _require_one_rate(instants: Sequence[Instant], clock: Clock) -> None:
@@ -310,7 +314,7 @@ def _require_one_rate(instants: Sequence[Instant], clock: Clock) -> None:
         )
 
 
-def _doubts(instants: Sequence[Instant], looks: Mapping[str, Looks], options: SyncOptions) -> Iterator[str]:
+def _doubts_by_motion(instants: Sequence[Instant], looks: Mapping[str, Looks], options: SyncOptions) -> Iterator[str]:
     """Cameras whose motion would fit together better if one had begun earlier or later."""
     for one, other in combinations(sorted(looks), 2):
         both = [instant.numbers for instant in instants if one in instant.numbers and other in instant.numbers]
@@ -322,3 +326,15 @@ def _doubts(instants: Sequence[Instant], looks: Mapping[str, Looks], options: Sy
                 f"by the motion in its images {later} is {abs(found.frames)} frames later than {earlier}, which "
                 f"--sync {options.sync} has together; look at both, or give --sync motion"
             )
+
+
+def _doubts_by_flash(instants: Sequence[Instant], looks: Mapping[str, Looks], options: SyncOptions) -> Iterator[str]:
+    """Cameras that saw a clear flash at other instants."""
+    seen: dict[str, int] = {}
+    for camera, each in sorted(looks.items()):
+        with suppress(InputError, StopIteration):
+            flash = flash_of(camera, each.level_dn, options)
+            seen[camera] = next(k for k, instant in enumerate(instants) if instant.numbers.get(camera) == flash)
+    if seen and max(seen.values()) - min(seen.values()) > 1:
+        places = ", ".join(f"{camera} {instants[k].name}" for camera, k in seen.items())
+        yield f"the cameras saw a flash at different frames ({places}); look at them, or give --sync flash"

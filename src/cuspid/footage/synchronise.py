@@ -207,30 +207,37 @@ def one_clock(instants: Sequence[Instant], times_s: Signals, *, is_set: bool) ->
 
 def flash_starts(brightness: Signals, options: SyncOptions) -> dict[str, int]:
     """When each camera started, from a flash that all saw. Raises InputError where one saw none, or several."""
-    flashes = {camera: _flash(camera, each, options) for camera, each in brightness.items()}
-    return _from_zero({camera: -at for camera, at in flashes.items()})
+    return _from_zero({camera: -flash_of(camera, each, options) for camera, each in brightness.items()})
 
 
-def _flash(camera: str, brightness: Float[np.ndarray, "_"], options: SyncOptions) -> int:
-    """The first frame that a flash is in."""
-    jumps = np.diff(_filled(brightness))
-    if len(jumps) < 5:
+def flash_of(camera: str, brightness: Float[np.ndarray, "_"], options: SyncOptions) -> int:
+    """The first frame that a flash is in. Raises InputError where there is none, or no clear one."""
+    if len(brightness) < 6:
         raise InputError(f"{camera}: {len(brightness)} frames are too few to find a flash in")
-    top = int(jumps.argmax())
-    usual = _spread(jumps)
-    if jumps[top] < max(_LEAST_DN, options.flash_sigmas * usual):
+    rises = _rises(_filled(brightness))
+    top = int(rises.argmax())
+    usual = _spread(np.diff(_filled(brightness)))
+    if rises[top] < max(_LEAST_DN, options.flash_sigmas * usual):
         raise InputError(
-            f"{camera}: no flash; its brightness jumps by {jumps[top]:.1f} of 255 at most (frame {top + 1}), and by "
-            f"{usual:.1f} usually; film one flash that all cameras see, or use another --sync"
+            f"{camera}: no flash; its brightness rises by {rises[top]:.1f} of 255 at most (frame {top}), and usually "
+            f"changes by {usual:.1f}; film one flash that all cameras see, or use another --sync"
         )
-    rest = jumps.copy()
+    rest = rises.copy()
     rest[max(0, top - 2) : top + 3] = -np.inf
-    if rest.max() > options.second_share * jumps[top]:
+    if rest.max() > options.second_share * rises[top]:
         raise InputError(
-            f"{camera}: not one clear flash; its brightness jumps at frame {top + 1} and about as much at frame "
-            f"{int(rest.argmax()) + 1}; cut the film, or use another --sync"
+            f"{camera}: not one clear flash; its brightness rises at frame {top} and about as much at frame "
+            f"{int(rest.argmax())}; cut the film, or use another --sync"
         )
-    return top if top and jumps[top - 1] > _RISE * jumps[top] else top + 1
+    return top - 1 if rises[top - 1] > _RISE * rises[top] else top
+
+
+def _rises(brightness: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """By how much each frame is brighter than the one before, and than was usual before: a dark frame ends in none."""
+    before = [
+        max(brightness[k - 1], np.median(brightness[max(0, k - _SLOW // 2) : k])) for k in range(1, len(brightness))
+    ]
+    return np.concatenate([[0.0], brightness[1:] - before])
 
 
 # --- by the motion in the images -----------------------------------------------------------------------------------
