@@ -279,6 +279,26 @@ def test_a_flash_that_is_not_clear_is_refused(wrong):
         flash_starts({"a": level}, OPTIONS)
 
 
+def test_a_flash_is_found_where_it_is_not_whole_or_the_light_stays_on_and_no_dark_frame_is_one():
+    """A rolling shutter has a part of it in the frame before; a dark frame ends as suddenly as a flash begins."""
+    level = 100 + np.random.default_rng(0).normal(0, 1.0, 80)
+    level[60] = 3
+    whole, part, stays = level.copy(), level.copy(), level.copy()
+    whole[20] += 80
+    part[[20, 21]] += (40, 80)
+    stays[20:] += 80
+    assert flash_starts({"whole": whole, "part": part, "stays": stays}, OPTIONS) == {"whole": 0, "part": 0, "stays": 0}
+
+
+def test_a_flash_that_contradicts_the_names_is_told(tmp_path, probe, capsys):
+    films = filmed({"left": 0, "right": 4}, count=20)
+    films["left"][12] = np.full_like(films["left"][12], 250)
+    films["right"][8] = np.full_like(films["right"][8], 250)
+    imported(write_films(tmp_path / "footage", films), probe)
+    said = " ".join(capsys.readouterr().err.split())
+    assert "saw a flash at different frames (left 00012, right 00008)" in said
+
+
 def test_names_are_in_the_order_of_their_numbers():
     instants = by_names({"a": ["f2", "f10", "f1"], "b": ["f10", "f3"]})
     assert [each.name for each in instants] == ["f1", "f2", "f3", "f10"]

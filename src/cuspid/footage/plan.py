@@ -38,6 +38,8 @@ FrameTimes = Mapping[str, Mapping[str, float]]
 """For each camera the time in s of its frames, by number or name."""
 Films = Mapping[str, Film]
 """By camera."""
+_ROUNDING_S = 1e-6
+"""Of times."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,7 +215,7 @@ def _selected(instants: Sequence[int], clock: Clock | None, options: SelectionOp
         raise InputError("the frames have no times, which --start-s and --end-s need; give --times, or leave them out")
     times = clock.times_s - np.nanmin(clock.times_s)
     start, end = options.start_s or 0.0, np.inf if options.end_s is None else options.end_s
-    chosen = [k for k in instants if start <= times[k] <= end]
+    chosen = [k for k in instants if start - _ROUNDING_S <= times[k] <= end + _ROUNDING_S]
     if not chosen:
         raise InputError(f"no frame lies between {start:g} and {end:g} s; the footage takes {np.nanmax(times):.2f} s")
     return chosen[:: options.every]
@@ -271,8 +273,8 @@ def _alone(instants: Sequence[Instant]) -> Iterator[str]:
     if instants:
         counts = Counter(camera for instant in instants for camera in instant.numbers)
         (camera, number), *_ = instants[0].numbers.items()
-        each = ", ".join(f"{name} {count}" for name, count in sorted(counts.items()))
-        yield f"{len(instants)} images without one of another camera are left out ({each}; first: {camera} {number})"
+        each = ", ".join(f"{count} of {name}" for name, count in sorted(counts.items()))
+        yield f"images that none of another camera goes with are left out: {each} (first: frame {number} of {camera})"
 
 
 def _depth_notes(looks: Mapping[str, Looks]) -> Iterator[str]:
