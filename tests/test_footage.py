@@ -221,7 +221,7 @@ def test_an_offset_is_found_whatever_the_cameras_see_of_the_motion(later, seed, 
     assert (back.frames, back.doubt) == (-later, None)
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), count=st.integers(5, 400))
 def test_noise_and_other_motion_are_no_offset(seed, count):
     rng = np.random.default_rng(seed)
@@ -515,6 +515,7 @@ def test_what_is_found_out_while_looking_is_one_clear_line(tmp_path, probe, caps
     assert "no image of 6 frames is of use: 18 dark" in line(footage, "--dark-below-dn", 255)
     folders = write_folders(tmp_path / "folders", films)
     assert "the frames have no times" in line(folders, "--end-s", 2)
+    assert "left: 0 of 6 frames have a time" in line(folders, "--sync", "times")
     for path in (folders / "right").iterdir():
         path.rename(path.with_stem(f"x{path.stem}"))
     assert "right: no image has the name of one of another camera" in line(folders)
