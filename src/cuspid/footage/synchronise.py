@@ -150,8 +150,8 @@ def _check_times(camera: str, times_s: Float[np.ndarray, "_"]) -> None:
     known = np.flatnonzero(np.isfinite(times_s))
     if len(known) < 2:
         raise InputError(
-            f"{camera}: {len(known)} of {len(times_s)} frames have a time, two at least are needed; give --times, or use "
-            "another --sync"
+            f"{camera}: {len(known)} of {len(times_s)} frames have a time, two at least are needed; give --times, "
+            "or use another --sync"
         )
     steps = np.diff(times_s[known])
     if (steps <= 0).any():
