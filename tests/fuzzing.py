@@ -253,6 +253,25 @@ def _photographs(folder: Path) -> None:
     photographs(folder / "photos", replace(whole, cameras=halved), Board(columns=6, rows=5, square_mm=3.0))
 
 
+def _footage(folder: Path) -> None:
+    """Films of two cameras in two kinds of videos, images of a third one, and when they were taken."""
+    verb("handpiece", "--design", "four", "--width-px", "96", "--height-px", "96", "--out", "@.")(folder)
+    names = storage.read_handpiece(folder / "handpiece.json").rig.names
+    images = [cv2.resize(picture(seed), (96, 96)) for seed in range(4)]
+    (folder / "footage").mkdir()
+    for name, kind, code in ((names[0], "avi", "MJPG"), (names[1], "mp4", "mp4v")):
+        film = cv2.VideoWriter(
+            str(folder / "footage" / f"{name}.{kind}"), cv2.VideoWriter.fourcc(*code), 25.0, (96, 96)
+        )
+        for image in images:
+            film.write(image)
+        film.release()
+    write_frames(folder / "footage" / names[2], images)
+    rows = [f"{name},{number},{number / 25}" for name in names[:2] for number in range(4)]
+    rows += [f"{names[2]},{number:03d},{number / 25 + 0.002}" for number in range(4)]
+    (folder / "footage" / "times.csv").write_text("\n".join(["camera,frame,time", *rows]))
+
+
 def _score(folder: Path) -> None:
     known = known_film(small_jaw())
     write_truth(known, folder)
@@ -288,6 +307,10 @@ SCENARIOS: Mapping[str, Scenario] = {
     "calibrate": Scenario(
         _photographs,
         verb("calibrate", "@photos", "--columns", "6", "--rows", "5", "--square-mm", "3", "--out", f"@{_OUT}"),
+    ),
+    "import": Scenario(
+        _footage,
+        verb("import", "@footage", "--handpiece", "@handpiece.json", "--sync", "times", "--out", f"@{_OUT}"),
     ),
     "stitch": Scenario(_film, verb("stitch", "@film/capture/images/camera", "--out", f"@{_OUT}")),
     "stitch-eval": Scenario(_score, verb("stitch-eval", "@panorama", "@truth", "--out", f"@{_OUT}")),

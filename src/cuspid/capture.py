@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import UInt8, UInt16
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from cuspid.errors import InputError
@@ -36,14 +36,23 @@ def read_rgba(path: Path) -> UInt8[np.ndarray, "h w 4"]:
     return _decoded(path, "RGBA")
 
 
-def _decoded(path: Path, mode: Literal["RGB", "RGBA"]) -> UInt8[np.ndarray, "h w c"]:
+def read_deep(path: Path) -> UInt8[np.ndarray, "h w *c"] | UInt16[np.ndarray, "h w *c"]:
+    """As :func:`read_image`, but grey as (h, w), of 8 or 16 bits as it is stored."""
+    return _decoded(path, None)
+
+
+def _decoded(
+    path: Path, mode: Literal["RGB", "RGBA"] | None
+) -> UInt8[np.ndarray, "h w *c"] | UInt16[np.ndarray, "h w"]:
     image_size(path)
     try:
         with Image.open(path) as image:
             upright = ImageOps.exif_transpose(image)
+            if mode is None and (upright.mode == "L" or upright.mode.startswith("I;16")):
+                return np.asarray(upright).astype(np.uint8 if upright.mode == "L" else np.uint16)
             if upright.mode.startswith("I;16"):
                 upright = Image.fromarray((np.asarray(upright) >> 8).astype(np.uint8))
-            return np.asarray(upright.convert(mode))
+            return np.asarray(upright.convert(mode or "RGB"))
     except Exception as error:  # as in image_size
         raise InputError(f"{path}: cannot be decoded ({one_line(error)}); copy the image again") from error
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import wraps
 from importlib import import_module
 from inspect import signature
+from keyword import iskeyword
 from typing import Any, get_type_hints
 
 import tyro
@@ -31,7 +32,8 @@ class _Verbs(Mapping[str, Callable[..., Any]]):
         self._modules = modules
 
     def __getitem__(self, verb: str) -> Callable[..., Any]:
-        return getattr(import_module(f"cuspid.cli.{self._modules[verb]}"), verb.replace("-", "_"))
+        name = verb.replace("-", "_")
+        return getattr(import_module(f"cuspid.cli.{self._modules[verb]}"), f"{name}_" if iskeyword(name) else name)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._modules)
@@ -54,6 +56,7 @@ COMMANDS: Mapping[str, Callable[..., Any]] = _Verbs(
         "target": "calibration",
         "photograph": "calibration",
         "calibrate": "calibration",
+        "import": "footage",
         "optics": "forecasts",
         "visibility": "forecasts",
         "precision": "forecasts",

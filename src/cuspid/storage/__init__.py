@@ -22,6 +22,7 @@ from cuspid.storage.files import (
     write_bytes,
     write_json,
 )
+from cuspid.storage.frame_times import TIMES_FILES, read_frame_times
 from cuspid.storage.handpieces import read_handpiece, read_rig_config, write_handpiece, write_rig_config
 from cuspid.storage.jaws import is_jaw, read_jaw, read_labelled_mesh, write_jaw
 from cuspid.storage.landmarks import MARKUPS_SUFFIX, LandmarkFile, LandmarkFrame, read_landmarks, write_landmarks
@@ -54,7 +55,7 @@ from cuspid.storage.results import (
     StudyResult,
     read_result,
 )
-from cuspid.storage.sequences import hash_source, read_sequence, rig_sources
+from cuspid.storage.sequences import hash_source, images_in, read_sequence, rig_sources
 from cuspid.storage.shapes import read_shape_model, write_shape_model
 from cuspid.storage.tables import csv_table, write_table
 from cuspid.storage.trueness import trueness_summary, write_trueness
@@ -68,6 +69,7 @@ __all__ = [
     "MM_PER_UNIT",
     "PART",
     "SIGMA",
+    "TIMES_FILES",
     "LandmarkFile",
     "LandmarkFrame",
     "MeshFile",
@@ -84,9 +86,11 @@ __all__ = [
     "hash_capture",
     "hash_file",
     "hash_source",
+    "images_in",
     "is_jaw",
     "read_capture",
     "read_depth_maps",
+    "read_frame_times",
     "read_handpiece",
     "read_jaw",
     "read_json",

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import UInt8, UInt16
 
 from cuspid.capture import Capture, Dropped, Frame, ImageFolder
 from cuspid.errors import InputError, OutputError
@@ -27,8 +27,8 @@ def write_capture(folder: Path, capture: Capture) -> None:
     write_json(folder / "capture.json", {"frames": capture.frames})
 
 
-def write_image(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Write an RGB image as PNG, whole or not at all."""
+def write_image(path: Path, image: UInt8[np.ndarray, "h w 3"] | UInt16[np.ndarray, "h w 3"]) -> None:
+    """Write an RGB image as PNG of its depth, whole or not at all."""
     ok, encoded = cv2.imencode(path.suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not ok:
         raise OutputError(f"{path}: the image could not be encoded")

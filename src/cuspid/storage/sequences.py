@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections import Counter
 from dataclasses import replace
@@ -21,14 +20,15 @@ from cuspid.rig import Handpiece, Rig
 from cuspid.storage.captures import IMAGE_SUFFIXES, read_capture, write_image
 from cuspid.storage.files import digest_of, finished, hash_file, read_json, reading
 from cuspid.storage.handpieces import camera_from_colmap, camera_from_json, read_handpiece, read_rig_config
+from cuspid.storage.videos import VIDEO_SUFFIXES, read_video, video_length
 from cuspid.values import checked_name
 
-VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm")
 LEAST_PX = 32
 """Side of a frame that shows something."""
 MOST_FRAMES = 300
 """A longer video is thinned evenly to about as many frames."""
 
+_NUMBERS = re.compile(r"(\D*)(\d*)")
 _DEEPEST = 32
 _STEPS = re.compile(r"</|<(?=\w)|[\[\]{}]")
 _DASHES = re.compile(rf"(?:-[ \t]+){{{_DEEPEST}}}|^[ \t]{{{10 * _DEEPEST}}}", re.MULTILINE)
@@ -75,12 +75,22 @@ def hash_source(source: Path) -> str:
     """SHA-256 of a video, or of the images of a folder and their names."""
     if source.is_file():
         return hash_file(source)
-    images = sorted(path for path in finished(source) if path.suffix.lower() in IMAGE_SUFFIXES)
-    return digest_of({path.name: hash_file(path) for path in images})
+    return digest_of({path.name: hash_file(path) for path in sorted(images_in(source))})
+
+
+def images_in(folder: Path) -> list[Path]:
+    """The images of a folder, in the order of the numbers in their names."""
+    images = [path for path in finished(folder) if path.suffix.lower() in IMAGE_SUFFIXES]
+    return sorted(images, key=lambda path: name_order(path.name))
+
+
+def name_order(name: str) -> list[tuple[str, int]]:
+    """What names are sorted by: ``2`` comes before ``10``."""
+    return [(text, int(digits or 0)) for text, digits in _NUMBERS.findall(name)]
 
 
 def _of_folder(folder: Path) -> ImageSequence:
-    paths = sorted(path for path in finished(folder) if path.suffix.lower() in IMAGE_SUFFIXES)
+    paths = images_in(folder)
     return ImageSequence(source=folder, paths=tuple(paths), size=_common_size(folder, paths))
 
 
@@ -115,28 +125,22 @@ def _common_size(folder: Path, paths: list[Path]) -> tuple[int, int]:
 
 
 def _of_video(video: Path, decoded: Path, progress: Progress) -> ImageSequence:
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    stream = cv2.VideoCapture(str(video))
-    announced = int(stream.get(cv2.CAP_PROP_FRAME_COUNT))
-    step = max(1, -(-announced // MOST_FRAMES))
-    paths, number = [], 0
-    while stream.grab():
-        if number % step == 0:
-            path = decoded / f"{number:05d}.png"
-            ok, image = stream.retrieve()
-            if not ok:
-                break
+    length = video_length(video)
+    step = max(1, -(-length.frames // MOST_FRAMES))
+    paths, number, time_s = [], 0, None
+    for frame in read_video(video):
+        if frame.number % step == 0:
+            path = decoded / f"{frame.number:05d}.png"
             if not path.exists():
-                write_image(path, cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+                write_image(path, frame.rgb())
             paths.append(path)
-        number += 1
-        progress("decoding", number, max(announced, number))
-    stream.release()
+        number, time_s = frame.number + 1, frame.time_s
+        progress("decoding", number, max(length.frames, number))
     if len(paths) < 2:
         raise InputError(f"{video}: {len(paths)} frame(s) could be decoded; not a video, truncated, or of one frame")
     notes = []
-    if number < announced - 1:
-        notes.append(f"{video.name}: truncated, {number} of {announced} frames could be decoded; the rest is missing")
+    if missing := length.missing(number, time_s):
+        notes.append(f"{video.name}: {missing}")
     if step > 1:
         notes.append(f"{video.name}: {number} frames; every {step}th is used")
     return ImageSequence(source=video, paths=tuple(paths), size=_common_size(decoded, paths), notes=tuple(notes))

@@ -1,0 +1,132 @@
+"""The film of a camera: a folder of images or a video, developed frame by frame."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Literal
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8, UInt16
+
+from cuspid.capture import image_size, read_deep
+from cuspid.errors import InputError
+from cuspid.options import Options, Range
+from cuspid.storage.sequences import hash_source, images_in
+from cuspid.storage.videos import VideoFrame, VideoLength, read_video, video_length
+
+Image = UInt8[np.ndarray, "h w *c"] | UInt16[np.ndarray, "h w *c"]
+"""Grey or RGB."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DevelopmentOptions(Options):
+    """How images are made of what the sensor gave."""
+
+    bayer: Literal["none", "RGGB", "BGGR", "GRBG", "GBRG"] = "none"
+    """Colours of the first four pixels (two rows) of images that are not demosaiced yet."""
+    bits: Annotated[int | None, Range(9, 16)] = None
+    """How many bits the values of 16-bit images really have; 16 unless given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Film:
+    """What one camera recorded."""
+
+    camera: str
+    """Its name."""
+    source: Path
+    """A folder of images, or a video."""
+    images: tuple[Path, ...]
+    """The images of a folder, in their order; none of a video."""
+    length: VideoLength
+    """How many frames there should be."""
+    digest: str
+    """SHA-256 of all of it."""
+
+    @property
+    def is_video(self) -> bool:
+        """Whether it is one file."""
+        return not self.images
+
+    def name(self, number: int) -> str:
+        """Of a frame: of its image file, or its number in the video."""
+        return f"{number:05d}" if self.is_video else self.images[number].stem
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FilmFrame:
+    """A frame of a film."""
+
+    number: int
+    """From 0, in the order of the film."""
+    time_s: float | None
+    """When it was shown, or None where the film does not say."""
+    where: str
+    """For messages."""
+    stored: Callable[[], Image]
+    """Reads what is stored: grey or RGB. Raises InputError where it is damaged."""
+    png: Path | None = None
+    """The file that it is, where that is a PNG."""
+
+
+def open_film(camera: str, source: Path) -> Film:
+    """The film of a camera. Raises InputError where it has no frame."""
+    images = tuple(images_in(source)) if source.is_dir() else ()
+    if source.is_dir() and not images:
+        raise InputError(f"{source}: no images in it; camera {camera} needs some, or a video")
+    stems = Counter(path.stem for path in images)
+    if images and max(stems.values()) > 1:
+        raise InputError(f"{source}: two images are named {stems.most_common(1)[0][0]}; each needs a name of its own")
+    if not images and next(read_video(source), None) is None:
+        raise InputError(f"{source}: no frame of it can be decoded; not a video, or truncated: copy it again")
+    length = VideoLength(frames=len(images), is_counted=True, seconds=0.0) if images else video_length(source)
+    return Film(camera=camera, source=source, images=images, length=length, digest=hash_source(source))
+
+
+def sizes_of(film: Film) -> Iterator[tuple[str, tuple[int, int]]]:
+    """Where an image lies and its width and height, as far as can be told at a glance: of a video the first one."""
+    for path in film.images:
+        try:
+            yield str(path), image_size(path)
+        except InputError:  # it is found to be damaged when it is looked at
+            continue
+    if film.is_video:
+        yield str(film.source), next(read_video(film.source)).size
+
+
+def frames_of(film: Film, options: DevelopmentOptions) -> Iterator[FilmFrame]:
+    """The frames of a film that there are, in their order."""
+    if film.is_video:
+        for frame in read_video(film.source):
+            where = f"{film.source}: frame {frame.number}"
+            read = partial(_of_video, frame, where, is_grey=options.bayer != "none")
+            yield FilmFrame(number=frame.number, time_s=frame.time_s, where=where, stored=read)
+    for number, path in enumerate(film.images):
+        png = path if path.suffix == ".png" else None
+        yield FilmFrame(number=number, time_s=None, where=str(path), stored=partial(read_deep, path), png=png)
+
+
+def _of_video(frame: VideoFrame, where: str, *, is_grey: bool) -> Image:
+    if frame.damaged:
+        raise InputError(f"{where}: damaged; copy the video again")
+    return frame.grey() if is_grey else frame.rgb()
+
+
+def developed(stored: Image, options: DevelopmentOptions, where: str) -> Image:
+    """The image of what is stored: colours made, values of the full range. Raises InputError where it cannot be."""
+    if options.bits is not None and stored.dtype == np.uint16:
+        if stored.max() >> options.bits:
+            raise InputError(
+                f"{where}: has values of {int(stored.max())}, more than {options.bits} bits; correct --bits"
+            )
+        stored = stored << (16 - options.bits)
+    if options.bayer == "none":
+        return stored
+    if stored.ndim != 2:
+        raise InputError(f"{where}: has colours already; --bayer is for images of one channel")
+    return cv2.cvtColor(stored, getattr(cv2, f"COLOR_Bayer{options.bayer}2RGB"))

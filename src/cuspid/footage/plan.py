@@ -1,0 +1,342 @@
+"""Which images of the films make which frame of the capture, and what is left out and why."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float
+
+from cuspid.capture import Dropped, Frame
+from cuspid.errors import InputError
+from cuspid.footage.films import Film
+from cuspid.footage.quality import Looks, QualityOptions, faults
+from cuspid.footage.synchronise import (
+    Clock,
+    Instant,
+    SyncOptions,
+    by_names,
+    by_starts,
+    by_times,
+    flash_of,
+    flash_starts,
+    jumps_in,
+    motion_starts,
+    offset_between,
+    one_by_one,
+    one_clock,
+)
+from cuspid.options import Options, Range
+from cuspid.rig import Handpiece
+
+FrameTimes = Mapping[str, Mapping[str, float]]
+"""For each camera the time in s of its frames, by number or name."""
+Films = Mapping[str, Film]
+"""By camera."""
+_ROUNDING_S = 1e-6
+"""Of times."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelectionOptions(Options):
+    """Which part of the footage is taken."""
+
+    every: Annotated[int, Range(1, 100_000)] = 1
+    """Only every so manyth frame."""
+    start_s: Annotated[float | None, Range(0, 1e6)] = None
+    """From so long after the first frame."""
+    end_s: Annotated[float | None, Range(0, 1e6)] = None
+    """Until so long after the first frame."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportOptions:
+    """Which images of footage become a capture."""
+
+    sync: SyncOptions = field(default_factory=SyncOptions)
+    """How the cameras are synchronised."""
+    quality: QualityOptions = field(default_factory=QualityOptions)
+    """Which images are left out."""
+    selection: SelectionOptions = field(default_factory=SelectionOptions)
+    """Which part of the footage is taken."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bad:
+    """An image that is of no use."""
+
+    frame: str
+    """Name of the frame of the capture."""
+    camera: str
+    """That took it."""
+    reason: str
+    """Kind and figure, as ``dark: 95 % of it is below 9 of 255``."""
+
+    @property
+    def kind(self) -> str:
+        """Of the reason, a word."""
+        return self.reason.partition(":")[0]
+
+    def dropped(self) -> Dropped:
+        """As a capture has it."""
+        return Dropped(what=f"camera {self.camera} of frame {self.frame}", reason=self.reason)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Plan:
+    """What is to be made of footage."""
+
+    frames: tuple[Frame, ...]
+    """Of the capture, with the cameras whose images are of use."""
+    numbers: Mapping[str, Mapping[str, int]]
+    """For each frame by name, and each camera that has an image of it, used or not, its number in the film."""
+    bad: tuple[Bad, ...]
+    """Images of these frames that are of no use."""
+    times_s: Mapping[str, Float[np.ndarray, "_"]]
+    """For each camera when its frames were taken by its own clock; NaN where that is not known."""
+    starts_frames: Mapping[str, int] | None
+    """How many frames after the first camera each began, where that was found."""
+    apart_ms: Float[np.ndarray, "f"] | None
+    """How far the images of each frame are apart in time, where they were synchronised by that."""
+    notes: tuple[str, ...]
+    """What was found, one line each."""
+
+
+def plan_import(
+    films: Films, looks: Mapping[str, Looks], handpiece: Handpiece, options: ImportOptions, times: FrameTimes | None
+) -> Plan:
+    """Synchronise and choose. Raises InputError where that cannot be trusted, or nothing of use is left."""
+    times_s = {
+        camera: each.time_s if times is None else _times_of(films[camera], len(each.time_s), times.get(camera, {}))
+        for camera, each in looks.items()
+    }
+    every, starts = _instants(films, looks, times_s, options.sync)
+    clock = one_clock(every, times_s, is_set=options.sync.sync == "times")
+    notes = [
+        *_film_notes(films, looks, handpiece),
+        *_sync_notes(every, looks, times_s, clock, options.sync),
+        *_depth_notes(looks),
+    ]
+    is_kept = [options.sync.sync == "none" or len(films) == 1 or len(instant.numbers) > 1 for instant in every]
+    notes += _alone([instant for instant, kept in zip(every, is_kept, strict=True) if not kept])
+    chosen = _selected(np.flatnonzero(is_kept).tolist(), clock, options.selection)
+    wrong = {camera: faults(each, options.quality) for camera, each in looks.items()}
+    frames, bad = _judged([every[k] for k in chosen], [_time(clock, k) for k in chosen], wrong, handpiece)
+    return Plan(
+        frames=frames,
+        numbers={every[k].name: every[k].numbers for k in chosen},
+        bad=bad,
+        times_s=times_s,
+        starts_frames=starts,
+        apart_ms=1000 * clock.apart_s[chosen] if clock is not None and options.sync.sync == "times" else None,
+        notes=tuple(notes),
+    )
+
+
+# --- times -----------------------------------------------------------------------------------------------------------
+
+
+def _times_of(film: Film, count: int, said: Mapping[str, float]) -> Float[np.ndarray, "_"]:
+    """The time of each frame, from a table that names frames by image or by number, of the film or of a longer one."""
+    numbers = {film.name(k): k for k in range(count)}
+    if not set(said) <= set(numbers):
+        numbers = _by_number(film, count, said)
+    found = np.full(count, np.nan)
+    found[[numbers[frame] for frame in said]] = list(said.values())
+    return found
+
+
+def _by_number(film: Film, count: int, said: Mapping[str, float]) -> dict[str, int]:
+    if all(frame.isascii() and frame.isdigit() for frame in said):
+        ordered = sorted(said, key=int)
+        if int(ordered[-1]) < count:
+            return {frame: int(frame) for frame in ordered}
+        if len(ordered) == count:
+            return {frame: k for k, frame in enumerate(ordered)}
+    raise InputError(
+        f"the table of times has {len(said)} frames of {film.camera}, {min(said)} to {max(said)}, but {film.source} "
+        f"has {count} frames and other numbers; give the table that belongs to the films"
+    )
+
+
+def _time(clock: Clock | None, instant: int) -> float | None:
+    """Of an instant, where it is known."""
+    if clock is None or not np.isfinite(clock.times_s[instant]):
+        return None
+    return float(clock.times_s[instant])
+
+
+# --- instants --------------------------------------------------------------------------------------------------------
+
+
+def _instants(
+    films: Films, looks: Mapping[str, Looks], times_s: Mapping[str, np.ndarray], options: SyncOptions
+) -> tuple[tuple[Instant, ...], dict[str, int] | None]:
+    """The instants, and where it was found when each camera began."""
+    counts = {camera: len(each.level_dn) for camera, each in looks.items()}
+    if options.sync == "none":
+        return one_by_one(counts, times_s), None
+    if options.sync == "times":
+        return by_times(times_s, options), None
+    if options.sync == "names" or len(films) == 1:
+        return by_names(_names(films, counts)), None
+    starts = (
+        flash_starts({camera: each.level_dn for camera, each in looks.items()}, options)
+        if options.sync == "flash"
+        else motion_starts({camera: each.change_dn for camera, each in looks.items()}, options)
+    )
+    return by_starts(starts, counts), starts
+
+
+def _names(films: Films, counts: Mapping[str, int]) -> dict[str, list[str]]:
+    if len({film.is_video for film in films.values()}) > 1:
+        raise InputError("folders and videos have no names in common; give --sync times, flash or motion")
+    names = {camera: [film.name(k) for k in range(counts[camera])] for camera, film in films.items()}
+    shared = Counter(name for each in names.values() for name in each)
+    for camera, each in names.items():
+        if len(films) > 1 and all(shared[name] == 1 for name in each):
+            raise InputError(
+                f"{films[camera].source}: no image has the name of one of another camera (its first is {each[0]}); "
+                "name alike what was taken at once, or give --sync times, flash, motion or none"
+            )
+    return names
+
+
+def _selected(instants: Sequence[int], clock: Clock | None, options: SelectionOptions) -> list[int]:
+    """Those of the instants that are asked for. Raises InputError where none is, or times are not known."""
+    if options.start_s is None and options.end_s is None:
+        return list(instants[:: options.every])
+    if clock is None:
+        raise InputError("the frames have no times, which --start-s and --end-s need; give --times, or leave them out")
+    times = clock.times_s - np.nanmin(clock.times_s)
+    start, end = options.start_s or 0.0, np.inf if options.end_s is None else options.end_s
+    chosen = [k for k in instants if start - _ROUNDING_S <= times[k] <= end + _ROUNDING_S]
+    if not chosen:
+        raise InputError(f"no frame lies between {start:g} and {end:g} s; the footage takes {np.nanmax(times):.2f} s")
+    return chosen[:: options.every]
+
+
+# --- judging ---------------------------------------------------------------------------------------------------------
+
+
+def _judged(
+    instants: Sequence[Instant],
+    times_s: Sequence[float | None],
+    wrong: Mapping[str, Mapping[int, str]],
+    handpiece: Handpiece,
+) -> tuple[tuple[Frame, ...], tuple[Bad, ...]]:
+    """The frames with their good images, and the bad ones. Raises InputError where nothing good is left."""
+    lighting = handpiece.lightings[0].name if len(handpiece.lightings) == 1 else None
+    frames, found = [], []
+    for instant, time_s in zip(instants, times_s, strict=True):
+        bad = {camera: wrong[camera][k] for camera, k in instant.numbers.items() if k in wrong[camera]}
+        good = tuple(camera for camera in handpiece.rig.names if camera in instant.numbers and camera not in bad)
+        found += [Bad(frame=instant.name, camera=camera, reason=bad[camera]) for camera in sorted(bad)]
+        if good:
+            frames.append(Frame(name=instant.name, cameras=good, lighting=lighting, time_s=time_s))
+    if not frames:
+        kinds = ", ".join(f"{count} {kind}" for kind, count in kinds_of(found).items())
+        raise InputError(
+            f"no image of {len(instants)} frames is of use: {kinds}; look at them, and at --blurred-below, "
+            "--dark-below-dn, --burnt-above, --same-below-dn and --bits"
+        )
+    return tuple(frames), tuple(found)
+
+
+def kinds_of(bad: Sequence[Bad]) -> dict[str, int]:
+    """How many images are of no use for which kind of reason, the most frequent first."""
+    return dict(Counter(each.kind for each in bad).most_common())
+
+
+# --- notes -----------------------------------------------------------------------------------------------------------
+
+
+def _film_notes(films: Films, looks: Mapping[str, Looks], handpiece: Handpiece) -> Iterator[str]:
+    for camera in handpiece.rig.names:
+        if camera not in films:
+            yield f"camera {camera} has no footage; the capture is without it"
+    counts = {camera: len(each.level_dn) for camera, each in looks.items()}
+    for camera, film in films.items():
+        if missing := film.length.missing(counts[camera], float(looks[camera].time_s[-1])):
+            yield f"{film.source.name}: {missing}"
+    if len(set(counts.values())) > 1:
+        yield f"the films have not one length: {', '.join(f'{name} {count}' for name, count in counts.items())} frames"
+
+
+def _alone(instants: Sequence[Instant]) -> Iterator[str]:
+    """Images that no other camera has one with."""
+    if instants:
+        counts = Counter(camera for instant in instants for camera in instant.numbers)
+        (camera, number), *_ = instants[0].numbers.items()
+        each = ", ".join(f"{count} of {name}" for name, count in sorted(counts.items()))
+        yield f"images that none of another camera goes with are left out: {each} (first: frame {number} of {camera})"
+
+
+def _depth_notes(looks: Mapping[str, Looks]) -> Iterator[str]:
+    for camera, each in looks.items():
+        peak = float(np.nanmax(each.peak, initial=0.0))
+        if 0 < peak < 1 << 14:
+            bits = max(9, int(peak).bit_length())
+            yield f"{camera}: 16-bit images with values below {1 << bits}; where that is white, give --bits {bits}"
+
+
+def _sync_notes(
+    instants: Sequence[Instant],
+    looks: Mapping[str, Looks],
+    times_s: Mapping[str, np.ndarray],
+    clock: Clock | None,
+    options: SyncOptions,
+) -> Iterator[str]:
+    """Raises InputError where the times of the films contradict what was taken for at once."""
+    for camera, times in times_s.items():
+        if jumps := jumps_in(times):
+            yield f"{camera}: frames are missing, time jumps before frame {jumps[0]} and at {len(jumps)} places in all"
+    if options.sync == "none" or len(looks) == 1:
+        return
+    if clock is not None and options.sync != "times":
+        _require_one_rate(instants, clock)
+    if options.sync != "motion":
+        yield from _doubts_by_motion(instants, looks, options)
+    if options.sync != "flash":
+        yield from _doubts_by_flash(instants, looks, options)
+
+
+def _require_one_rate(instants: Sequence[Instant], clock: Clock) -> None:
+    worst = int(np.nanargmax(clock.apart_s))
+    if clock.apart_s[worst] > clock.interval_s / 2:
+        raise InputError(
+            f"by their times the images of frame {instants[worst].name} are {1000 * clock.apart_s[worst]:.0f} ms apart "
+            f"(a frame takes {1000 * clock.interval_s:.0f} ms): frames were dropped, or the rates differ; "
+            "give --sync times"
+        )
+
+
+def _doubts_by_motion(instants: Sequence[Instant], looks: Mapping[str, Looks], options: SyncOptions) -> Iterator[str]:
+    """Cameras whose motion would fit together better if one had begun earlier or later."""
+    for one, other in combinations(sorted(looks), 2):
+        both = [instant.numbers for instant in instants if one in instant.numbers and other in instant.numbers]
+        signals = [looks[camera].change_dn[[numbers[camera] for numbers in both]] for camera in (one, other)]
+        found = offset_between(signals[0], signals[1], options)
+        if found.doubt is None and abs(found.frames) > 1:
+            later, earlier = (other, one) if found.frames > 0 else (one, other)
+            yield (
+                f"by the motion in its images {later} is {abs(found.frames)} frames later than {earlier}, which "
+                f"--sync {options.sync} has together; look at both, or give --sync motion"
+            )
+
+
+def _doubts_by_flash(instants: Sequence[Instant], looks: Mapping[str, Looks], options: SyncOptions) -> Iterator[str]:
+    """Cameras that saw a clear flash at other instants."""
+    seen: dict[str, int] = {}
+    for camera, each in sorted(looks.items()):
+        with suppress(InputError, StopIteration):
+            flash = flash_of(camera, each.level_dn, options)
+            seen[camera] = next(k for k, instant in enumerate(instants) if instant.numbers.get(camera) == flash)
+    if seen and max(seen.values()) - min(seen.values()) > 1:
+        places = ", ".join(f"{camera} {instants[k].name}" for camera, k in seen.items())
+        yield f"the cameras saw a flash at different frames ({places}); look at them, or give --sync flash"

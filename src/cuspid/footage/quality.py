@@ -1,0 +1,111 @@
+"""Which images are of use: not blurred, dark, burnt, damaged, or the one before once more."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8, UInt16
+from scipy.ndimage import median_filter
+
+from cuspid.options import SHARE, Options, Range
+
+_LOOKED_AT_PX = 640
+"""Longer side of what is judged; noise is less in a smaller image, blur that matters is not."""
+_BURNT_DN = 250
+"""Of 255."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class QualityOptions(Options):
+    """Which images are left out."""
+
+    blurred_below: Annotated[float, SHARE] = 0.4
+    """Of the usual sharpness of the frames about it (0: none is)."""
+    dark_below_dn: Annotated[float, Range(0, 255)] = 20.0
+    """Grey value of 255 that the brightest twentieth of an image reaches (0: none is)."""
+    burnt_above: Annotated[float, SHARE] = 0.3
+    """Share of an image that is white (1: none is)."""
+    same_below_dn: Annotated[float, Range(0, 255)] = 0.1
+    """Mean difference from the frame before, of 255 (0: none is the same)."""
+    window_frames: Annotated[int, Range(3, 1001)] = 51
+    """How many frames say what is usual."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Looks:
+    """What each frame of a camera looks like; NaN where it could not be read."""
+
+    time_s: Float[np.ndarray, "n"]
+    """When it was taken; NaN where the file does not say."""
+    level_dn: Float[np.ndarray, "n"]
+    """Mean grey value of 255."""
+    bright_dn: Float[np.ndarray, "n"]
+    """Grey value that a twentieth of the image exceeds."""
+    burnt: Float[np.ndarray, "n"]
+    """Share of white pixels."""
+    sharpness: Float[np.ndarray, "n"]
+    """Standard deviation of the Laplacian over the mean grey value."""
+    change_dn: Float[np.ndarray, "n"]
+    """Mean difference from the frame before; NaN where there is none."""
+    peak: Float[np.ndarray, "n"]
+    """Largest value as it is stored."""
+
+    @property
+    def readable(self) -> Bool[np.ndarray, "n"]:
+        """Whether a frame could be read."""
+        return np.isfinite(self.level_dn)
+
+
+def seen(image: UInt8[np.ndarray, "h w *c"] | UInt16[np.ndarray, "h w *c"]) -> Float32[np.ndarray, "a b"]:
+    """An image, RGB or grey, as it is judged: grey values up to 255, small."""
+    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    scale = min(1.0, _LOOKED_AT_PX / max(grey.shape))
+    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey
+    return small.astype(np.float32) / (257 if grey.dtype == np.uint16 else 1)
+
+
+def look(
+    shown: Float32[np.ndarray, "a b"], before: Float32[np.ndarray, "a b"] | None
+) -> tuple[float, float, float, float, float]:
+    """Level, brightness, burnt share, sharpness and change of an image as :func:`seen`, as in :class:`Looks`."""
+    level = float(shown.mean())
+    edges = cv2.Laplacian(cv2.GaussianBlur(shown, (0, 0), 1.0), cv2.CV_32F)
+    change = float(np.abs(shown - before).mean()) if before is not None else np.nan
+    return (
+        level,
+        float(np.percentile(shown, 95)),
+        float((shown >= _BURNT_DN).mean()),
+        float(edges.std()) / max(level, 1.0),
+        change,
+    )
+
+
+def faults(looks: Looks, options: QualityOptions) -> dict[int, str]:
+    """What is wrong with the frames that are of no use, by their number."""
+    usual = _usual_sharpness(looks, options)
+    found = {}
+    for number in range(len(looks.level_dn)):
+        share = looks.sharpness[number] / usual[number] if usual[number] > 0 else 1.0
+        if not looks.readable[number]:
+            found[number] = "damaged: it cannot be read whole"
+        elif looks.bright_dn[number] < options.dark_below_dn:
+            found[number] = f"dark: 95 % of it is below {looks.bright_dn[number]:.0f} of 255"
+        elif looks.burnt[number] > options.burnt_above:
+            found[number] = f"burnt: {100 * looks.burnt[number]:.0f} % of it is white"
+        elif looks.change_dn[number] < options.same_below_dn:
+            found[number] = f"duplicate: {looks.change_dn[number]:.2f} of 255 from the frame before"
+        elif share < options.blurred_below:
+            found[number] = f"blurred: {share:.2f} of the sharpness of the frames about it"
+    return found
+
+
+def _usual_sharpness(looks: Looks, options: QualityOptions) -> Float[np.ndarray, "n"]:
+    """Running median over the frames that are neither dark nor burnt; 0 where there are none."""
+    use = looks.readable & (looks.bright_dn >= options.dark_below_dn) & (looks.burnt <= options.burnt_above)
+    usual = np.zeros(len(use))
+    if use.any():
+        usual[use] = median_filter(looks.sharpness[use], min(options.window_frames, int(use.sum())), mode="nearest")
+    return usual

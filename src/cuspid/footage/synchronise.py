@@ -1,0 +1,357 @@
+"""Which images of several cameras were taken at once, from their times or from what they saw.
+
+An instant is numbered from the first frame of the camera that began first; a camera *starts* at the instant of its
+first frame. Frames of a camera are numbered from 0. Nothing here depends on the order of the cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import median_filter
+from scipy.signal import correlate
+
+from cuspid.errors import InputError
+from cuspid.options import SHARE, Options, Range
+from cuspid.storage.sequences import name_order
+
+Sync = Literal["names", "times", "flash", "motion", "none"]
+Signals = Mapping[str, Float[np.ndarray, "_"]]
+"""A number for each frame of each camera; NaN where there is none."""
+
+_SLOW = 31
+"""Frames; what changes more slowly than that is no sign of one moment."""
+_RISE = 0.25
+"""Of the largest jump; the frame before it has a part of the flash where it jumped by more than that."""
+_LEAST_DN = 4.0
+"""No flash is weaker."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SyncOptions(Options):
+    """How the cameras are synchronised, and when that is to be trusted."""
+
+    sync: Sync = "names"
+    """What was taken at once: images of one name and video frames of one number (names), of about one time (times), as
+    far from a flash that all cameras saw (flash) or as the motion in the images says (motion); or nothing (none)."""
+    apart_share: Annotated[float, Range(0.01, 0.5)] = 0.25
+    """Of the time between frames; images that are farther apart were not taken at once (times)."""
+    flash_sigmas: Annotated[float, Range(3, 1000)] = 10.0
+    """By how many standard deviations of the usual changes of brightness a flash stands out."""
+    motion_sigmas: Annotated[float, Range(3, 1000)] = 6.0
+    """By how many standard deviations of all other offsets the best one stands out."""
+    second_share: Annotated[float, SHARE] = 0.6
+    """A flash, or an offset, is clear where the second best reaches no more of it than this."""
+    overlap_share: Annotated[float, Range(0.1, 1)] = 0.5
+    """Of the shorter film that an offset leaves in common, at least (motion)."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Instant:
+    """Images that were taken at once."""
+
+    name: str
+    """Of the frame."""
+    numbers: Mapping[str, int]
+    """For each camera that has an image of it the number of its frame."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Offset:
+    """How much later one camera began than another, by the motion in their images."""
+
+    frames: int
+    """Frames; frame 0 of the later one is frame ``frames`` of the first one."""
+    correlation: float
+    """Of the changes of both cameras at this offset."""
+    sigmas: float
+    """By which it stands out from the other offsets."""
+    doubt: str | None
+    """Why it is not to be trusted."""
+
+
+# --- by name, number and time --------------------------------------------------------------------------------------
+
+
+def by_names(names: Mapping[str, Sequence[str]]) -> tuple[Instant, ...]:
+    """Images of one name, for each camera the names of its frames, in the order of the numbers in them."""
+    numbers = {camera: {name: k for k, name in enumerate(each)} for camera, each in names.items()}
+    every = sorted(set().union(*names.values()), key=name_order)
+    return tuple(
+        Instant(name=name, numbers={camera: each[name] for camera, each in numbers.items() if name in each})
+        for name in every
+    )
+
+
+def by_starts(starts: Mapping[str, int], counts: Mapping[str, int]) -> tuple[Instant, ...]:
+    """Frames of one instant, from the instant of each camera's first frame and its number of frames."""
+    last = max(starts[camera] + count for camera, count in counts.items())
+    running = [
+        {camera: k - start for camera, start in starts.items() if 0 <= k - start < counts[camera]} for k in range(last)
+    ]
+    return _numbered(running)
+
+
+def by_times(times_s: Signals, options: SyncOptions) -> tuple[Instant, ...]:
+    """Images that are no farther apart in time than a share of the time between frames.
+
+    From the earliest image on, each takes with it the next ones of other cameras; one without a time has no instant.
+    Raises InputError where times run backwards, or the times of a camera have nothing in common with the others'.
+    """
+    for camera, times in times_s.items():
+        _check_times(camera, times)
+    apart_s = options.apart_share * interval_s(times_s)
+    images = sorted(
+        (float(time), camera, number)
+        for camera, times in times_s.items()
+        for number, time in enumerate(times)
+        if np.isfinite(time)
+    )
+    groups: list[dict[str, int]] = []
+    since = -np.inf
+    for time, camera, number in images:
+        if time - since > apart_s or camera in groups[-1]:
+            groups.append({})
+            since = time
+        groups[-1][camera] = number
+    alone = [camera for camera in times_s if not any(camera in group and len(group) > 1 for group in groups)]
+    if alone and len(times_s) > 1:
+        spans = ", ".join(f"{name} {np.nanmin(each):.3f} to {np.nanmax(each):.3f} s" for name, each in times_s.items())
+        raise InputError(
+            f"no image of {alone[0]} was taken within {1000 * apart_s:.0f} ms of one of another camera ({spans}); "
+            "give times of one clock, or --sync flash or motion"
+        )
+    return _numbered(groups)
+
+
+def one_by_one(counts: Mapping[str, int], times_s: Signals) -> tuple[Instant, ...]:
+    """Each image for itself, in the order of their times where all have one, else camera by camera."""
+    images = [(camera, number) for camera, count in counts.items() for number in range(count)]
+    if all(np.isfinite(each).all() for each in times_s.values()):
+        images.sort(key=lambda image: float(times_s[image[0]][image[1]]))
+    return tuple(Instant(name=f"{camera}_{number:05d}", numbers={camera: number}) for camera, number in images)
+
+
+def _numbered(groups: Sequence[Mapping[str, int]]) -> tuple[Instant, ...]:
+    return tuple(Instant(name=f"{k:05d}", numbers=numbers) for k, numbers in enumerate(groups))
+
+
+def interval_s(times_s: Signals) -> float:
+    """The usual time between frames of the fastest camera."""
+    return min(float(np.median(np.diff(each[np.isfinite(each)]))) for each in times_s.values())
+
+
+def _check_times(camera: str, times_s: Float[np.ndarray, "_"]) -> None:
+    known = np.flatnonzero(np.isfinite(times_s))
+    if len(known) < 2:
+        raise InputError(
+            f"{camera}: {len(known)} of {len(times_s)} frames have a time, two at least are needed; give --times, "
+            "or use another --sync"
+        )
+    steps = np.diff(times_s[known])
+    if (steps <= 0).any():
+        at = int(np.argmax(steps <= 0))
+        raise InputError(
+            f"{camera}: time runs backwards, {times_s[known[at]]:.6g} s at frame {known[at]} and "
+            f"{times_s[known[at + 1]]:.6g} s at frame {known[at + 1]}; mend the times, or use another --sync"
+        )
+
+
+def jumps_in(times_s: Float[np.ndarray, "_"]) -> tuple[int, ...]:
+    """The frames before which more than half a frame's time is missing."""
+    known = np.flatnonzero(np.isfinite(times_s))
+    steps = np.diff(times_s[known]) / np.diff(known)
+    return tuple(known[1:][steps > 1.5 * np.median(steps)].tolist()) if len(steps) else ()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Clock:
+    """The cameras' times on one clock."""
+
+    times_s: Float[np.ndarray, "i"]
+    """Of the instants; NaN where no image has a time."""
+    apart_s: Float[np.ndarray, "i"]
+    """How far the images of each instant are from each other, once the clocks are set."""
+    interval_s: float
+    """The usual time between frames."""
+
+
+def one_clock(instants: Sequence[Instant], times_s: Signals, *, is_set: bool) -> Clock | None:
+    """The times of instants. Clocks of cameras are set by the median difference, unless they are already (``is_set``).
+
+    None where no camera, or not every one, has times.
+    """
+    if any(np.isfinite(each).sum() < 2 for each in times_s.values()):
+        return None
+    table = np.array(
+        [
+            [times[instant.numbers[camera]] if camera in instant.numbers else np.nan for instant in instants]
+            for camera, times in sorted(times_s.items())
+        ]
+    )
+    if not is_set:
+        most = table[np.argmax(np.isfinite(table).sum(axis=1))]
+        both = np.isfinite(table) & np.isfinite(most)
+        shifts = [np.median((row - most)[use]) if use.any() else 0.0 for row, use in zip(table, both, strict=True)]
+        table = table - np.array(shifts)[:, None]
+    known = np.isfinite(table)
+    first = np.where(known.any(axis=0), np.where(known, table, np.inf).min(axis=0), np.nan)
+    last = np.where(known.any(axis=0), np.where(known, table, -np.inf).max(axis=0), np.nan)
+    return Clock(times_s=first, apart_s=last - first, interval_s=interval_s(times_s))
+
+
+# --- by a flash ----------------------------------------------------------------------------------------------------
+
+
+def flash_starts(brightness: Signals, options: SyncOptions) -> dict[str, int]:
+    """When each camera started, from a flash that all saw. Raises InputError where one saw none, or several."""
+    return _from_zero({camera: -flash_of(camera, each, options) for camera, each in brightness.items()})
+
+
+def flash_of(camera: str, brightness: Float[np.ndarray, "_"], options: SyncOptions) -> int:
+    """The first frame that a flash is in. Raises InputError where there is none, or no clear one."""
+    if len(brightness) < 6:
+        raise InputError(f"{camera}: {len(brightness)} frames are too few to find a flash in")
+    rises = _rises(_filled(brightness))
+    top = int(rises.argmax())
+    usual = _spread(np.diff(_filled(brightness)))
+    if rises[top] < max(_LEAST_DN, options.flash_sigmas * usual):
+        raise InputError(
+            f"{camera}: no flash; its brightness rises by {rises[top]:.1f} of 255 at most (frame {top}), and usually "
+            f"changes by {usual:.1f}; film one flash that all cameras see, or use another --sync"
+        )
+    rest = rises.copy()
+    rest[max(0, top - 2) : top + 3] = -np.inf
+    if rest.max() > options.second_share * rises[top]:
+        raise InputError(
+            f"{camera}: not one clear flash; its brightness rises at frame {top} and about as much at frame "
+            f"{int(rest.argmax())}; cut the film, or use another --sync"
+        )
+    return top - 1 if rises[top - 1] > _RISE * rises[top] else top
+
+
+def _rises(brightness: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """By how much each frame is brighter than the one before, and than was usual before: a dark frame ends in none."""
+    before = [
+        max(brightness[k - 1], np.median(brightness[max(0, k - _SLOW // 2) : k])) for k in range(1, len(brightness))
+    ]
+    return np.concatenate([[0.0], brightness[1:] - before])
+
+
+# --- by the motion in the images -----------------------------------------------------------------------------------
+
+
+def motion_starts(motion: Signals, options: SyncOptions) -> dict[str, int]:
+    """When each camera started, from when the images of each change much and little.
+
+    Every two cameras are compared, and those offsets that can be trusted must agree. Raises InputError where a
+    camera's motion is like that of no other, or they do not agree.
+    """
+    offsets = {
+        pair: offset_between(motion[pair[0]], motion[pair[1]], options) for pair in combinations(sorted(motion), 2)
+    }
+    trusted = {pair: each for pair, each in offsets.items() if each.doubt is None}
+    starts = dict.fromkeys(sorted(motion)[:1], 0)
+    while joined := {pair: each for pair, each in trusted.items() if (pair[0] in starts) != (pair[1] in starts)}:
+        one, other = best = max(joined, key=lambda pair: joined[pair].sigmas)
+        if one in starts:
+            starts[other] = starts[one] + trusted[best].frames
+        else:
+            starts[one] = starts[other] - trusted[best].frames
+    for camera in sorted(motion):
+        if camera not in starts:
+            near = {pair: each for pair, each in offsets.items() if camera in pair}
+            pair = max(near, key=lambda pair: near[pair].sigmas)
+            raise InputError(
+                f"{camera}: no offset by motion can be trusted; the best, with {pair[pair[0] == camera]}: "
+                f"{near[pair].doubt}; use another --sync"
+            )
+    for (one, other), each in trusted.items():
+        if abs(starts[other] - starts[one] - each.frames) > 1:
+            raise InputError(
+                f"{one} and {other}: by motion {each.frames} frames apart, but "
+                f"{starts[other] - starts[one]} over the other cameras; use another --sync"
+            )
+    return _from_zero(starts)
+
+
+def offset_between(one: Float[np.ndarray, "m"], other: Float[np.ndarray, "n"], options: SyncOptions) -> Offset:
+    """How much later the other camera began, by the correlation of what changes quickly in both signals."""
+    first, second = _quick(one), _quick(other)
+    offsets, found, overlaps = _correlations(first, second)
+    usable = overlaps >= max(2 * _SLOW, options.overlap_share * min(len(one), len(other)))
+    if usable.sum() < _SLOW:
+        return Offset(frames=0, correlation=0.0, sigmas=0.0, doubt=f"{min(len(one), len(other))} frames are too few")
+    heights = np.where(usable, found * np.sqrt(overlaps), -np.inf)
+    best = int(heights.argmax())
+    far = usable & (np.abs(offsets - offsets[best]) > 3)
+    usual = _spread(heights[far])
+    sigmas = float(heights[best] / usual) if usual > 0 else 0.0
+    second_best = int(np.where(far, heights, -np.inf).argmax())
+    frames = int(offsets[best])
+    doubt: str | None
+    if sigmas < options.motion_sigmas:
+        doubt = f"{frames} frames stands out by {sigmas:.1f} standard deviations"
+    elif heights[second_best] > options.second_share * heights[best]:
+        doubt = f"{offsets[second_best]} frames is about as good as {frames}"
+    else:
+        doubt = _disagreement(first, second, frames)
+    return Offset(frames=frames, correlation=float(found[best]), sigmas=sigmas, doubt=doubt)
+
+
+def _disagreement(one: Float[np.ndarray, "m"], other: Float[np.ndarray, "n"], frames: int) -> str | None:
+    """Whether the two halves of what both saw want other offsets, as where cameras have other rates."""
+    start, end = max(0, frames), min(len(one), len(other) + frames)
+    middle = (start + end) // 2
+    halves = []
+    for part in (slice(start, middle), slice(middle, end)):
+        offsets, found, overlaps = _correlations(one[part], other[part.start - frames : part.stop - frames])
+        heights = np.where(np.abs(offsets) <= _SLOW, found * np.sqrt(overlaps), -np.inf)
+        halves.append(frames + int(offsets[heights.argmax()]))
+    if max(abs(each - frames) for each in halves) <= 1:
+        return None
+    return f"{halves[0]} frames in its first half and {halves[1]} in its second; the rates may differ"
+
+
+def _correlations(
+    one: Float[np.ndarray, "m"], other: Float[np.ndarray, "n"]
+) -> tuple[np.ndarray, Float[np.ndarray, "o"], Float[np.ndarray, "o"]]:
+    """Each offset, the correlation at it, and how many frames of both there are."""
+    known = np.isfinite(one), np.isfinite(other)
+    first, second = np.where(known[0], one, 0.0), np.where(known[1], other, 0.0)
+    products = correlate(first, second)
+    powers = correlate(first**2, 1.0 * known[1]), correlate(1.0 * known[0], second**2)
+    overlaps = np.rint(correlate(1.0 * known[0], 1.0 * known[1]))
+    power = np.sqrt(np.maximum(powers[0] * powers[1], 1e-12))
+    return np.arange(len(one) + len(other) - 1) - (len(other) - 1), products / power, overlaps
+
+
+def _quick(signal: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """What changes quickly, in its usual size; NaN where there was none."""
+    logs = np.log(_filled(signal) + 0.1)
+    quick = logs - median_filter(logs, _SLOW, mode="nearest")
+    scale = quick.std()
+    return np.where(np.isfinite(signal), quick / scale if scale > 0 else np.nan, np.nan)
+
+
+def _filled(signal: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """With a straight line where there is nothing."""
+    known = np.flatnonzero(np.isfinite(signal))
+    if not len(known):
+        return np.zeros_like(signal)
+    return np.interp(np.arange(len(signal)), known, signal[known])
+
+
+def _spread(values: Float[np.ndarray, "n"]) -> float:
+    """Standard deviation, from the median of the deviations."""
+    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+
+
+def _from_zero(starts: Mapping[str, int]) -> dict[str, int]:
+    first = min(starts.values())
+    return {camera: start - first for camera, start in starts.items()}
