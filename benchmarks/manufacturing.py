@@ -63,16 +63,22 @@ def judge(*, tolerances: str, seed: int, jaw: Jaw, path: ScanPathOptions, pixels
 def scanned(how: str, capture: Capture, folder: Path, options: ReconstructionOptions) -> dict[str, Value]:
     """The figures of a scan, each with ``how`` before its name."""
     begin, begin_cpu = time.perf_counter(), time.process_time()
-    reconstruction, mesh = pipeline.reconstruct(capture, folder / how, options)
-    expected = reconstruction.expectation
+    reconstruction = pipeline.find_poses(capture, folder / how, options)
+    mesh, sigma_um = pipeline.surface(capture, reconstruction, folder / how, options)
     took, took_cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
     reference = pipeline.load_reference(folder / "truth")
     found = pipeline.evaluate(
-        mesh, reference.jaw, EvaluationOptions(), scannable=reference.scannable, crown=reference.crown
+        mesh,
+        reference.jaw,
+        EvaluationOptions(),
+        scannable=reference.scannable,
+        crown=reference.crown,
+        sigma_um=sigma_um,
     )
     trajectory = trajectory_error(
         reconstruction.rig_from_world, read_poses(folder / "truth" / "poses.json"), found.reference_from_scan
     )
+    expected, within = reconstruction.expectation, found.within_sigmas_pct
     figures: dict[str, Value] = {
         "mean_um": found.accuracy.mean_abs_um,
         "p95_um": found.accuracy.p95_um,
@@ -83,6 +89,9 @@ def scanned(how: str, capture: Capture, folder: Path, options: ReconstructionOpt
         "located": len(reconstruction.frames),
         "notes": "; ".join(reconstruction.notes),
         "scale_sigma_ppm": None if expected is None else expected.scale_sigma_ppm,
+        "span_sigma_um": None if expected is None else expected.span_sigma_um,
+        "within_sigma_pct": None if within is None else within["1"],
+        "within_2_sigmas_pct": None if within is None else within["2"],
         "reconstruction_s": took,
         "reconstruction_cpu_s": took_cpu,
     }
