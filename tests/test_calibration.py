@@ -13,7 +13,8 @@ from cuspid.calibration import bundle, calibrate
 from cuspid.calibration.bundle import BoardScene, adjust_board
 from cuspid.calibration.calibrate import RigCalibration, calibrate_rig
 from cuspid.calibration.corners import BoardView, find_corners
-from cuspid.calibration.start import first_camera
+from cuspid.calibration.start import board_pose, first_camera
+from cuspid.camera import Camera
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.rig import Rig
@@ -332,6 +333,16 @@ def test_boards_alone_are_placed_in_a_known_rig():
     assert all(np.array_equal(found.scene.cameras[n].parameters, truth.cameras[n].parameters) for n in truth.cameras)
     off = [(found.scene.rig_from_board[name] @ pose.inverse()).angle_deg for name, pose in truth.rig_from_board.items()]
     assert max(off) < 0.1
+
+
+def test_a_few_corners_almost_on_a_line_have_a_pose():
+    """Five in a row and one beside it, at which the method for planes gives up."""
+    board = Board(columns=9, rows=7, square_mm=0.7)
+    camera = Camera(width=250, height=250, focal_px=np.full(2, 207.3), principal_point_px=np.array([123.7, 126.3]))
+    pixels = [[81.6, 203.9], [105.1, 199.3], [130.3, 194.0], [156.1, 189.1], [191.6, 213.1], [183.7, 183.4]]
+    view = BoardView(np.array([7, 15, 23, 31, 38, 39]), np.array(pixels))
+    found = camera.project(board_pose(view, board, camera).apply(board.corners[view.corner]))
+    assert np.linalg.norm(found - view.pixels, axis=1).max() < 1
 
 
 def test_one_camera_begins_near_the_truth():

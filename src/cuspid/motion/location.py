@@ -313,6 +313,7 @@ def _advice(found: Reconstruction) -> Iterator[str]:
             f"expected: the scale is known within {expected.scale_sigma_ppm / 1e4:.2g} % only (one sigma), for the "
             "calibration leaves it open; calibrate the handpiece with a board (cuspid calibrate)"
         )
+        return
     by_scale_um = expected.scale_sigma_ppm * expected.span_mm / 1000
     bent_um = float(np.sqrt(max(expected.span_sigma_um**2 - by_scale_um**2, 0.0)))
     if 1000 * bent_um > _LOOSE_SPAN_PPM * expected.span_mm:
