@@ -238,7 +238,8 @@ def manufacturing(result: Result) -> str:
             "points and k1 of the built cameras: fine 3 um, 0.02 deg; usual 10 um, 0.05 deg, 0.3 %, 1 px, 0.01; rough "
             "30 um, 0.2 deg, and lenses as usual. *Held*: the file is taken as exact; *refined*: within these "
             "tolerances. Bars of the mean, refined: 3, 5 and 10 um. The last column is the share of the surface within "
-            "one and two of the standard deviations that the scan expects of itself. `python benchmarks/manufacturing.py`.",
+            "one and two of the standard deviations that the scan expects of itself. "
+            "`python benchmarks/manufacturing.py`.",
             "",
             markdown_table((*_BUILT, "within 1, 2 expected sigmas %"), rows),
         ]
