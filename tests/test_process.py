@@ -66,6 +66,22 @@ def test_a_name_of_a_file_steers_no_terminal(tmp_path: Path, capsys: pytest.Capt
     assert ("[/bold]" in line) == ("[/bold]" in name)
 
 
+@pytest.mark.parametrize("given", [None, "2"])
+def test_linear_algebra_starts_no_threads_unless_it_is_told_to(given: str | None) -> None:
+    """Those of the stages use the cores."""
+    code = (
+        "import sys; from cuspid.__main__ import main; sys.argv = ['cuspid', '--version']\n"
+        "try: main()\nexcept SystemExit: pass\n"
+        "import numpy as np; np.ones((500, 500)) @ np.ones((500, 500))\n"
+        "print(len(__import__('os').listdir('/proc/self/task')))"
+    )
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    if given is not None:
+        environment["OPENBLAS_NUM_THREADS"] = given
+    ended = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
+    assert (int(ended.stdout.split()[-1]) == 1) == (given is None)
+
+
 def test_out_may_not_be_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "out").write_text("mine")
     assert "is a file" in refused(capsys, "simulate", "--tooth", "46", "--out", tmp_path / "out")

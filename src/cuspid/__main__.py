@@ -5,6 +5,7 @@ It takes seconds to load. Ctrl-C ends it then without a word; what is loaded mig
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
@@ -25,6 +26,8 @@ def _signals_of_our_own() -> Iterator[None]:
 
 def main() -> None:
     """Load what the verb needs and run it; signals are the main thread's."""
+    # Our own threads use the cores; more of them for each small system only wait for each other on a busy machine.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if threading.current_thread() is threading.main_thread():
         with _signals_of_our_own():
             from cuspid import cli
