@@ -4,7 +4,8 @@ A corner X of the board is seen by camera c at instant i at ``project(c, cam_fro
 Unknowns and how a step changes them: of each camera (fx, fy, cx, cy, k1, k2, p1, p2) by addition, and its place by a
 small motion (rotation vector rad, translation mm) on the left of ``cam_from_rig``; the place of the board at each
 instant by one on the left of ``rig_from_board``; and three numbers of a board that is not quite flat: out of its plane
-by b1 u^2 + b2 u v + b3 v^2 mm at the distances u and v, in units of half its diagonal, from its middle.
+by b1 u^2 + b2 u v + b3 v^2 mm at the distances u and v, in units of half its diagonal, from its middle. One with
+terraces is a solid body and not bent.
 
 The rig is where the first camera is; for the covariance it is where the cameras are on the whole (inner constraints,
 Triggs et al. 2000, section 9.2), so that no camera counts as exact.
@@ -81,7 +82,7 @@ class _Observations:
     camera: Int[np.ndarray, "n"]
     instant: Int[np.ndarray, "n"]
     points: Float[np.ndarray, "n 3"]
-    """On the flat board, mm."""
+    """On the board that is not bent, mm."""
     basis: Float[np.ndarray, "n 3"]
     """What each number of the bending lifts them by."""
     pixels: Float[np.ndarray, "n 2"]
@@ -228,7 +229,8 @@ class _Free:
 
     @staticmethod
     def of(scene: BoardScene, board: Board, *, only_boards: bool) -> _Free:
-        """All but the place of the first camera, which is the rig; or the places of the board alone."""
+        """All but the place of the first camera, which is the rig, and the bending of a board with terraces; or the
+        places of the board alone."""
         cameras, instants = len(scene.cameras), len(scene.rig_from_board)
         first = (_INTRINSICS + _PLACE) * cameras
         if only_boards:
@@ -242,7 +244,9 @@ class _Free:
             ]
         )
         place = _INTRINSICS * cameras
-        columns = np.delete(np.arange(len(precision)), np.arange(place, place + _PLACE))
+        held = np.arange(place, place + _PLACE)
+        bending = np.arange(len(precision) - _BENDING, len(precision))
+        columns = np.setdiff1d(np.arange(len(precision)), held if board.terraces == 1 else [*held, *bending])
         return _Free(columns, precision[columns])
 
 

@@ -15,6 +15,7 @@ from cuspid import storage
 from cuspid.board import Board
 from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, calibrate_rig
 from cuspid.calibration.corners import BoardView, Views, find_corners
+from cuspid.calibration.target import PLATE_MM, target_body
 from cuspid.cli.shared import Flat, console, show_progress
 from cuspid.image_sequence import ImageSequence
 from cuspid.options import Range
@@ -27,14 +28,20 @@ from cuspid.workers import map_in_threads
 
 
 def target(*, out: Path, board: Annotated[Board, Flat] = Board()) -> None:
-    """Draw a ChArUco board or a chessboard in its true size, to print.
+    """Draw a ChArUco board or a chessboard in its true size, to print, or make the body that it is put on.
 
     Args:
-        out: PDF, SVG or PNG file.
+        out: PDF, SVG or PNG file for the pattern, of terraces a strip to be folded over the steps; STL file for the body.
     """
-    save_board(out, board)
     width, height = board.size_mm
-    console.print(f"{out}: {width:g} x {height:g} mm; measure the ruler on the print, and give its length over squares")
+    if out.suffix.lower() == ".stl":
+        storage.write_mesh(out, target_body(board))
+        size = f"{width:g} x {height:g} x {PLATE_MM + board.height_mm:g} mm"
+        console.print(f"{out}: {size}; measure the steps of the body, and give them")
+        return
+    save_board(out, board)
+    size = f"{width + board.height_mm:g} x {height:g} mm"
+    console.print(f"{out}: {size}; measure the ruler on the print, and give its length over squares")
 
 
 def photograph(

@@ -1,0 +1,38 @@
+"""The body that a board is put on: a plate, with a terrace over each of its runs of columns.
+
+Frame: ``body``: +X as the board's, +Y up its columns, +Z out of it, towards the cameras; the plate lies on Z = 0 and the
+origin is below the bottom left corner of the squares.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from manifold3d import CrossSection, Manifold
+
+from cuspid.board import Board
+from cuspid.errors import InputError
+from cuspid.mesh import Mesh
+
+PLATE_MM = 2.0
+"""Thickness of the body below the first terrace."""
+
+
+def target_body(board: Board) -> Mesh:
+    """One closed solid, as large as the squares, to be printed or milled.
+
+    Raises InputError where it would not stay closed in single precision, as files keep it.
+    """
+    solid = Manifold.extrude(CrossSection([_profile(board)]), board.size_mm[1]).rotate([90, 0, 0])
+    made = solid.translate([0, board.size_mm[1], 0]).to_mesh()
+    vertices = np.asarray(made.vert_properties, dtype=np.float64)[:, :3]
+    if len(np.unique(vertices, axis=0)) < 4 * (board.terraces + 1) or solid.volume() <= 0:
+        raise InputError("target: its steps vanish in single precision, as files keep it; make them or the squares larger")
+    return Mesh(vertices, np.asarray(made.tri_verts, dtype=np.int64))
+
+
+def _profile(board: Board) -> Float[np.ndarray, "n 2"]:
+    """Along X and up, counter-clockwise."""
+    edges, heights = board.edges_mm, PLATE_MM + board.step_mm * np.arange(board.terraces)
+    tops = np.stack([np.repeat(edges, 2)[1:-1], np.repeat(heights, 2)], axis=1)
+    return np.concatenate([[[0, 0], [edges[-1], 0]], tops[::-1]])
