@@ -79,8 +79,8 @@ def first_camera(views: Sequence[BoardView], board: Board, size: tuple[int, int]
 
 
 def board_pose(view: BoardView, board: Board, camera: Camera) -> Rigid3:
-    """``cam_from_board`` of one view (T. Collins, A. Bartoli, IJCV 109, 2014; where it is not flat G. Terzakis, M. Lourakis,
-    ECCV 2020).
+    """``cam_from_board`` of one view (T. Collins, A. Bartoli, IJCV 109, 2014; with terraces G. Terzakis, M. Lourakis, ECCV
+    2020).
 
     Raises InputError where there is none.
     """

@@ -1,6 +1,6 @@
 """The body that a board is put on: a plate, with a terrace over each of its runs of columns.
 
-Frame: ``body``: +X as the board's, +Y up its columns, +Z out of it, towards the cameras; the plate lies on Z = 0 and the
+Frame: ``body``: +X as the board's, +Y up its columns, +Z out of it, towards the cameras. The plate lies on Z = 0; the
 origin is below the bottom left corner of the squares.
 """
 
@@ -27,7 +27,7 @@ def target_body(board: Board) -> Mesh:
     made = solid.translate([0, board.size_mm[1], 0]).to_mesh()
     vertices = np.asarray(made.vert_properties, dtype=np.float64)[:, :3]
     if len(np.unique(vertices, axis=0)) < 4 * (board.terraces + 1) or solid.volume() <= 0:
-        raise InputError("target: its steps vanish in single precision, as files keep it; make them or the squares larger")
+        raise InputError("target: its steps vanish in single precision, as files keep it; make --step-mm larger")
     return Mesh(vertices, np.asarray(made.tri_verts, dtype=np.int64))
 
 

@@ -31,7 +31,7 @@ def target(*, out: Path, board: Annotated[Board, Flat] = Board()) -> None:
     """Draw a ChArUco board or a chessboard in its true size, to print, or make the body that it is put on.
 
     Args:
-        out: PDF, SVG or PNG file for the pattern, of terraces a strip to be folded over the steps; STL file for the body.
+        out: PDF, SVG or PNG file of the pattern, with terraces a strip to be folded over them; STL file of the body.
     """
     width, height = board.size_mm
     if out.suffix.lower() == ".stl":

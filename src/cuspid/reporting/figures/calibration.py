@@ -22,6 +22,8 @@ _MM_PER_INCH = 25.4
 _MARGIN_MM, _RULER_MM = 5.0, 7.0
 _GAP_MM, _FOLD_MM = 0.5, 3.5
 """Distances from the squares between which lines tell where to cut and to fold."""
+_CUT, _FOOT, _HEAD = (0.0, ()), (0.0, (4.0, 2.0)), (0.0, (1.0, 1.5))
+"""Dashes of these lines."""
 _INK = "#333333"
 _LONGEST = 0.1
 """Line of the largest residual, as a share of the width of an image."""
@@ -66,8 +68,8 @@ def _draw_folds(axes: Axes, board: Board, height: float) -> None:
     """Lines beside the strip, not on it, for cameras must not see them: whole where it is cut, dashed at the foot and
     dotted at the top of each riser."""
     edges, steps, width = board.edges_mm, board.step_mm * np.arange(board.terraces), board.size_mm[0] + board.height_mm
-    folds = {"--": edges[1:-1] + steps[:-1], ":": edges[1:-1] + steps[1:], "-": [0.0, width]}
-    for dashes, places in folds.items():
+    feet, heads = edges[1:-1] + steps[:-1], edges[1:-1] + steps[1:]
+    for dashes, places in ((_CUT, [0.0, width]), (_FOOT, feet), (_HEAD, heads)):
         for ends in (-_FOLD_MM, -_GAP_MM), (height + _GAP_MM, height + _FOLD_MM):
             axes.vlines(places, *ends, colors="black", linewidth=0.4, linestyles=dashes)
     for ends in (-_FOLD_MM, -_GAP_MM), (width + _GAP_MM, width + _FOLD_MM):
