@@ -4,8 +4,9 @@
                                  [--out benchmarks/results/targets.json]
 
 The six cameras, built within tolerances, another handpiece for each seed. Boards are shown tilted by up to 40 degrees,
-and by up to 15, where a probe leaves no room for more. Beside that the terraces are taken for higher than they are by
-10 um a step. Finished calibrations are kept in the work folder and not run again.
+and by up to 15, where a probe leaves no room for more. From the same images of terraces there are three calibrations:
+with steps that are known to 1 um (``known``), with steps that are 10 um off and known to as much (``off``), and with
+such steps that are trusted to 1 um (``trusted``). Finished calibrations are kept in the work folder and not run again.
 """
 
 from __future__ import annotations
@@ -41,12 +42,16 @@ TOLERANCES = ManufacturingOptions(
     manufacturing_centre_px=1.0,
     manufacturing_k1=0.01,
 )
-WRONG_MM = 0.01
-"""By which the steps are taken for higher than they are."""
+STEPS = {
+    "known": {"step_mm": 1.0, "step_sigma_um": 1.0},
+    "off": {"step_mm": 1.01, "step_sigma_um": 10.0},
+    "trusted": {"step_mm": 1.01, "step_sigma_um": 1.0},
+}
+"""What is said of steps of 1 mm."""
 
 
 def judge(*, board: str, tilt_deg: float, seed: int, instants: int, pixels: int) -> dict[str, Value]:
-    """The figures of one calibration, and of one with wrong steps."""
+    """The figures of one handpiece before one board."""
     true = built(
         six_cameras(DesignOptions(width_px=pixels, height_px=pixels)), replace(TOLERANCES, manufacturing_seed=seed)
     )
@@ -54,11 +59,12 @@ def judge(*, board: str, tilt_deg: float, seed: int, instants: int, pixels: int)
     with TemporaryDirectory(prefix="cuspid-target-") as folder:
         take_photographs(true, BOARDS[board], Path(folder), shown)
         views = views_in(Path(folder) / "images", BOARDS[board])
-    figures = errors(calibrated(views, true, BOARDS[board]), true.rig)
-    if board == "terraces":
-        wrong = replace(BOARDS[board], step_mm=BOARDS[board].step_mm + WRONG_MM)
-        figures |= {f"wrong_{name}": value for name, value in errors(calibrated(views, true, wrong), true.rig).items()}
-    return figures
+    said = {"flat": FLAT} if board == "flat" else {name: replace(BOARDS[board], **each) for name, each in STEPS.items()}
+    return {
+        f"{name}_{figure}": value
+        for name, each in said.items()
+        for figure, value in errors(calibrated(views, true, each), true.rig).items()
+    }
 
 
 def views_in(images: Path, board: Board) -> Views:
@@ -129,7 +135,13 @@ def main() -> None:
         progress=lambda stage, done, total: print(f"{stage}: {done} of {total}", flush=True),
     )
     found = {each.case.name: {**each.figures, "failure": each.failure} for each in outcomes}
-    options = {"instants": arguments.instants, "pixels": arguments.pixels, "tolerances": TOLERANCES, "boards": BOARDS}
+    options = {
+        "instants": arguments.instants,
+        "pixels": arguments.pixels,
+        "tolerances": TOLERANCES,
+        "boards": BOARDS,
+        "steps": STEPS,
+    }
     write_json(arguments.out, {**options, "calibrations": found, **conditions()})
 
 

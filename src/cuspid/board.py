@@ -49,6 +49,8 @@ class Board(Options):
     """Flat pieces of whole columns, each higher than the one before; 1 is a flat board."""
     step_mm: Annotated[float, Range(0.001, 10_000)] = 1.0
     """How much higher each terrace is, towards the cameras, as measured on the body."""
+    step_sigma_um: Annotated[float, Range(0.001, 10_000)] = 10.0
+    """How well that is known, of all steps alike (standard deviation)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -87,7 +89,7 @@ class Board(Options):
         return (self.terraces - 1) * self.step_mm
 
     @property
-    def edges_mm(self) -> Float[np.ndarray, "t+1"]:
+    def edges_mm(self) -> Float[np.ndarray, "n"]:
         """Where terraces begin along X, and where the last one ends."""
         return self.square_mm * -(-np.arange(self.terraces + 1) * self.columns // self.terraces)
 

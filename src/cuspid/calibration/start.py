@@ -79,18 +79,18 @@ def first_camera(views: Sequence[BoardView], board: Board, size: tuple[int, int]
 
 
 def board_pose(view: BoardView, board: Board, camera: Camera) -> Rigid3:
-    """``cam_from_board`` of one view (T. Collins, A. Bartoli, IJCV 109, 2014; with terraces G. Terzakis, M. Lourakis, ECCV
-    2020).
+    """``cam_from_board`` of one view (T. Collins, A. Bartoli, IJCV 109, 2014; with terraces, and where that
+    finds none, G. Terzakis, M. Lourakis, ECCV 2020).
 
     Raises InputError where there is none.
     """
     points, ideal = board.corners[view.corner], np.ascontiguousarray(camera.rays(view.pixels)[:, None, :2])
-    method = cv2.SOLVEPNP_IPPE if board.terraces == 1 else cv2.SOLVEPNP_SQPNP
-    _, turns, shifts, _ = cv2.solvePnPGeneric(points, ideal, np.eye(3), None, flags=method)
-    if not turns:
-        raise InputError("calibration: a view of the board that no pose explains")
-    turn, shift = cv2.solvePnPRefineLM(points, ideal, np.eye(3), None, turns[0], shifts[0])
-    return Rigid3.from_rotation_vector(turn.ravel(), shift.ravel())
+    for method in [cv2.SOLVEPNP_IPPE] * (board.terraces == 1) + [cv2.SOLVEPNP_SQPNP]:
+        _, turns, shifts, _ = cv2.solvePnPGeneric(points, ideal, np.eye(3), None, flags=method)
+        if turns:
+            turn, shift = cv2.solvePnPRefineLM(points, ideal, np.eye(3), None, turns[0], shifts[0])
+            return Rigid3.from_rotation_vector(turn.ravel(), shift.ravel())
+    raise InputError("calibration: a view of the board that no pose explains")
 
 
 def joined(

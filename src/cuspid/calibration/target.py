@@ -11,7 +11,6 @@ from jaxtyping import Float
 from manifold3d import CrossSection, Manifold
 
 from cuspid.board import Board
-from cuspid.errors import InputError
 from cuspid.mesh import Mesh
 
 PLATE_MM = 2.0
@@ -19,16 +18,10 @@ PLATE_MM = 2.0
 
 
 def target_body(board: Board) -> Mesh:
-    """One closed solid, as large as the squares, to be printed or milled.
-
-    Raises InputError where it would not stay closed in single precision, as files keep it.
-    """
-    solid = Manifold.extrude(CrossSection([_profile(board)]), board.size_mm[1]).rotate([90, 0, 0])
-    made = solid.translate([0, board.size_mm[1], 0]).to_mesh()
-    vertices = np.asarray(made.vert_properties, dtype=np.float64)[:, :3]
-    if len(np.unique(vertices, axis=0)) < 4 * (board.terraces + 1) or solid.volume() <= 0:
-        raise InputError("target: its steps vanish in single precision, as files keep it; make --step-mm larger")
-    return Mesh(vertices, np.asarray(made.tri_verts, dtype=np.int64))
+    """One closed solid, as large as the squares, to be printed or milled."""
+    solid = Manifold.extrude(CrossSection([_profile(board)]), board.size_mm[1])
+    made = solid.rotate([90, 0, 0]).translate([0, board.size_mm[1], 0]).to_mesh64()
+    return Mesh(np.asarray(made.vert_properties)[:, :3], np.asarray(made.tri_verts, dtype=np.int64))
 
 
 def _profile(board: Board) -> Float[np.ndarray, "n 2"]:

@@ -94,15 +94,15 @@ def calibrate(
     notes = (*(note for each in sequences.values() for note in each.notes), *found.notes)
     found = replace(found, notes=notes)
     with storage.claimed_folder(out, "calibrate", settings, hashes, replace=True):
-        _write(found, out, working_distance_mm)
+        _write(found, board, out, working_distance_mm)
     _print(found, out)
 
 
-def _write(found: RigCalibration, out: Path, working_distance_mm: float | None) -> None:
+def _write(found: RigCalibration, board: Board, out: Path, working_distance_mm: float | None) -> None:
     handpiece = _handpiece(found, working_distance_mm)
     storage.write_handpiece(out / "handpiece.json", handpiece)
     storage.write_rig_config(out / "rig_config.json", handpiece.rig)
-    storage.write_json(out / "calibration.json", _figures(found))
+    storage.write_json(out / "calibration.json", _figures(found, board))
     cameras = {name: mounted.camera for name, mounted in handpiece.rig.cameras.items()}
     save_residuals_picture(out / "residuals.png", cameras, found.pixels, found.residuals, title="residuals")
 
@@ -133,10 +133,11 @@ def _handpiece(found: RigCalibration, working_distance_mm: float | None) -> Hand
     )
 
 
-def _figures(found: RigCalibration) -> dict[str, object]:
+def _figures(found: RigCalibration, board: Board) -> dict[str, object]:
+    terraces = {"board_step_mm": board.step_mm + found.bending_mm[0]}
     return {
         "sigma_px": found.sigma_px,
-        "board_bending_mm": found.bending_mm,
+        **(terraces if board.terraces > 1 else {"board_bending_mm": found.bending_mm}),
         "board_distance_mm": found.distance_mm,
         "cameras": {name: asdict(each) for name, each in found.cameras.items()},
         "notes": found.notes,
