@@ -119,6 +119,15 @@ def test_a_flat_board_is_seen_as_a_plane(inverted):
     assert np.array_equal(light, np.repeat((0.75 + (0.03 - 0.75) * ink)[..., None], 3, axis=2))
 
 
+def test_an_inverted_board_is_dark_where_the_other_is_light():
+    """Risers, too."""
+    camera = Camera(width=80, height=60, focal_px=np.full(2, 60.0), principal_point_px=np.array([40.0, 30]))
+    pose = Rigid3.from_rotation_vector(np.array([0.3, -0.4, 0.2]), np.array([-3.0, -2.0, 6.0]))
+    lights = [board_light(each, camera, pixel_rays(camera, 2), pose) for each in (SMALL, replace(SMALL, inverted=True))]
+    assert np.allclose(lights[0] + lights[1], 0.75 + 0.03)
+    assert 0.2 < lights[0].mean() < 0.6
+
+
 def test_rays_end_where_they_meet_the_body():
     """As Embree finds it, from above, from aside and from below the highest terrace."""
     rng = np.random.default_rng(0)

@@ -134,10 +134,10 @@ def _handpiece(found: RigCalibration, working_distance_mm: float | None) -> Hand
 
 
 def _figures(found: RigCalibration, board: Board) -> dict[str, object]:
-    terraces = {"board_step_mm": board.step_mm + found.bending_mm[0]}
+    bent = {"board_bending_mm": found.bending_mm}
     return {
         "sigma_px": found.sigma_px,
-        **(terraces if board.terraces > 1 else {"board_bending_mm": found.bending_mm}),
+        **(bent if board.terraces == 1 else {"board_step_mm": board.step_mm + found.bending_mm[0]}),
         "board_distance_mm": found.distance_mm,
         "cameras": {name: asdict(each) for name, each in found.cameras.items()},
         "notes": found.notes,

@@ -105,13 +105,14 @@ def take_photographs(
 def board_light(
     board: Board, camera: Camera, rays_in_cam: Float[np.ndarray, "n 3"], cam_from_board: Rigid3
 ) -> Float[np.ndarray, "h w 3"]:
-    """Linear light of each pixel that looks at a board; paper where it looks past it, at a riser or at its back. The
-    rays of a pixel follow each other (:func:`cuspid.simulation.raycast.pixel_rays`)."""
+    """Linear light of each pixel that looks at a board; paper where it looks past it or at its back. Risers are as
+    between the squares. The rays of a pixel follow each other (:func:`cuspid.simulation.raycast.pixel_rays`)."""
     rays = rays_in_cam @ cam_from_board.rotation
     eye = cam_from_board.inverse().translation
     reach, on_terrace = _first_hits(board, eye, rays)
-    before = (reach > 0) & on_terrace
-    dark = np.zeros(len(rays), dtype=bool)
+    before = (reach > 0) & np.isfinite(reach)
+    dark = before & board.inverted
+    before &= on_terrace
     dark[before] = board.is_dark(eye[:2] + reach[before, None] * rays[before, :2])
     ink = dark.reshape(camera.height, camera.width, -1).mean(axis=2)
     return np.repeat((_LIGHT + (_DARK - _LIGHT) * ink)[..., None], 3, axis=2)

@@ -36,7 +36,7 @@ def save_board(path: Path, board: Board) -> None:
     Raises InputError for another kind of file.
     """
     if path.suffix.lower() not in BOARD_SUFFIXES:
-        raise InputError(f"{path}: a board is written as {', '.join(BOARD_SUFFIXES)}")
+        raise InputError(f"{path}: a board is written as {', '.join(BOARD_SUFFIXES)}, its body as .stl")
     width, height = board.size_mm[0] + board.height_mm, board.size_mm[1]
     margin = max(_MARGIN_MM, board.square_mm / 2)
     page = np.array([width + 2 * margin, height + 2 * margin + _RULER_MM])
