@@ -70,14 +70,15 @@ def undistorted(camera: Camera) -> Camera:
 def views_of(
     truth: BoardScene, board: Board, noise_px: float, rng: np.random.Generator
 ) -> dict[tuple[str, str], BoardView]:
-    """What the cameras see of the board, with noise; corners beyond the image are missing."""
+    """What the cameras see of the board, with noise; corners beyond the image are missing,
+    and those on the edge of a step."""
     u, v = bending_coordinates(board, board.corners).T
     bent = board.corners + np.outer(np.stack([u * u, u * v, v * v], 1) @ truth.bending_mm, [0, 0, 1.0])
     views = {}
     for camera, lens in truth.cameras.items():
         for instant, pose in truth.rig_from_board.items():
             pixels = lens.project((truth.cam_from_rig[camera] @ pose).apply(bent))
-            seen = np.flatnonzero(lens.contains(pixels))
+            seen = np.flatnonzero(lens.contains(pixels) & board.saddles)
             if len(seen) >= 12 and (board.kind == "charuco" or len(seen) == len(bent)):
                 views[camera, instant] = BoardView(seen, pixels[seen] + rng.normal(0, noise_px, (len(seen), 2)))
     return views

@@ -1,7 +1,8 @@
-"""Flat boards with known corners: what cameras are calibrated from.
+"""Boards with known corners, flat or in terraces: what cameras are calibrated from.
 
 Frame: ``board``: +X along a row of squares, +Y down the columns, +Z into the board; the origin is its top left corner.
-Corners are where four squares meet, numbered along the rows as OpenCV does.
+Corners are where four squares meet, numbered along the rows as OpenCV does. Terraces are runs of whole columns that
+rise towards the cameras, along +X; seen from straight above, the squares are those of the flat board.
 """
 
 from __future__ import annotations
@@ -44,23 +45,60 @@ class Board(Options):
     """Boards of even rows of OpenCV before 4.6, with a marker in the first corner."""
     inverted: bool = False
     """Light where others are dark."""
+    terraces: Annotated[int, Range(1, 50)] = 1
+    """Flat pieces of whole columns, each higher than the one before; 1 is a flat board."""
+    step_mm: Annotated[float, Range(0.001, 10_000)] = 1.0
+    """How much higher each terrace is, towards the cameras, as measured on the body."""
+    step_sigma_um: Annotated[float, Range(0.001, 10_000)] = 10.0
+    """How well that is known, of all steps alike (standard deviation)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         markers, needed = int(self.dictionary.split("_")[1]), self.columns * self.rows // 2
         if self.kind == "charuco" and markers < needed:
             raise InputError(f"board: {needed} markers are needed, but the dictionary {self.dictionary} has {markers}")
+        if self.terraces > 1 and self.kind != "charuco":
+            raise InputError("board: a chessboard must be flat; terraces need the kind charuco")
+        if 2 * self.terraces > self.columns:
+            raise InputError(
+                f"board: {self.terraces} terraces need {2 * self.terraces} columns at least, but it has {self.columns}"
+            )
 
     @property
     def size_mm(self) -> tuple[float, float]:
-        """Width and height."""
+        """Width and height of the squares, seen from straight above."""
         return self.columns * self.square_mm, self.rows * self.square_mm
 
     @property
     def corners(self) -> Float[np.ndarray, "n 3"]:
         """Where four squares meet, mm."""
-        column, row = np.meshgrid(np.arange(1.0, self.columns), np.arange(1.0, self.rows))
-        return self.square_mm * np.stack([column, row, 0 * row], axis=-1).reshape(-1, 3)
+        column, row = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
+        places = self.square_mm * np.stack([column, row, 0 * row], axis=-1).reshape(-1, 3)
+        places[:, 2] -= self.step_mm * self._terrace_of(column.ravel())
+        return places
+
+    @property
+    def saddles(self) -> Bool[np.ndarray, "n"]:
+        """Whether a corner can be seen: on the edge of a step four squares do not meet."""
+        column = np.tile(np.arange(1, self.columns), self.rows - 1)
+        return self._terrace_of(column) == self._terrace_of(column - 1)
+
+    @property
+    def height_mm(self) -> float:
+        """Of the last terrace over the first."""
+        return (self.terraces - 1) * self.step_mm
+
+    @property
+    def edges_mm(self) -> Float[np.ndarray, "n"]:
+        """Where terraces begin along X, and where the last one ends."""
+        return self.square_mm * -(-np.arange(self.terraces + 1) * self.columns // self.terraces)
+
+    def terrace_at(self, x_mm: Float[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+        """The terrace below places along X; the first and the last go on beside the board."""
+        return self._terrace_of(np.clip(np.floor(x_mm / self.square_mm), 0, self.columns - 1).astype(np.int64))
+
+    def _terrace_of(self, column: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+        return column * self.terraces // self.columns
 
     @cached_property
     def orders(self) -> Int[np.ndarray, "k n"]:
@@ -83,7 +121,7 @@ class Board(Options):
 
     @cached_property
     def dark(self) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
-        """The printed squares: the top left corner (mm) and the side of each."""
+        """The printed squares, seen from straight above: the top left corner (mm) and the side of each."""
         row, column = np.indices((self.rows, self.columns))
         corners = np.argwhere((row + column) % 2 == self._first_dark)[:, ::-1]
         places, sides = [corners * self.square_mm], [np.full(len(corners), self.square_mm)]
@@ -96,7 +134,8 @@ class Board(Options):
         return np.concatenate(places), np.concatenate(sides)
 
     def is_dark(self, points: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
-        """Whether it is dark at places on the board, mm; beside it, it is as between the squares."""
+        """Whether it is dark at places on the board, mm, seen from straight above; beside it, it is as between the
+        squares."""
         squares = points / self.square_mm
         column, row = np.floor(squares).astype(np.int64).T
         inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)

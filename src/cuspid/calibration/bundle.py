@@ -4,7 +4,8 @@ A corner X of the board is seen by camera c at instant i at ``project(c, cam_fro
 Unknowns and how a step changes them: of each camera (fx, fy, cx, cy, k1, k2, p1, p2) by addition, and its place by a
 small motion (rotation vector rad, translation mm) on the left of ``cam_from_rig``; the place of the board at each
 instant by one on the left of ``rig_from_board``; and three numbers of a board that is not quite flat: out of its plane
-by b1 u^2 + b2 u v + b3 v^2 mm at the distances u and v, in units of half its diagonal, from its middle.
+by b1 u^2 + b2 u v + b3 v^2 mm at the distances u and v, in units of half its diagonal, from its middle. One with
+terraces is a solid body and not bent: there b1 is by how much each step is higher than given, and b2 and b3 are 0.
 
 The rig is where the first camera is; for the covariance it is where the cameras are on the whole (inner constraints,
 Triggs et al. 2000, section 9.2), so that no camera counts as exact.
@@ -55,7 +56,7 @@ class BoardScene:
     rig_from_board: Mapping[str, Rigid3]
     """Of the board at each instant."""
     bending_mm: Float[np.ndarray, "3"]
-    """Out of the plane, of u^2, u v and v^2."""
+    """Out of the plane, of u^2, u v and v^2; with terraces that by which each step is higher than given, and zeros."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -81,7 +82,7 @@ class _Observations:
     camera: Int[np.ndarray, "n"]
     instant: Int[np.ndarray, "n"]
     points: Float[np.ndarray, "n 3"]
-    """On the flat board, mm."""
+    """On the board as it is given, mm."""
     basis: Float[np.ndarray, "n 3"]
     """What each number of the bending lifts them by."""
     pixels: Float[np.ndarray, "n 2"]
@@ -95,16 +96,23 @@ class _Observations:
         counts = [len(views[key].corner) for key in keys]
         corner = np.concatenate([views[key].corner for key in keys])
         points = board.corners[corner]
-        u, v = bending_coordinates(board, points).T
         return _Observations(
             np.repeat([cameras.index(camera) for camera, _ in keys], counts),
             np.repeat([instants.index(instant) for _, instant in keys], counts),
             points,
-            np.stack([u * u, u * v, v * v], axis=1),
+            _basis(board, points),
             np.concatenate([views[key].pixels for key in keys]),
             keys,
             np.cumsum([0, *counts]),
         )
+
+
+def _basis(board: Board, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """What each number of the bending lifts places on a board by, mm along +Z."""
+    if board.terraces > 1:
+        return np.asarray(points[:, 2:] / board.step_mm * [1.0, 0.0, 0.0])
+    u, v = bending_coordinates(board, points).T
+    return np.stack([u * u, u * v, v * v], axis=1)
 
 
 def bending_coordinates(board: Board, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
@@ -228,22 +236,31 @@ class _Free:
 
     @staticmethod
     def of(scene: BoardScene, board: Board, *, only_boards: bool) -> _Free:
-        """All but the place of the first camera, which is the rig; or the places of the board alone."""
+        """All but the place of the first camera, which is the rig, and what a board with terraces has no use of; or
+        the places of the board alone."""
         cameras, instants = len(scene.cameras), len(scene.rig_from_board)
         first = (_INTRINSICS + _PLACE) * cameras
         if only_boards:
             return _Free(first + np.arange(_PLACE * instants), np.zeros(_PLACE * instants))
-        half_mm = float(np.linalg.norm(board.size_mm)) / 2
         precision = np.concatenate(
             [
                 *(_lens_precision(camera) for camera in scene.cameras.values()),
                 np.zeros(_PLACE * (cameras + instants)),
-                np.full(_BENDING, (_BENDING_SHARE * half_mm) ** -2.0),
+                np.full(_BENDING, _bending_sigma_mm(board) ** -2.0),
             ]
         )
         place = _INTRINSICS * cameras
-        columns = np.delete(np.arange(len(precision)), np.arange(place, place + _PLACE))
+        held = np.arange(place, place + _PLACE)
+        unused = np.arange(len(precision) - (_BENDING - 1 if board.terraces > 1 else 0), len(precision))
+        columns = np.delete(np.arange(len(precision)), [*held, *unused])
         return _Free(columns, precision[columns])
+
+
+def _bending_sigma_mm(board: Board) -> float:
+    """Standard deviation of the numbers of the bending."""
+    if board.terraces > 1:
+        return board.step_sigma_um / 1000
+    return _BENDING_SHARE * float(np.linalg.norm(board.size_mm)) / 2
 
 
 def adjust_board(start: BoardScene, views: Views, board: Board, *, only_boards: bool = False) -> Adjusted:

@@ -75,7 +75,7 @@ class RigCalibration:
     sigma_px: float
     """Standard deviation of a coordinate of a corner."""
     bending_mm: Float[np.ndarray, "3"]
-    """Of the board, see :mod:`cuspid.calibration.bundle`."""
+    """Of the board, or the error of its steps, see :mod:`cuspid.calibration.bundle`."""
     cameras: Mapping[str, CameraCheck]
     """By name."""
     pixels: Mapping[str, Float[np.ndarray, "n 2"]]

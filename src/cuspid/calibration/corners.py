@@ -38,20 +38,34 @@ def find_corners(gray: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | No
     """The corners of the board in an image, to a fraction of a pixel; None where too few are found.
 
     A plain chessboard must be seen whole (A. Duda, U. Frese, BMVC 2018); of a ChArUco board any part may
-    (S. Garrido-Jurado et al., Pattern Recognition 47, 2014).
+    (S. Garrido-Jurado et al., Pattern Recognition 47, 2014). Each corner is looked for where the two markers beside
+    it say, so that steps elsewhere do not matter.
     """
     image = 255 - gray if board.inverted else gray
     found = _charuco(image, board) if board.kind == "charuco" else _chessboard(image, board)
-    if found is None or len(found.corner) < LEAST_CORNERS or _on_a_line(board.corners[found.corner, :2]):
-        return None
-    return found
+    return found if found is not None and _tells(found, board) else None
+
+
+def pieces(view: BoardView, board: Board) -> list[BoardView]:
+    """The flat parts of a view, terrace by terrace, of which each tells something by itself."""
+    terrace = board.terrace_at(board.corners[view.corner, 0])
+    parts = [BoardView(view.corner[terrace == k], view.pixels[terrace == k]) for k in range(board.terraces)]
+    return [part for part in parts if _tells(part, board)]
+
+
+def _tells(view: BoardView, board: Board) -> bool:
+    """Whether it has enough corners, and these do not lie on a line."""
+    return len(view.corner) >= LEAST_CORNERS and not _on_a_line(board.corners[view.corner, :2])
 
 
 def _charuco(image: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | None:
-    pixels, corner, _, _ = cv2.aruco.CharucoDetector(board.opencv).detectBoard(image)
+    parameters = cv2.aruco.CharucoParameters()
+    parameters.checkMarkers = board.terraces == 1  # it takes the markers beyond a step for wrong ones
+    pixels, corner, _, _ = cv2.aruco.CharucoDetector(board.opencv, parameters).detectBoard(image)
     if corner is None:
         return None
-    return BoardView(corner.ravel().astype(np.int64), pixels.reshape(-1, 2) + OPENCV_PIXEL_OFFSET)
+    seen = board.saddles[corner.ravel()]
+    return BoardView(corner.ravel()[seen].astype(np.int64), pixels.reshape(-1, 2)[seen] + OPENCV_PIXEL_OFFSET)
 
 
 def _chessboard(image: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | None:

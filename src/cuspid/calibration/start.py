@@ -14,7 +14,7 @@ import numpy as np
 
 from cuspid.board import Board
 from cuspid.calibration.bundle import Adjusted, BoardScene, adjust_board, in_front, of_instants
-from cuspid.calibration.corners import BoardView, Views
+from cuspid.calibration.corners import BoardView, Views, pieces
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
@@ -55,12 +55,14 @@ def calibrated_alone(views: Sequence[BoardView], board: Board, size: tuple[int, 
 
 
 def first_camera(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> Camera:
-    """A camera from its views of the board (Z. Zhang, IEEE PAMI 22, 2000), with the first term of distortion alone."""
-    spread = np.unique(np.linspace(0, len(views) - 1, _MOST_VIEWS).astype(int))
-    chosen = [views[k] for k in spread]
+    """A camera from its views of the board, each terrace as a plane for itself (Z. Zhang, IEEE PAMI 22, 2000), with the
+    first term of distortion alone."""
+    planes = [piece for view in views for piece in pieces(view, board)]
+    spread = np.unique(np.linspace(0, len(planes) - 1, _MOST_VIEWS).astype(int))
+    chosen = [planes[k] for k in spread]
     flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_ASPECT_RATIO
     _, matrix, distortion, _, _ = cv2.calibrateCamera(
-        [board.corners[view.corner].astype(np.float32) for view in chosen],
+        [(board.corners[view.corner] * [1, 1, 0]).astype(np.float32) for view in chosen],
         [(view.pixels - OPENCV_PIXEL_OFFSET).astype(np.float32)[:, None] for view in chosen],
         size,
         np.diag([float(max(size)), float(max(size)), 1.0]),
@@ -77,17 +79,18 @@ def first_camera(views: Sequence[BoardView], board: Board, size: tuple[int, int]
 
 
 def board_pose(view: BoardView, board: Board, camera: Camera) -> Rigid3:
-    """``cam_from_board`` of one view (T. Collins, A. Bartoli, IJCV 109, 2014; of few corners that tell little, G.
-    Terzakis, M. Lourakis, ECCV 2020). Raises InputError where there is none."""
+    """``cam_from_board`` of one view (T. Collins, A. Bartoli, IJCV 109, 2014; with terraces, and where that
+    finds none, G. Terzakis, M. Lourakis, ECCV 2020).
+
+    Raises InputError where there is none.
+    """
     points, ideal = board.corners[view.corner], np.ascontiguousarray(camera.rays(view.pixels)[:, None, :2])
-    for method in (cv2.SOLVEPNP_IPPE, cv2.SOLVEPNP_SQPNP):
+    for method in [cv2.SOLVEPNP_IPPE] * (board.terraces == 1) + [cv2.SOLVEPNP_SQPNP]:
         _, turns, shifts, _ = cv2.solvePnPGeneric(points, ideal, np.eye(3), None, flags=method)
         if turns:
-            break
-    else:
-        raise InputError("calibration: a view of the board that no pose explains")
-    turn, shift = cv2.solvePnPRefineLM(points, ideal, np.eye(3), None, turns[0], shifts[0])
-    return Rigid3.from_rotation_vector(turn.ravel(), shift.ravel())
+            turn, shift = cv2.solvePnPRefineLM(points, ideal, np.eye(3), None, turns[0], shifts[0])
+            return Rigid3.from_rotation_vector(turn.ravel(), shift.ravel())
+    raise InputError("calibration: a view of the board that no pose explains")
 
 
 def joined(

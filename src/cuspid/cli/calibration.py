@@ -15,6 +15,7 @@ from cuspid import storage
 from cuspid.board import Board
 from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, calibrate_rig
 from cuspid.calibration.corners import BoardView, Views, find_corners
+from cuspid.calibration.target import PLATE_MM, target_body
 from cuspid.cli.shared import Flat, console, show_progress
 from cuspid.image_sequence import ImageSequence
 from cuspid.options import Range
@@ -27,14 +28,20 @@ from cuspid.workers import map_in_threads
 
 
 def target(*, out: Path, board: Annotated[Board, Flat] = Board()) -> None:
-    """Draw a ChArUco board or a chessboard in its true size, to print.
+    """Draw a ChArUco board or a chessboard in its true size, to print, or make the body that it is put on.
 
     Args:
-        out: PDF, SVG or PNG file.
+        out: PDF, SVG or PNG file of the pattern, with terraces a strip to be folded over them; STL file of the body.
     """
-    save_board(out, board)
     width, height = board.size_mm
-    console.print(f"{out}: {width:g} x {height:g} mm; measure the ruler on the print, and give its length over squares")
+    if out.suffix.lower() == ".stl":
+        storage.write_mesh(out, target_body(board))
+        size = f"{width:g} x {height:g} x {PLATE_MM + board.height_mm:g} mm"
+        console.print(f"{out}: {size}; measure the steps of the body, and give them")
+        return
+    save_board(out, board)
+    size = f"{width + board.height_mm:g} x {height:g} mm"
+    console.print(f"{out}: {size}; measure the ruler on the print, and give its length over squares")
 
 
 def photograph(
@@ -87,15 +94,15 @@ def calibrate(
     notes = (*(note for each in sequences.values() for note in each.notes), *found.notes)
     found = replace(found, notes=notes)
     with storage.claimed_folder(out, "calibrate", settings, hashes, replace=True):
-        _write(found, out, working_distance_mm)
+        _write(found, board, out, working_distance_mm)
     _print(found, out)
 
 
-def _write(found: RigCalibration, out: Path, working_distance_mm: float | None) -> None:
+def _write(found: RigCalibration, board: Board, out: Path, working_distance_mm: float | None) -> None:
     handpiece = _handpiece(found, working_distance_mm)
     storage.write_handpiece(out / "handpiece.json", handpiece)
     storage.write_rig_config(out / "rig_config.json", handpiece.rig)
-    storage.write_json(out / "calibration.json", _figures(found))
+    storage.write_json(out / "calibration.json", _figures(found, board))
     cameras = {name: mounted.camera for name, mounted in handpiece.rig.cameras.items()}
     save_residuals_picture(out / "residuals.png", cameras, found.pixels, found.residuals, title="residuals")
 
@@ -126,10 +133,11 @@ def _handpiece(found: RigCalibration, working_distance_mm: float | None) -> Hand
     )
 
 
-def _figures(found: RigCalibration) -> dict[str, object]:
+def _figures(found: RigCalibration, board: Board) -> dict[str, object]:
+    bent = {"board_bending_mm": found.bending_mm}
     return {
         "sigma_px": found.sigma_px,
-        "board_bending_mm": found.bending_mm,
+        **(bent if board.terraces == 1 else {"board_step_mm": board.step_mm + found.bending_mm[0]}),
         "board_distance_mm": found.distance_mm,
         "cameras": {name: asdict(each) for name, each in found.cameras.items()},
         "notes": found.notes,

@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from cuspid.board import Board
 from cuspid.camera import Camera
+from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.options import SEED, Options, Range
 from cuspid.progress import Progress, silent
@@ -31,6 +32,8 @@ _LIGHT, _DARK = 0.75, 0.03
 """Linear light of paper and of ink; full scale is 1."""
 _NEAR, _FAR = 0.9, 1.3
 """Distance of the board, in working distances."""
+_HIGHEST = 0.5
+"""Height of the terraces at most, in working distances."""
 _ASIDE = 0.15
 """How far the middle of the board is from the axis of the camera, in working distances (standard deviation)."""
 
@@ -66,7 +69,7 @@ def _held(distance_mm: float, board: Board, options: PhotographOptions, rng: np.
     axis = np.array([np.cos(towards), np.sin(towards), 0])
     rotation = (Rotation.from_rotvec(tilt * axis) * Rotation.from_euler("z", turn)).as_matrix()
     middle = distance_mm * np.array([*rng.normal(0, _ASIDE, 2), rng.uniform(_NEAR, _FAR)])
-    return Rigid3(rotation, middle - rotation @ np.array([*board.size_mm, 0.0]) / 2)
+    return Rigid3(rotation, middle - rotation @ np.array([*board.size_mm, -board.height_mm]) / 2)
 
 
 def take_photographs(
@@ -75,7 +78,13 @@ def take_photographs(
     """Photograph a board: ``folder/truth/handpiece.json`` and ``folder/images/<camera>/<instant>.png``.
 
     Images that are there already are kept; a run that goes on gives the same bits as one that was not interrupted.
+    Raises InputError for terraces that would reach the cameras.
     """
+    if board.height_mm > _HIGHEST * handpiece.working_distance_mm:
+        raise InputError(
+            f"board: the last terrace is {board.height_mm:g} mm over the first, which is too near the cameras at a "
+            f"working distance of {handpiece.working_distance_mm:g} mm; make --step-mm smaller"
+        )
     truth = folder / "truth" / "handpiece.json"
     write_handpiece(truth, handpiece)
     stage = Stage("photographs", folder, [board, options], ("simulation",))
@@ -96,14 +105,32 @@ def take_photographs(
 def board_light(
     board: Board, camera: Camera, rays_in_cam: Float[np.ndarray, "n 3"], cam_from_board: Rigid3
 ) -> Float[np.ndarray, "h w 3"]:
-    """Linear light of each pixel that looks at a board; paper where it looks past it or at its back. The rays
-    of a pixel follow each other (:func:`cuspid.simulation.raycast.pixel_rays`)."""
+    """Linear light of each pixel that looks at a board; paper where it looks past it or at its back. Risers are as
+    between the squares. The rays of a pixel follow each other (:func:`cuspid.simulation.raycast.pixel_rays`)."""
     rays = rays_in_cam @ cam_from_board.rotation
     eye = cam_from_board.inverse().translation
-    with np.errstate(divide="ignore", invalid="ignore"):
-        reach = -eye[2] / rays[:, 2]
-    before = (eye[2] < 0) & (reach > 0) & np.isfinite(reach)
-    dark = np.zeros(len(rays), dtype=bool)
+    reach, on_terrace = _first_hits(board, eye, rays)
+    before = (reach > 0) & np.isfinite(reach)
+    dark = before & board.inverted
+    before &= on_terrace
     dark[before] = board.is_dark(eye[:2] + reach[before, None] * rays[before, :2])
     ink = dark.reshape(camera.height, camera.width, -1).mean(axis=2)
     return np.repeat((_LIGHT + (_DARK - _LIGHT) * ink)[..., None], 3, axis=2)
+
+
+def _first_hits(
+    board: Board, eye: Float[np.ndarray, "3"], rays: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+    """How far along each ray it enters the body, in lengths of the ray and infinite where it does not; and whether that
+    is through the top of a terrace. The body is as wide as you like: it goes on beside the squares."""
+    nearest, on_terrace = np.full(len(rays), np.inf), np.zeros(len(rays), dtype=bool)
+    edges = np.array([-np.inf, *board.edges_mm[1:-1], np.inf])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for k in range(board.terraces):
+            top = (-k * board.step_mm - eye[2]) / rays[:, 2]
+            sides = (edges[k : k + 2, None] - eye[0]) / rays[:, 0]
+            enters = np.maximum(top, sides.min(axis=0))
+            leaves = sides.max(axis=0)
+            hit = (rays[:, 2] > 0) & (leaves > 0) & (enters <= leaves) & (enters < nearest)
+            nearest[hit], on_terrace[hit] = enters[hit], (enters == top)[hit]
+    return nearest, on_terrace

@@ -20,19 +20,25 @@ from cuspid.reporting.figures.drawing import new_figure, save_figure
 BOARD_SUFFIXES = (".pdf", ".svg", ".png")
 _MM_PER_INCH = 25.4
 _MARGIN_MM, _RULER_MM = 5.0, 7.0
+_GAP_MM, _FOLD_MM = 0.5, 3.5
+"""Distances from the squares between which lines tell where to cut and to fold."""
+_CUT, _FOOT, _HEAD = (0.0, ()), (0.0, (4.0, 2.0)), (0.0, (1.0, 1.5))
+"""Dashes of these lines."""
 _INK = "#333333"
 _LONGEST = 0.1
 """Line of the largest residual, as a share of the width of an image."""
 
 
 def save_board(path: Path, board: Board) -> None:
-    """PDF, SVG or PNG of a board in its true size, with a ruler that shows whether the printer kept it.
+    """PDF, SVG or PNG of a board in its true size, with a ruler that shows whether the printer kept it; of terraces a
+    strip to be folded over the steps, blank where the risers are, with the folds beside it.
 
     Raises InputError for another kind of file.
     """
     if path.suffix.lower() not in BOARD_SUFFIXES:
-        raise InputError(f"{path}: a board is written as {', '.join(BOARD_SUFFIXES)}")
-    (width, height), margin = board.size_mm, max(_MARGIN_MM, board.square_mm / 2)
+        raise InputError(f"{path}: a board is written as {', '.join(BOARD_SUFFIXES)}, its body as .stl")
+    width, height = board.size_mm[0] + board.height_mm, board.size_mm[1]
+    margin = max(_MARGIN_MM, board.square_mm / 2)
     page = np.array([width + 2 * margin, height + 2 * margin + _RULER_MM])
     figure = Figure(figsize=tuple(page / _MM_PER_INCH), dpi=600, facecolor="white")
     FigureCanvasAgg(figure)
@@ -40,13 +46,34 @@ def save_board(path: Path, board: Board) -> None:
     axes.set_xlim(-margin, width + margin)
     axes.set_ylim(height + margin + _RULER_MM, -margin)
     axes.set_axis_off()
-    places, sides = board.dark
+    places, sides = _unfolded(board)
     if board.inverted:
         ground = np.array([[-margin / 2, -margin / 2]])
         axes.add_collection(_squares(ground, np.array([[width + margin, height + margin]]), "black"))
     axes.add_collection(_squares(places, np.stack([sides, sides], axis=1), "white" if board.inverted else "black"))
+    if board.terraces > 1:
+        _draw_folds(axes, board, height)
     _draw_ruler(figure, board, height + margin)
     save_figure(figure, path)
+
+
+def _unfolded(board: Board) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
+    """The printed squares on the strip that is folded over the steps: the top left corner and the side of each, mm."""
+    places, sides = board.dark
+    risers = board.step_mm * board.terrace_at(places[:, 0] + sides / 2)
+    return places + np.outer(risers, [1, 0]), sides
+
+
+def _draw_folds(axes: Axes, board: Board, height: float) -> None:
+    """Lines beside the strip, not on it, for cameras must not see them: whole where it is cut, dashed at the foot and
+    dotted at the top of each riser."""
+    edges, steps, width = board.edges_mm, board.step_mm * np.arange(board.terraces), board.size_mm[0] + board.height_mm
+    feet, heads = edges[1:-1] + steps[:-1], edges[1:-1] + steps[1:]
+    for dashes, places in ((_CUT, [0.0, width]), (_FOOT, feet), (_HEAD, heads)):
+        for ends in (-_FOLD_MM, -_GAP_MM), (height + _GAP_MM, height + _FOLD_MM):
+            axes.vlines(places, *ends, colors="black", linewidth=0.4, linestyles=dashes)
+    for ends in (-_FOLD_MM, -_GAP_MM), (width + _GAP_MM, width + _FOLD_MM):
+        axes.hlines([0.0, height], *ends, colors="black", linewidth=0.4)
 
 
 def _squares(places: Float[np.ndarray, "n 2"], sizes: Float[np.ndarray, "n 2"], colour: str) -> PolyCollection:
@@ -68,7 +95,8 @@ def _draw_ruler(figure: Figure, board: Board, top_mm: float) -> None:
 
 def _named(board: Board) -> str:
     markers = f", {board.dictionary}, markers {board.marker_share:g}" if board.kind == "charuco" else ""
-    return f"{board.kind} {board.columns} x {board.rows} x {board.square_mm:g} mm{markers}"
+    terraces = f"\n{board.terraces} terraces, steps of {board.step_mm:g} mm" if board.terraces > 1 else ""
+    return f"{board.kind} {board.columns} x {board.rows} x {board.square_mm:g} mm{markers}{terraces}"
 
 
 def save_residuals_picture(
