@@ -24,6 +24,7 @@ from run import conditions
 from cuspid.board import Board
 from cuspid.calibration.calibrate import RigCalibration, calibrate_rig
 from cuspid.calibration.corners import Views, find_corners
+from cuspid.capture import read_image
 from cuspid.handpiece.designs import DesignOptions, six_cameras
 from cuspid.rig import Handpiece, Rig
 from cuspid.simulation.board_images import PhotographOptions, take_photographs
@@ -42,12 +43,8 @@ TOLERANCES = ManufacturingOptions(
     manufacturing_centre_px=1.0,
     manufacturing_k1=0.01,
 )
-STEPS = {
-    "known": {"step_mm": 1.0, "step_sigma_um": 1.0},
-    "off": {"step_mm": 1.01, "step_sigma_um": 10.0},
-    "trusted": {"step_mm": 1.01, "step_sigma_um": 1.0},
-}
-"""What is said of steps of 1 mm."""
+STEPS = {"known": (1.0, 1.0), "off": (1.01, 10.0), "trusted": (1.01, 1.0)}
+"""What is said of steps of 1 mm: height in mm, standard deviation in um."""
 
 
 def judge(*, board: str, tilt_deg: float, seed: int, instants: int, pixels: int) -> dict[str, Value]:
@@ -59,7 +56,11 @@ def judge(*, board: str, tilt_deg: float, seed: int, instants: int, pixels: int)
     with TemporaryDirectory(prefix="cuspid-target-") as folder:
         take_photographs(true, BOARDS[board], Path(folder), shown)
         views = views_in(Path(folder) / "images", BOARDS[board])
-    said = {"flat": FLAT} if board == "flat" else {name: replace(BOARDS[board], **each) for name, each in STEPS.items()}
+    steps = {} if board == "flat" else STEPS
+    said = {
+        name: replace(BOARDS[board], step_mm=step_mm, step_sigma_um=sigma_um)
+        for name, (step_mm, sigma_um) in steps.items()
+    } or {"flat": FLAT}
     return {
         f"{name}_{figure}": value
         for name, each in said.items()
@@ -70,7 +71,7 @@ def judge(*, board: str, tilt_deg: float, seed: int, instants: int, pixels: int)
 def views_in(images: Path, board: Board) -> Views:
     """The board in the images of each camera."""
     found = {
-        (path.parent.name, path.stem): find_corners(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), board)
+        (path.parent.name, path.stem): find_corners(cv2.cvtColor(read_image(path), cv2.COLOR_RGB2GRAY), board)
         for path in sorted(images.glob("*/*.png"))
     }
     return {key: view for key, view in found.items() if view is not None}
@@ -85,7 +86,7 @@ def calibrated(views: Views, handpiece: Handpiece, board: Board) -> RigCalibrati
 def errors(found: RigCalibration, true: Rig) -> dict[str, Value]:
     """Root mean squares over the cameras: of focal lengths in per mille, of distances between cameras in um."""
     focal = {name: each.camera.focal_px for name, each in true.cameras.items()}
-    known = [np.sqrt(np.diag(found.rig[name].camera.covariance)[:2]) / each for name, each in focal.items()]
+    known = [np.sqrt(np.diag(np.array(found.rig[name].camera.covariance))[:2]) / each for name, each in focal.items()]
     off = [found.rig[name].camera.focal_px / each - 1 for name, each in focal.items()]
     return {
         "corners": sum(each.corners for each in found.cameras.values()),
