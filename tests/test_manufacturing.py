@@ -8,8 +8,9 @@ import pytest
 from cuspid import storage
 from cuspid.handpiece.designs import DesignOptions, essential_four, twelve_cameras
 from cuspid.simulation.manufacturing import ManufacturingOptions, built, told
+from cuspid.simulation.path.scan import ScanPathOptions
+from cuspid.simulation.stage import SimulationOptions, simulate
 from cuspid.tolerances import EXACT, NominalOptions, held, is_nominal
-from verbs import run
 
 ROUGH = ManufacturingOptions(
     manufacturing_um=10.0,
@@ -91,13 +92,15 @@ def test_another_seed_is_another_handpiece_and_the_same_one_the_same():
         assert not np.array_equal(once.rig[name].cam_from_rig.matrix, other.rig[name].cam_from_rig.matrix)
 
 
-def test_the_scan_is_told_of_the_drawn_one_and_the_truth_has_the_built_one(tmp_path):
-    tiny = ("--handpiece", tmp_path / "probe" / "handpiece.json", "--tooth", 46, "--frames", 2, "--length-mm", 1)
-    run("handpiece", "--design", "four", "--width-px", 64, "--height-px", 64, "--out", tmp_path / "probe")
-    run("simulate", *tiny, "--supersampling", 1, "--manufacturing-um", 20, "--out", tmp_path / "scan")
-    drawn, known, true = (
-        storage.read_handpiece(tmp_path / path / "handpiece.json") for path in ("probe", "scan/capture", "scan/truth")
+def test_the_scan_is_told_of_the_drawn_one_and_the_truth_has_the_built_one(tmp_path, coarse_phantom):
+    options = SimulationOptions(
+        path=ScanPathOptions(tooth=46, frames=2, length_mm=1.0),
+        manufacturing=ManufacturingOptions(manufacturing_um=20.0),
+        supersampling=1,
     )
+    drawn = essential_four(DesignOptions(width_px=64, height_px=64))
+    simulate(coarse_phantom, drawn, tmp_path, options)
+    known, true = (storage.read_handpiece(tmp_path / folder / "handpiece.json") for folder in ("capture", "truth"))
     for name, mounted in drawn.rig.cameras.items():
         assert np.allclose(known.rig[name].cam_from_rig.matrix, mounted.cam_from_rig.matrix, atol=1e-12)
         assert np.allclose(known.rig[name].covariance, np.diag([0, 0, 0, 4e-4, 4e-4, 4e-4]))
