@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.reconstruction import DepthMap
+from cuspid.stereo.stage import StoredDepthMaps
 from cuspid.surface.evidence import Evidence, observe, observe_foot
 from cuspid.surface.fusion import FusionOptions, Votes
 from cuspid.surface.fusion import fuse as fuse_depth_maps
@@ -81,6 +83,25 @@ def test_depth_is_as_uncertain_as_it_says(noise_mm: float) -> None:
     assert 0.7 < np.sqrt(np.mean(said**2) / np.mean(off**2)) < 1.4
     assert 0.55 < np.mean(np.abs(off) < said) < 0.85
     assert 0.88 < np.mean(np.abs(off) < 2 * said) < 0.99
+
+
+def test_maps_of_one_frame_count_as_one() -> None:
+    """They share its images: the same map a second time tells nothing new, be it of depth within or across frames."""
+    maps = [replace(each, depth_mm=each.depth_mm + np.float32(0.004 * k)) for k, each in enumerate(depth_maps(HILLS))]
+    once = fuse_depth_maps(maps, POSES, RESOLUTION_MM).sigma_mm
+    twice = fuse_depth_maps([each for each in maps for _ in range(2)], POSES, RESOLUTION_MM).sigma_mm
+    assert np.median(once) > 0.001
+    assert np.median(twice) == pytest.approx(np.median(once), rel=0.05)
+
+
+def test_stored_maps_follow_each_other_frame_by_frame() -> None:
+    within, across = (
+        StoredDepthMaps({Path(kind) / f"{name}.npz": kind for name in names})
+        for kind, names in (("depth", ("b", "a", "c")), ("depth-temporal", ("a", "b")))
+    )
+    order = [(file.stem, file.parent.name) for file in (within | across).made]
+    assert [name for name, _ in order] == ["b", "b", "a", "a", "c"]
+    assert [kind for _, kind in order] == ["depth", "depth-temporal"] * 2 + ["depth"]
 
 
 def test_every_seen_place_is_covered() -> None:

@@ -28,15 +28,17 @@ class StoredDepthMaps:
     """Depth maps on disk, read while they are iterated, as often as need be."""
 
     made: Mapping[Path, str]
-    """One file a frame, in the order of the frames, and the key that it was made under."""
+    """Files of one frame after those of another, in the order of the frames, and the key that each was made under."""
 
     def __iter__(self) -> Iterator[DepthMap]:
         for file in self.made:
             yield from read_depth_maps(file)
 
     def __or__(self, other: StoredDepthMaps) -> StoredDepthMaps:
-        """These and others."""
-        return StoredDepthMaps({**self.made, **other.made})
+        """These and others, frame by frame."""
+        made = {**self.made, **other.made}
+        place = {name: k for k, name in enumerate(dict.fromkeys(file.stem for file in made))}
+        return StoredDepthMaps(dict(sorted(made.items(), key=lambda item: place[item[0].stem])))
 
     @property
     def digest(self) -> str:

@@ -74,7 +74,7 @@ def fuse(
 
     ``resolution_mm`` is what the handpiece resolves (:func:`cuspid.pairing.resolved_mm`); lengths count in it.
     ``depth_maps`` is gone through twice and may read its items lazily, but a generator, which is spent after the first
-    time, will not do. The same maps in the same order give the same mesh.
+    time, will not do. The maps of a frame follow each other. The same maps in the same order give the same mesh.
     """
     options = options or FusionOptions()
     voxel_mm = options.voxel_for(resolution_mm)
@@ -125,7 +125,7 @@ class Votes:
     maps: Int[np.ndarray, "v"]
     """Number of depth maps that confirm the vertex."""
     frames: Int[np.ndarray, "v 2"]
-    """Number of frames that do, and the last of them."""
+    """Number of frames that do, and the last of them: the maps of a frame follow each other."""
 
     @staticmethod
     def on(rough: Mesh) -> Votes:
