@@ -44,6 +44,14 @@ def scanned_tooth(jaw: Jaw) -> tuple[Mesh, np.ndarray, int]:
     return moved, deviation_um, top
 
 
+def known_sigma_um(scan: Mesh) -> np.ndarray:
+    """What is expected of a scan: more towards one side, nothing of a few vertices."""
+    across = scan.vertices[:, 0] - scan.vertices[:, 0].min()
+    sigma_um = 1.0 + 3.0 * across / across.max()
+    sigma_um[::50] = np.nan
+    return sigma_um
+
+
 def known_trueness(deviation_um: np.ndarray) -> Trueness:
     found = statistics(deviation_um / 1000)
     within = {"50": 98.0, "100": 99.0, "200": 100.0}
@@ -86,8 +94,9 @@ def write_evaluation(folder: Path, jaw: Jaw) -> None:
     aligned, deviation_um, _ = scanned_tooth(jaw)
     scan = aligned.transformed(REFERENCE_FROM_SCAN.inverse())
     colored = Mesh(scan.vertices, scan.faces, deviation_colors(deviation_um))
+    values = {"deviation_um": deviation_um, storage.SIGMA: known_sigma_um(aligned)}
     storage.claim_folder(folder, "evaluate", {"evaluation": {"samples": 100, "seed": 7}}, {"mesh": "a" * 64})
-    storage.write_mesh(folder / "deviation.ply", colored, values={"deviation_um": deviation_um})
+    storage.write_mesh(folder / "deviation.ply", colored, values=values)
     storage.write_trueness(folder / "trueness.json", known_trueness(deviation_um))
 
 

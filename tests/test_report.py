@@ -7,11 +7,15 @@ import re
 import shutil
 import socket
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
 from importlib.metadata import version
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -20,12 +24,20 @@ from cuspid.errors import InputError, MissingDependencyError
 from cuspid.mesh import Mesh
 from cuspid.panorama import FrameUse, Panorama
 from cuspid.reporting import live_view
-from cuspid.reporting.figures.drawing import RANGES_UM, fitting_range_um
+from cuspid.reporting.figures.drawing import (
+    NOT_COUNTED,
+    RANGES_UM,
+    FigureOptions,
+    deviation_colors,
+    fitting_range_um,
+    fitting_sigma_um,
+)
+from cuspid.reporting.pages.color_scale import deviation_scale, sigma_scale
 from cuspid.reporting.pages.page import LARGEST_PAGE_BYTES, flat_settings, number, packed, script_json, signed
 from cuspid.reporting.pages.report import report_page
 from cuspid.reporting.pages.scan import ReportOptions, histogram, worst_places
 from cuspid.reporting.pages.scene import camera_lines
-from cuspid.reporting.pages.shown_mesh import UM_PER_STEP, UNKNOWN, pack_deviation, pack_mesh, simplified
+from cuspid.reporting.pages.shown_mesh import UM_PER_STEP, UNKNOWN, pack_mesh, pack_um, simplified
 from cuspid.reporting.pages.study import heading
 from report_folders import (
     BUMP_UM,
@@ -65,13 +77,13 @@ def scan_folder(tmp_path, coarse_phantom):
 @given(st.lists(st.floats(-3000, 3000), min_size=1))
 def test_deviations_survive_to_half_a_step(values):
     given_um = np.array([*values, np.nan])
-    found = unpacked(pack_deviation(given_um))
+    found = unpacked(pack_um(given_um))
     assert found[-1] == UNKNOWN
     assert np.abs(UM_PER_STEP * found[:-1] - given_um[:-1]).max() <= 0.5001 * UM_PER_STEP
 
 
 def test_what_is_off_the_scale_is_clipped_and_not_taken_for_unknown():
-    assert list(unpacked(pack_deviation(np.array([-1e6, 1e6])))) == [UNKNOWN + 1, 32767]
+    assert list(unpacked(pack_um(np.array([-1e6, 1e6])))) == [UNKNOWN + 1, 32767]
 
 
 def test_a_jaw_survives_to_a_micrometre(coarse_phantom):
@@ -205,7 +217,73 @@ def test_the_shown_surface_lies_on_the_reference(scan_folder, coarse_phantom):
     shown = layer["origin"] + layer["step"] * unpacked(layer["vertices"]).reshape(-1, 3)
     distances, _, _ = coarse_phantom.mesh.closest(shown)
     assert 0.05 < distances.max() < 0.2, "the bump, and no more"
-    assert np.abs(UM_PER_STEP * unpacked(layer["values"])).max() == pytest.approx(BUMP_UM, abs=3)
+    assert np.abs(UM_PER_STEP * unpacked(layer["values"]["deviation"])).max() == pytest.approx(BUMP_UM, abs=3)
+
+
+def test_a_scan_is_coloured_by_its_deviation_or_by_what_was_expected(scan_folder, coarse_phantom):
+    page = report_page(storage.read_result(scan_folder))
+    scene = scene_of(page)
+    layer, scales = scene["layers"][0], {each["name"]: each for each in scene["scales"]}
+    assert list(scales) == list(layer["values"]) == ["deviation", "sigma"]
+    shown = UM_PER_STEP * unpacked(layer["values"]["sigma"])
+    known = unpacked(layer["values"]["sigma"]) != UNKNOWN
+    assert 0.01 < np.mean(~known) < 0.03, "those that are NaN"
+    assert (shown[known].min(), shown[known].max()) == pytest.approx((1.0, 4.0), abs=0.06)
+    across = layer["step"] * unpacked(layer["vertices"]).reshape(-1, 3)[known, 0]
+    assert np.corrcoef(across, shown[known])[0, 1] > 0.999, "each vertex has its own"
+    assert (scales["sigma"]["end"], scales["sigma"]["signed"]) == (5.0, False)
+    assert scales["deviation"]["signed"]
+    assert "Expected error along the normal" in page
+
+
+def test_where_nothing_was_expected_no_colours_are_offered_for_it(scan_folder):
+    file = storage.read_mesh_file(scan_folder / "deviation.ply")
+    deviations = {"deviation_um": file.vertex_values["deviation_um"]}
+    storage.write_mesh(scan_folder / "deviation.ply", file.mesh, values=deviations)
+    result = storage.read_result(scan_folder)
+    assert result.sigma_um is None
+    page = report_page(result)
+    assert [each["name"] for each in scene_of(page)["scales"]] == ["deviation"]
+    assert "Expected error" not in page
+
+
+def test_what_no_standard_deviation_can_be_is_not_known(scan_folder):
+    file = storage.read_mesh_file(scan_folder / "deviation.ply")
+    sigma_um = np.full(len(file.mesh.vertices), 2.0)
+    sigma_um[:3] = (-1.0, np.inf, np.nan)
+    storage.write_mesh(scan_folder / "deviation.ply", file.mesh, values={storage.SIGMA: sigma_um})
+    found = storage.read_result(scan_folder).sigma_um
+    assert np.isnan(found[:3]).all()
+    assert (found[3:] == 2.0).all()
+
+
+@given(st.lists(st.floats(0, 1e4), min_size=1), st.integers(0, 5))
+def test_the_scale_of_what_is_expected_holds_most_of_it(values, unknown):
+    given_um = np.array([*values, *[np.nan] * unknown])
+    end = fitting_sigma_um(given_um)
+    assert end in RANGES_UM
+    assert end == RANGES_UM[-1] or np.mean(np.array(values) <= end) >= 0.9
+    smaller = [each for each in RANGES_UM if each < end]
+    assert not smaller or np.percentile(values, 95) > smaller[-1]
+    assert fitting_sigma_um(np.full(3, np.nan)) == RANGES_UM[0]
+
+
+@pytest.mark.parametrize("scale", [deviation_scale(50.0), sigma_scale(np.array([40.0]))], ids=lambda each: each.name)
+def test_colours_go_from_one_end_of_the_bar_to_the_other(scale):
+    bar = unpacked(scale.in_scene["colors"]).reshape(-1, 3)
+    low = -scale.end if scale.signed else 0.0
+    asked = np.array([low, scale.end, low - 1e3, 1e3, np.nan])
+    found = scale.rgb(asked)
+    assert np.array_equal(found[:4], bar[[0, -1, 0, -1]])
+    assert np.array_equal(found[4], NOT_COUNTED)
+    assert not (bar == NOT_COUNTED).all(axis=1).any(), "grey is none of its colours"
+    assert np.array_equal(scale.rgb(2 * asked[:2], 2 * scale.end), found[:2])
+
+
+def test_deviations_have_the_colours_of_their_picture():
+    given_um = np.linspace(-70, 70, 200)
+    pictured = deviation_colors(given_um, FigureOptions(range_um=50.0, tolerance_um=12.5))
+    assert np.array_equal(deviation_scale(50.0).rgb(given_um), pictured)
 
 
 def test_a_large_surface_is_simplified_and_the_page_says_so(scan_folder):
@@ -228,7 +306,7 @@ def test_what_a_folder_lacks_is_said(scan_folder):
     page = report_page(storage.read_result(scan_folder))
     assert "run cuspid evaluate" in page
     assert "not evaluated" in page
-    assert scene_of(page)["layers"][0]["values"] is None
+    assert list(scene_of(page)["layers"][0]["values"]) == ["sigma"], "expected, though not evaluated"
 
 
 def test_a_note_of_the_reconstruction_stands_at_the_top(scan_folder):
@@ -395,6 +473,76 @@ def test_the_live_view_starts_and_stops(scan_folder):
             assert answer.status == 200
     finally:
         server.stop()
+
+
+class Recorded(SimpleNamespace):
+    """What viser was asked to show, of which a reader can choose another value."""
+
+    def on_update(self, react) -> None:
+        self.react = react
+
+    def choose(self, value: str) -> None:
+        self.value = value
+        self.react(None)
+
+
+def colored_surface(result, monkeypatch) -> tuple[dict[str, Recorded], dict[str, trimesh.Trimesh]]:
+    """Dropdowns of the live view by their label, its legend as ``legend``, and what is shown by name."""
+    choices, shown, server = {}, {}, MagicMock()
+
+    def add_dropdown(label, options, initial_value=None, visible=True):
+        choices[label] = Recorded(value=initial_value or options[0], options=options, visible=visible)
+        return choices[label]
+
+    def add_html(content):
+        choices["legend"] = Recorded(content=content, visible=True)
+        return choices["legend"]
+
+    def add_mesh(name, mesh, visible):
+        shown[name] = mesh
+        return Recorded(visible=visible)
+
+    server.gui.add_dropdown, server.gui.add_html = add_dropdown, add_html
+    server.scene.add_mesh_trimesh = add_mesh
+    monkeypatch.setitem(sys.modules, "viser", SimpleNamespace(ViserServer=lambda **_: server))
+    monkeypatch.setattr(live_view, "only_own_pages", lambda _: nullcontext())
+    live_view.serve(result, "127.0.0.1", 18082)
+    return choices, shown
+
+
+def colors_of(mesh: trimesh.Trimesh) -> np.ndarray:
+    return np.unique(mesh.visual.vertex_colors, axis=0)
+
+
+def test_the_live_view_colours_by_what_is_chosen(scan_folder, monkeypatch):
+    choices, shown = colored_surface(storage.read_result(scan_folder), monkeypatch)
+    assert choices["Colours"].options == ["Deviation", "Expected", "None"]
+    deviation, expected = choices["Range, ± µm"], choices["Range, 0 to µm"]
+    assert (deviation.visible, expected.visible) == (True, False)
+    assert "positive outside" in choices["legend"].content
+    by_deviation = colors_of(shown["/scan"])
+    choices["Colours"].choose("Expected")
+    assert (deviation.visible, expected.visible, expected.value) == (False, True, "5")
+    assert "standard deviation" in choices["legend"].content
+    assert "<span>0</span><span>5</span>" in choices["legend"].content
+    by_sigma = colors_of(shown["/scan"])
+    assert len(by_sigma) > 20
+    assert not np.array_equal(by_sigma, by_deviation)
+    expected.choose("100")
+    assert "<span>0</span><span>100</span>" in choices["legend"].content
+    assert len(colors_of(shown["/scan"])) < len(by_sigma), "all of it near the lower end"
+    choices["Colours"].choose("None")
+    assert len(colors_of(shown["/scan"])) == 1
+    assert not any(each.visible for each in (choices["legend"], deviation, expected))
+
+
+def test_the_live_view_offers_what_the_folder_has(scan_folder, monkeypatch):
+    result = storage.read_result(scan_folder)
+    choices, _ = colored_surface(replace(result, deviation_um=None, trueness=None), monkeypatch)
+    assert choices["Colours"].options == ["Expected", "None"]
+    choices, shown = colored_surface(replace(result, deviation_um=None, sigma_um=None), monkeypatch)
+    assert choices == {}
+    assert len(colors_of(shown["/scan"])) == 1
 
 
 def asked(port: int, **headers: str) -> str:

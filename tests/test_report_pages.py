@@ -122,7 +122,7 @@ def scan(browser, pages) -> Iterator[Visit]:
 def fresh(scan: Visit) -> Visit:
     """The page of the scan as it was when it was opened."""
     for button in scan.page.locator("#viewer [data-layer], #viewer [data-colors], #viewer [data-teeth]").all():
-        wanted = "true" if button.inner_text() in ("Scan", "Colours") else "false"
+        wanted = "true" if button.inner_text() in ("Scan", "Deviation") else "false"
         if button.get_attribute("aria-pressed") != wanted:
             button.click()
     scan.press("[data-reset]")
@@ -151,9 +151,43 @@ def test_colours_are_those_of_the_deviation(fresh):
     blue, green, red = np.moveaxis(fresh.picture()[..., :3].astype(int), 2, 0)
     assert 0.0005 < np.mean((red > green + 60) & (red > blue + 60)) < 0.05
     assert np.mean((green > red + 30) & (green > blue + 30)) > 0.1
-    fresh.press("[data-colors]")
+    fresh.press("[data-colors=deviation]")
     blue, green, red = np.moveaxis(fresh.picture()[..., :3].astype(int), 2, 0)
     assert np.abs(red - green).max() < 40
+
+
+def test_colours_are_those_of_what_was_expected_when_that_is_chosen(fresh):
+    """It grows along X, from blue to yellow; grey is not known."""
+    deviation = fresh.picture()
+    fresh.press("[data-colors=sigma]")
+    picture = fresh.picture()
+    assert differing(deviation, picture) > 0.1
+    blue, green = np.moveaxis(picture[..., :2].astype(int), 2, 0)
+    _, left = np.nonzero((blue > green + 20) & (picture[..., 3] == 255))
+    _, right = np.nonzero((green > blue + 40) & (picture[..., 3] == 255))
+    assert np.median(left) < np.median(right) - 50
+    legend = fresh.page.locator(".legend:visible")
+    assert "standard deviation" in legend.inner_text()
+    ticks = [float(each) for each in legend.locator(".ticks span").all_inner_texts()]
+    assert ticks == [0, 1.25, 2.5, 3.75, 5]
+    legend.locator("[data-range]").select_option("100.0")
+    assert legend.locator(".ticks span").last.inner_text() == "100"
+    assert differing(picture, fresh.picture()) > 0.1
+    legend.locator("[data-range]").select_option("5.0")
+    assert differing(picture, fresh.picture()) == 0
+    fresh.press("[data-colors=deviation]")
+    assert differing(deviation, fresh.picture()) == 0
+    assert "positive outside" in fresh.page.locator(".legend:visible").inner_text()
+
+
+def test_what_was_expected_is_read_where_one_clicks(fresh):
+    fresh.press("[data-colors=sigma]")
+    box = fresh.page.locator("canvas").bounding_box()
+    fresh.page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    text = fresh.page.locator(".readout").inner_text()
+    assert text.startswith("not known") or 1 < float(re.match(r"[\d.]+", text)[0]) < 4, "without a sign"
+    fresh.press("[data-colors=deviation]")
+    assert fresh.page.locator(".readout").is_hidden(), "it was read off other colours"
 
 
 def test_turning_changes_the_picture_and_reset_brings_it_back(fresh):
@@ -218,13 +252,13 @@ def test_standard_views_differ_from_the_occlusal_one(fresh, view):
 
 
 def test_the_range_changes_colours_and_the_legend(fresh):
-    before, ticks = fresh.picture(), fresh.page.locator(".ticks").inner_text()
-    chosen = fresh.page.locator("[data-range]").input_value()
-    fresh.page.select_option("[data-range]", "500.0")
-    assert "+500" in fresh.page.locator(".ticks").inner_text()
+    before, ticks = fresh.picture(), fresh.page.locator(".ticks:visible").inner_text()
+    chosen = fresh.page.locator("[data-range]:visible").input_value()
+    fresh.page.select_option("[data-range]:visible", "500.0")
+    assert "+500" in fresh.page.locator(".ticks:visible").inner_text()
     assert differing(before, fresh.picture()) > 0.001
-    fresh.page.select_option("[data-range]", chosen)
-    assert fresh.page.locator(".ticks").inner_text() == ticks
+    fresh.page.select_option("[data-range]:visible", chosen)
+    assert fresh.page.locator(".ticks:visible").inner_text() == ticks
 
 
 def test_the_worst_place_is_the_bump_and_the_view_goes_there(fresh):
@@ -302,6 +336,9 @@ def test_on_a_phone(browser, pages):
     assert box["height"] < 0.75 * PHONE["height"], "the page can still be moved by a finger beside the view"
     phone.page.touchscreen.tap(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     assert "µm" in phone.page.locator(".readout").inner_text()
+    phone.press("[data-colors=sigma]")
+    assert "standard deviation" in phone.page.locator(".legend:visible").inner_text()
+    assert phone.page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
     assert phone.complaints == []
     phone.page.context.close()
 

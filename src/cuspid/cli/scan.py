@@ -163,7 +163,8 @@ def _measure_trueness(mesh: Path, reference: Path, out: Path, source: Source, op
         for name in _FURTHER:  # of another mesh or reference they would be shown as of this one
             (out / name).unlink(missing_ok=True)
         coloured = replace(scan, colors=deviation_colors(trueness.deviation_um))
-        storage.write_mesh(out / "deviation.ply", coloured, values={"deviation_um": trueness.deviation_um})
+        values = {"deviation_um": trueness.deviation_um} | ({} if sigma_um is None else {storage.SIGMA: sigma_um})
+        storage.write_mesh(out / "deviation.ply", coloured, values=values)
         save_deviation_picture(out / "deviation.png", scan, trueness)
         storage.write_trueness(out / "trueness.json", trueness)
     _print_trueness(trueness)

@@ -5,7 +5,7 @@ The frame is that of the page of the same folder (mm).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,14 +14,16 @@ from jaxtyping import Float, UInt8
 
 from cuspid.errors import InputError, MissingDependencyError
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures.drawing import RANGES_UM, FigureOptions, deviation_colors, fitting_range_um
+from cuspid.reporting.pages.color_scale import ColorScale
 from cuspid.reporting.pages.scene import (
     PLASTER_COLOR,
     REFERENCE_COLOR,
     camera_lines,
     camera_path,
+    deviation_range_um,
     poses_from,
     shown_frame,
+    surface_maps,
 )
 from cuspid.reporting.same_origin import only_own_pages
 from cuspid.shape_model import ShapeModel
@@ -33,6 +35,7 @@ Node = Any
 """What viser shows, with ``visible``."""
 _MOST_MODES = 5
 _GAMMA = 2.2
+_NO_COLORS = "None"
 
 
 def serve(result: Result, host: str, port: int) -> Server:
@@ -71,12 +74,13 @@ def _show_scan(server: Server, result: ScanResult, scan: Mesh) -> None:
     _look_down_on(server, moved)
     nodes: dict[str, Node] = {}
 
-    def paint(range_um: float) -> None:
+    def paint(rgb: UInt8[np.ndarray, "v 3"] | None) -> None:
         visible = nodes["scan"].visible if "scan" in nodes else True
-        nodes["scan"] = _add(server, "/scan", moved, _deviation_rgb(moved, result.deviation_um, range_um), visible)
+        colors = _plain(moved, PLASTER_COLOR) if rgb is None else rgb
+        nodes["scan"] = _add(server, "/scan", moved, colors, visible)
 
-    range_um = 100.0 if result.trueness is None else fitting_range_um(float(result.trueness["p95_um"]))
-    paint(range_um)
+    maps = surface_maps(result, deviation_range_um(result))
+    paint(next((scale.rgb(values) for scale, values in maps), None))
     if result.reference is not None:
         mesh = result.reference.mesh
         nodes["reference"] = _add(server, "/reference", mesh, _plain(mesh, REFERENCE_COLOR), False)
@@ -90,10 +94,46 @@ def _show_scan(server: Server, result: ScanResult, scan: Mesh) -> None:
         for name, (points, color) in lines.items():
             nodes[name] = server.scene.add_line_segments(f"/{name}", points, np.array(color), visible=False)
     _add_toggles(server, nodes)
-    if result.deviation_um is not None:
-        ranges = [f"{each:g}" for each in RANGES_UM]
-        choice = server.gui.add_dropdown("Range, ± µm", ranges, initial_value=f"{range_um:g}")
-        choice.on_update(lambda _: paint(float(choice.value)))
+    if maps:
+        _add_colors(server, maps, paint)
+
+
+def _add_colors(
+    server: Server,
+    maps: Sequence[tuple[ColorScale, Float[np.ndarray, "v"]]],
+    paint: Callable[[UInt8[np.ndarray, "v 3"] | None], None],
+) -> None:
+    """A choice of what the surface is coloured by (it is by the first) and up to which value, and a legend."""
+    first = maps[0][0]
+    chosen = server.gui.add_dropdown("Colours", [*(scale.label for scale, _ in maps), _NO_COLORS])
+    ends = [_add_ends(server, scale, visible=scale is first) for scale, _ in maps]
+    legend = server.gui.add_html(_legend(first, first.end))
+
+    def update(_: Any) -> None:
+        legend.visible, rgb = False, None
+        for (scale, values), choice in zip(maps, ends, strict=True):
+            choice.visible = scale.label == chosen.value
+            if choice.visible:
+                end = float(choice.value)
+                legend.visible, legend.content, rgb = True, _legend(scale, end), scale.rgb(values, end)
+        paint(rgb)
+
+    for choice in (chosen, *ends):
+        choice.on_update(update)
+
+
+def _add_ends(server: Server, scale: ColorScale, *, visible: bool) -> Node:
+    """A choice of the upper end of a scale."""
+    ends, name = [f"{each:g}" for each in scale.ends], f"Range, {scale.reach} {scale.unit}"
+    return server.gui.add_dropdown(name, ends, initial_value=f"{scale.end:g}", visible=visible)
+
+
+def _legend(scale: ColorScale, end: float) -> str:
+    """The bar with its ends, and what it means, as HTML."""
+    low, high = (f"−{end:g}", f"+{end:g}") if scale.signed else ("0", f"{end:g}")
+    bar = f'<div style="height: 12px; border-radius: 3px; background: {scale.gradient}"></div>'
+    ticks = f'<div style="display: flex; justify-content: space-between"><span>{low}</span><span>{high}</span></div>'
+    return f'<div style="margin: 6px 12px; font-size: 12px">{bar}{ticks}{scale.meaning}</div>'
 
 
 def _show_shape(server: Server, model: ShapeModel) -> None:
@@ -155,11 +195,3 @@ def _add(server: Server, name: str, mesh: Mesh, rgb: UInt8[np.ndarray, "v 3"], v
 
 def _plain(mesh: Mesh, color: tuple[int, int, int]) -> UInt8[np.ndarray, "v 3"]:
     return np.tile(np.array(color, dtype=np.uint8), (len(mesh.vertices), 1))
-
-
-def _deviation_rgb(
-    mesh: Mesh, deviation_um: Float[np.ndarray, "v"] | None, range_um: float
-) -> UInt8[np.ndarray, "v 3"]:
-    if deviation_um is None:
-        return _plain(mesh, PLASTER_COLOR)
-    return deviation_colors(deviation_um, FigureOptions(range_um=range_um, tolerance_um=range_um / 4))

@@ -27,7 +27,7 @@ from cuspid.shape_model import ShapeModel
 from cuspid.storage.captures import read_capture
 from cuspid.storage.files import hash_file, read_json, read_manifest, reading
 from cuspid.storage.jaws import is_jaw, read_jaw, read_labelled_mesh
-from cuspid.storage.meshes import Unit, read_mesh, read_mesh_file
+from cuspid.storage.meshes import SIGMA, MeshFile, Unit, read_mesh_file
 from cuspid.storage.panoramas import read_panorama
 from cuspid.storage.reconstructions import read_reconstruction
 from cuspid.storage.shapes import read_shape_model
@@ -55,6 +55,9 @@ class ScanResult(_Result):
     """The surface in its own frame."""
     deviation_um: Float[np.ndarray, "v"] | None
     """Signed deviation of each of its vertices, NaN where it is not evaluated; None before it was evaluated."""
+    sigma_um: Float[np.ndarray, "v"] | None = None
+    """Standard deviation that was expected of each of its vertices along the normal, NaN where it is not known; None
+    where the surface does not have it."""
     trueness: Mapping[str, Any] | None
     """``trueness.json``."""
     reference_from_scan: Rigid3 | None
@@ -156,7 +159,10 @@ def _is_scan(folder: Path, run: Mapping[str, Any]) -> bool:
 
 def _read_scan(folder: Path, run: Mapping[str, Any], reference: Path | None, unit: Unit) -> ScanResult:
     missing: list[str] = []
-    scan, deviation_um = _surface(folder, missing)
+    file = _surface(folder, missing)
+    scan = None if file is None else file.mesh
+    values = {} if file is None else file.vertex_values
+    deviation_um = values.get("deviation_um")
     trueness = _optional_json(folder / "trueness.json")
     if trueness is None and scan is not None:
         missing.append("the trueness: run cuspid evaluate")
@@ -179,6 +185,7 @@ def _read_scan(folder: Path, run: Mapping[str, Any], reference: Path | None, uni
         missing=tuple(missing),
         scan=scan,
         deviation_um=deviation_um if known else None,
+        sigma_um=_sigma_um(values.get(SIGMA)),
         trueness=trueness,
         reference_from_scan=None if trueness is None else _alignment(folder / "trueness.json", trueness),
         reference=jaw,
@@ -198,14 +205,17 @@ _SCAN_PICTURES = {
 }
 
 
-def _surface(folder: Path, missing: list[str]) -> tuple[Mesh | None, Float[np.ndarray, "v"] | None]:
-    if (folder / "deviation.ply").exists():
-        file = read_mesh_file(folder / "deviation.ply")
-        return file.mesh, file.vertex_values.get("deviation_um")
-    if (folder / "mesh.ply").exists():
-        return read_mesh(folder / "mesh.ply"), None
+def _surface(folder: Path, missing: list[str]) -> MeshFile | None:
+    for name in ("deviation.ply", "mesh.ply"):
+        if (folder / name).exists():
+            return read_mesh_file(folder / name)
     missing.append("the surface: the run is not complete; give the same command again, it goes on where it stopped")
-    return None, None
+    return None
+
+
+def _sigma_um(given: Float[np.ndarray, "v"] | None) -> Float[np.ndarray, "v"] | None:
+    """What a file says; what no standard deviation can be is not known."""
+    return None if given is None else np.where(np.isfinite(given) & (given >= 0), given, np.nan)
 
 
 def _reference(folder: Path, run: Mapping[str, Any], given: Path | None, unit: Unit) -> Jaw | None:

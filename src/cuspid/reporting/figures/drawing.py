@@ -30,6 +30,8 @@ NOT_COUNTED = np.array([168, 168, 168], dtype=np.uint8)
 """Colour of a vertex without a deviation."""
 RANGES_UM = (5.0, 10.0, 25.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
 """Ends of the colour bar from which the reader chooses."""
+SIGMA_COLORS = "viridis"
+"""Colours of standard deviations from 0 up, by their name in matplotlib."""
 _BACK = 0.78
 """Grey of a surface seen from behind."""
 _INK = "#333333"
@@ -84,6 +86,13 @@ def deviation_map(options: FigureOptions) -> LinearSegmentedColormap:
 def fitting_range_um(p95_um: float) -> float:
     """The smallest range of the colour bar that is at least two and a half times the 95th percentile."""
     return next((each for each in RANGES_UM if each >= 2.5 * p95_um), RANGES_UM[-1])
+
+
+def fitting_sigma_um(sigma_um: Float[np.ndarray, "v"]) -> float:
+    """The smallest end of a colour bar from 0 that holds 95 % of the standard deviations that are known."""
+    known = sigma_um[~np.isnan(sigma_um)]
+    most = float(np.percentile(known, 95)) if len(known) else 0.0
+    return next((each for each in RANGES_UM if each >= most), RANGES_UM[-1])
 
 
 def deviation_colors(
@@ -192,8 +201,7 @@ def save_deviation_picture(
 
 def save_expected_picture(path: Path, mesh: Mesh, sigma_um: Float[np.ndarray, "v"], *, width_px: int = 1000) -> None:
     """PNG of a mesh (in its own frame) coloured by the standard deviation of each vertex, with the colour bar."""
-    limit = next((each for each in RANGES_UM if each >= np.percentile(sigma_um, 95)), RANGES_UM[-1])
-    colours = ScalarMappable(Normalize(0, limit), "viridis")
+    colours = ScalarMappable(Normalize(0, fitting_sigma_um(sigma_um)), SIGMA_COLORS)
     figure = new_figure(12.0, 7.2, dpi=130)
     colored = replace(mesh, colors=colours.to_rgba(sigma_um, bytes=True)[:, :3])
     _draw_views(figure, colored, 0.18, width_px=width_px)

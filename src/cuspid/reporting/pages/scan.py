@@ -22,30 +22,29 @@ from cuspid.mesh import Mesh
 from cuspid.options import Options, Range
 from cuspid.reconstruction import Reconstruction
 from cuspid.reporting.figures.drawing import (
-    RANGES_UM,
     FigureOptions,
-    deviation_colors,
     deviation_map,
-    fitting_range_um,
     render,
 )
+from cuspid.reporting.pages.color_scale import ColorScale, css_color
 from cuspid.reporting.pages.page import jpeg_uri, picture_uri, provenance, render_page, script_json
 from cuspid.reporting.pages.scene import (
     REFERENCE_COLOR,
     Place,
     camera_layer,
-    color_table,
-    css_color,
-    css_gradient,
+    deviation_range_um,
     mesh_layer,
     path_layer,
     poses_from,
     shown_frame,
     standard_views,
+    surface_maps,
 )
-from cuspid.reporting.pages.shown_mesh import UM_PER_STEP, ShownMesh, simplified
+from cuspid.reporting.pages.shown_mesh import ShownMesh, simplified
 from cuspid.storage import ScanResult
 
+_Maps = Sequence[tuple[ColorScale, Float[np.ndarray, "v"]]]
+"""What a surface can be coloured by, the first one at the start, with the values of its vertices."""
 _BINS = 80
 _WORST_APART_MM = 1.0
 _WORST_VIEW_MM = 2.5
@@ -74,22 +73,19 @@ def scan_page(result: ScanResult, options: ReportOptions = ReportOptions()) -> s
         raise InputError(f"{result.name}: nothing to show; {'; '.join(result.missing)}")
     shown_from_scan = shown_frame(result)
     scan = result.scan.transformed(shown_from_scan)
-    range_um = options.range_um or _range_of(result)
+    range_um = options.range_um or deviation_range_um(result)
     worst = worst_places(scan, result.deviation_um, result.reference, options.worst)
     shown = simplified(scan, options.most_faces)
-    carried = None if result.deviation_um is None else shown.carried(result.deviation_um)
-    scene, sizes = _scene(result, shown, carried, shown_from_scan, range_um, options)
+    maps = [(scale, shown.carried(values)) for scale, values in surface_maps(result, range_um)]
+    scene, sizes = _scene(result, shown, maps, shown_from_scan, options)
     return render_page(
         "scan.html.j2",
         title=_title(result),
         name=result.name,
         missing=result.missing,
         scene=script_json({**scene, "worst": [asdict(place) for place in worst]}),
-        still=_still(shown.mesh, carried, range_um),
-        gradient=css_gradient(),
-        range_um=range_um,
-        ranges_um=sorted({*RANGES_UM, range_um}),
-        has_deviation=result.deviation_um is not None,
+        still=_still(shown.mesh, maps),
+        scales=[scale for scale, _ in maps],
         toggles=[(layer["name"], layer["label"], layer["visible"]) for layer in scene["layers"]],
         views=[view["name"] for view in scene["views"]],
         shown=sizes,
@@ -116,23 +112,18 @@ def _title(result: ScanResult) -> str:
     return what if result.trueness is not None else f"{what}, not evaluated"
 
 
-def _range_of(result: ScanResult) -> float:
-    return fitting_range_um(float(result.trueness["p95_um"])) if result.trueness else 100.0
-
-
 # --- what is drawn ----------------------------------------------------------------------------------------------------
 
 
 def _scene(
     result: ScanResult,
     shown: ShownMesh,
-    carried: Float[np.ndarray, "v"] | None,
+    maps: _Maps,
     shown_from_scan: Rigid3,
-    range_um: float,
     options: ReportOptions,
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The scene, and from how many to how many faces each surface was simplified."""
-    layers = [mesh_layer("scan", "Scan", shown.mesh, deviation_um=carried)]
+    layers = [mesh_layer("scan", "Scan", shown.mesh, values_um={scale.name: values for scale, values in maps})]
     sizes = [_size("scan", shown.full_faces, len(shown.mesh.faces), shown.off_um)]
     if result.reference is not None:
         truth = simplified(result.reference.mesh, options.most_reference_faces)
@@ -146,10 +137,7 @@ def _scene(
     arch = None if result.reference is None else result.reference.arch
     scene = {
         "layers": layers,
-        "colors": color_table(),
-        "range": range_um,
-        "unit": "µm",
-        "per_step": UM_PER_STEP,
+        "scales": [scale.in_scene for scale, _ in maps],
         "views": standard_views(arch),
         "teeth": [asdict(place) for place in _teeth(result)],
     }
@@ -175,10 +163,9 @@ def _tooth_place(jaw: Jaw, fdi: int) -> Place:
     return Place(name=str(fdi), position_mm=(x, y, z), radius_mm=1.25 * radius)
 
 
-def _still(scan: Mesh, deviation_um: Float[np.ndarray, "v"] | None, range_um: float) -> str:
+def _still(scan: Mesh, maps: _Maps) -> str:
     """What is seen where there is no WebGL, and in print before the view was drawn."""
-    figure = FigureOptions(range_um=range_um, tolerance_um=range_um / 4)
-    colors = None if deviation_um is None else deviation_colors(deviation_um, figure)
+    colors = next((scale.rgb(values) for scale, values in maps), None)
     return jpeg_uri(render(Mesh(scan.vertices, scan.faces, colors), width_px=900, supersampling=1).image)
 
 

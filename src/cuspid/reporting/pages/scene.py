@@ -7,19 +7,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
-from matplotlib.colors import Colormap
+from jaxtyping import Float
 
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Arch
 from cuspid.mesh import Mesh
 from cuspid.reconstruction import Reconstruction
-from cuspid.reporting.figures.drawing import FigureOptions, deviation_map
+from cuspid.reporting.figures.drawing import fitting_range_um
+from cuspid.reporting.pages.color_scale import ColorScale, deviation_scale, sigma_scale
 from cuspid.reporting.pages.page import packed
-from cuspid.reporting.pages.shown_mesh import pack_deviation, pack_mesh
+from cuspid.reporting.pages.shown_mesh import pack_mesh, pack_um
 from cuspid.rig import Rig
 from cuspid.storage import ScanResult
 
@@ -28,7 +29,6 @@ PLASTER_COLOR = (222, 214, 200)
 REFERENCE_COLOR = (196, 205, 214)
 """sRGB of the reference."""
 _FRUSTUM_MM = 1.2
-_COLORS = 257
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +65,22 @@ def shown_frame(result: ScanResult) -> Rigid3:
     return Rigid3.from_rotation_vector(turn / sine * np.arctan2(sine, up[2]), np.zeros(3))
 
 
+def deviation_range_um(result: ScanResult) -> float:
+    """The range that fits the deviations of a scan, as far as they are known."""
+    return fitting_range_um(float(result.trueness["p95_um"])) if result.trueness else 100.0
+
+
+def surface_maps(result: ScanResult, range_um: float) -> list[tuple[ColorScale, Float[np.ndarray, "v"]]]:
+    """What the surface of a scan can be coloured by, with the values of its vertices: its deviations, with this range,
+    and what was expected of them; those of them that the folder has."""
+    maps = []
+    if result.deviation_um is not None:
+        maps.append((deviation_scale(range_um), result.deviation_um))
+    if result.sigma_um is not None:
+        maps.append((sigma_scale(result.sigma_um), result.sigma_um))
+    return maps
+
+
 def poses_from(reconstruction: Reconstruction, shown_from_scan: Rigid3) -> dict[str, Rigid3]:
     """``rig_from_shown`` of each frame."""
     scan_from_shown = shown_from_scan.inverse()
@@ -91,12 +107,13 @@ def mesh_layer(
     mesh: Mesh,
     *,
     visible: bool = True,
-    deviation_um: Float[np.ndarray, "v"] | None = None,
+    values_um: Mapping[str, Float[np.ndarray, "v"]] = MappingProxyType({}),
     color: Sequence[int] = PLASTER_COLOR,
     behind: bool = False,
 ) -> dict[str, Any]:
-    """A surface. ``behind``: where it coincides with another one, the other is seen."""
-    values = None if deviation_um is None else pack_deviation(deviation_um)
+    """A surface. ``values_um`` of its vertices by the name of their colour scale. ``behind``: where it coincides with
+    another one, the other is seen."""
+    values = {each: pack_um(values) for each, values in values_um.items()}
     look = {"visible": visible, "color": list(color), "behind": behind, "values": values}
     return {"kind": "mesh", "name": name, "label": label, **pack_mesh(mesh), **look}
 
@@ -149,20 +166,3 @@ def camera_path(rig: Rig, rig_from_shown: Mapping[str, Rigid3]) -> Float[np.ndar
     """Where the middle of the cameras was at each frame."""
     middle = np.mean([mounted.centre_in_rig for mounted in rig.cameras.values()], axis=0)
     return np.array([pose.inverse().apply(middle) for pose in rig_from_shown.values()]).reshape(-1, 3)
-
-
-def color_table(colors: Colormap | None = None) -> dict[str, str]:
-    """The colour bar from one end to the other (default: of deviations, green within a quarter of the range), sRGB."""
-    table = (colors or deviation_map(FigureOptions()))(np.linspace(0, 1, _COLORS), bytes=True)[:, :3]
-    return packed(np.asarray(table, dtype=np.uint8))
-
-
-def css_color(rgb: UInt8[np.ndarray, "3"]) -> str:
-    """An sRGB colour as CSS knows it."""
-    return f"#{bytes(rgb).hex()}"
-
-
-def css_gradient(colors: Colormap | None = None) -> str:
-    """The same as a CSS gradient from left to right."""
-    table = (colors or deviation_map(FigureOptions()))(np.linspace(0, 1, 65), bytes=True)[:, :3]
-    return f"linear-gradient(to right, {', '.join(map(css_color, table))})"

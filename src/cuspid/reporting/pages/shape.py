@@ -9,8 +9,9 @@ import numpy as np
 from cuspid.mesh import Mesh
 from cuspid.reporting.figures.drawing import render
 from cuspid.reporting.figures.shape import SHIFT_COLORS
+from cuspid.reporting.pages.color_scale import ColorScale
 from cuspid.reporting.pages.page import jpeg_uri, packed, picture_uri, provenance, render_page, script_json
-from cuspid.reporting.pages.scene import color_table, css_gradient, mesh_layer, standard_views
+from cuspid.reporting.pages.scene import mesh_layer, standard_views
 from cuspid.reporting.pages.shown_mesh import ShownMesh, simplified
 from cuspid.shape_model import ShapeModel
 from cuspid.storage import ShapeResult
@@ -27,8 +28,8 @@ def shape_page(result: ShapeResult, most_faces: int = 120_000) -> str:
     shown = simplified(model.mean.mesh, most_faces)
     count = min(_MOST_MODES, len(model.modes))
     shares = 100 * model.variance_shares
-    range_mm = _fitting_range(model)
-    scene = _scene(model, shown, count, range_mm)
+    scale = _scale(model)
+    scene = _scene(model, shown, count, scale)
     size = {"name": "mean", "full": shown.full_faces, "shown": len(shown.mesh.faces), "off_um": shown.off_um}
     return render_page(
         "shape.html.j2",
@@ -37,9 +38,7 @@ def shape_page(result: ShapeResult, most_faces: int = 120_000) -> str:
         missing=result.missing,
         scene=script_json(scene),
         still=jpeg_uri(render(Mesh(shown.mesh.vertices, shown.mesh.faces), width_px=900, supersampling=1).image),
-        gradient=css_gradient(SHIFT_COLORS),
-        range=range_mm,
-        ranges=_RANGES_MM,
+        scales=[scale],
         toggles=[("mean", "Jaw", True)],
         views=[view["name"] for view in scene["views"]],
         shown=[size],
@@ -63,15 +62,12 @@ def shape_page(result: ShapeResult, most_faces: int = 120_000) -> str:
     )
 
 
-def _scene(model: ShapeModel, shown: ShownMesh, modes: int, range_mm: float) -> dict[str, Any]:
+def _scene(model: ShapeModel, shown: ShownMesh, modes: int, scale: ColorScale) -> dict[str, Any]:
     """What the viewer draws: the mean and what moves it."""
     return {
         "layers": [mesh_layer("mean", "Mean", shown.mesh)],
         "modes": [_mode(model, k, shown.nearest) for k in range(modes)],
-        "colors": color_table(SHIFT_COLORS),
-        "range": range_mm,
-        "unit": "mm",
-        "per_step": _MM_PER_STEP,
+        "scales": [scale.in_scene],
         "views": standard_views(model.mean.arch),
         "teeth": [],
         "worst": [],
@@ -83,6 +79,20 @@ def _mode(model: ShapeModel, k: int, nearest: np.ndarray) -> dict[str, Any]:
     field = (model.standard_deviations_mm[k] * model.modes[k])[nearest]
     step = float(np.abs(field).max()) / _LARGEST or 1.0
     return {"step": step, "field": packed(np.rint(field / step).astype(np.int16))}
+
+
+def _scale(model: ShapeModel) -> ColorScale:
+    """Of shifts along the normals of the mean."""
+    return ColorScale(
+        name="shift",
+        label="Colours",
+        meaning="Shift along the normals of the mean in mm, positive outwards.",
+        colors=SHIFT_COLORS,
+        end=_fitting_range(model),
+        ends=_RANGES_MM,
+        unit="mm",
+        per_step=_MM_PER_STEP,
+    )
 
 
 def _fitting_range(model: ShapeModel) -> float:

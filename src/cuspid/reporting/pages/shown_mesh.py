@@ -20,9 +20,9 @@ _MOST = 65535
 _PROBES = 50_000
 """About so many vertices of the full mesh tell how near the shown one is."""
 UM_PER_STEP = 0.1
-"""Deviations are kept in whole steps of this size."""
+"""Deviations and standard deviations are kept in whole steps of this size."""
 UNKNOWN = -32768
-"""A deviation that is not known."""
+"""What is not known."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -68,8 +68,8 @@ def pack_mesh(mesh: Mesh) -> dict[str, Any]:
     }
 
 
-def pack_deviation(deviation_um: Float[np.ndarray, "v"]) -> dict[str, str]:
-    """Deviations in steps of `UM_PER_STEP`."""
+def pack_um(values_um: Float[np.ndarray, "v"]) -> dict[str, str]:
+    """Values of vertices in steps of `UM_PER_STEP`; NaN is not known."""
     limit = -UNKNOWN - 1
-    steps = np.clip(np.rint(np.nan_to_num(deviation_um) / UM_PER_STEP), -limit, limit)
-    return packed(np.where(np.isnan(deviation_um), UNKNOWN, steps).astype(np.int16))
+    steps = np.clip(np.rint(np.nan_to_num(values_um) / UM_PER_STEP), -limit, limit)
+    return packed(np.where(np.isnan(values_um), UNKNOWN, steps).astype(np.int16))

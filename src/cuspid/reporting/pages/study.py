@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,12 @@ from jaxtyping import Float
 from cuspid.errors import InputError
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
-from cuspid.reporting.figures.drawing import RANGES_UM, FigureOptions, deviation_colors, fitting_range_um, render
+from cuspid.reporting.figures.drawing import fitting_range_um, render
 from cuspid.reporting.figures.repeat import faces_around
+from cuspid.reporting.pages.color_scale import deviation_scale
 from cuspid.reporting.pages.page import jpeg_uri, number, picture_uri, provenance, render_page, script_json, signed
-from cuspid.reporting.pages.scene import color_table, css_gradient, mesh_layer, standard_views
-from cuspid.reporting.pages.shown_mesh import UM_PER_STEP, simplified
+from cuspid.reporting.pages.scene import mesh_layer, standard_views
+from cuspid.reporting.pages.shown_mesh import simplified
 from cuspid.storage import StudyResult
 
 _MOST_FACES = 120_000
@@ -30,6 +32,11 @@ _TITLES = {
     "compare": "Handpieces compared",
     "repeat": "Repeated scans: trueness and precision",
 }
+_REPEATED = (
+    "In µm, positive outside the reference: the mean over the scans is systematic, their SD is random. Grey: not on "
+    "all scans."
+)
+"""What the colours tell."""
 _WHEN = ("simulation_s", "reconstruction_s", "reconstruction_cpu_s", "cpu_s")
 
 
@@ -66,26 +73,25 @@ def _view(reference: Jaw, values: Mapping[str, Float[np.ndarray, "v"]]) -> dict[
     carried = {name: shown.carried(values[column][keep]) for name, (_, column) in maps.items()}
     layers = [
         {
-            **mesh_layer(name, label, shown.mesh, visible=name == "mean", deviation_um=carried[name]),
+            **mesh_layer(name, label, shown.mesh, visible=name == "mean", values_um={"deviation": carried[name]}),
             "group": "map",
         }
         for name, (label, _) in maps.items()
     ]
     size = {"full": shown.full_faces, "shown": len(shown.mesh.faces), "off_um": shown.off_um}
     range_um = fitting_range_um(float(np.nanpercentile(np.abs(carried["mean"]), 95)))
-    colors = deviation_colors(carried["mean"], FigureOptions(range_um=range_um, tolerance_um=range_um / 4))
-    still = render(Mesh(shown.mesh.vertices, shown.mesh.faces, colors), width_px=900, supersampling=1)
+    scale = replace(deviation_scale(range_um), label="Colours", meaning=_REPEATED)
+    colored = Mesh(shown.mesh.vertices, shown.mesh.faces, scale.rgb(carried["mean"]))
+    still = render(colored, width_px=900, supersampling=1)
     views = standard_views(reference.arch)
-    scene = {"layers": layers, "colors": color_table(), "range": range_um, "unit": "µm", "per_step": UM_PER_STEP}
+    scene = {"layers": layers, "scales": [scale.in_scene]}
     return {
         "scene": script_json({**scene, "views": views, "teeth": [], "worst": []}),
         "still": jpeg_uri(still.image),
         "toggles": [(layer["name"], layer["label"], layer["visible"]) for layer in layers],
         "views": [each["name"] for each in views],
         "shown": [{"name": "scanned part of the reference", **size}],
-        "gradient": css_gradient(),
-        "range_um": range_um,
-        "ranges_um": RANGES_UM,
+        "scales": [scale],
     }
 
 

@@ -1,4 +1,4 @@
-// The 3-D view of a page: surfaces with the colours of their deviation, lines, standard views, places to go to.
+// The 3-D view of a page: surfaces in the colours of what is known of them, lines, standard views, places to go to.
 //
 // Everything is drawn by three.js in the occlusal frame (mm) with an orthographic camera, so that the length bar holds
 // everywhere. What to draw stands in the element #scene; arrays are base64 of gzip of little-endian numbers. A picture
@@ -45,8 +45,8 @@
   Object.assign(controls, { rotateSpeed: 3.2, zoomSpeed: 1.4, panSpeed: 0.5, staticMoving: true });
 
   const layers = new Map();
-  let range = scene.range;
-  let colored = true;
+  const scales = new Map(scene.scales.map((each) => [each.name, each]));
+  let scale = scene.scales[0] ?? null; // What colours tell; null for none.
   let dirty = true;
   let snapshotTimer = 0;
 
@@ -71,7 +71,9 @@
     geometry.computeVertexNormals();
     geometry.computeBoundingSphere();
     const object = new THREE.Mesh(geometry, surfaceMaterial(layer));
-    object.userData = { values: layer.values ? await unpack(layer.values) : null, color: layer.color };
+    const values = {};
+    for (const name of Object.keys(layer.values)) values[name] = await unpack(layer.values[name]);
+    object.userData = { values, color: layer.color };
     return object;
   }
 
@@ -87,23 +89,27 @@
     return line;
   }
 
-  const bar = Array.from(await unpack(scene.colors), (value) => linear(value / 255));
-  const last = bar.length / 3 - 1;
+  for (const each of scene.scales) each.bar = Array.from(await unpack(each.colors), (value) => linear(value / 255));
+
+  function shareOf(value, { end, signed, per_step: step }) {
+    const share = (value * step) / end;
+    return Math.min(1, Math.max(0, signed ? 0.5 + 0.5 * share : share));
+  }
 
   function paint(object) {
-    const { values, color } = object.userData;
+    const { color } = object.userData;
+    const values = scale && object.userData.values[scale.name];
     const colors = object.geometry.attributes.color;
     const plain = color.map((value) => linear(value / 255));
     const grey = linear(168 / 255);
     for (let k = 0; k < colors.count; k++) {
-      if (!values || !colored) {
+      if (!values) {
         colors.setXYZ(k, ...plain);
       } else if (values[k] === UNKNOWN) {
         colors.setXYZ(k, grey, grey, grey);
       } else {
-        const share = 0.5 + (0.5 * values[k] * scene.per_step) / range;
-        const at = 3 * Math.round(last * Math.min(1, Math.max(0, share)));
-        colors.setXYZ(k, bar[at], bar[at + 1], bar[at + 2]);
+        const at = 3 * Math.round((scale.bar.length / 3 - 1) * shareOf(values[k], scale));
+        colors.setXYZ(k, scale.bar[at], scale.bar[at + 1], scale.bar[at + 2]);
       }
     }
     colors.needsUpdate = true;
@@ -255,28 +261,33 @@
 
   function showTicks() {
     const sign = (value) => (value > 0 ? "+" : value < 0 ? "−" : "");
-    root.querySelectorAll(".ticks span").forEach((tick, k) => {
-      const value = range * (k / 2 - 1);
-      tick.textContent = value ? `${sign(value)}${Number(Math.abs(value).toPrecision(3))}` : "0";
-    });
-    const unit = find(".unit");
-    if (unit) unit.textContent = scene.unit;
+    for (const legend of root.querySelectorAll("[data-scale]")) {
+      const { end, signed } = scales.get(legend.dataset.scale);
+      legend.querySelectorAll(".ticks span").forEach((tick, k) => {
+        const value = signed ? end * (k / 2 - 1) : (end * k) / 4;
+        tick.textContent = value ? `${signed ? sign(value) : ""}${Number(Math.abs(value).toPrecision(3))}` : "0";
+      });
+    }
   }
+
+  // What a click reads: the values that are coloured, or without colours those that were first.
+  const readable = () => scale ?? scene.scales[0];
 
   function read(event) {
     const box = canvas.getBoundingClientRect();
     const at = new THREE.Vector2((2 * (event.clientX - box.left)) / box.width - 1, 1 - (2 * (event.clientY - box.top)) / box.height);
     const ray = new THREE.Raycaster();
     ray.setFromCamera(at, camera);
-    const surfaces = [...layers.values()].filter((each) => each.isMesh && each.visible && each.userData.values);
+    const surfaces = [...layers.values()].filter((each) => each.isMesh && each.visible && each.userData.values[readable()?.name]);
     const [hit] = ray.intersectObjects(surfaces, false);
     const readout = find(".readout");
     readout.hidden = !hit;
     if (!hit) return;
-    const value = hit.object.userData.values[hit.face.a];
-    const amount = value * scene.per_step;
+    const { name, unit, signed, per_step: step } = readable();
+    const value = hit.object.userData.values[name][hit.face.a];
+    const amount = value * step;
     const where = hit.point.toArray().map((each) => each.toFixed(2)).join(", ");
-    const text = value === UNKNOWN ? "not counted" : `${amount > 0 ? "+" : ""}${amount.toFixed(scene.unit === "mm" ? 3 : 1)} ${scene.unit}`;
+    const text = value === UNKNOWN ? "not known" : `${signed && amount > 0 ? "+" : ""}${amount.toFixed(unit === "mm" ? 3 : 1)} ${unit}`;
     readout.textContent = `${text}  at ${where} mm`.replace(/-/g, "−");
   }
 
@@ -304,6 +315,17 @@
     }
   }
 
+  const repaint = () => layers.forEach((each) => each.isMesh && paint(each));
+
+  // Of the scales one is shown, or none; the legend is that of the last one.
+  function color(button) {
+    scale = toggled(button) ? scales.get(button.dataset.colors) : null;
+    for (const other of root.querySelectorAll("[data-colors]")) if (other !== button) press(other, false);
+    for (const legend of root.querySelectorAll("[data-scale]")) legend.hidden = legend.dataset.scale !== button.dataset.colors;
+    find(".readout").hidden = true;
+    repaint();
+  }
+
   function bind() {
     for (const button of root.querySelectorAll("[data-layer]")) {
       button.addEventListener("click", () => {
@@ -323,16 +345,15 @@
       mark(null);
       whole();
     });
-    find("[data-colors]")?.addEventListener("click", (event) => {
-      colored = toggled(event.currentTarget);
-      layers.forEach((each) => each.userData.values && paint(each));
-    });
-    find("[data-range]")?.addEventListener("change", (event) => {
-      range = Number(event.target.value);
-      layers.forEach((each) => each.userData.values && paint(each));
-      showTicks();
-      change();
-    });
+    for (const button of root.querySelectorAll("[data-colors]")) button.addEventListener("click", () => color(button));
+    for (const choice of root.querySelectorAll("[data-range]")) {
+      choice.addEventListener("change", () => {
+        scales.get(choice.closest("[data-scale]").dataset.scale).end = Number(choice.value);
+        repaint();
+        showTicks();
+        change();
+      });
+    }
     if (labels.length) {
       find("[data-teeth]").hidden = false;
       find("[data-teeth]").addEventListener("click", (event) => {
@@ -383,7 +404,9 @@
     const normals = geometry.attributes.normal.array.slice();
     const fields = await Promise.all(scene.modes.map((mode) => unpack(mode.field)));
     const inputs = [...root.querySelectorAll("[data-mode]")];
-    surface.userData.values = new Int16Array(rest.length / 3);
+    const [{ name, per_step: step }] = scene.scales;
+    const shifts = new Int16Array(rest.length / 3);
+    surface.userData.values[name] = shifts;
     const move = () => {
       const { array } = geometry.attributes.position;
       array.set(rest);
@@ -396,7 +419,7 @@
       for (let v = 0; v < array.length; v += 3) {
         let shift = 0;
         for (let i = v; i < v + 3; i++) shift += (array[i] - rest[i]) * normals[i];
-        surface.userData.values[v / 3] = Math.max(-32767, Math.min(32767, Math.round(shift / scene.per_step)));
+        shifts[v / 3] = Math.max(-32767, Math.min(32767, Math.round(shift / step)));
       }
       geometry.attributes.position.needsUpdate = true;
       geometry.computeVertexNormals();
