@@ -163,6 +163,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
     "jaws_full_auto": ("Real jaws at full size, with further passes", anatomy_sections.jaws),
     "manufacturing": ("Handpieces that are not built as drawn", handpiece_sections.manufacturing),
     "manufacturing_arch": ("The same, an arch at half size", handpiece_sections.manufacturing),
+    "expectations": ("What is expected of a scan", trust_sections.expectations),
     "grid": ("Running many", handpiece_sections.grid),
     "fuzz": ("Damaged input", trust_sections.fuzz),
     "kill": ("Killed runs", trust_sections.kill),
