@@ -35,9 +35,9 @@ def expectations(result: Result) -> str:
         [
             "Teeth of the phantom, each seed another jaw, texture and hand; exact calibration; *short*: six frames "
             "over 3 mm. Right would be 68.3, 95.4 and 99.7 % of the surface within one, two and three of its own "
-            "sigmas, and 1 for the errors of the poses (root mean square; those of one scan hang together, so that a single scan "
-            "is anywhere from a half to two). The sigma of the scale is of poses and calibration alone: a surface that "
-            "lies too far out everywhere is not in it. `python benchmarks/expectations.py`.",
+            "sigmas, and 1 for the errors of the poses (root mean square; those of one scan hang together, so that a "
+            "single scan is anywhere from a half to two). The sigma of the scale is of poses and calibration "
+            "alone: a surface that lies too far out everywhere is not in it. `python benchmarks/expectations.py`.",
             "",
             markdown_table(_EXPECTED, rows),
         ]

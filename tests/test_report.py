@@ -517,7 +517,7 @@ def colors_of(mesh: trimesh.Trimesh) -> np.ndarray:
 def test_the_live_view_colours_by_what_is_chosen(scan_folder, monkeypatch):
     choices, shown = colored_surface(storage.read_result(scan_folder), monkeypatch)
     assert choices["Colours"].options == ["Deviation", "Expected", "None"]
-    deviation, expected = choices["Range, ± µm"], choices["Range, 0 to µm"]
+    deviation, expected = choices["Range in µm, ±"], choices["Range in µm, 0 to"]
     assert (deviation.visible, expected.visible) == (True, False)
     assert "positive outside" in choices["legend"].content
     by_deviation = colors_of(shown["/scan"])

@@ -124,7 +124,7 @@ def _add_colors(
 
 def _add_ends(server: Server, scale: ColorScale, *, visible: bool) -> Node:
     """A choice of the upper end of a scale."""
-    ends, name = [f"{each:g}" for each in scale.ends], f"Range, {scale.reach} {scale.unit}"
+    ends, name = [f"{each:g}" for each in scale.ends], f"Range in {scale.unit}, {scale.reach}"
     return server.gui.add_dropdown(name, ends, initial_value=f"{scale.end:g}", visible=visible)
 
 
