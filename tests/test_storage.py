@@ -393,6 +393,26 @@ def test_a_folder_belongs_to_one_run(tmp_path):
         storage.claim_folder(tmp_path / "other", "simulate", {}, {})
 
 
+def test_results_stay_those_of_the_run_that_made_them_until_they_are_replaced(tmp_path):
+    def settings() -> dict[str, object]:
+        return storage.read_json(tmp_path / "out" / "run.json")["measure"]["settings"]
+
+    def measure(arch: str, error: BaseException | None = None) -> None:
+        with storage.claimed_folder(tmp_path / "out", "measure", {"arch": arch}, {}, replace=True):
+            assert settings() == {"arch": "lower"}  # of the first run, or of what is there still
+            if error is not None:
+                raise error
+            (tmp_path / "out" / "jaws.csv").write_text(arch)
+
+    measure("lower")
+    for error in (InputError("no jaw"), KeyboardInterrupt()):
+        with pytest.raises(type(error)):
+            measure("upper", error)
+        assert settings() == {"arch": "lower"}
+    measure("upper")
+    assert settings() == {"arch": "upper"}
+
+
 def test_files_are_whole_or_absent(tmp_path):
     path = tmp_path / "value.json"
     storage.write_json(path, {"a": float("nan"), "b": np.float32(0.5)})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
@@ -19,6 +18,7 @@ from cuspid.pipeline import StitchOptions
 from cuspid.progress import Progress
 from cuspid.reporting.figures.panorama import save_camera_path
 from cuspid.stitching.ortho import Stitched
+from cuspid.workers import map_in_threads
 
 
 def stitch(
@@ -59,9 +59,10 @@ def _read(frames: Path, out: Path, calibration: Path | None, progress: Progress)
 
 
 def _hashes(sequence: ImageSequence, calibration: Path | None) -> dict[str, str]:
-    """Of the list of frames with their sizes, and of the calibration."""
-    listing = [(path.name, path.stat().st_size) for path in sequence.paths]
-    hashes = {"frames": hashlib.sha256(repr(listing).encode()).hexdigest()}
+    """Of the frames, and of the calibration."""
+    frames = map_in_threads(storage.hash_file, sequence.paths)
+    named = dict(zip((path.name for path in sequence.paths), frames, strict=True))
+    hashes = {"frames": storage.digest_of(named)}
     return hashes if calibration is None else {**hashes, "calibration": storage.hash_file(calibration)}
 
 

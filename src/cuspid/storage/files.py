@@ -201,15 +201,14 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 def claim_folder(
     folder: Path, stage: str, settings: Mapping[str, object], inputs: Mapping[str, str], *, replace: bool = False
-) -> None:
-    """Make ``folder`` the home of one run of a stage, or find that it is already.
+) -> Mapping[str, object]:
+    """Make ``folder`` the home of one run of a stage, or find that it is already; what is kept of the run.
 
     ``run.json`` keeps for each stage the version, the settings and the hashes of the inputs. Of files that the settings
     name only the contents count, which are among the inputs. Raises OutputError where the folder holds files that no
-    run of cuspid wrote, or the same stage made from something else (unless it may be replaced, since it is made anew as
-    a whole).
+    run of cuspid wrote, or the same stage made from something else; where that may be replaced, since it is made anew
+    as a whole, ``run.json`` stays as it is.
     """
-    manifest_path = folder / "run.json"
     plain = to_plain(settings, path=lambda _: None)
     entry = {"cuspid": cuspid.__version__, "settings": plain, "inputs_sha256": to_plain(inputs)}
     if folder.exists() and not folder.is_dir():
@@ -222,17 +221,23 @@ def claim_folder(
         raise OutputError(
             f"{folder}: holds another run of '{stage}' ({changed} differs); give another --out or delete the folder"
         )
-    if manifest.get(stage) != entry:
-        write_json(manifest_path, {**manifest, stage: entry})
+    if stage not in manifest:
+        _enter(folder, stage, entry)
+    return entry
+
+
+def _enter(folder: Path, stage: str, entry: Mapping[str, object]) -> None:
+    write_json(folder / "run.json", {**read_manifest(folder), stage: entry})
 
 
 @contextmanager
 def claimed_folder(
     folder: Path, stage: str, settings: Mapping[str, object], inputs: Mapping[str, str], *, replace: bool = False
 ) -> Iterator[None]:
-    """:func:`claim_folder` for the work in the block; leaves no trace where the work is refused before it wrote."""
+    """:func:`claim_folder` for the work in the block. Leaves no trace where the work is refused before it wrote; results
+    that are to be replaced stay those of the run that made them until the work is done."""
     existed = folder.exists()
-    claim_folder(folder, stage, settings, inputs, replace=replace)
+    entry = claim_folder(folder, stage, settings, inputs, replace=replace)
     try:
         yield
     except CuspidError:
@@ -240,6 +245,8 @@ def claimed_folder(
             (folder / "run.json").unlink()
             folder.rmdir()
         raise
+    if read_manifest(folder).get(stage) != entry:
+        _enter(folder, stage, entry)
 
 
 def _first_difference(old: Any, new: Any, name: str = "") -> str:
