@@ -158,7 +158,7 @@ def _score_turns(turned, targets, frames, fixed, nearest, origin, pitch, cap):
         for k in range(len(turned)):
             summed = 0.0
             for i in range(turned.shape[1]):
-                if (i == 6 and summed > 0.9 * i) or (i == 12 and summed > 0.8 * i) or (i == 36 and summed > 0.65 * i):
+                if (i == 6 and summed > 0.9 * i) or (i == 12 and summed > 0.85 * i) or (i == 36 and summed > 0.72 * i):
                     break
                 summed += _distance(turned, k, i, targets, frames, t, fixed, nearest, origin, pitch, cap)
             else:

@@ -234,8 +234,8 @@ def _enter(folder: Path, stage: str, entry: Mapping[str, object]) -> None:
 def claimed_folder(
     folder: Path, stage: str, settings: Mapping[str, object], inputs: Mapping[str, str], *, replace: bool = False
 ) -> Iterator[None]:
-    """:func:`claim_folder` for the work in the block. Leaves no trace where the work is refused before it wrote; results
-    that are to be replaced stay those of the run that made them until the work is done."""
+    """:func:`claim_folder` for the work in the block. Leaves no trace where the work is refused before it wrote;
+    results that are to be replaced stay those of the run that made them until the work is done."""
     existed = folder.exists()
     entry = claim_folder(folder, stage, settings, inputs, replace=replace)
     try:
