@@ -55,7 +55,7 @@ class Rehearsal:
         for name, pose in zip(names, poses, strict=True):
             on = [] if lit == "evenly" else lights if lit == "together" else [name.split("-")[1]]
             lamps = [true.lights[each].in_frame(pose.inverse()) for each in on]
-            gain = exposure * (1.0 if lit == "evenly" else 12.0 if lit == "together" else 35.0)
+            gain = exposure * (1.0 if lit == "evenly" else 6.0 if lit == "together" else 20.0)
             for camera, mounted in true.rig.cameras.items():
                 light = board_light(BOARD, mounted.camera, rays[camera], mounted.cam_from_rig @ pose, lamps)
                 self.images[camera, name] = record(light, gain, true, camera, rng)

@@ -242,16 +242,21 @@ def _print_light(light: Photometry) -> None:
     for note in light.notes:
         console.print(f"note: {note}")
     table = Table(title="Light")
-    for heading in ("camera", "gain", "corners %", "gamma", "noise DN", "residual %: before", "held out"):
-        table.add_column(heading, justify="left" if heading == "camera" else "right")
+    for heading in ("camera", "gain, ±%", "corners, %", "gamma, ±%", "noise DN", "before %", "held out %"):
+        table.add_column(heading, justify="left" if heading == "camera" else "right", no_wrap=True)
     for name, each in light.cameras.items():
-        gain = f"{each.gain:.3f} ± {each.gain * each.gain_sigma_pct / 100:.3f}"
-        corner = f"{-each.corner_loss_pct:.1f} ± {each.corner_loss_sigma_pct:.1f}"
-        gamma = f"{each.gamma:.2f} ± {each.gamma * each.gamma_sigma_pct / 100:.2f}"
-        table.add_row(
-            name, gain, corner, gamma, _shown(each.noise_dn), _shown(each.before_pct), _shown(each.held_out_pct)
-        )
+        gain = f"{each.gain:.3f} ±{each.gain_sigma_pct:.1f}"
+        corner = f"{-each.corner_loss_pct:.1f} ±{each.corner_loss_sigma_pct:.1f}"
+        gamma = f"{each.gamma:.2f} ±{each.gamma_sigma_pct:.1f}"
+        left = [_shown(value) for value in (each.noise_dn, each.before_pct, each.held_out_pct)]
+        table.add_row(name, gain, corner, gamma, *left)
     console.print(table)
+    found = [np.sqrt(np.diag(lamp.covariance)) for lamp in light.lights.values() if lamp.covariance is not None]
+    if found:
+        place, power = 1000 * np.median([each[:3] for each in found]), 100 * np.median([each[3] for each in found])
+        console.print(
+            f"{len(found)} lights: places to {place:.0f} um along each axis, powers to {power:.1f} % (medians)"
+        )
 
 
 def _shown(value: float | None, digits: int = 2) -> str:
