@@ -79,7 +79,7 @@ class Rig:
     def rebased(self, reference: str | None = None) -> tuple[Rig, Rigid3]:
         """The same rig in the frame of one of its cameras (default: the first), and ``reference_from_rig``."""
         reference_from_rig = self[reference or self.names[0]].cam_from_rig
-        return self._in_frame(reference_from_rig), reference_from_rig
+        return self.in_frame(reference_from_rig), reference_from_rig
 
     def over_surface(self, distance_mm: float) -> Rig:
         """The same rig in a frame on the surface that it looks at from a distance: +Z back to the cameras, against
@@ -94,9 +94,10 @@ class Rig:
         right = unit(right - (right @ back) * back)
         rotation = np.stack([right, np.cross(back, right), back])
         origin = np.mean([each.centre_in_rig for each in mounted] + distance_mm * axes, axis=0)
-        return self._in_frame(Rigid3(rotation, -rotation @ origin))
+        return self.in_frame(Rigid3(rotation, -rotation @ origin))
 
-    def _in_frame(self, new_from_rig: Rigid3) -> Rig:
+    def in_frame(self, new_from_rig: Rigid3) -> Rig:
+        """The same rig in another frame."""
         rig_from_new = new_from_rig.inverse()
         return Rig(
             {
@@ -146,12 +147,39 @@ class Light:
     """Linear RGB."""
     lobe_exponent: float = 1.0
     """Intensity falls as cos(angle)^exponent; 1 is a bare Lambertian LED."""
+    covariance: Float[np.ndarray, "4 4"] | None = None
+    """Covariance of the place (mm) and of the logarithm of the power; None where nobody has said how well they are
+    known."""
 
     def __post_init__(self) -> None:
         direction = np.asarray(self.direction, dtype=np.float64)
         object.__setattr__(self, "direction", read_only(direction / np.linalg.norm(direction)))
         object.__setattr__(self, "position_mm", read_only(np.asarray(self.position_mm, dtype=np.float64)))
         object.__setattr__(self, "colour", read_only(np.asarray(self.colour, dtype=np.float64)))
+        if self.covariance is not None:
+            object.__setattr__(self, "covariance", read_only(np.asarray(self.covariance, dtype=np.float64)))
+
+    def irradiance(
+        self, points: Float[np.ndarray, "*n 3"], normals: Float[np.ndarray, "*n 3"]
+    ) -> Float[np.ndarray, "*n"]:
+        """Light on a surface at points of the rig frame (mm) with unit normals; that of a power of 1 at 1 mm, both
+        facing each other, is 1. 0 behind the light and on the back of the surface; nothing is in the way."""
+        towards = self.position_mm - points
+        distance = np.linalg.norm(towards, axis=-1)
+        leaving = np.maximum(-(towards @ self.direction) / distance, 0.0)
+        arriving = np.maximum((towards * normals).sum(axis=-1) / distance, 0.0)
+        return np.asarray(self.power * leaving**self.lobe_exponent * arriving / distance**2)
+
+    def in_frame(self, new_from_rig: Rigid3) -> Light:
+        """The same light in another frame."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = new_from_rig.rotation
+        return replace(
+            self,
+            position_mm=new_from_rig.apply(self.position_mm),
+            direction=new_from_rig.rotate(self.direction),
+            covariance=None if self.covariance is None else matrix @ self.covariance @ matrix.T,
+        )
 
     @property
     def light_from_rig(self) -> Rigid3:
@@ -160,9 +188,9 @@ class Light:
         return Rigid3(turn, -turn @ self.position_mm)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Sensor:
-    """What turns light into numbers."""
+    """What turns light into numbers, the losses of the lens included."""
 
     noise_dn: float = 1.5
     """Standard deviation of the noise at mid grey, in digital numbers of 255."""
@@ -170,6 +198,34 @@ class Sensor:
     """Share (0 to 1) of the noise variance at mid grey that grows with the signal; the rest is constant."""
     gamma: float = 2.2
     """Encoding exponent from linear light to digital numbers."""
+    gain: float = 1.0
+    """How much brighter than those of the other cameras its images are, in linear light."""
+    falloff: tuple[float, float] = (0.0, 0.0)
+    """(a, b) of the share ``exp(a r^2 + b r^4)`` of the light that reaches a pixel, where r is its distance from the
+    principal point in halves of the diagonal of the image (vignetting; as a logarithm, after S. J. Kim, M. Pollefeys,
+    IEEE Trans. PAMI 30, 2008)."""
+    covariance: Float[np.ndarray, "4 4"] | None = None
+    """Covariance of (log gain, a, b, log gamma); None where nobody has said how well they are known."""
+
+    def __post_init__(self) -> None:
+        if self.covariance is not None:
+            object.__setattr__(self, "covariance", read_only(np.asarray(self.covariance, dtype=np.float64)))
+
+    @property
+    def corner_loss(self) -> float:
+        """Share of the light that is lost in the corners of an image."""
+        return float(1 - np.exp(sum(self.falloff)))
+
+    def transmitted(self, camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+        """Linear light that pixels of a camera show, over that which a camera of gain 1 without falloff would."""
+        return np.asarray(self.gain * np.exp(falloff_terms(camera, pixels) @ self.falloff))
+
+
+def falloff_terms(camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+    """r^2 and r^4 of pixels, see :attr:`Sensor.falloff`."""
+    half_diagonal_px = np.hypot(camera.width, camera.height) / 2
+    squared = (((pixels - camera.principal_point_px) / half_diagonal_px) ** 2).sum(axis=-1)
+    return np.stack([squared, squared**2], axis=-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,7 +263,9 @@ class Handpiece:
     lightings: tuple[Lighting, ...] = ()
     """Lighting patterns, in the order in which they take turns; empty where nothing is known of them."""
     sensor: Sensor = field(default_factory=Sensor)
-    """Common to all cameras."""
+    """Of the cameras that have none of their own."""
+    sensors: Mapping[str, Sensor] = field(default_factory=dict)
+    """By camera, of those that are not like the others."""
     working_distance_mm: float = 5.0
     """Nominal distance from a camera to the surface that it looks at."""
     depth_range_mm: tuple[float, float] = (2.5, 9.0)
@@ -219,6 +277,10 @@ class Handpiece:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lights", MappingProxyType(dict(self.lights)))
+        object.__setattr__(self, "sensors", MappingProxyType(dict(self.sensors)))
+        strange = set(self.sensors) - set(self.rig.names)
+        if strange:
+            raise InputError(f"handpiece: sensors of unknown cameras {one_line(', '.join(sorted(strange)))}")
         unknown = {light for lighting in self.lightings for light in lighting.lights} - set(self.lights)
         if unknown:
             raise InputError(f"handpiece: lighting patterns name unknown lights {one_line(', '.join(sorted(unknown)))}")
@@ -248,6 +310,10 @@ class Handpiece:
         """Side of what a pixel sees of a surface at the working distance, mm: median of the cameras."""
         focal_px = [mounted.camera.focal_px.mean() for mounted in self.rig.cameras.values()]
         return self.working_distance_mm / float(np.median(focal_px))
+
+    def sensor_of(self, camera: str) -> Sensor:
+        """The sensor of a camera."""
+        return self.sensors.get(camera, self.sensor)
 
     def lights_on(self, lighting: str | None) -> list[Light]:
         """The lights of a lighting pattern; all of them where the pattern is not known (None).

@@ -115,6 +115,13 @@ def _basis(board: Board, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, 
     return np.stack([u * u, u * v, v * v], axis=1)
 
 
+def bent(
+    board: Board, points: Float[np.ndarray, "n 3"], bending_mm: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Places on a board as it is given, where they are on the bent one, mm."""
+    return points + (_basis(board, points) @ bending_mm)[:, None] * [0.0, 0.0, 1.0]
+
+
 def bending_coordinates(board: Board, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """u and v of places on a board."""
     size = np.array(board.size_mm)

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from cuspid.board import Board
 from cuspid.calibration.bundle import (
@@ -23,7 +24,8 @@ from cuspid.calibration.bundle import (
 )
 from cuspid.calibration.corners import Views
 from cuspid.calibration.start import LEAST_VIEWS, calibrated_alone, groups, joined, require_one_group
-from cuspid.errors import ReconstructionError
+from cuspid.errors import InputError, ReconstructionError
+from cuspid.geometry import Rigid3
 from cuspid.options import Options, Range
 from cuspid.rig import MountedCamera, Rig
 
@@ -82,6 +84,10 @@ class RigCalibration:
     """Where each camera saw corners."""
     residuals: Mapping[str, Float[np.ndarray, "n 2"]]
     """Seen minus projected, px."""
+    views: Views
+    """That were used."""
+    rig_from_board: Mapping[str, Rigid3]
+    """Of the board at each instant."""
     distance_mm: float
     """Median distance of the board from the cameras."""
     notes: tuple[str, ...]
@@ -174,6 +180,28 @@ def _rms(residuals: Float[np.ndarray, "n 2"]) -> float:
     return float(np.sqrt(np.mean(residuals**2)))
 
 
+def in_frame_of(found: RigCalibration, drawn: Rig) -> RigCalibration:
+    """A calibration in the frame of the drawn rig: with its cameras where those are, on the whole.
+
+    Raises InputError where these are not the same cameras.
+    """
+    if set(drawn.names) != set(found.rig.names):
+        raise InputError(
+            f"calibration: the drawn handpiece has the cameras {', '.join(drawn.names)}, the images are of "
+            f"{', '.join(found.rig.names)}; give them the same names"
+        )
+    turns = [
+        drawn[name].cam_from_rig.rotation.T @ each.cam_from_rig.rotation for name, each in found.rig.cameras.items()
+    ]
+    turn = Rotation.from_matrix(np.stack(turns)).mean().as_matrix()
+    ours, theirs = (
+        np.mean([rig[name].centre_in_rig for name in found.rig.names], axis=0) for rig in (found.rig, drawn)
+    )
+    drawn_from_rig = Rigid3(turn, theirs - turn @ ours)
+    boards = {name: drawn_from_rig @ pose for name, pose in found.rig_from_board.items()}
+    return replace(found, rig=found.rig.in_frame(drawn_from_rig), rig_from_board=boards)
+
+
 # --- what it is worth --------------------------------------------------------------------------------------------
 
 
@@ -209,6 +237,8 @@ def _described(
         cameras=checks,
         pixels=pixels,
         residuals=residuals,
+        views=views,
+        rig_from_board=found.scene.rig_from_board,
         distance_mm=float(np.median(distances)),
         notes=(*notes, *_doubts(found.settled, checks, rig)),
     )
@@ -217,8 +247,8 @@ def _described(
 def _widened(mounted: MountedCamera, check: CameraCheck) -> MountedCamera:
     """With covariances that account for how far two halves of the images are apart."""
     lens, place = (max(1.0, apart or 0.0) ** 2 for apart in (check.parameters_apart, check.place_apart))
-    camera = replace(mounted.camera, covariance=lens * _known(mounted.camera.covariance))
-    return replace(mounted, camera=camera, covariance=place * _known(mounted.covariance))
+    camera = replace(mounted.camera, covariance=lens * known(mounted.camera.covariance))
+    return replace(mounted, camera=camera, covariance=place * known(mounted.covariance))
 
 
 def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Iterator[str]:
@@ -239,7 +269,7 @@ def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Itera
                 "they may not have seen the board at the same moment, or have moved against each other"
             )
     for name, mounted in rig.cameras.items():
-        share = float(np.sqrt(_known(mounted.camera.covariance)[0, 0])) / mounted.camera.focal_px[0]
+        share = float(np.sqrt(known(mounted.camera.covariance)[0, 0])) / mounted.camera.focal_px[0]
         if share > _OPEN_SHARE:
             yield f"camera {name}: its focal length is known to {share:.0%} only; show the board tilted, near and far"
 
@@ -276,13 +306,13 @@ def _apart(one: Adjusted, other: Adjusted) -> dict[str, tuple[float, float]]:
         a, b = ours[name], theirs[name]
         shift = a.camera.parameters - b.camera.parameters
         found[name] = (
-            _in_sigmas(shift, _known(a.camera.covariance) + _known(b.camera.covariance)),
-            _in_sigmas(motion, _known(a.covariance) + _known(b.covariance)),
+            _in_sigmas(shift, known(a.camera.covariance) + known(b.camera.covariance)),
+            _in_sigmas(motion, known(a.covariance) + known(b.covariance)),
         )
     return found
 
 
-def _known(covariance: Float[np.ndarray, "n n"] | None) -> Float[np.ndarray, "n n"]:
+def known(covariance: Float[np.ndarray, "n n"] | None) -> Float[np.ndarray, "n n"]:
     """Of a camera that was calibrated here, which always has one."""
     if covariance is None:
         raise ValueError("a calibration without covariance")

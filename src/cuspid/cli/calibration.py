@@ -8,20 +8,23 @@ from pathlib import Path
 from typing import Annotated
 
 import cv2
+import numpy as np
+from jaxtyping import UInt8
 from rich.table import Table
 from tyro.conf import Positional
 
 from cuspid import storage
 from cuspid.board import Board
-from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, calibrate_rig
+from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, calibrate_rig, in_frame_of
 from cuspid.calibration.corners import BoardView, Views, find_corners
+from cuspid.calibration.photometry import Photometry, PhotometryOptions, calibrate_light, look_at_patches
 from cuspid.calibration.target import PLATE_MM, target_body
 from cuspid.cli.shared import Flat, console, show_progress
 from cuspid.image_sequence import ImageSequence
 from cuspid.options import Range
 from cuspid.progress import Progress
-from cuspid.reporting.figures.calibration import save_board, save_residuals_picture
-from cuspid.rig import Handpiece, depth_of_field_mm
+from cuspid.reporting.figures.calibration import save_board, save_photometry_picture, save_residuals_picture
+from cuspid.rig import Handpiece, Light, depth_of_field_mm
 from cuspid.simulation.board_images import PhotographOptions, take_photographs
 from cuspid.simulation.manufacturing import ManufacturingOptions, built
 from cuspid.workers import map_in_threads
@@ -72,18 +75,31 @@ def calibrate(
     out: Path,
     board: Annotated[Board, Flat] = Board(),
     working_distance_mm: Annotated[float | None, Range(0.1, 100_000)] = None,
+    drawn: Path | None = None,
     options: Annotated[CalibrationOptions, Flat] = CalibrationOptions(),
+    photometry: Annotated[PhotometryOptions, Flat] = PhotometryOptions(),
 ) -> None:
     """Calibrate the cameras of a rig from images of a board: handpiece.json with the covariance of every number.
 
     Args:
         images: Folder with a folder of images, or a video, for each camera; what was taken at once has one name.
-        out: Folder for handpiece.json, rig_config.json, calibration.json (how each camera did) and residuals.png.
-        working_distance_mm: From the cameras to the teeth; without it the median distance of the board.
+        out: Folder for handpiece.json, rig_config.json, calibration.json (how each camera did), residuals.png and
+            photometry.png.
+        working_distance_mm: From the cameras to the teeth; without it that of the drawn handpiece, or the median
+            distance of the board.
+        drawn: handpiece.json of the handpiece as it was drawn, whose lights, and no others, lit the board: they are
+            calibrated, too.
     """
-    settings = {"board": board, "options": options, "working_distance_mm": working_distance_mm}
+    settings = {
+        "board": board,
+        "options": options,
+        "working_distance_mm": working_distance_mm,
+        "photometry": photometry,
+    }
     sources = storage.rig_sources(images)
     hashes = {name: storage.hash_source(path) for name, path in sources.items()}
+    given = None if drawn is None else storage.read_handpiece(drawn)
+    drawn_hash = {} if drawn is None else {"drawn": storage.hash_file(drawn)}
     with storage.claimed_folder(out, "frames", {}, hashes), show_progress() as progress:
         sequences = {
             name: storage.read_sequence(path, out / "frames" / name, progress=progress)
@@ -91,20 +107,44 @@ def calibrate(
         }
         views = _views(sequences, board, progress)
         found = calibrate_rig(views, {name: each.size for name, each in sequences.items()}, board, options)
+        found = found if given is None else in_frame_of(found, given.rig)
+        light = _light(found, sequences, board, given, photometry, progress) if photometry.photometry else None
     notes = (*(note for each in sequences.values() for note in each.notes), *found.notes)
     found = replace(found, notes=notes)
-    with storage.claimed_folder(out, "calibrate", settings, hashes, replace=True):
-        _write(found, board, out, working_distance_mm)
+    with storage.claimed_folder(out, "calibrate", settings, hashes | drawn_hash, replace=True):
+        _write(found, light, _handpiece(found, light, given, working_distance_mm), board, out)
     _print(found, out)
+    if light is not None:
+        _print_light(light)
 
 
-def _write(found: RigCalibration, board: Board, out: Path, working_distance_mm: float | None) -> None:
-    handpiece = _handpiece(found, working_distance_mm)
+def _light(
+    found: RigCalibration,
+    sequences: Mapping[str, ImageSequence],
+    board: Board,
+    drawn: Handpiece | None,
+    options: PhotometryOptions,
+    progress: Progress,
+) -> Photometry:
+    """What the cameras make of light, from the images that were used."""
+    index = {name: {frame: k for k, frame in enumerate(each.names)} for name, each in sequences.items()}
+
+    def image(camera: str, instant: str) -> UInt8[np.ndarray, "h w 3"]:
+        return sequences[camera].image(index[camera][instant])
+
+    patches = look_at_patches(found, image, board, options, progress=progress)
+    return calibrate_light(found, patches, board, drawn, options)
+
+
+def _write(found: RigCalibration, light: Photometry | None, handpiece: Handpiece, board: Board, out: Path) -> None:
     storage.write_handpiece(out / "handpiece.json", handpiece)
     storage.write_rig_config(out / "rig_config.json", handpiece.rig)
-    storage.write_json(out / "calibration.json", _figures(found, board))
+    storage.write_json(out / "calibration.json", {**_figures(found, board), **_light_figures(light)})
     cameras = {name: mounted.camera for name, mounted in handpiece.rig.cameras.items()}
     save_residuals_picture(out / "residuals.png", cameras, found.pixels, found.residuals, title="residuals")
+    if light is not None and light.sensors:
+        shown = {name: (each.levels_dn, each.variances_dn2) for name, each in light.noise.items()}
+        save_photometry_picture(out / "photometry.png", light.sensors, shown, light.residuals_pct)
 
 
 def _views(sequences: Mapping[str, ImageSequence], board: Board, progress: Progress) -> Views:
@@ -123,14 +163,21 @@ def _views(sequences: Mapping[str, ImageSequence], board: Board, progress: Progr
     }
 
 
-def _handpiece(found: RigCalibration, working_distance_mm: float | None) -> Handpiece:
+def _handpiece(
+    found: RigCalibration, light: Photometry | None, drawn: Handpiece | None, working_distance_mm: float | None
+) -> Handpiece:
+    """The drawn handpiece with what was found, or one of what was found alone."""
+    sensors = {} if light is None else light.sensors
+    if drawn is not None:
+        lights = drawn.lights if light is None else light.lights
+        known = replace(drawn, rig=found.rig, lights=lights, sensors={**drawn.sensors, **sensors}, name="calibrated")
+        return known if working_distance_mm is None else _focused(known, working_distance_mm)
     distance_mm = found.distance_mm if working_distance_mm is None else working_distance_mm
-    return Handpiece(
-        rig=found.rig.over_surface(distance_mm),
-        working_distance_mm=distance_mm,
-        depth_range_mm=depth_of_field_mm(distance_mm),
-        name="calibrated",
-    )
+    return _focused(Handpiece(rig=found.rig.over_surface(distance_mm), sensors=sensors, name="calibrated"), distance_mm)
+
+
+def _focused(handpiece: Handpiece, distance_mm: float) -> Handpiece:
+    return replace(handpiece, working_distance_mm=distance_mm, depth_range_mm=depth_of_field_mm(distance_mm))
 
 
 def _figures(found: RigCalibration, board: Board) -> dict[str, object]:
@@ -141,6 +188,31 @@ def _figures(found: RigCalibration, board: Board) -> dict[str, object]:
         "board_distance_mm": found.distance_mm,
         "cameras": {name: asdict(each) for name, each in found.cameras.items()},
         "notes": found.notes,
+    }
+
+
+def _light_figures(light: Photometry | None) -> dict[str, object]:
+    if light is None:
+        return {}
+    lights = {name: _lamp_figures(lamp) for name, lamp in light.lights.items() if lamp.covariance is not None}
+    return {
+        "photometry": {
+            "cameras": {name: asdict(each) for name, each in light.cameras.items()},
+            "lights": lights,
+            "light_deviation_pct": light.light_deviation_pct,
+            "halves_apart": light.halves_apart,
+            "notes": light.notes,
+        }
+    }
+
+
+def _lamp_figures(lamp: Light) -> dict[str, object]:
+    sigma = np.sqrt(np.diag(np.zeros((4, 4)) if lamp.covariance is None else lamp.covariance))
+    return {
+        "position_mm": lamp.position_mm,
+        "position_sigma_um": 1000 * sigma[:3],
+        "power": lamp.power,
+        "power_sigma_pct": 100 * sigma[3],
     }
 
 
@@ -164,6 +236,27 @@ def _print(found: RigCalibration, out: Path) -> None:
         table.add_row(name, str(each.views), str(each.corners), *pixels, ", ".join(apart))
     console.print(table)
     console.print(f"{out / 'handpiece.json'}: {len(found.cameras)} cameras, corners to {found.sigma_px:.2f} px")
+
+
+def _print_light(light: Photometry) -> None:
+    for note in light.notes:
+        console.print(f"note: {note}")
+    table = Table(title="Light")
+    for heading in ("camera", "gain, ±%", "corners, %", "gamma, ±%", "noise DN", "before %", "held out %"):
+        table.add_column(heading, justify="left" if heading == "camera" else "right", no_wrap=True)
+    for name, each in light.cameras.items():
+        gain = f"{each.gain:.3f} ±{each.gain_sigma_pct:.1f}"
+        corner = f"{-each.corner_loss_pct:.1f} ±{each.corner_loss_sigma_pct:.1f}"
+        gamma = f"{each.gamma:.2f} ±{each.gamma_sigma_pct:.1f}"
+        left = [_shown(value) for value in (each.noise_dn, each.before_pct, each.held_out_pct)]
+        table.add_row(name, gain, corner, gamma, *left)
+    console.print(table)
+    found = [np.sqrt(np.diag(lamp.covariance)) for lamp in light.lights.values() if lamp.covariance is not None]
+    if found:
+        place, power = 1000 * np.median([each[:3] for each in found]), 100 * np.median([each[3] for each in found])
+        console.print(
+            f"{len(found)} lights: places to {place:.0f} um along each axis, powers to {power:.1f} % (medians)"
+        )
 
 
 def _shown(value: float | None, digits: int = 2) -> str:

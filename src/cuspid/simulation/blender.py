@@ -25,7 +25,7 @@ from cuspid.geometry import Rigid3, axes_about
 from cuspid.rig import Light, MountedCamera
 from cuspid.simulation.appearance import face_materials
 from cuspid.simulation.raycast import Scene, Sink, image_rng, metered_gains
-from cuspid.simulation.sensor import expose
+from cuspid.simulation.sensor import record
 
 PYTHON_VARIABLE = "CUSPID_BLENDER_PYTHON"
 """Environment variable with the path of the Python that has bpy."""
@@ -67,7 +67,7 @@ def render_with_blender(
         for frame, camera in _run(python, folder):
             image = folder / f"{frame}-{camera}.npy"
             rng = image_rng(scene, frame, camera)
-            sink(frame, camera, expose(np.load(image), gain_of[frame], scene.handpiece.sensor, rng))
+            sink(frame, camera, record(np.load(image), gain_of[frame], scene.handpiece, camera, rng))
             image.unlink()
             yield frame, camera
 

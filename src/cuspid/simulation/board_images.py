@@ -1,14 +1,16 @@
 """Photographs of a board with a handpiece, in simulation: to rehearse a calibration, and to try one against the truth.
 
 The board lies before one camera after the other, at about its working distance, tilted and turned at random, and all
-cameras take it at once. Light is even: no shading, no blur.
+cameras take it at once. Light is even, which is all that corners need, or comes from the lights of the handpiece: from
+points, on a surface that scatters it evenly (Lambert), without shadows. Nothing is blurred.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,9 +22,9 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.options import SEED, Options, Range
 from cuspid.progress import Progress, silent
-from cuspid.rig import Handpiece
+from cuspid.rig import Handpiece, Light
 from cuspid.simulation.raycast import pixel_rays
-from cuspid.simulation.sensor import expose
+from cuspid.simulation.sensor import record
 from cuspid.storage.captures import write_image
 from cuspid.storage.files import hash_file
 from cuspid.storage.handpieces import write_handpiece
@@ -30,6 +32,8 @@ from cuspid.storage.stages import Stage
 
 _LIGHT, _DARK = 0.75, 0.03
 """Linear light of paper and of ink; full scale is 1."""
+_BRIGHT_PERCENTILE = 98.0
+"""Of the light on the corners of the board in all images of an exposure: what is brighter may burn out."""
 _NEAR, _FAR = 0.9, 1.3
 """Distance of the board, in working distances."""
 _HIGHEST = 0.5
@@ -48,6 +52,9 @@ class PhotographOptions(Options):
     """Of the board, from facing the camera."""
     supersampling: Annotated[int, Range(1, 16)] = 3
     """Rays through a pixel along each side."""
+    lit: Literal["evenly", "together", "one-by-one"] = "evenly"
+    """By even light, by all lights of the handpiece, or by one of them after the other, which the names of the images
+    then end in."""
     seed: Annotated[int, SEED] = 0
     """Chooses how the board is held, and the sensor noise."""
 
@@ -89,33 +96,88 @@ def take_photographs(
     write_handpiece(truth, handpiece)
     stage = Stage("photographs", folder, [board, options], ("simulation",))
     key = stage.key({"handpiece": hash_file(truth)})
-    digits, names = len(str(options.instants - 1)), handpiece.rig.names
+    shots, names = _shots(handpiece, board, options), handpiece.rig.names
     rays = {name: pixel_rays(each.camera, options.supersampling) for name, each in handpiece.rig.cameras.items()}
-    for k, rig_from_board in enumerate(board_poses(handpiece, board, options)):
+    gain = _gain(handpiece, board, shots)
+    for k, shot in enumerate(shots):
         for index, (name, mounted) in enumerate(handpiece.rig.cameras.items()):
-            file = folder / "images" / name / f"{k:0{digits}d}.png"
+            file = folder / "images" / name / f"{shot.name}.png"
             if not stage.has(key, [file]):
-                light = board_light(board, mounted.camera, rays[name], mounted.cam_from_rig @ rig_from_board)
+                cam_from_board = mounted.cam_from_rig @ shot.rig_from_board
+                light = board_light(board, mounted.camera, rays[name], cam_from_board, shot.lights)
                 rng = np.random.default_rng([options.seed, 5, k, index])
-                write_image(file, expose(light, 1.0, handpiece.sensor, rng))
+                write_image(file, record(light, gain, handpiece, name, rng))
                 stage.record(key, [file])
             progress("photographs", k * len(names) + index + 1, options.instants * len(names))
 
 
+@dataclass(frozen=True, eq=False)
+class _Shot:
+    """An instant."""
+
+    name: str
+    rig_from_board: Rigid3
+    lights: tuple[Light, ...]
+    """In the frame of the board; none where light is even."""
+
+
+def _shots(handpiece: Handpiece, board: Board, options: PhotographOptions) -> list[_Shot]:
+    """Raises InputError where the handpiece has no lights to shine."""
+    if options.lit != "evenly" and not handpiece.lights:
+        raise InputError(f"handpiece {handpiece.name}: it has no lights; leave --lit evenly")
+    digits, lights = len(str(options.instants - 1)), list(handpiece.lights)
+    shots = []
+    for k, pose in enumerate(board_poses(handpiece, board, options)):
+        name, on = f"{k:0{digits}d}", lights if options.lit == "together" else []
+        if options.lit == "one-by-one":  # each light meets each camera, whatever numbers there are of both
+            on = [lights[(k + k // len(lights)) % len(lights)]]
+            name = f"{name}-{on[0]}"
+        board_from_rig = pose.inverse()
+        shots.append(_Shot(name, pose, tuple(handpiece.lights[each].in_frame(board_from_rig) for each in on)))
+    return shots
+
+
+def _gain(handpiece: Handpiece, board: Board, shots: Sequence[_Shot]) -> float:
+    """The exposure, one for all images: with it the board is about as bright as in even light."""
+    if not shots[0].lights:
+        return 1.0
+    levels = [_irradiance(shot.lights, board.corners).mean(axis=1) for shot in shots]
+    return float(1 / np.percentile(levels, _BRIGHT_PERCENTILE))
+
+
+def _irradiance(lights: Sequence[Light], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Linear RGB light on places of a board, of lights in its frame."""
+    facing = np.broadcast_to([0.0, 0.0, -1.0], points.shape)
+    return np.sum([np.outer(each.irradiance(points, facing), each.colour) for each in lights], axis=0)
+
+
 def board_light(
-    board: Board, camera: Camera, rays_in_cam: Float[np.ndarray, "n 3"], cam_from_board: Rigid3
+    board: Board,
+    camera: Camera,
+    rays_in_cam: Float[np.ndarray, "n 3"],
+    cam_from_board: Rigid3,
+    lights: Sequence[Light] = (),
 ) -> Float[np.ndarray, "h w 3"]:
-    """Linear light of each pixel that looks at a board; paper where it looks past it or at its back. Risers are as
-    between the squares. The rays of a pixel follow each other (:func:`cuspid.simulation.raycast.pixel_rays`)."""
+    """Linear light of each pixel that looks at a board, lit evenly or by lights in its frame; paper where it looks past
+    it or at its back, which lights do not reach. Risers are as between the squares. The rays of a pixel follow each
+    other (:func:`cuspid.simulation.raycast.pixel_rays`)."""
     rays = rays_in_cam @ cam_from_board.rotation
     eye = cam_from_board.inverse().translation
     reach, on_terrace = _first_hits(board, eye, rays)
     before = (reach > 0) & np.isfinite(reach)
     dark = before & board.inverted
-    before &= on_terrace
-    dark[before] = board.is_dark(eye[:2] + reach[before, None] * rays[before, :2])
+    printed = before & on_terrace
+    dark[printed] = board.is_dark(eye[:2] + reach[printed, None] * rays[printed, :2])
     ink = dark.reshape(camera.height, camera.width, -1).mean(axis=2)
-    return np.repeat((_LIGHT + (_DARK - _LIGHT) * ink)[..., None], 3, axis=2)
+    light = np.repeat((_LIGHT + (_DARK - _LIGHT) * ink)[..., None], 3, axis=2)
+    if not lights:
+        return light
+    samples = len(rays) // ink.size
+    middle = np.arange(samples // 2, len(rays), samples)
+    reached = middle[before[middle]]
+    shade = np.zeros((ink.size, 3))
+    shade[before[middle]] = _irradiance(lights, eye + reach[reached, None] * rays[reached])
+    return light * shade.reshape(light.shape)
 
 
 def _first_hits(

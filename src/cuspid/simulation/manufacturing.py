@@ -12,8 +12,11 @@ import numpy as np
 
 from cuspid.geometry import Rigid3
 from cuspid.options import SEED, Options, Range
-from cuspid.rig import Handpiece, MountedCamera
+from cuspid.rig import Handpiece, Light, MountedCamera, Sensor
 from cuspid.tolerances import Tolerances, with_cameras
+
+_DARKEST = 0.95
+"""Light that a corner lacks at most."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +34,16 @@ class ManufacturingOptions(Options):
     """Principal point, each axis."""
     manufacturing_k1: Annotated[float, Range(0, 1)] = 0.0
     """First term of the radial distortion."""
+    manufacturing_gain_pct: Annotated[float, Range(0, 50)] = 0.0
+    """Brightness of the images of a camera."""
+    manufacturing_falloff_pct: Annotated[float, Range(0, 80)] = 0.0
+    """Not a deviation: light that the corners of an image lack, on the average; each lens has 0.5 to 1.5 times that."""
+    manufacturing_gamma_pct: Annotated[float, Range(0, 20)] = 0.0
+    """Encoding exponent of a camera."""
+    manufacturing_led_um: Annotated[float, Range(0, 10_000)] = 0.0
+    """Place of a light, each axis."""
+    manufacturing_led_power_pct: Annotated[float, Range(0, 50)] = 0.0
+    """Power of a light."""
     manufacturing_seed: Annotated[int, SEED] = 0
     """Which of the handpieces that were built."""
 
@@ -49,7 +62,47 @@ class ManufacturingOptions(Options):
 def built(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:
     """One of the handpieces that are built to tolerances; the drawn one where there are none."""
     rng = np.random.default_rng([options.manufacturing_seed, 3])
-    return with_cameras(drawn, lambda mounted: _off(mounted, options.tolerances, rng))
+    placed = with_cameras(drawn, lambda mounted: _off(mounted, options.tolerances, rng))
+    return _lit_anew(_exposing_anew(placed, options), options)
+
+
+def _exposing_anew(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:
+    """With a sensor of its own for each camera, where they are not all alike."""
+    if not (options.manufacturing_gain_pct or options.manufacturing_falloff_pct or options.manufacturing_gamma_pct):
+        return drawn
+    rng = np.random.default_rng([options.manufacturing_seed, 6])
+    return replace(drawn, sensors={name: _sensor(drawn.sensor_of(name), options, rng) for name in drawn.rig.names})
+
+
+def _sensor(drawn: Sensor, options: ManufacturingOptions, rng: np.random.Generator) -> Sensor:
+    gain, gamma = rng.standard_normal(2)
+    loss, curved = rng.uniform([0.5, -0.3], [1.5, 0.3])
+    at_corner = np.log1p(-min(_DARKEST, loss * options.manufacturing_falloff_pct / 100))
+    return replace(
+        drawn,
+        gain=drawn.gain * float(np.exp(gain * options.manufacturing_gain_pct / 100)),
+        gamma=drawn.gamma * float(np.exp(gamma * options.manufacturing_gamma_pct / 100)),
+        falloff=(float((1 - curved) * at_corner), float(curved * at_corner)),
+        covariance=None,
+    )
+
+
+def _lit_anew(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:
+    """With lights that are not quite where, and not quite as bright as, they were drawn."""
+    if not (options.manufacturing_led_um or options.manufacturing_led_power_pct):
+        return drawn
+    rng = np.random.default_rng([options.manufacturing_seed, 7])
+    return replace(drawn, lights={name: _light(light, options, rng) for name, light in drawn.lights.items()})
+
+
+def _light(drawn: Light, options: ManufacturingOptions, rng: np.random.Generator) -> Light:
+    shift, brighter = rng.standard_normal(3), rng.standard_normal()
+    return replace(
+        drawn,
+        position_mm=drawn.position_mm + shift * options.manufacturing_led_um / 1000,
+        power=drawn.power * float(np.exp(brighter * options.manufacturing_led_power_pct / 100)),
+        covariance=None,
+    )
 
 
 def told(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:

@@ -29,7 +29,7 @@ from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
 from cuspid.simulation.appearance import Appearance, Palette, albedo_at, face_materials, palette
-from cuspid.simulation.sensor import expose
+from cuspid.simulation.sensor import record
 
 AMBIENT = 0.08
 """Share of the light reaching a point that arrives from all around after reflection in the mouth, unshadowed."""
@@ -383,7 +383,7 @@ def render_image(
     mounted = scene.handpiece.rig[camera_name]
     lights = lamps(scene.handpiece, frame.lighting, rig_from_world)
     light = radiance(scene, mounted.camera, mounted.cam_from_rig @ rig_from_world, lights)
-    return expose(light, gain, scene.handpiece.sensor, image_rng(scene, frame.name, camera_name))
+    return record(light, gain, scene.handpiece, camera_name, image_rng(scene, frame.name, camera_name))
 
 
 def image_rng(scene: Scene, frame: str, camera_name: str) -> np.random.Generator:

@@ -1,11 +1,11 @@
-"""From linear light to the digital numbers of an 8-bit RGB image: gain, gamma, noise, rounding."""
+"""From linear light to the digital numbers of an 8-bit RGB image: falloff, gain, gamma, noise, rounding."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from cuspid.rig import Sensor
+from cuspid.rig import Handpiece, Sensor
 
 MID_GREY_DN = 127.5
 
@@ -25,3 +25,13 @@ def expose(
     level = np.float32(255) * signal ** np.float32(1 / sensor.gamma)
     noisy = level + noise_sd_dn(level, sensor) * rng.standard_normal(level.shape, dtype=np.float32)
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+def record(
+    radiance: Float[np.ndarray, "h w 3"], gain: float, handpiece: Handpiece, name: str, rng: np.random.Generator
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The image that a camera of a handpiece records, its own gain and the falloff of its lens included."""
+    sensor, camera = handpiece.sensor_of(name), handpiece.rig[name].camera
+    if sensor.gain != 1 or any(sensor.falloff):
+        radiance = radiance * sensor.transmitted(camera, camera.pixel_centres())[..., None]
+    return expose(radiance, gain, sensor, rng)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -93,15 +92,37 @@ def _optics_to_json(handpiece: Handpiece) -> dict[str, Any]:
         }
         for name, mounted in handpiece.rig.cameras.items()
     }
+    sensors = {name: _sensor_to_json(sensor) for name, sensor in handpiece.sensors.items()}
     return {
         "name": handpiece.name,
         "working_distance_mm": handpiece.working_distance_mm,
         "depth_range_mm": handpiece.depth_range_mm,
         "cameras": cameras,
-        "lights": handpiece.lights,
+        "lights": {name: _light_to_json(light) for name, light in handpiece.lights.items()},
         "lightings": handpiece.lightings,
-        "sensor": handpiece.sensor,
+        "sensor": _sensor_to_json(handpiece.sensor),
+        **({"sensors": sensors} if sensors else {}),
     }
+
+
+_LIGHT_COVARIANCE, _SENSOR_COVARIANCE = "covariance_position_mm_log_power", "covariance_log_gain_a_b_log_gamma"
+
+
+def _light_to_json(light: Light) -> dict[str, Any]:
+    plain = {name: getattr(light, name) for name in _LIGHT_FIELDS}
+    return plain if light.covariance is None else {**plain, _LIGHT_COVARIANCE: light.covariance}
+
+
+def _sensor_to_json(sensor: Sensor) -> dict[str, Any]:
+    """What most sensors do not have is left out where there is none."""
+    value: dict[str, Any] = {name: getattr(sensor, name) for name in _SENSOR_RANGES}
+    if sensor.gain == 1:
+        del value["gain"]
+    if any(sensor.falloff):
+        value["falloff_r2_r4"] = sensor.falloff
+    if sensor.covariance is not None:
+        value[_SENSOR_COVARIANCE] = sensor.covariance
+    return value
 
 
 def _body_to_json(body: Body) -> dict[str, Any]:
@@ -111,8 +132,13 @@ def _body_to_json(body: Body) -> dict[str, Any]:
     }
 
 
-_FIELDS = {"name", "working_distance_mm", "depth_range_mm", "cameras", "lights", "lightings", "sensor", "body"}
+_FIELDS = {
+    "name", "working_distance_mm", "depth_range_mm", "cameras", "lights", "lightings", "sensor", "sensors", "body",
+}  # fmt: skip
 """Of ``handpiece.json``."""
+_LIGHT_FIELDS = ("position_mm", "direction", "power", "colour", "lobe_exponent")
+_SENSOR_RANGES = {"noise_dn": (0.0, 255.0), "shot_noise_share": (0.0, 1.0), "gamma": (0.1, 10.0), "gain": (1e-3, 1e3)}
+_STEEPEST_FALLOFF = 10.0
 _BOX_FIELDS = {"box_from_rig", "size_mm"}
 
 
@@ -122,27 +148,34 @@ def write_handpiece(path: Path, handpiece: Handpiece) -> None:
 
 
 def _light_from_json(value: Mapping[str, Any], what: str) -> Light:
-    strange = sorted(set(value) - {each.name for each in fields(Light)})
+    strange = sorted(set(value) - {*_LIGHT_FIELDS, _LIGHT_COVARIANCE})
     if strange:
         raise InputError(f"{what}: the field {shown(strange[0])} is not known; see docs/formats.md")
     direction = numbers(f"{what}: direction", value["direction"], (3,), -LONGEST_MM, LONGEST_MM)
     if not direction.any():
         raise InputError(f"{what}: direction is {shown(value['direction'])}; it must not be all 0")
+    matrix = value.get(_LIGHT_COVARIANCE)
     return Light(
         position_mm=numbers(f"{what}: position_mm", value["position_mm"], (3,), -LONGEST_MM, LONGEST_MM),
         direction=direction,
         power=number(f"{what}: power", value.get("power", 1.0), 0.0, _BRIGHTEST),
         colour=numbers(f"{what}: colour", value["colour"], (3,), 0.0, _BRIGHTEST),
         lobe_exponent=number(f"{what}: lobe_exponent", value.get("lobe_exponent", 1.0), 0.0, _NARROWEST_LOBE),
+        covariance=None if matrix is None else covariance(f"{what}: {_LIGHT_COVARIANCE}", matrix, 4),
     )
 
 
 def _sensor_from_json(value: Mapping[str, Any], what: str) -> Sensor:
-    ranges = {"noise_dn": (0.0, 255.0), "shot_noise_share": (0.0, 1.0), "gamma": (0.1, 10.0)}
-    strange = sorted(set(value) - set(ranges))
+    known = [*_SENSOR_RANGES, "falloff_r2_r4", _SENSOR_COVARIANCE]
+    strange = sorted(set(value) - set(known))
     if strange:
-        raise InputError(f"{what}: the field {shown(strange[0])} is not known; it has {', '.join(ranges)}")
-    return Sensor(**{key: number(f"{what}: {key}", each, *ranges[key]) for key, each in value.items()})
+        raise InputError(f"{what}: the field {shown(strange[0])} is not known; it has {', '.join(known)}")
+    plain = {key: number(f"{what}: {key}", value[key], *_SENSOR_RANGES[key]) for key in _SENSOR_RANGES if key in value}
+    falloff = value.get("falloff_r2_r4", (0.0, 0.0))
+    a, b = numbers(f"{what}: falloff_r2_r4", falloff, (2,), -_STEEPEST_FALLOFF, _STEEPEST_FALLOFF).tolist()
+    matrix = value.get(_SENSOR_COVARIANCE)
+    known_to = None if matrix is None else covariance(f"{what}: {_SENSOR_COVARIANCE}", matrix, 4)
+    return Sensor(**plain, falloff=(a, b), covariance=known_to)
 
 
 def _mounted_from_json(value: Mapping[str, Any], what: str) -> MountedCamera:
@@ -187,6 +220,10 @@ def read_handpiece(path: Path, working_distance_mm: float | None = None) -> Hand
                 for each in value.get("lightings", [])
             ),
             sensor=_sensor_from_json(value.get("sensor", {}), f"{path}: sensor"),
+            sensors={
+                checked_name(f"{path}: sensors", key): _sensor_from_json(sensor, f"{path}: sensor {shown(key)}")
+                for key, sensor in value.get("sensors", {}).items()
+            },
             working_distance_mm=distance_mm,
             depth_range_mm=(near, far),
             body=None if value.get("body") is None else _body_from_json(path, value["body"]),

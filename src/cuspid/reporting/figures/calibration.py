@@ -1,4 +1,5 @@
-"""Boards to print, and pictures of a calibration: where each camera saw corners, and what was left over there."""
+"""Boards to print, and pictures of a calibration: where each camera saw corners, what was left over there, and what the
+cameras make of light."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
@@ -16,6 +18,7 @@ from cuspid.board import Board
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.reporting.figures.drawing import new_figure, save_figure
+from cuspid.rig import Sensor
 
 BOARD_SUFFIXES = (".pdf", ".svg", ".png")
 _MM_PER_INCH = 25.4
@@ -25,6 +28,12 @@ _GAP_MM, _FOLD_MM = 0.5, 3.5
 _CUT, _FOOT, _HEAD = (0.0, ()), (0.0, (4.0, 2.0)), (0.0, (1.0, 1.5))
 """Dashes of these lines."""
 _INK = "#333333"
+_BEFORE, _AFTER = "#9a9a9a", "#1f5fd6"
+_MID_GREY_DN = 127.5
+_BINS = 12
+"""Of radii and of levels, over which points are averaged."""
+_FEWEST = 5
+"""Points in one of them at least."""
 _LONGEST = 0.1
 """Line of the largest residual, as a share of the width of an image."""
 
@@ -129,4 +138,89 @@ def _draw_residuals(axes: Axes, camera: Camera, at: Float[np.ndarray, "n 2"], dr
     axes.set_xlim(0, camera.width)
     axes.set_ylim(camera.height, 0)
     axes.set_aspect("equal")
+    axes.tick_params(labelsize=7, colors=_INK)
+
+
+Residuals = Mapping[str, tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]]
+"""By camera: distance of patches from the principal point in halves of the diagonal, residuals before and after, %."""
+
+
+def save_photometry_picture(
+    path: Path,
+    sensors: Mapping[str, Sensor],
+    variances: Mapping[str, tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]],
+    residuals: Residuals,
+) -> None:
+    """PNG of what cameras make of light: gain and falloff with standard deviations, what is left over of the grey
+    values before and after, and the noise at each level (``variances``: levels and variances of patches, DN)."""
+    figure = new_figure(12.5, 4.4, dpi=130)
+    colours = colormaps["turbo"](np.linspace(0.05, 0.95, len(sensors)))
+    axes = [figure.add_subplot(1, 3, k + 1) for k in range(3)]
+    for (name, sensor), colour in zip(sensors.items(), colours, strict=True):
+        _draw_falloff(axes[0], name, sensor, colour)
+        _draw_noise(axes[2], sensor, *variances[name], colour)
+    _draw_left_over(axes[1], residuals)
+    _label(axes[0], "gain and falloff", "distance from the principal point, half diagonals", "share of the light")
+    _label(axes[1], "left over", "distance from the principal point, half diagonals", "residual, % of the grey value")
+    _label(axes[2], "noise", "grey value, DN", "standard deviation, DN")
+    axes[0].legend(fontsize=7, ncols=-(-len(sensors) // 6), frameon=False)
+    axes[1].legend(fontsize=8, frameon=False)
+    figure.tight_layout()
+    save_figure(figure, path)
+
+
+def _draw_falloff(axes: Axes, name: str, sensor: Sensor, colour: Float[np.ndarray, "4"]) -> None:
+    """Gain times falloff, with one standard deviation to either side."""
+    r = np.linspace(0, 1, 60)
+    by = np.stack([np.ones_like(r), r**2, r**4], axis=1)
+    curve = sensor.gain * np.exp(by[:, 1:] @ sensor.falloff)
+    axes.plot(r, curve, color=colour, linewidth=1.2, label=name)
+    if sensor.covariance is not None:
+        sigma = np.sqrt(np.einsum("ni,ij,nj->n", by, sensor.covariance[:3, :3], by))
+        axes.fill_between(r, curve * np.exp(-sigma), curve * np.exp(sigma), color=colour, alpha=0.2, linewidth=0)
+
+
+def _draw_left_over(axes: Axes, residuals: Residuals) -> None:
+    """The mean over each ring of each camera, as lines, over all patches, as points."""
+    for index, (colour, label) in enumerate(((_BEFORE, "before"), (_AFTER, "after"))):
+        r = np.concatenate([each[0] for each in residuals.values()])
+        left = np.concatenate([each[index + 1] for each in residuals.values()])
+        axes.plot(r, left, ".", color=colour, markersize=1, alpha=0.25, rasterized=True)
+        for camera in residuals.values():
+            axes.plot(*_binned(camera[0], camera[index + 1]), color=colour, linewidth=1.2)
+        axes.plot([], [], color=colour, label=f"{label}: {np.sqrt(np.mean(left**2)):.2f} % RMS")
+    before = np.concatenate([each[1] for each in residuals.values()])
+    axes.set_ylim(*(1.2 * np.percentile(before, [0.5, 99.5])))
+
+
+def _draw_noise(
+    axes: Axes,
+    sensor: Sensor,
+    levels: Float[np.ndarray, "n"],
+    variances: Float[np.ndarray, "n"],
+    colour: Float[np.ndarray, "4"],
+) -> None:
+    """Of patches alike, as points, and of the sensor, as a line."""
+    at, variance = _binned(levels, variances)
+    axes.plot(at, np.sqrt(variance), ".", color=colour, markersize=5)
+    level = np.linspace(0, 255, 60)
+    share = sensor.shot_noise_share
+    axes.plot(level, sensor.noise_dn * np.sqrt(1 - share + share * level / _MID_GREY_DN), color=colour, linewidth=1)
+    axes.set_ylim(bottom=0)
+
+
+def _binned(
+    at: Float[np.ndarray, "n"], values: Float[np.ndarray, "n"]
+) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k"]]:
+    """Means over runs of points that are near to each other."""
+    edges = np.linspace(at.min(), at.max(), _BINS + 1)
+    which = np.clip(np.searchsorted(edges, at) - 1, 0, _BINS - 1)
+    full = [k for k in range(_BINS) if np.sum(which == k) >= _FEWEST]
+    return np.array([at[which == k].mean() for k in full]), np.array([values[which == k].mean() for k in full])
+
+
+def _label(axes: Axes, title: str, x: str, y: str) -> None:
+    axes.set_title(title, fontsize=10, color=_INK)
+    axes.set_xlabel(x, fontsize=8, color=_INK)
+    axes.set_ylabel(y, fontsize=8, color=_INK)
     axes.tick_params(labelsize=7, colors=_INK)

@@ -1,0 +1,203 @@
+"""Grey values of paper and ink in an image of a board whose place is known: windows well inside what is uniform."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Annotated
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from cuspid.board import Board
+from cuspid.calibration.bundle import bent
+from cuspid.camera import Camera
+from cuspid.geometry import Rigid3
+from cuspid.options import Options, Range
+
+BRIGHTEST_DN, DARKEST_DN = 245.0, 8.0
+"""Beyond these a mean may have been clipped."""
+_CELLS = 32
+"""Cells of a square along each side, in which places are looked for."""
+_APART = 4
+"""Cells between two places at least."""
+_HALF_CELL = 0.75
+"""From the middle of a cell to its corners at most, a little more."""
+_LEAST_CELLS = 1.0
+"""Clearance of a place at least."""
+_WINDOW = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), axis=-1).reshape(-1, 2)
+"""Rows and columns of a window about its middle."""
+VALUES = 3 * len(_WINDOW)
+"""That are averaged: three channels of a window."""
+_PLANE = np.column_stack([np.ones(len(_WINDOW)), _WINDOW])
+_OFF_PLANE = np.eye(len(_WINDOW)) - _PLANE @ np.linalg.pinv(_PLANE)
+"""Takes from a window the plane that fits it best."""
+FREEDOM = 3 * (len(_WINDOW) - _PLANE.shape[1])
+"""Degrees of freedom of the variance of a patch."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatchOptions(Options):
+    """Where grey values are taken."""
+
+    clear_px: Annotated[float, Range(2, 100)] = 3.0
+    """From the middle of a patch to where paper and ink meet; more where images are blurred."""
+    patches: Annotated[int, Range(6, 10_000)] = 60
+    """Of an image at most, of paper and ink together."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Places:
+    """Where a board is uniform around."""
+
+    points: Float[np.ndarray, "n 2"]
+    """Seen from straight above, mm."""
+    clearance_mm: Float[np.ndarray, "n"]
+    """To where paper and ink meet, or an edge."""
+    dark: Bool[np.ndarray, "n"]
+    """Whether it is ink."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Patches:
+    """Windows of 3 x 3 pixels that see paper or ink alone."""
+
+    pixels: Float[np.ndarray, "n 2"]
+    """Their middles, px."""
+    points: Float[np.ndarray, "n 3"]
+    """What they see, in the frame of the board, mm."""
+    dark: Bool[np.ndarray, "n"]
+    """Whether that is ink."""
+    level_dn: Float[np.ndarray, "n"]
+    """Mean of the pixels and channels."""
+    variance_dn2: Float[np.ndarray, "n"]
+    """Of a pixel in a channel, about the plane that fits the window best."""
+
+    @property
+    def usable(self) -> Bool[np.ndarray, "n"]:
+        """Neither burnt out nor black."""
+        return (self.level_dn < BRIGHTEST_DN) & (self.level_dn > DARKEST_DN)
+
+    def take(self, chosen: Bool[np.ndarray, "n"] | Int[np.ndarray, "m"]) -> Patches:
+        """Some of them."""
+        return Patches(**{each.name: getattr(self, each.name)[chosen] for each in fields(self)})
+
+
+def joined_patches(parts: Sequence[Patches]) -> Patches:
+    """All of several, in order."""
+    return Patches(**{each.name: np.concatenate([getattr(p, each.name) for p in parts]) for each in fields(Patches)})
+
+
+def clear_places(board: Board) -> Places:
+    """The middles of what is uniform: the clearest cells of a fine grid, none next to another."""
+    dark = _cells(board)
+    far = np.where(dark, _to_edge(dark), _to_edge(~dark))
+    far = np.minimum(far, _to_step(board)[None])
+    ridge = far + 1e-3 * np.random.default_rng(0).random(far.shape, dtype=np.float32)  # one of a row that is all alike
+    size = 2 * _APART + 1
+    clear = (ridge == cv2.dilate(ridge, np.ones((size, size), np.uint8))) & (far > _LEAST_CELLS)
+    row, column = np.nonzero(clear)
+    cell_mm = board.square_mm / _CELLS
+    return Places(
+        points=cell_mm * (np.stack([column, row], axis=1) + 0.5),
+        clearance_mm=cell_mm * far[clear].astype(np.float64),
+        dark=dark[clear],
+    )
+
+
+def _cells(board: Board) -> Bool[np.ndarray, "h w"]:
+    across, down = (np.arange(_CELLS * count) + 0.5 for count in (board.columns, board.rows))
+    points = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2) * (board.square_mm / _CELLS)
+    return board.is_dark(points).reshape(len(down), len(across))
+
+
+def _to_edge(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Distance of each cell that is inside to those that are not, the border of the board included; in cells."""
+    framed = np.pad(inside.astype(np.uint8), 1)
+    found = cv2.distanceTransform(framed, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    return np.asarray(np.maximum(found - _HALF_CELL, 0))
+
+
+def _to_step(board: Board) -> Float[np.ndarray, "w"]:
+    """Distance of each column of cells to the next edge of a step, of those in front of a riser to where that hides
+    nothing in a view of 45 degrees; in cells."""
+    x = (np.arange(_CELLS * board.columns) + 0.5) * (board.square_mm / _CELLS)
+    nearest = np.full(len(x), np.inf)
+    for edge in board.edges_mm[1:-1]:
+        gap = np.where(x < edge, edge - board.step_mm - x, x - edge)
+        nearest = np.minimum(nearest, np.where(x < edge, np.maximum(gap, 0), gap))
+    return np.asarray(nearest * (_CELLS / board.square_mm), dtype=np.float32)
+
+
+def patches_of(
+    image: UInt8[np.ndarray, "h w 3"],
+    camera: Camera,
+    cam_from_board: Rigid3,
+    board: Board,
+    bending_mm: Float[np.ndarray, "3"],
+    corner: Int[np.ndarray, "k"],
+    places: Places,
+    options: PatchOptions,
+) -> Patches:
+    """The patches of an image around the corners that were found in it."""
+    points = on_board(board, places.points, bending_mm)
+    pixels = camera.project(cam_from_board.apply(points))
+    inside = camera.contains(pixels, options.clear_px) & _beside(board, corner, places.points)
+    scale = _smallest_scale(camera, cam_from_board, points, places.clearance_mm)
+    chosen = np.flatnonzero(inside & (places.clearance_mm * scale >= options.clear_px))
+    chosen = _spread(chosen, places.dark, options.patches // 2)
+    level, variance = _grey(image, pixels[chosen])
+    return Patches(
+        pixels=np.floor(pixels[chosen]) + 0.5,
+        points=points[chosen],
+        dark=places.dark[chosen],
+        level_dn=level,
+        variance_dn2=variance,
+    )
+
+
+def on_board(
+    board: Board, places: Float[np.ndarray, "n 2"], bending_mm: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Places seen from straight above, in the frame of the board, mm."""
+    return bent(board, np.column_stack([places, -board.step_mm * board.terrace_at(places[:, 0])]), bending_mm)
+
+
+def _beside(board: Board, corner: Int[np.ndarray, "k"], places: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
+    """Whether a place lies in one of the squares that meet in a corner that was seen: nothing hides these."""
+    seen = np.zeros((board.rows, board.columns), dtype=bool)
+    row, column = np.divmod(corner, board.columns - 1)
+    for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        seen[row + down, column + across] = True
+    at = np.floor(places / board.square_mm).astype(np.int64)
+    return seen[at[:, 1], at[:, 0]]
+
+
+def _smallest_scale(
+    camera: Camera, cam_from_board: Rigid3, points: Float[np.ndarray, "n 3"], step_mm: Float[np.ndarray, "n"]
+) -> Float[np.ndarray, "n"]:
+    """Pixels that a millimetre of the board takes in the direction in which it takes fewest."""
+    steps = [camera.project(cam_from_board.apply(points + step_mm[:, None] * axis)) for axis in np.eye(3)[:2]]
+    here = camera.project(cam_from_board.apply(points))
+    x, y = ((there - here) / step_mm[:, None] for there in steps)
+    squares, area = (x**2 + y**2).sum(axis=1), np.abs(x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0])
+    return np.asarray(np.sqrt(np.maximum(squares - np.sqrt(np.maximum(squares**2 - 4 * area**2, 0)), 0) / 2))
+
+
+def _spread(chosen: Int[np.ndarray, "n"], dark: Bool[np.ndarray, "m"], most: int) -> Int[np.ndarray, "k"]:
+    """So many of paper and of ink at most, spread over all."""
+    tones = [chosen[dark[chosen] == tone] for tone in (False, True)]
+    return np.concatenate(
+        [each[np.unique(np.linspace(0, len(each) - 1, most).astype(int))] for each in tones if len(each)] or [chosen]
+    )
+
+
+def _grey(
+    image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "n 2"]
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Mean and variance of the windows at places in an image."""
+    column, row = np.floor(pixels).astype(np.int64).T
+    windows = image[row[:, None] + _WINDOW[:, 0], column[:, None] + _WINDOW[:, 1]].astype(np.float64)
+    left = np.einsum("vw,nwc->nvc", _OFF_PLANE, windows)
+    return windows.mean(axis=(1, 2)), (left**2).sum(axis=(1, 2)) / FREEDOM

@@ -1,0 +1,492 @@
+"""From images of a board whose places are known to what the cameras make of light, and where the lights are.
+
+What cannot be told from the images keeps what was given, and a note says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from cuspid.board import Board
+from cuspid.calibration.bundle import bending_coordinates
+from cuspid.calibration.calibrate import RigCalibration, known
+from cuspid.calibration.noise import Noise, noise_of
+from cuspid.calibration.patches import (
+    BRIGHTEST_DN,
+    VALUES,
+    Patches,
+    PatchOptions,
+    clear_places,
+    joined_patches,
+    patches_of,
+)
+from cuspid.calibration.shading import (
+    KNOWN_DEGREE,
+    PER_CAMERA,
+    UNKNOWN_DEGREE,
+    Given,
+    Samples,
+    Shading,
+    adjust_shading,
+    camera_columns,
+    common_columns,
+    light_columns,
+    polynomials,
+    prior,
+)
+from cuspid.options import Range
+from cuspid.progress import Progress, silent
+from cuspid.rig import Handpiece, Light, Sensor, falloff_terms
+from cuspid.workers import map_in_threads
+
+Image = UInt8[np.ndarray, "h w 3"]
+ViewPatches = Mapping[tuple[str, str], Patches]
+"""By camera and instant."""
+
+_LEAST_PATCHES = 50
+"""A camera with fewer is left out."""
+_LEAST_INSTANTS = 4
+"""To be divided into halves that both say something."""
+_FALLOFF_SIGMA = 1.0
+"""Of the terms of a falloff about none (logarithm of light)."""
+_OUTLYING = 5.0
+"""Standard deviations of a residual that is not of noise: a highlight, dirt."""
+_MANY_BURNT, _MANY_OUTLYING = 0.2, 0.05
+"""Shares of the patches of a camera (of paper, and of all) that are told of."""
+_FOREIGN = 0.1
+"""Deviation of the light from that of the lamps (logarithm) beyond which it is not theirs."""
+_OPEN_CORNER = 0.05
+"""Standard deviation of the light in the corners of which is told."""
+_TOLD = 0.7
+"""A standard deviation that is less than this share of what it was before: the images have told something."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotometryOptions(PatchOptions):
+    """What is found of gain, falloff, noise and lights, and what is known of them before (standard deviations)."""
+
+    photometry: bool = True
+    """Find what the cameras make of light, too."""
+    gamma: Annotated[float | None, Range(0.1, 10)] = None
+    """Encoding exponent of the images; default: of the drawn handpiece, or 2.2."""
+    gamma_pct: Annotated[float, Range(0, 50)] = 5.0
+    """How well that is known; 0 is exactly."""
+    led_um: Annotated[float, Range(0.1, 100_000)] = 200.0
+    """How well the places of drawn lights are known, each axis."""
+    led_power_pct: Annotated[float, Range(0.01, 100)] = 20.0
+    """How well their powers are known, against each other."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraLight:
+    """What a camera makes of light, with standard deviations."""
+
+    patches: int
+    """That were used."""
+    clipped_pct: float
+    """Of all patches: burnt out or black, and not used."""
+    gain: float
+    """Over the geometric mean of the cameras, in linear light."""
+    gain_sigma_pct: float
+    """Of it."""
+    corner_loss_pct: float
+    """Light that is lost in the corners of the image."""
+    corner_loss_sigma_pct: float
+    """In the same unit."""
+    gamma: float
+    """Encoding exponent."""
+    gamma_sigma_pct: float
+    """Of it."""
+    noise_dn: float
+    """Standard deviation at mid grey."""
+    noise_sigma_dn: float
+    """Of that."""
+    shot_noise_share: float
+    """See :attr:`cuspid.rig.Sensor.shot_noise_share`."""
+    before_pct: float
+    """Residuals, of the grey value, of cameras that are all alike, without falloff, and lights as drawn (RMS)."""
+    after_pct: float
+    """With what was found."""
+    held_out_pct: float | None
+    """The same at instants that it was not found from; None where there are too few to make halves."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Photometry:
+    """What was found, and how well it agrees with the images."""
+
+    sensors: Mapping[str, Sensor]
+    """Of the cameras of which enough was seen."""
+    lights: Mapping[str, Light]
+    """In the frame of the rig; as drawn where nothing was found of them, none where none were given."""
+    cameras: Mapping[str, CameraLight]
+    light_deviation_pct: Float[np.ndarray, "3"] | None
+    """Of the level, the slopes and the curvatures of the light at an instant from that of the lamps; None where these
+    were not known."""
+    halves_apart: float | None
+    """Difference of what two halves of the instants tell of the cameras, in the standard deviations that both state."""
+    noise: Mapping[str, Noise]
+    """And the patches that tell of it."""
+    residuals_pct: Mapping[str, tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]]
+    """Of each camera: r of the patches, residuals before and after."""
+    notes: tuple[str, ...]
+    """What cannot be told or was not as it should be, a line each."""
+
+
+def look_at_patches(
+    found: RigCalibration,
+    image: Callable[[str, str], Image],
+    board: Board,
+    options: PhotometryOptions,
+    *,
+    progress: Progress = silent,
+) -> ViewPatches:
+    """The patches of every image that was used; ``image`` gives that of a camera at an instant."""
+    places = clear_places(board)
+
+    def look(key: tuple[str, str]) -> Patches:
+        mounted = found.rig[key[0]]
+        cam_from_board = mounted.cam_from_rig @ found.rig_from_board[key[1]]
+        corner = found.views[key].corner
+        return patches_of(image(*key), mounted.camera, cam_from_board, board, found.bending_mm, corner, places, options)
+
+    return dict(zip(found.views, map_in_threads(look, found.views, stage="patches", progress=progress), strict=True))
+
+
+def calibrate_light(
+    found: RigCalibration,
+    patches: ViewPatches,
+    board: Board,
+    drawn: Handpiece | None = None,
+    options: PhotometryOptions = PhotometryOptions(),
+) -> Photometry:
+    """Gain, falloff, gamma and noise of each camera that saw enough; with a drawn handpiece, in whose frame the rig is,
+    the places and the powers of its lights."""
+    looked_at = {name: _of_camera(patches, name) for name in found.rig.names}
+    sound = {key: each.take(each.usable) for key, each in patches.items()}
+    counts = {name: len(_of_camera(sound, name).level_dn) for name in found.rig.names}
+    names = [name for name, count in counts.items() if count >= _LEAST_PATCHES]
+    notes = list(_unseen(counts, looked_at))
+    if not names:
+        return _nothing(drawn, notes)
+    noise = {name: noise_of(_of_camera(sound, name)) for name in names}
+    seen = {key: each for key, each in sound.items() if key[0] in names and len(each.level_dn)}
+    case = _Case(found, seen, board, names, noise, drawn, options)
+    fit = case.adjusted()
+    if case.lamps and fit.extra_sigma.max() > _FOREIGN:
+        notes.append(
+            f"the board was not lit by the drawn lights alone: its light is off from theirs by {fit.extra_sigma[0]:.0%}"
+            " between instants; the lights stay as drawn, and light is taken for anything"
+        )
+        case = replace(case, lamps_known=False)
+        fit = case.adjusted()
+    return _described(case, fit, {name: _share(~each.usable) for name, each in looked_at.items()}, notes)
+
+
+def _nothing(drawn: Handpiece | None, notes: Sequence[str]) -> Photometry:
+    return Photometry(
+        sensors={},
+        lights={} if drawn is None else drawn.lights,
+        cameras={},
+        light_deviation_pct=None,
+        halves_apart=None,
+        noise={},
+        residuals_pct={},
+        notes=tuple(notes),
+    )
+
+
+def _of_camera(patches: ViewPatches, name: str) -> Patches:
+    return joined_patches([each for (camera, _), each in patches.items() if camera == name])
+
+
+def _share(chosen: Bool[np.ndarray, "n"]) -> float:
+    return float(chosen.mean()) if len(chosen) else 0.0
+
+
+def _unseen(counts: Mapping[str, int], looked_at: Mapping[str, Patches]) -> Iterator[str]:
+    for name, count in counts.items():
+        paper = looked_at[name].take(~looked_at[name].dark)
+        burnt = _share(paper.level_dn >= BRIGHTEST_DN)
+        if burnt > _MANY_BURNT:
+            yield f"camera {name}: {burnt:.0%} of its patches of paper are burnt out and tell nothing; expose less"
+        if count < _LEAST_PATCHES:
+            yield (
+                f"camera {name}: {count} patches can be used, too few to tell its gain and falloff; come nearer, make "
+                "squares larger or --clear-px smaller"
+            )
+
+
+# --- the adjustment ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Case:
+    """All that an adjustment starts from."""
+
+    found: RigCalibration
+    patches: ViewPatches
+    board: Board
+    names: Sequence[str]
+    noise: Mapping[str, Noise]
+    drawn: Handpiece | None
+    options: PhotometryOptions
+    lamps_known: bool = True
+
+    @property
+    def lamps(self) -> dict[str, Light]:
+        """The lights, where the board is taken to be lit by them."""
+        return dict(self.drawn.lights) if self.drawn is not None and self.lamps_known else {}
+
+    @property
+    def instants(self) -> list[str]:
+        """Those with the same light follow each other, so that every second one has seen all of them."""
+        names = sorted({instant for _, instant in self.patches})
+        return sorted(names, key=lambda name: self.lit(name))
+
+    def lit(self, instant: str) -> tuple[int, ...]:
+        """The lamps that are on: all, unless the name ends in a hyphen and the name of a pattern or of a lamp."""
+        if self.drawn is None:
+            return ()
+        lamps = list(self.drawn.lights)
+        patterns = {each.name: each.lights for each in self.drawn.lightings}
+        for name, lights in {**{each: (each,) for each in lamps}, **patterns}.items():
+            if instant.endswith(f"-{name}"):
+                return tuple(lamps.index(each) for each in lights)
+        return tuple(range(len(lamps)))
+
+    @property
+    def given(self) -> Given:
+        """What is known before."""
+        lamps, options = self.lamps, self.options
+        tolerance = np.diag([(options.led_um / 1000) ** 2] * 3 + [(options.led_power_pct / 100) ** 2])
+        covariances = [tolerance if each.covariance is None else each.covariance for each in lamps.values()]
+        return Given(
+            gamma=np.array([self.sensor(name).gamma for name in self.names]),
+            lights=tuple(lamps.values()),
+            precision=prior(len(self.names), covariances, _FALLOFF_SIGMA, options.gamma_pct / 100),
+        )
+
+    def sensor(self, name: str) -> Sensor:
+        """As it was given."""
+        sensor = Sensor() if self.drawn is None else self.drawn.sensor_of(name)
+        return replace(sensor, gamma=self.options.gamma or sensor.gamma)
+
+    def samples(self, instants: Sequence[str]) -> Samples:
+        """The patches of some instants as arrays."""
+        keys = [(name, instant) for instant in instants for name in self.names if (name, instant) in self.patches]
+        every = joined_patches([self.patches[key] for key in keys])
+        counts = [len(self.patches[key].level_dn) for key in keys]
+        at = np.repeat([instants.index(instant) for _, instant in keys], counts)
+        camera = np.repeat([self.names.index(name) for name, _ in keys], counts)
+        poses = [self.found.rig_from_board[instant] for instant in instants]
+        degree = KNOWN_DEGREE if self.lamps else UNKNOWN_DEGREE
+        return Samples(
+            camera=camera,
+            starts=np.searchsorted(at, np.arange(len(instants) + 1)),
+            value=np.log(every.level_dn / 255),
+            sigma=self._sigma(every, camera),
+            dark=every.dark,
+            terms=np.concatenate(
+                [falloff_terms(self.found.rig[key[0]].camera, self.patches[key].pixels) for key in keys]
+            ),
+            basis=polynomials(bending_coordinates(self.board, every.points), degree),
+            points=np.concatenate([self.found.rig_from_board[key[1]].apply(self.patches[key].points) for key in keys]),
+            normals=np.stack([-pose.rotation[:, 2] for pose in poses])[at],
+            lit=tuple(self.lit(instant) for instant in instants),
+        )
+
+    def _sigma(self, patches: Patches, camera: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """Standard deviation of the logarithm of a level."""
+        sigma_dn = np.zeros(len(camera))
+        for index, name in enumerate(self.names):
+            own = camera == index
+            sigma_dn[own] = self.noise[name].sigma_dn(patches.level_dn[own])
+        return np.asarray(sigma_dn / np.sqrt(VALUES) / patches.level_dn)
+
+    def adjusted(self) -> Shading:
+        """From all instants."""
+        return adjust_shading(self.samples(self.instants), self.given)
+
+    def unadjusted(self, extra_sigma: Float[np.ndarray, "d"]) -> Shading:
+        """With cameras and lamps as given; only how bright all is is found."""
+        held = np.zeros(len(self.given.precision))
+        held[common_columns(len(self.names))] = np.nan
+        return adjust_shading(self.samples(self.instants), self.given, held=held, extra_sigma=extra_sigma)
+
+    def halves(self) -> list[tuple[Samples, Shading]]:
+        """Each for itself; nothing where they are too small, or miss a camera."""
+        parts = [self.instants[k::2] for k in range(2)]
+        if any(len(part) < _LEAST_INSTANTS // 2 for part in parts):
+            return []
+        samples = [self.samples(part) for part in parts]
+        if any(len(np.unique(each.camera)) < len(self.names) for each in samples):
+            return []
+        return [(each, adjust_shading(each, self.given)) for each in samples]
+
+
+# --- what it is worth --------------------------------------------------------------------------------------------
+
+
+def _described(case: _Case, fit: Shading, clipped: Mapping[str, float], notes: list[str]) -> Photometry:
+    halves = case.halves()
+    apart = _apart(halves, len(case.names)) if halves else None
+    fit = replace(fit, covariance=fit.covariance * max(1.0, apart or 0.0) ** 2)
+    sensors = {name: _sensor(case, fit, index) for index, name in enumerate(case.names)}
+    lamps = {name: _lamp(case, fit, k, light) for k, (name, light) in enumerate(case.lamps.items())}
+    residuals = _residuals(case, fit)
+    held_out = _held_out(case, halves)
+    return Photometry(
+        sensors=sensors,
+        lights=lamps or dict(case.drawn.lights if case.drawn else {}),
+        cameras={
+            name: CameraLight(
+                patches=len(r),
+                clipped_pct=100 * clipped[name],
+                **_numbers(sensors[name], case.noise[name]),
+                before_pct=_rms(before),
+                after_pct=_rms(after),
+                held_out_pct=100 * _rms(held_out[name]) if halves else None,
+            )
+            for name, (r, before, after) in residuals.items()
+        },
+        light_deviation_pct=100 * fit.extra_sigma if case.lamps else None,
+        halves_apart=apart,
+        noise=case.noise,
+        residuals_pct=residuals,
+        notes=(*notes, *_doubts(case, fit, sensors), *_untold(case, lamps)),
+    )
+
+
+def _residuals(
+    case: _Case, fit: Shading
+) -> dict[str, tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]]:
+    """Of each camera: r of its patches, and residuals before and after, %."""
+    samples, before = case.samples(case.instants), case.unadjusted(fit.extra_sigma)
+    own = {name: samples.camera == index for index, name in enumerate(case.names)}
+    return {
+        name: (np.sqrt(samples.terms[at, 0]), 100 * before.residuals[at], 100 * fit.residuals[at])
+        for name, at in own.items()
+    }
+
+
+def _numbers(sensor: Sensor, noise: Noise) -> dict[str, float]:
+    covariance = known(sensor.covariance)
+    corner = float(covariance[1:3, 1:3].sum())
+    return {
+        "gain": sensor.gain,
+        "gain_sigma_pct": 100 * float(np.sqrt(covariance[0, 0])),
+        "corner_loss_pct": 100 * sensor.corner_loss,
+        "corner_loss_sigma_pct": 100 * (1 - sensor.corner_loss) * float(np.sqrt(corner)),
+        "gamma": sensor.gamma,
+        "gamma_sigma_pct": 100 * float(np.sqrt(covariance[3, 3])),
+        "noise_dn": noise.noise_dn,
+        "noise_sigma_dn": noise.noise_sigma_dn,
+        "shot_noise_share": noise.shot_noise_share,
+    }
+
+
+def _sensor(case: _Case, fit: Shading, index: int) -> Sensor:
+    own = camera_columns(index, len(case.names))
+    log_gain, a, b, log_gamma = fit.unknowns[own]
+    noise, given = case.noise[case.names[index]], case.sensor(case.names[index])
+    return Sensor(
+        noise_dn=noise.noise_dn,
+        shot_noise_share=noise.shot_noise_share,
+        gamma=given.gamma * float(np.exp(log_gamma)),
+        gain=float(np.exp(log_gain)),
+        falloff=(float(a), float(b)),
+        covariance=fit.covariance[np.ix_(own, own)],
+    )
+
+
+def _lamp(case: _Case, fit: Shading, index: int, drawn: Light) -> Light:
+    own = light_columns(index, len(case.names))
+    change = fit.unknowns[own]
+    return replace(
+        drawn,
+        position_mm=drawn.position_mm + change[:3],
+        power=drawn.power * float(np.exp(change[3])),
+        covariance=fit.covariance[np.ix_(own, own)],
+    )
+
+
+def _held_out(case: _Case, halves: Sequence[tuple[Samples, Shading]]) -> dict[str, Float[np.ndarray, "n"]]:
+    """Residuals of each half under what the other one tells."""
+    left: dict[str, list[Float[np.ndarray, "n"]]] = {name: [] for name in case.names}
+    for (samples, _), (_, other) in zip(halves, halves[::-1], strict=True):
+        residuals = adjust_shading(samples, case.given, held=other.unknowns, extra_sigma=other.extra_sigma).residuals
+        for index, name in enumerate(case.names):
+            left[name].append(residuals[samples.camera == index])
+    return {name: np.concatenate(each) if each else np.zeros(0) for name, each in left.items()}
+
+
+def _apart(halves: Sequence[tuple[Samples, Shading]], cameras: int) -> float:
+    """RMS over the numbers of the cameras, each in its standard deviations."""
+    size = PER_CAMERA * cameras
+    (_, one), (_, other) = halves
+    difference = (one.unknowns - other.unknowns)[:size]
+    variance = np.diag(one.covariance + other.covariance)[:size]
+    told = variance > 0
+    return float(np.sqrt(np.mean(difference[told] ** 2 / variance[told])))
+
+
+def _rms(residuals: Float[np.ndarray, "n"]) -> float:
+    """Without what is not of noise."""
+    usual = residuals[np.abs(residuals) <= _OUTLYING * 1.4826 * max(float(np.median(np.abs(residuals))), 1e-12)]
+    return float(np.sqrt(np.mean(usual**2))) if len(usual) else 0.0
+
+
+def _doubts(case: _Case, fit: Shading, sensors: Mapping[str, Sensor]) -> Iterator[str]:
+    """Where the search did not end, patches are not what the model says, or images leave something open."""
+    if not fit.settled:
+        yield "the adjustment of light did not come to its end; its numbers may be wrong"
+    if not case.lamps:
+        yield (
+            "light on the board may be anything: falloffs are told by how cameras differ that see the same place; give "
+            "the --drawn handpiece, if its lights alone lit the board, to find these"
+        )
+    samples = case.samples(case.instants)
+    odd = np.abs(fit.residuals) > _OUTLYING * fit.scale * samples.sigma
+    for index, name in enumerate(case.names):
+        outlying = _share(odd[samples.camera == index])
+        if outlying > _MANY_OUTLYING:
+            yield f"camera {name}: {outlying:.0%} of its patches are not as bright as they should be: highlights, dirt"
+        open_pct = _numbers(sensors[name], case.noise[name])["corner_loss_sigma_pct"]
+        if open_pct > 100 * _OPEN_CORNER:
+            yield (
+                f"camera {name}: the light in its corners is known to {open_pct:.0f} % only; show it the board in the "
+                "corners, too, together with other cameras"
+            )
+    if _gamma_told(case, fit) > _TOLD:
+        yield "gamma cannot be told from these images; it stays about what was given"
+
+
+def _gamma_told(case: _Case, fit: Shading) -> float:
+    """Standard deviation of what all cameras have in common of gamma, as a share of what it was before."""
+    count = len(case.names)
+    own = slice(3 * count, 4 * count)
+    return float(np.sqrt(fit.covariance[own, own].mean()) / max(case.options.gamma_pct / 100, 1e-4))
+
+
+def _untold(case: _Case, lamps: Mapping[str, Light]) -> Iterator[str]:
+    """Lamps whose places the images do not tell; and what they never tell."""
+    if not lamps:
+        return
+    tolerance = np.linalg.inv(case.given.precision[-PER_CAMERA:-1, -PER_CAMERA:-1])
+    open_ones = [
+        name
+        for name, lamp in lamps.items()
+        if np.trace(known(lamp.covariance)[:3, :3]) > _TOLD**2 * np.trace(tolerance)
+    ]
+    if open_ones:
+        yield (
+            f"lights {', '.join(open_ones)}: their places cannot be told, and stay about as drawn; light the board by "
+            "one after the other (names of images that end in -NAME)"
+        )
+    yield "powers of lights are against each other: how white paper is, and how long was exposed, is not known"
