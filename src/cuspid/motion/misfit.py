@@ -134,9 +134,10 @@ def held_misfit(
     return (
         f"calibration: held, but the images want it {np.sqrt(square / directions):.1f} standard deviations of "
         f"{_ALLOWED_PX:g} px (root mean square of {directions} numbers) from the file, camera "
-        f"{_farthest(wanted, held, names)} farthest; reprojection {_rms_px(state, observations):.2f} px where "
-        f"about {_rms_px(left, observations):.2f} px is expected. Is it the file of another handpiece, or of one built "
-        "with errors? Calibrate it (cuspid calibrate), or let it be refined, as a file without covariances is",
+        f"{_farthest(wanted, held, names)} farthest; reprojection {_typical_px(state, observations):.2f} px (median) "
+        f"where about {_typical_px(left, observations):.2f} px is expected. Is it the file of another handpiece, or "
+        "of one built with errors? Calibrate it (cuspid calibrate), or let it be refined, as a file without "
+        "covariances is",
     )
 
 
@@ -199,6 +200,6 @@ def _after(raw: State, observations: Observations, weighting: Weighting, step: F
     return settle(moved, observations, weighting)
 
 
-def _rms_px(state: State, observations: Observations) -> float:
-    """Root mean square length of the residuals of points before their cameras."""
-    return float(np.sqrt(np.nanmean(np.sum(residual_vectors(state, observations) ** 2, axis=1))))
+def _typical_px(state: State, observations: Observations) -> float:
+    """Median length of the residuals of points before their cameras; wrong matches are among them."""
+    return float(np.nanmedian(np.linalg.norm(residual_vectors(state, observations), axis=1)))
