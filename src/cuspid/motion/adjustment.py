@@ -25,13 +25,13 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from cuspid.epipolar import skew
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.motion.gauge import PLACE, best_gauge, moved_places, moved_world
+from cuspid.motion.misfit import CHANCE, held_misfit
 from cuspid.motion.normal_equations import (
     CALIBRATION,
     POSE,
@@ -39,11 +39,13 @@ from cuspid.motion.normal_equations import (
     State,
     System,
     Weighting,
+    influence,
     normal_equations,
     residual_vectors,
     scatter_of_tracks,
     settle,
     substitute,
+    with_poses_moved,
 )
 from cuspid.options import Options, Range
 from cuspid.reconstruction import Expectation, Reconstruction, Refinement, Tracks
@@ -59,8 +61,6 @@ _DRAWS, _MOST_DRAWN = 64, 2000
 """Draws from the covariance of what was found, and points whose motion in them is followed."""
 _END = 0.02
 """Of the length of a scan, what counts as its end."""
-_CHANCE = 1e-6
-"""A calibration that would come about with less than this chance is not that of the handpiece."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,13 +200,8 @@ def _initial_state(poses: Sequence[Rigid3], points: Float[np.ndarray, "p 3"], pr
 def _moved(state: State, observations: Observations, weighting: Weighting, prior: _Prior, step: Any) -> State:
     """The state after a step of poses and calibration, with the points where their rays then meet."""
     size = POSE * (len(state.frame_rotation) - 1)
-    motions = np.vstack([np.zeros((1, POSE)), step[:size].reshape(-1, POSE)])
-    turns = Rotation.from_rotvec(motions[:, :3]).as_matrix()
-    moved = state._replace(
-        frame_rotation=turns @ state.frame_rotation,
-        frame_translation=np.einsum("fij,fj->fi", turns, state.frame_translation) + motions[:, 3:],
-        points=substitute(state, observations, weighting, step),
-    )
+    points = substitute(state, observations, weighting, step)
+    moved = with_poses_moved(state, step[:size])._replace(points=points)
     if weighting.calibrated:
         moved = _with_calibration(moved, prior, state.whitened + step[size:].reshape(state.whitened.shape))
     return _in_front(settle(moved, observations, weighting), state.points, observations)
@@ -304,17 +299,9 @@ def _sigma_px(state: State, observations: Observations, weighting: Weighting, un
     For a robust loss the covariance of the estimate is a / b^2 (J^T J)^-1, with a the variance of the influence
     psi(r) = w(r) r and b its mean slope (Huber, Robust Statistics, 1981, section 7.6); so sigma^2 = a / b^2.
     """
-    squares, slope = _influence(state, observations, weighting)
+    squares, slope = influence(state, observations, weighting)
     variance = squares / max(2 * len(observations.frame) - unknowns, 1)
     return max(float(weighting.sigma_px * np.sqrt(variance) / slope), _LEAST_SIGMA_PX)
-
-
-def _influence(state: State, observations: Observations, weighting: Weighting) -> tuple[float, float]:
-    """Sum of the squares of psi(r), and the mean slope of psi."""
-    lengths = np.linalg.norm(residual_vectors(state, observations), axis=1) / weighting.sigma_px
-    beyond = lengths > weighting.huber_sigmas
-    slopes = np.where(beyond, weighting.huber_sigmas / (2 * np.maximum(lengths, 1e-300)), 1.0)
-    return float(np.sum(np.minimum(lengths, weighting.huber_sigmas) ** 2)), float(np.mean(slopes))
 
 
 # --- observations ------------------------------------------------------------------------------------------------
@@ -429,10 +416,9 @@ def _posterior(state: State, observations: Observations, weighting: Weighting) -
     """
     poses = np.zeros((len(state.frame_rotation), POSE, POSE))
     start = POSE * (len(poses) - 1)
-    _, slope = _influence(state, observations, weighting)
+    _, slope = influence(state, observations, weighting)
     hessian = slope * normal_equations(state, observations, weighting._replace(huber_sigmas=np.inf)).matrix
-    spare = 2 * len(observations.frame) - state.points.size
-    scatter = scatter_of_tracks(state, observations, weighting) * spare / max(spare - len(hessian), 1)
+    scatter = scatter_of_tracks(state, observations, weighting)
     prior = np.arange(start, len(hessian))
     hessian[prior, prior] += 1 - slope
     scatter[prior, prior] += 1
@@ -598,6 +584,7 @@ def _adjusted(
         sigma_px = _sigma_px(state, observations, weighting, unknowns)
         limit_px = options.outlier_sigmas * sigma_px
     posterior = _known_posterior(state, observations, weighting) if has_scale else None
+    misfits = _misfits(tracks, state, weighting, prior, options) if has_scale else ()
     residuals = residual_vectors(state, observations)
     return _Adjusted(
         rig=_adjusted_rig(state, prior, None if posterior is None else posterior.calibration),
@@ -607,13 +594,27 @@ def _adjusted(
         tracks=_as_tracks(state, observations, colors),
         pose_covariance=None if posterior is None else posterior.poses,
         reprojection_rms_px=float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))),
-        notes=(*_unsettled(minimum, options), *_implausible(state, prior)),
+        notes=(*_unsettled(minimum, options), *_implausible(state, prior), *misfits),
         log={
             "observation_sigma_px": sigma_px,
             "observations": len(residuals),
             "adjustment_steps": steps,
         },
     )
+
+
+def _misfits(
+    tracks: Tracks, found: State, weighting: Weighting, prior: _Prior, options: AdjustmentOptions
+) -> tuple[str, ...]:
+    """Whether the images fit what is held of the calibration: all that was matched, for of a camera that is far off
+    everything is dropped."""
+    observations, points = _sorted_by_point(tracks, np.ones(len(tracks.point_index), dtype=bool))
+    state = found._replace(points=tracks.points[points])
+    for _ in range(2):
+        state = _in_front(settle(state, observations, weighting), state.points, observations)
+        keep = _good(state, observations, options.start_px, options.minimum_angle_deg)
+        state, observations, _ = _select(state, observations, np.zeros((len(state.points), 3), np.uint8), keep)
+    return held_misfit(settle(state, observations, weighting), observations, weighting, prior.rig.names)
 
 
 def _unsettled(minimum: _Minimum, options: AdjustmentOptions) -> tuple[str, ...]:
@@ -639,7 +640,7 @@ def _refinement(state: State, prior: _Prior) -> Refinement | None:
 def _implausible(state: State, prior: _Prior) -> tuple[str, ...]:
     """Whether the refined calibration lies farther from the given one than its covariance allows."""
     cost, numbers = float(np.sum(state.whitened**2)), int(prior.free_numbers.sum())
-    if numbers == 0 or cost <= chdtri(numbers, _CHANCE):
+    if numbers == 0 or cost <= chdtri(numbers, CHANCE):
         return ()
     camera = int(np.argmax(np.sum(state.whitened**2, axis=1)))
     return (

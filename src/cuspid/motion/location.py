@@ -319,7 +319,8 @@ def _advice(found: Reconstruction) -> Iterator[str]:
     if 1000 * bent_um > _LOOSE_SPAN_PPM * expected.span_mm:
         yield (
             f"expected: apart from the scale, the {expected.span_mm:.0f} mm from end to end are known within "
-            f"{bent_um:.0f} um only (one sigma); a sweep straight from one end to the other, as over the palate, helps"
+            f"{bent_um:.0f} um only (one sigma); a sweep straight from one side to the other, as over the palate, "
+            "helps (in simulation --cross-sweep)"
         )
 
 

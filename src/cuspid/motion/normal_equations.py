@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit
 from scipy.sparse import csr_array
+from scipy.spatial.transform import Rotation
 
 from cuspid.workers import map_slices
 
@@ -463,9 +464,9 @@ def normal_equations(state: State, observations: Observations, weighting: Weight
 
 
 def scatter_of_tracks(state: State, observations: Observations, weighting: Weighting) -> Float[np.ndarray, "k k"]:
-    """Sum over the tracks of g g^T, g being the share of a track in the gradient of the reduced unknowns, where every
-    point lies where its rays meet best. It is what independent tracks make of the gradient's covariance, however the
-    errors within a track hang together."""
+    """Sum over the tracks of g g^T, g being the share of a track in the gradient of the reduced unknowns without the
+    prior, where every point lies where its rays meet best. It is what independent tracks make of the gradient's
+    covariance, however the errors within a track hang together (Liang and Zeger, Biometrika 73, 1986)."""
     size = POSE * (len(state.frame_rotation) - 1)
     total = size + (state.whitened.size if weighting.calibrated else 0)
     blocks = np.zeros((len(observations.frame), POSE + CALIBRATION))
@@ -484,7 +485,26 @@ def scatter_of_tracks(state: State, observations: Observations, weighting: Weigh
     rows = np.repeat(np.arange(len(state.points)), np.diff(observations.start))[:, None] + 0 * columns
     free = (columns >= 0) & (columns < total)
     shares = csr_array((blocks[free], (rows[free], columns[free])), shape=(len(state.points), total))
-    return np.asarray((shares.T @ shares).toarray())
+    spare = 2 * len(observations.frame) - state.points.size
+    return np.asarray((shares.T @ shares).toarray()) * spare / max(spare - total, 1)
+
+
+def influence(state: State, observations: Observations, weighting: Weighting) -> tuple[float, float]:
+    """Sum of the squares of psi(r) = w(r) r, and the mean slope of psi (Huber, Robust Statistics, 1981, sec. 7.6)."""
+    lengths = np.linalg.norm(residual_vectors(state, observations), axis=1) / weighting.sigma_px
+    beyond = lengths > weighting.huber_sigmas
+    slopes = np.where(beyond, weighting.huber_sigmas / (2 * np.maximum(lengths, 1e-300)), 1.0)
+    return float(np.sum(np.minimum(lengths, weighting.huber_sigmas) ** 2)), float(np.mean(slopes))
+
+
+def with_poses_moved(state: State, step: Float[np.ndarray, "n"]) -> State:
+    """The state after small motions on the left of all poses but the first."""
+    motions = np.vstack([np.zeros((1, POSE)), step.reshape(-1, POSE)])
+    turns = Rotation.from_rotvec(motions[:, :3]).as_matrix()
+    return state._replace(
+        frame_rotation=turns @ state.frame_rotation,
+        frame_translation=np.einsum("fij,fj->fi", turns, state.frame_translation) + motions[:, 3:],
+    )
 
 
 def substitute(

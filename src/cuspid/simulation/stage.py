@@ -84,7 +84,8 @@ def simulate(
     """
     handpiece = lit(handpiece)
     path = plan_scan_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
-    write_path(folder / "truth" / "path.json", path.minimum_overlap, path.mean_overlap, path.seen)
+    overlaps = path.minimum_overlap, path.mean_overlap
+    write_path(folder / "truth" / "path.json", *overlaps, path.seen, path.cross_sweep)
     true, known = built(handpiece, options.manufacturing), told(handpiece, options.manufacturing)
     return take_images(jaw, true, path.rig_from_world, folder, options, known=known, progress=progress)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from cuspid.jaw import GUM
@@ -29,10 +29,14 @@ def read_truth(folder: Path) -> GroundTruth:
     )
 
 
-def write_path(path: Path, minimum_overlap: float, mean_overlap: float, seen: Mapping[int, float]) -> None:
+def write_path(
+    path: Path, minimum_overlap: float, mean_overlap: float, seen: Mapping[int, float], cross_sweep: Sequence[str] = ()
+) -> None:
     """Write what is known of a path before anything is rendered.
 
     ``seen`` is about the share of each crown that two cameras see at once, by FDI number; 0 stands for all crowns.
+    ``cross_sweep`` names the frames of the sweep from one side of the arch to the other.
     """
     shares = {"all" if tooth == GUM else str(tooth): share for tooth, share in seen.items()}
-    write_json(path, {"minimum_overlap": minimum_overlap, "mean_overlap": mean_overlap, "crowns_seen": shares})
+    overlaps = {"minimum_overlap": minimum_overlap, "mean_overlap": mean_overlap}
+    write_json(path, {**overlaps, "crowns_seen": shares, "cross_sweep_frames": list(cross_sweep)})

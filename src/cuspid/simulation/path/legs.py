@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.simulation.path.arch import NEAR_MM, ArchCurve
+from cuspid.simulation.path.cross import Crossing
 
 _SIDE_DEG, _SIDE_MM = 60.0, (4.5, 2.5)
 """A handpiece rolled so far looks at this place: across from the middle of the crown, and down from the cusp tips."""
@@ -73,11 +74,18 @@ class SteadyPath:
     """How far the surface there lies outside of the nominal crown."""
     sinks_mm: Float[np.ndarray, "s"]
     """How far the handpiece sinks there, for teeth are missing."""
+    crossing: Crossing | None = None
+    """A sweep from one side to the other behind the last leg; it begins where that ends."""
 
     @property
     def span_mm(self) -> tuple[float, float]:
         """First and last travel."""
-        return float(self.travel_mm[0]), float(self.travel_mm[-1])
+        return float(self.travel_mm[0]), self.legs_end_mm + (self.crossing.length_mm if self.crossing else 0.0)
+
+    @property
+    def legs_end_mm(self) -> float:
+        """Travel at the end of the last leg."""
+        return float(self.travel_mm[-1])
 
     def place(self, travel_mm: float) -> tuple[float, float]:
         """Place on the curve in mm and roll in degrees."""
@@ -87,6 +95,8 @@ class SteadyPath:
 
     def rig_from_world(self, travel_mm: float) -> Rigid3:
         """The handpiece without the drift of a hand."""
+        if self.crossing is not None and travel_mm > self.legs_end_mm:
+            return self.crossing.at(travel_mm - self.legs_end_mm)
         length, roll = self.place(travel_mm)
         sink = float(np.interp(length, self.stations_mm, self.sinks_mm))
         hold_from_world = _hold_from_world(self.curve, length, sink)

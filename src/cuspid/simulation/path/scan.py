@@ -26,9 +26,10 @@ from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
 from cuspid.options import TOOTH, Options, Range
 from cuspid.rig import Handpiece
-from cuspid.room import check_clearance, room_about
+from cuspid.room import Room, check_clearance, room_about
 from cuspid.simulation.path.arch import ArchCurve, arch_curve
 from cuspid.simulation.path.coverage import CrownPoints, crown_points
+from cuspid.simulation.path.cross import plan_crossing
 from cuspid.simulation.path.detour import Detour, PoseAt, lifted, plan_detour
 from cuspid.simulation.path.further import further_legs, seen_from
 from cuspid.simulation.path.hand import HandMotion, hand_motion
@@ -45,6 +46,8 @@ _ARCH_MM = 80.0
 """What is longer is a whole arch."""
 _GROWTH = 1.15
 """By so much at most the number of frames is raised at once, where there are turns."""
+_LEAD_MM = 2.0
+"""A handpiece rides so far along the arch before it leaves it for the other side."""
 _MOST = 2
 """So many times the usual number of frames are taken at most for the overlap's sake."""
 _COARSE = 12
@@ -86,6 +89,10 @@ class ScanPathOptions(Options):
     passes: Literal["turns", "auto"] | None = None
     """turns: those that --turns says; auto: also others, rolled differently, over what two cameras did not see; a note
     tells how many frames they take. None for auto over a whole arch of which nothing else is said, else turns."""
+    cross_sweep: bool = False
+    """After the passes of a whole arch, sweep from one side straight to the other, as over the palate, as far back as
+    there is surface between them: it ties the two ends, and so the width of the arch. A note tells where there is none.
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -109,6 +116,8 @@ class ScanPath:
     overlap: Float[np.ndarray, "n c"]
     """For each frame but the last, and each camera: share of the surface in its image that the next image also sees;
     NaN where the image shows no surface."""
+    travel_mm: Float[np.ndarray, "f"]
+    """Travel at each frame."""
     steady: SteadyPath = field(repr=False)
     """The trajectory of a steady hand."""
     seen: Mapping[int, float] = field(default_factory=dict)
@@ -119,6 +128,13 @@ class ScanPath:
     def curve(self) -> ArchCurve:
         """The curve that the path follows."""
         return self.steady.curve
+
+    @property
+    def cross_sweep(self) -> tuple[str, ...]:
+        """Names of the frames of the sweep from one side to the other."""
+        if self.steady.crossing is None:
+            return ()
+        return tuple(np.array(list(self.rig_from_world))[self.travel_mm > self.steady.legs_end_mm].tolist())
 
     @property
     def minimum_overlap(self) -> float:
@@ -142,6 +158,8 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
     steady = first = steady_path(jaw.mesh, curve, _legs(jaw, curve, options))
     if _goes_on(options, curve):
         steady = further_legs(jaw.mesh, room, crowns, handpiece, first)
+    if options.cross_sweep:
+        steady = _crossed(jaw.mesh, room, handpiece, steady, options)
     detour = plan_detour(room, crowns, handpiece, steady.rig_from_world, steady.span_mm)
     hand = hand_motion(
         steady.span_mm,
@@ -160,7 +178,8 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
         )
     path = replace(path, seen=_seen(crowns, handpiece, path, options.tooth))
     notes = (_gap_notes(steady), _detour_notes(jaw, steady, detour), _further_pass_notes(steady, first, path))
-    for note in chain(*notes, _blind_notes(path), _unseen_notes(path)):
+    across = _crossing_notes(jaw, path) if options.cross_sweep else ()
+    for note in chain(*notes, across, _blind_notes(path), _unseen_notes(path)):
         _LOG.info(note)
     return path
 
@@ -192,6 +211,26 @@ def _goes_on(options: ScanPathOptions, curve: ArchCurve) -> bool:
         return options.passes == "auto"
     said = (options.tooth, options.frames, options.length_mm)
     return float(curve.lengths_mm[-1]) > _ARCH_MM and options.turns == 1 and all(each is None for each in said)
+
+
+def _crossed(mesh: Mesh, room: Room, handpiece: Handpiece, steady: SteadyPath, options: ScanPathOptions) -> SteadyPath:
+    """With a sweep to the other side from that on which the passes end; as it was where there is none.
+
+    Raises InputError for a single tooth and for a part of an arch, which have no other side.
+    """
+    if options.tooth is not None or float(steady.curve.lengths_mm[-1]) <= _ARCH_MM:
+        raise InputError(
+            "scan path: a sweep across goes from one side of a whole arch to the other, and this is a tooth or a part "
+            "of one; leave --cross-sweep out"
+        )
+    ends_at = steady.legs[-1].end_mm
+    crossing = plan_crossing(mesh, room, handpiece, steady.curve, ends_at)
+    if crossing is None:
+        return steady
+    before = crossing.start_mm + np.sign(ends_at - crossing.start_mm) * _LEAD_MM
+    lead = Leg(roll_deg=0.0, start_mm=float(before), end_mm=crossing.start_mm)
+    led = steady_path(mesh, steady.curve, (*steady.legs, lead))
+    return replace(led, crossing=crossing.after(led.rig_from_world(led.legs_end_mm)))
 
 
 def _stretch(jaw: Jaw, curve: ArchCurve, options: ScanPathOptions) -> tuple[float, float]:
@@ -276,6 +315,7 @@ def _even_path(mesh: Mesh, handpiece: Handpiece, steady: SteadyPath, pose_at: Po
     return ScanPath(
         rig_from_world={f"{index:05d}": pose for index, pose in enumerate(poses)},
         overlap=image_overlap(mesh, handpiece, poses),
+        travel_mm=travel,
         steady=steady,
     )
 
@@ -304,7 +344,7 @@ def _blind_notes(path: ScanPath) -> tuple[str, ...]:
 
 def _detour_notes(jaw: Jaw, steady: SteadyPath, detour: Detour) -> tuple[str, ...]:
     """Where the handpiece leaves the trajectory of a steady hand."""
-    changed = np.any(detour.changes != 0, axis=1)
+    changed = np.any(detour.changes != 0, axis=1) & (detour.travel_mm <= steady.legs_end_mm)
     if not changed.any():
         return ()
     shift, lift, *turns = detour.largest
@@ -329,10 +369,26 @@ def _further_pass_notes(steady: SteadyPath, first: SteadyPath, path: ScanPath) -
     further = [leg for leg in steady.legs if leg.roll_deg not in rolls]
     if not further:
         return ()
-    frames = len(path.rig_from_world)
-    more = round(frames * (1 - np.ptp(first.span_mm) / np.ptp(steady.span_mm)))
+    frames, passes_mm = len(path.rig_from_world), steady.legs_end_mm - steady.span_mm[0]
+    more = round((frames - len(path.cross_sweep)) * (1 - np.ptp(first.span_mm) / passes_mm))
     what = ", ".join(f"{leg.roll_deg:+.0f} deg over {leg.length_mm:.0f} mm" for leg in further)
     return (f"scan path: further passes, rolled to the cheek by {what}, take about {more} of {frames} frames",)
+
+
+def _crossing_notes(jaw: Jaw, path: ScanPath) -> tuple[str, ...]:
+    """Where the sweep to the other side goes, or that there is none."""
+    crossing, swept = path.steady.crossing, path.cross_sweep
+    if crossing is None:
+        return (
+            "scan path: no sweep across; between the sides of this arch there is nowhere surface all the way that two "
+            "cameras see in focus where the handpiece fits",
+        )
+    ends = np.array([path.curve.place(at) for at in (crossing.start_mm, crossing.end_mm)])
+    return (
+        f"scan path: the sweep across{_near_teeth(jaw, ends)} takes the frames {swept[0]} to {swept[-1]}, "
+        f"{len(swept)} of {len(path.rig_from_world)}; from one side to the other it is "
+        f"{np.linalg.norm(ends[1] - ends[0]):.0f} mm",
+    )
 
 
 def _unseen_notes(path: ScanPath) -> tuple[str, ...]:
