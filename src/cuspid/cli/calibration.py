@@ -242,7 +242,7 @@ def _print_light(light: Photometry) -> None:
     for note in light.notes:
         console.print(f"note: {note}")
     table = Table(title="Light")
-    for heading in ("camera", "gain, ±%", "corners, %", "gamma, ±%", "noise DN", "before %", "held out %"):
+    for heading in ("camera", "gain ±%", "corners %", "gamma ±%", "noise", "before %", "held out"):
         table.add_column(heading, justify="left" if heading == "camera" else "right", no_wrap=True)
     for name, each in light.cameras.items():
         gain = f"{each.gain:.3f} ±{each.gain_sigma_pct:.1f}"
