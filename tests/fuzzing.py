@@ -197,8 +197,9 @@ def _evaluation(folder: Path) -> None:
     reference = folder / "reference.ply"
     storage.write_mesh(reference, small_jaw().mesh)
     write_evaluation(folder / "evaluation", small_jaw())
-    hashes = {"reference": storage.hash_file(reference)}
-    storage.claim_folder(folder / "evaluation", "evaluate", {"evaluation": {"samples": 100}}, hashes, replace=True)
+    settings, hashes = {"evaluation": {"samples": 100}}, {"reference": storage.hash_file(reference)}
+    with storage.claimed_folder(folder / "evaluation", "evaluate", settings, hashes, replace=True):
+        pass
 
 
 def _studies(folder: Path) -> None:
