@@ -91,7 +91,7 @@ def fitting_range_um(p95_um: float) -> float:
 def fitting_sigma_um(sigma_um: Float[np.ndarray, "v"]) -> float:
     """The smallest end of a colour bar from 0 that holds 95 % of the standard deviations that are known."""
     known = sigma_um[~np.isnan(sigma_um)]
-    most = float(np.percentile(known, 95)) if len(known) else 0.0
+    most = float(np.percentile(known, 95, method="inverted_cdf")) if len(known) else 0.0
     return next((each for each in RANGES_UM if each >= most), RANGES_UM[-1])
 
 
