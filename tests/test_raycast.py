@@ -38,7 +38,7 @@ from cuspid.simulation.raycast import (
     render_depth,
     render_image,
 )
-from cuspid.simulation.sensor import expose, noise_sd_dn
+from cuspid.simulation.sensor import expose
 
 WHITE = Material(dark=(1.0, 1.0, 1.0), light=(1.0, 1.0, 1.0), wavelengths_mm=(1.0,))
 BLACK = replace(WHITE, dark=(0.0, 0.0, 0.0), light=(0.0, 0.0, 0.0))
@@ -276,7 +276,7 @@ def test_noise_has_the_asked_deviation_and_no_bias(level_dn: float, share: float
     grey = np.full((200, 200, 3), (level_dn / 255) ** sensor.gamma)
     image = expose(grey, 1.0, sensor, np.random.default_rng(3)).astype(float)
     expected = 1.5 * np.sqrt(1 - share + share * level_dn / 127.5)
-    assert float(noise_sd_dn(np.array([level_dn]), sensor)[0]) == pytest.approx(expected)
+    assert float(sensor.noise_sd_dn(np.array([level_dn]))[0]) == pytest.approx(expected)
     assert image.std() == pytest.approx(np.hypot(expected, np.sqrt(1 / 12)), rel=0.02)
     assert image.mean() == pytest.approx(level_dn, abs=0.03)
 

@@ -188,6 +188,9 @@ class Light:
         return Rigid3(turn, -turn @ self.position_mm)
 
 
+MID_GREY_DN = 127.5
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Sensor:
     """What turns light into numbers, the losses of the lens included."""
@@ -215,6 +218,11 @@ class Sensor:
     def corner_loss(self) -> float:
         """Share of the light that is lost in the corners of an image."""
         return float(1 - np.exp(sum(self.falloff)))
+
+    def noise_sd_dn(self, level_dn: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """Standard deviation of the noise at levels of the encoded image, in digital numbers."""
+        share = self.shot_noise_share
+        return np.asarray(self.noise_dn * np.sqrt(1 - share + share * level_dn / MID_GREY_DN))
 
     def transmitted(self, camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
         """Linear light that pixels of a camera show, over that which a camera of gain 1 without falloff would."""

@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.calibration.patches import FREEDOM, Patches
-from cuspid.rig import Sensor
+from cuspid.rig import MID_GREY_DN, Sensor
 
-_MID_GREY_DN = 127.5
 _ROUNDING_DN2 = 1 / 12
 """Variance that rounding to whole numbers adds."""
 _ROUNDS = 8
@@ -36,14 +35,14 @@ class Noise:
     @property
     def noise_dn(self) -> float:
         """See :attr:`cuspid.rig.Sensor.noise_dn`."""
-        return float(np.sqrt(max(self.read_dn2 + self.per_dn * _MID_GREY_DN - _ROUNDING_DN2, 0.0)))
+        return float(np.sqrt(max(self.read_dn2 + self.per_dn * MID_GREY_DN - _ROUNDING_DN2, 0.0)))
 
     @property
     def shot_noise_share(self) -> float:
         """See :attr:`cuspid.rig.Sensor.shot_noise_share`."""
         if not self.noise_dn:
             return Sensor().shot_noise_share
-        return float(np.clip(self.per_dn * _MID_GREY_DN / self.noise_dn**2, 0, 1))
+        return float(np.clip(self.per_dn * MID_GREY_DN / self.noise_dn**2, 0, 1))
 
     def sigma_dn(self, level_dn: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         """Standard deviation of a pixel in a channel."""
@@ -60,7 +59,7 @@ def noise_of(patches: Patches) -> Noise:
         matrix = (by * weight[:, None]).T @ by
         line = np.linalg.lstsq(matrix, by.T @ (weight * patches.variance_dn2), rcond=None)[0]
         expected = np.maximum(by @ line, _ROUNDING_DN2)
-    middle = np.array([1.0, _MID_GREY_DN])
+    middle = np.array([1.0, MID_GREY_DN])
     sigma_dn2 = float(np.sqrt(middle @ np.linalg.pinv(matrix) @ middle * 2 / FREEDOM))
     noise_dn = np.sqrt(max(float(middle @ line), _ROUNDING_DN2))
     return Noise(

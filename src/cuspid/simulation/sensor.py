@@ -7,15 +7,6 @@ from jaxtyping import Float, UInt8
 
 from cuspid.rig import Handpiece, Sensor
 
-MID_GREY_DN = 127.5
-
-
-def noise_sd_dn(level_dn: Float[np.ndarray, "*n"], sensor: Sensor) -> Float[np.ndarray, "*n"]:
-    """Standard deviation of the noise at a level of the encoded image, in digital numbers."""
-    share = sensor.shot_noise_share
-    relative_variance = 1 - share + share * level_dn / MID_GREY_DN
-    return np.asarray(sensor.noise_dn * np.sqrt(relative_variance))
-
 
 def expose(
     radiance: Float[np.ndarray, "h w 3"], gain: float, sensor: Sensor, rng: np.random.Generator
@@ -23,7 +14,7 @@ def expose(
     """The image that the sensor records. ``gain`` times the linear radiance of 1 is full scale."""
     signal = np.clip(gain * radiance, 0, 1).astype(np.float32)
     level = np.float32(255) * signal ** np.float32(1 / sensor.gamma)
-    noisy = level + noise_sd_dn(level, sensor) * rng.standard_normal(level.shape, dtype=np.float32)
+    noisy = level + sensor.noise_sd_dn(level) * rng.standard_normal(level.shape, dtype=np.float32)
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 

@@ -29,7 +29,6 @@ _CUT, _FOOT, _HEAD = (0.0, ()), (0.0, (4.0, 2.0)), (0.0, (1.0, 1.5))
 """Dashes of these lines."""
 _INK = "#333333"
 _BEFORE, _AFTER = "#9a9a9a", "#1f5fd6"
-_MID_GREY_DN = 127.5
 _BINS = 12
 """Of radii and of levels, over which points are averaged."""
 _FEWEST = 5
@@ -204,8 +203,7 @@ def _draw_noise(
     at, variance = _binned(levels, variances)
     axes.plot(at, np.sqrt(variance), ".", color=colour, markersize=5)
     level = np.linspace(0, 255, 60)
-    share = sensor.shot_noise_share
-    axes.plot(level, sensor.noise_dn * np.sqrt(1 - share + share * level / _MID_GREY_DN), color=colour, linewidth=1)
+    axes.plot(level, sensor.noise_sd_dn(level), color=colour, linewidth=1)
     axes.set_ylim(bottom=0)
 
 
