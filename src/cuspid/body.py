@@ -13,10 +13,10 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit
 
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, read_only
+from cuspid.kernels import kernel
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,7 @@ class Body:
         return distance, part
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _distances(points, rotations, translations, halves, distance, part):
     for n in range(len(points)):

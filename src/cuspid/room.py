@@ -17,12 +17,12 @@ from typing import no_type_check
 import igl
 import numpy as np
 from jaxtyping import Bool, Float
-from numba import njit
 from scipy.ndimage import map_coordinates
 
 from cuspid.body import CAMERA_MM, LED_MM, Body
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.kernels import kernel
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
 
@@ -189,7 +189,7 @@ def check_clearance(room: Room, poses: Mapping[str, Rigid3]) -> None:
             )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _in_box(points, r, t, low, high):
     """The points, moved, that then lie in a box."""
@@ -210,7 +210,7 @@ def _in_box(points, r, t, low, high):
     return found[:count].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _clear(points, rotations, translations, grid, origin, pitch, limit):
     """For each pose, whether the distances that the grid has at all points, moved by the pose, reach the limit."""

@@ -14,10 +14,10 @@ from typing import Annotated, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
 
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3, read_only
+from cuspid.kernels import kernel
 from cuspid.mesh import Mesh
 from cuspid.options import Options, Range
 from cuspid.rig import Handpiece
@@ -272,7 +272,7 @@ def _incidence_deg(mesh: Mesh, faces: Int[np.ndarray, "n"], eye: Float[np.ndarra
     return np.asarray(np.rad2deg(np.arccos(np.clip(cosine, -1, 1))))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _within_ball(points, middle, radius):
     """True for the points in a ball."""
@@ -283,7 +283,7 @@ def _within_ball(points, middle, radius):
     return found
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _facing(centres, normals, faces, rotation, eye, low, high, depth_range, minimum_cosine):
     """True for those of the faces whose centre lies in the box of view and that face the camera steeply enough."""

@@ -15,12 +15,12 @@ from typing import Annotated, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from cuspid.geometry import Rigid3, axes_about, unit
+from cuspid.kernels import kernel
 from cuspid.mesh import Mesh
 from cuspid.options import Options, Range
 from cuspid.workers import map_in_threads
@@ -149,7 +149,7 @@ def _try_all(cloud: _Cloud, table: _Table, cap_mm: float, options: SearchOptions
     return np.concatenate([rotation, shift[..., None]], axis=2)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 @no_type_check
 def _score_turns(turned, targets, frames, fixed, nearest, origin, pitch, cap):
     """Mean truncated distance (share of the cap) for each target and turn; 1 for a pose that soon looks hopeless."""
@@ -166,7 +166,7 @@ def _score_turns(turned, targets, frames, fixed, nearest, origin, pitch, cap):
     return scores
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 @no_type_check
 def _distance(turned, k, i, targets, frames, t, fixed, nearest, origin, pitch, cap):
     """Truncated distance of one point, as a share of the cap; 1 where the normals disagree."""

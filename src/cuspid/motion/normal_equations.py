@@ -10,10 +10,10 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
+from cuspid.kernels import kernel
 from cuspid.workers import map_slices
 
 POSE = 6
@@ -73,7 +73,7 @@ class System(NamedTuple):
 # --- one observation ---------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _camera_jacobian(k, x, y, z, pixel, by_point, by_parameters):
     """Projection of a point in the camera frame, and its derivatives (2x3 and 2x8)."""
@@ -100,7 +100,7 @@ def _camera_jacobian(k, x, y, z, pixel, by_point, by_parameters):
     by_parameters[0, 7], by_parameters[1, 7] = fx * (r2 + 2 * u * u), fy * 2 * u * v
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _move(rotation, translation, x, out):
     """out = rotation @ x + translation."""
@@ -108,14 +108,14 @@ def _move(rotation, translation, x, out):
         out[i] = rotation[i, 0] * x[0] + rotation[i, 1] * x[1] + rotation[i, 2] * x[2] + translation[i]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _is_before(x_in_cam):
     """Whether a point lies before its camera, and not almost beside it."""
     return x_in_cam[2] > _FLATTEST * (abs(x_in_cam[0]) + abs(x_in_cam[1]))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _times(a, b, out):
     """out (2xn) = a (2x3) @ b (3xn)."""
@@ -124,7 +124,7 @@ def _times(a, b, out):
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _times_motion(a, x, out):
     """out (2x6): a (2x3) times the derivative [-[x]_x, I] of x under a small motion on its left."""
@@ -135,7 +135,7 @@ def _times_motion(a, x, out):
         out[i, 3], out[i, 4], out[i, 5] = a[i, 0], a[i, 1], a[i, 2]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def linearise(state, point, frame, camera, calibrated, scratch, pixel, jacobian):
     """Projected pixel and its derivatives (2x23) by point, pose and whitened calibration. False behind the camera."""
@@ -160,7 +160,7 @@ def linearise(state, point, frame, camera, calibrated, scratch, pixel, jacobian)
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def pose_equations(lenses, rotations, translations, pose, points, pixels, cameras):
     """Normal equations of the pose of one frame alone, with Cauchy's weights at 1 px; a small motion on its left.
@@ -188,14 +188,14 @@ def pose_equations(lenses, rotations, translations, pose, points, pixels, camera
     return matrix, gradient
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def make_scratch():
     """Working memory of :func:`linearise`."""
     return np.zeros(3), np.zeros(3), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, CALIBRATION))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _residuals(state, observations, out):
     """Projected minus observed pixel for each observation; NaN behind the camera."""
@@ -215,7 +215,7 @@ def _residuals(state, observations, out):
 # --- normal equations --------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _weigh(state, observations, weighting, point, o, scratch, residual, jacobian):
     """Residual and Jacobian of an observation, scaled by the root of its weight. False behind the camera."""
@@ -232,7 +232,7 @@ def _weigh(state, observations, weighting, point, o, scratch, residual, jacobian
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _slot(offsets, count, offset, coupling):
     """Where a block of unknowns stands among the blocks of the present point; a new one starts at zero."""
@@ -244,7 +244,7 @@ def _slot(offsets, count, offset, coupling):
     return count, count + 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _add_block(matrix, row, column, left, right):
     """matrix[row:, column:] += left^T right for 2xn factors."""
@@ -253,7 +253,7 @@ def _add_block(matrix, row, column, left, right):
             matrix[row + i, column + j] += left[0, i] * right[0, j] + left[1, i] * right[1, j]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _add_gradient(system, offset, by_block, residual):
     """Add J^T r and the diagonal of J^T J of one block of unknowns."""
@@ -262,7 +262,7 @@ def _add_gradient(system, offset, by_block, residual):
         system.diagonal[offset + i] += by_block[0, i] ** 2 + by_block[1, i] ** 2
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _add_observation(system, blocks, jacobian, residual, pose_at, camera_at):
     """Add an observation to the direct part of the system and to the coupling of its blocks with the point."""
@@ -286,7 +286,7 @@ def _add_observation(system, blocks, jacobian, residual, pose_at, camera_at):
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _eliminate(system, offsets, widths, coupling, count, inverse, point_gradient):
     """Subtract what the blocks share through the present point: W V^-1 W^T and W V^-1 g. Lower triangle only."""
@@ -307,7 +307,7 @@ def _eliminate(system, offsets, widths, coupling, count, inverse, point_gradient
                     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _point_inverse(hessian, inverse):
     """Inverse of a point's 3x3 block; zero where the point is not determined."""
@@ -324,7 +324,7 @@ def _point_inverse(hessian, inverse):
     inverse[1, 2] = inverse[2, 1] = (b * c - a * e) / determinant
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _offsets_of(observations, weighting, o, frames):
     """Where the pose and the calibration of an observation stand in the system; -1 where they are held."""
@@ -333,7 +333,7 @@ def _offsets_of(observations, weighting, o, frames):
     return POSE * (frame - 1) if frame > 0 else -1, calibration_at if weighting.calibrated else -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _accumulate(state, observations, weighting, first, last, system):
     """Add the points ``first`` to ``last`` to the reduced normal equations."""
@@ -356,7 +356,7 @@ def _accumulate(state, observations, weighting, first, last, system):
         _eliminate(system, offsets, widths, coupling, count, inverse, gradient[:, 0])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _scores(state, observations, weighting, first, last, out):
     """J^T r of each observation of the points ``first`` to ``last``, by its pose and its calibration."""
@@ -368,7 +368,7 @@ def _scores(state, observations, weighting, first, last, out):
                     out[o, i] = jacobian[0, 3 + i] * residual[0] + jacobian[1, 3 + i] * residual[1]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _substitute(state, observations, weighting, step, first, last, moved):
     """Back-substitution: the points ``first`` to ``last`` after the reduced unknowns have made their step."""
@@ -395,7 +395,7 @@ def _substitute(state, observations, weighting, step, first, last, moved):
             )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _loss(state, observations, weighting, point, scratch, residual):
     """Huber loss of the observations of a point; infinite where it lies behind one of their cameras."""
@@ -415,7 +415,7 @@ def _loss(state, observations, weighting, point, scratch, residual):
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _settle(state, observations, weighting, first, last):
     """Move the points ``first`` to ``last`` to where their rays meet, the rest being held (Gauss-Newton)."""

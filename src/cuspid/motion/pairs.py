@@ -14,10 +14,10 @@ from typing import Annotated, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit
 
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
+from cuspid.kernels import kernel
 from cuspid.motion.features import DESCRIPTOR_NORM, Features
 from cuspid.options import SHARE, Options, Range
 
@@ -77,7 +77,7 @@ def index_features(features: Features, camera: Camera) -> IndexedFeatures:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _segment(ray, low, high, rotation, translation, focal, ends):
     """Ends in px, in the other image, of depth ``low`` to ``high`` on a ray. False if all of it lies behind."""
@@ -97,7 +97,7 @@ def _segment(ray, low, high, rotation, translation, focal, ends):
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _similarity(a, b):
     """Inner product of two byte descriptors."""
@@ -107,7 +107,7 @@ def _similarity(a, b):
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _off_segment(x, y, ends, tolerance):
     """Whether a place is farther than ``tolerance`` from a segment."""
@@ -119,7 +119,7 @@ def _off_segment(x, y, ends, tolerance):
     return (x - ends[0, 0] - along * dx) ** 2 + (y - ends[0, 1] - along * dy) ** 2 > tolerance**2
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _candidates(ends, tolerance, ideal, focal, order, cell_starts, grid, out):
     """Keypoints within ``tolerance`` of a segment; their number."""
@@ -144,7 +144,7 @@ def _candidates(ends, tolerance, ideal, focal, order, cell_starts, grid, out):
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _best(descriptor, candidates, count, descriptors, ideal, apart, least, ratio):
     """The most similar candidate, or -1 where it is not similar or not distinct enough."""
@@ -165,7 +165,7 @@ def _best(descriptor, candidates, count, descriptors, ideal, apart, least, ratio
     return best if max(unit - best_value, 0) < ratio**2 * (unit - second) else -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _match_one_way(a, b, low, high, rotation, translation, options):
     """For each keypoint of a the best one of b, or -1. ``a`` = (ideal, descriptors), ``b`` = those and the grid."""

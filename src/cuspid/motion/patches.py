@@ -16,9 +16,9 @@ from typing import Annotated, NamedTuple, no_type_check
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
-from numba import njit
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET
+from cuspid.kernels import kernel
 from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Tracks
@@ -53,7 +53,7 @@ class PatchOptions(Options):
     """Points that are found in fewer frames are left as they were."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _at(image, x, y):
     """Bilinear; NaN outside."""
@@ -66,7 +66,7 @@ def _at(image, x, y):
     return (1 - b) * top + b * ((1 - a) * image[j + 1, i] + a * image[j + 1, i + 1])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _template(image, x, y, radius, levels, slopes):
     """Fill in the levels of a patch less their mean, and their slopes; their standard deviation, NaN at the border."""
@@ -82,7 +82,7 @@ def _template(image, x, y, radius, levels, slopes):
     return np.sqrt((levels**2).mean()) + 0 * slopes.sum()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _aligned(template, image, here, there, warps, radius, limit, iterations, shifts, correlations):
     """Fill in for every patch its shift from where it should be, and the correlation there; NaN where it is lost."""

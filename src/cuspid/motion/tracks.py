@@ -6,10 +6,11 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
+
+from cuspid.kernels import kernel
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _root(parent, node):
     while parent[node] != node:
@@ -17,7 +18,7 @@ def _root(parent, node):
     return node
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _joined(matches, image_of, images):
     """One keypoint, the same for all, of the track of each; see :func:`join`."""
@@ -77,7 +78,7 @@ def intersect_rays(
     return points
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _claim(order, start, cell_of):
     """Tracks, taken in order, that come first to some cell."""

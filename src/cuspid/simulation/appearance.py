@@ -13,10 +13,10 @@ from typing import Literal, NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from numba import njit
 from scipy.spatial.transform import Rotation
 
 from cuspid.jaw import GUM, Jaw
+from cuspid.kernels import kernel
 
 Colour = tuple[float, float, float]
 Preset = Literal["artificial", "powder", "enamel"]
@@ -150,7 +150,7 @@ GRADIENT_NOISE_SD = 0.27
 """Standard deviation of :func:`gradient_noise` over space."""
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 @no_type_check
 def _corner(ix, iy, iz, x, y, z):
     """Dot product of the offset with one of twelve gradients, chosen by a hash of the lattice point."""
@@ -166,7 +166,7 @@ def _corner(ix, iy, iz, x, y, z):
     return (u if h & 1 == 0 else -u) + (v if h & 2 == 0 else -v)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 @no_type_check
 def gradient_noise(x, y, z):
     """Perlin's improved noise, about -1 to 1, zero mean, one feature a unit."""
@@ -189,7 +189,7 @@ def gradient_noise(x, y, z):
     return a + w * (c - a)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 @no_type_check
 def albedo_at(point, material, palette):
     """Linear RGB albedo of a material at one point of the jaw, as a tuple."""
@@ -213,7 +213,7 @@ def albedo_at(point, material, palette):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _albedo(points, materials, palette, out):
     for i in range(len(points)):

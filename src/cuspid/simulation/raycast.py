@@ -19,13 +19,13 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from numba import njit
 
 from cuspid.camera import Camera
 from cuspid.capture import Frame
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
+from cuspid.kernels import kernel
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
 from cuspid.simulation.appearance import Appearance, Palette, albedo_at, face_materials, palette
@@ -175,7 +175,7 @@ class _Rays(NamedTuple):
         return _Rays(*(array[chosen] for array in self))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _turned(directions, rotation):
     """``Rigid3.rotate`` without BLAS, whose threads would fight with the other processes."""
@@ -201,7 +201,7 @@ def _lighting(scene: Scene, rays: _Rays, lights: Lamps) -> tuple[Bool[np.ndarray
     return lit, ambient
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 @no_type_check
 def _point(rays, i):
     t = rays.distances[i]
@@ -212,13 +212,13 @@ def _point(rays, i):
     )
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 @no_type_check
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 @no_type_check
 def _normal(rays, i, surface):
     """Interpolated unit normal at a hit, on the side that the ray came from."""
@@ -234,7 +234,7 @@ def _normal(rays, i, surface):
     return x * scale, y * scale, z * scale
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 @no_type_check
 def _incoming(point, index, lights):
     """Unit vector towards a light, and its lobe over the squared distance at a point."""
@@ -251,7 +251,7 @@ def _incoming(point, index, lights):
     return towards, (cosine if exponent == 1 else cosine**exponent) / squared
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 @no_type_check
 def _light_matters(rays, surface, lights, points, matters, ambient):
     """Fill in for each ray: the point hit, the lights that give a noticeable part of its light, the ambient light."""
@@ -272,7 +272,7 @@ def _light_matters(rays, surface, lights, points, matters, ambient):
             matters[i, k] = strength[k] > threshold
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 @no_type_check
 def _coat(nl, nv, nh, vh, reflectance, roughness):
     """pi times the GGX reflectance times the cosine towards the light, and the Fresnel share."""
@@ -284,7 +284,7 @@ def _coat(nl, nv, nh, vh, reflectance, roughness):
     return fresnel * alpha2 / (bell * bell) * 0.5 * nl / masking, fresnel
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 @no_type_check
 def _reflected(normal, view, towards, reflectance, roughness):
     """Diffuse (to be multiplied by the albedo) and glossy answer to a light of strength 1; ``view`` points away."""
@@ -300,7 +300,7 @@ def _reflected(normal, view, towards, reflectance, roughness):
     return nl * (1 - fresnel), glossy
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 @no_type_check
 def _shade(rays, surface, palette, lights, lit, ambient, row, out):
     samples = len(rays.faces) // len(out)

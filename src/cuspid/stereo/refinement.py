@@ -20,8 +20,8 @@ from typing import Annotated, NamedTuple, no_type_check
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit
 
+from cuspid.kernels import kernel
 from cuspid.options import Options, Range
 
 Q, Q_U, Q_V, SCORE, VARIANCE, SUPPORT = range(6)
@@ -29,7 +29,7 @@ Q, Q_U, Q_V, SCORE, VARIANCE, SUPPORT = range(6)
 
 _ROUNDING_DN = 12**-0.5
 
-FAST = {"cache": True, "nogil": True, "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
+FAST = {"fastmath": {"contract", "reassoc", "arcp", "nsz"}}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +135,7 @@ def patch_window(options: RefinementOptions) -> Float[np.ndarray, "3 k"]:
     return np.stack([du.ravel(), dv.ravel(), (weights / weights.sum()).ravel()]).astype(np.float32)
 
 
-@njit(**FAST)
+@kernel(**FAST)
 @no_type_check
 def _load_template(view, u, v, template):
     """Normalised patch around a pixel of the reference image; returns its standard deviation."""
@@ -158,7 +158,7 @@ def _load_template(view, u, v, template):
     return deviation
 
 
-@njit(**FAST)
+@kernel(**FAST)
 @no_type_check
 def _is_inside(warp, radius, width, height):
     """True where the four corners of the window fall into the image, a pixel off its border."""
@@ -174,7 +174,7 @@ def _is_inside(warp, radius, width, height):
     return True
 
 
-@njit(**FAST)
+@kernel(**FAST)
 @no_type_check
 def _locate(window, warp, parallax, places):
     """Where the window's pixels lie in another image (x, y), and how these move with q. A loop that vectorises."""
@@ -190,7 +190,7 @@ def _locate(window, warp, parallax, places):
         places[2, k], places[3, k] = (bx - x * bz) * inverse, (by - y * bz) * inverse
 
 
-@njit(**FAST)
+@kernel(**FAST)
 @no_type_check
 def _sample(image, places, values, slopes):
     """Intensities of the window seen in another image (bilinear), and their derivative by q."""
@@ -208,7 +208,7 @@ def _sample(image, places, values, slopes):
         slopes[k] = slope_x * places[2, k] + slope_y * places[3, k]
 
 
-@njit(**FAST)
+@kernel(**FAST)
 @no_type_check
 def _normalize(template, weights, values, slopes):
     """Bring a warped patch to mean 0 and norm 1, its slopes with it; returns its ZNCC with the template."""
@@ -230,7 +230,7 @@ def _normalize(template, weights, values, slopes):
     return product * inverse
 
 
-@njit(**FAST)
+@kernel(**FAST)
 @no_type_check
 def _normal_equations(template, window, values, slopes, zncc, system):
     """Normal equations of a normalised patch: H (upper triangle, row by row), then the gradient."""
@@ -262,7 +262,7 @@ def _normal_equations(template, window, values, slopes, zncc, system):
     system[6], system[7], system[8] = e0 - i0 * lack, eu - iu * lack, ev - iv * lack
 
 
-@njit(**FAST)
+@kernel(**FAST)
 @no_type_check
 def _compare(view, u, v, plane, buffers):
     """ZNCC and normal equations of each other camera at a plane; -1 where the window is not inside the image."""
@@ -284,7 +284,7 @@ def _compare(view, u, v, plane, buffers):
                 _normal_equations(template, view.window, values, slopes, zncc, buffers.systems[j])
 
 
-@njit(**FAST)
+@kernel(**FAST)
 @no_type_check
 def _combine(buffers, camera_zncc, lag):
     """Sum the equations of the cameras that see the patch; returns how many, and their mean ZNCC."""
@@ -301,7 +301,7 @@ def _combine(buffers, camera_zncc, lag):
     return used, (score / used if used > 0 else best)
 
 
-@njit(**FAST)
+@kernel(**FAST)
 @no_type_check
 def _solve(total, step):
     """Gauss-Newton step from the summed equations; returns the variance factor (H^-1)_00, negative if singular."""
@@ -319,7 +319,7 @@ def _solve(total, step):
     return c00 / determinant
 
 
-@njit(**FAST)
+@kernel(**FAST)
 @no_type_check
 def _refine_plane(view, limits, buffers, u, v, plane):
     """Gauss-Newton from a plane, changed in place; ``buffers.result`` gets SCORE, VARIANCE, SUPPORT. False: failed."""
@@ -344,7 +344,7 @@ def _refine_plane(view, limits, buffers, u, v, plane):
     return True
 
 
-@njit(**FAST)
+@kernel(**FAST)
 @no_type_check
 def _best_start(view, limits, buffers, u, v, count):
     """Index of the candidate plane with the best mean ZNCC."""
@@ -359,7 +359,7 @@ def _best_start(view, limits, buffers, u, v, count):
     return best
 
 
-@njit(**FAST)
+@kernel(**FAST)
 @no_type_check
 def _gather_candidates(field, initial, row, column, direction, spacing, candidates):
     """Planes of neighbours that were visited before, carried on to this pixel, and initial ones that differ."""
@@ -385,7 +385,7 @@ def _gather_candidates(field, initial, row, column, direction, spacing, candidat
     return count
 
 
-@njit(**FAST)
+@kernel(**FAST)
 @no_type_check
 def _visit(view, limits, buffers, initial, field, row, column, direction):
     """Refine a pixel from the best of its candidates; writes the field where it correlates as well as it should."""
@@ -408,7 +408,7 @@ def _visit(view, limits, buffers, initial, field, row, column, direction):
         field[row, column, 3:] = buffers.result
 
 
-@njit(**FAST)
+@kernel(**FAST)
 @no_type_check
 def _refine_field(view, limits, buffers, initial, propagations):
     """Visit the pixels that have no plane yet, in raster order and against it, ``propagations`` times."""

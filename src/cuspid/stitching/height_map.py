@@ -14,12 +14,12 @@ from typing import Annotated, no_type_check
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from numba import njit
 from scipy.ndimage import gaussian_filter, grey_dilation
 from scipy.spatial import KDTree
 from skimage.morphology import remove_small_holes
 
 from cuspid.geometry import Rigid3
+from cuspid.kernels import kernel
 from cuspid.options import Options, Range
 from cuspid.sparse_model import SparseModel
 
@@ -79,7 +79,7 @@ def _disc(radius_mm: float, cell_mm: float) -> UInt8[np.ndarray, "k k"]:
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _mark_occluded(places, centre, occluder, corner, cell, start, over, occluded):
     """Fill in whether a place's line of sight to the centre passes under the occluder, beyond ``start`` cells."""

@@ -13,9 +13,9 @@ from typing import no_type_check
 import cv2
 import numpy as np
 from jaxtyping import Float, Int16, UInt8
-from numba import njit
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET
+from cuspid.kernels import kernel
 from cuspid.stitching.examination import frame_corners, warp
 from cuspid.stitching.warps import SEGMENT_PX, centroids
 
@@ -105,7 +105,7 @@ def frame_pixels(canvas: Canvas, placed: Placed, window: tuple[slice, slice]) ->
     return pixels
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _trace(first, inverses, segments, segment_px, size, pixels):
     """Where the whole frame's homography leads says which segment's to take, and where this one leads, once more."""

@@ -20,13 +20,13 @@ from typing import Annotated, NamedTuple, no_type_check
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
-from numba import njit
 from skimage.morphology import remove_small_holes, remove_small_objects
 from skimage.restoration import inpaint_biharmonic
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera, undistortion_maps
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.kernels import kernel
 from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.sparse_model import SparseModel
@@ -332,7 +332,7 @@ def _agreement(
 # --- heights -----------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _add_path(cost, total, down, right, small, large):
     """Add the least costs of paths in one direction to their sum over the directions."""

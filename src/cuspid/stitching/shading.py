@@ -27,9 +27,9 @@ from typing import Annotated, no_type_check
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from numba import njit
 
 from cuspid.camera import Camera
+from cuspid.kernels import kernel
 from cuspid.options import Options, Range
 
 _COARSEST_PX = 60
@@ -125,7 +125,7 @@ def _solve(
     return np.where(known, values, target / 2).astype(np.float32)
 
 
-@njit(cache=True, nogil=True, fastmath=False)
+@kernel
 @no_type_check
 def _jacobi(v, target, x, y, fx, fy, out):
     """One Newton step of every pixel with its neighbours held; v is infinite where it is not known."""

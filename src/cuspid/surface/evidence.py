@@ -12,9 +12,9 @@ from typing import Any, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from numba import njit
 from scipy.ndimage import distance_transform_edt
 
+from cuspid.kernels import kernel
 from cuspid.reconstruction import DepthMap
 
 DISTANCE, WEIGHT, NORMAL_X, NORMAL_Y, NORMAL_Z, PIXEL = range(6)
@@ -61,7 +61,7 @@ class Evidence:
         return Evidence(plane, weight, intrinsics)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _slope(inverse, row, column, d_row, d_column, jump):
     """Difference of inverse depth per pixel, from the neighbours that belong to the same surface; NaN without any."""
@@ -77,7 +77,7 @@ def _slope(inverse, row, column, d_row, d_column, jump):
     return total / count if count > 0 else np.nan
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _planes(inverse, intrinsics, jump):
     """Plane through each pixel, and the cosine between its normal and the ray; 0 where no plane can be told."""
@@ -99,7 +99,7 @@ def _planes(inverse, intrinsics, jump):
     return plane, cosine
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _grown(plane, weight):
     """Carry the planes one pixel on, for the outermost half windows and voxels would be lost at every border."""
@@ -119,7 +119,7 @@ def _grown(plane, weight):
     return wide_plane, wide_weight
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 @no_type_check
 def observe(evidence, right, down, depth, seen):
     """Ask about a point of the camera frame in front of the camera; False where the map has no answer."""
@@ -140,7 +140,7 @@ def observe(evidence, right, down, depth, seen):
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def observe_foot(evidence, nearest, farthest, right, down, depth, seen):
     """As :func:`observe` for a point whose own pixel tells nothing: what the pixel tells at the foot of its

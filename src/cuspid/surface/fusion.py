@@ -14,10 +14,10 @@ from typing import Annotated, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from numba import njit
 
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
+from cuspid.kernels import kernel
 from cuspid.mesh import Mesh
 from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
@@ -194,7 +194,7 @@ class Votes:
         return np.asarray(np.sqrt((frames * variance + _USUAL * usual) / (frames - 1 + _USUAL) / frames))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _vote(
     chunks, vertices, normals, rotation, translation, evidence, colors, agreement, moment, color, maps, frames, frame

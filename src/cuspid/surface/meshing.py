@@ -10,13 +10,13 @@ from __future__ import annotations
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
+from cuspid.kernels import kernel
 from cuspid.mesh import Mesh
 from cuspid.surface.volume import BLOCK, SparseVolume, unpack
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _place(neighbours, slot, i, j, k):
     """Slot (-1: none) and index of a voxel given relative to a block, up to one block away."""
@@ -25,7 +25,7 @@ def _place(neighbours, slot, i, j, k):
     return other, ((i & 7) * 8 + (j & 7)) * 8 + (k & 7)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _corners(distance, weight, neighbours, slot, i, j, k, least_weight, values):
     """Distances at the eight corners of a cell; False where one is unobserved or the surface does not cross."""
@@ -39,7 +39,7 @@ def _corners(distance, weight, neighbours, slot, i, j, k, least_weight, values):
     return 0 < inside < 8
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _cell_vertex(values, vertex):
     """Mean of the crossings of the twelve edges of a cell, in units of the cell."""
@@ -61,7 +61,7 @@ def _cell_vertex(values, vertex):
         vertex[axis] /= count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _vertices(distance, weight, neighbours, origins, least_weight, index_of_cell, vertices):
     """A vertex (grid units) for each cell that the surface crosses; returns how many (``vertices`` may be empty)."""
@@ -82,7 +82,7 @@ def _vertices(distance, weight, neighbours, origins, least_weight, index_of_cell
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _quad_around(index_of_cell, neighbours, slot, i, j, k, axis, quad):
     """Vertices of the four cells around the grid edge that leaves a voxel along an axis; False where one is missing."""
@@ -99,7 +99,7 @@ def _quad_around(index_of_cell, neighbours, slot, i, j, k, axis, quad):
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _faces(distance, weight, neighbours, index_of_cell, least_weight, faces):
     """Two triangles for each grid edge that the surface crosses; returns their number (``faces`` may be empty)."""

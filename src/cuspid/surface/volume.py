@@ -12,9 +12,9 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit
 
 from cuspid.geometry import Rigid3
+from cuspid.kernels import kernel
 from cuspid.surface.evidence import Evidence, observe, observe_foot
 from cuspid.workers import map_slices
 
@@ -122,7 +122,7 @@ def _grown(array: Float[np.ndarray, "b v"], room: int) -> Float[np.ndarray, "r v
     return grown
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _integrate(distance, weight, slots, origins, voxel, rotation, translation, evidence, nearest, truncation):
     """Running weighted mean of the signed distance in each voxel of the blocks."""

@@ -13,11 +13,11 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
 from scipy.spatial import KDTree
 
 from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw
+from cuspid.kernels import kernel
 from cuspid.rig import Handpiece
 from cuspid.simulation.path.arch import ArchCurve
 from cuspid.visibility import slope_bounds
@@ -122,7 +122,7 @@ def _nearest_table(directions: Float[np.ndarray, "d 3"]) -> Int[np.ndarray, "lat
     return np.asarray(KDTree(directions).query(places)[1])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 @no_type_check
 def _cameras_at(
     points, normals, open_, nearest, rotations, translations, cam_rotations, cam_translations, bounds, depths, cosine

@@ -1,0 +1,56 @@
+"""Compiled kernels: numba's ``njit`` without the GIL, kept on disk from run to run.
+
+numba keeps the machine code of a function in numbered files, with an index that names the file of each signature. It
+loads what the index names unchecked, although two processes that compile at the same time may have written each
+other's numbers (numba issue 10128 is such a case), and although a function that is called, and so compiled into it, may
+have changed in another module. Either gives wrong results in silence. Here each piece of code says what it is of, and
+counts only where that is what is wanted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from numba import njit
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.dispatcher import Dispatcher
+
+
+def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
+    """Decorator: compile a function when it is called first. ``options`` are those of ``numba.njit``."""
+    if function is None:
+        return partial(kernel, **options)
+    compiled = njit(nogil=True, **options)(function)
+    if isinstance(compiled, Dispatcher):  # otherwise numba is told not to compile
+        compiled._cache = _KernelCache(function)  # type: ignore[attr-defined]
+    return compiled
+
+
+class _KernelCache(FunctionCache):  # type: ignore[misc]
+    """The compiled code of one kernel on disk."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        stamp = self._impl.locator.get_source_stamp()
+        called = [getattr(function.__globals__.get(name), "_cache", None) for name in function.__code__.co_names]
+        self.stamp: tuple[object, ...] = stamp, *(each.stamp for each in called if isinstance(each, _KernelCache))
+        self._cache_file = CheckedFile(
+            cache_path=self._cache_path, filename_base=self._impl.filename_base, source_stamp=self.stamp
+        )
+
+
+class CheckedFile(IndexDataCacheFile):  # type: ignore[misc]
+    """Files of compiled code that say what they are of: the sources and the signature."""
+
+    def save(self, key: object, data: object) -> None:
+        """Keep code under a key."""
+        super().save(key, (self._source_stamp, key, data))
+
+    def load(self, key: object) -> object | None:
+        """The code of a key, None where there is none or the file is of something else."""
+        found = super().load(key)
+        if found is None or tuple(found[:2]) != (self._source_stamp, key):
+            return None
+        return found[2]
