@@ -16,7 +16,9 @@ from verbs import refused
 CUSPID = (sys.executable, "-m", "cuspid")
 
 
-@pytest.mark.parametrize(("how", "after_s"), [(signal.SIGINT, 0.5), (signal.SIGINT, 1.2), (signal.SIGTERM, 8.0)])
+@pytest.mark.parametrize(
+    ("how", "after_s"), [(signal.SIGINT, 0.5), (signal.SIGINT, 1.2), (signal.SIGTERM, 2.0), (signal.SIGTERM, 6.0)]
+)
 def test_it_ends_at_once_and_without_a_trace_of_where_it_was(tmp_path: Path, how: signal.Signals, after_s: float):
     """While it loads, and while libraries work that have handlers of their own."""
     begun = subprocess.Popen(
