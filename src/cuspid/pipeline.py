@@ -138,10 +138,15 @@ def surface(
     vertices is known: standard deviation along the normal, um."""
     handpiece = replace(capture.handpiece, rig=found.rig)
     capture, poses = replace(capture, handpiece=handpiece), found.rig_from_world
+    lengths_mm = resolved_mm(handpiece), handpiece.working_distance_mm
     depths = measure_depth(capture, folder / "depth", options.stereo, progress=progress)
     if options.temporal.enabled:
-        depths |= measure_temporal_depth(capture, poses, folder / "depth-temporal", options.temporal, progress=progress)
-    lengths_mm = resolved_mm(handpiece), handpiece.working_distance_mm
+        depths |= measure_temporal_depth(
+            *(capture, found, depths, folder / "depth-temporal", options.temporal),
+            agreement_mm=options.fusion.agreement * lengths_mm[0],
+            least_maps=options.fusion.least_maps,
+            progress=progress,
+        )
     how = options.fusion, options.cleaning
     return fuse(depths, depths.digest, poses, *lengths_mm, folder, *how, expected=found.expectation, progress=progress)
 

@@ -32,8 +32,9 @@ DESCRIPTOR_NORM = 512.0
 class FeatureOptions(Options):
     """Which keypoints are taken from an image."""
 
-    count: Annotated[int, Range(10, 1_000_000)] = 2000
-    """Most keypoints in an image; the strongest of each cell come first."""
+    count: Annotated[int | None, Range(10, 1_000_000)] = None
+    """Most keypoints in an image; the strongest of each cell come first. By default 2.5 times the number of cells, 1000
+    to 2000: with more than that a path is as true."""
     contrast: Annotated[float, Range(0, 1)] = 0.02
     """Least contrast of a keypoint, share of the grey range (OpenCV's ``contrastThreshold``)."""
     edge: Annotated[float, Range(1, 1_000_000)] = 10.0
@@ -43,6 +44,11 @@ class FeatureOptions(Options):
     upright: bool = True
     """Descriptors along the image's axes; False estimates an orientation for each keypoint, for free-hand turns of
     more than about 20 degrees about the optical axis between frames."""
+
+    def count_for(self, width: int, height: int) -> int:
+        """Most keypoints in an image of a size in px."""
+        usual = 2.5 * (width / self.cell_px) * (height / self.cell_px)
+        return int(min(max(usual, 1000), 2000)) if self.count is None else self.count
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -89,7 +95,7 @@ def _colors_at(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "n 2
 
 
 def detect(image: UInt8[np.ndarray, "h w 3"], options: FeatureOptions | None = None) -> Features:
-    """Keypoints of an RGB image, well spread, at most ``options.count``."""
+    """Keypoints of an RGB image, well spread."""
     options = options or FeatureOptions()
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     sift = cv2.SIFT.create(contrastThreshold=options.contrast, edgeThreshold=options.edge, enable_precise_upscale=True)
@@ -97,7 +103,8 @@ def detect(image: UInt8[np.ndarray, "h w 3"], options: FeatureOptions | None = N
     if options.upright:
         keypoints = _without_doubles(keypoints)
     places = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
-    chosen = spread(places, np.array([k.response for k in keypoints]), options.count, options.cell_px)
+    most = options.count_for(image.shape[1], image.shape[0])
+    chosen = spread(places, np.array([k.response for k in keypoints]), most, options.cell_px)
     keypoints = [keypoints[index] for index in chosen]
     if options.upright:
         for keypoint in keypoints:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
 
 from cuspid.capture import Capture, Frame
 from cuspid.geometry import Rigid3
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import DepthMap
+from cuspid.reconstruction import DepthMap, Reconstruction
+from cuspid.stereo.holes import Sightings, covering
 from cuspid.stereo.matching import DepthEstimator, StereoOptions
-from cuspid.stereo.temporal import TemporalOptions, measure_temporal
+from cuspid.stereo.temporal import TemporalOptions, measure_temporal, moving_pair
 from cuspid.storage.captures import hash_frame
 from cuspid.storage.files import digest_of
 from cuspid.storage.handpieces import hash_handpiece
@@ -63,30 +67,79 @@ def measure_depth(
 
 def measure_temporal_depth(
     capture: Capture,
-    rig_from_world: Mapping[str, Rigid3],
+    found: Reconstruction,
+    depths: Iterable[DepthMap],
     folder: Path,
     options: TemporalOptions,
     *,
+    agreement_mm: float,
+    least_maps: int,
     progress: Progress = silent,
 ) -> StoredDepthMaps:
-    """Depth maps of each camera together with itself at the next located frame of the same lighting pattern, kept in
-    ``folder``."""
-    following = _following([frame for frame in capture.frames if frame.name in rig_from_world])
-
-    def motion(frame: Frame) -> Rigid3:
-        return rig_from_world[following[frame.name].name] @ rig_from_world[frame.name].inverse()
+    """Depth maps of cameras together with themselves at the next located frame of the same lighting pattern, kept in
+    ``folder``: of those that fill holes (:attr:`TemporalOptions.least_gain`), which are where fewer than ``least_maps``
+    of ``depths`` confirm the sparse points within ``agreement_mm``."""
+    steps = _steps(capture, found.rig_from_world, options)
+    if found.tracks is not None and options.least_gain > 0:
+        sightings = Sightings.of(found, found.tracks)
+        missing = sightings.confirmed(depths, found.rig_from_world, agreement_mm) < least_maps
+        steps = _worthwhile(steps, sightings, missing, options.least_gain)
 
     def measure(frame: Frame) -> tuple[DepthMap, ...]:
-        now, after = capture.images(frame), capture.images(following[frame.name])
-        return measure_temporal(capture.handpiece, now, after, motion(frame), frame.name, options)
+        step = steps[frame.name]
+        now, after = capture.images(step.now), capture.images(step.after)
+        return measure_temporal(capture.handpiece, now, after, step.motion, frame.name, options)
 
     def inputs(frame: Frame) -> dict[str, str]:
-        after = hash_frame(capture, following[frame.name])
-        return {"frame": hash_frame(capture, frame), "after": after, "motion": digest_of(motion(frame))}
+        step = steps[frame.name]
+        now, after = hash_frame(capture, step.now), hash_frame(capture, step.after)
+        return {"frame": now, "after": after, "motion": digest_of(step.motion)}
 
-    frames = [frame for frame in capture.frames if frame.name in following]
     stage = Stage("temporal depth", folder, options, _CODE)
-    return _measure_all(capture, frames, measure, inputs, stage, progress)
+    return _measure_all(capture, [step.now for step in steps.values()], measure, inputs, stage, progress)
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """Two images of each of some cameras, and how the handpiece moved between them."""
+
+    now: Frame
+    after: Frame
+    motion: Rigid3
+
+    def of(self, cameras: Sequence[str]) -> _Step:
+        """With these cameras only."""
+        now, after = (replace(frame, cameras=tuple(cameras)) for frame in (self.now, self.after))
+        return replace(self, now=now, after=after)
+
+
+def _steps(capture: Capture, rig_from_world: Mapping[str, Rigid3], options: TemporalOptions) -> dict[str, _Step]:
+    """From each located frame, by its name, to the next of its lighting pattern, with the cameras that moved enough."""
+    following = _following([frame for frame in capture.frames if frame.name in rig_from_world])
+    steps: dict[str, _Step] = {}
+    for now in capture.frames:
+        if now.name in following:
+            after = following[now.name]
+            motion = rig_from_world[after.name] @ rig_from_world[now.name].inverse()
+            both = [camera for camera in now.cameras if camera in after.cameras]
+            moved = [c for c in both if moving_pair(capture.handpiece, c, motion, options) is not None]
+            if moved:
+                steps[now.name] = _Step(now, after, motion).of(moved)
+    return steps
+
+
+def _worthwhile(
+    steps: Mapping[str, _Step], sightings: Sightings, missing: Bool[np.ndarray, "p"], least_gain: float
+) -> dict[str, _Step]:
+    """The steps with those cameras that show points which are missing."""
+    tried = [(step, camera) for step in steps.values() for camera in step.now.cameras]
+    shown = [sightings.both((step.now.name, camera), (step.after.name, camera)) for step, camera in tried]
+    taken = covering([points[missing[points]] for points in shown], len(missing), least_gain * sightings.usual)
+    cameras: dict[str, list[str]] = {}
+    for index in taken:
+        step, camera = tried[index]
+        cameras.setdefault(step.now.name, []).append(camera)
+    return {name: steps[name].of(those) for name, those in cameras.items()}
 
 
 def _following(located: Sequence[Frame]) -> dict[str, Frame]:

@@ -1,0 +1,91 @@
+"""Where depth from one frame left holes, and which images of single cameras would fill them.
+
+The sparse points of the motion stand for the surface: they are spread evenly over the images, and they lie also where
+only one camera of a group sees it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from cuspid.geometry import Rigid3
+from cuspid.reconstruction import DepthMap, Reconstruction, Tracks
+
+Image = tuple[str, str]
+"""A frame and a camera of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Which sparse points each image shows."""
+
+    points: Float[np.ndarray, "p 3"]
+    """In the world frame, mm."""
+    shown: Mapping[Image, Int[np.ndarray, "_"]]
+    """Indices of the points of an image, increasing."""
+
+    @staticmethod
+    def of(found: Reconstruction, tracks: Tracks) -> Sightings:
+        """Of the sparse model of a reconstruction."""
+        cameras = found.rig.names
+        seen = np.unique(
+            np.stack([tracks.frame_index * len(cameras) + tracks.camera_index, tracks.point_index], axis=1), axis=0
+        )
+        images, starts = np.unique(seen[:, 0], return_index=True)
+        parts = np.split(seen[:, 1], starts[1:])
+        named = [(found.frames[image // len(cameras)], cameras[image % len(cameras)]) for image in images]
+        return Sightings(tracks.points, dict(zip(named, parts, strict=True)))
+
+    @cached_property
+    def usual(self) -> float:
+        """Points of an image (median)."""
+        return float(np.median([len(points) for points in self.shown.values()])) if self.shown else 0.0
+
+    def both(self, one: Image, other: Image) -> Int[np.ndarray, "_"]:
+        """Points that two images show."""
+        return np.intersect1d(self.shown.get(one, ()), self.shown.get(other, ()), assume_unique=True).astype(np.int64)
+
+    def confirmed(
+        self, depth_maps: Iterable[DepthMap], rig_from_world: Mapping[str, Rigid3], agreement_mm: float
+    ) -> Int[np.ndarray, "p"]:
+        """How many depth maps, of the images that show it, have each point on their surface."""
+        count = np.zeros(len(self.points), dtype=np.int64)
+        for depth_map in depth_maps:
+            here = self.shown.get((depth_map.frame, depth_map.camera_name))
+            if here is not None:
+                cam_from_world = depth_map.cam_from_rig @ rig_from_world[depth_map.frame]
+                count[here] += _on_surface(depth_map, cam_from_world.apply(self.points[here]), agreement_mm)
+        return count
+
+
+def _on_surface(depth_map: DepthMap, in_cam: Float[np.ndarray, "n 3"], agreement_mm: float) -> Bool[np.ndarray, "n"]:
+    """Which points in the frame of its camera lie on the surface of a depth map."""
+    pixels = depth_map.camera.project(in_cam)
+    on = depth_map.camera.contains(pixels, 1e-6)
+    column, row = pixels[on].astype(np.int64).T
+    on[on] = np.abs(depth_map.depth_mm[row, column] - in_cam[on, 2]) < agreement_mm
+    return on
+
+
+def covering(candidates: Sequence[Int[np.ndarray, "_"]], count: int, least_gain: float) -> list[int]:
+    """Which sets of points, of ``count``, cover what the sets cover together, greedily: the one that adds most, again
+    and again, as long as that is ``least_gain`` points or more. Indices of sets, increasing."""
+    missing = np.ones(count, dtype=bool)
+    gain = np.array([len(points) for points in candidates], dtype=np.int64)
+    taken: list[int] = []
+    while len(gain) and gain.max() >= max(least_gain, 1):
+        best = int(gain.argmax())
+        # Gains only fall: the best of the old ones that keeps its gain is the best.
+        now = int(missing[candidates[best]].sum())
+        if now < gain[best]:
+            gain[best] = now
+            continue
+        taken.append(best)
+        missing[candidates[best]] = False
+        gain[best] = 0
+    return sorted(taken)
