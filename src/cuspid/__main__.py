@@ -14,14 +14,13 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def _signals_of_our_own() -> Iterator[None]:
-    """What is loaded in the block leaves no handlers behind: those of some libraries print where they were."""
-    interrupt, terminate = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
-    if interrupt is signal.default_int_handler:  # otherwise whoever began it wants it passed over
+def _ended_by_interrupts() -> Iterator[None]:
+    """Ctrl-C ends the program in the block, unless whoever began it wants interrupts passed over."""
+    interrupt = signal.getsignal(signal.SIGINT)
+    if interrupt is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     yield
     signal.signal(signal.SIGINT, signal.default_int_handler if interrupt is None else interrupt)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL if terminate is None else terminate)
 
 
 def main() -> None:
@@ -29,7 +28,7 @@ def main() -> None:
     # Our own threads use the cores; more of them for each small system only wait for each other on a busy machine.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if threading.current_thread() is threading.main_thread():
-        with _signals_of_our_own():
+        with _ended_by_interrupts():
             from cuspid import cli
 
             cli.commands(sys.argv[1:])
