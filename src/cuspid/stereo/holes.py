@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -41,11 +40,6 @@ class Sightings:
         named = [(found.frames[image // len(cameras)], cameras[image % len(cameras)]) for image in images]
         return Sightings(tracks.points, dict(zip(named, parts, strict=True)))
 
-    @cached_property
-    def usual(self) -> float:
-        """Points of an image (median)."""
-        return float(np.median([len(points) for points in self.shown.values()])) if self.shown else 0.0
-
     def both(self, one: Image, other: Image) -> Int[np.ndarray, "_"]:
         """Points that two images show."""
         return np.intersect1d(self.shown.get(one, ()), self.shown.get(other, ()), assume_unique=True).astype(np.int64)
@@ -72,20 +66,21 @@ def _on_surface(depth_map: DepthMap, in_cam: Float[np.ndarray, "n 3"], agreement
     return on
 
 
-def covering(candidates: Sequence[Int[np.ndarray, "_"]], count: int, least_gain: float) -> list[int]:
-    """Which sets of points, of ``count``, cover what the sets cover together, greedily: the one that adds most, again
-    and again, as long as that is ``least_gain`` points or more. Indices of sets, increasing."""
-    missing = np.ones(count, dtype=bool)
+def covering(candidates: Sequence[Int[np.ndarray, "_"]], count: int, left: float) -> list[int]:
+    """Which sets of points, of ``count``, cover what the sets cover together, but for ``left`` points at most: greedily
+    the one that adds most, again and again. Indices of sets, increasing."""
+    missing = np.zeros(count, dtype=bool)
+    for points in candidates:
+        missing[points] = True
     gain = np.array([len(points) for points in candidates], dtype=np.int64)
     taken: list[int] = []
-    while len(gain) and gain.max() >= max(least_gain, 1):
+    while missing.sum() > left:
         best = int(gain.argmax())
         # Gains only fall: the best of the old ones that keeps its gain is the best.
         now = int(missing[candidates[best]].sum())
-        if now < gain[best]:
-            gain[best] = now
-            continue
-        taken.append(best)
-        missing[candidates[best]] = False
-        gain[best] = 0
+        if now == gain[best]:
+            taken.append(best)
+            missing[candidates[best]] = False
+            now = 0
+        gain[best] = now
     return sorted(taken)

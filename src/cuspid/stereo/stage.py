@@ -77,13 +77,13 @@ def measure_temporal_depth(
     progress: Progress = silent,
 ) -> StoredDepthMaps:
     """Depth maps of cameras together with themselves at the next located frame of the same lighting pattern, kept in
-    ``folder``: of those that fill holes (:attr:`TemporalOptions.least_gain`), which are where fewer than ``least_maps``
+    ``folder``: of those that fill holes (:attr:`TemporalOptions.left_share`), which are where fewer than ``least_maps``
     of ``depths`` confirm the sparse points within ``agreement_mm``."""
     steps = _steps(capture, found.rig_from_world, options)
-    if found.tracks is not None and options.least_gain > 0:
+    if found.tracks is not None and options.left_share > 0:
         sightings = Sightings.of(found, found.tracks)
         missing = sightings.confirmed(depths, found.rig_from_world, agreement_mm) < least_maps
-        steps = _worthwhile(steps, sightings, missing, options.least_gain)
+        steps = _worthwhile(steps, sightings, missing, options.left_share)
 
     def measure(frame: Frame) -> tuple[DepthMap, ...]:
         step = steps[frame.name]
@@ -116,12 +116,12 @@ class _Step:
 def _steps(capture: Capture, rig_from_world: Mapping[str, Rigid3], options: TemporalOptions) -> dict[str, _Step]:
     """From each located frame, by its name, to the next of its lighting pattern, with the cameras that moved enough."""
     following = _following([frame for frame in capture.frames if frame.name in rig_from_world])
-    steps: dict[str, _Step] = {}
+    cameras, steps = capture.handpiece.rig.in_own_order().names, dict[str, _Step]()
     for now in capture.frames:
         if now.name in following:
             after = following[now.name]
             motion = rig_from_world[after.name] @ rig_from_world[now.name].inverse()
-            both = [camera for camera in now.cameras if camera in after.cameras]
+            both = [camera for camera in cameras if camera in now.cameras and camera in after.cameras]
             moved = [c for c in both if moving_pair(capture.handpiece, c, motion, options) is not None]
             if moved:
                 steps[now.name] = _Step(now, after, motion).of(moved)
@@ -129,12 +129,12 @@ def _steps(capture: Capture, rig_from_world: Mapping[str, Rigid3], options: Temp
 
 
 def _worthwhile(
-    steps: Mapping[str, _Step], sightings: Sightings, missing: Bool[np.ndarray, "p"], least_gain: float
+    steps: Mapping[str, _Step], sightings: Sightings, missing: Bool[np.ndarray, "p"], left_share: float
 ) -> dict[str, _Step]:
     """The steps with those cameras that show points which are missing."""
     tried = [(step, camera) for step in steps.values() for camera in step.now.cameras]
     shown = [sightings.both((step.now.name, camera), (step.after.name, camera)) for step, camera in tried]
-    taken = covering([points[missing[points]] for points in shown], len(missing), least_gain * sightings.usual)
+    taken = covering([points[missing[points]] for points in shown], len(missing), left_share * len(missing))
     cameras: dict[str, list[str]] = {}
     for index in taken:
         step, camera = tried[index]

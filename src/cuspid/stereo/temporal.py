@@ -28,10 +28,10 @@ class TemporalOptions(Options):
 
     enabled: bool = True
     """Whether to measure it at all."""
-    least_gain: Annotated[float, SHARE] = 0.03
-    """A camera is matched with itself where that fills holes: where both its images show, of the sparse points that
-    depth within the frames leaves open, at least this share (0 to 1) of the points that an image usually shows. 0:
-    wherever it moved enough."""
+    left_share: Annotated[float, SHARE] = 0.005
+    """Cameras are matched with themselves where that fills holes: until, of the sparse points that depth within the
+    frames leaves without a surface, no more than this share (0 to 1) of all points is left to be filled. 0: wherever a
+    camera moved enough."""
     confidence_share: Annotated[float, SHARE] = 0.05
     """Its confidence relative to depth from one frame."""
     least_baseline_share: Annotated[float, Range(0, 10)] = 0.08
