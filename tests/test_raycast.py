@@ -35,6 +35,7 @@ from cuspid.simulation.raycast import (
     auto_gain,
     lamps,
     lit_frames,
+    pixel_rays,
     radiance,
     render_capture,
     render_depth,
@@ -351,6 +352,11 @@ def test_a_resumed_capture_equals_an_uninterrupted_one(scene: Scene, poses: dict
     assert set(rest) == set(whole) - first_half
     for key, image in rest.items():
         np.testing.assert_array_equal(image, whole[key])
+
+
+def test_rays_that_are_remembered_are_those_of_the_camera(scene: Scene) -> None:
+    for camera in (SKEWED, CAMERA, SKEWED, SKEWED):
+        np.testing.assert_array_equal(scene.rays(camera), pixel_rays(camera, scene.supersampling))
 
 
 def test_light_does_not_depend_on_what_is_shaded_at_once(
