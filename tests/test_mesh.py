@@ -39,6 +39,16 @@ def test_occlusion_is_of_the_open_segment(size):
     assert mesh.occluded(far, eye).all()
 
 
+def test_what_is_occluded_is_what_a_first_hit_lies_before():
+    mesh, rng = sphere(10.0, 3), np.random.default_rng(1)
+    points, eyes = rng.uniform(-15, 15, (2, 2000, 3))
+    distances = mesh.cast(eyes, points - eyes).distances
+    occluded = mesh.occluded(points, eyes)
+    np.testing.assert_array_equal(occluded, distances < 1 - 1e-3 / np.linalg.norm(points - eyes, axis=1))
+    assert 0.2 < occluded.mean() < 0.8
+    assert not mesh.occluded(points[:1], points[:1]).any()
+
+
 def test_each_edge_of_a_closed_surface_is_there_once_in_either_direction():
     edges = edges_of(sphere(10.0, 2).faces)
     assert len(np.unique(edges, axis=0)) == len(edges)

@@ -16,9 +16,11 @@ from cuspid.handpiece.designs import DesignOptions, twelve_cameras
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor
+from cuspid.simulation import raycast
 from cuspid.simulation.appearance import (
     APPEARANCES,
     GRADIENT_NOISE_SD,
+    NO_MATERIAL,
     Appearance,
     Material,
     albedo,
@@ -33,6 +35,7 @@ from cuspid.simulation.raycast import (
     auto_gain,
     lamps,
     lit_frames,
+    pixel_rays,
     radiance,
     render_capture,
     render_depth,
@@ -234,6 +237,20 @@ def test_noise_has_zero_mean_the_stated_deviation_and_is_continuous() -> None:
     assert np.abs(near - values[:2000]).max() < 1e-5
 
 
+def test_albedo_is_the_sum_of_the_octaves_at_each_point_and_black_where_nothing_is() -> None:
+    points, look = np.random.default_rng(0).uniform(-20, 20, (300, 3)), palette(APPEARANCES["enamel"], 0)
+    materials = np.tile(np.array([0, 1, NO_MATERIAL], dtype=np.uint8), 100)
+    shown = albedo(points, materials, look)
+    for point, material, colour in zip(points, materials, shown, strict=True):
+        if material == NO_MATERIAL:
+            assert not colour.any()
+            continue
+        octaves = look.noise_from_jaw[material, : look.octaves[material]]
+        unit = sum(gradient_noise(*(m[:, :3] @ point + m[:, 3])) for m in octaves) / GRADIENT_NOISE_SD
+        share = 1 / (1 + np.exp(-look.hardness[material] * unit / np.sqrt(len(octaves))))
+        np.testing.assert_allclose(colour, look.dark[material] + share * (look.light - look.dark)[material], rtol=1e-9)
+
+
 def test_presets_differ_in_contrast_and_seeds_in_pattern() -> None:
     points = np.random.default_rng(0).uniform(-20, 20, (10_000, 3))
     enamel = np.zeros(len(points), dtype=np.uint8)
@@ -335,6 +352,22 @@ def test_a_resumed_capture_equals_an_uninterrupted_one(scene: Scene, poses: dict
     assert set(rest) == set(whole) - first_half
     for key, image in rest.items():
         np.testing.assert_array_equal(image, whole[key])
+
+
+def test_rays_that_are_remembered_are_those_of_the_camera(scene: Scene) -> None:
+    for camera in (SKEWED, CAMERA, SKEWED, SKEWED):
+        np.testing.assert_array_equal(scene.rays(camera), pixel_rays(camera, scene.supersampling))
+
+
+def test_light_does_not_depend_on_what_is_shaded_at_once(
+    scene: Scene, poses: dict[str, Rigid3], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lights = lamps(scene.handpiece, "all", poses["00000"])
+    cam_from_world = scene.handpiece.rig["o1"].cam_from_rig @ poses["00000"]
+    whole = radiance(scene, SKEWED, cam_from_world, lights)
+    monkeypatch.setattr(raycast, "_BLOCK", 1000)
+    np.testing.assert_array_equal(radiance(scene, SKEWED, cam_from_world, lights), whole)
+    assert whole.any()
 
 
 def test_processes_give_the_same_images_as_one(scene: Scene, poses: dict[str, Rigid3], tmp_path) -> None:

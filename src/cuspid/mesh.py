@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import no_type_check
 
 import fast_simplification
 import igl
@@ -17,6 +18,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, read_only
+from cuspid.kernels import kernel
 
 _ROUNDING = 5e-7
 """Of a length in single precision, four steps."""
@@ -43,6 +45,37 @@ class RayHits:
 def edges_of(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
     """Edges of the faces, face by face; each edge of a closed mesh appears once in either direction."""
     return np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+
+
+@kernel
+@no_type_check
+def _in_double(faces, lengths, u, v):
+    """What Embree tells of first hits, as :class:`RayHits` has it."""
+    count = len(faces)
+    wide, distances, barycentric = np.empty(count, np.int64), np.empty(count), np.empty((count, 3))
+    for i in range(count):
+        wide[i], distances[i] = faces[i], lengths[i] if faces[i] >= 0 else np.inf
+        second, third = np.float64(u[i]), np.float64(v[i])
+        barycentric[i, 0], barycentric[i, 1], barycentric[i, 2] = 1 - second - third, second, third
+    return wide, distances, barycentric
+
+
+@kernel(error_model="numpy")
+@no_type_check
+def _backwards(points, towards, tolerance_mm):
+    """The rays of :meth:`Mesh.occluded`, from ``towards`` to the points, as Embree takes them, and how far occluders
+    are looked for."""
+    origins, directions = np.empty(points.shape, np.float32), np.empty(points.shape, np.float32)
+    farthest = np.empty(len(points), np.float32)
+    for i in range(len(points)):
+        x, y, z = points[i, 0] - towards[i, 0], points[i, 1] - towards[i, 1], points[i, 2] - towards[i, 2]
+        length = np.sqrt(x * x + y * y + z * z)
+        for c in range(3):
+            origins[i, c] = towards[i, c]
+        directions[i, 0], directions[i, 1], directions[i, 2] = x / length, y / length, z / length
+        largest = max(abs(points[i, 0]), abs(points[i, 1]), abs(points[i, 2]))
+        farthest[i] = length - max(tolerance_mm, _ROUNDING * (largest + length))
+    return origins, directions, farthest
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,10 +195,7 @@ class Mesh:
             np.ascontiguousarray(directions, dtype=np.float32),
             output=True,
         )
-        faces = hits["primID"].astype(np.int64)
-        u, v = hits["u"].astype(np.float64), hits["v"].astype(np.float64)
-        distances = np.where(faces >= 0, hits["tfar"].astype(np.float64), np.inf)
-        return RayHits(faces, distances, np.stack([1 - u - v, u, v], axis=1))
+        return RayHits(*_in_double(hits["primID"], hits["tfar"], hits["u"], hits["v"]))
 
     def occluded(
         self,
@@ -176,16 +206,8 @@ class Mesh:
         """True where the open segment from ``points`` to ``towards`` meets the mesh farther than the tolerance, or than
         single precision tells apart where the rays are long."""
         # The segment is shot backwards: a hit nearer than the surface point is an occluder.
-        reach = points - towards
-        length = np.linalg.norm(reach, axis=1)
-        rounding_mm = _ROUNDING * (np.abs(points).max(axis=1, initial=0) + length)
-        farthest = length - np.maximum(tolerance_mm, rounding_mm)
-        hits = self._scene.run(
-            np.ascontiguousarray(towards, dtype=np.float32),
-            np.ascontiguousarray(reach / length[:, None], dtype=np.float32),
-            dists=farthest.astype(np.float32),
-            query="OCCLUDED",
-        )
+        origins, directions, farthest = _backwards(np.asarray(points), np.asarray(towards), tolerance_mm)
+        hits = self._scene.run(origins, directions, dists=farthest, query="OCCLUDED")
         return np.asarray((hits >= 0) & (farthest > 0))
 
     @cached_property

@@ -118,6 +118,10 @@ class Palette(NamedTuple):
     """(material, octave, 3, 4): turn, scale and shift of each octave, so that their lattices never line up."""
 
 
+NO_MATERIAL = 255
+"""In place of the index of a material: nothing is there."""
+
+
 def face_materials(jaw: Jaw) -> UInt8[np.ndarray, "f"]:
     """Index of the material of each face: 0 enamel, 1 gum."""
     if jaw.face_labels is None:
@@ -150,7 +154,7 @@ GRADIENT_NOISE_SD = 0.27
 """Standard deviation of :func:`gradient_noise` over space."""
 
 
-@kernel(fastmath=True)
+@kernel(fastmath=True, inline="always")
 @no_type_check
 def _corner(ix, iy, iz, x, y, z):
     """Dot product of the offset with one of twelve gradients, chosen by a hash of the lattice point."""
@@ -166,7 +170,7 @@ def _corner(ix, iy, iz, x, y, z):
     return (u if h & 1 == 0 else -u) + (v if h & 2 == 0 else -v)
 
 
-@kernel(fastmath=True)
+@kernel(fastmath=True, inline="always")
 @no_type_check
 def gradient_noise(x, y, z):
     """Perlin's improved noise, about -1 to 1, zero mean, one feature a unit."""
@@ -191,39 +195,40 @@ def gradient_noise(x, y, z):
 
 @kernel(fastmath=True)
 @no_type_check
-def albedo_at(point, material, palette):
-    """Linear RGB albedo of a material at one point of the jaw, as a tuple."""
-    x, y, z = point
-    octaves = palette.octaves[material]
-    total = 0.0
-    for k in range(octaves):
-        m = palette.noise_from_jaw[material, k]
-        total += gradient_noise(
+def _add_octave(points, noise_from_jaw, total):
+    """Add an octave of the noise at points, given by their coordinates: only a plain loop becomes vector code."""
+    m, (xs, ys, zs) = noise_from_jaw, points
+    for i in range(len(total)):
+        x, y, z = xs[i], ys[i], zs[i]
+        total[i] += gradient_noise(
             m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
             m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3],
             m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3],
         )
-    unit = total / (GRADIENT_NOISE_SD * np.sqrt(octaves))
-    share = 1 / (1 + np.exp(-palette.hardness[material] * unit))
-    dark, light = palette.dark[material], palette.light[material]
-    return (
-        dark[0] + share * (light[0] - dark[0]),
-        dark[1] + share * (light[1] - dark[1]),
-        dark[2] + share * (light[2] - dark[2]),
-    )
 
 
-@kernel
+@kernel(fastmath=True)
 @no_type_check
 def _albedo(points, materials, palette, out):
-    for i in range(len(points)):
-        out[i] = albedo_at((points[i, 0], points[i, 1], points[i, 2]), materials[i], palette)
+    for material in range(len(palette.octaves)):
+        chosen = np.flatnonzero(materials == material)
+        octaves, total = palette.octaves[material], np.zeros(len(chosen))
+        coordinates = (points[chosen, 0], points[chosen, 1], points[chosen, 2])
+        for k in range(octaves):
+            _add_octave(coordinates, palette.noise_from_jaw[material, k], total)
+        dark, light = palette.dark[material], palette.light[material]
+        for i in range(len(chosen)):
+            unit = total[i] / (GRADIENT_NOISE_SD * np.sqrt(octaves))
+            share = 1 / (1 + np.exp(-palette.hardness[material] * unit))
+            for c in range(3):
+                out[chosen[i], c] = dark[c] + share * (light[c] - dark[c])
 
 
 def albedo(
     points: Float[np.ndarray, "n 3"], materials: UInt8[np.ndarray, "n"], palette: Palette
 ) -> Float[np.ndarray, "n 3"]:
-    """Linear RGB albedo at points of the jaw (mm in the occlusal frame), given the material of each."""
-    out = np.empty_like(points)
+    """Linear RGB albedo at points of the jaw (mm in the occlusal frame), given the material of each; black where that
+    is :data:`NO_MATERIAL`."""
+    out = np.zeros_like(points)
     _albedo(points, materials, palette, out)
     return out

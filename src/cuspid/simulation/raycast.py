@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from multiprocessing import get_context
 from typing import NamedTuple, no_type_check
 
@@ -28,7 +28,7 @@ from cuspid.jaw import Jaw
 from cuspid.kernels import kernel
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
-from cuspid.simulation.appearance import Appearance, Palette, albedo_at, face_materials, palette
+from cuspid.simulation.appearance import NO_MATERIAL, Appearance, Palette, albedo, face_materials, palette
 from cuspid.simulation.sensor import record
 
 AMBIENT = 0.08
@@ -45,6 +45,9 @@ BRIGHT_PERCENTILE, BRIGHT_LEVEL = 98.0, 0.75
 
 METERED_POSES = 5
 """The exposure is metered at this many poses, spread over the capture."""
+
+_BLOCK = 1 << 15
+"""Rays that are traced and shaded at once: what passes between the steps takes some 300 bytes a ray."""
 
 Sink = Callable[[str, str, UInt8[np.ndarray, "h w 3"]], None]
 """Takes frame, camera and image; called in the process that rendered it."""
@@ -70,6 +73,12 @@ class Scene:
         """The jaw as arrays for the compiled shading."""
         mesh = self.jaw.mesh
         return ShadedMesh(mesh.faces, mesh.face_normals, mesh.vertex_normals, face_materials(self.jaw))
+
+    @cached_property
+    def rays(self) -> Callable[[Camera], Float[np.ndarray, "n 3"]]:
+        """:func:`pixel_rays` of a camera, remembered for the last one: through a lens that distorts they cost more
+        than the rest of an image, and those of twelve cameras of 500 x 500 px would take 300 MB in each process."""
+        return lru_cache(maxsize=1)(partial(pixel_rays, supersampling=self.supersampling))
 
     @cached_property
     def palette(self) -> Palette:
@@ -128,7 +137,7 @@ def render_depth(mesh: Mesh, camera: Camera, cam_from_world: Rigid3) -> Float[np
 def radiance(scene: Scene, camera: Camera, cam_from_world: Rigid3, lights: Lamps) -> Float[np.ndarray, "h w 3"]:
     """Linear light at each pixel, averaged over the pixel's area; 0 where nothing is hit."""
     world_from_cam = cam_from_world.inverse()
-    directions = _turned(pixel_rays(camera, scene.supersampling), world_from_cam.rotation)
+    directions = _turned(scene.rays(camera), world_from_cam.rotation)
     origins = np.broadcast_to(world_from_cam.translation, directions.shape)
     return radiance_along(scene, origins, directions, lights).reshape(camera.height, camera.width, 3)
 
@@ -137,28 +146,52 @@ def radiance_along(
     scene: Scene, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"], lights: Lamps
 ) -> Float[np.ndarray, "m 3"]:
     """Linear light (float32) of pixels, given their rays, ``supersampling**2`` in a row for each."""
-    hits = scene.jaw.mesh.cast(origins, directions)
-    rays = _Rays(origins, directions, hits.faces, hits.distances, hits.barycentric)
-    chosen, row = _shadow_rows(hits.distances, scene.supersampling**2)
-    lit, ambient = _lighting(scene, rays.take(chosen), lights)
-    out = np.zeros((len(directions) // scene.supersampling**2, 3), dtype=np.float32)
-    _shade(rays, scene.surface, scene.palette, lights, lit, ambient, row, out)
+    samples = scene.supersampling**2
+    out = np.zeros((len(directions) // samples, 3), dtype=np.float32)
+    pixels = max(1, _BLOCK // samples)
+    for begin in range(0, len(out), pixels):
+        some = slice(begin * samples, (begin + pixels) * samples)
+        _add_light(scene, origins[some], directions[some], lights, out[begin : begin + pixels])
     return out
 
 
-def _shadow_rows(distances: Float[np.ndarray, "n"], samples: int) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "n"]]:
+def _add_light(
+    scene: Scene,
+    origins: Float[np.ndarray, "n 3"],
+    directions: Float[np.ndarray, "n 3"],
+    lights: Lamps,
+    out: Float[np.ndarray, "m 3"],
+) -> None:
+    """:func:`radiance_along` for some of the pixels, into ``out``."""
+    hits = scene.jaw.mesh.cast(origins, directions)
+    rays = _Rays(origins, directions, hits.faces, hits.distances, hits.barycentric)
+    chosen, row = _shadow_rows(hits.distances, scene.supersampling**2)
+    lit, ambient = _lighting(scene, rays, chosen, lights)
+    points, materials = _places(rays, scene.surface)
+    albedos = albedo(points, materials, scene.palette)
+    _shade(rays, albedos, scene.surface, scene.palette, lights, lit, ambient, row, out)
+
+
+@kernel
+@no_type_check
+def _shadow_rows(distances, samples):
     """The rays for which shadows are traced, and for each ray the row of its answer among them.
 
     One ray answers for a pixel, but where a pixel sees more than one surface each ray asks for itself: the shadow of an
     edge on what lies behind must not darken the edge.
     """
-    pixels = distances.reshape(-1, samples)
-    mixed = pixels.max(axis=1) > (1 + SAME_SURFACE) * pixels.min(axis=1)
-    counts = np.where(mixed, samples, 1)
-    row = (np.cumsum(counts) - counts)[:, None] + np.where(mixed[:, None], np.arange(samples), 0)
-    chosen = np.zeros(counts.sum(), dtype=np.int64)
-    chosen[row.ravel()] = np.arange(len(distances))
-    return chosen, row.ravel()
+    chosen, row = np.empty(len(distances), np.int64), np.empty(len(distances), np.int64)
+    count = 0
+    for first in range(0, len(distances), samples):
+        nearest = farthest = distances[first]
+        for i in range(first + 1, first + samples):
+            nearest, farthest = min(nearest, distances[i]), max(farthest, distances[i])
+        mixed = farthest > (1 + SAME_SURFACE) * nearest
+        for i in range(first, first + samples):
+            count += mixed or i == first
+            chosen[count - 1] = i
+            row[i] = count - 1
+    return chosen[:count], row
 
 
 class _Rays(NamedTuple):
@@ -169,10 +202,6 @@ class _Rays(NamedTuple):
     faces: np.ndarray
     distances: np.ndarray
     barycentric: np.ndarray
-
-    def take(self, chosen: Int[np.ndarray, "m"]) -> _Rays:
-        """Some of the rays."""
-        return _Rays(*(array[chosen] for array in self))
 
 
 @kernel
@@ -190,15 +219,43 @@ def _turned(directions, rotation):
     return out
 
 
-def _lighting(scene: Scene, rays: _Rays, lights: Lamps) -> tuple[Bool[np.ndarray, "n l"], Float[np.ndarray, "n 3"]]:
-    """Which lights reach each hit (False also where a light is too weak to matter), and the ambient light there."""
-    points, ambient = np.zeros((2, len(rays.faces), 3))
-    lit = np.zeros((len(rays.faces), len(lights.positions)), dtype=np.bool_)
-    _light_matters(rays, scene.surface, lights, points, lit, ambient)
-    for index, position in enumerate(lights.positions):
-        ask = np.flatnonzero(lit[:, index])
-        lit[ask, index] = ~scene.jaw.mesh.occluded(points[ask], np.broadcast_to(position, (len(ask), 3)))
+def _lighting(
+    scene: Scene, rays: _Rays, chosen: Int[np.ndarray, "n"], lights: Lamps
+) -> tuple[Bool[np.ndarray, "n l"], Float[np.ndarray, "n 3"]]:
+    """Which lights reach the hits of chosen rays (False also where a light is too weak to matter), and the ambient
+    light there."""
+    points, ambient = np.zeros((2, len(chosen), 3))
+    lit = np.zeros((len(chosen), len(lights.positions)), dtype=np.bool_)
+    _light_matters(rays, chosen, scene.surface, lights, points, lit, ambient)
+    _darken(lit, scene.jaw.mesh.occluded(*_segments(points, lit, lights.positions)))
     return lit, ambient
+
+
+@kernel
+@no_type_check
+def _segments(points, lit, positions):
+    """The ends of the way from each point to each light that may reach it, light by light."""
+    begins, ends = np.empty((2, lit.sum(), 3))
+    n = 0
+    for k in range(len(positions)):
+        for i in range(len(points)):
+            if lit[i, k]:
+                for c in range(3):
+                    begins[n, c], ends[n, c] = points[i, c], positions[k, c]
+                n += 1
+    return begins, ends
+
+
+@kernel
+@no_type_check
+def _darken(lit, hidden):
+    """Take away the lights that something hides, in the order of :func:`_segments`."""
+    n = 0
+    for k in range(lit.shape[1]):
+        for i in range(len(lit)):
+            if lit[i, k]:
+                lit[i, k] = not hidden[n]
+                n += 1
 
 
 @kernel(fastmath=True)
@@ -253,15 +310,16 @@ def _incoming(point, index, lights):
 
 @kernel(fastmath=True)
 @no_type_check
-def _light_matters(rays, surface, lights, points, matters, ambient):
-    """Fill in for each ray: the point hit, the lights that give a noticeable part of its light, the ambient light."""
+def _light_matters(rays, chosen, surface, lights, points, matters, ambient):
+    """Fill in for each chosen ray: the point hit, the lights that give a noticeable part of its light, the ambient
+    light."""
     strength = np.zeros(len(lights.positions))
-    for i in range(len(rays.faces)):
-        if rays.faces[i] < 0:
+    for i in range(len(chosen)):
+        if rays.faces[chosen[i]] < 0:
             continue
-        point = _point(rays, i)
-        points[i] = point
-        normal = _normal(rays, i, surface)
+        point = _point(rays, chosen[i])
+        points[i, 0], points[i, 1], points[i, 2] = point
+        normal = _normal(rays, chosen[i], surface)
         for k in range(len(strength)):
             towards, falloff = _incoming(point, k, lights)
             strength[k] = max(0.0, _dot(normal, towards)) * falloff
@@ -302,7 +360,19 @@ def _reflected(normal, view, towards, reflectance, roughness):
 
 @kernel(fastmath=True)
 @no_type_check
-def _shade(rays, surface, palette, lights, lit, ambient, row, out):
+def _places(rays, surface):
+    """The point that each ray hits, and its material."""
+    points, materials = np.zeros((len(rays.faces), 3)), np.full(len(rays.faces), NO_MATERIAL, np.uint8)
+    for i in range(len(rays.faces)):
+        if rays.faces[i] >= 0:
+            points[i, 0], points[i, 1], points[i, 2] = _point(rays, i)
+            materials[i] = surface.materials[rays.faces[i]]
+    return points, materials
+
+
+@kernel(fastmath=True)
+@no_type_check
+def _shade(rays, albedos, surface, palette, lights, lit, ambient, row, out):
     samples = len(rays.faces) // len(out)
     for i in range(len(rays.faces)):
         if rays.faces[i] < 0:
@@ -310,7 +380,7 @@ def _shade(rays, surface, palette, lights, lit, ambient, row, out):
         pixel = i // samples
         m = surface.materials[rays.faces[i]]
         point, normal = _point(rays, i), _normal(rays, i, surface)
-        albedo = albedo_at(point, m, palette)
+        albedo = albedos[i]
         direction = rays.directions[i]
         inverse = 1 / np.sqrt(_dot(direction, direction))
         view = (direction[0] * inverse, direction[1] * inverse, direction[2] * inverse)
@@ -432,6 +502,7 @@ def render_capture(
     scene that the parent built (a forked child could not build one) and run kernels that the parent compiled.
     """
     tasks = [(frame, camera) for frame in frames for camera in frame.cameras if not skip(frame.name, camera)]
+    tasks.sort(key=lambda task: task[1])  # one camera after the other, for whose rays a process remembers
     if not tasks:
         return
     worker = _Worker(scene=scene, poses=poses, gains=metered_gains(scene, frames, poses), sink=sink)
