@@ -114,3 +114,19 @@ def test_two_poses_that_fit_alike_are_told_and_chosen_from_alike():
 def test_surfaces_that_do_not_belong_together_are_refused():
     with pytest.raises(InputError, match="same teeth, in the same unit"):
         register(sphere(25.0), surface(), FAST, rng=np.random.default_rng(0))
+
+
+def flaring(mesh: Mesh, share: float, most_mm: float) -> Mesh:
+    """Outwards at the rim, as walls are that few cameras see: the more, the farther from the middle."""
+    radius = np.linalg.norm(mesh.vertices - mesh.vertices.mean(axis=0), axis=1)
+    rim = np.quantile(radius, 1 - share)
+    off_mm = most_mm * np.clip((radius - rim) / (radius.max() - rim), 0, 1)
+    return Mesh(mesh.vertices + off_mm[:, None] * mesh.vertex_normals, mesh.faces)
+
+
+@pytest.mark.parametrize("most_mm", [0.05, 0.1, 0.2])
+def test_a_flaring_rim_neither_moves_nor_swells_the_rest(most_mm: float):
+    scan = flaring(noisy(around_tooth(46, 8.0), 0.003), 0.15, most_mm)
+    found = fit(scan.sample(20_000, np.random.default_rng(0))[0], surface(), Rigid3.identity(), FAST)
+    assert error_um(found.reference_from_scan, Rigid3.identity(), scan.vertices) < 3
+    assert abs(found.scale - 1) < 2e-4

@@ -19,8 +19,8 @@ from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.options import Options, Range
 
-_WIDEST_MM = 2.0
-"""Upper bound of the distance at which a sample loses its weight."""
+_NARROWEST_MM, _WIDEST_MM = 1e-3, 2.0
+"""Bounds of the distance at which a sample loses its weight."""
 _LEAST_OVERLAP = 0.25
 _FEW = 2000
 """Samples that suffice to tell good poses from bad ones."""
@@ -35,7 +35,8 @@ class RegistrationOptions(Options):
     samples: Annotated[int, Range(100, 10_000_000)] = 60_000
     """Points of the scan, even by area, on which the alignment rests."""
     outlier_mm: Annotated[float, Range(0.0001, 100)] = 0.3
-    """Samples farther off than this (or than six robust standard deviations, if that is more) have no weight."""
+    """Samples nearer than this count as overlap. What weighs in the fit follows from the errors: nothing that is farther
+    off than six robust standard deviations."""
     tolerance_um: Annotated[float, Range(1e-06, 1000)] = 0.01
     """The alignment has converged when no sample moves more than this in a step."""
     iterations: Annotated[int, Range(1, 100_000)] = 100
@@ -94,7 +95,7 @@ def fit(
     """Align points of a scan with a surface from a pose nearby."""
     pose = refine(points, surface, start, options)
     closest = surface.closest_points(pose.apply(points))
-    weights = _weights(closest, options.outlier_mm)
+    weights = _weights(closest)
     return Alignment(
         reference_from_scan=pose,
         scale=best_scale(points, surface, pose, options),
@@ -112,7 +113,7 @@ def refine(
         moved = pose.apply(points)
         closest = surface.closest_points(moved)
         centre = moved.mean(axis=0)
-        step = _gauss_newton(moved - centre, closest, _weights(closest, options.outlier_mm))
+        step = _gauss_newton(moved - centre, closest, _weights(closest))
         motion = _about(centre, step)
         pose = motion @ pose
         if np.abs(motion.apply(moved) - moved).max() < options.tolerance_um / 1000:
@@ -128,7 +129,7 @@ def best_scale(
     for _ in range(options.iterations):
         closest = surface.closest_points(moved)
         centre = moved.mean(axis=0)
-        step = _gauss_newton(moved - centre, closest, _weights(closest, options.outlier_mm), with_scale=True)
+        step = _gauss_newton(moved - centre, closest, _weights(closest), with_scale=True)
         before = moved
         moved = _about(centre, step[:6]).apply(centre + (1 + step[6]) * (moved - centre))
         shrinking *= 1 + step[6]
@@ -161,14 +162,16 @@ def _gauss_newton(
     return np.asarray(step)
 
 
-def _weights(closest: ClosestPoints, outlier_mm: float) -> Float[np.ndarray, "n"]:
-    """Tukey's biweight, wide enough to leave normal errors their full weight; none at the border of the reference."""
+def _weights(closest: ClosestPoints) -> Float[np.ndarray, "n"]:
+    """Tukey's biweight, wide enough to leave normal errors nearly their full weight; none at the border of the
+    reference. It is as wide as the errors ask for and no wider: errors far beyond the usual ones mostly lie on one side,
+    as where a wall flares out at the border of a scan, and a few per cent of them would shift, turn and swell all."""
     distances = np.abs(closest.signed_mm)
     inside = ~closest.on_border
     if not inside.any():
         return np.zeros_like(distances)
     sigma = 1.4826 * np.median(distances[inside])
-    cutoff = np.clip(6 * sigma, outlier_mm, max(_WIDEST_MM, outlier_mm))
+    cutoff = np.clip(6 * sigma, _NARROWEST_MM, _WIDEST_MM)
     return np.asarray(np.where(inside & (distances < cutoff), (1 - (distances / cutoff) ** 2) ** 2, 0.0))
 
 
