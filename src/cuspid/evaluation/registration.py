@@ -35,8 +35,8 @@ class RegistrationOptions(Options):
     samples: Annotated[int, Range(100, 10_000_000)] = 60_000
     """Points of the scan, even by area, on which the alignment rests."""
     outlier_mm: Annotated[float, Range(0.0001, 100)] = 0.3
-    """Samples nearer than this count as overlap. What weighs in the fit follows from the errors: nothing that is farther
-    off than six robust standard deviations."""
+    """Samples nearer than this count as overlap. What weighs in the fit follows from the errors: nothing that is
+    farther off than six robust standard deviations."""
     tolerance_um: Annotated[float, Range(1e-06, 1000)] = 0.01
     """The alignment has converged when no sample moves more than this in a step."""
     iterations: Annotated[int, Range(1, 100_000)] = 100
@@ -164,8 +164,9 @@ def _gauss_newton(
 
 def _weights(closest: ClosestPoints) -> Float[np.ndarray, "n"]:
     """Tukey's biweight, wide enough to leave normal errors nearly their full weight; none at the border of the
-    reference. It is as wide as the errors ask for and no wider: errors far beyond the usual ones mostly lie on one side,
-    as where a wall flares out at the border of a scan, and a few per cent of them would shift, turn and swell all."""
+    reference. It is as wide as the errors ask for and no wider: errors far beyond the usual ones mostly lie on one
+    side, as where a wall flares out at the border of a scan, and a few per cent of them would shift, turn and swell
+    all."""
     distances = np.abs(closest.signed_mm)
     inside = ~closest.on_border
     if not inside.any():
