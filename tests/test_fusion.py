@@ -66,6 +66,28 @@ def test_true_depth_fuses_to_the_surface_without_bias() -> None:
     assert abs(deviation.mean()) < 0.5
 
 
+def is_measured(depth_map: DepthMap, vertices: np.ndarray) -> np.ndarray:
+    """Which vertices lie in a pixel that has a depth."""
+    pixels = depth_map.camera.project((depth_map.cam_from_rig @ POSES[depth_map.frame]).apply(vertices))
+    column, row = np.clip(np.nan_to_num(pixels, nan=-1), -1, 1e6).astype(int).T
+    height, width = depth_map.depth_mm.shape
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    return inside & np.isfinite(depth_map.depth_mm[np.where(inside, row, 0), np.where(inside, column, 0)])
+
+
+def test_no_vertex_lies_where_no_map_has_a_depth() -> None:
+    """Maps of half of the surface: each ends at the same line."""
+    maps = []
+    for each in depth_maps(HILLS):
+        x = POSES[each.frame].inverse().apply(each.points_in_rig()[0])[:, 0]
+        depth = each.depth_mm.copy().ravel()
+        depth[each.points_in_rig()[1][x > 0]] = np.nan
+        maps.append(replace(each, depth_mm=depth.reshape(each.depth_mm.shape)))
+    vertices = fuse(maps, POSES).vertices
+    assert len(vertices) > 2000
+    assert np.any([is_measured(each, vertices) for each in maps], axis=0).mean() > 0.998
+
+
 @pytest.mark.parametrize("noise_mm", [0.002, 0.01])
 def test_depth_is_as_uncertain_as_it_says(noise_mm: float) -> None:
     """Each frame is off by a smooth error of its own; where all three see the surface."""

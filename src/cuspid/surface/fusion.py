@@ -3,7 +3,8 @@
 The first pass blends signed distances in a sparse volume, whose zero level gives the topology. The second asks every
 depth map about every vertex and moves the vertex along its normal to the robust weighted mean of the surfaces that were
 seen, which takes out what the voxels rounded; it also counts who saw the vertex, and in which colour. A vertex that
-too few maps confirm from its outer side is not kept: that takes away ghosts and back walls.
+too few maps confirm from its outer side, or that none has a depth for, is not kept: that takes away ghosts, back walls,
+and what is only carried on past the borders of all maps.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 from typing import Annotated, no_type_check
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
@@ -124,6 +125,8 @@ class Votes:
     """Sum of weights times RGB."""
     maps: Int[np.ndarray, "v"]
     """Number of depth maps that confirm the vertex."""
+    measured: Bool[np.ndarray, "v"]
+    """Whether one of them has a depth there itself; others may only carry on what they have nearby."""
     frames: Int[np.ndarray, "v 2"]
     """Number of frames that do, and the last of them: the maps of a frame follow each other."""
 
@@ -137,14 +140,15 @@ class Votes:
             ball[:3] = (chunk.min(axis=0) + chunk.max(axis=0)) / 2
             ball[3] = np.linalg.norm(chunk - ball[:3], axis=1).max()
         whole = np.zeros((count, 2), dtype=np.int64)
-        return Votes(rough, balls, np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count, dtype=np.int64), whole)
+        maps, measured = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool)
+        return Votes(rough, balls, np.zeros((count, 3)), np.zeros((count, 3)), maps, measured, whole)
 
     def collect(
         self, evidence: Evidence, depth_map: DepthMap, cam_from_world: Rigid3, agreement_mm: float, frame: int
     ) -> None:
         """Let one depth map vote on the vertices that it sees; ``frame`` is the number of its frame, from 1 on."""
         chunks = self._in_view(depth_map.camera, cam_from_world)
-        colors = colors_of(depth_map)
+        colors, known = colors_of(depth_map), (np.isfinite(depth_map.depth_mm) & (depth_map.confidence > 0)).ravel()
         map_slices(
             lambda part: _vote(
                 chunks[part],
@@ -154,10 +158,12 @@ class Votes:
                 cam_from_world.translation,
                 evidence.arrays,
                 colors,
+                known,
                 agreement_mm,
                 self.moment,
                 self.color,
                 self.maps,
+                self.measured,
                 self.frames,
                 frame,
             ),
@@ -179,7 +185,7 @@ class Votes:
         total = np.maximum(self.moment[:, :1], 1e-12)
         vertices = self.rough.vertices + self.rough.vertex_normals * self.moment[:, 1:2] / total
         colors: UInt8[np.ndarray, "v 3"] = np.rint(self.color / total).clip(0, 255).astype(np.uint8)
-        confirmed = self.maps >= least_maps
+        confirmed = (self.maps >= least_maps) & self.measured
         kept = confirmed[self.rough.faces].all(axis=1)
         used = np.unique(self.rough.faces[kept])
         return Fused(Mesh(vertices, self.rough.faces, colors).submesh(kept), self._sigma_mm()[used])
@@ -197,7 +203,21 @@ class Votes:
 @kernel
 @no_type_check
 def _vote(
-    chunks, vertices, normals, rotation, translation, evidence, colors, agreement, moment, color, maps, frames, frame
+    chunks,
+    vertices,
+    normals,
+    rotation,
+    translation,
+    evidence,
+    colors,
+    known,
+    agreement,
+    moment,
+    color,
+    maps,
+    measured,
+    frames,
+    frame,
 ):
     """Each vertex that a depth map sees from its outer side and near its surface gets the map's vote."""
     seen, x, normal = np.zeros(6), np.zeros(3), np.zeros(3)
@@ -223,5 +243,6 @@ def _vote(
             for channel in range(3):
                 color[n, channel] += weight * colors[int(seen[5]), channel]
             maps[n] += 1
+            measured[n] |= known[int(seen[5])]
             if frames[n, 1] != frame:
                 frames[n, 0], frames[n, 1] = frames[n, 0] + 1, frame
