@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -174,3 +175,12 @@ def test_bad_images_and_caches_are_told(capture: Capture, tmp_path: Path) -> Non
     image_path(capture, "00001", "a").unlink()
     with pytest.raises(InputError, match=r"a/00001\.png"):
         detect_all(capture, cache=tmp_path / "cache")
+
+
+def test_how_many_keypoints_follows_from_the_size_of_the_image() -> None:
+    usual = FeatureOptions()
+    sizes = ((250, 250), (500, 500), (640, 480), (1280, 960))
+    assert [usual.count_for(*size) for size in sizes] == [1000, 1000, 1228, 2000]
+    assert FeatureOptions(count=50).count_for(1280, 960) == 50
+    fine = replace(usual, cell_px=10)
+    assert fine.count_for(200, 250) == replace(usual, cell_px=20).count_for(400, 500) == 1250

@@ -15,6 +15,7 @@ from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from horseshoe import horseshoe
 from strategies import rigid3s
+from synthetic_scene import height_field
 
 FAST = RegistrationOptions(search=SearchOptions(targets=2500, candidates=300), samples=20_000)
 
@@ -130,3 +131,16 @@ def test_a_flaring_rim_neither_moves_nor_swells_the_rest(most_mm: float):
     found = fit(scan.sample(20_000, np.random.default_rng(0))[0], surface(), Rigid3.identity(), FAST)
     assert error_um(found.reference_from_scan, Rigid3.identity(), scan.vertices) < 3
     assert abs(found.scale - 1) < 2e-4
+
+
+@pytest.mark.parametrize("off_mm", [0.05, 0.3])
+def test_a_plate_that_slides_but_for_two_posts_finds_its_place(off_mm: float):
+    """All that holds it are their walls, a thirtieth of it, which lie far beyond the usual errors at first."""
+
+    def posts(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return 5 - sum(0.3 * (1 + np.tanh((0.7 - np.hypot(x - a, y - b)) / 0.02)) for a, b in ((-2, -1), (1.5, 1.2)))
+
+    plate = height_field(posts, count=600)
+    points = noisy(plate, 0.0005).sample(20_000, np.random.default_rng(0))[0]
+    found = fit(points, SignedDistance(plate), Rigid3(np.eye(3), np.array([off_mm, -off_mm / 2, 0])), FAST)
+    assert error_um(found.reference_from_scan, Rigid3.identity(), plate.vertices) < 0.5

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
 
 from cuspid.camera import Camera
@@ -38,9 +38,14 @@ class DepthMap:
     color: UInt8[np.ndarray, "h w 3"] | None = None
     """RGB seen at each pixel."""
 
+    @property
+    def known(self) -> Bool[np.ndarray, "h w"]:
+        """Which pixels have a depth."""
+        return np.asarray(np.isfinite(self.depth_mm) & (self.confidence > 0))
+
     def points_in_rig(self) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
         """Known points in the rig frame (mm) and their flat pixel indices."""
-        known = np.flatnonzero(np.isfinite(self.depth_mm.ravel()) & (self.confidence.ravel() > 0))
+        known = np.flatnonzero(self.known)
         rays = self.camera.rays(self.camera.pixel_centres().reshape(-1, 2)[known])
         in_cam = rays * self.depth_mm.ravel()[known, None].astype(np.float64)
         return self.cam_from_rig.inverse().apply(in_cam), known

@@ -34,7 +34,7 @@ class FeatureOptions(Options):
 
     count: Annotated[int | None, Range(10, 1_000_000)] = None
     """Most keypoints in an image; the strongest of each cell come first. By default 2.5 times the number of cells, 1000
-    to 2000: with more than that a path is as true."""
+    to 2000: at 500 x 500 px 2000 gave no truer path over an arch than 1000."""
     contrast: Annotated[float, Range(0, 1)] = 0.02
     """Least contrast of a keypoint, share of the grey range (OpenCV's ``contrastThreshold``)."""
     edge: Annotated[float, Range(1, 1_000_000)] = 10.0

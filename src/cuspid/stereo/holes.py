@@ -62,7 +62,8 @@ def _on_surface(depth_map: DepthMap, in_cam: Float[np.ndarray, "n 3"], agreement
     pixels = depth_map.camera.project(in_cam)
     on = depth_map.camera.contains(pixels, 1e-6)
     column, row = pixels[on].astype(np.int64).T
-    on[on] = np.abs(depth_map.depth_mm[row, column] - in_cam[on, 2]) < agreement_mm
+    near = np.abs(depth_map.depth_mm[row, column] - in_cam[on, 2]) < agreement_mm
+    on[on] = near & depth_map.known[row, column]
     return on
 
 

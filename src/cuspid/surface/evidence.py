@@ -51,7 +51,7 @@ class Evidence:
     @staticmethod
     def of(depth_map: DepthMap, largest_jump_mm: float) -> Evidence:
         """Prepare a depth map; neighbours that differ by more than the jump do not belong to one surface."""
-        known = np.isfinite(depth_map.depth_mm) & (depth_map.confidence > 0)
+        known = depth_map.known
         inverse = np.where(known, 1 / depth_map.depth_mm, np.nan).astype(np.float32)
         focal, centre = depth_map.camera.focal_px, depth_map.camera.principal_point_px - 0.5
         intrinsics = np.concatenate([focal, centre])

@@ -148,7 +148,7 @@ class Votes:
     ) -> None:
         """Let one depth map vote on the vertices that it sees; ``frame`` is the number of its frame, from 1 on."""
         chunks = self._in_view(depth_map.camera, cam_from_world)
-        colors, known = colors_of(depth_map), (np.isfinite(depth_map.depth_mm) & (depth_map.confidence > 0)).ravel()
+        colors, known = colors_of(depth_map), depth_map.known.ravel()
         map_slices(
             lambda part: _vote(
                 chunks[part],
