@@ -81,7 +81,8 @@ def moved_world(state: State, gauge: Gauge) -> State:
     # The world is redefined so that the first pose stays: new_from_old = before^-1 after.
     before, place = state.frame_rotation[0], state.frame_translation[0]
     world_turn, world_shift = before.T @ rotation[0], before.T @ (translation[0] - place)
-    rotation = rotation @ world_turn.T
+    # Rounding would grow threefold in each step: what is not quite a rotation is not quite undone by its transpose.
+    rotation = Rotation.from_matrix(rotation @ world_turn.T).as_matrix()
     return state._replace(
         frame_rotation=rotation,
         frame_translation=translation - rotation @ world_shift,
