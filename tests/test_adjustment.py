@@ -254,7 +254,7 @@ def test_no_image_sees_a_gauge(seed: int, step: list[float]) -> None:
 
 def test_many_gauges_leave_the_poses_rotations() -> None:
     """Rounding grew threefold in each; after some thirty an adjustment came to nothing."""
-    state, observations, prior = disturbed_state(0, with_priors(make_rig()))
+    state, observations, _ = disturbed_state(0, with_priors(make_rig()))
     residuals, world = normal_equations.residual_vectors(state, observations), state
     for _ in range(20):
         for sign in (1, -1):

@@ -15,7 +15,8 @@ from cuspid.capture import Capture
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.motion import MotionOptions, locate
-from cuspid.motion.features import DESCRIPTOR_NORM, Features
+from cuspid.motion.features import DESCRIPTOR_NORM, Features, detect_all
+from cuspid.motion.least_squares_matching import LeastSquaresOptions
 from cuspid.motion.location import _advice, _loose_notes, locate_features, stereo_ties
 from cuspid.motion.odometry import Edge, OdometryOptions, chain, polish, triangulate_frame
 from cuspid.motion.pairs import MatchingOptions, index_features
@@ -348,12 +349,33 @@ def test_images_are_located(tmp_path: Path) -> None:
         for k in range(3)
     }
     stages: list[str] = []
-    found = locate(make_capture(tmp_path, rig, path), progress=lambda stage, done, total: stages.append(stage))
+    capture = make_capture(tmp_path, rig, path)
+    found = locate(capture, progress=lambda stage, done, total: stages.append(stage))
+    plain = locate(capture, replace(MotionOptions(), least_squares=LeastSquaresOptions(enabled=False)))
+    for one, most_mm, most_px in ((found, 0.003, 0.1), (plain, 0.01, 0.5)):
+        assert one.frames == tuple(path)
+        assert 0 < np.abs(errors(one, path)[:, 3:]).max() < most_mm
+        assert 0 < one.reprojection_rms_px < most_px
+    assert list(dict.fromkeys(stages)) == ["features", "triangulation", "matching", "patches"]
+    assert {"features_s", "odometry_s", "adjustment_s", "observations"} <= set(found.log)
+
+
+def test_where_no_patch_is_found_keypoints_are_taken(tmp_path: Path) -> None:
+    """As behind glare that comes up after the keypoints were found: nothing is lost but exactness, and that is said."""
+    rig = Rig({name: m for name, m in make_handpiece().rig.cameras.items() if name != "side"})
+    path = {f"{k:05d}": Rigid3(np.eye(3), np.array([-0.6 * k, 0, 0])) for k in range(3)}
+    capture = make_capture(tmp_path, rig, path)
+    seen = detect_all(capture, MotionOptions().features)
+
+    def read(frame: str, camera: str) -> np.ndarray:
+        image = capture.source.read(frame, camera)[..., 0]
+        return np.full_like(image, 250) if frame == "00001" else image
+
+    found = locate_features(capture.handpiece, seen, list(path), MotionOptions(), read=read)
     assert found.frames == tuple(path)
     assert 0 < np.abs(errors(found, path)[:, 3:]).max() < 0.01
-    assert 0 < found.reprojection_rms_px < 0.5
-    assert list(dict.fromkeys(stages)) == ["features", "triangulation", "matching"]
-    assert {"features_s", "odometry_s", "adjustment_s", "observations"} <= set(found.log)
+    assert "1 frames (00001 first)" in "".join(found.notes)
+    assert not locate(capture).notes
 
 
 def test_what_single_cameras_tie_is_told():

@@ -13,7 +13,7 @@ from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.motion.guided import GuidedOptions
-from cuspid.motion.patches import PatchOptions, align_patches, lengthen
+from cuspid.motion.patches import PatchOptions, align_patches, cut_patches, lengthen
 from cuspid.reconstruction import Tracks
 from cuspid.sparse_model import SparseModel
 
@@ -25,6 +25,14 @@ def wall(seed: int = 0, size: int = 400) -> np.ndarray:
 
 
 CENTRES = np.array([[x, y] for x in (150.0, 200.3, 251.7) for y in (150.0, 204.4, 247.2)])
+
+
+def laid(
+    here: np.ndarray, there: np.ndarray, places: np.ndarray, start: np.ndarray, warps: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the patches of one picture are in another."""
+    options = PatchOptions()
+    return align_patches(cut_patches(here, places, options.radius_px), there, start, warps, options)
 
 
 @settings(max_examples=20, deadline=None)
@@ -43,7 +51,7 @@ def test_a_patch_is_found_where_it_went(shift: tuple[float, float], turn_deg: fl
     moved = gain * cv2.warpAffine(picture, matrix, picture.shape[::-1], flags=cv2.INTER_CUBIC) + 9
     true = CENTRES @ linear.T + offset
     warps = np.broadcast_to(linear, (len(CENTRES), 2, 2))
-    found, correlation = align_patches(picture, moved, CENTRES, true + shift, warps, PatchOptions())
+    found, correlation = laid(picture, moved, CENTRES, true + shift, warps)
     assert np.all(correlation > 0.98)
     # OpenCV warps to 1/32 px. 0.068 px is the worst of 1,500 draws.
     assert np.abs(found - true).max() < 0.08
@@ -52,11 +60,11 @@ def test_a_patch_is_found_where_it_went(shift: tuple[float, float], turn_deg: fl
 def test_what_is_not_there_is_not_found() -> None:
     here, other, flat = wall(), wall(1), np.full((400, 400), 80, np.float32)
     warps = np.broadcast_to(np.eye(2), (len(CENTRES), 2, 2))
-    _, on_other = align_patches(here, other, CENTRES, CENTRES, warps, PatchOptions())
+    _, on_other = laid(here, other, CENTRES, CENTRES, warps)
     assert not np.any(on_other > 0.85)
-    assert np.isnan(align_patches(flat, flat, CENTRES, CENTRES, warps, PatchOptions())[1]).all()
+    assert np.isnan(laid(flat, flat, CENTRES, CENTRES, warps)[1]).all()
     border = np.full_like(CENTRES, 3.0)
-    assert np.isnan(align_patches(here, here, border, border, warps, PatchOptions())[1]).all()
+    assert np.isnan(laid(here, here, border, border, warps)[1]).all()
 
 
 def over_a_wall(frames: int = 8) -> tuple[SparseModel, dict[str, np.ndarray]]:

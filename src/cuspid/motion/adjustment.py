@@ -518,15 +518,18 @@ class _Adjusted:
     log: Mapping[str, float | int]
 
 
-def adjust(reconstruction: Reconstruction, options: AdjustmentOptions | None = None) -> Reconstruction:
+def adjust(
+    reconstruction: Reconstruction, options: AdjustmentOptions | None = None, *, judge: bool = True
+) -> Reconstruction:
     """Refine poses, points and free calibration together; the tracks come back without outliers.
 
     The covariance of the poses is relative to the first frame, that of the calibration replaces its prior. Both take
-    the tracks for independent, not the keypoints of one. Raises ReconstructionError where the observations do not
-    determine every pose.
+    the tracks for independent, not the keypoints of one. Unless it is to ``judge`` what it found, there is neither a
+    covariance nor a word on a calibration that does not fit, which takes half of the time. Raises ReconstructionError
+    where the observations do not determine every pose.
     """
     poses = tuple(reconstruction.rig_from_world.values())
-    found = _adjusted(reconstruction.rig, poses, reconstruction.tracks, options or AdjustmentOptions())
+    found = _adjusted(reconstruction.rig, poses, reconstruction.tracks, options or AdjustmentOptions(), judge=judge)
     return replace(
         reconstruction,
         rig=found.rig,
@@ -547,7 +550,7 @@ def adjust_model(model: SparseModel, options: AdjustmentOptions | None = None) -
     name = "camera"
     rig = Rig({name: MountedCamera(model.camera, Rigid3.identity())})
     poses = tuple(model.cam_from_world.values())
-    found = _adjusted(rig, poses, model.tracks, options or AdjustmentOptions(), has_scale=False)
+    found = _adjusted(rig, poses, model.tracks, options or AdjustmentOptions(), judge=False)
     return replace(
         model,
         camera=found.rig[name].camera,
@@ -563,9 +566,9 @@ def _adjusted(
     tracks: Tracks | None,
     options: AdjustmentOptions,
     *,
-    has_scale: bool = True,
+    judge: bool,
 ) -> _Adjusted:
-    """The adjustment itself; without a scale there is no covariance."""
+    """The adjustment itself; to be judged it needs a scale."""
     if tracks is None or len(tracks.point_index) == 0:
         raise ReconstructionError("adjustment: no tracks to adjust; more texture or more overlap is needed")
     prior = _Prior.of(rig)
@@ -583,8 +586,8 @@ def _adjusted(
         unknowns = state.points.size + POSE * (len(state.frame_rotation) - 1)
         sigma_px = _sigma_px(state, observations, weighting, unknowns)
         limit_px = options.outlier_sigmas * sigma_px
-    posterior = _known_posterior(state, observations, weighting) if has_scale else None
-    misfits = _misfits(tracks, state, weighting, prior, options) if has_scale else ()
+    posterior = _known_posterior(state, observations, weighting) if judge else None
+    misfits = _misfits(tracks, state, weighting, prior, options) if judge else ()
     residuals = residual_vectors(state, observations)
     return _Adjusted(
         rig=_adjusted_rig(state, prior, None if posterior is None else posterior.calibration),

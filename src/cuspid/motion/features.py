@@ -41,9 +41,17 @@ class FeatureOptions(Options):
     """Largest ratio of the curvatures of a keypoint (OpenCV's ``edgeThreshold``); more takes in points on edges."""
     cell_px: Annotated[int, Range(1, 10_000)] = 25
     """Size of the cells over which keypoints are spread."""
+    halved_from_px: Annotated[int | None, Range(16, 1_000_000)] = None
+    """Images whose shorter side has so many px are searched at half their size, which takes a third of the time; the
+    places are half as exact. None: never."""
     upright: bool = True
     """Descriptors along the image's axes; False estimates an orientation for each keypoint, for free-hand turns of
     more than about 20 degrees about the optical axis between frames."""
+
+    def size_for(self, width: int, height: int) -> tuple[int, int]:
+        """At which size (px) an image is searched."""
+        halved = self.halved_from_px is not None and min(width, height) >= self.halved_from_px
+        return (round(width / 2), round(height / 2)) if halved else (width, height)
 
     def count_for(self, width: int, height: int) -> int:
         """Most keypoints in an image of a size in px."""
@@ -97,13 +105,18 @@ def _colors_at(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "n 2
 def detect(image: UInt8[np.ndarray, "h w 3"], options: FeatureOptions | None = None) -> Features:
     """Keypoints of an RGB image, well spread."""
     options = options or FeatureOptions()
+    height, width = image.shape[:2]
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    searched = options.size_for(width, height)
+    if searched != (width, height):
+        gray = cv2.resize(gray, searched, interpolation=cv2.INTER_AREA)
+    px = np.array([width, height]) / searched
     sift = cv2.SIFT.create(contrastThreshold=options.contrast, edgeThreshold=options.edge, enable_precise_upscale=True)
     keypoints = list(sift.detect(gray, None))
     if options.upright:
         keypoints = _without_doubles(keypoints)
-    places = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
-    most = options.count_for(image.shape[1], image.shape[0])
+    places = px * np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
+    most = options.count_for(width, height)
     chosen = spread(places, np.array([k.response for k in keypoints]), most, options.cell_px)
     keypoints = [keypoints[index] for index in chosen]
     if options.upright:
@@ -112,7 +125,7 @@ def detect(image: UInt8[np.ndarray, "h w 3"], options: FeatureOptions | None = N
     described, descriptors = sift.compute(gray, keypoints)
     if descriptors is None:
         descriptors = np.zeros((0, 128), np.float32)
-    pixels = np.array([k.pt for k in described], dtype=np.float64).reshape(-1, 2) + OPENCV_PIXEL_OFFSET
+    pixels = px * (np.array([k.pt for k in described], dtype=np.float64).reshape(-1, 2) + OPENCV_PIXEL_OFFSET)
     return Features(pixels=pixels, descriptors=_root_sift(descriptors), colors=_colors_at(image, pixels))
 
 

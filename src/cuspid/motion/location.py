@@ -10,8 +10,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
+import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from cuspid.capture import Capture
 from cuspid.errors import ReconstructionError
@@ -19,6 +20,7 @@ from cuspid.geometry import Rigid3
 from cuspid.motion.adjustment import AdjustmentOptions, adjust, calibration_sigma_px
 from cuspid.motion.closure import Image, closing_pairs
 from cuspid.motion.features import FeatureOptions, Features, detect_all
+from cuspid.motion.least_squares_matching import LeastSquaresOptions, ReadGray, match_patches
 from cuspid.motion.odometry import (
     Cloud,
     FrameFeatures,
@@ -41,13 +43,16 @@ from cuspid.workers import map_in_threads
 _LOOSE_SCALE_PPM, _LOOSE_SPAN_PPM = 1000.0, 300.0
 """Standard deviations of the scale and, apart from it, of the length of a scan, beyond which there is advice."""
 
+_ROUGHLY = 10.0
+"""Tolerance of an adjustment that only tells about where patches lie."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class MotionOptions(Options):
     """How the handpiece's way is found from features."""
 
-    features: FeatureOptions = field(default_factory=FeatureOptions)
-    """Keypoints."""
+    features: FeatureOptions = field(default_factory=lambda: FeatureOptions(halved_from_px=400))
+    """Keypoints; of images that are halved their places are exact only once patches are aligned."""
     pairing: PairingOptions = field(default_factory=PairingOptions)
     """Which cameras are matched within a frame."""
     within: MatchingOptions = field(default_factory=MatchingOptions)
@@ -61,6 +66,8 @@ class MotionOptions(Options):
     depth_slack: Annotated[float, Range(0, 100_000)] = 8.3
     """Uncertainty of the depth of a point triangulated within a frame, when it is looked for in another, in resolutions
     of the handpiece (0.1 mm at 12 um)."""
+    least_squares: LeastSquaresOptions = field(default_factory=LeastSquaresOptions)
+    """Patches that make the places of keypoints exact."""
     cell_px: Annotated[float, Range(0, 10_000)] = 35.0
     """Every cell of this size of an image keeps its longest track for the adjustment; 0 keeps all tracks."""
     minimum_located: Annotated[float, SHARE] = 0.5
@@ -243,12 +250,14 @@ def locate_features(
     names: Sequence[str],
     options: MotionOptions,
     *,
+    read: ReadGray | None = None,
     progress: Progress = silent,
 ) -> Reconstruction:
     """As :func:`locate`, from the keypoints by (frame, camera) of the frames ``names`` in the order of capture.
 
     A camera without keypoints of a frame is left out of that frame. In what order the handpiece has its cameras decides
-    nothing but their order in the result.
+    nothing but their order in the result. ``read`` gives the grey picture of a frame and a camera by their names;
+    without it the places of keypoints stay as they are.
     """
     given, handpiece = handpiece.rig.names, replace(handpiece, rig=handpiece.rig.in_own_order())
     rig, log = handpiece.rig, dict[str, float]()
@@ -283,7 +292,7 @@ def locate_features(
         clouds=[clouds[f] for f in trajectory.rig_from_world],
         poses=list(trajectory.rig_from_world.values()),
     )
-    adjusted = _adjusted(start, scan, options, log, progress)
+    adjusted = _adjusted(start, scan, options, read if options.least_squares.enabled else None, log, progress)
     notes = (*adjusted.notes, *_loose_notes(adjusted, options.odometry.minimum_matches), *_advice(adjusted))
     return replace(adjusted.with_cameras_as(given), log={**log, **adjusted.log}, notes=notes)
 
@@ -337,25 +346,46 @@ def stereo_ties(tracks: Tracks, frames: int) -> Int[np.ndarray, "k"]:
 
 
 def _adjusted(
-    start: Reconstruction, scan: _Scan, options: MotionOptions, log: dict[str, float], progress: Progress
+    start: Reconstruction,
+    scan: _Scan,
+    options: MotionOptions,
+    read: ReadGray | None,
+    log: dict[str, float],
+    progress: Progress,
 ) -> Reconstruction:
-    """Tracks over the located frames, adjusted; and again with those that join what was seen twice."""
+    """Tracks over the located frames, adjusted; and again with those that join what was seen twice, and with exact
+    places."""
+    first = options.adjustment if read is None else replace(options.adjustment, rounds=2, tolerance=_ROUGHLY)
     with _timed(log, "matching"):
         pairs = frame_pairs(len(scan.frames), options.reach)
         images = (((i, camera), (j, camera)) for i, j in pairs for camera in scan.handpiece.rig.names)
         matches = [*_within_frames(scan), *_across_frames(scan, images, options, "matching", progress)]
         tracks = _tracks(scan, matches, options.cell_px)
     with _timed(log, "adjustment"):
-        adjusted = adjust(replace(start, tracks=tracks), options.adjustment)
+        adjusted = adjust(replace(start, tracks=tracks), first, judge=read is None)
     with _timed(log, "closure"):
         scan = replace(scan, poses=list(adjusted.rig_from_world.values()))
         closing = closing_pairs(scan.handpiece, scan.poses, adjusted.tracks or tracks)
         again = _across_frames(scan, closing, options, "loop closure", progress)
         log["closing_matches"] = float(sum(map(len, again)))
-        if not log["closing_matches"]:
-            return adjusted
-        tracks = _tracks(scan, [*matches, *again], options.cell_px)
-        return adjust(replace(start, rig_from_world=adjusted.rig_from_world, tracks=tracks), options.adjustment)
+        if log["closing_matches"]:
+            tracks = _tracks(scan, [*matches, *again], options.cell_px)
+            joined = replace(start, rig_from_world=adjusted.rig_from_world, tracks=tracks)
+            adjusted = adjust(joined, first, judge=read is None)
+    if read is None:
+        return adjusted
+    with _timed(log, "least_squares"):
+        placed = match_patches(adjusted, read, options.least_squares, progress=progress)
+        found = np.bincount(placed.frame_index, minlength=len(adjusted.frames))
+        few = np.flatnonzero(found < options.odometry.minimum_matches)
+        if len(few):
+            note = (
+                f"motion: in {len(few)} frames ({adjusted.frames[few[0]]} first) hardly any patch is found again, as "
+                "behind glare or blur: keypoints are taken as they are, and the path is less exact"
+            )
+            start, placed = replace(start, notes=(*start.notes, note)), tracks
+        exact = replace(start, rig_from_world=adjusted.rig_from_world, tracks=placed)
+        return adjust(exact, options.adjustment)
 
 
 def locate(
@@ -374,5 +404,10 @@ def locate(
     with _timed(log, "features"):
         features = detect_all(capture, options.features, progress=progress, cache=cache)
     names = [frame.name for frame in capture.frames]
-    found = locate_features(capture.handpiece, features, names, options, progress=progress)
+    frames = {frame.name: frame for frame in capture.frames}
+
+    def read(frame: str, camera: str) -> UInt8[np.ndarray, "h w"]:
+        return np.asarray(cv2.cvtColor(capture.image(frames[frame], camera), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+    found = locate_features(capture.handpiece, features, names, options, read=read, progress=progress)
     return replace(found, dropped=(*capture.left_out, *found.dropped), log={**log, **found.log})

@@ -32,25 +32,37 @@ _STILL_PX = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
-class PatchOptions(Options):
-    """Which patches are followed, and what counts as found."""
+class AlignmentOptions(Options):
+    """How patches are aligned, and what counts as found."""
 
     radius_px: Annotated[int, Range(1, 100)] = 7
     """Half the width of a patch."""
     blur_px: Annotated[float, Range(0, 100)] = 1.0
     """Standard deviation of the Gaussian filter before."""
-    reach: Annotated[int, Range(1, 10_000)] = 12
-    """A patch is looked for so many frames before and after its own."""
-    turn_deg: Annotated[float, Range(0, 180)] = 40.0
-    """Not in frames that look at it from a direction that differs by more."""
     limit_px: Annotated[float, Range(0.01, 1000)] = 3.0
     """Farthest from where it should be."""
     correlation: Annotated[float, Range(-1, 1)] = 0.85
     """Least correlation (-1 to 1) of the patch with where it is found."""
     iterations: Annotated[int, Range(1, 10_000)] = 15
     """Most steps of an alignment."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatchOptions(AlignmentOptions):
+    """Which patches are followed, and what counts as found."""
+
+    reach: Annotated[int, Range(1, 10_000)] = 12
+    """A patch is looked for so many frames before and after its own."""
+    turn_deg: Annotated[float, Range(0, 180)] = 40.0
+    """Not in frames that look at it from a direction that differs by more."""
     minimum_views: Annotated[int, Range(2, 1000)] = 4
     """Points that are found in fewer frames are left as they were."""
+
+
+def smooth(picture: UInt8[np.ndarray, "h w"], sigma_px: float) -> Float32[np.ndarray, "h w"]:
+    """Grey levels without the noise of single pixels."""
+    levels = picture.astype(np.float32)
+    return levels if sigma_px == 0 else np.asarray(cv2.GaussianBlur(levels, (0, 0), sigma_px))
 
 
 @kernel
@@ -68,15 +80,25 @@ def _at(image, x, y):
 
 @kernel
 @no_type_check
-def _template(image, x, y, radius, levels, slopes):
+def _cut(image, places, patches):
+    """Fill in the levels around places; NaN outside."""
+    side = patches.shape[1]
+    for n in range(len(places)):
+        for j in range(side):
+            for i in range(side):
+                patches[n, j, i] = _at(image, places[n, 0] + i - side // 2, places[n, 1] + j - side // 2)
+
+
+@kernel
+@no_type_check
+def _template(patch, levels, slopes):
     """Fill in the levels of a patch less their mean, and their slopes; their standard deviation, NaN at the border."""
-    k = 0
-    for dy in range(-radius, radius + 1):
-        for dx in range(-radius, radius + 1):
-            u, v = x + dx, y + dy
-            levels[k] = _at(image, u, v)
-            slopes[k, 0] = (_at(image, u + 1, v) - _at(image, u - 1, v)) / 2
-            slopes[k, 1] = (_at(image, u, v + 1) - _at(image, u, v - 1)) / 2
+    k, side = 0, len(patch)
+    for j in range(1, side - 1):
+        for i in range(1, side - 1):
+            levels[k] = patch[j, i]
+            slopes[k, 0] = (patch[j, i + 1] - patch[j, i - 1]) / 2
+            slopes[k, 1] = (patch[j + 1, i] - patch[j - 1, i]) / 2
             k += 1
     levels -= levels.mean()
     return np.sqrt((levels**2).mean()) + 0 * slopes.sum()
@@ -84,14 +106,15 @@ def _template(image, x, y, radius, levels, slopes):
 
 @kernel
 @no_type_check
-def _aligned(template, image, here, there, warps, radius, limit, iterations, shifts, correlations):
+def _aligned(patches, image, there, warps, limit, iterations, shifts, correlations):
     """Fill in for every patch its shift from where it should be, and the correlation there; NaN where it is lost."""
+    radius = patches.shape[1] // 2 - 1
     count = (2 * radius + 1) ** 2
     levels, slopes, found = np.empty(count), np.empty((count, 2)), np.empty(count)
-    for n in range(len(here)):
+    for n in range(len(there)):
         shifts[n] = 0.0
         correlations[n] = np.nan
-        spread = _template(template, here[n, 0], here[n, 1], radius, levels, slopes)
+        spread = _template(patches[n], levels, slopes)
         if not spread > _LEAST_CONTRAST:
             continue
         warp = warps[n]
@@ -122,22 +145,31 @@ def _aligned(template, image, here, there, warps, radius, limit, iterations, shi
         shifts[n, 0], shifts[n, 1] = x - there[n, 0], y - there[n, 1]
 
 
+def cut_patches(
+    picture: Float32[np.ndarray, "h w"], places_px: Float[np.ndarray, "n 2"], radius_px: int
+) -> Float32[np.ndarray, "n s s"]:
+    """The patches around places of a picture, with a px more on each side, for their slopes; NaN outside."""
+    patches = np.empty((len(places_px), 2 * radius_px + 3, 2 * radius_px + 3), dtype=np.float32)
+    _cut(picture, np.ascontiguousarray(places_px - OPENCV_PIXEL_OFFSET), patches)
+    return patches
+
+
 def align_patches(
-    template: Float32[np.ndarray, "h w"],
-    image: Float32[np.ndarray, "h w"],
-    here_px: Float[np.ndarray, "n 2"],
+    patches: Float32[np.ndarray, "n s s"],
+    picture: Float32[np.ndarray, "h w"],
     there_px: Float[np.ndarray, "n 2"],
     warps: Float[np.ndarray, "n 2 2"],
-    options: PatchOptions,
+    options: AlignmentOptions,
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
-    """Where patches of one picture are in another, px, and their correlation there (NaN where they are not found).
+    """Where patches (:func:`cut_patches`) are in another picture, px, and their correlation there (NaN where they are
+    not found).
 
     ``warps`` take an offset from the middle of a patch to the one in the other picture; ``there_px`` is where to start.
     """
-    shifts, correlations = np.empty_like(there_px), np.empty(len(here_px))
-    starts = [np.ascontiguousarray(px - OPENCV_PIXEL_OFFSET) for px in (here_px, there_px)]
+    shifts, correlations = np.empty_like(there_px), np.empty(len(there_px))
+    start = np.ascontiguousarray(there_px - OPENCV_PIXEL_OFFSET)
     _aligned(
-        *(template, image, *starts, np.ascontiguousarray(warps), options.radius_px),
+        *(patches, picture, start, np.ascontiguousarray(warps)),
         *(options.limit_px, options.iterations, shifts, correlations),
     )
     return there_px + shifts, correlations
@@ -183,9 +215,10 @@ def lengthen(
     for frame in range(len(names)):
         near = range(max(0, frame - options.reach), min(len(names), frame + options.reach + 1))
         kept = {other: pictures[other] for other in near if other in pictures}
-        pictures = kept | {n: _smooth(read(names[n]), options.blur_px) for n in near if n not in kept}
+        pictures = kept | {n: smooth(read(names[n]), options.blur_px) for n in near if n not in kept}
         mine = np.flatnonzero(tracks.frame_index[own] == frame)
-        follow = partial(_follow, model, poses, pictures, frame, mine, own[mine], options)
+        patches = cut_patches(pictures[frame], tracks.pixels[own[mine]], options.radius_px)
+        follow = partial(_follow, model, poses, pictures, frame, mine, patches, options)
         found += [
             (mine, np.full(len(mine), frame), tracks.pixels[own[mine]]),
             *map_in_threads(follow, [other for other in near if other != frame]),
@@ -203,17 +236,13 @@ def _own_observations(model: SparseModel) -> Int[np.ndarray, "p"]:
     return np.asarray(order[np.unique(tracks.point_index[order], return_index=True)[1]])
 
 
-def _smooth(picture: UInt8[np.ndarray, "h w"], sigma_px: float) -> Float32[np.ndarray, "h w"]:
-    return np.asarray(cv2.GaussianBlur(picture.astype(np.float32), (0, 0), sigma_px))
-
-
 def _follow(
     model: SparseModel,
     poses: _Poses,
     pictures: Mapping[int, np.ndarray],
     here: int,
     mine: Int[np.ndarray, "k"],
-    observations: Int[np.ndarray, "k"],
+    patches: Float32[np.ndarray, "k s s"],
     options: PatchOptions,
     there: int,
 ) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"], Float[np.ndarray, "m 2"]]:
@@ -227,8 +256,7 @@ def _follow(
     step = (depth[seen] / float(np.mean(camera.focal_px)))[:, None]
     beside = [camera.project(poses.inside(there, points + poses.rotations[here][axis] * step)) for axis in (0, 1)]
     warps = np.stack([each - expected for each in beside], axis=-1)
-    own_px = model.tracks.pixels[observations[seen]]
-    pixels, correlation = align_patches(pictures[here], pictures[there], own_px, expected, warps, options)
+    pixels, correlation = align_patches(patches[seen], pictures[there], expected, warps, options)
     good = correlation > options.correlation
     return mine[good], np.full(int(good.sum()), there), pixels[good]
 

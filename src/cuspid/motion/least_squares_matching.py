@@ -1,0 +1,172 @@
+"""Tracks whose places are those of one and the same patch: least squares matching (Gruen 1985).
+
+A keypoint is found in each image by itself, to a quarter of a pixel, and its error hangs on the direction of view: so
+the errors of neighbouring images hang together, and a path bends. Once poses and points are known about, the patch
+around each point, from the image that looks at it most nearly as all do on average, is laid over the other images as
+the plane through the neighbouring points says, and shifted until it fits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+from scipy.spatial import cKDTree
+
+from cuspid.motion.patches import AlignmentOptions, align_patches, cut_patches, smooth
+from cuspid.progress import Progress, silent
+from cuspid.reconstruction import Reconstruction, Tracks
+from cuspid.workers import map_in_threads
+
+_NEIGHBOURS = 12
+"""Points, with the one itself, whose plane a patch lies in."""
+_LEAST_COS = 0.35
+"""Of the angle between a plane's normal and the ray of the patch; a plane seen at a flatter angle is not believed."""
+_STEP_PX = 2.0
+_CROSS = _STEP_PX * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+"""The middle of a patch, and places around it that tell how it is warped."""
+
+Image = tuple[int, int]
+"""Indices of a frame and of a camera."""
+ReadGray = Callable[[str, str], UInt8[np.ndarray, "h w"]]
+"""The grey picture of a frame and a camera by their names."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeastSquaresOptions(AlignmentOptions):
+    """Exact places of keypoints, by patches that are aligned once the poses are known about."""
+
+    enabled: bool = True
+    """Whether keypoints are put in exact places at all."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Views:
+    """Where all images were taken from."""
+
+    found: Reconstruction
+    rotations: Float[np.ndarray, "f c 3 3"]
+    translations: Float[np.ndarray, "f c 3"]
+
+    @staticmethod
+    def of(found: Reconstruction) -> _Views:
+        """``cam_from_world`` of every camera in every frame."""
+        poses = [
+            [each.cam_from_rig @ pose for each in found.rig.cameras.values()] for pose in found.rig_from_world.values()
+        ]
+        rotations = np.array([[pose.rotation for pose in row] for row in poses])
+        return _Views(found, rotations, np.array([[pose.translation for pose in row] for row in poses]))
+
+    def towards(self, tracks: Tracks) -> Float[np.ndarray, "o 3"]:
+        """For each observation the unit vector from its point to the camera."""
+        centres = -np.einsum("fcji,fcj->fci", self.rotations, self.translations)
+        rays = centres[tracks.frame_index, tracks.camera_index] - tracks.points[tracks.point_index]
+        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def own_observations(tracks: Tracks, towards: Float[np.ndarray, "o 3"]) -> Int[np.ndarray, "p"]:
+    """Of each point that was seen, in the order of the points: the observation whose ray is nearest to their mean."""
+    mean = np.zeros_like(tracks.points)
+    np.add.at(mean, tracks.point_index, towards)
+    along = np.einsum("oi,oi->o", towards, mean[tracks.point_index])
+    order = np.lexsort((-along, tracks.point_index))
+    return np.asarray(order[np.unique(tracks.point_index[order], return_index=True)[1]])
+
+
+def normals_of(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+    """Normals, of either sign, of the planes that fit each point and its neighbours best."""
+    _, near = cKDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))
+    off = points[near.reshape(len(points), -1)]
+    off = off - off.mean(axis=1, keepdims=True)
+    return np.asarray(np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))[1][:, :, 0])
+
+
+class _Facets(NamedTuple):
+    """What patches show."""
+
+    own: Int[np.ndarray, "k"]
+    """The observations that the patches are taken from, one for each point that was seen."""
+    crosses: Float[np.ndarray, "p 5 3"]
+    """The places of ``_CROSS`` on the plane of the patch, in the world, mm."""
+
+
+def _facets(views: _Views, tracks: Tracks) -> _Facets:
+    own = own_observations(tracks, views.towards(tracks))
+    normals, crosses = normals_of(tracks.points), np.zeros((len(tracks.points), len(_CROSS), 3))
+    for index, mounted in enumerate(views.found.rig.cameras.values()):
+        mine = own[tracks.camera_index[own] == index]
+        frame, point = tracks.frame_index[mine], tracks.point_index[mine]
+        rotation, translation = views.rotations[frame, index], views.translations[frame, index]
+        rays = mounted.camera.rays((tracks.pixels[mine, None] + _CROSS).reshape(-1, 2)).reshape(-1, len(_CROSS), 3)
+        depth = np.einsum("ni,ni->n", rotation[:, 2], tracks.points[point]) + translation[:, 2]
+        normal = np.einsum("nij,nj->ni", rotation, normals[point])
+        middle = rays[:, 0] / np.linalg.norm(rays[:, 0], axis=1, keepdims=True)
+        flat = np.abs(np.einsum("ni,ni->n", normal, middle)) < _LEAST_COS
+        normal = np.where(flat[:, None], middle, normal)
+        along = np.einsum("ni,nki->nk", normal, rays)
+        inside = rays * (depth[:, None] * along[:, :1] / along)[..., None]
+        crosses[point] = np.einsum("nji,nkj->nki", rotation, inside - translation[:, None])
+    return _Facets(own, crosses)
+
+
+def _by_image(tracks: Tracks, observations: Int[np.ndarray, "k"]) -> dict[Image, Int[np.ndarray, "_"]]:
+    """Observations by their images."""
+    frame, camera = tracks.frame_index[observations], tracks.camera_index[observations]
+    order = np.lexsort((camera, frame))
+    new = np.diff(frame[order], prepend=-1).astype(bool) | np.diff(camera[order], prepend=-1).astype(bool)
+    parts = np.split(observations[order], np.flatnonzero(new)[1:])
+    return {(int(tracks.frame_index[part[0]]), int(tracks.camera_index[part[0]])): part for part in parts if len(part)}
+
+
+def match_patches(
+    found: Reconstruction,
+    read: ReadGray,
+    options: AlignmentOptions,
+    *,
+    progress: Progress = silent,
+) -> Tracks:
+    """The tracks of a reconstruction, which has some, with their places put where the patch of each point is seen;
+    without observations in which it is not found, and points that are seen nowhere else.
+
+    ``read`` may be asked twice for each picture.
+    """
+    tracks = found.tracks
+    assert tracks is not None
+    views = _Views.of(found)
+    facets = _facets(views, tracks)
+    cameras, names = tuple(found.rig.cameras.items()), found.frames
+
+    def picture(image: Image) -> Float32[np.ndarray, "h w"]:
+        return smooth(read(names[image[0]], cameras[image[1]][0]), options.blur_px)
+
+    def cut(image: Image, own: Int[np.ndarray, "k"]) -> Float32[np.ndarray, "k s s"]:
+        return cut_patches(picture(image), tracks.pixels[own], options.radius_px)
+
+    own = _by_image(tracks, facets.own)
+    side = 2 * options.radius_px + 3
+    patches = np.zeros((len(tracks.points), side, side), dtype=np.float32)
+    for observations, some in zip(own.values(), map_in_threads(lambda item: cut(*item), own.items()), strict=True):
+        patches[tracks.point_index[observations]] = some
+
+    def lay(image: Image, others: Int[np.ndarray, "k"]) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, "k"]]:
+        point, camera = tracks.point_index[others], cameras[image[1]][1].camera
+        inside = facets.crosses[point] @ views.rotations[image].T + views.translations[image]
+        crosses = camera.project(inside.reshape(-1, 3)).reshape(-1, len(_CROSS), 2)
+        warps = np.stack([crosses[:, 1] - crosses[:, 2], crosses[:, 3] - crosses[:, 4]], axis=-1) / (2 * _STEP_PX)
+        return align_patches(patches[point], picture(image), tracks.pixels[others], warps, options)
+
+    others = _by_image(tracks, np.setdiff1d(np.arange(len(tracks.point_index)), facets.own))
+    laid = map_in_threads(lambda item: lay(*item), others.items(), stage="patches", progress=progress)
+    pixels, correlation = tracks.pixels.copy(), np.ones(len(tracks.pixels))
+    for observations, (places, alike) in zip(others.values(), laid, strict=True):
+        pixels[observations], correlation[observations] = places, alike
+    good = correlation > options.correlation
+    good &= (np.bincount(tracks.point_index, weights=good) >= 2)[tracks.point_index]
+    return replace(
+        tracks,
+        pixels=pixels[good],
+        **{name: getattr(tracks, name)[good] for name in ("point_index", "frame_index", "camera_index")},
+    )
