@@ -41,14 +41,19 @@ def laid(
     turn_deg=st.floats(-10, 10),
     scale=st.floats(0.9, 1.1),
     gain=st.floats(0.5, 1.0),
+    light=st.tuples(st.floats(-2, 2), st.floats(-2, 2)),
 )
-def test_a_patch_is_found_where_it_went(shift: tuple[float, float], turn_deg: float, scale: float, gain: float) -> None:
+def test_a_patch_is_found_where_it_went(
+    shift: tuple[float, float], turn_deg: float, scale: float, gain: float, light: tuple[float, float]
+) -> None:
+    """Whatever the gain, the offset and the slope of the light."""
     picture, angle = wall(), np.deg2rad(turn_deg)
     linear = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     offset = np.array([200.0, 200.0]) - linear @ [200.0, 200.0]
     # OpenCV's first pixel has its centre at 0.
     matrix = np.column_stack([linear, offset + linear @ [0.5, 0.5] - 0.5])
     moved = gain * cv2.warpAffine(picture, matrix, picture.shape[::-1], flags=cv2.INTER_CUBIC) + 9
+    moved += (light[0] * np.arange(400) + light[1] * np.arange(400)[:, None]).astype(np.float32)
     true = CENTRES @ linear.T + offset
     warps = np.broadcast_to(linear, (len(CENTRES), 2, 2))
     found, correlation = laid(picture, moved, CENTRES, true + shift, warps)

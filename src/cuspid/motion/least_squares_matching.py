@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 from scipy.spatial import cKDTree
 
 from cuspid.motion.patches import AlignmentOptions, align_patches, cut_patches, smooth
+from cuspid.options import Range
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.workers import map_in_threads
@@ -41,6 +42,10 @@ class LeastSquaresOptions(AlignmentOptions):
 
     enabled: bool = True
     """Whether keypoints are put in exact places at all."""
+    radius_px: Annotated[int, Range(1, 100)] = 5
+    """Half the width of a patch; the surface of a wide one is no plane, which shifts it."""
+    blur_px: Annotated[float, Range(0, 100)] = 0.8
+    """Standard deviation of the Gaussian filter before."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -68,7 +68,7 @@ class MotionOptions(Options):
     of the handpiece (0.1 mm at 12 um)."""
     least_squares: LeastSquaresOptions = field(default_factory=LeastSquaresOptions)
     """Patches that make the places of keypoints exact."""
-    cell_px: Annotated[float, Range(0, 10_000)] = 35.0
+    cell_px: Annotated[float, Range(0, 10_000)] = 50.0
     """Every cell of this size of an image keeps its longest track for the adjustment; 0 keeps all tracks."""
     minimum_located: Annotated[float, SHARE] = 0.5
     """Least share (0 to 1) of the frames that must be located for a result."""

@@ -3,7 +3,7 @@
 Keypoints of plain enamel come and go: a track of them is short and its places are uncertain by about a pixel, and so an
 arch bends. Once the poses are known, the patch around each point, from the frame that has it nearest to the middle of
 the picture, is laid over all frames around where it should be seen, and shifted until it fits (Lucas and Kanade 1981,
-with the template's gradients, Baker and Matthews 2004; gain and offset are free).
+with the template's gradients, Baker and Matthews 2004; gain, offset and slope of the light are free).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from cuspid.workers import map_in_threads
 
 _LEAST_CONTRAST = 0.5
 """Standard deviation of the grey levels of a patch, below which it says nothing."""
-_STILL_PX = 0.01
+_STILL_PX = 0.003
 """The alignment ends when a step is shorter."""
 
 
@@ -91,8 +91,30 @@ def _cut(image, places, patches):
 
 @kernel
 @no_type_check
+def _flatten(levels, radius):
+    """Take the plane that fits the levels of a patch best out of them: offset and slope of the light."""
+    total = across = down = square = 0.0
+    k = 0
+    for dy in range(-radius, radius + 1):
+        for dx in range(-radius, radius + 1):
+            total += levels[k]
+            across += dx * levels[k]
+            down += dy * levels[k]
+            square += dx * dx
+            k += 1
+    total, across, down = total / k, across / square, down / square
+    k = 0
+    for dy in range(-radius, radius + 1):
+        for dx in range(-radius, radius + 1):
+            levels[k] -= total + across * dx + down * dy
+            k += 1
+
+
+@kernel
+@no_type_check
 def _template(patch, levels, slopes):
-    """Fill in the levels of a patch less their mean, and their slopes; their standard deviation, NaN at the border."""
+    """Fill in the levels of a patch less the plane through them, and their slopes; their standard deviation, NaN where
+    it reaches over the border."""
     k, side = 0, len(patch)
     for j in range(1, side - 1):
         for i in range(1, side - 1):
@@ -100,7 +122,9 @@ def _template(patch, levels, slopes):
             slopes[k, 0] = (patch[j, i + 1] - patch[j, i - 1]) / 2
             slopes[k, 1] = (patch[j + 1, i] - patch[j - 1, i]) / 2
             k += 1
-    levels -= levels.mean()
+    _flatten(levels, side // 2 - 1)
+    _flatten(slopes[:, 0], side // 2 - 1)
+    _flatten(slopes[:, 1], side // 2 - 1)
     return np.sqrt((levels**2).mean()) + 0 * slopes.sum()
 
 
@@ -130,7 +154,7 @@ def _aligned(patches, image, there, warps, limit, iterations, shifts, correlatio
                 for dx in range(-radius, radius + 1):
                     found[k] = _at(image, x + warp[0, 0] * dx + warp[0, 1] * dy, y + warp[1, 0] * dx + warp[1, 1] * dy)
                     k += 1
-            found -= found.mean()
+            _flatten(found, radius)
             power, common = (found**2).sum(), (found * levels).sum()
             correlations[n] = common / (np.sqrt(power * count) * spread + 1e-9)
             off = slopes_there.T @ (levels - common / (power + 1e-9) * found)

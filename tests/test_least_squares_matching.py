@@ -1,0 +1,124 @@
+"""Laws of least squares matching: places that are off come to where one and the same spot is seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cuspid.capture import Capture
+from cuspid.geometry import Rigid3
+from cuspid.motion.least_squares_matching import LeastSquaresOptions, match_patches, normals_of, own_observations
+from cuspid.reconstruction import Reconstruction, Tracks
+from cuspid.rig import Rig
+from test_odometry import make_capture, make_handpiece
+
+OFF_PX = 0.5
+
+
+@pytest.fixture(scope="module")
+def speckled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, Reconstruction]:
+    """Images of a speckled plane at z = 5, and points on it that are seen a little beside their true places."""
+    rig = Rig({name: each for name, each in make_handpiece().rig.cameras.items() if name != "side"})
+    path = {
+        f"{k:05d}": Rigid3.from_rotation_vector(np.array([0.03 * k, -0.02 * k, 0.03 * k]), np.array([-0.6 * k, 0, 0]))
+        for k in range(2)
+    }
+    rng = np.random.default_rng(3)
+    points = np.column_stack([rng.uniform([-1.5, -1.2], [2.5, 2.0], (250, 2)), np.full(250, 5.0)])
+    rows = []
+    for f, pose in enumerate(path.values()):
+        for c, mounted in enumerate(rig.cameras.values()):
+            pixels = mounted.camera.project((mounted.cam_from_rig @ pose).apply(points))
+            inside = np.flatnonzero(mounted.camera.contains(pixels, 30.0))
+            rows += [(p, f, c, *pixels[p]) for p in inside]
+    index, pixels = np.array([row[:3] for row in rows]), np.array([row[3:] for row in rows])
+    tracks = Tracks(
+        points=points,
+        colors=np.zeros((250, 3), np.uint8),
+        point_index=index[:, 0],
+        frame_index=index[:, 1],
+        camera_index=index[:, 2],
+        pixels=pixels,
+    )
+    folder: Path = tmp_path_factory.mktemp("speckled")
+    return make_capture(folder, rig, path), Reconstruction(rig=rig, rig_from_world=path, tracks=tracks)
+
+
+def matched(speckled: tuple[Capture, Reconstruction], off_px: np.ndarray, *, light: float = 1.0) -> Tracks:
+    """What becomes of the tracks when all places but those of the patches are so far off."""
+    capture, found = speckled
+    tracks = found.tracks
+    own = own_observations(tracks, towards(found))
+    moved = tracks.pixels + off_px
+    moved[own] = tracks.pixels[own]
+
+    def read(frame: str, camera: str) -> np.ndarray:
+        gray = capture.source.read(frame, camera)[..., 0]
+        return gray if camera != "b" else np.rint(light * gray).astype(np.uint8)
+
+    return match_patches(replace(found, tracks=replace(tracks, pixels=moved)), read, LeastSquaresOptions())
+
+
+def towards(found: Reconstruction) -> np.ndarray:
+    """Rays of the observations."""
+    centres = {
+        (f, c): pose.inverse().apply(mounted.centre_in_rig[None])[0]
+        for f, pose in enumerate(found.rig_from_world.values())
+        for c, mounted in enumerate(found.rig.cameras.values())
+    }
+    tracks = found.tracks
+    images = zip(tracks.frame_index.tolist(), tracks.camera_index.tolist(), strict=True)
+    rays = np.array([centres[image] for image in images]) - tracks.points[tracks.point_index]
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def key(tracks: Tracks) -> list[tuple[int, int, int]]:
+    """What each observation is of."""
+    return list(
+        zip(tracks.point_index.tolist(), tracks.frame_index.tolist(), tracks.camera_index.tolist(), strict=True)
+    )
+
+
+@pytest.mark.parametrize("light", [1.0, 0.6])
+def test_places_come_to_where_the_spot_is_seen(speckled: tuple[Capture, Reconstruction], light: float) -> None:
+    """From half a pixel off to a few hundredths, darker images or not; nearly all are found."""
+    true = dict(zip(key(speckled[1].tracks), speckled[1].tracks.pixels, strict=True))
+    rng = np.random.default_rng(0)
+    tracks = matched(speckled, rng.normal(0, OFF_PX, speckled[1].tracks.pixels.shape), light=light)
+    errors = np.linalg.norm(tracks.pixels - np.array([true[each] for each in key(tracks)]), axis=1)
+    moved = errors > 0
+    assert len(errors) > 0.95 * len(true)
+    assert 0.5 < moved.mean() < 0.95
+    assert 0.002 < np.median(errors[moved]) < 0.08
+    assert np.quantile(errors, 0.95) < 0.2
+
+
+def test_where_the_start_was_is_forgotten(speckled: tuple[Capture, Reconstruction]) -> None:
+    """Two starts half a pixel apart end at the same places."""
+    ends = [matched(speckled, np.full(speckled[1].tracks.pixels.shape, off)) for off in (-0.25, 0.25)]
+    one, other = (dict(zip(key(tracks), tracks.pixels, strict=True)) for tracks in ends)
+    both = sorted(one.keys() & other.keys())
+    assert len(both) > 0.95 * max(len(one), len(other))
+    apart = np.array([np.linalg.norm(one[each] - other[each]) for each in both])
+    assert np.quantile(apart, 0.95) < 0.03
+
+
+def test_what_shows_something_else_is_left_out(speckled: tuple[Capture, Reconstruction]) -> None:
+    """Six pixels off there is another speckle; a point whose patch is found nowhere else is no point."""
+    off = np.zeros(speckled[1].tracks.pixels.shape)
+    off[speckled[1].tracks.point_index < 100] = 6.0
+    tracks = matched(speckled, off)
+    assert np.mean(tracks.point_index < 100) < 0.05
+    assert np.bincount(tracks.point_index)[np.unique(tracks.point_index)].min() >= 2
+
+
+def test_normals_are_those_of_the_surface() -> None:
+    """Of points on a sphere, to a few degrees, of either sign."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(3000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    cosines = np.abs(np.einsum("ni,ni->n", normals_of(points), points))
+    assert np.quantile(np.rad2deg(np.arccos(np.clip(cosines, 0, 1))), 0.95) < 5
