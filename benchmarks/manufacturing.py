@@ -1,11 +1,11 @@
 """Scan with handpieces that are not what their files say: held as drawn, and refined within their tolerances.
 
-    python benchmarks/manufacturing.py [--jaw JAW --tooth T] [--seeds 0 1 2] [--only fine usual] [--size half]
+    python benchmarks/manufacturing.py [--jaw JAW --tooth T] [--seeds 0 1 2] [--only fine usual] [--size half] [--held]
                                        [--work FOLDER] [--out benchmarks/results/manufacturing.json]
 
 Twelve cameras, artificial texture, the molar 46 of the phantom, or a jaw of your own (all of it in one pass unless a
-tooth is given). Each handpiece of a row is another one that was built to the same tolerances. Finished scans are kept
-in the work folder and not run again.
+tooth is given). The images are made once, with the drawn handpiece; the file of each case is that of another one that
+was built to the tolerances. Finished scans are kept in the work folder and not run again.
 """
 
 from __future__ import annotations
@@ -14,30 +14,34 @@ import argparse
 import resource
 import tempfile
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
+import numpy as np
 from run import conditions
 
-from cuspid import pipeline
+from cuspid import pipeline, storage
 from cuspid.anatomy.jaw_files import load_jaw
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.capture import Capture
 from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.evaluation.trajectory import trajectory_error
+from cuspid.geometry import Rigid3, best_similarity
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
-from cuspid.jaw import Jaw
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
-from cuspid.simulation.manufacturing import ManufacturingOptions
+from cuspid.simulation.manufacturing import ManufacturingOptions, built, told
 from cuspid.simulation.path.scan import ScanPathOptions
-from cuspid.storage import read_poses, write_json
+from cuspid.storage import write_json
 from cuspid.studies.grid import Case, Value, run_grid
 from cuspid.studies.scan_cases import commit
 
 HERE = Path(__file__).parent
 LENSES = ManufacturingOptions(manufacturing_focal_pct=0.3, manufacturing_centre_px=1.0, manufacturing_k1=0.01)
+CALIBRATIONS: dict[str, Literal["fixed", "refined"]] = {"held": "fixed", "refined": "refined"}
 TOLERANCES = {
     "none": ManufacturingOptions(),
     "fine": ManufacturingOptions(manufacturing_um=3.0, manufacturing_deg=0.02),
@@ -46,27 +50,33 @@ TOLERANCES = {
 }
 
 
-def judge(*, tolerances: str, seed: int, jaw: Jaw, path: ScanPathOptions, pixels: int) -> dict[str, Value]:
-    """The figures of one handpiece, held and refined."""
+def judge(*, tolerances: str, seed: int, scan: Path, held: bool) -> dict[str, Value]:
+    """The figures of one handpiece: the images are those of the drawn one, the file is that of one that was built."""
+    capture = storage.read_capture(scan / "capture")
     manufacturing = replace(TOLERANCES[tolerances], manufacturing_seed=seed)
-    options = SimulationOptions(path=path, manufacturing=manufacturing, seed=seed)
-    handpiece = twelve_cameras(DesignOptions(width_px=pixels, height_px=pixels))
+    off = told(built(capture.handpiece, manufacturing), manufacturing)
+    exact = tolerances == "none"
     figures: dict[str, Value] = {"commit": commit()}
     with tempfile.TemporaryDirectory(prefix="cuspid-built-") as folder:
-        capture, _ = pipeline.simulate(jaw, handpiece, Path(folder), options)
-        figures |= scanned("held", capture, Path(folder), ReconstructionOptions(calibration="fixed"))
-        if tolerances != "none":
-            figures |= scanned("refined", capture, Path(folder), ReconstructionOptions())
+        for how, calibration in CALIBRATIONS.items():
+            if how == ("held" if exact else "refined") or (held and not exact):
+                figures |= scanned(how, replace(capture, handpiece=off), scan, Path(folder), calibration)
     return figures | {"peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6}
 
 
-def scanned(how: str, capture: Capture, folder: Path, options: ReconstructionOptions) -> dict[str, Value]:
-    """The figures of a scan, each with ``how`` before its name."""
+def scanned(
+    how: str, capture: Capture, scan: Path, folder: Path, calibration: Literal["fixed", "refined"]
+) -> dict[str, Value]:
+    """The figures of a scan, each with ``how`` before its name. Keypoints are found once for all handpieces."""
+    (scan / "features").mkdir(exist_ok=True)
+    (folder / how / "motion").mkdir(parents=True)
+    (folder / how / "motion" / "cache").symlink_to((scan / "features").resolve())
+    options = ReconstructionOptions(calibration=calibration)
     begin, begin_cpu = time.perf_counter(), time.process_time()
     reconstruction = pipeline.find_poses(capture, folder / how, options)
     mesh, sigma_um = pipeline.surface(capture, reconstruction, folder / how, options)
     took, took_cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
-    reference = pipeline.load_reference(folder / "truth")
+    reference = pipeline.load_reference(scan / "truth")
     found = pipeline.evaluate(
         mesh,
         reference.jaw,
@@ -75,9 +85,10 @@ def scanned(how: str, capture: Capture, folder: Path, options: ReconstructionOpt
         crown=reference.crown,
         sigma_um=sigma_um,
     )
-    trajectory = trajectory_error(
-        reconstruction.rig_from_world, read_poses(folder / "truth" / "poses.json"), found.reference_from_scan
-    )
+    true = storage.read_poses(scan / "truth" / "poses.json")
+    trajectory = trajectory_error(reconstruction.rig_from_world, true, found.reference_from_scan)
+    scaled = replace(mesh, vertices=mesh.vertices / (1 + found.scale_error_ppm / 1e6))
+    similar = pipeline.evaluate(scaled, reference.jaw, EvaluationOptions(), scannable=reference.scannable)
     expected, within = reconstruction.expectation, found.within_sigmas_pct
     figures: dict[str, Value] = {
         "mean_um": found.accuracy.mean_abs_um,
@@ -86,6 +97,9 @@ def scanned(how: str, capture: Capture, folder: Path, options: ReconstructionOpt
         "scale_ppm": found.scale_error_ppm,
         "inter_molar_um": found.inter_molar_error_um,
         "trajectory_um": trajectory.ape_um.rmse,
+        "similar_mean_um": similar.accuracy.mean_abs_um,
+        "similar_trajectory_um": shape_error_um(reconstruction.rig_from_world, true),
+        "adjustment_s": sum(reconstruction.log.get(each, 0.0) for each in ("adjustment_s", "least_squares_s")),
         "located": len(reconstruction.frames),
         "notes": "; ".join(reconstruction.notes),
         "scale_sigma_ppm": None if expected is None else expected.scale_sigma_ppm,
@@ -98,6 +112,13 @@ def scanned(how: str, capture: Capture, folder: Path, options: ReconstructionOpt
     return {f"{how}_{name}": value for name, value in figures.items()}
 
 
+def shape_error_um(found: Mapping[str, Rigid3], true: Mapping[str, Rigid3]) -> float:
+    """Of the places of the handpiece, RMS, after the best similarity."""
+    places = [np.array([poses[name].inverse().translation for name in found]) for poses in (found, true)]
+    scale, rotation, shift = best_similarity(*places)
+    return float(1000 * np.sqrt(np.mean(np.sum((scale * places[0] @ rotation.T + shift - places[1]) ** 2, axis=1))))
+
+
 def asked() -> argparse.Namespace:
     """What the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -107,6 +128,7 @@ def asked() -> argparse.Namespace:
     parser.add_argument("--tooth", type=int, default=None)
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2])
     parser.add_argument("--only", nargs="*", choices=list(TOLERANCES), default=list(TOLERANCES))
+    parser.add_argument("--held", action="store_true", help="also with the files taken as exact")
     parser.add_argument("--size", choices=("half", "full"), default="full", help="of the images: 250 or 500 px")
     return parser.parse_args()
 
@@ -118,14 +140,17 @@ def main() -> None:
     jaw = load_jaw(arguments.jaw)[0] if own else build_phantom(PhantomOptions())
     path = ScanPathOptions(tooth=arguments.tooth if own else 46, passes="turns")
     what = f"{arguments.jaw.stem if own else 'phantom'}-{path.tooth or 'arch'}-{arguments.size}"
+    px = 500 if arguments.size == "full" else 250
+    scan, drawn = arguments.work / what, twelve_cameras(DesignOptions(width_px=px, height_px=px))
+    pipeline.simulate(jaw, drawn, scan, SimulationOptions(path=path))
     outcomes = run_grid(
         [
             Case(name=f"{each}-seed{seed}", parameters={"tolerances": each, "seed": seed})
             for each in arguments.only
-            for seed in arguments.seeds
+            for seed in (arguments.seeds if each != "none" else arguments.seeds[:1])
         ],
-        partial(judge, jaw=jaw, path=path, pixels=500 if arguments.size == "full" else 250),
-        arguments.work / what,
+        partial(judge, scan=scan, held=arguments.held),
+        scan,
         workers=1,
         progress=lambda stage, done, total: print(f"{stage}: {done} of {total}", flush=True),
     )

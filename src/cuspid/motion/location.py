@@ -52,7 +52,7 @@ class MotionOptions(Options):
     """How the handpiece's way is found from features."""
 
     features: FeatureOptions = field(default_factory=lambda: FeatureOptions(halved_from_px=400))
-    """Keypoints; of images that are halved their places are exact only once patches are aligned."""
+    """Keypoints; images are halved only where patches make the places exact afterwards."""
     pairing: PairingOptions = field(default_factory=PairingOptions)
     """Which cameras are matched within a frame."""
     within: MatchingOptions = field(default_factory=MatchingOptions)
@@ -68,14 +68,20 @@ class MotionOptions(Options):
     of the handpiece (0.1 mm at 12 um)."""
     least_squares: LeastSquaresOptions = field(default_factory=LeastSquaresOptions)
     """Patches that make the places of keypoints exact."""
-    cell_px: Annotated[float, Range(0, 10_000)] = 50.0
-    """Every cell of this size of an image keeps its longest track for the adjustment; 0 keeps all tracks."""
+    cell_px: Annotated[float | None, Range(0, 10_000)] = None
+    """Every cell of this size of an image keeps its longest track for the adjustment; 0 keeps all tracks. By default a
+    tenth of the shorter side."""
     minimum_located: Annotated[float, SHARE] = 0.5
     """Least share (0 to 1) of the frames that must be located for a result."""
     adjustment: AdjustmentOptions = field(default_factory=AdjustmentOptions)
     """The final refinement."""
     seed: Annotated[int, SEED] = 0
     """Of the random samples of the pose estimation."""
+
+    def cell_for(self, rig: Rig) -> float:
+        """Size of the cells that keep their longest track, px."""
+        sides = [min(each.camera.width, each.camera.height) for each in rig.cameras.values()]
+        return min(sides) / 10 if self.cell_px is None else self.cell_px
 
 
 @contextmanager
@@ -355,12 +361,13 @@ def _adjusted(
 ) -> Reconstruction:
     """Tracks over the located frames, adjusted; and again with those that join what was seen twice, and with exact
     places."""
+    cell_px = options.cell_for(start.rig)
     first = options.adjustment if read is None else replace(options.adjustment, rounds=2, tolerance=_ROUGHLY)
     with _timed(log, "matching"):
         pairs = frame_pairs(len(scan.frames), options.reach)
         images = (((i, camera), (j, camera)) for i, j in pairs for camera in scan.handpiece.rig.names)
         matches = [*_within_frames(scan), *_across_frames(scan, images, options, "matching", progress)]
-        tracks = _tracks(scan, matches, options.cell_px)
+        tracks = _tracks(scan, matches, cell_px)
     with _timed(log, "adjustment"):
         adjusted = adjust(replace(start, tracks=tracks), first, judge=read is None)
     with _timed(log, "closure"):
@@ -369,7 +376,7 @@ def _adjusted(
         again = _across_frames(scan, closing, options, "loop closure", progress)
         log["closing_matches"] = float(sum(map(len, again)))
         if log["closing_matches"]:
-            tracks = _tracks(scan, [*matches, *again], options.cell_px)
+            tracks = _tracks(scan, [*matches, *again], cell_px)
             joined = replace(start, rig_from_world=adjusted.rig_from_world, tracks=tracks)
             adjusted = adjust(joined, first, judge=read is None)
     if read is None:
@@ -401,8 +408,10 @@ def locate(
     """
     options, log = options or MotionOptions(), dict[str, float]()
     require_stereo(capture.handpiece, options.pairing)
+    exact = options.least_squares.enabled
+    sought = options.features if exact else replace(options.features, halved_from_px=None)
     with _timed(log, "features"):
-        features = detect_all(capture, options.features, progress=progress, cache=cache)
+        features = detect_all(capture, sought, progress=progress, cache=cache)
     names = [frame.name for frame in capture.frames]
     frames = {frame.name: frame for frame in capture.frames}
 
