@@ -3,8 +3,9 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
+BPY    := build/blender
 
-.PHONY: demo test lint format docs wheel benchmarks clean
+.PHONY: demo test lint format docs wheel benchmarks blender clean
 
 demo: $(STAMP)
 	$(BIN)/cuspid run --tooth 46 --out demo
@@ -40,6 +41,15 @@ wheel: $(STAMP)
 
 benchmarks: $(STAMP)
 	$(BIN)/python benchmarks/run.py --out benchmarks/results
+
+# For the renderer blender and its tests, where CUSPID_BLENDER_PYTHON is build/blender/bin/python.
+blender: $(BPY)/.installed
+
+$(BPY)/.installed: constraints-blender.txt
+	python3.11 -m venv $(BPY)
+	$(BPY)/bin/pip install --quiet --disable-pip-version-check --constraint constraints-blender.txt bpy
+	$(BPY)/bin/python -c 'import bpy'
+	touch $@
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
