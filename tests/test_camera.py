@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -60,6 +62,17 @@ def test_undistortion_is_exact_at_the_corner():
 def test_orthographic_projection_ignores_depth():
     points = np.array([[1.0, 2.0, 3.0], [1.0, 2.0, 30.0]])
     np.testing.assert_array_equal(project_orthographic(points, 10.0), [[10, 20], [10, 20]])
+
+
+def test_a_resized_camera_sees_the_same_in_smaller_pixels():
+    camera = Camera.from_field_of_view(500, 401, 62.0)
+    camera = camera.with_parameters(camera.parameters + [0, 3, 2, -1, -0.08, 0.02, 1e-3, 0])
+    uncertain = replace(camera, covariance=np.diag([4.0, 4, 1, 1, 1e-4, 1e-4, 0, 0]))
+    points = np.array([[0.3, -0.2, 5.0], [-1.0, 1.0, 4.0], [0, 0, 6.0]])
+    small = uncertain.resized(250, 200)
+    np.testing.assert_allclose(small.project(points), camera.project(points) * [0.5, 200 / 401])
+    assert (small.width, small.height) == (250, 200)
+    np.testing.assert_allclose(np.diag(small.covariance)[[0, 3, 4]], [1.0, (200 / 401) ** 2, 1e-4])
 
 
 def test_a_camera_needs_a_positive_focal_length():

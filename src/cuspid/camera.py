@@ -128,6 +128,14 @@ class Camera:
             distortion=parameters[4:],
         )
 
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera whose images are those of this one, resized."""
+        by = np.array([width / self.width, height / self.height])
+        factors = np.concatenate([by, by, np.ones(4)])
+        covariance = None if self.covariance is None else factors[:, None] * self.covariance * factors
+        fewer = replace(self, width=width, height=height, covariance=covariance)
+        return fewer.with_parameters(factors * self.parameters)
+
     def project(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
         """Perspective projection of points in the camera frame (mm) to px. NaN where Z <= 0."""
         depth = points[..., 2:]

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Literal, Protocol, runtime_checkable
 
+import cv2
 import numpy as np
 from jaxtyping import UInt8, UInt16
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from cuspid.errors import InputError
 from cuspid.inputs import require_file
-from cuspid.rig import Handpiece
+from cuspid.rig import Handpiece, Rig
 from cuspid.values import checked_name, one_line
 
 # What is too large or damaged is refused; short of that nothing need be said.
@@ -185,6 +186,42 @@ class ImageFolder:
         return str(self.path(frame, camera))
 
 
+@dataclass(frozen=True)
+class HalvedImages:
+    """The images of another source at half their size. An :class:`ImageSource`."""
+
+    whole: ImageSource
+    """The other source."""
+
+    @property
+    def suffix(self) -> str:
+        """As :attr:`ImageSource.suffix`."""
+        return self.whole.suffix
+
+    def read(self, frame: str, camera: str) -> UInt8[np.ndarray, "h w 3"]:
+        """As :meth:`ImageSource.read`."""
+        image = self.whole.read(frame, camera)
+        size = halved_size(image.shape[1], image.shape[0])
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+    def size(self, frame: str, camera: str) -> tuple[int, int]:
+        """As :meth:`ImageSource.size`."""
+        return halved_size(*self.whole.size(frame, camera))
+
+    def digest(self, frame: str, camera: str) -> str:
+        """As :meth:`ImageSource.digest`."""
+        return self.whole.digest(frame, camera)
+
+    def where(self, frame: str, camera: str) -> str:
+        """As :meth:`ImageSource.where`."""
+        return self.whole.where(frame, camera)
+
+
+def halved_size(width: int, height: int) -> tuple[int, int]:
+    """Of an image of half the size, px."""
+    return max(round(width / 2), 1), max(round(height / 2), 1)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Capture:
     """What a handpiece recorded. Images are read when asked for."""
@@ -197,6 +234,16 @@ class Capture:
     """Where the images come from."""
     left_out: tuple[Dropped, ...] = ()
     """Images that are not there, and why."""
+
+    def halved(self) -> Capture:
+        """The same with images of half the size, and a handpiece that takes such images."""
+        cameras = {
+            name: replace(
+                mounted, camera=mounted.camera.resized(*halved_size(mounted.camera.width, mounted.camera.height))
+            )
+            for name, mounted in self.handpiece.rig.cameras.items()
+        }
+        return replace(self, handpiece=replace(self.handpiece, rig=Rig(cameras)), source=HalvedImages(self.source))
 
     def image(self, frame: Frame, camera: str) -> UInt8[np.ndarray, "h w 3"]:
         """RGB image. Raises InputError where it is missing, broken, or of another size than the camera's."""

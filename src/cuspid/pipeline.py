@@ -75,10 +75,18 @@ __all__ = [
 ]
 
 
+Quality = Literal["draft", "standard"]
+_DRAFT_KEYPOINTS = 500
+_DRAFT_LEFT_SHARE = 0.03
+
+
 @dataclass(frozen=True, kw_only=True)
 class ReconstructionOptions:
     """How images become a mesh."""
 
+    quality: Quality = "standard"
+    """draft: a quick look at a scan, with depth from images of half the size, half of the keypoints, and more small
+    holes. standard: all that the images tell."""
     calibration: Literal["refined", "fixed"] = "refined"
     """refined: as the images want it, within its covariance. fixed: as if the file were exact."""
     nominal: NominalOptions = field(default_factory=NominalOptions)
@@ -119,6 +127,7 @@ def find_poses(
     progress: Progress = silent,
 ) -> Reconstruction:
     """Where the frames were, and the calibration as the images want it (first part of :func:`reconstruct`)."""
+    options = _settled(options)
     handpiece = as_known(capture.handpiece, options)
     capture = replace(capture, handpiece=handpiece)
     if colmap_model is not None:
@@ -136,9 +145,11 @@ def surface(
 ) -> tuple[Mesh, Float[np.ndarray, "v"]]:
     """The mesh, once it is known where the frames were (second part of :func:`reconstruct`), and how well each of its
     vertices is known: standard deviation along the normal, um."""
-    handpiece = replace(capture.handpiece, rig=found.rig)
-    capture, poses = replace(capture, handpiece=handpiece), found.rig_from_world
-    lengths_mm = resolved_mm(handpiece), handpiece.working_distance_mm
+    options = _settled(options)
+    capture, poses = replace(capture, handpiece=replace(capture.handpiece, rig=found.rig)), found.rig_from_world
+    if options.quality == "draft":
+        capture = capture.halved()
+    lengths_mm = resolved_mm(capture.handpiece), capture.handpiece.working_distance_mm
     depths = measure_depth(capture, folder / "depth", options.stereo, progress=progress)
     if options.temporal.enabled:
         depths |= measure_temporal_depth(
@@ -149,6 +160,18 @@ def surface(
         )
     how = options.fusion, options.cleaning
     return fuse(depths, depths.digest, poses, *lengths_mm, folder, *how, expected=found.expectation, progress=progress)
+
+
+def _settled(options: ReconstructionOptions) -> ReconstructionOptions:
+    """With what the quality decides, where nothing else was asked for."""
+    tracking, temporal = options.tracking, options.temporal
+    if options.quality == "standard":
+        return options
+    if tracking.features.count is None:
+        tracking = replace(tracking, features=replace(tracking.features, count=_DRAFT_KEYPOINTS))
+    if temporal.left_share is None:
+        temporal = replace(temporal, left_share=_DRAFT_LEFT_SHARE)
+    return replace(options, tracking=tracking, temporal=temporal)
 
 
 def as_known(handpiece: Handpiece, options: ReconstructionOptions) -> Handpiece:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET
-from cuspid.capture import Capture, Frame
+from cuspid.capture import Capture, Frame, halved_size
 from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.storage.files import write_arrays
@@ -51,7 +51,7 @@ class FeatureOptions(Options):
     def size_for(self, width: int, height: int) -> tuple[int, int]:
         """At which size (px) an image is searched."""
         halved = self.halved_from_px is not None and min(width, height) >= self.halved_from_px
-        return (round(width / 2), round(height / 2)) if halved else (width, height)
+        return halved_size(width, height) if halved else (width, height)
 
     def count_for(self, width: int, height: int) -> int:
         """Most keypoints in an image of a size in px."""

@@ -30,6 +30,9 @@ _STEP_PX = 2.0
 _CROSS = _STEP_PX * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
 """The middle of a patch, and places around it that tell how it is warped."""
 
+_DECIMALS = 9
+"""Of the cosine that chooses the image of a patch."""
+
 Image = tuple[int, int]
 """Indices of a frame and of a camera."""
 ReadGray = Callable[[str, str], UInt8[np.ndarray, "h w"]]
@@ -77,7 +80,8 @@ def own_observations(tracks: Tracks, towards: Float[np.ndarray, "o 3"]) -> Int[n
     mean = np.zeros_like(tracks.points)
     np.add.at(mean, tracks.point_index, towards)
     along = np.einsum("oi,oi->o", towards, mean[tracks.point_index])
-    order = np.lexsort((-along, tracks.point_index))
+    # Two rays are as near to their mean as each other: the first is taken, not the one that rounding prefers.
+    order = np.lexsort((tracks.camera_index, tracks.frame_index, -along.round(_DECIMALS), tracks.point_index))
     return np.asarray(order[np.unique(tracks.point_index[order], return_index=True)[1]])
 
 

@@ -43,9 +43,6 @@ from cuspid.workers import map_in_threads
 _LOOSE_SCALE_PPM, _LOOSE_SPAN_PPM = 1000.0, 300.0
 """Standard deviations of the scale and, apart from it, of the length of a scan, beyond which there is advice."""
 
-_ROUGHLY = 10.0
-"""Tolerance of an adjustment that only tells about where patches lie."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class MotionOptions(Options):
@@ -362,7 +359,7 @@ def _adjusted(
     """Tracks over the located frames, adjusted; and again with those that join what was seen twice, and with exact
     places."""
     cell_px = options.cell_for(start.rig)
-    first = options.adjustment if read is None else replace(options.adjustment, rounds=2, tolerance=_ROUGHLY)
+    first = options.adjustment if read is None else replace(options.adjustment, rounds=2)
     with _timed(log, "matching"):
         pairs = frame_pairs(len(scan.frames), options.reach)
         images = (((i, camera), (j, camera)) for i, j in pairs for camera in scan.handpiece.rig.names)

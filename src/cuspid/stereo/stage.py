@@ -25,6 +25,8 @@ from cuspid.tolerances import held
 from cuspid.workers import map_in_threads
 
 _CODE = ("stereo",)
+_LEFT_SHARE = 0.005
+"""Of the sparse points, that temporal stereo need not reach."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +82,11 @@ def measure_temporal_depth(
     ``folder``: of those that fill holes (:attr:`TemporalOptions.left_share`), which are where fewer than ``least_maps``
     of ``depths`` confirm the sparse points within ``agreement_mm``."""
     steps = _steps(capture, found.rig_from_world, options)
-    if found.tracks is not None and options.left_share > 0:
+    left_share = _LEFT_SHARE if options.left_share is None else options.left_share
+    if found.tracks is not None and left_share > 0:
         sightings = Sightings.of(found, found.tracks)
         missing = sightings.confirmed(depths, found.rig_from_world, agreement_mm) < least_maps
-        steps = _worthwhile(steps, sightings, missing, options.left_share)
+        steps = _worthwhile(steps, sightings, missing, left_share)
 
     def measure(frame: Frame) -> tuple[DepthMap, ...]:
         step = steps[frame.name]

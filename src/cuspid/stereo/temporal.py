@@ -28,10 +28,10 @@ class TemporalOptions(Options):
 
     enabled: bool = True
     """Whether to measure it at all."""
-    left_share: Annotated[float, SHARE] = 0.005
+    left_share: Annotated[float | None, SHARE] = None
     """Cameras are matched with themselves where that fills holes: until, of the sparse points that depth within the
     frames leaves without a surface, no more than this share (0 to 1) of all points is left to be filled. 0: wherever a
-    camera moved enough."""
+    camera moved enough. By default 0.005, of a draft 0.03."""
     confidence_share: Annotated[float, SHARE] = 0.05
     """Its confidence relative to depth from one frame."""
     least_baseline_share: Annotated[float, Range(0, 10)] = 0.08
