@@ -16,9 +16,9 @@ from cuspid.visibility import VisibilityOptions
 
 folder = Path(sys.argv[1])
 
-jaw = build_phantom(PhantomOptions(arch="lower", edge_mm=0.4))  # the default, 0.2 mm, takes longer to make
+jaw = build_phantom(PhantomOptions(arch="lower", edge_mm=0.5))  # the default, 0.2 mm, takes longer to make
 handpiece = DESIGNS["four"](DesignOptions(width_px=240, height_px=240))  # the default, 500 px, takes thrice the time
-path = ScanPathOptions(tooth=46, frames=6, length_mm=5)  # the middle of it; the default is all of it
+path = ScanPathOptions(tooth=46, frames=5, length_mm=4)  # the middle of it; the default is all of it
 capture, truth = pipeline.simulate(jaw, handpiece, folder, pipeline.SimulationOptions(path=path))
 
 reconstruction, mesh = pipeline.reconstruct(capture, folder, pipeline.ReconstructionOptions())

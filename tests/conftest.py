@@ -1,16 +1,21 @@
-"""Values that are costly to make, once for each worker."""
+"""Values that are costly to make, once for each worker.
+
+The package is imported where it is needed: the process that only hands out the tests reads this file, too.
+"""
+
+from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings
 
 import shape_checks
-from cuspid import storage
-from cuspid.anatomy.phantom.build import build_phantom
-from cuspid.anatomy.phantom.options import PhantomOptions
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
+
+if TYPE_CHECKING:
+    from cuspid.jaw import Jaw
+    from cuspid.mesh import Mesh
 
 # Machines differ in speed, and a test says nothing about it.
 settings.register_profile("cuspid", deadline=None)
@@ -26,12 +31,17 @@ def shapes_are_checked() -> None:
 @pytest.fixture(scope="session")
 def coarse_phantom() -> Jaw:
     """The built-in lower jaw with coarse faces."""
+    from cuspid.anatomy.phantom.build import build_phantom
+    from cuspid.anatomy.phantom.options import PhantomOptions
+
     return build_phantom(PhantomOptions(edge_mm=0.5))
 
 
 @pytest.fixture(scope="session")
 def phantom_file(tmp_path_factory: pytest.TempPathFactory, coarse_phantom: Jaw) -> Path:
     """The same as a file."""
+    from cuspid import storage
+
     path = tmp_path_factory.mktemp("jaw") / "phantom_lower.ply"
     storage.write_jaw(path, coarse_phantom)
     return path

@@ -16,6 +16,7 @@ import signal
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -67,6 +68,7 @@ class Scenario:
 # --- scenarios ----------------------------------------------------------------------------------------------------
 
 
+@cache
 def small_jaw() -> Jaw:
     """A molar with its neighbours, in big faces."""
     jaw = build_phantom(PhantomOptions(edge_mm=1.0))
@@ -219,12 +221,19 @@ def _probe(folder: Path) -> None:
 
 HOLDER = ("--out", f"@{_OUT}", "--body", f"@{_OUT}/holder.stl")
 PROBE = ("--handpiece", "@handpiece.json", "--tooth", str(TOOTH))
-SCAN = ("--frames", "3", "--length-mm", "1.5", "--supersampling", "1")
+SCAN = ("--frames", "2", "--length-mm", "0.8", "--supersampling", "1")
 
 
-def _textured_scan(folder: Path) -> None:
-    _probe(folder)
-    verb("simulate", "@jaw.ply", *PROBE, *SCAN, "--out", "@scan")(folder)
+def _textured_capture(folder: Path) -> None:
+    """A scan, of which the folder has what reconstruction is given."""
+    with tempfile.TemporaryDirectory() as made:
+        _probe(Path(made))
+        verb("simulate", "@jaw.ply", *PROBE, *SCAN, "--out", "@scan")(Path(made))
+        shutil.move(Path(made) / "scan" / "capture", folder)
+
+
+def _four_cameras(folder: Path) -> None:
+    storage.write_handpiece(folder / "handpiece.json", DESIGNS["four"]())
 
 
 def _arch(folder: Path) -> None:
@@ -302,9 +311,9 @@ SCENARIOS: Mapping[str, Scenario] = {
     "measure": Scenario(_arch, verb("measure", "@jaw.ply", "--out", f"@{_OUT}")),
     "simulate": Scenario(_probe, verb("simulate", "@jaw.ply", *PROBE, *SCAN, "--out", f"@{_OUT}")),
     "precision": Scenario(_probe, verb("precision", "@jaw.ply", *PROBE, "--out", f"@{_OUT}")),
-    "mouth": Scenario(_probe, verb("mouth", "--handpiece", "@handpiece.json", "--out", f"@{_OUT}")),
-    "holder": Scenario(_probe, verb("handpiece", "--handpiece", "@handpiece.json", *HOLDER)),
-    "reconstruct": Scenario(_textured_scan, verb("reconstruct", "@scan/capture", "--out", f"@{_OUT}")),
+    "mouth": Scenario(_four_cameras, verb("mouth", "--handpiece", "@handpiece.json", "--out", f"@{_OUT}")),
+    "holder": Scenario(_four_cameras, verb("handpiece", "--handpiece", "@handpiece.json", *HOLDER)),
+    "reconstruct": Scenario(_textured_capture, verb("reconstruct", "@capture", "--out", f"@{_OUT}")),
     "calibrate": Scenario(
         _photographs,
         verb("calibrate", "@photos", "--columns", "6", "--rows", "5", "--square-mm", "3", "--out", f"@{_OUT}"),

@@ -11,9 +11,19 @@ from cuspid.errors import ReconstructionError
 from cuspid.studies.grid import Case, run_grid
 
 
-def square(x: int, delay_s: float = 0.0) -> dict[str, float]:
-    time.sleep(delay_s)
+def square(x: int) -> dict[str, float]:
     return {"square_mm2": float(x * x)}
+
+
+def square_unless(x: int) -> dict[str, float]:
+    """Refuses 2, is killed by 3, breaks on 0, and is slow with 5."""
+    if x == 2:
+        raise ReconstructionError("no surface: the images need texture")
+    if x == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if x == 5:
+        time.sleep(1.0)
+    return {"square_mm2": x * x * x / x}
 
 
 def starts_a_child(x: int) -> dict[str, float]:
@@ -25,21 +35,9 @@ def starts_a_child(x: int) -> dict[str, float]:
     return {"core": float(min(cores))}
 
 
-def refuses_two(x: int) -> dict[str, float]:
-    if x == 2:
-        raise ReconstructionError("no surface: the images need texture")
-    return {"half": 1 / (x - 3) if x != 4 else x / 2}
-
-
 def leaves_a_mark(x: int, folder: str) -> dict[str, float]:
     with (Path(folder) / "calls").open("a") as stream:
         stream.write(f"{x}\n")
-    return {"y": float(x)}
-
-
-def dies_on_three(x: int) -> dict[str, float]:
-    if x == 3:
-        os.kill(os.getpid(), signal.SIGKILL)
     return {"y": float(x)}
 
 

@@ -14,8 +14,8 @@ _trusted = []
 
 
 def first_calls(stub):
-    """Beartype for jaxtyping, until a function was called often enough."""
-    checked, calls = beartype(stub), itertools.count(1)
+    """Beartype for jaxtyping, from the first call of a function until it was called often enough."""
+    checked, calls = functools.cache(lambda: beartype(stub)), itertools.count(1)
 
     @functools.wraps(stub)
     def check(*arguments, **named):
@@ -26,7 +26,7 @@ def first_calls(stub):
             if not function.__module__.startswith("cuspid.cli"):
                 function.__no_type_check__ = True
                 _trusted.append(function)
-        return checked(*arguments, **named)
+        return checked()(*arguments, **named)
 
     return check
 

@@ -165,7 +165,7 @@ def linearised(state, frame, camera, point):
     return pixel, jacobian
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_jacobian_agrees_with_finite_differences(seed: int) -> None:
     """By point, pose, extrinsics and intrinsics, with distortion, away from the prior."""
@@ -328,7 +328,7 @@ def test_perfect_observations_give_the_truth() -> None:
 
 def test_poses_are_as_uncertain_as_their_covariance_says() -> None:
     """Mean normalised error squared (NEES) over seeds is that of chi-square with six degrees of freedom."""
-    scene = make_scene()
+    scene = make_scene(points=150)
     squares = []
     for seed in range(12):
         found = adjust(disturbed(scene, np.random.default_rng(seed)))
@@ -342,7 +342,7 @@ def test_poses_are_as_uncertain_as_their_covariance_says() -> None:
 
 def test_errors_that_hang_together_within_a_track_are_accounted_for() -> None:
     """A keypoint slides over the surface from frame to frame, in all cameras alike: a walk for each point."""
-    scene = make_scene(frames=8, points=500)
+    scene = make_scene(frames=8, points=300)
     tracks, squares, ignored = scene.tracks, [], []
     for seed in range(4):
         rng = np.random.default_rng(seed)
@@ -391,7 +391,7 @@ def test_the_surface_is_as_uncertain_as_is_expected(free: bool) -> None:
     for seed in range(6):
         rng = np.random.default_rng(seed)
         rig = drawn_from_priors(nominal, rng) if free else nominal
-        scene = make_scene(rig=rig, points=200)
+        scene = make_scene(rig=rig, points=120)
         found = adjust(disturbed(scene, rng, rig=nominal))
         expected, true, ours = found.expectation, scene.tracks.points, as_the_motion_has_it(found, scene)
         squares.append(np.mean(np.sum((fitted(ours, true) - true) ** 2, axis=1)))
@@ -421,7 +421,7 @@ def test_calibration_is_as_uncertain_as_its_covariance_says() -> None:
     poses, extrinsics, parameters, before, after = [], [], [], [], []
     for seed in range(10):
         rng = np.random.default_rng(seed)
-        scene = make_scene(rig=drawn_from_priors(nominal, rng), points=150)
+        scene = make_scene(rig=drawn_from_priors(nominal, rng), points=100)
         found = adjust(disturbed(scene, rng, rig=nominal))
         motions, shifts = calibration_errors(found.rig, scene.rig)
         mounted = list(found.rig.cameras.values())
@@ -444,7 +444,7 @@ def test_the_start_does_not_decide_the_scale(size: float) -> None:
     """Only the prior knows the scale of a free rig; the size of poses and points at the start is no news."""
     nominal = with_priors(make_rig())
     rng = np.random.default_rng(4)
-    start = disturbed(make_scene(rig=drawn_from_priors(nominal, rng), frames=12, points=400), rng, rig=nominal)
+    start = disturbed(make_scene(rig=drawn_from_priors(nominal, rng), frames=12, points=200), rng, rig=nominal)
     resized = replace(
         start,
         rig_from_world={n: Rigid3(p.rotation, size * p.translation) for n, p in start.rig_from_world.items()},
@@ -534,11 +534,13 @@ def test_result_does_not_depend_on_the_gauge() -> None:
     assert other.reprojection_rms_px == pytest.approx(one.reprojection_rms_px, rel=1e-6)
 
 
-def test_result_is_repeatable() -> None:
-    """Bit for bit, for the sums have a fixed order."""
+def test_result_is_repeatable(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bit for bit, for the sums have a fixed order; in threads and, of few points, without them."""
     start = disturbed(make_scene(), np.random.default_rng(8))
-    one, other = adjust(start), adjust(start)
-    np.testing.assert_array_equal(one.tracks.points, other.tracks.points)
+    alone = adjust(start)
+    monkeypatch.setattr(normal_equations, "_FEW", 0)
+    for found in (adjust(start), adjust(start)):
+        np.testing.assert_array_equal(found.tracks.points, alone.tracks.points)
 
 
 def test_a_frame_without_observations_is_an_error() -> None:

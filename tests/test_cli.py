@@ -96,9 +96,9 @@ def test_evaluate_works_on_meshes_that_cuspid_never_saw(tmp_path, capsys, jaw_li
     storage.write_mesh(tmp_path / "reference.stl", jaw_like)
     turned = jaw_like.transformed(Rigid3.from_rotation_vector(np.array([1.0, 2, 0.5]), np.array([100.0, 5, -30])))
     storage.write_mesh(tmp_path / "scan.obj", turned)
-    cli.main(
-        ["evaluate", str(tmp_path / "scan.obj"), str(tmp_path / "reference.stl"), "--out", str(tmp_path / "result")]
-    )
+    search = ("--registration.search.targets", 1500, "--registration.search.candidates", 200)
+    few = ("--samples", 50_000, "--registration.samples", 20_000)
+    run("evaluate", tmp_path / "scan.obj", tmp_path / "reference.stl", "--out", tmp_path / "result", *search, *few)
     trueness = storage.read_json(tmp_path / "result" / "trueness.json")
     assert 0 <= trueness["mean_abs_um"] < 0.5
     assert trueness["completeness_pct"]["50"] > 99.9
@@ -109,9 +109,17 @@ def test_evaluate_works_on_meshes_that_cuspid_never_saw(tmp_path, capsys, jaw_li
     assert "Trueness" in capsys.readouterr().out
 
 
+def test_every_verb_is_in_the_help(capsys):
+    with pytest.raises(SystemExit) as caught:
+        run("--help")
+    assert caught.value.code == 0
+    printed = capsys.readouterr().out
+    assert all(verb in printed for verb in cli.COMMANDS)
+
+
 def test_the_module_runs():
-    done = subprocess.run([sys.executable, "-m", "cuspid", "--help"], capture_output=True, text=True, check=True)
-    assert all(verb in done.stdout for verb in cli.COMMANDS)
+    done = subprocess.run([sys.executable, "-m", "cuspid", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == f"cuspid {__version__}\n"
 
 
 def test_the_version(capsys):
@@ -127,8 +135,10 @@ def test_only_what_is_asked_for_is_loaded(asked, modules):
     assert {name.split(".")[2] for name in loaded if name.startswith("cuspid.cli.")} == modules
 
 
-def test_an_evaluation_keeps_nothing_of_another_one(tmp_path):
+def test_an_evaluation_keeps_nothing_of_another_one(tmp_path, monkeypatch):
     """Of another mesh, errors of poses, spheres and margins would look like those of this one."""
+    for costly in ("save_deviation_picture", "report"):
+        monkeypatch.setattr(f"cuspid.cli.scan.{costly}", lambda *_, **__: None)
     mesh, out = tmp_path / "scan.stl", tmp_path / "out"
     storage.write_mesh(mesh, sphere(8.0, 3))
     run("evaluate", mesh, mesh, "--out", out, "--no-align", "--samples", 2000)

@@ -76,7 +76,7 @@ def test_only_what_sees_the_same_from_the_same_side_is_paired():
 def test_a_way_back_is_tied_to_the_way_there(monkeypatch: pytest.MonkeyPatch, calibrated: bool):
     """The frames of the end come to those of the beginning much better than by the chain alone."""
     handpiece, path = without_far_sight(), there_and_back()
-    seen = see(handpiece, path, points=1600, length_mm=20.0)
+    seen = see(handpiece, path, points=1000, length_mm=20.0)
     handpiece = handpiece if calibrated else wrongly_calibrated(handpiece)
     closed = locate_features(handpiece, seen, list(path), MotionOptions())
     assert closed.log["closing_matches"] > 100
@@ -88,5 +88,5 @@ def test_a_way_back_is_tied_to_the_way_there(monkeypatch: pytest.MonkeyPatch, ca
 
 def test_one_way_has_nothing_to_close():
     handpiece, path = without_far_sight(), dict(list(there_and_back().items())[:OUT])
-    found = locate_features(handpiece, see(handpiece, path, points=1600, length_mm=20.0), list(path), MotionOptions())
+    found = locate_features(handpiece, see(handpiece, path, points=1000, length_mm=20.0), list(path), MotionOptions())
     assert found.log["closing_matches"] == 0

@@ -12,8 +12,8 @@ from fuzzing import SCENARIOS, Fuzzer, wrong_with
 CASES = 19
 """Of each scenario."""
 FEWER = {
-    **{name: 8 for name in SCENARIOS if name.startswith("report")},
-    **dict.fromkeys(("evaluate", "measure", "simulate", "precision", "mouth", "holder", "reconstruct"), 4),
+    **{name: 8 for name in SCENARIOS if name.startswith("report") or name == "reconstruct"},
+    **dict.fromkeys(("evaluate", "measure", "simulate", "precision"), 4),
     **dict.fromkeys(("stitch", "stitch-eval"), 3),
 }
 """Of those that take longest."""

@@ -89,7 +89,7 @@ def test_a_path_around_an_obstacle_fits_and_still_sees(
 
 @pytest.mark.parametrize(
     "teeth",
-    [(41, 42, 43, 44, 45, 46, 47), (43, 42, 41, 31, 32, 33), (46,), (45,), (31,), (34, 35, 36), (47, 44, 42, 31, 35)],
+    [(41, 42, 43, 44, 45, 46, 47), (43, 42, 41, 31, 32, 33), (46,), (45,), (31,), (34, 35, 36), (44, 42, 31)],
     ids=str,
 )
 def test_parts_of_an_arch_are_scanned(coarse_phantom: Jaw, teeth: tuple[int, ...]) -> None:

@@ -136,15 +136,13 @@ def test_a_crown_preparation_lowers_the_occlusal_surface(jaw: Jaw, prepared: Jaw
 
 def test_a_crack_has_its_width_and_depth(jaw: Jaw, prepared: Jaw, sites: dict[int, ToothSite]) -> None:
     bottom = sites[46].site_from_jaw.apply(prepared.lines["46.crack_bottom"])
-    found = []
-    for k in range(len(bottom) // 3, 2 * len(bottom) // 3, 5):
-        along = bottom[k + 1, :2] - bottom[k - 1, :2]
-        across = np.array([-along[1], along[0]]) / np.linalg.norm(along)
-        offsets = np.arange(-0.15, 0.15, 0.001)
-        xy = bottom[k, :2] + offsets[:, None] * across
-        deep = heights(jaw, sites[46], xy) - heights(prepared, sites[46], xy)
-        found.append((1000 * 0.001 * np.sum(deep > 0.005), 1000 * deep.max()))
-    width_um, depth_um = np.median(found, axis=0)
+    middle = np.arange(len(bottom) // 3, 2 * len(bottom) // 3, 5)
+    along = bottom[middle + 1, :2] - bottom[middle - 1, :2]
+    across = np.column_stack([-along[:, 1], along[:, 0]]) / np.linalg.norm(along, axis=1, keepdims=True)
+    xy = (bottom[middle, None, :2] + np.arange(-0.15, 0.15, 0.001)[:, None] * across[:, None]).reshape(-1, 2)
+    deep = (heights(jaw, sites[46], xy) - heights(prepared, sites[46], xy)).reshape(len(middle), -1)
+    width_um = np.median(1000 * 0.001 * np.sum(deep > 0.005, axis=1))
+    depth_um = np.median(1000 * deep.max(axis=1))
     assert width_um == pytest.approx(150, abs=10)
     assert depth_um == pytest.approx(1000, abs=10)
 
@@ -165,8 +163,9 @@ def test_an_inlay_has_its_isthmus_depth_and_divergence(
     assert divergence == pytest.approx(options.divergence_deg, abs=2.5)
     assert opened[0] - 0.8 * np.tan(np.deg2rad(8)) == pytest.approx(options.isthmus_width_mm, abs=0.05)
     x = np.linspace(-0.5, 0.5, 21) * site.width_mm / 2
-    lines = [heights(jaw, site, np.column_stack([0 * y + each, y])) for each in x]
-    groove = np.median([line[np.abs(y - y[len(y) // 2]) < 1.5].min() for line in lines])
+    near = y[np.abs(y - y[len(y) // 2]) < 1.5]
+    lines = heights(jaw, site, np.stack(np.meshgrid(x, near, indexing="ij"), axis=-1).reshape(-1, 2))
+    groove = np.median(lines.reshape(len(x), -1).min(axis=1))
     assert groove - floor == pytest.approx(options.pulpal_depth_mm, abs=0.1)
 
 

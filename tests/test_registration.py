@@ -17,7 +17,7 @@ from horseshoe import horseshoe
 from strategies import rigid3s
 from synthetic_scene import height_field
 
-FAST = RegistrationOptions(search=SearchOptions(targets=2500, candidates=300), samples=20_000)
+FAST = RegistrationOptions(search=SearchOptions(targets=1500, candidates=200), samples=10_000)
 
 
 @cache
@@ -45,9 +45,8 @@ def noisy(mesh: Mesh, sd_mm: float) -> Mesh:
     return Mesh(mesh.vertices + noise[:, None] * mesh.vertex_normals, mesh.faces)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_an_identical_surface_is_laid_exactly_from_any_pose(seed: int):
-    scan_from_reference = any_pose(seed, 200)
+def test_an_identical_surface_is_laid_exactly():
+    scan_from_reference = any_pose(1, 200)
     scan = jaw().mesh.transformed(scan_from_reference)
     found = register(scan, surface(), FAST, rng=np.random.default_rng(0))
     assert error_um(found.reference_from_scan, scan_from_reference.inverse(), scan.vertices) < 0.1
@@ -133,14 +132,14 @@ def test_a_flaring_rim_neither_moves_nor_swells_the_rest(most_mm: float):
     assert abs(found.scale - 1) < 2e-4
 
 
-@pytest.mark.parametrize("off_mm", [0.05, 0.3])
-def test_a_plate_that_slides_but_for_two_posts_finds_its_place(off_mm: float):
+def test_a_plate_that_slides_but_for_two_posts_finds_its_place():
     """All that holds it are their walls, a thirtieth of it, which lie far beyond the usual errors at first."""
 
     def posts(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return 5 - sum(0.3 * (1 + np.tanh((0.7 - np.hypot(x - a, y - b)) / 0.02)) for a, b in ((-2, -1), (1.5, 1.2)))
 
     plate = height_field(posts, count=600)
-    points = noisy(plate, 0.0005).sample(20_000, np.random.default_rng(0))[0]
-    found = fit(points, SignedDistance(plate), Rigid3(np.eye(3), np.array([off_mm, -off_mm / 2, 0])), FAST)
-    assert error_um(found.reference_from_scan, Rigid3.identity(), plate.vertices) < 0.5
+    points, surface = noisy(plate, 0.0005).sample(20_000, np.random.default_rng(0))[0], SignedDistance(plate)
+    for off_mm in (0.05, 0.3):
+        found = fit(points, surface, Rigid3(np.eye(3), np.array([off_mm, -off_mm / 2, 0])), FAST)
+        assert error_um(found.reference_from_scan, Rigid3.identity(), plate.vertices) < 0.5, off_mm

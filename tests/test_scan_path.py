@@ -159,9 +159,9 @@ def test_unknown_teeth_are_refused(coarse_phantom: Jaw) -> None:
 
 
 def test_a_handpiece_that_would_touch_the_jaw_is_lifted(coarse_phantom: Jaw, caplog: pytest.LogCaptureFixture) -> None:
-    steady = Room(coarse_phantom.mesh, twelve_cameras().solid, 4.0)
-    least = min(steady.clearance(pose)[0] for pose in steady_poses(coarse_phantom, STILL, 10))
-    wanted = replace(STILL, clearance_mm=least + 0.3)
+    still, steady = replace(STILL, length_mm=5.0), Room(coarse_phantom.mesh, twelve_cameras().solid, 4.0)
+    least = min(steady.clearance(pose)[0] for pose in steady_poses(coarse_phantom, still, 10))
+    wanted = replace(still, clearance_mm=least + 0.3)
     with caplog.at_level("INFO", logger="cuspid"):
         path = plan(coarse_phantom, wanted)
     clearances = [steady.clearance(pose)[0] for pose in path.rig_from_world.values()]
@@ -171,7 +171,7 @@ def test_a_handpiece_that_would_touch_the_jaw_is_lifted(coarse_phantom: Jaw, cap
 
 def test_what_sees_nothing_where_it_fits_is_refused(coarse_phantom: Jaw) -> None:
     with pytest.raises(InputError, match="no camera sees the jaw in focus"):
-        plan(coarse_phantom, replace(STILL, clearance_mm=11.0), essential_four())
+        plan(coarse_phantom, replace(STILL, length_mm=5.0, clearance_mm=11.0), essential_four())
 
 
 def with_gap(jaw: Jaw, teeth: tuple[int, ...], ridge_mm: float) -> Jaw:

@@ -58,6 +58,13 @@ def test_slices_follow_each_other_and_leave_nothing_out(count, parts):
     assert max(sizes) - min(sizes) <= 1
 
 
+def test_few_items_start_no_threads_and_are_cut_alike():
+    where = map_slices(lambda part: (part, threading.get_ident()), 99, 4, few=100)
+    assert {thread for _, thread in where} == {threading.get_ident()}
+    assert [part for part, _ in where] == map_slices(lambda part: part, 99, 4)
+    assert threading.get_ident() not in map_slices(lambda _: threading.get_ident(), 100, 4, few=100)
+
+
 def test_where_slices_are_cut_does_not_depend_on_the_cores():
     assert map_slices(lambda part: part, 1000, 4) == pinned(lambda: map_slices(lambda part: part, 1000, 4))
 

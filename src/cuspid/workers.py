@@ -51,10 +51,14 @@ def map_in_threads(
     return results
 
 
-def map_slices(work: Callable[[slice], _Result], count: int, parts: int | None = None) -> list[_Result]:
+def map_slices(
+    work: Callable[[slice], _Result], count: int, parts: int | None = None, *, few: int = 0
+) -> list[_Result]:
     """``work``, which must release the GIL, on consecutive slices of ``count`` items, in threads; results in order.
 
-    One slice for each usable core, or so many ``parts`` where the result depends on where they are cut.
+    One slice for each usable core, or so many ``parts`` where the result depends on where they are cut. Of fewer items
+    than ``few`` the slices are worked on one after the other: they are done before threads have started.
     """
     bounds = np.linspace(0, count, (parts or usable_cores()) + 1).astype(int)
-    return map_in_threads(work, [slice(*ends) for ends in pairwise(bounds.tolist())])
+    slices = [slice(*ends) for ends in pairwise(bounds.tolist())]
+    return [work(each) for each in slices] if count < few else map_in_threads(work, slices)

@@ -23,6 +23,8 @@ CALIBRATION = 14
 _COLUMNS = 3 + POSE + CALIBRATION
 _PARTS = 4
 """Fixed, for the order of a sum shows in its last bits: the result must not depend on the number of cores."""
+_FEW = 1000
+"""Points that are not worth threads."""
 _FLATTEST = 1e-3
 """Depth of a point, as a share of its distance from the axis, from which it counts as before the camera."""
 _SETTLING = 4
@@ -453,7 +455,7 @@ def normal_equations(state: State, observations: Observations, weighting: Weight
         _accumulate(state, observations, weighting, points.start, points.stop, system)
         return system
 
-    parts = map_slices(part, len(state.points), _PARTS)
+    parts = map_slices(part, len(state.points), _PARTS, few=_FEW)
     matrix, gradient, diagonal = (sum(terms[1:], terms[0]) for terms in zip(*parts, strict=True))
     if weighting.calibrated:
         prior = np.arange(size, total)
@@ -474,6 +476,7 @@ def scatter_of_tracks(state: State, observations: Observations, weighting: Weigh
         lambda points: _scores(state, observations, weighting, points.start, points.stop, blocks),
         len(state.points),
         _PARTS,
+        few=_FEW,
     )
     columns = np.concatenate(
         [
@@ -516,7 +519,7 @@ def substitute(
     def part(points: slice) -> None:
         _substitute(state, observations, weighting, step, points.start, points.stop, moved)
 
-    map_slices(part, len(moved), _PARTS)
+    map_slices(part, len(moved), _PARTS, few=_FEW)
     return moved
 
 
@@ -528,7 +531,7 @@ def settle(state: State, observations: Observations, weighting: Weighting) -> St
     def part(points: slice) -> None:
         _settle(settled, observations, held, points.start, points.stop)
 
-    map_slices(part, len(state.points), _PARTS)
+    map_slices(part, len(state.points), _PARTS, few=_FEW)
     return settled
 
 

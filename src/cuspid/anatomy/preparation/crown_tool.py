@@ -221,12 +221,16 @@ def _wall(
     depth = floor + (shape.axial_mm - floor) * smooth_step(rise.ravel(), 0.0, 1.2).reshape(rise.shape)
     within = _plan_distance(site, line)
     radii = np.repeat(line.radius[:, None], heights.shape[1], axis=1)
+    moving = np.ones(radii.shape, dtype=bool)
     for _ in range(25):
-        points = _points(site, line.angles, radii, heights).reshape(-1, 3)
-        from_walls = inset.ravel() - within(points[:, :2])
-        from_surface = np.maximum(site.side_distance(points) + depth.ravel(), -9.0)
-        excess = smooth_max(from_walls, from_surface, 0.1).reshape(radii.shape)
-        radii = np.maximum(radii - np.maximum(excess, 0.0), 0.05)
+        points = _points(site, line.angles, radii, heights)[moving]
+        from_walls = inset[moving] - within(points[:, :2])
+        from_surface = np.maximum(site.side_distance(points) + depth[moving], -9.0)
+        excess = smooth_max(from_walls, from_surface, 0.1)
+        before, radii[moving] = radii[moving], np.maximum(radii[moving] - np.maximum(excess, 0.0), 0.05)
+        moving[moving] = radii[moving] != before
+        if not moving.any():
+            break
     return radii
 
 
