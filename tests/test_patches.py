@@ -68,6 +68,8 @@ def test_what_is_not_there_is_not_found() -> None:
     _, on_other = laid(here, other, CENTRES, CENTRES, warps)
     assert not np.any(on_other > 0.85)
     assert np.isnan(laid(flat, flat, CENTRES, CENTRES, warps)[1]).all()
+    for nowhere in (0.0, np.nan):
+        assert np.isnan(laid(here, here, CENTRES, CENTRES, np.broadcast_to(nowhere * np.eye(2), warps.shape))[1]).all()
     border = np.full_like(CENTRES, 3.0)
     assert np.isnan(laid(here, here, border, border, warps)[1]).all()
 

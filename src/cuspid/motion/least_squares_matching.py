@@ -130,12 +130,50 @@ def _by_image(tracks: Tracks, observations: Int[np.ndarray, "k"]) -> dict[Image,
     return {(int(tracks.frame_index[part[0]]), int(tracks.camera_index[part[0]])): part for part in parts if len(part)}
 
 
+@dataclass(frozen=True, eq=False)
+class _Matching:
+    """What is laid over what."""
+
+    views: _Views
+    tracks: Tracks
+    read: ReadGray
+    options: AlignmentOptions
+
+    def picture(self, image: Image) -> Float32[np.ndarray, "h w"]:
+        """Of an image, smooth."""
+        frame, camera = self.views.found.frames[image[0]], self.views.found.rig.names[image[1]]
+        return smooth(self.read(frame, camera), self.options.blur_px)
+
+    def patches(self, own: Int[np.ndarray, "k"]) -> Float32[np.ndarray, "p s s"]:
+        """Of all points, from their own observations."""
+        side = 2 * self.options.radius_px + 3
+        patches = np.zeros((len(self.tracks.points), side, side), dtype=np.float32)
+        parts = _by_image(self.tracks, own)
+
+        def cut(part: tuple[Image, Int[np.ndarray, "_"]]) -> Float32[np.ndarray, "_ s s"]:
+            return cut_patches(self.picture(part[0]), self.tracks.pixels[part[1]], self.options.radius_px)
+
+        for mine, some in zip(parts.values(), map_in_threads(cut, parts.items()), strict=True):
+            patches[self.tracks.point_index[mine]] = some
+        return patches
+
+    def lay(
+        self,
+        image: Image,
+        others: Int[np.ndarray, "k"],
+        patches: Float32[np.ndarray, "k s s"],
+        crosses: Float[np.ndarray, "k 5 3"],
+    ) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, "k"]]:
+        """Where patches are in an image, and their correlation there."""
+        inside = crosses @ self.views.rotations[image].T + self.views.translations[image]
+        camera = tuple(self.views.found.rig.cameras.values())[image[1]].camera
+        arms = camera.project(inside.reshape(-1, 3)).reshape(-1, len(_CROSS), 2)
+        warps = np.stack([arms[:, 1] - arms[:, 2], arms[:, 3] - arms[:, 4]], axis=-1) / (2 * _STEP_PX)
+        return align_patches(patches, self.picture(image), self.tracks.pixels[others], warps, self.options)
+
+
 def match_patches(
-    found: Reconstruction,
-    read: ReadGray,
-    options: AlignmentOptions,
-    *,
-    progress: Progress = silent,
+    found: Reconstruction, read: ReadGray, options: AlignmentOptions, *, progress: Progress = silent
 ) -> Tracks:
     """The tracks of a reconstruction, which has some, with their places put where the patch of each point is seen;
     without observations in which it is not found, and points that are seen nowhere else.
@@ -144,31 +182,16 @@ def match_patches(
     """
     tracks = found.tracks
     assert tracks is not None
-    views = _Views.of(found)
-    facets = _facets(views, tracks)
-    cameras, names = tuple(found.rig.cameras.items()), found.frames
+    matching = _Matching(_Views.of(found), tracks, read, options)
+    facets = _facets(matching.views, tracks)
+    patches = matching.patches(facets.own)
 
-    def picture(image: Image) -> Float32[np.ndarray, "h w"]:
-        return smooth(read(names[image[0]], cameras[image[1]][0]), options.blur_px)
-
-    def cut(image: Image, own: Int[np.ndarray, "k"]) -> Float32[np.ndarray, "k s s"]:
-        return cut_patches(picture(image), tracks.pixels[own], options.radius_px)
-
-    own = _by_image(tracks, facets.own)
-    side = 2 * options.radius_px + 3
-    patches = np.zeros((len(tracks.points), side, side), dtype=np.float32)
-    for observations, some in zip(own.values(), map_in_threads(lambda item: cut(*item), own.items()), strict=True):
-        patches[tracks.point_index[observations]] = some
-
-    def lay(image: Image, others: Int[np.ndarray, "k"]) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, "k"]]:
-        point, camera = tracks.point_index[others], cameras[image[1]][1].camera
-        inside = facets.crosses[point] @ views.rotations[image].T + views.translations[image]
-        crosses = camera.project(inside.reshape(-1, 3)).reshape(-1, len(_CROSS), 2)
-        warps = np.stack([crosses[:, 1] - crosses[:, 2], crosses[:, 3] - crosses[:, 4]], axis=-1) / (2 * _STEP_PX)
-        return align_patches(patches[point], picture(image), tracks.pixels[others], warps, options)
+    def lay(part: tuple[Image, Int[np.ndarray, "_"]]) -> tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_"]]:
+        point = tracks.point_index[part[1]]
+        return matching.lay(*part, patches[point], facets.crosses[point])
 
     others = _by_image(tracks, np.setdiff1d(np.arange(len(tracks.point_index)), facets.own))
-    laid = map_in_threads(lambda item: lay(*item), others.items(), stage="patches", progress=progress)
+    laid = map_in_threads(lay, others.items(), stage="patches", progress=progress)
     pixels, correlation = tracks.pixels.copy(), np.ones(len(tracks.pixels))
     for observations, (places, alike) in zip(others.values(), laid, strict=True):
         pixels[observations], correlation[observations] = places, alike

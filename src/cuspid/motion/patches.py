@@ -27,6 +27,8 @@ from cuspid.workers import map_in_threads
 
 _LEAST_CONTRAST = 0.5
 """Standard deviation of the grey levels of a patch, below which it says nothing."""
+_LEAST_AREA = 1e-3
+"""Of the picture of a patch, as a share of its own, so that there is anything to lay it over."""
 _STILL_PX = 0.003
 """The alignment ends when a step is shorter."""
 
@@ -142,6 +144,9 @@ def _aligned(patches, image, there, warps, limit, iterations, shifts, correlatio
         if not spread > _LEAST_CONTRAST:
             continue
         warp = warps[n]
+        area = warp[0, 0] * warp[1, 1] - warp[0, 1] * warp[1, 0]
+        if not abs(area) > _LEAST_AREA:
+            continue
         slopes_there = slopes @ np.linalg.inv(warp)
         square = slopes_there.T @ slopes_there
         determinant = square[0, 0] * square[1, 1] - square[0, 1] ** 2
