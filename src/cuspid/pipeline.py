@@ -13,7 +13,8 @@ panorama             = stitch(frames, ...)
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -24,7 +25,7 @@ from jaxtyping import Bool, Float
 from cuspid import storage
 from cuspid.anatomy.crowns import crowns_of
 from cuspid.anatomy.orientation import find_occlusal_frame
-from cuspid.capture import Capture
+from cuspid.capture import Capture, Frame
 from cuspid.evaluation.crown import OpenCrown, open_parts, pieces
 from cuspid.evaluation.deviation import EvaluationOptions, evaluate
 from cuspid.geometry import Rigid3
@@ -85,8 +86,8 @@ class ReconstructionOptions:
     """How images become a mesh."""
 
     quality: Quality = "standard"
-    """draft: a quick look at a scan, with depth from images of half the size, half of the keypoints, and more small
-    holes. standard: all that the images tell."""
+    """draft: a quick look at a scan, with depth of every second frame from images of half the size, half of the
+    keypoints, and more small holes. standard: all that the images tell."""
     calibration: Literal["refined", "fixed"] = "refined"
     """refined: as the images want it, within its covariance. fixed: as if the file were exact."""
     nominal: NominalOptions = field(default_factory=NominalOptions)
@@ -148,7 +149,7 @@ def surface(
     options = _settled(options)
     capture, poses = replace(capture, handpiece=replace(capture.handpiece, rig=found.rig)), found.rig_from_world
     if options.quality == "draft":
-        capture = capture.halved()
+        capture = replace(capture.halved(), frames=_every_second(capture.frames))
     lengths_mm = resolved_mm(capture.handpiece), capture.handpiece.working_distance_mm
     depths = measure_depth(capture, folder / "depth", options.stereo, progress=progress)
     if options.temporal.enabled:
@@ -172,6 +173,17 @@ def _settled(options: ReconstructionOptions) -> ReconstructionOptions:
     if temporal.left_share is None:
         temporal = replace(temporal, left_share=_DRAFT_LEFT_SHARE)
     return replace(options, tracking=tracking, temporal=temporal)
+
+
+def _every_second(frames: Sequence[Frame]) -> tuple[Frame, ...]:
+    """Of the frames of each lighting pattern."""
+    ranks = Counter[str | None]()
+    kept = []
+    for frame in frames:
+        if ranks[frame.lighting] % 2 == 0:
+            kept.append(frame)
+        ranks[frame.lighting] += 1
+    return tuple(kept)
 
 
 def as_known(handpiece: Handpiece, options: ReconstructionOptions) -> Handpiece:
