@@ -162,7 +162,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
     "jaws_full": ("Real jaws at full size", anatomy_sections.jaws),
     "jaws_full_auto": ("Real jaws at full size, with further passes", anatomy_sections.jaws),
     "manufacturing": ("Handpieces that are not built as drawn", handpiece_sections.manufacturing),
-    "manufacturing_arch": ("The same, an arch at half size", handpiece_sections.manufacturing),
+    "manufacturing_arch": ("The same, a whole real arch", handpiece_sections.manufacturing),
     "expectations": ("What is expected of a scan", trust_sections.expectations),
     "grid": ("Running many", handpiece_sections.grid),
     "fuzz": ("Damaged input", trust_sections.fuzz),
