@@ -280,7 +280,12 @@ def test_order_and_names_do_not_change_the_scan(change: str, folder: Path) -> No
 
 def test_a_draft_is_the_same_scan_at_a_glance(folder: Path) -> None:
     """The same frames at about the same places, and the same surface in fewer faces, less exactly."""
-    found, mesh = pipeline.reconstruct(scan(), folder / "draft", replace(FIXED, quality="draft"))
+    shown = dict[str, tuple[int, int]]()
+    found, mesh = pipeline.reconstruct(
+        *(scan(), folder / "draft", replace(FIXED, quality="draft")),
+        progress=lambda stage, done, total: shown.update({stage: (done, total)}),
+    )
+    assert all(done == total for done, total in shown.values())
     expected, reference = reconstructed(1.0, folder)
     assert found.frames == expected.frames
     for frame, pose in found.rig_from_world.items():

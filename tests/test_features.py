@@ -64,12 +64,15 @@ def test_keypoints_are_accurate_and_unbiased() -> None:
     assert np.abs(errors[good].mean(axis=0)).max() < 0.05
 
 
-def test_a_blob_lies_where_it_was_drawn() -> None:
-    """The pixel origin: a Gaussian blob centred on the corner between pixels (60, 80) has COLMAP's (60, 80)."""
-    x, y = np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5)
+@pytest.mark.parametrize("halved_from_px", [None, 100])
+@pytest.mark.parametrize("size", [SIZE, SIZE + 1])
+def test_a_blob_lies_where_it_was_drawn(size: int, halved_from_px: int | None) -> None:
+    """The pixel origin: a Gaussian blob centred on the corner between pixels (60, 80) has COLMAP's (60, 80), also where
+    the image is halved, of an odd size too."""
+    x, y = np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5)
     gray = 60 + 150 * np.exp(-((x - 60) ** 2 + (y - 80) ** 2) / (2 * 4.0**2))
     image = np.repeat(np.rint(gray).astype(np.uint8)[..., None], 3, axis=2)
-    nearest = detect(image).pixels - [60, 80]
+    nearest = detect(image, FeatureOptions(halved_from_px=halved_from_px)).pixels - [60, 80]
     assert np.linalg.norm(nearest, axis=1).min() < 0.05
 
 

@@ -10,7 +10,14 @@ import pytest
 
 from cuspid.capture import Capture
 from cuspid.geometry import Rigid3
-from cuspid.motion.least_squares_matching import LeastSquaresOptions, match_patches, normals_of, own_observations
+from cuspid.motion.least_squares_matching import (
+    LeastSquaresOptions,
+    _facets,
+    _Views,
+    match_patches,
+    normals_of,
+    own_observations,
+)
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import Rig
 from test_odometry import make_capture, make_handpiece
@@ -113,6 +120,21 @@ def test_what_shows_something_else_is_left_out(speckled: tuple[Capture, Reconstr
     tracks = matched(speckled, off)
     assert np.mean(tracks.point_index < 100) < 0.05
     assert np.bincount(tracks.point_index)[np.unique(tracks.point_index)].min() >= 2
+
+
+def test_a_patch_lies_on_the_plane_of_its_neighbours(speckled: tuple[Capture, Reconstruction]) -> None:
+    """Its middle and its arms, whatever the camera's tilt: they project to where the keypoint is and 2 px beside it."""
+    found = speckled[1]
+    tracks = found.tracks
+    facets = _facets(_Views.of(found), tracks)
+    seen = np.unique(tracks.point_index)
+    assert np.abs(facets.crosses[seen, :, 2] - 5).max() < 1e-6
+    poses, cameras = list(found.rig_from_world.values()), list(found.rig.cameras.values())
+    for one in facets.own[:40]:
+        mounted, cross = cameras[tracks.camera_index[one]], facets.crosses[tracks.point_index[one]]
+        pixels = mounted.camera.project((mounted.cam_from_rig @ poses[tracks.frame_index[one]]).apply(cross))
+        arms = pixels - tracks.pixels[one]
+        np.testing.assert_allclose(arms, [[0, 0], [2, 0], [-2, 0], [0, 2], [0, -2]], atol=1e-5)
 
 
 def test_normals_are_those_of_the_surface() -> None:

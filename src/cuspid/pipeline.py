@@ -147,9 +147,11 @@ def surface(
     """The mesh, once it is known where the frames were (second part of :func:`reconstruct`), and how well each of its
     vertices is known: standard deviation along the normal, um."""
     options = _settled(options)
-    capture, poses = replace(capture, handpiece=replace(capture.handpiece, rig=found.rig)), found.rig_from_world
+    capture = replace(capture, handpiece=replace(capture.handpiece, rig=found.rig))
     if options.quality == "draft":
         capture = replace(capture.halved(), frames=_every_second(capture.frames))
+    taken = {frame.name for frame in capture.frames}
+    poses = {name: pose for name, pose in found.rig_from_world.items() if name in taken}
     lengths_mm = resolved_mm(capture.handpiece), capture.handpiece.working_distance_mm
     depths = measure_depth(capture, folder / "depth", options.stereo, progress=progress)
     if options.temporal.enabled:
