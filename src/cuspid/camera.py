@@ -140,7 +140,8 @@ class Camera:
         """Perspective projection of points in the camera frame (mm) to px. NaN where Z <= 0."""
         depth = points[..., 2:]
         normalized = points[..., :2] / np.where(depth > 0, depth, np.nan)
-        return distort(normalized, self.distortion) * self.focal_px + self.principal_point_px
+        distorted = distort(normalized, self.distortion) if np.any(self.distortion) else normalized
+        return distorted * self.focal_px + self.principal_point_px
 
     def rays(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 3"]:
         """Directions with Z = 1 in the camera frame through pixels, the inverse of :meth:`project`."""

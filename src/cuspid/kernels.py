@@ -1,4 +1,5 @@
-"""Compiled kernels: numba's ``njit`` without the GIL, kept on disk from run to run.
+"""Compiled kernels: numba's ``njit`` without the GIL, kept on disk from run to run. A division by zero is infinite or
+NaN, as numpy's: to raise an error takes a branch in each loop that divides, which then does not vectorise.
 
 numba keeps the machine code of a function in numbered files, with an index that names the file of each signature. It
 loads what the index names unchecked, although two processes that compile at the same time may have written each
@@ -22,7 +23,7 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """Decorator: compile a function when it is called first. ``options`` are those of ``numba.njit``."""
     if function is None:
         return partial(kernel, **options)
-    compiled = njit(nogil=True, **options)(function)
+    compiled = njit(nogil=True, error_model="numpy", **options)(function)
     if isinstance(compiled, Dispatcher):  # otherwise numba is told not to compile
         compiled._cache = _KernelCache(function)  # type: ignore[attr-defined]
     return compiled

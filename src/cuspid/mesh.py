@@ -60,7 +60,7 @@ def _in_double(faces, lengths, u, v):
     return wide, distances, barycentric
 
 
-@kernel(error_model="numpy")
+@kernel
 @no_type_check
 def _backwards(points, towards, tolerance_mm):
     """The rays of :meth:`Mesh.occluded`, from ``towards`` to the points, as Embree takes them, and how far occluders

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Annotated
 
@@ -42,6 +42,8 @@ from cuspid.workers import map_in_threads
 
 _LOOSE_SCALE_PPM, _LOOSE_SPAN_PPM = 1000.0, 300.0
 """Standard deviations of the scale and, apart from it, of the length of a scan, beyond which there is advice."""
+_PICTURES_BYTES = 400_000_000
+"""Memory for grey pictures that are asked for again."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -412,6 +414,9 @@ def locate(
     names = [frame.name for frame in capture.frames]
     frames = {frame.name: frame for frame in capture.frames}
 
+    sizes = [mounted.camera.width * mounted.camera.height for mounted in capture.handpiece.rig.cameras.values()]
+
+    @lru_cache(_PICTURES_BYTES // max(sizes))
     def read(frame: str, camera: str) -> UInt8[np.ndarray, "h w"]:
         return np.asarray(cv2.cvtColor(capture.image(frames[frame], camera), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 

@@ -95,12 +95,10 @@ def initial_layer(points_in_rig: Float[np.ndarray, "n 3"], view: IdealView, grid
     in_cam = view.cam_from_rig.apply(points_in_rig)
     pixels = grid.project(in_cam)
     seen = grid.contains(pixels, 1e-6)
-    in_cam, pixels = in_cam[seen], pixels[seen]
-    order = np.argsort(-in_cam[:, 2], kind="stable")
-    column, row = pixels[order].astype(int).T
-    layer = np.full((grid.height, grid.width), np.nan)
-    layer[row, column] = in_cam[order, 2]
-    return layer
+    column, row = pixels[seen].astype(int).T
+    layer = np.full(grid.height * grid.width, np.inf)
+    np.minimum.at(layer, row * grid.width + column, in_cam[seen, 2])
+    return np.where(np.isfinite(layer), layer, np.nan).reshape(grid.height, grid.width)
 
 
 def stack_images(

@@ -77,6 +77,7 @@ class _View(NamedTuple):
     """What the kernels see of a reference camera and its group."""
 
     images: np.ndarray
+    pixels: np.ndarray
     sizes: np.ndarray
     reference: int
     infinite: np.ndarray
@@ -107,10 +108,10 @@ class _Buffers(NamedTuple):
     """Memory that the kernels use again for each pixel."""
 
     template: np.ndarray
-    values: np.ndarray
-    slopes: np.ndarray
     warp: np.ndarray
     places: np.ndarray
+    indices: np.ndarray
+    corners: np.ndarray
     systems: np.ndarray
     znccs: np.ndarray
     total: np.ndarray
@@ -158,7 +159,7 @@ def _load_template(view, u, v, template):
     return deviation
 
 
-@kernel(**FAST)
+@kernel(inline="always", **FAST)
 @no_type_check
 def _is_inside(warp, radius, width, height):
     """True where the four corners of the window fall into the image, a pixel off its border."""
@@ -174,114 +175,120 @@ def _is_inside(warp, radius, width, height):
     return True
 
 
-@kernel(**FAST)
+@kernel(inline="always", **FAST)
 @no_type_check
-def _locate(window, warp, parallax, places):
-    """Where the window's pixels lie in another image (x, y), and how these move with q. A loop that vectorises."""
-    x0, y0, z0 = np.float32(warp[0, 0]), np.float32(warp[0, 1]), np.float32(warp[0, 2])
-    xu, yu, zu = np.float32(warp[1, 0]), np.float32(warp[1, 1]), np.float32(warp[1, 2])
-    xv, yv, zv = np.float32(warp[2, 0]), np.float32(warp[2, 1]), np.float32(warp[2, 2])
-    bx, by, bz = np.float32(parallax[0]), np.float32(parallax[1]), np.float32(parallax[2])
-    for k in range(window.shape[1]):
+def _locate(window, warp, parallax, j, places):
+    """Where the window's pixels lie in another image (x, y), and how these move with q. Loops that vectorise."""
+    inverse = 1 / warp[0, 2]
+    x, y = warp[0, 0] * inverse, warp[0, 1] * inverse
+    xu, xv = np.float32((warp[1, 0] - x * warp[1, 2]) * inverse), np.float32((warp[2, 0] - x * warp[2, 2]) * inverse)
+    yu, yv = np.float32((warp[1, 1] - y * warp[1, 2]) * inverse), np.float32((warp[2, 1] - y * warp[2, 2]) * inverse)
+    zu, zv = np.float32(warp[1, 2] * inverse), np.float32(warp[2, 2] * inverse)
+    bx, by = np.float32(parallax[j, 0] * inverse), np.float32(parallax[j, 1] * inverse)
+    bz = np.float32(parallax[j, 2] * inverse)
+    x0, y0, one = np.float32(x), np.float32(y), np.float32(1)
+    samples = window.shape[1]
+    for k in range(samples):
+        places[4, k] = one / (one + window[0, k] * zu + window[1, k] * zv)
+    for k in range(samples):
         du, dv = window[0, k], window[1, k]
-        inverse = np.float32(1) / (z0 + du * zu + dv * zv)
-        x, y = (x0 + du * xu + dv * xv) * inverse, (y0 + du * yu + dv * yv) * inverse
-        places[0, k], places[1, k] = x, y
-        places[2, k], places[3, k] = (bx - x * bz) * inverse, (by - y * bz) * inverse
+        places[0, k] = x0 + (du * xu + dv * xv) * places[4, k]
+        places[1, k] = y0 + (du * yu + dv * yv) * places[4, k]
+    for k in range(samples):
+        places[2, k] = (bx - places[0, k] * bz) * places[4, k]
+        places[3, k] = (by - places[1, k] * bz) * places[4, k]
 
 
-@kernel(**FAST)
+@kernel(inline="always", **FAST)
 @no_type_check
-def _sample(image, places, values, slopes):
-    """Intensities of the window seen in another image (bilinear), and their derivative by q."""
-    one = np.uint32(1)
-    for k in range(values.size):
-        x, y = places[0, k], places[1, k]
+def _look_up(pixels, first, stride, places, indices, corners):
+    """The four pixels around each place of an image that begins at ``first``; x and y become the fractions between."""
+    for k in range(indices.size):
+        indices[k] = np.int32(first) + np.int32(places[1, k]) * np.int32(stride) + np.int32(places[0, k])
+    for k in range(indices.size):
+        places[0, k] -= np.floor(places[0, k])
+        places[1, k] -= np.floor(places[1, k])
+    for k in range(indices.size):
         # Unsigned: numba would look for negative indices otherwise.
-        column, row = np.uint32(x), np.uint32(y)
-        fx, fy = x - np.float32(column), y - np.float32(row)
-        a, b = image[row, column], image[row, column + one]
-        c, d = image[row + one, column], image[row + one, column + one]
-        top, bottom = a + fx * (b - a), c + fx * (d - c)
-        slope_x, slope_y = (b - a) + fy * ((d - c) - (b - a)), bottom - top
-        values[k] = top + fy * slope_y
-        slopes[k] = slope_x * places[2, k] + slope_y * places[3, k]
+        above = np.uint32(indices[k])
+        below = above + np.uint32(stride)
+        corners[0, k], corners[1, k] = pixels[above], pixels[above + np.uint32(1)]
+        corners[2, k], corners[3, k] = pixels[below], pixels[below + np.uint32(1)]
 
 
-@kernel(**FAST)
+@kernel(inline="always", **FAST)
 @no_type_check
-def _normalize(template, weights, values, slopes):
-    """Bring a warped patch to mean 0 and norm 1, its slopes with it; returns its ZNCC with the template."""
-    count = weights.size
-    mean = np.float32(0)
-    for k in range(count):
-        mean += weights[k] * values[k]
-    variance, product = np.float32(0), np.float32(0)
-    for k in range(count):
-        values[k] -= mean
-        variance += weights[k] * values[k] * values[k]
-        product += weights[k] * values[k] * template[k]
-    if not variance > 1e-6:
-        return np.float32(-1)
-    inverse = 1 / np.sqrt(variance)
-    for k in range(count):
-        values[k] *= inverse
-        slopes[k] *= inverse
-    return product * inverse
-
-
-@kernel(**FAST)
-@no_type_check
-def _normal_equations(template, window, values, slopes, zncc, system):
-    """Normal equations of a normalised patch: H (upper triangle, row by row), then the gradient."""
-    m0 = mu = mv = i0 = iu = iv = e0 = eu = ev = np.float32(0)
+def _normal_equations(template, window, places, corners, systems, j):
+    """ZNCC of the template and the window seen in another image (bilinear), and its normal equations: H (upper
+    triangle, row by row), then the gradient. The patch is normalised in the sums, not pixel by pixel."""
+    start = corners[0, corners.shape[1] // 2]
+    mean = square = product = s0 = su = sv = i0 = iu = iv = t0 = tu = tv = np.float32(0)
     h00 = h0u = h0v = huu = huv = hvv = np.float32(0)
     for k in range(window.shape[1]):
-        du, dv = window[0, k], window[1, k]
-        ws = window[2, k] * slopes[k]
-        we, wi, wss = ws * (values[k] - template[k]), ws * values[k], ws * slopes[k]
-        m0 += ws
-        mu += ws * du
-        mv += ws * dv
+        du, dv, weight, fx, fy = window[0, k], window[1, k], window[2, k], places[0, k], places[1, k]
+        a, b, c, d = corners[0, k], corners[1, k], corners[2, k], corners[3, k]
+        top, bottom = a + fx * (b - a), c + fx * (d - c)
+        slope_x, slope_y = (b - a) + fy * ((d - c) - (b - a)), bottom - top
+        value = top + fy * slope_y - start
+        slope = slope_x * places[2, k] + slope_y * places[3, k]
+        mean += weight * value
+        square += weight * value * value
+        product += weight * value * template[k]
+        ws = weight * slope
+        wi, wt, wss = ws * value, ws * template[k], ws * slope
+        s0 += ws
+        su += ws * du
+        sv += ws * dv
         i0 += wi
         iu += wi * du
         iv += wi * dv
-        e0 += we
-        eu += we * du
-        ev += we * dv
+        t0 += wt
+        tu += wt * du
+        tv += wt * dv
         h00 += wss
         h0u += wss * du
         h0v += wss * dv
         huu += wss * du * du
         huv += wss * du * dv
         hvv += wss * dv * dv
+    variance = square - mean * mean
+    if not variance > 1e-6:
+        return np.float32(-1)
+    gain = 1 / np.sqrt(variance)
+    zncc = product * gain
+    s0, su, sv, t0, tu, tv = s0 * gain, su * gain, sv * gain, t0 * gain, tu * gain, tv * gain
+    power = gain * gain
+    i0, iu, iv = i0 * power - mean * gain * s0, iu * power - mean * gain * su, iv * power - mean * gain * sv
     # The derivative of a normalised patch has no component along 1 nor along the patch itself.
-    system[0], system[1], system[2] = h00 - m0 * m0 - i0 * i0, h0u - m0 * mu - i0 * iu, h0v - m0 * mv - i0 * iv
-    system[3], system[4], system[5] = huu - mu * mu - iu * iu, huv - mu * mv - iu * iv, hvv - mv * mv - iv * iv
-    lack = 1 - zncc
-    system[6], system[7], system[8] = e0 - i0 * lack, eu - iu * lack, ev - iv * lack
+    systems[j, 0] = h00 * power - s0 * s0 - i0 * i0
+    systems[j, 1] = h0u * power - s0 * su - i0 * iu
+    systems[j, 2] = h0v * power - s0 * sv - i0 * iv
+    systems[j, 3] = huu * power - su * su - iu * iu
+    systems[j, 4] = huv * power - su * sv - iu * iv
+    systems[j, 5] = hvv * power - sv * sv - iv * iv
+    systems[j, 6], systems[j, 7], systems[j, 8] = i0 * zncc - t0, iu * zncc - tu, iv * zncc - tv
+    return zncc
 
 
 @kernel(**FAST)
 @no_type_check
 def _compare(view, u, v, plane, buffers):
     """ZNCC and normal equations of each other camera at a plane; -1 where the window is not inside the image."""
-    warp = buffers.warp
+    # No slices: each would count a reference.
+    warp, infinite, parallax, places = buffers.warp, view.infinite, view.parallax, buffers.places
+    corners, indices, systems, znccs = buffers.corners, buffers.indices, buffers.systems, buffers.znccs
+    height, width = view.images.shape[1:]
     for j in range(view.others.size):
-        other, a, b = view.others[j], view.infinite[j], view.parallax[j]
+        other = view.others[j]
         for k in range(3):
-            warp[0, k] = a[k, 0] * u + a[k, 1] * v + a[k, 2] + plane[0] * b[k]
-            warp[1, k] = a[k, 0] + plane[1] * b[k]
-            warp[2, k] = a[k, 1] + plane[2] * b[k]
-        buffers.znccs[j] = -1
+            warp[0, k] = infinite[j, k, 0] * u + infinite[j, k, 1] * v + infinite[j, k, 2] + plane[0] * parallax[j, k]
+            warp[1, k] = infinite[j, k, 0] + plane[1] * parallax[j, k]
+            warp[2, k] = infinite[j, k, 1] + plane[2] * parallax[j, k]
+        znccs[j] = -1
         if _is_inside(warp, view.radius, view.sizes[other, 1], view.sizes[other, 0]):
-            template, values, slopes = buffers.template, buffers.values, buffers.slopes
-            _locate(view.window, warp, b, buffers.places)
-            _sample(view.images[other], buffers.places, values, slopes)
-            zncc = _normalize(template, view.window[2], values, slopes)
-            buffers.znccs[j] = zncc
-            if zncc > 0:
-                _normal_equations(template, view.window, values, slopes, zncc, buffers.systems[j])
+            _locate(view.window, warp, parallax, j, places)
+            _look_up(view.pixels, other * height * width, width, places, indices, corners)
+            znccs[j] = _normal_equations(buffers.template, view.window, places, corners, systems, j)
 
 
 @kernel(**FAST)
@@ -289,9 +296,11 @@ def _compare(view, u, v, plane, buffers):
 def _combine(buffers, camera_zncc, lag):
     """Sum the equations of the cameras that see the patch; returns how many, and their mean ZNCC."""
     znccs, total = buffers.znccs, buffers.total
-    best = znccs.max()
-    total[:] = 0
-    used, score = 0, np.float32(0)
+    for k in range(9):
+        total[k] = 0
+    used, score, best = 0, np.float32(0), np.float32(-1)
+    for j in range(znccs.size):
+        best = max(best, znccs[j])
     for j in range(znccs.size):
         if znccs[j] >= camera_zncc and znccs[j] >= best - lag:
             used += 1
@@ -323,17 +332,16 @@ def _solve(total, step):
 @no_type_check
 def _refine_plane(view, limits, buffers, u, v, plane):
     """Gauss-Newton from a plane, changed in place; ``buffers.result`` gets SCORE, VARIANCE, SUPPORT. False: failed."""
-    result, step = buffers.result, buffers.step
+    result, step, solved = buffers.result, buffers.step, True
     for iteration in range(limits.iterations):
         _compare(view, u, v, plane, buffers)
         # The start may be a pixel off: let cameras in that do not agree well yet.
         floor = limits.camera_zncc if iteration >= 2 else np.float32(0.4) * limits.camera_zncc
         used, score = _combine(buffers, floor, limits.lag)
-        if used == 0:
-            return False
-        factor = _solve(buffers.total, step)
-        if factor < 0:
-            return False
+        factor = _solve(buffers.total, step) if used > 0 else -1.0
+        solved = factor >= 0
+        if not solved:
+            break
         result[0], result[1], result[2] = score, 2 * (1 - score) * factor / limits.effective, used
         length = abs(step[0])
         shrink = 1.0 if length <= 1 else 1 / length
@@ -341,17 +349,15 @@ def _refine_plane(view, limits, buffers, u, v, plane):
             plane[k] += shrink * step[k]
         if length < limits.converged:
             break
-    return True
+    return solved
 
 
 @kernel(**FAST)
 @no_type_check
 def _best_start(view, limits, buffers, u, v, count):
     """Index of the candidate plane with the best mean ZNCC."""
-    if count == 1:
-        return 0
     best, best_score = 0, np.float32(-2)
-    for c in range(count):
+    for c in range(count if count > 1 else 0):
         _compare(view, u, v, buffers.candidates[c], buffers)
         _, score = _combine(buffers, np.float32(0.4) * limits.camera_zncc, limits.lag)
         if score > best_score:
@@ -446,6 +452,7 @@ def refine(
     near, far = depth_range_mm
     view = _View(
         images=images,
+        pixels=images.ravel(),
         sizes=sizes,
         reference=reference,
         infinite=geometry.infinite,
@@ -476,10 +483,10 @@ def refine(
 def _new_buffers(samples: int, others: int, layers: int) -> _Buffers:
     return _Buffers(
         template=np.zeros(samples, np.float32),
-        values=np.zeros(samples, np.float32),
-        slopes=np.zeros(samples, np.float32),
         warp=np.zeros((3, 3)),
-        places=np.zeros((4, samples), np.float32),
+        places=np.zeros((5, samples), np.float32),
+        indices=np.zeros(samples, np.int32),
+        corners=np.zeros((4, samples), np.float32),
         systems=np.zeros((others, 9), np.float32),
         znccs=np.zeros(others, np.float32),
         total=np.zeros(9),

@@ -1,8 +1,9 @@
 """What one depth map says about a point in space: its distance to the surface that was seen, and how sure that is.
 
 Around a pixel the surface is a plane. With normalised coordinates (x, y) inverse depth is affine there,
-1/Z = a x + b y + c, so that the plane is n.X = 1 with n = (a, b, c), and a point X of the camera frame lies at the
-signed distance (1 - n.X) / |n| from it, positive on the side of the camera. The pixel nearest to a point answers.
+1/Z = a x + b y + c, so that a X + b Y + c Z = 1: with the normal n = -(a, b, c) / |(a, b, c)| and the distance of the
+camera d = 1 / |(a, b, c)| a point X of the camera frame lies at the signed distance n.X + d from it, positive on the
+side of the camera. The pixel nearest to a point answers.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ EXTRAPOLATED = 0.1
 class Evidence:
     """A depth map prepared for questions."""
 
-    plane: Float[np.ndarray, "h w 3"]
-    """n of the plane at each pixel, in the camera frame, 1/mm. float32."""
+    plane: Float[np.ndarray, "h w 4"]
+    """Hessian normal form (n, d) of the plane at each pixel, in the camera frame, d in mm. float32."""
     weight: Float[np.ndarray, "h w"]
     """Confidence times the cosine between ray and normal, 0 where nothing is known. float32."""
     intrinsics: Float[np.ndarray, "4"]
@@ -83,7 +84,7 @@ def _planes(inverse, intrinsics, jump):
     """Plane through each pixel, and the cosine between its normal and the ray; 0 where no plane can be told."""
     height, width = inverse.shape
     fx, fy, cx, cy = intrinsics
-    plane = np.zeros((height, width, 3), np.float32)
+    plane = np.zeros((height, width, 4), np.float32)
     cosine = np.zeros((height, width), np.float32)
     for row in range(height):
         for column in range(width):
@@ -94,8 +95,10 @@ def _planes(inverse, intrinsics, jump):
                 continue
             x, y = (column - cx) / fx, (row - cy) / fy
             c = here - a * x - b * y
-            plane[row, column, 0], plane[row, column, 1], plane[row, column, 2] = a, b, c
-            cosine[row, column] = here / np.sqrt((a * a + b * b + c * c) * (x * x + y * y + 1))
+            d = 1 / np.sqrt(a * a + b * b + c * c)
+            plane[row, column, 0], plane[row, column, 1], plane[row, column, 2] = -a * d, -b * d, -c * d
+            plane[row, column, 3] = d
+            cosine[row, column] = here * d / np.sqrt(x * x + y * y + 1)
     return plane, cosine
 
 
@@ -121,35 +124,33 @@ def _grown(plane, weight):
 
 @kernel(inline="always")
 @no_type_check
-def observe(evidence, right, down, depth, seen):
+def observe(plane, weight, intrinsics, right, down, depth, seen):
     """Ask about a point of the camera frame in front of the camera; False where the map has no answer."""
-    plane, weight, intrinsics = evidence
-    u = intrinsics[0] * right / depth + intrinsics[2] + 0.5
-    v = intrinsics[1] * down / depth + intrinsics[3] + 0.5
+    inverse = 1 / depth
+    u = intrinsics[0] * right * inverse + intrinsics[2] + 0.5
+    v = intrinsics[1] * down * inverse + intrinsics[3] + 0.5
     if not (u >= 0 and v >= 0 and u < weight.shape[1] and v < weight.shape[0]):
         return False
     column, row = int(u), int(v)
     if not weight[row, column] > 0:
         return False
-    a, b, c = plane[row, column, 0], plane[row, column, 1], plane[row, column, 2]
-    inverse_length = 1 / np.sqrt(a * a + b * b + c * c)
-    seen[0] = (1 - a * right - b * down - c * depth) * inverse_length
+    x, y, z = plane[row, column, 0], plane[row, column, 1], plane[row, column, 2]
+    seen[0] = plane[row, column, 3] + x * right + y * down + z * depth
     seen[1] = weight[row, column]
-    seen[2], seen[3], seen[4] = -a * inverse_length, -b * inverse_length, -c * inverse_length
+    seen[2], seen[3], seen[4] = x, y, z
     seen[5] = row * weight.shape[1] + column
     return True
 
 
 @kernel
 @no_type_check
-def observe_foot(evidence, nearest, farthest, right, down, depth, seen):
+def observe_foot(plane, weight, intrinsics, nearest, farthest, right, down, depth, seen):
     """As :func:`observe` for a point whose own pixel tells nothing: what the pixel tells at the foot of its
     perpendicular, where the surface is seen there and is not farther away than ``farthest``. A camera that looks along
     a slope sees past it what lies outside of it.
 
     ``nearest`` is what :meth:`Evidence.nearest` gives.
     """
-    plane, weight, intrinsics = evidence
     height, width = weight.shape
     u = intrinsics[0] * right / depth + intrinsics[2] + 0.5
     v = intrinsics[1] * down / depth + intrinsics[3] + 0.5
@@ -159,17 +160,17 @@ def observe_foot(evidence, nearest, farthest, right, down, depth, seen):
     if pixel < 0:
         return False
     row, column = pixel // width, pixel % width
-    a, b, c = plane[row, column, 0], plane[row, column, 1], plane[row, column, 2]
-    square = a * a + b * b + c * c
-    along = (1 - a * right - b * down - c * depth) / square
-    if along * along * square > farthest * farthest or depth + along * c <= 0:
+    x, y, z = plane[row, column, 0], plane[row, column, 1], plane[row, column, 2]
+    distance = plane[row, column, 3] + x * right + y * down + z * depth
+    if abs(distance) > farthest or depth - distance * z <= 0:
         return False
-    if not observe(evidence, right + along * a, down + along * b, depth + along * c, seen):
+    foot = right - distance * x, down - distance * y, depth - distance * z
+    if not observe(plane, weight, intrinsics, foot[0], foot[1], foot[2], seen):
         return False
-    # seen[2:5] is the unit normal there, and seen[0] how far its plane lies from the foot: far where the slope ended.
+    # The plane seen there lies far from the foot where the slope ended.
     if abs(seen[0]) > _SAME_SURFACE * farthest:
         return False
-    seen[0] -= along * (a * seen[2] + b * seen[3] + c * seen[4])
+    seen[0] += distance * (x * seen[2] + y * seen[3] + z * seen[4])
     return abs(seen[0]) <= farthest
 
 

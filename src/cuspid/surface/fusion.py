@@ -156,7 +156,7 @@ class Votes:
                 self.rough.vertex_normals,
                 cam_from_world.rotation,
                 cam_from_world.translation,
-                evidence.arrays,
+                *evidence.arrays,
                 colors,
                 known,
                 agreement_mm,
@@ -208,7 +208,9 @@ def _vote(
     normals,
     rotation,
     translation,
-    evidence,
+    plane,
+    weights,
+    intrinsics,
     colors,
     known,
     agreement,
@@ -228,7 +230,7 @@ def _vote(
                 for m in range(3):
                     x[k] += rotation[k, m] * vertices[n, m]
                     normal[k] += rotation[k, m] * normals[n, m]
-            if x[2] <= 0 or not observe(evidence, x[0], x[1], x[2], seen):
+            if x[2] <= 0 or not observe(plane, weights, intrinsics, x[0], x[1], x[2], seen):
                 continue
             distance = seen[0]
             facing = normal[0] * seen[2] + normal[1] * seen[3] + normal[2] * seen[4]

@@ -71,7 +71,7 @@ class SparseVolume:
                 self.voxel_mm,
                 cam_from_world.rotation,
                 cam_from_world.translation,
-                evidence.arrays,
+                *evidence.arrays,
                 nearest,
                 self.truncation_mm,
             ),
@@ -124,7 +124,9 @@ def _grown(array: Float[np.ndarray, "b v"], room: int) -> Float[np.ndarray, "r v
 
 @kernel
 @no_type_check
-def _integrate(distance, weight, slots, origins, voxel, rotation, translation, evidence, nearest, truncation):
+def _integrate(
+    distance, weight, slots, origins, voxel, rotation, translation, plane, known, intrinsics, nearest, truncation
+):
     """Running weighted mean of the signed distance in each voxel of the blocks."""
     seen = np.zeros(6)
     for n in range(slots.size):
@@ -140,10 +142,10 @@ def _integrate(distance, weight, slots, origins, voxel, rotation, translation, e
                         continue
                     right = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]
                     down = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]
-                    if observe(evidence, right, down, depth, seen):
+                    if observe(plane, known, intrinsics, right, down, depth, seen):
                         if seen[0] < -truncation:
                             continue
-                    elif not observe_foot(evidence, nearest, truncation, right, down, depth, seen):
+                    elif not observe_foot(plane, known, intrinsics, nearest, truncation, right, down, depth, seen):
                         continue
                     voxel_index = (i * 8 + j) * 8 + k
                     new = seen[1]
