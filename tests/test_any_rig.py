@@ -296,14 +296,11 @@ def test_a_draft_is_the_same_scan_at_a_glance(folder: Path) -> None:
     assert 0.0003 < np.median(distance) < 0.01
 
 
-def test_a_draft_takes_every_second_frame_of_each_light() -> None:
-    frames = [Frame(name=f"{k}", cameras=("a",), lighting=lit) for k, lit in enumerate("xyxyyxx")]
-    assert [frame.name for frame in pipeline._every_second(frames)] == ["0", "1", "4", "5"]
-
-
 def test_what_was_asked_for_goes_before_the_quality() -> None:
     asked = ReconstructionOptions(quality="draft", temporal=TemporalOptions(left_share=0.2))
     assert pipeline._settled(asked).temporal.left_share == 0.2
     assert pipeline._settled(asked).tracking.features.count == 500
+    assert pipeline._settled(asked).left_share == 1
+    assert pipeline._settled(replace(asked, left_share=0.3)).left_share == 0.3
     standard = ReconstructionOptions()
-    assert pipeline._settled(standard) == standard
+    assert pipeline._settled(standard) == replace(standard, left_share=pipeline._LEFT_SHARE)

@@ -1,7 +1,8 @@
-"""Temporal stereo goes where depth from one frame left holes."""
+"""Depth is measured where it adds to the surface, and temporal stereo where it left holes."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -13,10 +14,12 @@ from hypothesis import strategies as st
 
 from builders import folder_capture, image_path
 from cuspid import storage
+from cuspid.capture import Frame
 from cuspid.geometry import Rigid3
 from cuspid.reconstruction import DepthMap, Reconstruction, Tracks
 from cuspid.stereo import stage
 from cuspid.stereo.holes import Sightings, covering
+from cuspid.stereo.matching import StereoOptions
 from cuspid.stereo.temporal import TemporalOptions
 from synthetic_scene import diamond
 
@@ -75,16 +78,28 @@ def test_a_map_confirms_the_points_on_its_surface(off_mm: float, expected: int) 
     assert (count == expected).all()
 
 
-def test_maps_of_all_images_count_and_only_where_they_show_the_point() -> None:
+def test_maps_of_all_located_frames_count_whether_keypoints_were_found_there_or_not() -> None:
     found, tracks = scene()
     seen = (tracks.point_index > 4) | (tracks.frame_index == 1)
     columns = ("point_index", "frame_index", "camera_index", "pixels")
     tracks = replace(tracks, **{name: getattr(tracks, name)[seen] for name in columns})
     depth = {name: found.rig[name].cam_from_rig.apply(tracks.points)[0, 2] for name in ("west", "east")}
     maps = [plane(found, frame, name, depth[name]) for frame in ("00000", "00001") for name in ("west", "east")]
-    count = Sightings.of(found, tracks).confirmed(maps, found.rig_from_world, 0.08)
-    assert (count[:5] == 2).all()
-    assert (count[5:] == 4).all()
+    sightings = Sightings.of(found, tracks)
+    assert (sightings.confirmed(maps, found.rig_from_world, 0.08) == 4).all()
+    assert (sightings.confirmed(maps, {"00001": found.rig_from_world["00001"]}, 0.08) == 2).all()
+    aside = found.rig_from_world | {"00001": Rigid3(np.eye(3), np.array([50.0, 0, 0]))}
+    assert (sightings.confirmed(maps, aside, 0.08) == 2).all()
+
+
+def test_points_in_stereo_are_those_that_two_of_the_cameras_show() -> None:
+    found, tracks = scene()
+    seen = (tracks.point_index < 7) | (tracks.camera_index == found.rig.names.index("west"))
+    columns = ("point_index", "frame_index", "camera_index", "pixels")
+    sightings = Sightings.of(found, replace(tracks, **{name: getattr(tracks, name)[seen] for name in columns}))
+    assert sightings.in_stereo("00001", found.rig.names).tolist() == list(range(7))
+    assert sightings.in_stereo("00001", ["west", "nobody"]).size == 0
+    assert sightings.in_stereo("elsewhere", found.rig.names).size == 0
 
 
 def test_images_share_the_points_that_both_show() -> None:
@@ -123,3 +138,59 @@ def test_a_camera_is_matched_with_its_next_frame_where_that_fills_a_hole(
     assert matched(tmp_path / "holes", monkeypatch, found, full[:1], 0.03) in ([["west"]], [["east"]])
     assert matched(tmp_path / "everywhere", monkeypatch, found, full, 0.0) == [every]
     assert matched(tmp_path / "unknown", monkeypatch, replace(found, tracks=None), full, 0.03) == [every]
+
+
+def measured(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, found: Reconstruction, cameras: Sequence[str], left_share: float
+) -> list[tuple[str, ...]]:
+    """The frame and the cameras of each frame that depth is measured of, where some cameras get all of the surface."""
+    capture, asked = folder_capture(folder, diamond(), ("00000", "00001")), list[tuple[str, ...]]()
+    for frame, name in product(("00000", "00001"), diamond().rig.names):
+        camera = diamond().rig[name].camera
+        blank = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
+        storage.write_image(image_path(capture, frame, name), blank)
+
+    def measure(_: object, images: Mapping[str, np.ndarray], frame: str) -> tuple[DepthMap, ...]:
+        asked.append((frame, *sorted(images)))
+        return tuple(plane(found, frame, name, 5.0) for name in cameras)
+
+    monkeypatch.setattr(stage.DepthEstimator, "measure", measure)
+    told = dict[str, tuple[int, int]]()
+    depths = stage.measure_enough_depth(
+        *(capture, found, folder / "depth", StereoOptions()),
+        agreement_mm=0.08,
+        left_share=left_share,
+        progress=lambda name, done, total: told.update({name: (done, total)}),
+    )
+    assert depths.frames == tuple(frame for frame, *_ in asked)
+    assert all(done == total for done, total in told.values())
+    return asked
+
+
+def test_depth_of_a_frame_between_is_measured_where_it_adds_to_the_surface(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, _ = scene()
+    every = tuple(sorted(found.rig.names))
+    first, both = [("00000", *every)], [("00000", *every), ("00001", *every)]
+    assert measured(tmp_path / "enough", monkeypatch, found, every, 0.1) == first
+    assert measured(tmp_path / "few", monkeypatch, found, every[:3], 0.1) == both
+    assert measured(tmp_path / "left", monkeypatch, found, every[:3], 1.0) == first
+    assert measured(tmp_path / "all", monkeypatch, found, every, 0.0) == both
+    assert measured(tmp_path / "unknown", monkeypatch, replace(found, tracks=None), every, 0.1) == both
+    assert measured(tmp_path / "draft", monkeypatch, replace(found, tracks=None), every, 1.0) == first
+
+
+def test_a_frame_between_is_measured_by_the_cameras_that_show_what_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, tracks = scene()
+    seen = (tracks.frame_index == 0) | (tracks.camera_index == found.rig.names.index("west"))
+    columns = ("point_index", "frame_index", "camera_index", "pixels")
+    alone = replace(tracks, **{name: getattr(tracks, name)[seen] for name in columns})
+    assert len(measured(tmp_path, monkeypatch, replace(found, tracks=alone), ["west"], 0.1)) == 1
+
+
+def test_every_second_frame_of_each_light_comes_first() -> None:
+    frames = [Frame(name=f"{k}", cameras=("a",), lighting=lit) for k, lit in enumerate("xyxyyxx")]
+    assert [frame.name for frame in stage._every_second(frames)] == ["0", "1", "4", "5"]

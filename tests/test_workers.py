@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from cuspid.workers import core_numbers, map_in_threads, map_slices, usable_cores
+from cuspid.workers import core_numbers, map_ahead, map_in_threads, map_slices, usable_cores
 
 
 def pinned(work):
@@ -46,6 +46,33 @@ def test_the_first_error_is_raised_and_what_was_not_begun_is_left():
     with pytest.raises(ValueError, match=r"^0$"):
         map_in_threads(refuse, range(1000))
     assert len(begun) < 1000
+
+
+def test_work_ahead_comes_in_order_and_goes_no_farther_than_there_are_cores():
+    drawn = []
+
+    def items():
+        for item in range(20):
+            drawn.append(item)
+            yield item
+
+    def late(item):
+        time.sleep(0.002 * (3 - item % 4))
+        return 10 * item
+
+    taken = []
+    for result in map_ahead(late, items()):
+        taken.append(result)
+        assert len(drawn) <= len(taken) + usable_cores()
+    assert taken == [10 * item for item in drawn] == list(range(0, 200, 10))
+    assert list(map_ahead(late, [])) == []
+
+
+def test_the_first_error_of_work_ahead_is_raised_in_its_place():
+    results = map_ahead(lambda item: 1 // (item - 1), range(5))
+    assert next(results) == -1
+    with pytest.raises(ZeroDivisionError):
+        next(results)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 1000])

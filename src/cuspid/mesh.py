@@ -47,6 +47,11 @@ def edges_of(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
     return np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
 
 
+def used_vertices(faces: Int[np.ndarray, "f 3"], count: int) -> Int[np.ndarray, "u"]:
+    """Those of ``count`` vertices that the faces use, increasing."""
+    return np.flatnonzero(np.bincount(faces.ravel(), minlength=count))
+
+
 @kernel
 @no_type_check
 def _in_double(faces, lengths, u, v):
@@ -166,9 +171,11 @@ class Mesh:
     def submesh(self, keep: Bool[np.ndarray, "f"]) -> Mesh:
         """The faces where ``keep`` is true, with only the vertices that they use."""
         faces = self.faces[keep]
-        used, inverse = np.unique(faces, return_inverse=True)
+        used = used_vertices(faces, len(self.vertices))
+        number = np.zeros(len(self.vertices), dtype=np.int64)
+        number[used] = np.arange(len(used))
         colors = None if self.colors is None else self.colors[used]
-        return Mesh(self.vertices[used], inverse.reshape(-1, 3), colors)
+        return Mesh(self.vertices[used], number[faces], colors)
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
         """Points spread evenly by area (stratified over the faces), and the face of each."""

@@ -13,11 +13,10 @@ panorama             = stitch(frames, ...)
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -25,7 +24,7 @@ from jaxtyping import Bool, Float
 from cuspid import storage
 from cuspid.anatomy.crowns import crowns_of
 from cuspid.anatomy.orientation import find_occlusal_frame
-from cuspid.capture import Capture, Frame
+from cuspid.capture import Capture
 from cuspid.evaluation.crown import OpenCrown, open_parts, pieces
 from cuspid.evaluation.deviation import EvaluationOptions, evaluate
 from cuspid.geometry import Rigid3
@@ -41,7 +40,7 @@ from cuspid.reconstruction import Reconstruction
 from cuspid.rig import Handpiece
 from cuspid.simulation.stage import FilmOptions, RenderOptions, SimulationOptions, film, simulate, take_images
 from cuspid.stereo.matching import StereoOptions
-from cuspid.stereo.stage import measure_depth, measure_temporal_depth
+from cuspid.stereo.stage import measure_depth, measure_enough_depth, measure_temporal_depth
 from cuspid.stereo.temporal import TemporalOptions
 from cuspid.stitching.ortho import OrthoOptions, Stitched, orthophoto
 from cuspid.stitching.thesis_method import ThesisOptions, stitch_as_thesis
@@ -67,6 +66,7 @@ __all__ = [
     "load_reference",
     "locate",
     "measure_depth",
+    "measure_enough_depth",
     "measure_temporal_depth",
     "reconstruct",
     "scannable",
@@ -78,7 +78,8 @@ __all__ = [
 
 Quality = Literal["draft", "standard"]
 _DRAFT_KEYPOINTS = 500
-_DRAFT_LEFT_SHARE = 0.03
+_LEFT_SHARE, _DRAFT_LEFT_SHARE = 0.005, 1.0
+_DRAFT_TEMPORAL_LEFT_SHARE = 0.03
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +88,11 @@ class ReconstructionOptions:
 
     quality: Quality = "standard"
     """draft: a quick look at a scan, with depth of every second frame from images of half the size, half of the
-    keypoints, and more small holes. standard: all that the images tell."""
+    keypoints, and more small holes. standard: all that the images tell, but for frames that add nothing."""
+    left_share: Annotated[float | None, SHARE] = None
+    """Depth is measured in every second frame, and in those between where that adds to the surface: until, of the
+    sparse points that few depth maps confirm, no more than this share (0 to 1) of all points could still gain. 0: in
+    all frames. By default 0.005, of a draft 1."""
     calibration: Literal["refined", "fixed"] = "refined"
     """refined: as the images want it, within its covariance. fixed: as if the file were exact."""
     nominal: NominalOptions = field(default_factory=NominalOptions)
@@ -147,45 +152,42 @@ def surface(
     """The mesh, once it is known where the frames were (second part of :func:`reconstruct`), and how well each of its
     vertices is known: standard deviation along the normal, um."""
     options = _settled(options)
+    assert options.left_share is not None
     capture = replace(capture, handpiece=replace(capture.handpiece, rig=found.rig))
     if options.quality == "draft":
-        capture = replace(capture.halved(), frames=_every_second(capture.frames))
-    taken = {frame.name for frame in capture.frames}
-    poses = {name: pose for name, pose in found.rig_from_world.items() if name in taken}
+        capture = capture.halved()
     lengths_mm = resolved_mm(capture.handpiece), capture.handpiece.working_distance_mm
-    depths = measure_depth(capture, folder / "depth", options.stereo, progress=progress)
+    agreement_mm = options.fusion.agreement * lengths_mm[0]
+    depths = measure_enough_depth(
+        *(capture, found, folder / "depth", options.stereo),
+        agreement_mm=agreement_mm,
+        left_share=options.left_share,
+        progress=progress,
+    )
     if options.temporal.enabled:
         depths |= measure_temporal_depth(
             *(capture, found, depths, folder / "depth-temporal", options.temporal),
-            agreement_mm=options.fusion.agreement * lengths_mm[0],
+            agreement_mm=agreement_mm,
             least_maps=options.fusion.least_maps,
             progress=progress,
         )
+    poses = {name: found.rig_from_world[name] for name in depths.frames if name in found.rig_from_world}
     how = options.fusion, options.cleaning
     return fuse(depths, depths.digest, poses, *lengths_mm, folder, *how, expected=found.expectation, progress=progress)
 
 
 def _settled(options: ReconstructionOptions) -> ReconstructionOptions:
     """With what the quality decides, where nothing else was asked for."""
-    tracking, temporal = options.tracking, options.temporal
-    if options.quality == "standard":
+    draft, tracking, temporal = options.quality == "draft", options.tracking, options.temporal
+    if options.left_share is None:
+        options = replace(options, left_share=_DRAFT_LEFT_SHARE if draft else _LEFT_SHARE)
+    if not draft:
         return options
     if tracking.features.count is None:
         tracking = replace(tracking, features=replace(tracking.features, count=_DRAFT_KEYPOINTS))
     if temporal.left_share is None:
-        temporal = replace(temporal, left_share=_DRAFT_LEFT_SHARE)
+        temporal = replace(temporal, left_share=_DRAFT_TEMPORAL_LEFT_SHARE)
     return replace(options, tracking=tracking, temporal=temporal)
-
-
-def _every_second(frames: Sequence[Frame]) -> tuple[Frame, ...]:
-    """Of the frames of each lighting pattern."""
-    ranks = Counter[str | None]()
-    kept = []
-    for frame in frames:
-        if ranks[frame.lighting] % 2 == 0:
-            kept.append(frame)
-        ranks[frame.lighting] += 1
-    return tuple(kept)
 
 
 def as_known(handpiece: Handpiece, options: ReconstructionOptions) -> Handpiece:

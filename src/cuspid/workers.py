@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import pairwise
 from typing import TypeVar
 
@@ -51,6 +52,28 @@ def map_in_threads(
     return results
 
 
+def map_ahead(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
+    """``work`` on each item, in threads that run one item for each usable core ahead of what was taken; results in the
+    order of the items, which are read as they are needed."""
+    ahead = usable_cores()
+    jobs = deque[Future[_Result]]()
+    with ThreadPoolExecutor(ahead) as pool:
+        try:
+            for item in items:
+                jobs.append(pool.submit(work, item))
+                if len(jobs) > ahead:
+                    yield jobs.popleft().result()
+            while jobs:
+                yield jobs.popleft().result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def beside_work_ahead() -> int:
+    """Into how many parts to cut what is done with each result of :func:`map_ahead`, whose threads go on meanwhile."""
+    return max(usable_cores() // 2, 1)
+
+
 def map_slices(
     work: Callable[[slice], _Result], count: int, parts: int | None = None, *, few: int = 0
 ) -> list[_Result]:
@@ -61,4 +84,4 @@ def map_slices(
     """
     bounds = np.linspace(0, count, (parts or usable_cores()) + 1).astype(int)
     slices = [slice(*ends) for ends in pairwise(bounds.tolist())]
-    return [work(each) for each in slices] if count < few else map_in_threads(work, slices)
+    return [work(each) for each in slices] if count < few or len(slices) == 1 else map_in_threads(work, slices)

@@ -1,4 +1,4 @@
-"""Where depth from one frame left holes, and which images of single cameras would fill them.
+"""Where depth left holes, and which images would fill them.
 
 The sparse points of the motion stand for the surface: they are spread evenly over the images, and they lie also where
 only one camera of a group sees it.
@@ -44,22 +44,28 @@ class Sightings:
         """Points that two images show."""
         return np.intersect1d(self.shown.get(one, ()), self.shown.get(other, ()), assume_unique=True).astype(np.int64)
 
+    def in_stereo(self, frame: str, cameras: Sequence[str]) -> Int[np.ndarray, "_"]:
+        """Points that two or more of some cameras show in a frame."""
+        shown = [self.shown[frame, camera] for camera in cameras if (frame, camera) in self.shown]
+        points, count = np.unique(np.concatenate([np.zeros(0, np.int64), *shown]), return_counts=True)
+        return points[count >= 2]
+
     def confirmed(
         self, depth_maps: Iterable[DepthMap], rig_from_world: Mapping[str, Rigid3], agreement_mm: float
     ) -> Int[np.ndarray, "p"]:
-        """How many depth maps, of the images that show it, have each point on their surface."""
+        """How many depth maps of located frames have each point on their surface, whether their image shows it or
+        not: keypoints come and go."""
         count = np.zeros(len(self.points), dtype=np.int64)
         for depth_map in depth_maps:
-            here = self.shown.get((depth_map.frame, depth_map.camera_name))
-            if here is not None:
+            if depth_map.frame in rig_from_world:
                 cam_from_world = depth_map.cam_from_rig @ rig_from_world[depth_map.frame]
-                count[here] += _on_surface(depth_map, cam_from_world.apply(self.points[here]), agreement_mm)
+                count += _on_surface(depth_map, cam_from_world.apply(self.points), agreement_mm)
         return count
 
 
 def _on_surface(depth_map: DepthMap, in_cam: Float[np.ndarray, "n 3"], agreement_mm: float) -> Bool[np.ndarray, "n"]:
     """Which points in the frame of its camera lie on the surface of a depth map."""
-    pixels = depth_map.camera.project(in_cam)
+    pixels = depth_map.camera.project(in_cam)  # NaN behind the camera
     on = depth_map.camera.contains(pixels, 1e-6)
     column, row = pixels[on].astype(np.int64).T
     near = np.abs(depth_map.depth_mm[row, column] - in_cam[on, 2]) < agreement_mm

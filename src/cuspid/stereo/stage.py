@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from jaxtyping import Bool
 
 from cuspid.capture import Capture, Frame
 from cuspid.geometry import Rigid3
+from cuspid.pairing import camera_groups
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.stereo.holes import Sightings, covering
@@ -27,6 +29,8 @@ from cuspid.workers import map_in_threads
 _CODE = ("stereo",)
 _LEFT_SHARE = 0.005
 """Of the sparse points, that temporal stereo need not reach."""
+_ENOUGH_MAPS = 4
+"""Depth maps of every second frame that make those between superfluous."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +47,13 @@ class StoredDepthMaps:
     def __or__(self, other: StoredDepthMaps) -> StoredDepthMaps:
         """These and others, frame by frame."""
         made = {**self.made, **other.made}
-        place = {name: k for k, name in enumerate(dict.fromkeys(file.stem for file in made))}
+        place = {name: k for k, name in enumerate(StoredDepthMaps(made).frames)}
         return StoredDepthMaps(dict(sorted(made.items(), key=lambda item: place[item[0].stem])))
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Names of the frames that were measured."""
+        return tuple(dict.fromkeys(file.stem for file in self.made))
 
     @property
     def digest(self) -> str:
@@ -65,6 +74,70 @@ def measure_depth(
         return {"frame": hash_frame(capture, frame)}
 
     return _measure_all(capture, capture.frames, measure, inputs, Stage("depth", folder, options, _CODE), progress)
+
+
+def measure_enough_depth(
+    capture: Capture,
+    found: Reconstruction,
+    folder: Path,
+    options: StereoOptions,
+    *,
+    agreement_mm: float,
+    left_share: float,
+    progress: Progress = silent,
+) -> StoredDepthMaps:
+    """Depth maps of every second frame, and of those groups of cameras in the frames between that show surface which
+    few of these confirm within ``agreement_mm``, kept in ``folder``.
+
+    Frames between are measured until, of the sparse points that they could confirm, no more than ``left_share`` (0 to
+    1) of all points is left: none at 1; all at 0, and where there are no sparse points.
+    """
+    if left_share == 0 or (found.tracks is None and left_share < 1):
+        return measure_depth(capture, folder, options, progress=progress)
+    every_second = _every_second(capture.frames)
+    depths = measure_depth(replace(capture, frames=every_second), folder, options, progress=progress)
+    if found.tracks is None or left_share == 1:
+        return depths
+    sightings = Sightings.of(found, found.tracks)
+    missing = sightings.confirmed(depths, found.rig_from_world, agreement_mm) < _ENOUGH_MAPS
+    between = _between(capture, set(every_second), sightings, missing, left_share, options)
+    return depths | measure_depth(
+        *(replace(capture, frames=between), folder, options),
+        progress=lambda _, done, total: progress("more depth", done, total),
+    )
+
+
+def _every_second(frames: Sequence[Frame]) -> tuple[Frame, ...]:
+    """Of the frames of each lighting pattern."""
+    ranks = Counter[str | None]()
+    kept = []
+    for frame in frames:
+        if ranks[frame.lighting] % 2 == 0:
+            kept.append(frame)
+        ranks[frame.lighting] += 1
+    return tuple(kept)
+
+
+def _between(
+    capture: Capture,
+    measured: Container[Frame],
+    sightings: Sightings,
+    missing: Bool[np.ndarray, "p"],
+    left_share: float,
+    options: StereoOptions,
+) -> tuple[Frame, ...]:
+    """The frames that were not measured, with the groups of cameras that show points which are missing."""
+    groups = camera_groups(capture.handpiece.rig, capture.handpiece.working_distance_mm, options.pairing)
+    tried = [(frame, group) for frame in capture.frames if frame not in measured for group in groups]
+    shown = [sightings.in_stereo(frame.name, group) for frame, group in tried]
+    taken = covering([points[missing[points]] for points in shown], len(missing), left_share * len(missing))
+    cameras: dict[Frame, set[str]] = {}
+    for frame, group in (tried[index] for index in taken):
+        cameras.setdefault(frame, set()).update(group)
+    return tuple(
+        replace(frame, cameras=tuple(camera for camera in frame.cameras if camera in those))
+        for frame, those in cameras.items()
+    )
 
 
 def measure_temporal_depth(

@@ -6,13 +6,14 @@ Faces are *connected* across edges that exactly two of them share.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cuspid.graph import parts_of
-from cuspid.mesh import Mesh
+from cuspid.kernels import kernel
+from cuspid.mesh import Mesh, used_vertices
 from cuspid.options import Options, Range
 
 
@@ -96,31 +97,75 @@ def ghost_faces(mesh: Mesh, depth_mm: float) -> Bool[np.ndarray, "f"]:
     return (hits.faces >= 0) & (hits.distances < depth_mm) & same_way
 
 
-def _edges(mesh: Mesh) -> tuple[Int[np.ndarray, "e"], Int[np.ndarray, "e 2"]]:
-    """For each side of each face (side-major): the number of its undirected edge, and its two vertices in order."""
-    sides = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
-    low, high = sides.min(axis=1), sides.max(axis=1)
-    _, edge = np.unique(low * len(mesh.vertices) + high, return_inverse=True)
-    return edge, sides
+class _Sides(NamedTuple):
+    """The sides of faces: those that begin at their first corners, then at their second ones, then at their third."""
+
+    ends: Int[np.ndarray, "s 2"]
+    """Two vertices, in order."""
+    edge: Int[np.ndarray, "s"]
+    """Number of the undirected edge."""
+    before: Int[np.ndarray, "s"]
+    """The side before, of those of the same edge; -1 for the first."""
+
+    @staticmethod
+    def of(mesh: Mesh) -> _Sides:
+        """Of all faces."""
+        ends = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+        return _Sides(ends, *_joined(ends.min(axis=1), ends.max(axis=1), len(mesh.vertices)))
+
+    @property
+    def uses(self) -> Int[np.ndarray, "e"]:
+        """How many sides each edge has."""
+        return np.bincount(self.edge, minlength=1)
+
+    @property
+    def pairs(self) -> tuple[Int[np.ndarray, "p"], Int[np.ndarray, "p"]]:
+        """Sides of one edge, each with the one before."""
+        later = np.flatnonzero(self.before >= 0)
+        return self.before[later], later
+
+
+@kernel
+@no_type_check
+def _joined(low, high, vertices):
+    """Of sides by their two vertices: the number of their edge, and the side before that has the same."""
+    start = np.zeros(vertices + 2, np.int64)
+    for vertex in low:
+        start[vertex + 2] += 1
+    for vertex in range(vertices):
+        start[vertex + 2] += start[vertex + 1]
+    around = np.empty(len(low), np.int64)
+    edge, before, count = np.empty(len(low), np.int64), np.full(len(low), -1), 0
+    for side, vertex in enumerate(low):
+        around[start[vertex + 1]] = side
+        start[vertex + 1] += 1
+    for vertex in range(vertices):
+        for k in range(start[vertex], start[vertex + 1]):
+            side = around[k]
+            edge[side] = count
+            for m in range(k - 1, start[vertex] - 1, -1):
+                if high[around[m]] == high[side]:
+                    edge[side], before[side] = edge[around[m]], around[m]
+                    break
+            count += edge[side] == count
+    return edge, before
 
 
 def non_manifold_faces(mesh: Mesh) -> Bool[np.ndarray, "f"]:
     """Faces with an edge that three or more faces share, or that two share in the same direction, or without area."""
-    edge, sides = _edges(mesh)
-    forward = sides[:, 0] < sides[:, 1]
-    count = np.bincount(edge, minlength=1)
-    along = np.bincount(edge, forward, minlength=1)
+    sides = _Sides.of(mesh)
+    forward = sides.ends[:, 0] < sides.ends[:, 1]
+    count = sides.uses
+    along = np.bincount(sides.edge, forward, minlength=1)
     bad = (count > 2) | ((count == 2) & (along != 1))
-    return bad[edge].reshape(3, -1).any(axis=0) | (mesh.face_areas == 0)
+    return bad[sides.edge].reshape(3, -1).any(axis=0) | (mesh.face_areas == 0)
 
 
 def face_pieces(mesh: Mesh) -> Int[np.ndarray, "f"]:
     """Number of the connected piece that each face belongs to."""
-    edge, _ = _edges(mesh)
-    face = np.tile(np.arange(len(mesh.faces)), 3)
-    order = np.argsort(edge, kind="stable")
-    pair = np.flatnonzero(edge[order][1:] == edge[order][:-1])
-    return parts_of(np.stack([face[order][pair], face[order][pair + 1]], axis=1), len(mesh.faces))
+    one, other = _Sides.of(mesh).pairs
+    count = max(len(mesh.faces), 1)
+    return parts_of(np.stack([one % count, other % count], axis=1), len(mesh.faces))
 
 
 def floating_faces(mesh: Mesh, least_mm2: float, least_share: float) -> tuple[Bool[np.ndarray, "f"], int]:
@@ -139,28 +184,25 @@ def with_split_fans(mesh: Mesh) -> tuple[Mesh, int]:
     if corners == 0:
         return mesh, 0
     # Corners (face-major) of one fan are joined where two faces share an edge.
-    edge, _ = _edges(mesh)
+    one, other = _Sides.of(mesh).pairs
     count = len(mesh.faces)
-    order = np.argsort(edge, kind="stable")
-    pair = np.flatnonzero(edge[order][1:] == edge[order][:-1])
-    one, other = order[pair], order[pair + 1]
     start = [side % count * 3 + side // count for side in (one, other)]
     end = [side % count * 3 + (side // count + 1) % 3 for side in (one, other)]
     # The two faces run along the edge in opposite directions.
     same = np.stack([np.concatenate([start[0], end[0]]), np.concatenate([end[1], start[1]])], axis=1)
     fan = parts_of(same, corners)
-    _, first = np.unique(fan, return_index=True)
-    source = mesh.faces.ravel()[first]
+    source = np.empty(fan.max() + 1, dtype=np.int64)
+    source[fan] = mesh.faces.ravel()
     colors = None if mesh.colors is None else mesh.colors[source]
-    used = len(np.unique(mesh.faces))
+    used = len(used_vertices(mesh.faces, len(mesh.vertices)))
     return Mesh(mesh.vertices[source], fan.reshape(-1, 3), colors), len(source) - used
 
 
 def boundaries(mesh: Mesh) -> tuple[float, tuple[Hole, ...]]:
     """Length of the outer boundaries (the longest of each piece, mm), and the other ones as holes, largest first."""
-    edge, sides = _edges(mesh)
-    alone = np.bincount(edge, minlength=1)[edge] == 1
-    open_sides = sides[alone]
+    sides = _Sides.of(mesh)
+    alone = sides.uses[sides.edge] == 1
+    open_sides = sides.ends[alone]
     if len(open_sides) == 0:
         return 0.0, ()
     face = np.tile(np.arange(len(mesh.faces)), 3)[alone]

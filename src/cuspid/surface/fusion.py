@@ -19,14 +19,14 @@ from jaxtyping import Bool, Float, Int, UInt8
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.kernels import kernel
-from cuspid.mesh import Mesh
+from cuspid.mesh import Mesh, used_vertices
 from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import DepthMap
 from cuspid.surface.evidence import Evidence, colors_of, observe
 from cuspid.surface.meshing import extract
-from cuspid.surface.volume import SparseVolume
-from cuspid.workers import map_slices
+from cuspid.surface.volume import Reached, SparseVolume
+from cuspid.workers import beside_work_ahead, map_ahead, map_slices
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,27 +82,50 @@ def fuse(
     jump_mm, agreement_mm = options.largest_jump * resolution_mm, options.agreement * resolution_mm
     volume = SparseVolume(voxel_mm, options.truncation_voxels * voxel_mm)
     half = len(rig_from_world)
-    for depth_map, cam_from_world, done in _located(depth_maps, rig_from_world):
-        points = rig_from_world[depth_map.frame].inverse().apply(depth_map.points_in_rig()[0])
-        volume.integrate(Evidence.of(depth_map, jump_mm), cam_from_world, points)
-        progress("fusion", done, 2 * half)
+
+    def reached(one: _Located) -> tuple[_Located, Evidence, Reached]:
+        evidence = Evidence.of(one.depth_map, jump_mm)
+        return one, evidence, volume.reached(evidence, one.cam_from_world, one.points_in_world())
+
+    for one, evidence, where in map_ahead(reached, _located(depth_maps, rig_from_world)):
+        volume.integrate(evidence, one.cam_from_world, where)
+        progress("fusion", one.number, 2 * half)
     votes = Votes.on(extract(volume, options.least_weight))
     del volume
-    for depth_map, cam_from_world, done in _located(depth_maps, rig_from_world):
-        votes.collect(Evidence.of(depth_map, jump_mm), depth_map, cam_from_world, agreement_mm, done)
-        progress("fusion", half + done, 2 * half)
+    for one, evidence in map_ahead(
+        lambda one: (one, Evidence.of(one.depth_map, jump_mm)), _located(depth_maps, rig_from_world)
+    ):
+        votes.collect(evidence, one.depth_map, one.cam_from_world, agreement_mm, one.number)
+        progress("fusion", half + one.number, 2 * half)
     return votes.outcome(options.least_maps)
 
 
-def _located(
-    depth_maps: Iterable[DepthMap], rig_from_world: Mapping[str, Rigid3]
-) -> Iterator[tuple[DepthMap, Rigid3, int]]:
-    """Depth maps of located frames, where their camera was, and how many frames were begun."""
+@dataclass(frozen=True, eq=False)
+class _Located:
+    """A depth map of a located frame."""
+
+    depth_map: DepthMap
+    rig_from_world: Rigid3
+    number: int
+    """Of its frame, from 1 on."""
+
+    @property
+    def cam_from_world(self) -> Rigid3:
+        """Where its camera was."""
+        return self.depth_map.cam_from_rig @ self.rig_from_world
+
+    def points_in_world(self) -> Float[np.ndarray, "n 3"]:
+        """What it measured, mm."""
+        return self.rig_from_world.inverse().apply(self.depth_map.points_in_rig()[0])
+
+
+def _located(depth_maps: Iterable[DepthMap], rig_from_world: Mapping[str, Rigid3]) -> Iterator[_Located]:
+    """Depth maps of located frames."""
     begun: set[str] = set()
     for depth_map in depth_maps:
         if depth_map.frame in rig_from_world:
             begun.add(depth_map.frame)
-            yield depth_map, depth_map.cam_from_rig @ rig_from_world[depth_map.frame], len(begun)
+            yield _Located(depth_map, rig_from_world[depth_map.frame], len(begun))
 
 
 _USUAL = 3
@@ -168,6 +191,7 @@ class Votes:
                 frame,
             ),
             len(chunks),
+            parts=beside_work_ahead(),
         )
 
     def _in_view(self, camera: Camera, cam_from_world: Rigid3) -> Int[np.ndarray, "k"]:
@@ -187,7 +211,7 @@ class Votes:
         colors: UInt8[np.ndarray, "v 3"] = np.rint(self.color / total).clip(0, 255).astype(np.uint8)
         confirmed = (self.maps >= least_maps) & self.measured
         kept = confirmed[self.rough.faces].all(axis=1)
-        used = np.unique(self.rough.faces[kept])
+        used = used_vertices(self.rough.faces[kept], len(self.rough.vertices))
         return Fused(Mesh(vertices, self.rough.faces, colors).submesh(kept), self._sigma_mm()[used])
 
     def _sigma_mm(self) -> Float[np.ndarray, "v"]:

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from cuspid.geometry import Rigid3
 from cuspid.kernels import kernel
 from cuspid.surface.evidence import Evidence, observe, observe_foot
-from cuspid.workers import map_slices
+from cuspid.workers import beside_work_ahead, map_slices
 
 BLOCK = 8
 """Voxels along the side of a block."""
@@ -35,6 +35,16 @@ def unpack(keys: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n 3"]:
     """Inverse of :func:`pack`."""
     mask = (1 << 21) - 1
     return np.stack([keys >> 42, (keys >> 21) & mask, keys & mask], axis=-1) - _OFFSET
+
+
+@dataclass(frozen=True, eq=False)
+class Reached:
+    """Where a depth map tells something."""
+
+    keys: Int[np.ndarray, "b"]
+    """Of the blocks around its points, sorted."""
+    nearest: Int[np.ndarray, "h w"]
+    """As :meth:`Evidence.nearest` within the truncation distance."""
 
 
 @dataclass
@@ -56,12 +66,14 @@ class SparseVolume:
         """Packed coordinates of the blocks in order of their slots."""
         return np.fromiter(self._slot_of_key, dtype=np.int64, count=len(self._slot_of_key))
 
-    def integrate(self, evidence: Evidence, cam_from_world: Rigid3, points: Float[np.ndarray, "n 3"]) -> None:
-        """Blend in one depth map, in the blocks around its points (world, mm)."""
-        keys = self._keys_around(points)
-        slots = self._allocate(keys)
-        origins = unpack(keys).astype(np.float64) * BLOCK
-        nearest = evidence.nearest(self._reach_px(evidence, cam_from_world, points))
+    def reached(self, evidence: Evidence, cam_from_world: Rigid3, points: Float[np.ndarray, "n 3"]) -> Reached:
+        """What a depth map with these points (world, mm) will change; asks nothing of what was blended before."""
+        return Reached(self._keys_around(points), evidence.nearest(self._reach_px(evidence, cam_from_world, points)))
+
+    def integrate(self, evidence: Evidence, cam_from_world: Rigid3, reached: Reached) -> None:
+        """Blend in one depth map."""
+        slots = self._allocate(reached.keys)
+        origins = unpack(reached.keys).astype(np.float64) * BLOCK
         map_slices(
             lambda part: _integrate(
                 self.distance,
@@ -72,10 +84,11 @@ class SparseVolume:
                 cam_from_world.rotation,
                 cam_from_world.translation,
                 *evidence.arrays,
-                nearest,
+                reached.nearest,
                 self.truncation_mm,
             ),
             len(slots),
+            parts=beside_work_ahead(),
         )
 
     def _reach_px(self, evidence: Evidence, cam_from_world: Rigid3, points: Float[np.ndarray, "n 3"]) -> int:
