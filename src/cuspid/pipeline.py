@@ -34,6 +34,7 @@ from cuspid.mesh import Mesh
 from cuspid.motion.location import MotionOptions
 from cuspid.motion.single import SingleOptions, locate_single
 from cuspid.motion.stage import MotionMethod, locate, take_poses
+from cuspid.options import SHARE
 from cuspid.pairing import resolved_mm
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
