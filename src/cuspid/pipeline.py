@@ -34,7 +34,7 @@ from cuspid.mesh import Mesh
 from cuspid.motion.location import MotionOptions
 from cuspid.motion.single import SingleOptions, locate_single
 from cuspid.motion.stage import MotionMethod, locate, take_poses
-from cuspid.options import SHARE
+from cuspid.options import SHARE, Options
 from cuspid.pairing import resolved_mm
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
@@ -84,7 +84,7 @@ _DRAFT_TEMPORAL_LEFT_SHARE = 0.03
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReconstructionOptions:
+class ReconstructionOptions(Options):
     """How images become a mesh."""
 
     quality: Quality = "standard"
