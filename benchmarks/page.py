@@ -165,6 +165,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
     "manufacturing_arch": ("The same, a whole real arch", handpiece_sections.manufacturing),
     "expectations": ("What is expected of a scan", trust_sections.expectations),
     "grid": ("Running many", handpiece_sections.grid),
+    "qualities": ("Draft and standard", trust_sections.qualities),
     "fuzz": ("Damaged input", trust_sections.fuzz),
     "kill": ("Killed runs", trust_sections.kill),
     "large": ("A mesh of 5 million faces", trust_sections.large),

@@ -1,4 +1,4 @@
-"""Sections of docs/benchmarks.md on what scans expect of themselves, damaged input, killed runs and large meshes."""
+"""Sections of docs/benchmarks.md on qualities, what scans expect, damaged input, killed runs and large meshes."""
 
 from __future__ import annotations
 
@@ -123,4 +123,60 @@ def large(result: Result) -> str:
             "",
             markdown_table(("verb", "peak memory, GiB", "wall s", "CPU s"), rows),
         ]
+    )
+
+
+_QUALITIES = (
+    "quality",
+    "cores",
+    "images to mesh s",
+    "CPU-s",
+    "of ideal %",
+    "peak GiB",
+    "mean um",
+    "P95 um",
+    "everything, mean um",
+    "complete within 50 um, %: seen",
+    "all crowns",
+    "mapping s",
+)
+
+
+def qualities(result: Result) -> str:
+    """What each quality takes and gives."""
+    rows = []
+    for row in result["rows"]:
+        alone = next((each for each in result["rows"] if (each["quality"], each["cores"]) == (row["quality"], 1)), row)
+        ideal = 100 * alone["wall_s"] / (row["cores"] * row["wall_s"])
+        rows.append(
+            (
+                row["quality"],
+                row["cores"],
+                f"{row['wall_s']:.0f}",
+                f"{row['cpu_s']:.0f}",
+                f"{ideal:.0f}",
+                f"{row['peak_gib']:.1f}",
+                *_trueness_cells(row["trueness"]),
+                f"{sum(seconds for part, seconds in row['motion_s'].items() if part.endswith('_s')):.0f}",
+            )
+        )
+    return "\n".join(
+        [
+            f"One scan ({result['jaw']}, {result['images']} images) by each `--quality`, on one core and on all. *Of "
+            "ideal*: the time on one core, shared among them all, beside the time that it took. *Mapping*: from the "
+            "images to the poses. `python benchmarks/qualities.py`.",
+            "",
+            markdown_table(_QUALITIES, rows),
+        ]
+    )
+
+
+def _trueness_cells(trueness: Result) -> tuple[str, ...]:
+    everything, crown = trueness.get("everything"), trueness.get("crown")
+    return (
+        f"{trueness['mean_abs_um']:.1f}",
+        f"{trueness['p95_um']:.1f}",
+        "" if everything is None else f"{everything['mean_abs_um']:.1f}",
+        f"{trueness['completeness_pct']['50']:.1f}",
+        "" if crown is None else f"{crown['completeness_pct']['50']:.1f}",
     )

@@ -300,7 +300,9 @@ def test_what_was_asked_for_goes_before_the_quality() -> None:
     asked = ReconstructionOptions(quality="draft", temporal=TemporalOptions(left_share=0.2))
     assert pipeline._settled(asked).temporal.left_share == 0.2
     assert pipeline._settled(asked).tracking.features.count == 500
+    assert pipeline._settled(asked).tracking.features.size_for(640, 480) == (160, 120)
     assert pipeline._settled(asked).left_share == 1
     assert pipeline._settled(replace(asked, left_share=0.3)).left_share == 0.3
     standard = ReconstructionOptions()
+    assert pipeline._settled(standard).tracking.features.size_for(640, 480) == (320, 240)
     assert pipeline._settled(standard) == replace(standard, left_share=pipeline._LEFT_SHARE)

@@ -18,6 +18,7 @@ from cuspid.errors import InputError, OutputError
 from cuspid.geometry import Rigid3
 from cuspid.motion.features import DESCRIPTOR_NORM, FeatureOptions, detect, detect_all, spread
 from cuspid.motion.pairs import match_unguided
+from cuspid.motion.pictures import Pictures
 from cuspid.rig import Handpiece, MountedCamera, Rig
 
 SIZE = 240
@@ -64,16 +65,16 @@ def test_keypoints_are_accurate_and_unbiased() -> None:
     assert np.abs(errors[good].mean(axis=0)).max() < 0.05
 
 
-@pytest.mark.parametrize("halved_from_px", [None, 100])
+@pytest.mark.parametrize(("halved_from_px", "halvings"), [(None, None), (100, None), (100, 2)])
 @pytest.mark.parametrize("size", [SIZE, SIZE + 1])
-def test_a_blob_lies_where_it_was_drawn(size: int, halved_from_px: int | None) -> None:
+def test_a_blob_lies_where_it_was_drawn(size: int, halved_from_px: int | None, halvings: int | None) -> None:
     """The pixel origin: a Gaussian blob centred on the corner between pixels (60, 80) has COLMAP's (60, 80), also where
-    the image is halved, of an odd size too."""
+    the image is halved, or that again, of an odd size too."""
     x, y = np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5)
     gray = 60 + 150 * np.exp(-((x - 60) ** 2 + (y - 80) ** 2) / (2 * 4.0**2))
     image = np.repeat(np.rint(gray).astype(np.uint8)[..., None], 3, axis=2)
-    nearest = detect(image, FeatureOptions(halved_from_px=halved_from_px)).pixels - [60, 80]
-    assert np.linalg.norm(nearest, axis=1).min() < 0.05
+    nearest = detect(image, FeatureOptions(halved_from_px=halved_from_px, halvings=halvings)).pixels - [60, 80]
+    assert np.linalg.norm(nearest, axis=1).min() < 0.05 * (halvings or 1)
 
 
 def test_descriptors_have_their_length_and_colors_their_place() -> None:
@@ -144,29 +145,54 @@ def test_all_images_are_read_once(capture: Capture, tmp_path: Path, monkeypatch:
     """A second run takes every image from the cache and finds the same; a changed option or image does not."""
     seen: list[tuple[str, int, int]] = []
     cache = tmp_path / "cache"
-    first = detect_all(capture, cache=cache, progress=lambda *step: seen.append(step))
+    first = detect_all(Pictures(capture), cache=cache, progress=lambda *step: seen.append(step))
     assert seen == [("features", k, 4) for k in (1, 2, 3, 4)]
     assert set(first) == {(f"{k:05d}", c) for k in (0, 1) for c in "ab"}
     reads: list[object] = []
     original = Capture.image
     monkeypatch.setattr(Capture, "image", lambda self, *which: reads.append(which) or original(self, *which))
-    again = detect_all(capture, cache=cache)
+    again = detect_all(Pictures(capture), cache=cache)
     assert not reads
     np.testing.assert_array_equal(again["00001", "b"].descriptors, first["00001", "b"].descriptors)
     np.testing.assert_array_equal(again["00001", "b"].pixels, first["00001", "b"].pixels)
     cv2.imwrite(str(image_path(capture, "00001", "b")), photograph(SECOND))
-    detect_all(capture, cache=cache)
+    detect_all(Pictures(capture), cache=cache)
     assert reads == [(capture.frames[1], "b")]
-    assert len(detect_all(capture, FeatureOptions(count=10), cache=cache)["00000", "a"]) == 10
+    assert len(detect_all(Pictures(capture), FeatureOptions(count=10), cache=cache)["00000", "a"]) == 10
+
+
+def test_grey_pictures_are_read_once_as_far_as_memory_goes(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that were kept and those that are read again are the same."""
+    reads: list[tuple[object, ...]] = []
+    original = Capture.image
+    monkeypatch.setattr(Capture, "image", lambda self, *which: reads.append(which) or original(self, *which))
+    every = [(frame, camera) for frame in capture.frames for camera in frame.cameras]
+    height, width = original(capture, *every[0]).shape[:2]
+    greys, counts = [], []
+    for room in (0, 2, 100):
+        pictures = Pictures(capture, most_bytes=room * height * width)
+        for image in every:
+            pictures.image(*image)
+        reads.clear()
+        greys.append([pictures.grey(*image) for image in every])
+        counts.append(len(reads))
+    assert counts == [4, 2, 0]
+    for some in zip(*greys, strict=True):
+        assert some[0].shape == (height, width)
+        assert some[0].std() > 0
+        np.testing.assert_array_equal(some[0], some[1])
+        np.testing.assert_array_equal(some[0], some[2])
 
 
 def test_a_broken_cache_file_is_made_again(capture: Capture, tmp_path: Path) -> None:
     """A run that was killed while writing leaves nothing that a later one trusts."""
     cache = tmp_path / "cache"
-    first = detect_all(capture, cache=cache)
+    first = detect_all(Pictures(capture), cache=cache)
     file = cache / "features" / "a" / "00000.npz"
     file.write_bytes(file.read_bytes()[:500])
-    np.testing.assert_array_equal(detect_all(capture, cache=cache)["00000", "a"].pixels, first["00000", "a"].pixels)
+    np.testing.assert_array_equal(
+        detect_all(Pictures(capture), cache=cache)["00000", "a"].pixels, first["00000", "a"].pixels
+    )
 
 
 def test_bad_images_and_caches_are_told(capture: Capture, tmp_path: Path) -> None:
@@ -174,10 +200,10 @@ def test_bad_images_and_caches_are_told(capture: Capture, tmp_path: Path) -> Non
     blocked = tmp_path / "blocked"
     blocked.write_text("a file, not a folder")
     with pytest.raises(OutputError, match="blocked"):
-        detect_all(capture, cache=blocked)
+        detect_all(Pictures(capture), cache=blocked)
     image_path(capture, "00001", "a").unlink()
     with pytest.raises(InputError, match=r"a/00001\.png"):
-        detect_all(capture, cache=tmp_path / "cache")
+        detect_all(Pictures(capture), cache=tmp_path / "cache")
 
 
 def test_how_many_keypoints_follows_from_the_size_of_the_image() -> None:

@@ -162,6 +162,7 @@ def measured(
         left_share=left_share,
         progress=lambda name, done, total: told.update({name: (done, total)}),
     )
+    asked.sort()  # threads take them in any order
     assert depths.frames == tuple(frame for frame, *_ in asked)
     assert all(done == total for done, total in told.values())
     return asked

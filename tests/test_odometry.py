@@ -20,6 +20,7 @@ from cuspid.motion.least_squares_matching import LeastSquaresOptions
 from cuspid.motion.location import _advice, _loose_notes, locate_features, stereo_ties
 from cuspid.motion.odometry import Edge, OdometryOptions, chain, polish, triangulate_frame
 from cuspid.motion.pairs import MatchingOptions, index_features
+from cuspid.motion.pictures import Pictures
 from cuspid.pairing import stereo_pairs
 from cuspid.reconstruction import Expectation, Reconstruction, Tracks
 from cuspid.rig import Handpiece, MountedCamera, Rig
@@ -365,7 +366,7 @@ def test_where_no_patch_is_found_keypoints_are_taken(tmp_path: Path) -> None:
     rig = Rig({name: m for name, m in make_handpiece().rig.cameras.items() if name != "side"})
     path = {f"{k:05d}": Rigid3(np.eye(3), np.array([-0.6 * k, 0, 0])) for k in range(3)}
     capture = make_capture(tmp_path, rig, path)
-    seen = detect_all(capture, MotionOptions().features)
+    seen = detect_all(Pictures(capture), MotionOptions().features)
 
     def read(frame: str, camera: str) -> np.ndarray:
         image = capture.source.read(frame, camera)[..., 0]

@@ -78,7 +78,7 @@ __all__ = [
 
 
 Quality = Literal["draft", "standard"]
-_DRAFT_KEYPOINTS = 500
+_DRAFT_KEYPOINTS, _DRAFT_HALVINGS = 500, 2
 _LEFT_SHARE, _DRAFT_LEFT_SHARE = 0.005, 1.0
 _DRAFT_TEMPORAL_LEFT_SHARE = 0.03
 
@@ -88,8 +88,9 @@ class ReconstructionOptions(Options):
     """How images become a mesh."""
 
     quality: Quality = "standard"
-    """draft: a quick look at a scan, with depth of every second frame from images of half the size, half of the
-    keypoints, and more small holes. standard: all that the images tell, but for frames that add nothing."""
+    """draft: a quick look at a scan, with keypoints from images of a quarter of the size, depth of every second frame
+    from images of half the size, and more small holes. standard: all that the images tell, but for frames that add
+    nothing."""
     left_share: Annotated[float | None, SHARE] = None
     """Depth is measured in every second frame, and in those between where that adds to the surface: until, of the
     sparse points that few depth maps confirm, no more than this share (0 to 1) of all points could still gain. 0: in
@@ -184,11 +185,14 @@ def _settled(options: ReconstructionOptions) -> ReconstructionOptions:
         options = replace(options, left_share=_DRAFT_LEFT_SHARE if draft else _LEFT_SHARE)
     if not draft:
         return options
-    if tracking.features.count is None:
-        tracking = replace(tracking, features=replace(tracking.features, count=_DRAFT_KEYPOINTS))
+    features = tracking.features
+    if features.count is None:
+        features = replace(features, count=_DRAFT_KEYPOINTS)
+    if features.halvings is None:
+        features = replace(features, halvings=_DRAFT_HALVINGS)
     if temporal.left_share is None:
         temporal = replace(temporal, left_share=_DRAFT_TEMPORAL_LEFT_SHARE)
-    return replace(options, tracking=tracking, temporal=temporal)
+    return replace(options, tracking=replace(tracking, features=features), temporal=temporal)
 
 
 def as_known(handpiece: Handpiece, options: ReconstructionOptions) -> Handpiece:

@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET
-from cuspid.capture import Capture, Frame, halved_size
+from cuspid.capture import Frame, halved_size
+from cuspid.motion.pictures import Pictures
 from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.storage.files import write_arrays
@@ -44,14 +45,18 @@ class FeatureOptions(Options):
     halved_from_px: Annotated[int | None, Range(16, 1_000_000)] = None
     """Images whose shorter side has so many px are searched at half their size, which takes a third of the time; the
     places are half as exact. None: never."""
+    halvings: Annotated[int | None, Range(1, 4)] = None
+    """How many times over they are halved. By default once, for a draft twice."""
     upright: bool = True
     """Descriptors along the image's axes; False estimates an orientation for each keypoint, for free-hand turns of
     more than about 20 degrees about the optical axis between frames."""
 
     def size_for(self, width: int, height: int) -> tuple[int, int]:
         """At which size (px) an image is searched."""
-        halved = self.halved_from_px is not None and min(width, height) >= self.halved_from_px
-        return halved_size(width, height) if halved else (width, height)
+        if self.halved_from_px is not None and min(width, height) >= self.halved_from_px:
+            for _ in range(self.halvings or 1):
+                width, height = halved_size(width, height)
+        return width, height
 
     def count_for(self, width: int, height: int) -> int:
         """Most keypoints in an image of a size in px."""
@@ -135,34 +140,37 @@ def _load(path: Path) -> Features:
         return Features(pixels=kept["pixels"], descriptors=kept["descriptors"], colors=kept["colors"])
 
 
-def _detect_kept(capture: Capture, frame: Frame, camera: str, options: FeatureOptions, stage: Stage | None) -> Features:
+def _detect_kept(
+    pictures: Pictures, frame: Frame, camera: str, options: FeatureOptions, stage: Stage | None
+) -> Features:
     """Features of one image of a capture, from the results of an earlier run where they are there."""
     if stage is None:
-        return detect(capture.image(frame, camera), options)
+        return detect(pictures.image(frame, camera), options)
     path = stage.folder / camera / f"{frame.name}.npz"
-    key = stage.key({"image": capture.source.digest(frame.name, camera)})
+    key = stage.key({"image": pictures.capture.source.digest(frame.name, camera)})
     if stage.has(key, [path]):
         return _load(path)
-    features = detect(capture.image(frame, camera), options)
+    features = detect(pictures.image(frame, camera), options)
     write_arrays(path, {name: getattr(features, name) for name in ("pixels", "descriptors", "colors")})
     stage.record(key, [path])
     return features
 
 
 def detect_all(
-    capture: Capture,
+    pictures: Pictures,
     options: FeatureOptions | None = None,
     *,
     progress: Progress = silent,
     cache: Path | None = None,
 ) -> Mapping[tuple[str, str], Features]:
-    """Features of every image by (frame, camera). Finished images are kept in ``cache``. Raises InputError."""
+    """Features of every image of a capture by (frame, camera). Finished images are kept in ``cache``. Raises
+    InputError."""
     options = options or FeatureOptions()
     stage = None if cache is None else Stage("features", cache / "features", options, ("motion/features.py",))
-    images = [(frame, camera) for frame in capture.frames for camera in frame.cameras]
+    images = [(frame, camera) for frame in pictures.capture.frames for camera in frame.cameras]
 
     def kept(image: tuple[Frame, str]) -> Features:
-        return _detect_kept(capture, *image, options, stage)
+        return _detect_kept(pictures, *image, options, stage)
 
     found = map_in_threads(kept, images, stage="features", progress=progress)
     return {(frame.name, camera): features for (frame, camera), features in zip(images, found, strict=True)}

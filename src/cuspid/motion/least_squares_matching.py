@@ -178,7 +178,7 @@ def match_patches(
     """The tracks of a reconstruction, which has some, with their places put where the patch of each point is seen;
     without observations in which it is not found, and points that are seen nowhere else.
 
-    ``read`` may be asked twice for each picture, the second time in the opposite order.
+    ``read`` may be asked twice for each picture.
     """
     tracks = found.tracks
     assert tracks is not None
@@ -190,8 +190,7 @@ def match_patches(
         point = tracks.point_index[part[1]]
         return matching.lay(*part, patches[point], facets.crosses[point])
 
-    # Those first whose patches were cut last: their pictures may still be at hand.
-    others = dict(reversed(_by_image(tracks, np.setdiff1d(np.arange(len(tracks.point_index)), facets.own)).items()))
+    others = _by_image(tracks, np.setdiff1d(np.arange(len(tracks.point_index)), facets.own))
     laid = map_in_threads(lay, others.items(), stage="patches", progress=progress)
     pixels, correlation = tracks.pixels.copy(), np.ones(len(tracks.pixels))
     for observations, (places, alike) in zip(others.values(), laid, strict=True):

@@ -6,11 +6,10 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
@@ -32,6 +31,7 @@ from cuspid.motion.odometry import (
     triangulate_frame,
 )
 from cuspid.motion.pairs import MatchingOptions, frame_pairs, index_features, match_guided
+from cuspid.motion.pictures import Pictures
 from cuspid.motion.tracks import intersect_rays, join, thin
 from cuspid.options import SEED, SHARE, Options, Range
 from cuspid.pairing import PairingOptions, require_stereo, resolved_mm, stereo_pairs
@@ -42,8 +42,6 @@ from cuspid.workers import map_in_threads
 
 _LOOSE_SCALE_PPM, _LOOSE_SPAN_PPM = 1000.0, 300.0
 """Standard deviations of the scale and, apart from it, of the length of a scan, beyond which there is advice."""
-_PICTURES_BYTES = 400_000_000
-"""Memory for grey pictures that are asked for again."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -409,16 +407,14 @@ def locate(
     require_stereo(capture.handpiece, options.pairing)
     exact = options.least_squares.enabled
     sought = options.features if exact else replace(options.features, halved_from_px=None)
+    pictures = Pictures(capture) if exact else Pictures(capture, most_bytes=0)
     with _timed(log, "features"):
-        features = detect_all(capture, sought, progress=progress, cache=cache)
+        features = detect_all(pictures, sought, progress=progress, cache=cache)
     names = [frame.name for frame in capture.frames]
     frames = {frame.name: frame for frame in capture.frames}
 
-    sizes = [mounted.camera.width * mounted.camera.height for mounted in capture.handpiece.rig.cameras.values()]
-
-    @lru_cache(_PICTURES_BYTES // max(sizes))
     def read(frame: str, camera: str) -> UInt8[np.ndarray, "h w"]:
-        return np.asarray(cv2.cvtColor(capture.image(frames[frame], camera), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+        return pictures.grey(frames[frame], camera)
 
     found = locate_features(capture.handpiece, features, names, options, read=read, progress=progress)
     return replace(found, dropped=(*capture.left_out, *found.dropped), log={**log, **found.log})

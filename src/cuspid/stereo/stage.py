@@ -24,7 +24,7 @@ from cuspid.storage.handpieces import hash_handpiece
 from cuspid.storage.reconstructions import read_depth_maps, write_depth_maps
 from cuspid.storage.stages import Stage
 from cuspid.tolerances import held
-from cuspid.workers import map_in_threads
+from cuspid.workers import map_ahead, map_in_threads
 
 _CODE = ("stereo",)
 _LEFT_SHARE = 0.005
@@ -41,8 +41,8 @@ class StoredDepthMaps:
     """Files of one frame after those of another, in the order of the frames, and the key that each was made under."""
 
     def __iter__(self) -> Iterator[DepthMap]:
-        for file in self.made:
-            yield from read_depth_maps(file)
+        for maps in map_ahead(read_depth_maps, self.made):
+            yield from maps
 
     def __or__(self, other: StoredDepthMaps) -> StoredDepthMaps:
         """These and others, frame by frame."""
@@ -154,12 +154,15 @@ def measure_temporal_depth(
     """Depth maps of cameras together with themselves at the next located frame of the same lighting pattern, kept in
     ``folder``: of those that fill holes (:attr:`TemporalOptions.left_share`), which are where fewer than ``least_maps``
     of ``depths`` confirm the sparse points within ``agreement_mm``."""
-    steps = _steps(capture, found.rig_from_world, options)
     left_share = _LEFT_SHARE if options.left_share is None else options.left_share
-    if found.tracks is not None and left_share > 0:
+    if found.tracks is None or left_share == 0:
+        steps = _steps(capture, found.rig_from_world, options)
+    else:
         sightings = Sightings.of(found, found.tracks)
         missing = sightings.confirmed(depths, found.rig_from_world, agreement_mm) < least_maps
-        steps = _worthwhile(steps, sightings, missing, left_share)
+        few = missing.sum() <= left_share * len(missing)
+        every = {} if few else _steps(capture, found.rig_from_world, options)
+        steps = _worthwhile(every, sightings, missing, left_share)
 
     def measure(frame: Frame) -> tuple[DepthMap, ...]:
         step = steps[frame.name]
