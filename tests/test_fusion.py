@@ -178,6 +178,18 @@ def test_the_foot_of_a_perpendicular_must_lie_on_the_surface() -> None:
     assert max(answers) < 1e-4
 
 
+def test_planes_beside_an_edge_are_those_of_its_sides() -> None:
+    """Not the mean of both."""
+    seen = true_depth_map(RIDGE, diamond(120).rig["west"], Rigid3.identity(), "a", "west")
+    evidence = Evidence.of(seen, 0.15)
+    normals = np.array([[0.8, 0, -1], [-0.8, 0, -1]]) / np.hypot(0.8, 1) @ seen.cam_from_rig.rotation.T
+    known = seen.known.copy()
+    known[[0, -1]] = known[:, [0, -1]] = False
+    alike = (evidence.plane[known][:, :3] @ normals.T).max(axis=1)
+    assert known.mean() > 0.5
+    assert np.rad2deg(np.arccos(np.clip(alike, -1, 1))).max() < 1
+
+
 def test_faces_look_at_the_cameras() -> None:
     mesh = fused_hills()
     _, face, _ = HILLS.closest(mesh.face_centres)

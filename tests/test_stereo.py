@@ -28,11 +28,12 @@ from cuspid.stereo.confidence import (
 from cuspid.stereo.initial_depth import initial_pairs, semi_global
 from cuspid.stereo.matching import DepthEstimator, StereoOptions, coarser, group_geometry
 from cuspid.stereo.rectification import IdealView, rectify
-from cuspid.stereo.refinement import image_noise
+from cuspid.stereo.refinement import RefinementOptions, half_window, image_noise, patch_window
 from synthetic_scene import cast_depth, diamond, height_field, render
 
 HILLS = height_field(lambda x, y: 5 + 0.25 * np.sin(1.8 * x) * np.cos(1.5 * y))
 STEP = height_field(lambda x, y: np.where(x < 0, 4.6, 5.4), count=400)
+ROOF = height_field(lambda x, y: 4.6 + 0.8 * np.abs(x), count=401)
 LENS = (-0.12, 0.03, 0.001, -0.002)
 
 
@@ -152,6 +153,40 @@ def test_depth_outside_of_the_range_is_not_kept() -> None:
         known = depth_map.depth_mm[np.isfinite(depth_map.depth_mm)]
         assert known.size > 0
         assert known.min() >= 4.949
+
+
+def roofs() -> tuple[DepthMap, DepthMap]:
+    """The depth map of one camera with and without half windows."""
+    images = photograph(diamond(), ROOF)
+    options = StereoOptions(spacing_px=2)
+    plain = replace(options, refinement=replace(options.refinement, bend_px=None))
+    sharp, blunt = (DepthEstimator(diamond(), each).measure(images, "00000")[0] for each in (options, plain))
+    return sharp, blunt
+
+
+def test_an_edge_is_not_rounded_off() -> None:
+    """Half windows see one side of a roof; beyond the reach of a window hardly anything changes."""
+    sharp, blunt = roofs()
+    truth = cast_depth(ROOF, sharp.camera, sharp.cam_from_rig)
+    across = np.abs(truth - 4.6) / 0.8
+    both = np.isfinite(sharp.depth_mm) & np.isfinite(blunt.depth_mm)
+    near, far = both & (across < 0.06), both & (across > 0.4)
+    assert near.sum() > 100
+    off = {name: 1000 * (each.depth_mm - truth)[near] for name, each in (("sharp", sharp), ("blunt", blunt))}
+    assert np.median(off["blunt"]) > 4
+    assert abs(np.median(off["sharp"])) < 0.4 * np.median(off["blunt"])
+    assert 0 < np.abs(off["sharp"]).mean() < 0.7 * np.abs(off["blunt"]).mean()
+    assert (sharp.depth_mm != blunt.depth_mm)[far].mean() < 0.005
+
+
+@pytest.mark.parametrize("side", [(0, 1), (-1, 0), (1, -1)])
+def test_half_of_a_window_has_the_middle_and_one_side(side: tuple[int, int]) -> None:
+    window = patch_window(RefinementOptions())
+    half, other = half_window(window, side), half_window(window, (-side[0], -side[1]))
+    assert half.shape[1] + other.shape[1] == window.shape[1] + 2 * RefinementOptions().radius_px + 1
+    assert half[2].sum() == pytest.approx(1)
+    assert np.all(half[1] * side[0] + half[0] * side[1] >= 0)
+    np.testing.assert_allclose(np.sort(half[2]), np.sort(other[2]), rtol=1e-6)
 
 
 def test_a_step_is_not_bridged() -> None:

@@ -10,6 +10,9 @@ s, the longest of the K_j t_j, so that q counts pixels of disparity in the wides
 mean 0 and norm 1, so that gain and offset of a camera do not matter; their inner product is the ZNCC. (q, q_u, q_v)
 minimises the summed squared differences over the cameras that see the patch; a camera whose ZNCC falls behind is
 taken to be occluded and left out. Pixels are OpenCV's here: the first centre is 0.
+
+A window over an edge sees two planes, and rounds it off. So where the planes around a pixel differ, halves of its
+window are tried as well, each from the plane on its side, and the one that leaves the least unexplained is taken.
 """
 
 from __future__ import annotations
@@ -28,6 +31,9 @@ Q, Q_U, Q_V, SCORE, VARIANCE, SUPPORT = range(6)
 """Channels of a refined field: the plane, mean ZNCC of the cameras used, variance of q, how many cameras."""
 
 _ROUNDING_DN = 12**-0.5
+
+_SIDES = ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
+"""Rows and columns towards which half windows lie."""
 
 FAST = {"fastmath": {"contract", "reassoc", "arcp", "nsz"}}
 
@@ -57,6 +63,12 @@ class RefinementOptions(Options):
     """Standard deviation of a window, in those of the noise, below which it carries no texture."""
     propagations: Annotated[int, Range(0, 100)] = 1
     """How often planes are propagated to neighbours without one, in each direction."""
+    bend_px: Annotated[float | None, Range(0, 1000)] = 0.75
+    """Planes on two sides of a window that differ by so much disparity at its border are taken to meet in an edge, and
+    halves of the window are tried. None: nowhere."""
+    half_sigmas: Annotated[float, Range(0, 100)] = 2.5
+    """The half of a window is taken where it leaves less of the texture unexplained (1 - ZNCC) than the whole one does,
+    by so many of the standard deviations that noise gives to what a half leaves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,18 +148,28 @@ def patch_window(options: RefinementOptions) -> Float[np.ndarray, "3 k"]:
     return np.stack([du.ravel(), dv.ravel(), (weights / weights.sum()).ravel()]).astype(np.float32)
 
 
+def half_window(window: Float[np.ndarray, "3 k"], side: tuple[int, int]) -> Float[np.ndarray, "3 h"]:
+    """The part of a window that lies towards some rows and columns, the middle included, with weights of sum 1."""
+    half = np.ascontiguousarray(window[:, window[1] * side[0] + window[0] * side[1] >= 0])
+    half[2] /= half[2].sum()
+    return half
+
+
+def _effective(window: Float[np.ndarray, "3 k"]) -> float:
+    """How many samples of equal weight a window is worth."""
+    return float(1 / np.sum(window[2].astype(np.float64) ** 2))
+
+
 @kernel(**FAST)
 @no_type_check
 def _load_template(view, u, v, template):
     """Normalised patch around a pixel of the reference image; returns its standard deviation."""
-    image, weights, radius = view.images[view.reference], view.window[2], view.radius
-    count = 0
+    image, window = view.images[view.reference], view.window
+    weights, count = window[2], window.shape[1]
     mean = np.float32(0)
-    for dv in range(-radius, radius + 1):
-        for du in range(-radius, radius + 1):
-            template[count] = image[v + dv, u + du]
-            mean += weights[count] * template[count]
-            count += 1
+    for k in range(count):
+        template[k] = image[v + int(window[1, k]), u + int(window[0, k])]
+        mean += weights[k] * template[k]
     variance = np.float32(0)
     for k in range(count):
         template[k] -= mean
@@ -431,6 +453,57 @@ def _refine_field(view, limits, buffers, initial, propagations):
     return field
 
 
+@kernel
+@no_type_check
+def _bends(field, row, column, reach, least):
+    """Whether the slants on opposite sides of a pixel differ."""
+    for d_row, d_column in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        one, other = (row - reach * d_row, column - reach * d_column), (row + reach * d_row, column + reach * d_column)
+        if field[one[0], one[1], SCORE] > 0 and field[other[0], other[1], SCORE] > 0:
+            for slant in (Q_U, Q_V):
+                if abs(field[one[0], one[1], slant] - field[other[0], other[1], slant]) > least:
+                    return True
+    return False
+
+
+@kernel(**FAST)
+@no_type_check
+def _refine_half(view, limits, buffers, field, row, column, side):
+    """Refine a pixel with the half of a window, from the plane on that side; False where that fails."""
+    if field[side[0], side[1], SCORE] == 0:
+        return False
+    spacing, plane = view.spacing, buffers.candidates[0]
+    u, v = spacing // 2 + column * spacing, spacing // 2 + row * spacing
+    if _load_template(view, u, v, buffers.template) < limits.least_contrast:
+        return False
+    plane[1], plane[2] = field[side[0], side[1], Q_U], field[side[0], side[1], Q_V]
+    plane[0] = field[side[0], side[1], Q] + spacing * ((column - side[1]) * plane[1] + (row - side[0]) * plane[2])
+    return _refine_plane(view, limits, buffers, u, v, plane) and view.q_low <= plane[0] <= view.q_high
+
+
+@kernel(**FAST)
+@no_type_check
+def _sharpen(views, limits, buffers, field, reach, least_bend, sigmas):
+    """The field with the planes of half windows where it bends and they explain more."""
+    rows, columns = field.shape[:2]
+    out = field.copy()
+    for row in range(reach, rows - reach):
+        for column in range(reach, columns - reach):
+            if field[row, column, SCORE] == 0 or not _bends(field, row, column, reach, least_bend):
+                continue
+            # What is left of n samples of noise scatters by the share sqrt(2 / n).
+            chance = sigmas * np.sqrt(2 / (limits.effective * field[row, column, SUPPORT]))
+            least = (1 - chance) * (1 - field[row, column, SCORE])
+            for k in range(len(views)):
+                side = (row + reach * _SIDES[k][0], column + reach * _SIDES[k][1])
+                found = _refine_half(views[k], limits, buffers, field, row, column, side)
+                if found and 1 - buffers.result[0] < least:
+                    least = 1 - buffers.result[0]
+                    out[row, column, :3] = buffers.candidates[0]
+                    out[row, column, 3:] = buffers.result
+    return out
+
+
 def refine(
     images: Float[np.ndarray, "c h w"],
     sizes: Int[np.ndarray, "c 2"],
@@ -473,11 +546,18 @@ def refine(
         weak=options.weak_zncc,
         noise2=noise_dn**2,
         least_contrast=options.least_contrast * noise_dn,
-        effective=float(1 / np.sum(window[2].astype(np.float64) ** 2)),
+        effective=_effective(window),
     )
     buffers = _new_buffers(window.shape[1], len(geometry.others), len(initial_mm))
     initial = np.nan_to_num(geometry.scale / initial_mm).astype(np.float64)
-    return np.asarray(_refine_field(view, limits, buffers, initial, options.propagations))
+    field = _refine_field(view, limits, buffers, initial, options.propagations)
+    if options.bend_px is None:
+        return np.asarray(field)
+    halves = [half_window(window, side) for side in _SIDES]
+    views = tuple(view._replace(window=half) for half in halves)
+    reach, bend = -(-options.radius_px // spacing_px), options.bend_px / options.radius_px
+    limits = limits._replace(effective=_effective(halves[0]))
+    return np.asarray(_sharpen(views, limits, buffers, field, reach, bend, options.half_sigmas))
 
 
 def _new_buffers(samples: int, others: int, layers: int) -> _Buffers:

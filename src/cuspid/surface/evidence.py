@@ -24,6 +24,11 @@ DISTANCE, WEIGHT, NORMAL_X, NORMAL_Y, NORMAL_Z, PIXEL = range(6)
 _SAME_SURFACE = 0.5
 """A foot that lies farther from the plane of its own pixel, as a share of the farthest distance, is on no surface."""
 
+_BEND = 0.25
+"""Tangents of the surface on both sides of a pixel differ by so much at an edge."""
+_STRAIGHTER = 0.5
+"""At an edge, a side whose own tangent changes by less than this share of what the other's does is taken alone."""
+
 EXTRAPOLATED = 0.1
 """Weight of a pixel without depth beside pixels with depth, relative to theirs."""
 
@@ -64,18 +69,36 @@ class Evidence:
 
 @kernel
 @no_type_check
-def _slope(inverse, row, column, d_row, d_column, jump):
-    """Difference of inverse depth per pixel, from the neighbours that belong to the same surface; NaN without any."""
+def _step(inverse, row, column, d_row, d_column, jump):
+    """Difference of inverse depth to a neighbour that belongs to the same surface; NaN where it does not."""
+    r, c = row + d_row, column + d_column
+    if not (0 <= r < inverse.shape[0] and 0 <= c < inverse.shape[1]):
+        return np.nan
     here = inverse[row, column]
-    total, count = 0.0, 0
-    for side in (-1, 1):
-        r, c = row + side * d_row, column + side * d_column
-        if 0 <= r < inverse.shape[0] and 0 <= c < inverse.shape[1]:
-            difference = inverse[r, c] - here
-            if abs(difference) <= jump * here * here:
-                total += side * difference
-                count += 1
-    return total / count if count > 0 else np.nan
+    difference = inverse[r, c] - here
+    return difference if abs(difference) <= jump * here * here else np.nan
+
+
+@kernel
+@no_type_check
+def _slope(inverse, row, column, d_row, d_column, jump, bend):
+    """Difference of inverse depth per pixel, from the neighbours that belong to the same surface; NaN without any.
+
+    Where the surface bends at the pixel, from the side on which it is the straighter (as ENO schemes do, A. Harten et
+    al. 1987): the mean of both would round an edge off.
+    """
+    after = _step(inverse, row, column, d_row, d_column, jump)
+    before = -_step(inverse, row, column, -d_row, -d_column, jump)
+    if np.isnan(after) or np.isnan(before):
+        return before if np.isnan(after) else after
+    if abs(after - before) > bend * inverse[row, column]:
+        further = abs(_step(inverse, row + d_row, column + d_column, d_row, d_column, jump) - after)
+        farther = abs(-_step(inverse, row - d_row, column - d_column, -d_row, -d_column, jump) - before)
+        if further < _STRAIGHTER * farther:
+            return after
+        if farther < _STRAIGHTER * further:
+            return before
+    return (after + before) / 2
 
 
 @kernel
@@ -89,8 +112,8 @@ def _planes(inverse, intrinsics, jump):
     for row in range(height):
         for column in range(width):
             here = inverse[row, column]
-            a = _slope(inverse, row, column, 0, 1, jump) * fx
-            b = _slope(inverse, row, column, 1, 0, jump) * fy
+            a = _slope(inverse, row, column, 0, 1, jump, _BEND / fx) * fx
+            b = _slope(inverse, row, column, 1, 0, jump, _BEND / fy) * fy
             if not (np.isfinite(a) and np.isfinite(b) and np.isfinite(here)):
                 continue
             x, y = (column - cx) / fx, (row - cy) / fy
