@@ -303,6 +303,7 @@ def test_what_was_asked_for_goes_before_the_quality() -> None:
     assert pipeline._settled(asked).tracking.features.size_for(640, 480) == (160, 120)
     assert pipeline._settled(asked).left_share == 1
     assert pipeline._settled(replace(asked, left_share=0.3)).left_share == 0.3
+    assert pipeline._settled(asked).stereo.refinement.bend_px == 1000
     standard = ReconstructionOptions()
     assert pipeline._settled(standard).tracking.features.size_for(640, 480) == (320, 240)
     assert pipeline._settled(standard) == replace(standard, left_share=pipeline._LEFT_SHARE)

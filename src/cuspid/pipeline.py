@@ -80,7 +80,7 @@ __all__ = [
 Quality = Literal["draft", "standard"]
 _DRAFT_KEYPOINTS, _DRAFT_HALVINGS = 500, 2
 _LEFT_SHARE, _DRAFT_LEFT_SHARE = 0.005, 1.0
-_DRAFT_TEMPORAL_LEFT_SHARE = 0.03
+_DRAFT_TEMPORAL_LEFT_SHARE, _DRAFT_BEND_PX = 0.03, 1000.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,7 +192,10 @@ def _settled(options: ReconstructionOptions) -> ReconstructionOptions:
         features = replace(features, halvings=_DRAFT_HALVINGS)
     if temporal.left_share is None:
         temporal = replace(temporal, left_share=_DRAFT_TEMPORAL_LEFT_SHARE)
-    return replace(options, tracking=replace(tracking, features=features), temporal=temporal)
+    stereo = options.stereo
+    if stereo.refinement.bend_px is None:
+        stereo = replace(stereo, refinement=replace(stereo.refinement, bend_px=_DRAFT_BEND_PX))
+    return replace(options, tracking=replace(tracking, features=features), stereo=stereo, temporal=temporal)
 
 
 def as_known(handpiece: Handpiece, options: ReconstructionOptions) -> Handpiece:

@@ -32,6 +32,7 @@ Q, Q_U, Q_V, SCORE, VARIANCE, SUPPORT = range(6)
 
 _ROUNDING_DN = 12**-0.5
 
+_BEND_PX = 0.75
 _SIDES = ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
 """Rows and columns towards which half windows lie."""
 
@@ -63,9 +64,9 @@ class RefinementOptions(Options):
     """Standard deviation of a window, in those of the noise, below which it carries no texture."""
     propagations: Annotated[int, Range(0, 100)] = 1
     """How often planes are propagated to neighbours without one, in each direction."""
-    bend_px: Annotated[float | None, Range(0, 1000)] = 0.75
+    bend_px: Annotated[float | None, Range(0, 1000)] = None
     """Planes on two sides of a window that differ by so much disparity at its border are taken to meet in an edge, and
-    halves of the window are tried. None: nowhere."""
+    halves of the window are tried. By default 0.75, of a draft 1000: nowhere."""
     half_sigmas: Annotated[float, Range(0, 100)] = 2.5
     """The half of a window is taken where it leaves less of the texture unexplained (1 - ZNCC) than the whole one does,
     by so many of the standard deviations that noise gives to what a half leaves."""
@@ -551,11 +552,10 @@ def refine(
     buffers = _new_buffers(window.shape[1], len(geometry.others), len(initial_mm))
     initial = np.nan_to_num(geometry.scale / initial_mm).astype(np.float64)
     field = _refine_field(view, limits, buffers, initial, options.propagations)
-    if options.bend_px is None:
-        return np.asarray(field)
     halves = [half_window(window, side) for side in _SIDES]
     views = tuple(view._replace(window=half) for half in halves)
-    reach, bend = -(-options.radius_px // spacing_px), options.bend_px / options.radius_px
+    reach = -(-options.radius_px // spacing_px)
+    bend = (_BEND_PX if options.bend_px is None else options.bend_px) / options.radius_px
     limits = limits._replace(effective=_effective(halves[0]))
     return np.asarray(_sharpen(views, limits, buffers, field, reach, bend, options.half_sigmas))
 
