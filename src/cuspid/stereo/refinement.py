@@ -479,6 +479,10 @@ def _refine_half(view, limits, buffers, field, row, column, side):
         return False
     plane[1], plane[2] = field[side[0], side[1], Q_U], field[side[0], side[1], Q_V]
     plane[0] = field[side[0], side[1], Q] + spacing * ((column - side[1]) * plane[1] + (row - side[0]) * plane[2])
+    _compare(view, u, v, plane, buffers)
+    # A plane of the other side of the edge fits worse than what is there.
+    if _combine(buffers, limits.camera_zncc, limits.lag)[1] < field[row, column, SCORE]:
+        return False
     return _refine_plane(view, limits, buffers, u, v, plane) and view.q_low <= plane[0] <= view.q_high
 
 
