@@ -77,6 +77,12 @@ def test_a_blob_lies_where_it_was_drawn(size: int, halved_from_px: int | None, h
     assert np.linalg.norm(nearest, axis=1).min() < 0.05 * (halvings or 1)
 
 
+def test_the_smallest_image_that_is_halved_twice_is_searched() -> None:
+    """OpenCV fails on images of fewer than 3 px."""
+    image = np.random.default_rng(0).integers(0, 255, (16, 16, 3)).astype(np.uint8)
+    assert len(detect(image, FeatureOptions(halved_from_px=16, halvings=2))) == 0
+
+
 def test_descriptors_have_their_length_and_colors_their_place() -> None:
     """RootSIFT of length 512; the colour is the image's."""
     image = photograph(FIRST)

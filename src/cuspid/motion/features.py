@@ -45,7 +45,7 @@ class FeatureOptions(Options):
     halved_from_px: Annotated[int | None, Range(16, 1_000_000)] = None
     """Images whose shorter side has so many px are searched at half their size, which takes a third of the time; the
     places are half as exact. None: never."""
-    halvings: Annotated[int | None, Range(1, 4)] = None
+    halvings: Annotated[int | None, Range(1, 2)] = None
     """How many times over they are halved. By default once, for a draft twice."""
     upright: bool = True
     """Descriptors along the image's axes; False estimates an orientation for each keypoint, for free-hand turns of

@@ -241,9 +241,9 @@ def _look_up(pixels, first, stride, places, indices, corners):
 
 @kernel(inline="always", **FAST)
 @no_type_check
-def _normal_equations(template, window, places, corners, systems, j):
-    """ZNCC of the template and the window seen in another image (bilinear), and its normal equations: H (upper
-    triangle, row by row), then the gradient. The patch is normalised in the sums, not pixel by pixel."""
+def _sums(template, window, places, corners):
+    """Weighted sums over the window seen in another image (bilinear): of its values, their squares and products with
+    the template; of its slopes s along q, q_u and q_v, of these times values (i) and template (t); and of s times s."""
     start = corners[0, corners.shape[1] // 2]
     mean = square = product = s0 = su = sv = i0 = iu = iv = t0 = tu = tv = np.float32(0)
     h00 = h0u = h0v = huu = huv = hvv = np.float32(0)
@@ -274,6 +274,16 @@ def _normal_equations(template, window, places, corners, systems, j):
         huu += wss * du * du
         huv += wss * du * dv
         hvv += wss * dv * dv
+    return mean, square, product, s0, su, sv, i0, iu, iv, t0, tu, tv, h00, h0u, h0v, huu, huv, hvv
+
+
+@kernel(inline="always", **FAST)
+@no_type_check
+def _normal_equations(template, window, places, corners, systems, j):
+    """ZNCC of the template and the window seen in another image, and its normal equations: H (upper triangle, row by
+    row), then the gradient. The patch is normalised in the sums, not pixel by pixel."""
+    sums = _sums(template, window, places, corners)
+    mean, square, product, s0, su, sv, i0, iu, iv, t0, tu, tv, h00, h0u, h0v, huu, huv, hvv = sums
     variance = square - mean * mean
     if not variance > 1e-6:
         return np.float32(-1)
@@ -561,6 +571,7 @@ def refine(
     reach = -(-options.radius_px // spacing_px)
     bend = (_BEND_PX if options.bend_px is None else options.bend_px) / options.radius_px
     limits = limits._replace(effective=_effective(halves[0]))
+    buffers = _new_buffers(halves[0].shape[1], len(geometry.others), len(initial_mm))
     return np.asarray(_sharpen(views, limits, buffers, field, reach, bend, options.half_sigmas))
 
 
