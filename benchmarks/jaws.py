@@ -179,6 +179,12 @@ def scanned(jaw: Jaw, handpiece: Handpiece, folder: Path, path: ScanPathOptions)
     }
 
 
+def is_asked(name: str, words: list[str], known: list[Case]) -> bool:
+    """Whether a case is one of those asked for, by its name or, where a word names none, by a part of it."""
+    names = {each.name for each in known}
+    return any(word == name or (word not in names and word in name) for word in words)
+
+
 def asked() -> argparse.Namespace:
     """What the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -200,7 +206,8 @@ def main() -> None:
     kind = "_".join(["plan" if arguments.plan else arguments.size, *auto])
     pixels = 500 if arguments.size == "full" else 250
     files = {path.stem: path for path in sorted(arguments.folder.rglob("*.ply"))}
-    chosen = [each for each in cases(files) if not arguments.only or any(word in each.name for word in arguments.only)]
+    known = list(cases(files))
+    chosen = [each for each in known if arguments.only is None or is_asked(each.name, arguments.only, known)]
     outcomes = run_grid(
         chosen,
         partial(judge, pixels=pixels, passes=arguments.passes, plan_only=arguments.plan),
@@ -211,9 +218,8 @@ def main() -> None:
     out = arguments.out or HERE / "results" / f"jaws_{kind}.json"
     before = read_json(out)["scans"] if arguments.add and out.exists() else {}
     scans = before | {each.case.name: {**each.figures, "failure": each.failure} for each in outcomes}
-    ordered = {each.name: scans[each.name] for each in cases(files) if each.name in scans}
-    asked_for = len(list(cases(files)))
-    write_json(out, {"kind": kind, "cases": asked_for, "scans": ordered, **conditions()})
+    ordered = {each.name: scans[each.name] for each in known if each.name in scans}
+    write_json(out, {"kind": kind, "cases": len(known), "scans": ordered, **conditions()})
 
 
 if __name__ == "__main__":
