@@ -1,13 +1,13 @@
 """Make docs/benchmarks.md from the JSON files in benchmarks/results.
 
-python benchmarks/page.py [--mixed]
+python benchmarks/page.py [--older]
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,14 @@ import anatomy_sections
 import handpiece_sections
 import panorama_sections
 import trust_sections
+from freshness import changes
 
 HERE = Path(__file__).parent
 
 Result = Mapping[str, Any]
+
+NOT_HERE = ("thesis_checks",)
+"""Results that docs/reproduction.md shows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,15 +99,18 @@ def cell(bar: Bar, result: Result) -> str:
     return f"{value:.1f}" if bar.met(value) else f"**{value:.1f}** (missed)"
 
 
-def table(results: list[Result]) -> str:
+def table(results: Mapping[str, Result], older: Older) -> str:
     """Figures of cases that share their bars, a row each, the bar on top."""
-    bars = BARS[group_of(results[0]["case"])]
+    bars = BARS[group_of(next(iter(results)))]
     lines = [
         "| case | " + " | ".join(bar.name for bar in bars) + " |",
         "|---" * (len(bars) + 1) + "|",
         "| bar | " + " | ".join(f"{'>=' if bar.at_least else '<='} {bar.limit:g}" for bar in bars) + " |",
     ]
-    lines += [f"| {result['case']} | " + " | ".join(cell(bar, result) for bar in bars) + " |" for result in results]
+    lines += [
+        f"| {case}{' (older code)' if case in older else ''} | " + " | ".join(cell(bar, result) for bar in bars) + " |"
+        for case, result in results.items()
+    ]
     return "\n".join(lines)
 
 
@@ -156,11 +163,13 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
     "design_comparison": ("Six cameras or twelve", handpiece_sections.design_comparison),
     "design_comparison_full_size": ("Six cameras or twelve, images of full size", handpiece_sections.design_comparison),
     "any_rig": ("Any rig", handpiece_sections.any_rig),
+    "stereo_pairs": ("Photographs of two cameras", handpiece_sections.stereo_pairs),
     "jaws_plan": ("Real jaws: the path", anatomy_sections.jaws),
     "jaws_half": ("Real jaws at half size", anatomy_sections.jaws),
     "jaws_half_auto": ("Real jaws at half size, with further passes", anatomy_sections.jaws),
     "jaws_full": ("Real jaws at full size", anatomy_sections.jaws),
     "jaws_full_auto": ("Real jaws at full size, with further passes", anatomy_sections.jaws),
+    "targets": ("Boards and terraces", handpiece_sections.targets),
     "manufacturing": ("Handpieces that are not built as drawn", handpiece_sections.manufacturing),
     "manufacturing_arch": ("The same, a whole real arch", handpiece_sections.manufacturing),
     "expectations": ("What is expected of a scan", trust_sections.expectations),
@@ -173,27 +182,39 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
 """Title and text for each file of results that is not of scans, by its stem."""
 
 
-def commits(loaded: Iterable[Result]) -> list[str]:
-    """Of which the results are."""
-    return sorted({str(result["commit"]) for result in loaded if "commit" in result})
+Older = Mapping[str, tuple[str, ...]]
+"""What has changed since, by the names of the results that no longer hold."""
 
 
-def _mix(known: list[str]) -> list[str]:
-    if len(known) < 2:
-        return []
-    return [
-        f"**These results are of {len(known)} commits**, not of one: each says below of which. What is newer than a "
-        "result may have changed it.",
-        "",
-    ]
+def origin(results: Mapping[str, Result], older: Older) -> str:
+    """Of which code some results are."""
+    commits = sorted({str(result["commit"]) for result in results.values()})
+    told = f"Commit{'s' if len(commits) > 1 else ''} {', '.join(commits)}"
+    changed = sorted({file for name in results for file in older.get(name, ())})
+    if not changed:
+        return f"{told}."
+    more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
+    return f"{told}; **older code**: changed since are {', '.join(f'`{each}`' for each in changed[:3])}{more}."
 
 
-def page(results: list[Result], motions: list[Result], others: Mapping[str, Result], panoramas: list[Result]) -> str:
+def standing(count: int, older: Older) -> str:
+    """How many of the results hold."""
+    if not older:
+        return f"All {count} results hold for the code beside this page: nothing that made them has changed since."
+    return (
+        f"**{count - len(older)} of {count} results hold for the code beside this page**: nothing that made them has "
+        "changed since. The others are marked *older code*; what has changed since may have changed them."
+    )
+
+
+def page(results: Mapping[str, Result], older: Older) -> str:
     """The whole page."""
+    scans = {name: result for name, result in results.items() if "images_to_mesh" in result}
+    panoramas = {name: result for name, result in results.items() if name.startswith("panorama/")}
     parts = [
         "# Benchmarks",
         "",
-        "Generated by `python benchmarks/page.py` from `benchmarks/results/*.json`; do not edit.",
+        "Generated by `python benchmarks/page.py` from `benchmarks/results`; do not edit.",
         "",
         "Conditions of the thesis: texture `artificial`, twelve cameras with exact calibration, noise 1.5 DN in each "
         "colour channel, 120 images for a tooth and 1200 or more for an arch. Trueness is scan to reference over the "
@@ -201,43 +222,54 @@ def page(results: list[Result], motions: list[Result], others: Mapping[str, Resu
         "seconds of `cuspid reconstruct` on 2 cores with numba's compiled code cached. Whole arches are scanned in one "
         "pass (`--passes turns`).",
         "",
-        *_mix(commits([*results, *motions, *others.values(), *panoramas])),
+        standing(len(results), older),
+        "",
     ]
     for group in BARS:
-        chosen = [result for result in results if group_of(result["case"]) == group]
+        chosen = {name: result for name, result in scans.items() if group_of(name) == group}
         if chosen:
-            parts += [f"## {group}", "", table(chosen), ""]
-    sphere_scans = [result for result in results if "spheres" in result]
-    parts += [
-        text for result in sphere_scans for text in ("## The sphere arch", "", anatomy_sections.spheres(result), "")
-    ]
-    prepared = [result for result in results if result["case"].startswith("prepared-")]
+            parts += [f"## {group}", "", table(chosen, older), ""]
+    for name, result in scans.items():
+        if "spheres" in result:
+            parts += ["## The sphere arch", "", anatomy_sections.spheres(result), "", origin({name: result}, older), ""]
+    prepared = {name: result for name, result in scans.items() if name.startswith("prepared-")}
     if prepared:
-        parts += ["## Prepared teeth (Table 3.2 of the thesis)", "", anatomy_sections.prepared(prepared), ""]
-    for motion in motions:
-        parts += ["## Against COLMAP", "", motion_table(motion["rows"]), "", f"Commit {motion['commit']}.", ""]
+        told = anatomy_sections.prepared(list(prepared.values()))
+        parts += ["## Prepared teeth (Table 3.2 of the thesis)", "", told, "", origin(prepared, older), ""]
+    for name, result in results.items():
+        if name.startswith("motion-"):
+            parts += ["## Against COLMAP", "", motion_table(result["rows"]), "", origin({name: result}, older), ""]
     for stem, (title, text) in SECTIONS.items():
-        if stem in others:
-            parts += [f"## {title}", "", text(others[stem]), "", f"Commit {others[stem]['commit']}.", ""]
+        if stem in results:
+            parts += [f"## {title}", "", text(results[stem]), "", origin({stem: results[stem]}, older), ""]
     if panoramas:
-        parts += ["## Panoramas", "", panorama_sections.panoramas(panoramas), ""]
-    parts += ["## Conditions", "", *(f"{detail(result)}\n" for result in results)]
+        told = panorama_sections.panoramas(list(panoramas.values()))
+        parts += ["## Panoramas", "", told, "", origin(panoramas, older), ""]
+    parts += ["## Conditions", "", *(f"{detail(result)}\n" for result in scans.values())]
     return "\n".join(parts)
 
 
+def read(folder: Path) -> dict[str, Result]:
+    """Results by their paths in the folder, without the ending."""
+    names = {str(path.relative_to(folder).with_suffix("")): path for path in sorted(folder.rglob("*.json"))}
+    return {name: json.loads(path.read_text()) for name, path in names.items() if name not in NOT_HERE}
+
+
 def main() -> None:
-    """Read the results, write the page. Results of several commits are refused unless they are asked for."""
+    """Read the results, write the page. Results that no longer hold are refused unless they are asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--mixed", action="store_true", help="take results of several commits, and say so on the page")
-    mixed = parser.parse_args().mixed
-    loaded = {path.stem: json.loads(path.read_text()) for path in sorted((HERE / "results").glob("*.json"))}
-    scans = [value for value in loaded.values() if "images_to_mesh" in value]
-    motions = [value for stem, value in loaded.items() if stem.startswith("motion-")]
-    panoramas = [json.loads(path.read_text()) for path in sorted((HERE / "results" / "panorama").glob("*.json"))]
-    known = commits([*loaded.values(), *panoramas])
-    if len(known) > 1 and not mixed:
-        raise SystemExit(f"results of {len(known)} commits: {', '.join(known)}; run them anew at one, or give --mixed")
-    (HERE.parent / "docs" / "benchmarks.md").write_text(page(scans, motions, loaded, panoramas))
+    parser.add_argument("--older", action="store_true", help="take results of older code, and say so on the page")
+    arguments = parser.parse_args()
+    results = read(HERE / "results")
+    older = {name: changed for name, result in results.items() if (changed := changes(name, result))}
+    if older and not arguments.older:
+        lines = [f"{name}: {', '.join(changed)}" for name, changed in older.items()]
+        raise SystemExit(
+            "\n".join(
+                [*lines, f"{len(older)} of {len(results)} results no longer hold: run them anew, or give --older"]
+            )
+        )
+    (HERE.parent / "docs" / "benchmarks.md").write_text(page(results, older))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,6 @@ def panoramas(results: Sequence[Result]) -> str:
     """All methods side by side, then the default method subject by subject."""
     by_method = {name: [each for each in results if each["method"] == name] for name in METHODS}
     ortho = by_method["ortho"]
-    commits = sorted({result["commit"] for result in results})
     return "\n".join(
         [
             "Phantoms of the population and real jaws (`benchmarks/panorama.py`), each filmed in 120 frames of "
@@ -47,8 +46,6 @@ def panoramas(results: Sequence[Result]) -> str:
                 ),
                 [subject_row(result) for result in ortho],
             ),
-            "",
-            f"Commits: {', '.join(commits)}.",
         ]
     )
 

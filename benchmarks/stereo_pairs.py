@@ -1,10 +1,11 @@
 """Measure rectified pairs of photographs whose disparity is known, by cuspid's stereo and by OpenCV's matcher.
 
-    python benchmarks/stereo_pairs.py FOLDER [--pictures FOLDER]
+    python benchmarks/stereo_pairs.py FOLDER [--pictures FOLDER] [--out benchmarks/results/stereo_pairs.json]
 
 Each folder in FOLDER is a pair: ``left.*`` and ``right.*``, images that OpenCV reads, and ``disparity.npy``, px of the
 left image, not finite where unknown. Nothing else is known of the cameras: the pair is given to :class:`DepthEstimator`
-as a handpiece whose working distance is that of the middle disparity.
+as a handpiece whose working distance is that of the middle disparity. Densities are of all pixels whose disparity is
+known, and, as Middlebury's tables have them, of those of them that both cameras see.
 """
 
 from __future__ import annotations
@@ -16,15 +17,18 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
+from run import conditions
 
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.rig import Handpiece, MountedCamera, Rig
 from cuspid.stereo import DepthEstimator, StereoOptions
+from cuspid.storage import write_json
 
 Image = UInt8[np.ndarray, "h w 3"]
 Disparity = Float[np.ndarray, "h w"]
+HERE = Path(__file__).parent
 BASELINE_MM = 100.0
 
 
@@ -69,25 +73,39 @@ def sgbm(left: Image, right: Image, lowest_px: float, highest_px: float) -> Disp
 METHODS: dict[str, Callable[[Image, Image, float, float], Disparity]] = {"cuspid": cuspid, "SGBM": sgbm}
 
 
-def row(folder: Path, method: str, pictures: Path | None) -> str:
-    """Line of the table: pixels with depth, median error, gross errors, CPU seconds."""
+def seen_by_both(truth: Disparity) -> Bool[np.ndarray, "h w"]:
+    """Pixels of the left image whose place in the right one lies within it, and nothing nearer comes to the same."""
+    row, left = np.nonzero(np.isfinite(truth))
+    right = np.rint(left - truth[row, left]).astype(int)
+    row, left, right = row[right >= 0], left[right >= 0], right[right >= 0]
+    nearest = np.full(truth.shape, -np.inf)
+    np.maximum.at(nearest, (row, right), truth[row, left])
+    seen = np.zeros(truth.shape, bool)
+    seen[row, left] = truth[row, left] >= nearest[row, right] - 1.0
+    return seen
+
+
+def measured(folder: Path, method: str, pictures: Path | None) -> dict[str, float]:
+    """Pixels with depth, median error, gross errors, CPU seconds."""
     left, right = (
         cv2.cvtColor(cv2.imread(str(next(folder.glob(f"{side}.*")))), cv2.COLOR_BGR2RGB) for side in ("left", "right")
     )
     truth = np.load(folder / "disparity.npy")
-    known = np.isfinite(truth)
+    known, both = np.isfinite(truth), seen_by_both(truth)
     lowest, highest = np.quantile(truth[known], [0.001, 0.999]) + [-2, 2]
     start = time.process_time()
-    found = METHODS[method](left, right, max(float(lowest), 1.0), float(highest))
+    disparity = METHODS[method](left, right, max(float(lowest), 1.0), float(highest))
     seconds = time.process_time() - start
-    error = np.abs(found - truth)
-    both = known & np.isfinite(found)
+    found, error = np.isfinite(disparity), np.abs(disparity - truth)
     if pictures is not None:
-        _draw(pictures / f"{folder.name}-{method}.png", found, error, (lowest, highest))
-    return (
-        f"| {folder.name} | {method} | {100 * both.sum() / known.sum():.1f} | {np.median(error[both]):.3f} | "
-        f"{100 * np.mean(error[both] > 1):.1f} | {seconds:.1f} |"
-    )
+        _draw(pictures / f"{folder.name}-{method}.png", disparity, error, (lowest, highest))
+    return {
+        "density_pct": 100 * float(np.mean(found[known])),
+        "density_of_seen_by_both_pct": 100 * float(np.mean(found[both])),
+        "median_px": float(np.median(error[found & known])),
+        "above_1_px_pct": 100 * float(np.mean(error[found & known] > 1)),
+        "cpu_s": seconds,
+    }
 
 
 def _draw(path: Path, found: Disparity, error: Disparity, limits: tuple[float, float]) -> None:
@@ -102,16 +120,19 @@ def _draw(path: Path, found: Disparity, error: Disparity, limits: tuple[float, f
 
 
 def main() -> None:
-    """Print the table."""
+    """Measure all pairs by all methods."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--pictures", type=Path, help="where pictures of disparity and error go")
+    parser.add_argument("--out", type=Path, default=HERE / "results" / "stereo_pairs.json")
     arguments = parser.parse_args()
-    print("| pair | method | with depth, % | median error, px | off by more than 1 px, % | CPU s |")
-    print("|---|---|---|---|---|---|")
-    for folder in sorted(arguments.folder.iterdir()):
-        for method in METHODS:
-            print(row(folder, method, arguments.pictures), flush=True)
+    folders = sorted(each for each in arguments.folder.iterdir() if each.is_dir())
+    for method in METHODS:
+        measured(folders[0], method, None)  # compiles
+    pairs = {
+        folder.name: {method: measured(folder, method, arguments.pictures) for method in METHODS} for folder in folders
+    }
+    write_json(arguments.out, {"pairs": pairs, **conditions()})
 
 
 if __name__ == "__main__":

@@ -1,0 +1,106 @@
+"""The page of the benchmarks: which results still hold, and how those are shown that do not."""
+
+import shutil
+import subprocess
+from fnmatch import fnmatch
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+REFINEMENT = "src/cuspid/stereo/refinement.py"
+
+
+@pytest.fixture
+def freshness(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    return import_module("freshness")
+
+
+@pytest.fixture
+def repository(tmp_path, freshness, monkeypatch):
+    """The code as it stands, committed."""
+    for folder in ("src", "benchmarks"):
+        kept = shutil.ignore_patterns("__pycache__", "results")
+        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=kept)
+    git = ("git", "-C", str(tmp_path), "-c", "user.name=n", "-c", "user.email=e@x.org")
+    for command in (("init", "-q"), ("add", "."), ("commit", "-qm", "as it stands")):
+        subprocess.run([*git, *command], check=True)
+    monkeypatch.setattr(freshness, "ROOT", tmp_path)
+    monkeypatch.setattr(freshness, "HERE", tmp_path / "benchmarks")
+    for each in ("_changed_since", "_meaning_of", "_imported"):
+        getattr(freshness, each).cache_clear()
+    return tmp_path
+
+
+def commit_of(repository: Path) -> str:
+    return subprocess.check_output(["git", "-C", str(repository), "rev-parse", "--short=12", "HEAD"], text=True).strip()
+
+
+def add(repository: Path, file: str, text: str) -> None:
+    with (repository / file).open("a") as stream:
+        stream.write(text)
+
+
+def test_a_result_of_the_same_code_holds(freshness, repository):
+    result = {"commit": commit_of(repository)}
+    assert all(freshness.changes(pattern.replace("*", "x"), result) == () for pattern in freshness.MAKERS)
+
+
+@pytest.mark.parametrize("text", ["\n# a remark\n", '\n"""What is said."""\n'])
+def test_what_is_only_read_changes_no_result(freshness, repository, text):
+    add(repository, REFINEMENT, text)
+    assert freshness.changes("jaws_half", {"commit": commit_of(repository)}) == ()
+
+
+def test_a_change_ends_what_it_made_and_nothing_else(freshness, repository):
+    add(repository, REFINEMENT, "\nNEW = 1\n")
+    result = {"commit": commit_of(repository)}
+    for name in ("jaws_half", "molar-seed0", "fuzz", "stereo_pairs"):
+        assert freshness.changes(name, result) == (REFINEMENT,)
+    for name in ("mouth", "populations", "measure"):
+        assert freshness.changes(name, result) == ()
+
+
+def test_pictures_and_pages_are_no_part_of_figures(freshness, repository):
+    add(repository, "src/cuspid/reporting/figures/drawing.py", "\nNEW = 1\n")
+    add(repository, "benchmarks/page.py", "\nNEW = 1\n")
+    assert freshness.changes("molar-seed0", {"commit": commit_of(repository)}) == ()
+
+
+def test_scripts_of_one_another_count(freshness, repository):
+    add(repository, "benchmarks/run.py", "\nNEW = 1\n")
+    assert freshness.changes("jaws_half", {"commit": commit_of(repository)}) == ("benchmarks/run.py",)
+
+
+def test_every_scan_of_a_result_tells_of_its_own_code(freshness, repository):
+    old = commit_of(repository)
+    add(repository, REFINEMENT, "\nNEW = 1\n")
+    subprocess.run(
+        ["git", "-C", str(repository), "-c", "user.name=n", "-c", "user.email=e@x.org", "commit", "-qam", "new"],
+        check=True,
+    )
+    new = commit_of(repository)
+    scans = {"a": {"commit": new}, "b": {"commit": old}}
+    assert freshness.changes("jaws_half", {"commit": new, "scans": scans}) == (REFINEMENT,)
+    assert freshness.changes("jaws_half", {"commit": new, "scans": {"a": scans["a"]}}) == ()
+
+
+@pytest.mark.parametrize("commit", [None, "0123456789ab-dirty", "0123456789ab"])
+def test_code_that_nobody_has_is_no_code_of_a_result(freshness, repository, commit):
+    assert freshness.changes("molar-seed0", {"commit": commit})
+
+
+def test_every_result_has_a_maker_and_a_place_on_the_page(freshness):
+    page = import_module("page")
+    results = page.read(ROOT / "benchmarks" / "results")
+    text = page.page(results, {})
+    for name, result in results.items():
+        assert any(fnmatch(name, pattern) for pattern in freshness.MAKERS), name
+        assert str(result["commit"]) in text, name
+    assert "older code" not in text
+    shown = page.page(results, dict.fromkeys(results, ("src/a.py", "src/b.py", "src/c.py", "src/d.py")))
+    assert f"0 of {len(results)} results hold" in shown
+    assert "| molar-seed0 (older code) |" in shown
+    assert "`src/a.py`, `src/b.py`, `src/c.py` and 1 more" in shown
