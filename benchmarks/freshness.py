@@ -97,19 +97,18 @@ def _blobs(*arguments: str) -> dict[str, str]:
 
 
 def _differs(blob: str, file: str) -> bool:
-    return _meaning_of(blob) != _meaning(file, (ROOT / file).read_bytes())
+    then, now = _content(blob), (ROOT / file).read_bytes()
+    return then != now and _meaning(then) != _meaning(now)
 
 
 @cache
-def _meaning_of(blob: str) -> str:
-    return _meaning("then.py", _git("cat-file", "blob", blob))
+def _content(blob: str) -> bytes:
+    return _git("cat-file", "blob", blob)
 
 
 @cache
-def _meaning(name: str, content: bytes) -> str:
+def _meaning(content: bytes) -> str:
     """A module without what people only read."""
-    if not name.endswith(".py"):
-        return content.decode()
     tree = ast.parse(content)
     for node in ast.walk(tree):
         for body in (getattr(node, "body", None), getattr(node, "orelse", None)):

@@ -29,7 +29,7 @@ def repository(tmp_path, freshness, monkeypatch):
         subprocess.run([*git, *command], check=True)
     monkeypatch.setattr(freshness, "ROOT", tmp_path)
     monkeypatch.setattr(freshness, "HERE", tmp_path / "benchmarks")
-    for each in ("_changed_since", "_meaning_of", "_imported"):
+    for each in ("_changed_since", "_imported"):
         getattr(freshness, each).cache_clear()
     return tmp_path
 

@@ -71,7 +71,7 @@ def test_a_path_around_an_obstacle_fits_and_still_sees(
     coarse_phantom: Jaw, curve: ArchCurve, crowns: CrownPoints
 ) -> None:
     """The handpiece is to keep more room than there is."""
-    room, span = Room(coarse_phantom.mesh, HANDPIECE.solid, 4.3), (20.0, 40.0)
+    room, span = Room(coarse_phantom.mesh, HANDPIECE.solid, 4.3), (24.0, 36.0)
     detour = plan_detour(room, crowns, HANDPIECE, curve.rig_from_world, span)
     poses = [detour.at(float(at)) @ curve.rig_from_world(float(at)) for at in detour.travel_mm]
     steady = [curve.rig_from_world(float(at)) for at in detour.travel_mm]
@@ -79,7 +79,7 @@ def test_a_path_around_an_obstacle_fits_and_still_sees(
     assert min(room.clearance(pose)[0] for pose in poses) > 4.25
     steps = np.abs(np.diff(detour.changes, axis=0)) / _UNITS
     assert steps.max() <= 1.7
-    middle = crowns.within(np.array([pose.inverse().translation for pose in steady[5:15]]), 5.0)
+    middle = crowns.within(np.array([pose.inverse().translation for pose in steady[3:-3]]), 5.0)
     seen = seen_from(crowns, HANDPIECE, poses).any(axis=0)[middle].mean()
     assert seen > 0.8
 
