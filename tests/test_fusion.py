@@ -19,7 +19,7 @@ from cuspid.mesh import Mesh
 from cuspid.reconstruction import DepthMap
 from cuspid.stereo.stage import StoredDepthMaps
 from cuspid.surface.evidence import Evidence, observe, observe_foot
-from cuspid.surface.fusion import FusionOptions, Votes
+from cuspid.surface.fusion import FusionOptions, Votes, find_holes
 from cuspid.surface.fusion import fuse as fuse_depth_maps
 from cuspid.surface.volume import SparseVolume, pack, unpack
 from synthetic_scene import diamond, height_field, true_depth_map
@@ -151,6 +151,34 @@ def test_a_narrow_strip_of_a_slope_is_covered_and_not_widened(steepness: float) 
     beyond = np.maximum(mesh.vertices[:, 0] - points[:, 0].max(), points[:, 0].min() - mesh.vertices[:, 0])
     assert beyond.max() < 1.6 * pixel_mm
     assert 0 < np.abs(signed_um(mesh, slope)).mean() < 2
+
+
+def without(depth_map: DepthMap, width_mm: float) -> DepthMap:
+    """Nothing known of |x| < width / 2, |y| < 1 of the world."""
+    rows, columns = np.indices(depth_map.depth_mm.shape)
+    rays = depth_map.camera.rays(np.stack([columns + 0.5, rows + 0.5], axis=-1).reshape(-1, 2).astype(float))
+    in_cam = rays * depth_map.depth_mm.reshape(-1, 1)
+    x, y, _ = np.abs((depth_map.cam_from_rig @ POSES[depth_map.frame]).inverse().apply(in_cam)).T
+    known = ~((x < width_mm / 2) & (y < 1)).reshape(depth_map.depth_mm.shape)
+    return replace(depth_map, confidence=np.where(known, depth_map.confidence, 0).astype(np.float32))
+
+
+@pytest.mark.parametrize("width_mm", [0.15, 0.3, 1.0])
+def test_what_no_map_has_a_depth_of_is_a_hole_whose_rim_is_found(width_mm: float) -> None:
+    holes = find_holes([without(each, width_mm) for each in depth_maps(HILLS)], POSES, RESOLUTION_MM)
+    x, y, _ = holes.points.T
+    near = (np.abs(x) < width_mm / 2 + 0.2) & (np.abs(y) < 1.2)
+    assert near.sum() > 20
+    assert near.mean() > 0.9
+    apart = np.maximum(np.abs(x) - width_mm / 2, np.abs(y) - 1)[near]
+    assert -0.2 < apart.min() <= apart.max() < 0.2
+    assert (np.histogram(y[near], bins=np.arange(-1, 1.01, 0.25))[0] > 0).all(), "all along"
+    assert (holes.normals[near, 2] < -0.7).all()
+    assert np.abs(HILLS.closest(holes.points)[0]).max() < 0.02
+
+
+def test_a_whole_surface_has_a_border_and_no_holes() -> None:
+    assert len(find_holes(depth_maps(HILLS), POSES, RESOLUTION_MM).points) < 10
 
 
 def test_the_foot_of_a_perpendicular_must_lie_on_the_surface() -> None:

@@ -16,9 +16,9 @@ from builders import folder_capture, image_path
 from cuspid import storage
 from cuspid.capture import Frame
 from cuspid.geometry import Rigid3
-from cuspid.reconstruction import DepthMap, Reconstruction, Tracks
+from cuspid.reconstruction import DepthMap, Reconstruction, SurfacePoints, Tracks
 from cuspid.stereo import stage
-from cuspid.stereo.holes import Sightings, covering
+from cuspid.stereo.holes import Sightings, Views, covering
 from cuspid.stereo.matching import StereoOptions
 from cuspid.stereo.temporal import TemporalOptions
 from synthetic_scene import diamond
@@ -33,6 +33,14 @@ def test_the_sets_that_are_taken_cover_all_but_what_may_be_left(sets: list[set[i
     assert len(every - covered) <= left
     assert taken == sorted(set(taken))
     assert len(taken) <= max(len(every) - left, 0)
+
+
+@given(sets=SETS, least=st.integers(1, 6))
+def test_no_set_is_taken_that_adds_too_little(sets: list[set[int]], least: int) -> None:
+    taken = covering([np.array(sorted(each), dtype=np.int64) for each in sets], 40, least=least)
+    covered = set().union(*(sets[k] for k in taken))
+    assert all(len(each - covered) < least for each in sets)
+    assert len(taken) * least <= len(covered)
 
 
 def scene() -> tuple[Reconstruction, Tracks]:
@@ -109,11 +117,47 @@ def test_images_share_the_points_that_both_show() -> None:
     assert sightings.both(("00000", "west"), ("00001", "nobody")).size == 0
 
 
+def facing_cameras(points: np.ndarray) -> SurfacePoints:
+    return SurfacePoints(points, np.tile([0.0, 0.0, -1.0], (len(points), 1)))
+
+
+@pytest.mark.parametrize(("nearer_mm", "hides"), [(0.2, True), (0.05, False), (-0.5, False), (np.nan, False)])
+def test_a_place_is_hidden_behind_a_depth_that_is_nearer(nearer_mm: float, hides: bool) -> None:
+    found, tracks = scene()
+    maps = [plane(found, "00000", "west", 5.0 - nearer_mm)]
+    views = Views.of(facing_cameras(tracks.points), found, maps, 0.08)
+    both = views.both(("00000", "west"), ("00001", "west"))  # the second has no depth map
+    assert both.tolist() == ([] if hides else list(range(25)))
+
+
+@pytest.mark.parametrize(("turned_deg", "shown"), [(0, True), (65, True), (75, False), (180, False)])
+def test_an_image_shows_what_is_turned_to_it(turned_deg: float, shown: bool) -> None:
+    found, _ = scene()
+    straight_ahead = found.rig["west"].cam_from_rig.inverse().apply(np.array([[0.0, 0, 5]]))
+    turn = Rigid3.from_rotation_vector(np.array([0, np.deg2rad(turned_deg), 0]), np.zeros(3))
+    places = SurfacePoints(straight_ahead, turn.rotate(np.array([[0.0, 0, -1]])))
+    image = ("00000", "west")
+    for maps in ([], [plane(found, "00000", "west", 5.0)]):
+        assert (len(Views.of(places, found, maps, 0.08).both(image, image)) == 1) == shown
+
+
+def test_an_image_shows_what_lies_in_it() -> None:
+    found, tracks = scene()
+    places = facing_cameras(tracks.points + [30.0, 0, 0])
+    for maps in ([], [plane(found, "00000", "west", 5.0)]):
+        assert Views.of(places, found, maps, 0.08).both(("00000", "west"), ("00000", "west")).size == 0
+
+
 STEP = Rigid3.from_rotation_vector(np.array([0.01, -0.02, 0.03]), np.array([-1.1, 0.15, 0.05]))
 
 
 def matched(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, found: Reconstruction, maps: list[DepthMap], left_share: float
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    found: Reconstruction,
+    maps: list[DepthMap],
+    left_share: float,
+    holes: SurfacePoints | None = None,
 ) -> list[list[str]]:
     """The cameras that temporal stereo is measured of, frame by frame."""
     capture, asked = folder_capture(folder, diamond(), ("00000", "00001")), list[list[str]]()
@@ -123,7 +167,9 @@ def matched(
         storage.write_image(image_path(capture, frame, name), blank)
     monkeypatch.setattr(stage, "measure_temporal", lambda _, now, after, *__: asked.append(sorted(now)) or ())
     options = TemporalOptions(left_share=left_share)
-    stage.measure_temporal_depth(capture, found, maps, folder / "temporal", options, agreement_mm=0.08, least_maps=2)
+    stage.measure_temporal_depth(
+        *(capture, found, maps, folder / "temporal", options), agreement_mm=0.08, least_maps=2, holes=holes
+    )
     return asked
 
 
@@ -138,6 +184,20 @@ def test_a_camera_is_matched_with_its_next_frame_where_that_fills_a_hole(
     assert matched(tmp_path / "holes", monkeypatch, found, full[:1], 0.03) in ([["west"]], [["east"]])
     assert matched(tmp_path / "everywhere", monkeypatch, found, full, 0.0) == [every]
     assert matched(tmp_path / "unknown", monkeypatch, replace(found, tracks=None), full, 0.03) == [every]
+
+
+def test_a_hole_that_no_sparse_point_tells_is_matched_by_two_cameras_that_show_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, tracks = scene()
+    found = replace(found, rig_from_world={"00000": Rigid3.identity(), "00001": STEP})
+    full = [plane(found, "00000", name, 5.0) for name in ("west", "east")]
+    behind = [plane(found, "00000", name, 4.0) for name in ("north", "south")]
+    holes = facing_cameras(tracks.points[:9])
+    [taken] = matched(tmp_path / "hole", monkeypatch, found, full, 0.03, holes)
+    assert len(taken) == 2
+    assert matched(tmp_path / "hidden", monkeypatch, found, [*full, *behind], 0.03, holes) == [["east", "west"]]
+    assert matched(tmp_path / "tiny", monkeypatch, found, full, 0.03, facing_cameras(tracks.points[:4])) == []
 
 
 def measured(

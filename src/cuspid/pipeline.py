@@ -41,12 +41,12 @@ from cuspid.reconstruction import Reconstruction
 from cuspid.rig import Handpiece
 from cuspid.simulation.stage import FilmOptions, RenderOptions, SimulationOptions, film, simulate, take_images
 from cuspid.stereo.matching import StereoOptions
-from cuspid.stereo.stage import measure_depth, measure_enough_depth, measure_temporal_depth
+from cuspid.stereo.stage import StoredDepthMaps, measure_depth, measure_enough_depth, measure_temporal_depth
 from cuspid.stereo.temporal import TemporalOptions
 from cuspid.stitching.ortho import OrthoOptions, Stitched, orthophoto
 from cuspid.stitching.thesis_method import ThesisOptions, stitch_as_thesis
 from cuspid.surface.cleaning import CleaningOptions
-from cuspid.surface.fusion import FusionOptions
+from cuspid.surface.fusion import FusionOptions, find_holes
 from cuspid.surface.stage import fuse
 from cuspid.tolerances import NominalOptions, held
 from cuspid.trueness import GroundTruth
@@ -167,15 +167,27 @@ def surface(
         progress=progress,
     )
     if options.temporal.enabled:
+        holes = None
+        if options.temporal.small_holes is not False and options.temporal.left_share != 0:
+            holes = find_holes(depths, _poses(found, depths), lengths_mm[0], options.fusion, progress=progress)
         depths |= measure_temporal_depth(
             *(capture, found, depths, folder / "depth-temporal", options.temporal),
             agreement_mm=agreement_mm,
             least_maps=options.fusion.least_maps,
+            holes=holes,
             progress=progress,
         )
-    poses = {name: found.rig_from_world[name] for name in depths.frames if name in found.rig_from_world}
     how = options.fusion, options.cleaning
-    return fuse(depths, depths.digest, poses, *lengths_mm, folder, *how, expected=found.expectation, progress=progress)
+    return fuse(
+        *(depths, depths.digest, _poses(found, depths), *lengths_mm, folder, *how),
+        expected=found.expectation,
+        progress=progress,
+    )
+
+
+def _poses(found: Reconstruction, depths: StoredDepthMaps) -> dict[str, Rigid3]:
+    """``rig_from_world`` of the located frames that have depth maps."""
+    return {name: found.rig_from_world[name] for name in depths.frames if name in found.rig_from_world}
 
 
 def _settled(options: ReconstructionOptions) -> ReconstructionOptions:
@@ -192,6 +204,8 @@ def _settled(options: ReconstructionOptions) -> ReconstructionOptions:
         features = replace(features, halvings=_DRAFT_HALVINGS)
     if temporal.left_share is None:
         temporal = replace(temporal, left_share=_DRAFT_TEMPORAL_LEFT_SHARE)
+    if temporal.small_holes is None:
+        temporal = replace(temporal, small_holes=False)
     stereo = options.stereo
     if stereo.refinement.bend_px is None:
         stereo = replace(stereo, refinement=replace(stereo.refinement, bend_px=_DRAFT_BEND_PX))

@@ -51,6 +51,16 @@ class DepthMap:
         return self.cam_from_rig.inverse().apply(in_cam), known
 
 
+@dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """Points of a surface, and which way it faces there."""
+
+    points: Float[np.ndarray, "p 3"]
+    """In the world frame, mm."""
+    normals: Float[np.ndarray, "p 3"]
+    """Of length 1, outward."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Tracks:
     """Sparse points and where they were seen."""

@@ -1,7 +1,8 @@
 """Where depth left holes, and which images would fill them.
 
 The sparse points of the motion stand for the surface: they are spread evenly over the images, and they lie also where
-only one camera of a group sees it.
+only one camera of a group sees it. They are too few to tell of a narrow strip, as on the slope of a cusp; there the
+places stand for it that a coarse fusion leaves open.
 """
 
 from __future__ import annotations
@@ -12,11 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
-from cuspid.reconstruction import DepthMap, Reconstruction, Tracks
+from cuspid.reconstruction import DepthMap, Reconstruction, SurfacePoints, Tracks
+from cuspid.rig import Rig
 
 Image = tuple[str, str]
 """A frame and a camera of it."""
+_STEEPEST_DEG = 70.0
+"""Between the line of sight and the normal of a place that is worth another look."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +78,53 @@ def _on_surface(depth_map: DepthMap, in_cam: Float[np.ndarray, "n 3"], agreement
     return on
 
 
-def covering(candidates: Sequence[Int[np.ndarray, "_"]], count: int, left: float) -> list[int]:
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Which of some places on a surface each image shows."""
+
+    places: SurfacePoints
+    rig: Rig
+    rig_from_world: Mapping[str, Rigid3]
+    shown: dict[Image, Bool[np.ndarray, "p"]]
+    """Of images with a depth map; the others follow when they are asked for."""
+
+    @staticmethod
+    def of(places: SurfacePoints, found: Reconstruction, depth_maps: Iterable[DepthMap], agreement_mm: float) -> Views:
+        """By depth maps: a place is hidden behind a depth that is nearer by more than ``agreement_mm``."""
+        views = Views(places, found.rig, found.rig_from_world, {})
+        for depth_map in depth_maps:
+            if depth_map.frame in found.rig_from_world:
+                cam_from_world = depth_map.cam_from_rig @ found.rig_from_world[depth_map.frame]
+                facing = views._facing(depth_map.camera, cam_from_world)
+                in_cam = cam_from_world.apply(places.points[facing])
+                column, row = depth_map.camera.project(in_cam).astype(np.int64).T
+                in_front = depth_map.depth_mm[row, column] < in_cam[:, 2] - agreement_mm
+                facing[facing] = ~(in_front & depth_map.known[row, column])
+                views.shown[depth_map.frame, depth_map.camera_name] = facing
+        return views
+
+    def both(self, one: Image, other: Image) -> Int[np.ndarray, "_"]:
+        """Places that two images show."""
+        return np.flatnonzero(self._shown(one) & self._shown(other))
+
+    def _shown(self, image: Image) -> Bool[np.ndarray, "p"]:
+        if image not in self.shown:
+            frame, name = image
+            mounted = self.rig[name]
+            self.shown[image] = self._facing(mounted.camera, mounted.cam_from_rig @ self.rig_from_world[frame])
+        return self.shown[image]
+
+    def _facing(self, camera: Camera, cam_from_world: Rigid3) -> Bool[np.ndarray, "p"]:
+        """Which places lie in the image of a camera and are not turned too far away from it."""
+        towards = cam_from_world.inverse().translation - self.places.points
+        cosine = np.sum(towards * self.places.normals, axis=1) / np.linalg.norm(towards, axis=1)
+        inside = camera.contains(camera.project(cam_from_world.apply(self.places.points)), 1e-6)
+        return np.asarray(inside & (cosine > np.cos(np.deg2rad(_STEEPEST_DEG))))
+
+
+def covering(candidates: Sequence[Int[np.ndarray, "_"]], count: int, left: float = 0, *, least: int = 1) -> list[int]:
     """Which sets of points, of ``count``, cover what the sets cover together, but for ``left`` points at most: greedily
-    the one that adds most, again and again. Indices of sets, increasing."""
+    the one that adds most, again and again, while it adds ``least`` (>= 1). Indices of sets, increasing."""
     missing = np.zeros(count, dtype=bool)
     for points in candidates:
         missing[points] = True
@@ -83,6 +132,8 @@ def covering(candidates: Sequence[Int[np.ndarray, "_"]], count: int, left: float
     taken: list[int] = []
     while missing.sum() > left:
         best = int(gain.argmax())
+        if gain[best] < least:
+            break
         # Gains only fall: the best of the old ones that keeps its gain is the best.
         now = int(missing[candidates[best]].sum())
         if now == gain[best]:

@@ -14,8 +14,8 @@ from cuspid.capture import Capture, Frame
 from cuspid.geometry import Rigid3
 from cuspid.pairing import camera_groups
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import DepthMap, Reconstruction
-from cuspid.stereo.holes import Sightings, covering
+from cuspid.reconstruction import DepthMap, Reconstruction, SurfacePoints
+from cuspid.stereo.holes import Sightings, Views, covering
 from cuspid.stereo.matching import DepthEstimator, StereoOptions
 from cuspid.stereo.temporal import TemporalOptions, measure_temporal, moving_pair
 from cuspid.storage.captures import hash_frame
@@ -29,6 +29,10 @@ from cuspid.workers import map_ahead, map_in_threads
 _CODE = ("stereo",)
 _LEFT_SHARE = 0.005
 """Of the sparse points, that temporal stereo need not reach."""
+_LEAST_PLACES = 5
+"""Of a surface, that make it worth matching a camera with itself."""
+_TIMES = 2
+"""That a place in a hole should be matched."""
 _ENOUGH_MAPS = 4
 """Depth maps of every second frame that make those between superfluous."""
 
@@ -149,20 +153,22 @@ def measure_temporal_depth(
     *,
     agreement_mm: float,
     least_maps: int,
+    holes: SurfacePoints | None = None,
     progress: Progress = silent,
 ) -> StoredDepthMaps:
     """Depth maps of cameras together with themselves at the next located frame of the same lighting pattern, kept in
     ``folder``: of those that fill holes (:attr:`TemporalOptions.left_share`), which are where fewer than ``least_maps``
-    of ``depths`` confirm the sparse points within ``agreement_mm``."""
+    of ``depths`` confirm the sparse points within ``agreement_mm``, and further ones given as ``holes``."""
+    steps = _steps(capture, found.rig_from_world, options)
     left_share = _LEFT_SHARE if options.left_share is None else options.left_share
-    if found.tracks is None or left_share == 0:
-        steps = _steps(capture, found.rig_from_world, options)
-    else:
+    if found.tracks is not None and left_share > 0:
         sightings = Sightings.of(found, found.tracks)
         missing = sightings.confirmed(depths, found.rig_from_world, agreement_mm) < least_maps
-        few = missing.sum() <= left_share * len(missing)
-        every = {} if few else _steps(capture, found.rig_from_world, options)
-        steps = _worthwhile(every, sightings, missing, left_share)
+        tried = [(step, camera) for step in steps.values() for camera in step.now.cameras]
+        taken = _that_fill_holes(tried, sightings, missing, left_share)
+        if holes is not None:
+            taken |= _that_fill_small_holes(tried, taken, Views.of(holes, found, depths, agreement_mm))
+        steps = _of_cameras(tried, taken)
 
     def measure(frame: Frame) -> tuple[DepthMap, ...]:
         step = steps[frame.name]
@@ -207,18 +213,42 @@ def _steps(capture: Capture, rig_from_world: Mapping[str, Rigid3], options: Temp
     return steps
 
 
-def _worthwhile(
-    steps: Mapping[str, _Step], sightings: Sightings, missing: Bool[np.ndarray, "p"], left_share: float
-) -> dict[str, _Step]:
-    """The steps with those cameras that show points which are missing."""
-    tried = [(step, camera) for step in steps.values() for camera in step.now.cameras]
+def _that_fill_holes(
+    tried: Sequence[tuple[_Step, str]], sightings: Sightings, missing: Bool[np.ndarray, "p"], left_share: float
+) -> set[int]:
+    """Which steps of a camera show points that are missing."""
+    if missing.sum() <= left_share * len(missing):
+        return set()
     shown = [sightings.both((step.now.name, camera), (step.after.name, camera)) for step, camera in tried]
-    taken = covering([points[missing[points]] for points in shown], len(missing), left_share * len(missing))
-    cameras: dict[str, list[str]] = {}
+    return set(covering([points[missing[points]] for points in shown], len(missing), left_share * len(missing)))
+
+
+def _that_fill_small_holes(tried: Sequence[tuple[_Step, str]], taken: set[int], views: Views) -> set[int]:
+    """Which further steps of a camera it takes to show each place several times: one alone leaves gaps of its own."""
+    shown = [views.both((step.now.name, camera), (step.after.name, camera)) for step, camera in tried]
+    times, further = np.zeros(len(views.places.points), dtype=np.int64), set[int]()
     for index in taken:
-        step, camera = tried[index]
+        times[shown[index]] += 1
+    for few in range(1, _TIMES + 1):
+        left = times < few
+        untaken = [places[left[places]] for places in shown]
+        for index in taken | further:
+            untaken[index] = untaken[index][:0]
+        more = covering(untaken, len(left), least=_LEAST_PLACES)
+        for index in more:
+            times[shown[index]] += 1
+        further |= set(more)
+    return further
+
+
+def _of_cameras(tried: Sequence[tuple[_Step, str]], taken: set[int]) -> dict[str, _Step]:
+    """The steps that were taken, by the names of their frames, each with its cameras."""
+    cameras: dict[str, list[str]] = {}
+    steps: dict[str, _Step] = {}
+    for step, camera in (tried[index] for index in sorted(taken)):
+        steps[step.now.name] = step
         cameras.setdefault(step.now.name, []).append(camera)
-    return {name: steps[name].of(those) for name, those in cameras.items()}
+    return {name: step.of(cameras[name]) for name, step in steps.items()}
 
 
 def _following(located: Sequence[Frame]) -> dict[str, Frame]:

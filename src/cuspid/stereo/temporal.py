@@ -32,6 +32,9 @@ class TemporalOptions(Options):
     """Cameras are matched with themselves where that fills holes: until, of the sparse points that depth within the
     frames leaves without a surface, no more than this share (0 to 1) of all points is left to be filled. 0: wherever a
     camera moved enough. By default 0.005, of a draft 0.03."""
+    small_holes: bool | None = None
+    """Also where that fills holes in the surface which are too small to be told by sparse points. By default so, but
+    not of a draft."""
     confidence_share: Annotated[float, SHARE] = 0.05
     """Its confidence relative to depth from one frame."""
     least_baseline_share: Annotated[float, Range(0, 10)] = 0.08

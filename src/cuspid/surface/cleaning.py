@@ -200,23 +200,39 @@ def with_split_fans(mesh: Mesh) -> tuple[Mesh, int]:
 
 def boundaries(mesh: Mesh) -> tuple[float, tuple[Hole, ...]]:
     """Length of the outer boundaries (the longest of each piece, mm), and the other ones as holes, largest first."""
+    sides, loop, outer = _open_loops(mesh)
+    perimeter, area = _loop_measures(mesh.vertices[sides], loop)
+    holes = [
+        Hole(perimeter_mm=float(perimeter[k]), area_mm2=float(area[k]))
+        for k in np.argsort(-perimeter, kind="stable")
+        if not outer[k]
+    ]
+    return float(perimeter[outer].sum()), tuple(holes)
+
+
+def hole_rims(mesh: Mesh) -> Int[np.ndarray, "n"]:
+    """Indices of the vertices on the rims of holes, which are all boundaries but the longest of each piece."""
+    sides, loop, outer = _open_loops(mesh)
+    return np.unique(sides[~outer[loop]])
+
+
+def _open_loops(mesh: Mesh) -> tuple[Int[np.ndarray, "s 2"], Int[np.ndarray, "s"], Bool[np.ndarray, "l"]]:
+    """Sides of one face alone, the loop of each, and which of the loops are outer ones."""
     sides = _Sides.of(mesh)
     alone = sides.uses[sides.edge] == 1
     open_sides = sides.ends[alone]
     if len(open_sides) == 0:
-        return 0.0, ()
+        return open_sides, np.zeros(0, dtype=np.int64), np.zeros(0, dtype=bool)
     face = np.tile(np.arange(len(mesh.faces)), 3)[alone]
-    loop = parts_of(open_sides, len(mesh.vertices))[open_sides[:, 0]]
-    _, loop = np.unique(loop, return_inverse=True)
-    perimeter, area = _loop_measures(mesh.vertices[open_sides], loop)
+    _, loop = np.unique(parts_of(open_sides, len(mesh.vertices))[open_sides[:, 0]], return_inverse=True)
+    perimeter, _ = _loop_measures(mesh.vertices[open_sides], loop)
     piece_of_loop = np.zeros(len(perimeter), dtype=np.int64)
     piece_of_loop[loop] = face_pieces(mesh)[face]
     by_length = np.argsort(-perimeter, kind="stable")
     _, outermost = np.unique(piece_of_loop[by_length], return_index=True)
     outer = np.zeros(len(perimeter), dtype=bool)
     outer[by_length[outermost]] = True
-    holes = [Hole(perimeter_mm=float(perimeter[k]), area_mm2=float(area[k])) for k in by_length if not outer[k]]
-    return float(perimeter[outer].sum()), tuple(holes)
+    return open_sides, loop, outer
 
 
 def _loop_measures(
@@ -224,6 +240,8 @@ def _loop_measures(
 ) -> tuple[Float[np.ndarray, "l"], Float[np.ndarray, "l"]]:
     """Perimeter and area of the fan from the centroid, for each boundary loop."""
     count = np.bincount(loop)
+    if len(count) == 0:
+        return np.zeros(0), np.zeros(0)
     centroid = np.stack([np.bincount(loop, segments[:, 0, axis]) for axis in range(3)], axis=1) / count[:, None]
     to_start, to_end = segments[:, 0] - centroid[loop], segments[:, 1] - centroid[loop]
     perimeter = np.bincount(loop, np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1))

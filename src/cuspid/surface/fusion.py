@@ -10,7 +10,7 @@ and what is only carried on past the borders of all maps.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, no_type_check
 
 import numpy as np
@@ -22,7 +22,8 @@ from cuspid.kernels import kernel
 from cuspid.mesh import Mesh, used_vertices
 from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import DepthMap
+from cuspid.reconstruction import DepthMap, SurfacePoints
+from cuspid.surface.cleaning import hole_rims
 from cuspid.surface.evidence import Evidence, colors_of, observe
 from cuspid.surface.meshing import extract
 from cuspid.surface.volume import Reached, SparseVolume
@@ -78,6 +79,36 @@ def fuse(
     time, will not do. The maps of a frame follow each other. The same maps in the same order give the same mesh.
     """
     options = options or FusionOptions()
+    return _votes(depth_maps, rig_from_world, resolution_mm, options, "fusion", progress).outcome(options.least_maps)
+
+
+def find_holes(
+    depth_maps: Iterable[DepthMap],
+    rig_from_world: Mapping[str, Rigid3],
+    resolution_mm: float,
+    options: FusionOptions | None = None,
+    *,
+    progress: Progress = silent,
+) -> SurfacePoints:
+    """Places on the rims of the holes of the mesh that :func:`fuse` would give on a grid of twice the spacing.
+    Arguments as there."""
+    options = options or FusionOptions()
+    coarse = replace(options, voxel_mm=2 * options.voxel_for(resolution_mm))
+    votes = _votes(depth_maps, rig_from_world, resolution_mm, coarse, "holes", progress)
+    mesh = votes.outcome(options.least_maps).mesh
+    rims = hole_rims(mesh)
+    return SurfacePoints(mesh.vertices[rims], mesh.vertex_normals[rims])
+
+
+def _votes(
+    depth_maps: Iterable[DepthMap],
+    rig_from_world: Mapping[str, Rigid3],
+    resolution_mm: float,
+    options: FusionOptions,
+    stage: str,
+    progress: Progress,
+) -> Votes:
+    """What the depth maps say about the rough mesh that they blend to."""
     voxel_mm = options.voxel_for(resolution_mm)
     jump_mm, agreement_mm = options.largest_jump * resolution_mm, options.agreement * resolution_mm
     volume = SparseVolume(voxel_mm, options.truncation_voxels * voxel_mm)
@@ -89,15 +120,15 @@ def fuse(
 
     for one, evidence, where in map_ahead(reached, _located(depth_maps, rig_from_world)):
         volume.integrate(evidence, one.cam_from_world, where)
-        progress("fusion", one.number, 2 * half)
+        progress(stage, one.number, 2 * half)
     votes = Votes.on(extract(volume, options.least_weight))
     del volume
     for one, evidence in map_ahead(
         lambda one: (one, Evidence.of(one.depth_map, jump_mm)), _located(depth_maps, rig_from_world)
     ):
         votes.collect(evidence, one.depth_map, one.cam_from_world, agreement_mm, one.number)
-        progress("fusion", half + one.number, 2 * half)
-    return votes.outcome(options.least_maps)
+        progress(stage, half + one.number, 2 * half)
+    return votes
 
 
 @dataclass(frozen=True, eq=False)
