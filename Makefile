@@ -12,7 +12,7 @@ demo: $(STAMP)
 
 # One BLAS thread for each of the two workers: more would only wait for one another.
 test: $(STAMP)
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m "not documentation"
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
@@ -24,9 +24,10 @@ format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# A warning, as of a link that leads nowhere, is an error.
+# A warning, as of a link that leads nowhere, is an error, and so is a command on a page that does not run.
 docs: $(STAMP).docs
 	$(BIN)/sphinx-build --quiet --fail-on-warning --doctree-dir build/doctrees docs build/docs
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 -m documentation tests/test_docs.py
 	@echo "build/docs/index.html"
 
 # As users get it: in an environment of its own, far from the sources.

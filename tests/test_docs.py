@@ -93,6 +93,7 @@ def test_commands_are_found_wherever_they_stand(tmp_path, monkeypatch):
     assert [block.run for block in blocks(page)] == [True, False, True]
 
 
+@pytest.mark.documentation
 @pytest.mark.parametrize("page", RUN)
 def test_the_commands_of_a_page_run(page, tmp_path, monkeypatch, phantom_file):
     """In their order, in an empty folder; a how-to page has ``jaw.ply``, as it says."""

@@ -125,8 +125,8 @@ def facing_cameras(points: np.ndarray) -> SurfacePoints:
 def test_a_place_is_hidden_behind_a_depth_that_is_nearer(nearer_mm: float, hides: bool) -> None:
     found, tracks = scene()
     maps = [plane(found, "00000", "west", 5.0 - nearer_mm)]
-    views = Views.of(facing_cameras(tracks.points), found, maps, 0.08)
-    both = views.both(("00000", "west"), ("00001", "west"))  # the second has no depth map
+    images = ("00000", "west"), ("00001", "west")  # the second has no depth map
+    both = Views.of(facing_cameras(tracks.points), found, images, maps, 0.08).both(*images)
     assert both.tolist() == ([] if hides else list(range(25)))
 
 
@@ -138,14 +138,15 @@ def test_an_image_shows_what_is_turned_to_it(turned_deg: float, shown: bool) -> 
     places = SurfacePoints(straight_ahead, turn.rotate(np.array([[0.0, 0, -1]])))
     image = ("00000", "west")
     for maps in ([], [plane(found, "00000", "west", 5.0)]):
-        assert (len(Views.of(places, found, maps, 0.08).both(image, image)) == 1) == shown
+        assert (len(Views.of(places, found, [image], maps, 0.08).both(image, image)) == 1) == shown
 
 
 def test_an_image_shows_what_lies_in_it() -> None:
     found, tracks = scene()
     places = facing_cameras(tracks.points + [30.0, 0, 0])
+    image = ("00000", "west")
     for maps in ([], [plane(found, "00000", "west", 5.0)]):
-        assert Views.of(places, found, maps, 0.08).both(("00000", "west"), ("00000", "west")).size == 0
+        assert Views.of(places, found, [image], maps, 0.08).both(image, image).size == 0
 
 
 STEP = Rigid3.from_rotation_vector(np.array([0.01, -0.02, 0.03]), np.array([-1.1, 0.15, 0.05]))

@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float, Int
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.reconstruction import DepthMap, Reconstruction, SurfacePoints, Tracks
-from cuspid.rig import Rig
 
 Image = tuple[str, str]
 """A frame and a camera of it."""
@@ -82,44 +81,51 @@ def _on_surface(depth_map: DepthMap, in_cam: Float[np.ndarray, "n 3"], agreement
 class Views:
     """Which of some places on a surface each image shows."""
 
-    places: SurfacePoints
-    rig: Rig
-    rig_from_world: Mapping[str, Rigid3]
-    shown: dict[Image, Bool[np.ndarray, "p"]]
-    """Of images with a depth map; the others follow when they are asked for."""
+    count: int
+    """Of the places."""
+    shown: Mapping[Image, Bool[np.ndarray, "p"]]
 
     @staticmethod
-    def of(places: SurfacePoints, found: Reconstruction, depth_maps: Iterable[DepthMap], agreement_mm: float) -> Views:
-        """By depth maps: a place is hidden behind a depth that is nearer by more than ``agreement_mm``."""
-        views = Views(places, found.rig, found.rig_from_world, {})
+    def of(
+        places: SurfacePoints,
+        found: Reconstruction,
+        images: Iterable[Image],
+        depth_maps: Iterable[DepthMap],
+        agreement_mm: float,
+    ) -> Views:
+        """Of images of located frames. A place is hidden behind a depth that is nearer by more than ``agreement_mm``;
+        where an image has no depth map, nothing is."""
+        shown = dict[Image, Bool[np.ndarray, "p"]]()
         for depth_map in depth_maps:
             if depth_map.frame in found.rig_from_world:
                 cam_from_world = depth_map.cam_from_rig @ found.rig_from_world[depth_map.frame]
-                facing = views._facing(depth_map.camera, cam_from_world)
-                in_cam = cam_from_world.apply(places.points[facing])
-                column, row = depth_map.camera.project(in_cam).astype(np.int64).T
-                in_front = depth_map.depth_mm[row, column] < in_cam[:, 2] - agreement_mm
-                facing[facing] = ~(in_front & depth_map.known[row, column])
-                views.shown[depth_map.frame, depth_map.camera_name] = facing
-        return views
+                facing = _facing(places, depth_map.camera, cam_from_world)
+                facing[facing] = ~_hidden(depth_map, cam_from_world.apply(places.points[facing]), agreement_mm)
+                shown[depth_map.frame, depth_map.camera_name] = facing
+        for frame, name in set(images) - set(shown):
+            mounted = found.rig[name]
+            cam_from_world = mounted.cam_from_rig @ found.rig_from_world[frame]
+            shown[frame, name] = _facing(places, mounted.camera, cam_from_world)
+        return Views(len(places.points), shown)
 
     def both(self, one: Image, other: Image) -> Int[np.ndarray, "_"]:
-        """Places that two images show."""
-        return np.flatnonzero(self._shown(one) & self._shown(other))
+        """Indices of the places that two images show."""
+        return np.flatnonzero(self.shown[one] & self.shown[other])
 
-    def _shown(self, image: Image) -> Bool[np.ndarray, "p"]:
-        if image not in self.shown:
-            frame, name = image
-            mounted = self.rig[name]
-            self.shown[image] = self._facing(mounted.camera, mounted.cam_from_rig @ self.rig_from_world[frame])
-        return self.shown[image]
 
-    def _facing(self, camera: Camera, cam_from_world: Rigid3) -> Bool[np.ndarray, "p"]:
-        """Which places lie in the image of a camera and are not turned too far away from it."""
-        towards = cam_from_world.inverse().translation - self.places.points
-        cosine = np.sum(towards * self.places.normals, axis=1) / np.linalg.norm(towards, axis=1)
-        inside = camera.contains(camera.project(cam_from_world.apply(self.places.points)), 1e-6)
-        return np.asarray(inside & (cosine > np.cos(np.deg2rad(_STEEPEST_DEG))))
+def _facing(places: SurfacePoints, camera: Camera, cam_from_world: Rigid3) -> Bool[np.ndarray, "p"]:
+    """Which places lie in the image of a camera and are not turned too far away from it."""
+    towards = cam_from_world.inverse().translation - places.points
+    cosine = np.sum(towards * places.normals, axis=1) / np.linalg.norm(towards, axis=1)
+    inside = camera.contains(camera.project(cam_from_world.apply(places.points)), 1e-6)
+    return np.asarray(inside & (cosine > np.cos(np.deg2rad(_STEEPEST_DEG))))
+
+
+def _hidden(depth_map: DepthMap, in_cam: Float[np.ndarray, "n 3"], agreement_mm: float) -> Bool[np.ndarray, "n"]:
+    """Which points in the frame of its camera, all in its image, lie behind the surface of a depth map."""
+    column, row = depth_map.camera.project(in_cam).astype(np.int64).T
+    nearer = depth_map.depth_mm[row, column] < in_cam[:, 2] - agreement_mm
+    return np.asarray(nearer & depth_map.known[row, column])
 
 
 def covering(candidates: Sequence[Int[np.ndarray, "_"]], count: int, left: float = 0, *, least: int = 1) -> list[int]:

@@ -167,7 +167,8 @@ def measure_temporal_depth(
         tried = [(step, camera) for step in steps.values() for camera in step.now.cameras]
         taken = _that_fill_holes(tried, sightings, missing, left_share)
         if holes is not None:
-            taken |= _that_fill_small_holes(tried, taken, Views.of(holes, found, depths, agreement_mm))
+            images = [(frame.name, camera) for step, camera in tried for frame in (step.now, step.after)]
+            taken |= _that_fill_small_holes(tried, taken, Views.of(holes, found, images, depths, agreement_mm))
         steps = _of_cameras(tried, taken)
 
     def measure(frame: Frame) -> tuple[DepthMap, ...]:
@@ -226,7 +227,7 @@ def _that_fill_holes(
 def _that_fill_small_holes(tried: Sequence[tuple[_Step, str]], taken: set[int], views: Views) -> set[int]:
     """Which further steps of a camera it takes to show each place several times: one alone leaves gaps of its own."""
     shown = [views.both((step.now.name, camera), (step.after.name, camera)) for step, camera in tried]
-    times, further = np.zeros(len(views.places.points), dtype=np.int64), set[int]()
+    times, further = np.zeros(views.count, dtype=np.int64), set[int]()
     for index in taken:
         times[shown[index]] += 1
     for few in range(1, _TIMES + 1):
@@ -234,7 +235,7 @@ def _that_fill_small_holes(tried: Sequence[tuple[_Step, str]], taken: set[int], 
         untaken = [places[left[places]] for places in shown]
         for index in taken | further:
             untaken[index] = untaken[index][:0]
-        more = covering(untaken, len(left), least=_LEAST_PLACES)
+        more = covering(untaken, views.count, least=_LEAST_PLACES)
         for index in more:
             times[shown[index]] += 1
         further |= set(more)
