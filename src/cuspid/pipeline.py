@@ -46,8 +46,8 @@ from cuspid.stereo.temporal import TemporalOptions
 from cuspid.stitching.ortho import OrthoOptions, Stitched, orthophoto
 from cuspid.stitching.thesis_method import ThesisOptions, stitch_as_thesis
 from cuspid.surface.cleaning import CleaningOptions
-from cuspid.surface.fusion import FusionOptions, find_holes
-from cuspid.surface.stage import fuse
+from cuspid.surface.fusion import FusionOptions
+from cuspid.surface.stage import find_holes, fuse
 from cuspid.tolerances import NominalOptions, held
 from cuspid.trueness import GroundTruth
 from cuspid.visibility import VisibilityOptions, scannable_faces
@@ -168,8 +168,9 @@ def surface(
     )
     if options.temporal.enabled:
         holes = None
-        if options.temporal.small_holes is not False and options.temporal.left_share != 0:
-            holes = find_holes(depths, _poses(found, depths), lengths_mm[0], options.fusion, progress=progress)
+        if found.tracks is not None and options.temporal.small_holes is not False and options.temporal.left_share != 0:
+            located = depths, depths.digest, _poses(found, depths)
+            holes = find_holes(*located, lengths_mm[0], folder, options.fusion, progress=progress)
         depths |= measure_temporal_depth(
             *(capture, found, depths, folder / "depth-temporal", options.temporal),
             agreement_mm=agreement_mm,

@@ -11,7 +11,7 @@ import numpy as np
 
 from cuspid.capture import Dropped
 from cuspid.geometry import Rigid3
-from cuspid.reconstruction import DepthMap, Expectation, Reconstruction, Refinement, Tracks
+from cuspid.reconstruction import DepthMap, Expectation, Reconstruction, Refinement, SurfacePoints, Tracks
 from cuspid.rig import Handpiece
 from cuspid.storage.files import as_declared, read_arrays, read_json, reading, to_plain, write_arrays, write_json
 from cuspid.storage.handpieces import (
@@ -113,6 +113,9 @@ def _read_tracks(path: Path) -> Tracks:
         return as_declared(Tracks, **{name: arrays[name] for name in _TRACKS})
 
 
+_MADE_ANEW = "run the same command again, it is made anew"
+
+
 def write_depth_maps(path: Path, depth_maps: Sequence[DepthMap]) -> None:
     """Write the depth maps of one frame as one ``.npz``."""
     arrays: dict[str, np.ndarray] = {}
@@ -136,7 +139,7 @@ def write_depth_maps(path: Path, depth_maps: Sequence[DepthMap]) -> None:
 
 def read_depth_maps(path: Path) -> tuple[DepthMap, ...]:
     """Read what :func:`write_depth_maps` wrote. Raises InputError."""
-    arrays = read_arrays(path, remedy="run the same command again, it is made anew")
+    arrays = read_arrays(path, remedy=_MADE_ANEW)
     with reading(path):
         header = json.loads(arrays["header"].tobytes())
         return tuple(
@@ -152,3 +155,15 @@ def read_depth_maps(path: Path) -> tuple[DepthMap, ...]:
             )
             for index, entry in enumerate(header)
         )
+
+
+def write_surface_points(path: Path, places: SurfacePoints) -> None:
+    """Write points of a surface as ``.npz``."""
+    write_arrays(path, {"points": places.points, "normals": places.normals})
+
+
+def read_surface_points(path: Path) -> SurfacePoints:
+    """Read what :func:`write_surface_points` wrote. Raises InputError."""
+    arrays = read_arrays(path, remedy=_MADE_ANEW)
+    with reading(path):
+        return as_declared(SurfacePoints, points=arrays["points"], normals=arrays["normals"])

@@ -1,4 +1,4 @@
-"""The mesh of a capture, made once and kept on disk."""
+"""The mesh of a capture, and where a rough one has holes, each made once and kept on disk."""
 
 from __future__ import annotations
 
@@ -13,13 +13,39 @@ from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import DepthMap, Expectation
+from cuspid.reconstruction import DepthMap, Expectation, SurfacePoints
 from cuspid.storage.files import digest_of, write_json
 from cuspid.storage.meshes import SIGMA, read_mesh_file, write_mesh
+from cuspid.storage.reconstructions import read_surface_points, write_surface_points
 from cuspid.storage.stages import Stage
 from cuspid.surface.cleaning import CleaningOptions, clean
 from cuspid.surface.fusion import Fused, FusionOptions
+from cuspid.surface.fusion import find_holes as find_holes_of_depth_maps
 from cuspid.surface.fusion import fuse as fuse_depth_maps
+
+_CODE = ("surface",)
+
+
+def find_holes(
+    depths: Iterable[DepthMap],
+    made_from: str,
+    rig_from_world: Mapping[str, Rigid3],
+    resolution_mm: float,
+    folder: Path,
+    fusion: FusionOptions,
+    *,
+    progress: Progress = silent,
+) -> SurfacePoints:
+    """Places on the rims of the holes that :func:`cuspid.surface.fusion.find_holes` finds: ``holes.npz``. Arguments as
+    of :func:`fuse`."""
+    stage, file = Stage("holes", folder, [fusion, resolution_mm], _CODE), folder / "holes.npz"
+
+    def write() -> None:
+        holes = find_holes_of_depth_maps(depths, rig_from_world, resolution_mm, fusion, progress=progress)
+        write_surface_points(file, holes)
+
+    stage.make({"depths": made_from, "poses": digest_of(dict(rig_from_world))}, [file], write)
+    return read_surface_points(file)
 
 
 def fuse(
@@ -43,7 +69,7 @@ def fuse(
     the handpiece resolves, ``working_distance_mm`` how far it is held. Raises ReconstructionError where they hold
     nothing.
     """
-    stage = Stage("mesh", folder, [fusion, cleaning, resolution_mm, working_distance_mm], ("surface",))
+    stage = Stage("mesh", folder, [fusion, cleaning, resolution_mm, working_distance_mm], _CODE)
     files = [folder / name for name in ("mesh.json", "mesh.stl", "mesh.ply")]
 
     def write() -> None:
