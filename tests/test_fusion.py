@@ -21,6 +21,7 @@ from cuspid.stereo.stage import StoredDepthMaps
 from cuspid.surface.evidence import Evidence, observe, observe_foot
 from cuspid.surface.fusion import FusionOptions, Votes, find_holes
 from cuspid.surface.fusion import fuse as fuse_depth_maps
+from cuspid.surface.stage import find_holes as find_holes_once
 from cuspid.surface.volume import SparseVolume, pack, unpack
 from synthetic_scene import diamond, height_field, true_depth_map
 
@@ -179,6 +180,18 @@ def test_what_no_map_has_a_depth_of_is_a_hole_whose_rim_is_found(width_mm: float
 
 def test_a_whole_surface_has_a_border_and_no_holes() -> None:
     assert len(find_holes(depth_maps(HILLS), POSES, RESOLUTION_MM).points) < 10
+
+
+def test_holes_are_looked_for_once_and_again_when_the_depth_maps_have_changed(tmp_path: Path) -> None:
+    maps = [without(each, 0.3) for each in depth_maps(HILLS)]
+
+    def found(maps: list[DepthMap], digest: str) -> np.ndarray:
+        return find_holes_once(maps, digest, POSES, RESOLUTION_MM, tmp_path, FusionOptions()).points
+
+    first = found(maps, "a")
+    np.testing.assert_array_equal(first, find_holes(maps, POSES, RESOLUTION_MM).points)
+    np.testing.assert_array_equal(first, found([], "a"), "nothing is fused")
+    assert len(found([], "b")) == 0
 
 
 def test_the_foot_of_a_perpendicular_must_lie_on_the_surface() -> None:
