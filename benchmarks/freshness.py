@@ -1,8 +1,8 @@
 """Which results still hold: nothing that made them has changed since the commit that they are of.
 
 What makes a result is its script, the modules that the script imports, in turn, and those of the verbs that it runs.
-Comments, docstrings, the number of the version and what only draws pages and pictures (``cuspid.reporting``) have no
-part in it.
+Comments, docstrings, the number of the version and what only makes pages and pictures of a finished folder have no part
+in it.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ import grimp
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
+SHOWN_BY = ("cuspid.reporting", "cuspid.storage.results")
+"""Modules that only show what was made."""
 UNTOLD = "no commit, or one of uncommitted changes"
 
 Result = Mapping[str, Any]
@@ -157,7 +159,7 @@ def _imported(script: Path) -> frozenset[str]:
 @cache
 def _graph() -> grimp.ImportGraph:
     graph = grimp.build_graph("cuspid", cache_dir=None)
-    for module in {"cuspid.reporting"} | graph.find_descendants("cuspid.reporting"):
+    for module in {each for shown in SHOWN_BY for each in {shown} | graph.find_descendants(shown)}:
         graph.remove_module(module)
     return graph
 

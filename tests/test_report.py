@@ -358,6 +358,13 @@ def test_a_folder_with_nothing_to_report(tmp_path, capsys, scan_folder):
     assert not list(tmp_path.glob("**/report.html"))
 
 
+def test_an_alignment_that_puts_all_vertices_in_one_place_is_refused(capsys, scan_folder):
+    known = storage.read_json(scan_folder / "trueness.json")
+    known["reference_from_scan"][1][3] = 1e30
+    (scan_folder / "trueness.json").write_text(json.dumps(known))
+    assert "trueness.json: reference_from_scan is [[" in refused(capsys, "report", scan_folder)
+
+
 def test_the_page_of_a_shape_model(tmp_path, coarse_phantom):
     write_shape(tmp_path / "shape", tooth_alone(coarse_phantom))
     scene = scene_of(report_page(storage.read_result(tmp_path / "shape")))

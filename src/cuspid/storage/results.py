@@ -31,6 +31,7 @@ from cuspid.storage.meshes import SIGMA, MeshFile, Unit, read_mesh_file
 from cuspid.storage.panoramas import read_panorama
 from cuspid.storage.reconstructions import read_reconstruction
 from cuspid.storage.shapes import read_shape_model
+from cuspid.values import LONGEST_MM, numbers
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -234,7 +235,8 @@ def _reference(folder: Path, run: Mapping[str, Any], given: Path | None, unit: U
 
 def _alignment(path: Path, trueness: Mapping[str, Any]) -> Rigid3:
     with reading(path):
-        return Rigid3.from_matrix(np.array(trueness["reference_from_scan"], dtype=np.float64))
+        matrix = numbers("reference_from_scan", trueness["reference_from_scan"], (4, 4), -LONGEST_MM, LONGEST_MM)
+        return Rigid3.from_matrix(matrix)
 
 
 # --- the others -------------------------------------------------------------------------------------------------------
