@@ -1,8 +1,8 @@
 """Which results still hold: nothing that made them has changed since the commit that they are of.
 
 What makes a result is its script, the modules that the script imports, in turn, and those of the verbs that it runs.
-Comments, docstrings, the number of the version and what only makes pages and pictures of a finished folder have no part
-in it.
+Comments, docstrings and the number of the version have no part in it, nor has what only makes pages and pictures of a
+finished folder, unless all verbs are tried.
 """
 
 from __future__ import annotations
@@ -128,8 +128,9 @@ def _made_by(maker: Maker) -> set[str]:
     """Files that take part."""
     scripts = _scripts(maker.script)
     roots = {name for script in scripts for name in _imported(script) if name.split(".")[0] == "cuspid"}
-    verbs = [path.stem for path in (ROOT / "src/cuspid/cli").glob("*.py")] if "*" in maker.verbs else maker.verbs
-    modules = _upstream(roots | {f"cuspid.cli.{verb}" for verb in verbs if verb != "__init__"})
+    all_of_them = "*" in maker.verbs
+    verbs = [path.stem for path in (ROOT / "src/cuspid/cli").glob("*.py")] if all_of_them else maker.verbs
+    modules = _upstream(roots | {f"cuspid.cli.{verb}" for verb in verbs if verb != "__init__"}, shown=all_of_them)
     return {str(path.relative_to(ROOT)) for path in [*scripts, *map(_file_of, modules)]}
 
 
@@ -157,15 +158,16 @@ def _imported(script: Path) -> frozenset[str]:
 
 
 @cache
-def _graph() -> grimp.ImportGraph:
+def _graph(shown: bool) -> grimp.ImportGraph:
     graph = grimp.build_graph("cuspid", cache_dir=None)
-    for module in {each for shown in SHOWN_BY for each in {shown} | graph.find_descendants(shown)}:
-        graph.remove_module(module)
+    for name in () if shown else SHOWN_BY:
+        for module in {name} | graph.find_descendants(name):
+            graph.remove_module(module)
     return graph
 
 
-def _upstream(roots: Iterable[str]) -> set[str]:
-    graph = _graph()
+def _upstream(roots: Iterable[str], *, shown: bool) -> set[str]:
+    graph = _graph(shown)
     known: Sequence[str] = [root for root in roots if root in graph.modules]
     return set(known).union(*(graph.find_upstream_modules(root) for root in known)) - {"cuspid"}
 
