@@ -1,6 +1,7 @@
 """``cuspid`` and ``python -m cuspid``: the command line.
 
-It takes seconds to load. Ctrl-C ends it then without a word; what is loaded might pass it over, or tell where it was.
+Loading takes seconds. Ctrl-C during that time ends the program silently; the libraries being loaded might otherwise
+ignore it or print a traceback.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ def _ended_by_interrupts() -> Iterator[None]:
 
 
 def main() -> None:
-    """Load what the verb needs and run it; signals are the main thread's."""
+    """Load what the verb needs and run it; signals are handled by the main thread."""
     # Our own threads use the cores; more of them for each small system only wait for each other on a busy machine.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if threading.current_thread() is threading.main_thread():

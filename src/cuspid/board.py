@@ -22,7 +22,7 @@ Dictionary = Literal[
     "4X4_50", "4X4_100", "4X4_250", "4X4_1000", "5X5_50", "5X5_100", "5X5_250", "5X5_1000",
     "6X6_50", "6X6_100", "6X6_250", "6X6_1000", "7X7_50", "7X7_100", "7X7_250", "7X7_1000",
 ]  # fmt: skip
-"""Families of markers: bits, and how many there are (OpenCV's predefined ones)."""
+"""OpenCV's predefined families of markers: bits and number of markers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +30,8 @@ class Board(Options):
     """A ChArUco board (a chessboard with a marker in each light square) or a plain chessboard."""
 
     kind: Literal["charuco", "chessboard"] = "charuco"
-    """With markers, which tell the corners apart and may be seen in part, or without."""
+    """With markers (charuco), which tell the corners apart, so that the board may be seen in part, or without
+    (chessboard)."""
     columns: Annotated[int, Range(3, 100)] = 8
     """Squares in a row."""
     rows: Annotated[int, Range(3, 100)] = 11
@@ -38,19 +39,19 @@ class Board(Options):
     square_mm: Annotated[float, Range(0.001, 10_000)] = 1.0
     """Side of a square, as measured on the printed board."""
     marker_share: Annotated[float, Range(0.1, 0.95)] = 0.75
-    """Side of a marker, as a share of that of its square."""
+    """Side of a marker, as a share (0 to 1) of the side of its square."""
     dictionary: Dictionary = "4X4_1000"
-    """The markers; their numbers begin at 0."""
+    """Family of markers; their ids begin at 0."""
     legacy: bool = False
-    """Boards of even rows of OpenCV before 4.6, with a marker in the first corner."""
+    """Layout of OpenCV before 4.6 for boards with an even number of rows: a marker in the first corner."""
     inverted: bool = False
-    """Light where others are dark."""
+    """Light and dark are swapped."""
     terraces: Annotated[int, Range(1, 50)] = 1
-    """Flat pieces of whole columns, each higher than the one before; 1 is a flat board."""
+    """Number of flat pieces of whole columns, each higher than the one before; 1 is a flat board."""
     step_mm: Annotated[float, Range(0.001, 10_000)] = 1.0
-    """How much higher each terrace is, towards the cameras, as measured on the body."""
+    """How much higher each terrace is than the one before, towards the cameras, as measured on the body."""
     step_sigma_um: Annotated[float, Range(0.001, 10_000)] = 10.0
-    """How well that is known, of all steps alike (standard deviation)."""
+    """Standard deviation of that step, common to all steps."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -71,7 +72,7 @@ class Board(Options):
 
     @property
     def corners(self) -> Float[np.ndarray, "n 3"]:
-        """Where four squares meet, mm."""
+        """The points where four squares meet, mm."""
         column, row = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
         places = self.square_mm * np.stack([column, row, 0 * row], axis=-1).reshape(-1, 3)
         places[:, 2] -= self.step_mm * self._terrace_of(column.ravel())
@@ -79,22 +80,22 @@ class Board(Options):
 
     @property
     def saddles(self) -> Bool[np.ndarray, "n"]:
-        """Whether a corner can be seen: on the edge of a step four squares do not meet."""
+        """Whether each corner can be seen: at the edge of a step, four squares do not meet."""
         column = np.tile(np.arange(1, self.columns), self.rows - 1)
         return self._terrace_of(column) == self._terrace_of(column - 1)
 
     @property
     def height_mm(self) -> float:
-        """Of the last terrace over the first."""
+        """Height of the last terrace above the first."""
         return (self.terraces - 1) * self.step_mm
 
     @property
     def edges_mm(self) -> Float[np.ndarray, "n"]:
-        """Where terraces begin along X, and where the last one ends."""
+        """Where each terrace begins along X, and where the last one ends."""
         return self.square_mm * -(-np.arange(self.terraces + 1) * self.columns // self.terraces)
 
     def terrace_at(self, x_mm: Float[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
-        """The terrace below places along X; the first and the last go on beside the board."""
+        """The terrace at places along X; the first and the last extend beyond the board."""
         return self._terrace_of(np.clip(np.floor(x_mm / self.square_mm), 0, self.columns - 1).astype(np.int64))
 
     def _terrace_of(self, column: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
@@ -102,15 +103,15 @@ class Board(Options):
 
     @cached_property
     def orders(self) -> Int[np.ndarray, "k n"]:
-        """The ways to number the corners that an image of the board does not tell apart, the usual one first: turned
-        by half a turn where it has no markers, and by a quarter where it is square."""
+        """The numberings of the corners that an image of the board does not tell apart, the usual one first: rotated by
+        half a turn if it has no markers, by quarter turns if it is also square."""
         usual = np.arange((self.columns - 1) * (self.rows - 1)).reshape(self.rows - 1, self.columns - 1)
         turns = 1 if self.kind == "charuco" else 4 if self.columns == self.rows else 2
         return np.stack([np.rot90(usual, k * (4 // turns)).ravel() for k in range(turns)])
 
     @cached_property
     def opencv(self) -> cv2.aruco.CharucoBoard:
-        """The same board of OpenCV's. Raises InputError for a chessboard."""
+        """The same board as an OpenCV object. Raises InputError for a chessboard."""
         if self.kind != "charuco":
             raise InputError("board: a chessboard has no markers")
         markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
@@ -121,7 +122,7 @@ class Board(Options):
 
     @cached_property
     def dark(self) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
-        """The printed squares, seen from straight above: the top left corner (mm) and the side of each."""
+        """The printed squares, seen from straight above: top left corner (mm) and side of each."""
         row, column = np.indices((self.rows, self.columns))
         corners = np.argwhere((row + column) % 2 == self._first_dark)[:, ::-1]
         places, sides = [corners * self.square_mm], [np.full(len(corners), self.square_mm)]
@@ -134,8 +135,8 @@ class Board(Options):
         return np.concatenate(places), np.concatenate(sides)
 
     def is_dark(self, points: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
-        """Whether it is dark at places on the board, mm, seen from straight above; beside it, it is as between the
-        squares."""
+        """Whether the board is dark at some places, mm, seen from straight above; beyond its border it is as between
+        the squares."""
         squares = points / self.square_mm
         column, row = np.floor(squares).astype(np.int64).T
         inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)

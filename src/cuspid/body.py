@@ -1,7 +1,7 @@
-"""The body of a handpiece: what takes up room, as boxes.
+"""The body of a handpiece: the space that it occupies, as boxes.
 
-Frames: ``rig`` is the frame of the handpiece; ``box`` that of a box, its origin in the middle, its axes along the
-edges.
+Frames: ``rig`` is the frame of the handpiece; ``box`` is that of a box, with its origin in the middle and its axes
+along the edges.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ class Box:
     """A solid block."""
 
     box_from_rig: Rigid3
-    """Where it is."""
+    """Its pose."""
     half_mm: Float[np.ndarray, "3"]
-    """Half its lengths along its axes."""
+    """Half its side lengths, along its axes."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "half_mm", read_only(np.asarray(self.half_mm, dtype=np.float64)))
@@ -35,7 +35,7 @@ class Box:
 
     @property
     def corners(self) -> Float[np.ndarray, "8 3"]:
-        """In the rig frame, mm."""
+        """The corners in the rig frame, mm."""
         return self.box_from_rig.inverse().apply((np.array(list(np.ndindex(2, 2, 2))) * 2 - 1.0) * self.half_mm)
 
 
@@ -44,17 +44,17 @@ CAMERA_MM, LED_MM = (1.0, 1.0, 1.6), (0.5, 0.5, 0.6)
 
 
 def module(front_from_rig: Rigid3, size_mm: tuple[float, float, float]) -> Box:
-    """The box of a part whose front is the plane XY of a frame; it lies behind it, towards -Z."""
+    """The box of a component whose front is the XY plane of a frame; it extends behind it, towards -Z."""
     half = np.array(size_mm) / 2
     return Box(Rigid3(np.eye(3), np.array([0, 0, half[2]])) @ front_from_rig, half)
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """Boxes that together are the handpiece."""
+    """The boxes that make up the handpiece."""
 
     parts: Mapping[str, Box]
-    """By name."""
+    """Boxes by name."""
 
     def __post_init__(self) -> None:
         if not self.parts:
@@ -68,12 +68,13 @@ class Body:
 
     @property
     def bounds(self) -> Float[np.ndarray, "2 3"]:
-        """Lower and upper corner of the box around it all, in the rig frame, mm."""
+        """Lower and upper corner of the bounding box, in the rig frame, mm."""
         corners = np.concatenate([box.corners for box in self.parts.values()])
         return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
     def distances(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-        """Signed distance in mm of points of the rig frame to the nearest part, negative inside, and which part."""
+        """Signed distance in mm from points in the rig frame to the nearest part, negative inside, and the index of
+        that part."""
         boxes = self.parts.values()
         distance, part = np.empty(len(points)), np.empty(len(points), dtype=np.int64)
         _distances(

@@ -20,8 +20,8 @@ OPENCV_PIXEL_OFFSET = 0.5
 
 
 def distort(normalized: Float[np.ndarray, "*n 2"], distortion: Float[np.ndarray, "4 ..."]) -> Float[np.ndarray, "*n 2"]:
-    """Ideal normalised coordinates to distorted ones: COLMAP's OPENCV model (k1, k2, p1, p2), one lens for all or one
-    for each."""
+    """Ideal normalised coordinates to distorted ones: COLMAP's OPENCV model (k1, k2, p1, p2), with one lens for all
+    points or one for each."""
     k1, k2, p1, p2 = distortion
     x, y = normalized[..., 0], normalized[..., 1]
     r2 = x * x + y * y
@@ -74,8 +74,8 @@ class Camera:
     distortion: Float[np.ndarray, "4"] = field(default_factory=lambda: np.zeros(4))
     """(k1, k2, p1, p2) of COLMAP's OPENCV model."""
     covariance: Float[np.ndarray, "8 8"] | None = None
-    """Covariance of (fx, fy, cx, cy, k1, k2, p1, p2); zero for an exact calibration, None where nobody has said how
-    well it is known (an adjustment holds it)."""
+    """Covariance of (fx, fy, cx, cy, k1, k2, p1, p2); zero for an exact calibration, None if its uncertainty is not
+    stated (an adjustment then holds it fixed)."""
 
     def __post_init__(self) -> None:
         for name in ("focal_px", "principal_point_px", "distortion"):
@@ -160,8 +160,8 @@ class Camera:
 
 
 def undistortion_maps(camera: Camera) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]] | None:
-    """Where each pixel of the same camera without distortion lies in the image, as ``cv2.remap`` wants it, float32 (far
-    outside where it saw nothing); None where the camera has none."""
+    """For each pixel of the same camera without distortion, its place in the image, as float32 maps for ``cv2.remap``
+    (far outside where the image does not show it); None if the camera has no distortion."""
     if not np.any(camera.distortion):
         return None
     ideal = replace(camera, distortion=np.zeros(4), covariance=None)

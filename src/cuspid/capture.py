@@ -33,12 +33,12 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def read_rgba(path: Path) -> UInt8[np.ndarray, "h w 4"]:
-    """As :func:`read_image`, with how opaque each pixel is; 255 where the file does not say."""
+    """As :func:`read_image`, with the opacity of each pixel; 255 where the file has none."""
     return _decoded(path, "RGBA")
 
 
 def read_deep(path: Path) -> UInt8[np.ndarray, "h w *c"] | UInt16[np.ndarray, "h w *c"]:
-    """As :func:`read_image`, but grey as (h, w), of 8 or 16 bits as it is stored."""
+    """As :func:`read_image`, but as stored, with 8 or 16 bits; grey as (h, w)."""
     return _decoded(path, None)
 
 
@@ -59,7 +59,8 @@ def _decoded(
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height in px, from the header. Raises InputError where the file is missing, no image, or cut short."""
+    """Width and height in px, from the header. Raises InputError where the file is missing, truncated or not an
+    image."""
     try:
         with require_file(path, "image").open("rb") as stream:
             width, height = _upright_size(Image.open(stream))
@@ -91,13 +92,13 @@ class Frame:
     """One instant: the images that the cameras of the handpiece took together."""
 
     name: str
-    """File stem common to the images of all cameras."""
+    """File stem shared by the images of all cameras."""
     cameras: tuple[str, ...]
-    """The cameras that have an image of it."""
+    """The cameras that have an image of this frame."""
     lighting: str | None = None
-    """Name of the lighting pattern of the handpiece, or None where it is not known."""
+    """Name of the handpiece's lighting pattern, or None where it is not known."""
     time_s: float | None = None
-    """When it was taken, from any zero, or None where that is not known."""
+    """Time of capture, from an arbitrary zero, or None where it is not known."""
 
     def __post_init__(self) -> None:
         checked_name("frame", self.name)
@@ -110,7 +111,7 @@ class Dropped:
     what: str
     """For example ``frame 00012`` or ``camera b2``."""
     reason: str
-    """One line for people."""
+    """One human-readable line."""
 
 
 @runtime_checkable
@@ -119,7 +120,7 @@ class ImageSource(Protocol):
 
     @property
     def suffix(self) -> str:
-        """How the names of the images end."""
+        """Suffix of the image names."""
         ...
 
     def read(self, frame: str, camera: str) -> UInt8[np.ndarray, "h w 3"]:
@@ -127,15 +128,15 @@ class ImageSource(Protocol):
         ...
 
     def size(self, frame: str, camera: str) -> tuple[int, int]:
-        """Width and height in px, at a glance. Raises InputError where the image is missing or damaged."""
+        """Width and height in px, without decoding the image. Raises InputError where it is missing or damaged."""
         ...
 
     def digest(self, frame: str, camera: str) -> str:
-        """SHA-256 of the image as it is stored. Raises InputError where it is missing."""
+        """SHA-256 of the stored image. Raises InputError where it is missing."""
         ...
 
     def where(self, frame: str, camera: str) -> str:
-        """For messages."""
+        """Where the image is, for messages."""
         ...
 
 
@@ -161,7 +162,7 @@ class ImageFolder:
     """Image file suffix."""
 
     def path(self, frame: str, camera: str) -> Path:
-        """Where an image lies."""
+        """Path of an image."""
         return self.folder / "images" / image_name(frame, camera, self.suffix)
 
     def read(self, frame: str, camera: str) -> UInt8[np.ndarray, "h w 3"]:
@@ -218,25 +219,25 @@ class HalvedImages:
 
 
 def halved_size(width: int, height: int) -> tuple[int, int]:
-    """Of an image of half the size, px."""
+    """Width and height of an image at half its size, px."""
     return max(round(width / 2), 1), max(round(height / 2), 1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Capture:
-    """What a handpiece recorded. Images are read when asked for."""
+    """What a handpiece recorded. Images are read on demand."""
 
     handpiece: Handpiece
-    """Nominal or calibrated; all that reconstruction knows besides the images."""
+    """Nominal or calibrated; all that the reconstruction knows besides the images."""
     frames: tuple[Frame, ...]
     """In the order of capture."""
     source: ImageSource
     """Where the images come from."""
     left_out: tuple[Dropped, ...] = ()
-    """Images that are not there, and why."""
+    """Images that are missing, and why."""
 
     def halved(self) -> Capture:
-        """The same with images of half the size, and a handpiece that takes such images."""
+        """The same capture with images of half the size, and a handpiece that takes such images."""
         cameras = {
             name: replace(
                 mounted, camera=mounted.camera.resized(*halved_size(mounted.camera.width, mounted.camera.height))
@@ -246,7 +247,7 @@ class Capture:
         return replace(self, handpiece=replace(self.handpiece, rig=Rig(cameras)), source=HalvedImages(self.source))
 
     def image(self, frame: Frame, camera: str) -> UInt8[np.ndarray, "h w 3"]:
-        """RGB image. Raises InputError where it is missing, broken, or of another size than the camera's."""
+        """RGB image. Raises InputError where it is missing, damaged, or not of the camera's size."""
         self.check_image(frame, camera)
         return self.source.read(frame.name, camera)
 
@@ -255,7 +256,7 @@ class Capture:
         return {name: self.image(frame, name) for name in frame.cameras}
 
     def check_image(self, frame: Frame, camera: str) -> None:
-        """Raise what :meth:`image` would, as far as a glance at the image tells."""
+        """Raise what :meth:`image` would, as far as can be told without decoding the image."""
         model = self.handpiece.rig[camera].camera
         width, height = self.source.size(frame.name, camera)
         if (width, height) != (model.width, model.height):

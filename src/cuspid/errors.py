@@ -14,12 +14,12 @@ from __future__ import annotations
 import re
 
 _OVERLONG = re.compile(r"[^\s/\\'\"]{260,}")
-"""No name of a file or folder is as long: what a damaged file says."""
+"""No name of a file or folder is this long: it comes from a damaged file."""
 
 
 class CuspidError(Exception):
-    """Root of the family. ``str(error)`` is the one line shown to the user, with words longer than any name cut and
-    control characters written out."""
+    """Root of the family. ``str(error)`` is the one line shown to the user, with words longer than any file name cut
+    and control characters escaped."""
 
     def __init__(self, message: str) -> None:
         cut = _OVERLONG.sub(lambda word: f"{word[0][:40]}...", message)

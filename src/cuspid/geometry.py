@@ -1,8 +1,8 @@
-"""Rigid motions in three dimensions, and how points are laid on others.
+"""Rigid motions in three dimensions, and the alignment of points with other points.
 
 Notation: a transform is named ``target_from_source``; ``x_in_target = target_from_source @ x_in_source``.
 Lengths are millimetres. There is no similarity transform on purpose: the rig fixes the scale. Where nothing does (one
-camera, jaws of different size), :func:`best_similarity` tells the scale apart.
+camera, jaws of different size), :func:`best_similarity` returns the scale separately.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ def read_only(array: _Array) -> _Array:
 
 
 def unit(vectors: Float[np.ndarray, "*n d"]) -> Float[np.ndarray, "*n d"]:
-    """Vectors of length one; those of length zero stay."""
+    """Vectors scaled to length one; those of length zero stay zero."""
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12))
 
 
 def lengths_along(line: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n"]:
-    """Length of a line from its start to each of its points."""
+    """Length along a line from its start to each of its points."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
 
 
 def axes_about(directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
-    """Right-handed axes, as rows, whose last one is a given unit vector; the turn about it is whatever comes."""
+    """Right-handed axes, as rows, whose last one is a given unit vector; the rotation about it is arbitrary."""
     first = unit(np.cross(np.eye(3)[np.argmin(np.abs(directions), axis=-1)], directions))
     return np.stack([first, np.cross(directions, first), directions], axis=-2)
 
@@ -62,7 +62,7 @@ class Rigid3:
     """Translation in mm."""
 
     def __post_init__(self) -> None:
-        """Raises InputError unless the rotation is proper and orthonormal and all is finite."""
+        """Raise InputError unless the rotation is proper and orthonormal and all values are finite."""
         object.__setattr__(self, "rotation", read_only(np.asarray(self.rotation, dtype=np.float64)))
         object.__setattr__(self, "translation", read_only(np.asarray(self.translation, dtype=np.float64)))
         if not _is_rotation(self.rotation):
@@ -121,11 +121,11 @@ class Rigid3:
         return Rigid3(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
 
     def apply(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Move points (mm)."""
+        """Transform points (mm)."""
         return points @ self.rotation.T + self.translation
 
     def rotate(self, directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Turn directions, without translation."""
+        """Rotate directions, without translation."""
         return directions @ self.rotation.T
 
 

@@ -1,4 +1,4 @@
-"""Things, by number, that are joined in pairs: which of them hang together."""
+"""Connected components of numbered items that are joined in pairs."""
 
 from __future__ import annotations
 
@@ -14,5 +14,5 @@ def graph_of(pairs: Int[np.ndarray, "p 2"], count: int) -> coo_array:
 
 
 def parts_of(pairs: Int[np.ndarray, "p 2"], count: int) -> Int[np.ndarray, "n"]:
-    """For each of ``count`` things the number of the part that it belongs to; no pair joins two parts."""
+    """The component number of each of ``count`` items; no pair joins two components."""
     return np.asarray(connected_components(graph_of(pairs, count), directed=False)[1], dtype=np.int64)

@@ -1,4 +1,4 @@
-"""The frames of one hand-held camera in their order: images on disk that are read when asked for."""
+"""The frames of one hand-held camera in order: images on disk that are read on demand."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ class ImageSequence:
     source: Path
     """What the user gave: a folder, a video or a capture."""
     paths: tuple[Path, ...] = field(repr=False)
-    """One image file a frame; their stems are the frames' names."""
+    """One image file per frame; their stems are the frames' names."""
     size: tuple[int, int]
     """Width and height of every frame, px."""
     camera: Camera | None = None
-    """Calibration, or None where it is to be found from the images."""
+    """Calibration, or None if it is to be found from the images."""
     working_distance_mm: float | None = None
-    """Nominal distance of the camera from the teeth, where the calibration says so."""
+    """Nominal distance of the camera from the teeth, if the calibration states it."""
     notes: tuple[str, ...] = ()
     """What was found while reading, one line each."""
 
@@ -39,7 +39,7 @@ class ImageSequence:
         return len(self.paths)
 
     def image(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
-        """RGB image of a frame. Raises InputError where the file is missing, broken, or of another size."""
+        """RGB image of a frame. Raises InputError where the file is missing, damaged, or of another size."""
         image = read_image(self.paths[index])
         if image.shape[1::-1] != self.size:
             raise InputError(f"{self.paths[index]}: changed its size while it was used; start again")

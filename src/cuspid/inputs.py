@@ -1,6 +1,6 @@
-"""Files from outside: regular ones, of a size that can be held, and text that is text.
+"""Input files: only regular files of a manageable size, and text only if it is valid.
 
-A pipe, a device or a file that never ends is refused before it is opened.
+A pipe, a device or an endless file is refused before it is opened.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ Kind = Literal["text", "image", "mesh", "arrays", "file"]
 LARGEST_MIB: Mapping[Kind, int] = MappingProxyType(
     {"text": 64, "image": 1024, "mesh": 4096, "arrays": 8192, "file": 1 << 20}
 )
-"""No file of a kind is larger; ``file`` is any other, such as a video."""
+"""Largest size of each kind of file; ``file`` is any other, such as a video."""
 
 
 def require_file(path: Path, kind: Kind) -> Path:
-    """The path again. Raises InputError where it is no regular file, or one that is too large for its kind."""
+    """Return the path. Raises InputError where it is not a regular file, or is too large for its kind."""
     try:
         found = path.stat()
     except FileNotFoundError as error:
@@ -37,7 +37,7 @@ def require_file(path: Path, kind: Kind) -> Path:
 
 
 def read_bytes(path: Path, kind: Kind) -> bytes:
-    """The contents of a file. Raises InputError, as :func:`require_file` and where it cannot be read."""
+    """The contents of a file. Raises InputError as :func:`require_file` does, and where it cannot be read."""
     try:
         return require_file(path, kind).read_bytes()
     except OSError as error:
@@ -45,7 +45,7 @@ def read_bytes(path: Path, kind: Kind) -> bytes:
 
 
 def read_text(path: Path) -> str:
-    """A file of text in UTF-8. Raises InputError."""
+    """The contents of a text file in UTF-8. Raises InputError."""
     try:
         return read_bytes(path, "text").decode("utf-8-sig")
     except UnicodeDecodeError as error:

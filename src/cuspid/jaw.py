@@ -40,8 +40,8 @@ class Landmark:
     position: Float[np.ndarray, "3"]
     """In the occlusal frame, mm."""
     estimated_sigma_mm: float | None = None
-    """Standard uncertainty (one axis) of a point that was estimated from the surface; None for one that is known or was
-    placed by hand."""
+    """Standard uncertainty (one axis) of a point that was estimated from the surface; None for one that is known
+    exactly or was placed by hand."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", read_only(np.asarray(self.position, dtype=np.float64)))
@@ -67,14 +67,14 @@ class Jaw:
     mesh: Mesh
     """Surface in the occlusal frame."""
     face_labels: Int[np.ndarray, "f"] | None = None
-    """FDI number for each face, 0 for gum; None where the file has none."""
+    """FDI number for each face, 0 for gum; None if the file has no labels."""
     arch: Arch | None = None
-    """Which jaw, where it is known."""
+    """Upper or lower, where it is known."""
     landmarks: Mapping[str, Landmark] = field(default_factory=dict)
     """By label, ``<FDI>.<point>`` or ``<point>`` (scheme: `cuspid.anatomy.landmarks.scheme`)."""
     lines: Mapping[str, Float[np.ndarray, "_ 3"]] = field(default_factory=dict)
     """Polylines on the surface, mm, by label: ``45.margin`` is the margin line of the preparation of tooth 45; a closed
-    one ends where it begins."""
+    one ends at its first point."""
     spheres: Mapping[str, Sphere] = field(default_factory=dict)
     """Spheres of a metrology object, by label."""
 
@@ -88,7 +88,7 @@ class Jaw:
 
     @property
     def teeth(self) -> tuple[int, ...]:
-        """FDI numbers that occur, in ascending order; empty without labels."""
+        """FDI numbers that occur, in ascending order; empty if there are no labels."""
         if self.face_labels is None:
             return ()
         return tuple(int(label) for label in np.unique(self.face_labels) if label != GUM)

@@ -1,11 +1,11 @@
-"""Compiled kernels: numba's ``njit`` without the GIL, kept on disk from run to run. A division by zero is infinite or
-NaN, as numpy's: to raise an error takes a branch in each loop that divides, which then does not vectorise.
+"""Compiled kernels: numba's ``njit`` without the GIL, cached on disk. Division by zero gives infinity or NaN, as in
+numpy: raising an error would put a branch into each loop that divides, which would then not vectorise.
 
 numba keeps the machine code of a function in numbered files, with an index that names the file of each signature. It
 loads what the index names unchecked, although two processes that compile at the same time may have written each
 other's numbers (numba issue 10128 is such a case), and although a function that is called, and so compiled into it, may
-have changed in another module. Either gives wrong results in silence. Here each piece of code says what it is of, and
-counts only where that is what is wanted.
+have changed in another module. Either gives wrong results silently. Here each piece of compiled code records what it
+was compiled from, and is used only if that is what is wanted.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numba.core.dispatcher import Dispatcher
 
 
 def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """Decorator: compile a function when it is called first. ``options`` are those of ``numba.njit``."""
+    """Decorator: compile a function when it is first called. ``options`` are those of ``numba.njit``."""
     if function is None:
         return partial(kernel, **options)
     compiled = njit(nogil=True, error_model="numpy", **options)(function)
@@ -43,14 +43,14 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]
 
 
 class CheckedFile(IndexDataCacheFile):  # type: ignore[misc]
-    """Files of compiled code that say what they are of: the sources and the signature."""
+    """Files of compiled code that record what they were compiled from: the sources and the signature."""
 
     def save(self, key: object, data: object) -> None:
-        """Keep code under a key."""
+        """Store code under a key."""
         super().save(key, (self._source_stamp, key, data))
 
     def load(self, key: object) -> object | None:
-        """The code of a key, None where there is none or the file is of something else."""
+        """The code stored under a key; None where there is none, or the file was compiled from something else."""
         found = super().load(key)
         if found is None or tuple(found[:2]) != (self._source_stamp, key):
             return None

@@ -1,6 +1,6 @@
-"""A triangle mesh in millimetres that also answers rays (Embree) and distances (libigl).
+"""A triangle mesh in millimetres, with ray casting (Embree) and distance queries (libigl).
 
-Visibility, rendering and evaluation all ask here, so that there is one way to ask.
+Visibility, rendering and evaluation all use these, so that there is one implementation of each.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from cuspid.geometry import Rigid3, read_only
 from cuspid.kernels import kernel
 
 _ROUNDING = 5e-7
-"""Of a length in single precision, four steps."""
+"""Rounding of a length in single precision, relative: four steps."""
 
 
 _MOST_COLLAPSED = 500_000
-"""Faces of which edges are collapsed at most."""
+"""Largest number of faces that edge collapse starts from."""
 _BLOCK = 1 << 18
-"""Faces that are reckoned at once: of millions, corners and edges would take gigabytes."""
+"""Faces that are processed at once: for millions, corners and edges would take gigabytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +43,12 @@ class RayHits:
 
 
 def edges_of(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
-    """Edges of the faces, face by face; each edge of a closed mesh appears once in either direction."""
+    """Edges of the faces, face by face; each edge of a closed mesh appears once in each direction."""
     return np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
 
 
 def used_vertices(faces: Int[np.ndarray, "f 3"], count: int) -> Int[np.ndarray, "u"]:
-    """Those of ``count`` vertices that the faces use, increasing."""
+    """Those of ``count`` vertices that the faces use, in ascending order."""
     return np.flatnonzero(np.bincount(faces.ravel(), minlength=count))
 
 
@@ -104,7 +104,7 @@ class Mesh:
 
     @property
     def face_cross(self) -> Float[np.ndarray, "f 3"]:
-        """Cross product of two edges of each face: along its outward normal, twice its area long (mm^2)."""
+        """Cross product of two edges of each face: along its outward normal, with a length of twice its area (mm^2)."""
         crosses = np.empty(self.faces.shape)
         for begin in range(0, len(crosses), _BLOCK):
             a, b, c = self.vertices[self.faces[begin : begin + _BLOCK]].transpose(1, 0, 2)
@@ -131,7 +131,7 @@ class Mesh:
 
     @cached_property
     def vertex_areas(self) -> Float[np.ndarray, "v"]:
-        """A third of the area of the faces around each vertex, mm^2."""
+        """A third of the total area of the faces around each vertex, mm^2."""
         shares = np.repeat(self.face_areas / 3, 3)
         return read_only(np.bincount(self.faces.ravel(), shares, minlength=len(self.vertices)))
 
@@ -157,11 +157,11 @@ class Mesh:
 
     @property
     def bounds(self) -> Float[np.ndarray, "2 3"]:
-        """Lower and upper corner of the box around the vertices, mm."""
+        """Lower and upper corner of the bounding box of the vertices, mm."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     def centroid(self, faces: Bool[np.ndarray, "f"]) -> Float[np.ndarray, "3"]:
-        """Of the surface of some faces, mm."""
+        """Centroid of the surface of some faces, mm."""
         return np.asarray(np.average(self.face_centres[faces], axis=0, weights=self.face_areas[faces]))
 
     def transformed(self, target_from_source: Rigid3) -> Mesh:
@@ -178,7 +178,7 @@ class Mesh:
         return Mesh(self.vertices[used], number[faces], colors)
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
-        """Points spread evenly by area (stratified over the faces), and the face of each."""
+        """Points distributed uniformly by area (stratified over the faces), and the face of each."""
         cumulative = np.cumsum(self.face_areas)
         picks = (np.arange(count) + rng.random(count)) / count * cumulative[-1]
         faces = np.minimum(np.searchsorted(cumulative, picks), len(self.faces) - 1)
@@ -210,8 +210,8 @@ class Mesh:
         towards: Float[np.ndarray, "n 3"],
         tolerance_mm: float = 1e-3,
     ) -> Bool[np.ndarray, "n"]:
-        """True where the open segment from ``points`` to ``towards`` meets the mesh farther than the tolerance, or than
-        single precision tells apart where the rays are long."""
+        """True where the open segment from ``points`` to ``towards`` meets the mesh farther away than the tolerance
+        (or, for long rays, than single precision resolves)."""
         # The segment is shot backwards: a hit nearer than the surface point is an occluder.
         origins, directions, farthest = _backwards(np.asarray(points), np.asarray(towards), tolerance_mm)
         hits = self._scene.run(origins, directions, dists=farthest, query="OCCLUDED")
@@ -224,11 +224,11 @@ class Mesh:
         return tree
 
     def simplified(self, most_faces: int) -> Mesh:
-        """With at most so many faces, or as few as can be, by collapsing edges where it matters least (quadric error
-        metric, Garland and Heckbert 1997); itself where it has no more. Colours are lost.
+        """The mesh with at most so many faces, or as few as possible, by collapsing edges where it matters least
+        (quadric error metric, Garland and Heckbert 1997); the mesh itself if it has no more. Colours are lost.
 
-        Of a mesh of millions of faces, vertices that lie nearer together than those of the result will are joined
-        first: the collapse takes 300 bytes a face, which its library keeps.
+        In a mesh of millions of faces, vertices closer together than those of the result will be are merged first: the
+        collapse takes 300 bytes a face, which its library does not release.
         """
         if len(self.faces) <= most_faces:
             return self
@@ -242,8 +242,9 @@ class Mesh:
         return Mesh(vertices, faces)
 
     def thinned(self, about_faces: int) -> Mesh:
-        """With about so many faces, by joining the vertices in each cell of a grid in their mean (J. Rossignac,
-        P. Borrel, 1993); itself where it has no more. Quick, for where a rough surface will do. Colours are lost."""
+        """The mesh with about so many faces, by merging the vertices in each cell of a grid into their mean (J.
+        Rossignac, P. Borrel, 1993); the mesh itself if it has no more. Fast, for use where a rough surface suffices.
+        Colours are lost."""
         if len(self.faces) <= about_faces:
             return self
         cell_mm = float(np.sqrt(2 * self.face_areas.sum() / about_faces))
@@ -258,7 +259,7 @@ class Mesh:
     def closest(
         self, points: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-        """Exact closest point on the mesh: unsigned distances (mm), face indices, positions (libigl's AABB tree)."""
+        """Exact closest points on the mesh: unsigned distances (mm), face indices, positions (libigl's AABB tree)."""
         squared, faces, positions = self._tree.squared_distance(
             self.vertices, self.faces, np.ascontiguousarray(points, dtype=np.float64)
         )

@@ -1,4 +1,4 @@
-"""Options: every number has its range where it is declared, and is checked when the options are made.
+"""Options: every number is declared with its range, which is checked when the options are created.
 
 .. code-block:: python
 
@@ -22,28 +22,29 @@ from cuspid.values import number, shown
 
 @dataclass(frozen=True)
 class Range:
-    """The numbers that an option may take, bounds included; of several numbers, each of them."""
+    """The numbers that an option may take, bounds included; for a sequence of numbers, each of them."""
 
     low: int | float
     high: int | float
 
 
 SEED = Range(0, 2**31 - 1)
-"""Of random draws."""
+"""Seed of random draws."""
 SHARE = Range(0, 1)
 TOOTH = Range(11, 48)
-"""FDI number; whether a jaw has the tooth is found out later."""
+"""FDI number; whether the jaw has the tooth is checked later."""
 WORKERS = Range(1, 1024)
 """Processes that share the work."""
 Choices = tuple[object, ...]
-"""What a ``Literal`` may be."""
+"""The values that a ``Literal`` allows."""
 
 
 class Options:
-    """Base of all options: dataclasses whose numbers lie in the :class:`Range` that they are annotated with, and whose
-    ``Literal`` fields are one of those.
+    """Base class of all options: dataclasses whose numbers must lie in the :class:`Range` that they are annotated with,
+    and whose ``Literal`` fields must have one of the declared values.
 
-    Construction raises InputError for the first that is not. A class with checks of its own calls this one's first.
+    Construction raises InputError for the first value that does not. A class with checks of its own calls this one's
+    first.
     """
 
     def __post_init__(self) -> None:
@@ -51,7 +52,7 @@ class Options:
 
 
 def check(what: str, declared: Callable[..., object], values: Mapping[str, object]) -> None:
-    """Raise InputError for the first of the values that is not what a class or a function declares."""
+    """Raise InputError for the first of the values that does not fit the declaration of a class or a function."""
     for name, allowed in limits(declared).items():
         if name in values:
             _check(f"{what}: --{name.replace('_', '-')}", values[name], allowed)

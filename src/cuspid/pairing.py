@@ -1,5 +1,5 @@
-"""Which cameras of a rig are matched with each other, at what distance, and what they resolve: choices, made on the
-measures of :class:`cuspid.rig.Rig`."""
+"""Which cameras of a rig are matched with each other, at what distance, and what they resolve: choices that are based
+on the measures of :class:`cuspid.rig.Rig`."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from cuspid.rig import Handpiece, Rig
 
 _ROUNDING_DEG = 1e-5
 _CONVERGING_DEG = 10.0
-"""Axes that lean less towards each other may meet far behind what the cameras were mounted for."""
+"""Axes that converge less than this may meet far behind what the cameras were mounted for."""
 _SHARED = 0.6
-"""Of what a camera sees at the distance that it was mounted for, it shares about so much with its best partner: 0.45 to
-0.8 in the designs that come with cuspid."""
+"""Share of what a camera sees, at the distance that it was mounted for, that its best partner sees too: 0.45 to 0.8 in
+the designs that come with cuspid."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,7 @@ class PairingOptions(Options):
     """When two cameras see the same surface, from about the same side."""
 
     minimum_overlap: Annotated[float, SHARE] = 0.4
-    """Share (0 to 1) of what either sees at the working distance that the other must see, too."""
+    """Share (0 to 1) of what either camera sees at the working distance that the other must see too."""
     maximum_angle_deg: Annotated[float, Range(0, 180)] = 30.0
     """Largest angle between their optical axes."""
 
@@ -37,7 +37,7 @@ class PairingOptions(Options):
 def stereo_pairs(
     rig: Rig, distance_mm: float, options: PairingOptions = PairingOptions()
 ) -> tuple[tuple[str, str], ...]:
-    """Pairs of cameras that depth is measured from, where the surface is so far away."""
+    """Pairs of cameras that depth is measured from, for a surface at the given distance."""
     return tuple(
         (first, second)
         for first, second in combinations(rig.names, 2)
@@ -57,11 +57,11 @@ def camera_groups(
 
 
 def guess_working_distance_mm(rig: Rig) -> tuple[float, str]:
-    """How far from the surface a rig was probably made to work, and what that was taken from.
+    """The distance from the surface that a rig was probably made for, and what it was derived from.
 
-    Where no two of its cameras are about parallel, that is where the axes of the pairs meet (median); else where a
-    camera begins to share enough with its best partner (median): within a factor of two for the designs that come with
-    cuspid. Raises InputError for cameras of which no two can be a pair.
+    If no two of its cameras are roughly parallel, it is where the axes of the pairs meet (median); otherwise, where a
+    camera begins to share enough with its best partner (median; within a factor of two for the designs that come with
+    cuspid). Raises InputError if no two of the cameras can be a pair.
     """
     pairs = stereo_pairs(rig, 1.0, PairingOptions(minimum_overlap=0.0))
     if not pairs:
@@ -112,8 +112,8 @@ def require_stereo(handpiece: Handpiece, options: PairingOptions) -> None:
 
 
 def depth_step_mm(handpiece: Handpiece) -> float:
-    """Change of depth at the working distance that shifts a point by 1 px in the widest stereo pair, mm; infinite where
-    no two cameras see the same surface."""
+    """Change of depth at the working distance that shifts a point by 1 px in the stereo pair with the widest baseline,
+    mm; infinite where no two cameras see the same surface."""
     pairs = stereo_pairs(handpiece.rig, handpiece.working_distance_mm)
     parallax = max((_parallax_px_mm(handpiece.rig, *pair) for pair in pairs), default=0.0)
     return handpiece.working_distance_mm**2 / parallax if parallax > 0 else float("inf")
@@ -126,9 +126,9 @@ def _parallax_px_mm(rig: Rig, first: str, second: str) -> float:
 
 
 def resolved_mm(handpiece: Handpiece) -> float:
-    """The detail that the images resolve at the working distance, mm, the yardstick of all limits that are lengths.
+    """The detail that the images resolve at the working distance, mm: the unit of all limits that are lengths.
 
-    It is the footprint of a pixel or, where the cameras stand so close together that depth is less sure than that,
+    It is the footprint of a pixel or, where the cameras stand so close together that depth is less certain than that,
     the depth of half a pixel of disparity; 12 um for the built-in handpieces.
     """
     half_step = depth_step_mm(handpiece) / 2

@@ -2,7 +2,7 @@
 
 Frames: the world is the occlusal frame (XY the occlusal plane, +Z out of the gum towards the viewer); the picture looks
 down on it, columns run along +X and rows along -Y. Pixels are COLMAP's: the centre of the first pixel is (0.5, 0.5).
-Pixel (u, v) shows the world's column x = (u - u0) s, y = (v0 - v) s, where (u0, v0) is ``origin_px`` and s
+Pixel (u, v) shows the world's column x = (u - u0) s, y = (v0 - v) s, where (u0, v0) is ``origin_px`` and s is
 ``mm_per_px``.
 """
 
@@ -23,13 +23,13 @@ class FrameUse:
     name: str
     """File stem, or the number in the video."""
     used: bool
-    """Whether it is placed in the panorama."""
+    """Whether it has a place in the panorama."""
     reason: str | None = None
-    """Why it is not used, one line for people; None where it is."""
+    """Why it is not used, in one human-readable line; None if it is used."""
     inliers: int | None = None
-    """Matched points that agree with its place; None where that was not found out."""
+    """Number of matched points that agree with its place; None if that was not determined."""
     overlap: float | None = None
-    """Share (0 to 1) of what it sees that the frame used before it sees too; None where that is not known."""
+    """Share (0 to 1) of what it sees that the previous used frame also sees; None where that is not known."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,9 +41,9 @@ class Panorama:
     covered: Bool[np.ndarray, "h w"]
     """Where something was seen."""
     frame_index: Int16[np.ndarray, "h w"]
-    """Index into ``frames`` of the frame that dominates each pixel, -1 for none."""
+    """Index into ``frames`` of the frame that contributes most to each pixel, -1 for none."""
     frame_pixel: Float[np.ndarray, "h w 2"]
-    """Where each pixel lies in that frame: px of the (distorted) frame, COLMAP's origin; NaN for none. float32."""
+    """Place of each pixel in that frame: px of the (distorted) frame, COLMAP's origin; NaN for none. float32."""
     frames: tuple[FrameUse, ...]
     """Every frame of the sequence, in order."""
     method: str
@@ -51,15 +51,15 @@ class Panorama:
     origin_px: Float[np.ndarray, "2"]
     """Pixel (u0, v0) of the world's origin; may lie outside the picture."""
     mm_per_px: float | None = None
-    """Millimetres a pixel, in the occlusal plane; None where nothing told the scale."""
+    """Millimetres per pixel, in the occlusal plane; None where the scale is unknown."""
     height_mm: Float[np.ndarray, "h w"] | None = None
     """World Z of the surface at each pixel, in mm (in px where the scale is unknown), NaN for none. float32."""
     part: int = 1
-    """Which part this is, from 1, where the sequence broke."""
+    """Number of this part, from 1, where the sequence broke."""
     parts: int = 1
-    """How many parts there are; 1 means that all that was placed is in one piece."""
+    """Number of parts; 1 means that everything that could be placed is in one piece."""
     notes: tuple[str, ...] = ()
-    """What a user must know of it, one line each."""
+    """What a user must know about it, one line each."""
 
     def __post_init__(self) -> None:
         for name in ("image", "covered", "frame_index", "frame_pixel", "height_mm", "origin_px"):
@@ -96,7 +96,7 @@ class Strip:
     curve: Float[np.ndarray, "w 2"]
     """World (x, y) of the arch curve at each column, mm (px of the panorama where the scale is unknown)."""
     mm_per_px: float | None
-    """Millimetres a pixel along the curve and across it; None where nothing told the scale."""
+    """Millimetres per pixel along the curve and across it; None where the scale is unknown."""
 
     def __post_init__(self) -> None:
         for name in ("image", "covered", "zone", "curve"):

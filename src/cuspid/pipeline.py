@@ -1,4 +1,4 @@
-"""The whole flow. Each verb reads and writes folders (docs/formats.md) and goes on where it stopped.
+"""The whole pipeline. Each verb reads and writes folders (docs/formats.md) and resumes where it stopped.
 
 handpiece            = DESIGNS["twelve"](DesignOptions())
 capture, truth       = simulate(jaw, handpiece, folder, ...)        images, and what only the simulator knows
@@ -8,7 +8,7 @@ mesh                 = fuse(depths, ...)
 trueness             = evaluate(mesh, truth.jaw, ...)
 panorama             = stitch(frames, ...)
 
-``measure_depth``, ``locate``, ``fuse`` and ``stitch`` see images and calibration alone.
+``measure_depth``, ``locate``, ``fuse`` and ``stitch`` see only images and calibration.
 """
 
 from __future__ import annotations
@@ -89,26 +89,27 @@ class ReconstructionOptions(Options):
 
     quality: Quality = "standard"
     """draft: a quick look at a scan, with keypoints from images of a quarter of the size, depth of every second frame
-    from images of half the size, and more small holes. standard: all that the images tell, but for frames that add
-    nothing."""
+    from images of half the size, and more small holes. standard: everything that the images give, except for frames
+    that add nothing."""
     left_share: Annotated[float | None, SHARE] = None
-    """Depth is measured in every second frame, and in those between where that adds to the surface: until, of the
-    sparse points that few depth maps confirm, no more than this share (0 to 1) of all points could still gain. 0: in
-    all frames. By default 0.005, of a draft 1."""
+    """Depth is measured in every second frame, and then in those frames between them that add to the surface, until the
+    sparse points that few depth maps confirm, and that more frames could still improve, are no more than this share (0
+    to 1) of all points. 0: in all frames. Default: 0.005, for a draft 1 (every second frame only)."""
     calibration: Literal["refined", "fixed"] = "refined"
-    """refined: as the images want it, within its covariance. fixed: as if the file were exact."""
+    """refined: adjusted to the images, within its covariance. fixed: treated as exact."""
     nominal: NominalOptions = field(default_factory=NominalOptions)
-    """What is assumed where the file does not say how well it is known."""
+    """What is assumed about the calibration if the file does not state how well it is known."""
     motion: MotionMethod = "rig"
-    """How the frames are located: rig (ours), or COLMAP's own mapper without (colmap) and with the rig (colmap-rig)."""
+    """How the frames are located: rig (cuspid's own method), or COLMAP's mapper without the rig (colmap) or with it
+    (colmap-rig)."""
     stereo: StereoOptions = field(default_factory=StereoOptions)
     """Depth within a frame."""
     temporal: TemporalOptions = field(default_factory=TemporalOptions)
-    """Depth from consecutive frames, where one camera of a group alone saw the surface."""
+    """Depth from consecutive frames, where only one camera of a group saw the surface."""
     tracking: MotionOptions = field(default_factory=MotionOptions)
-    """Features, odometry and adjustment of the method ``rig``."""
+    """Features, odometry and adjustment for the method ``rig``."""
     fusion: FusionOptions = field(default_factory=FusionOptions)
-    """Depth maps to one surface."""
+    """How depth maps are fused into one surface."""
     cleaning: CleaningOptions = field(default_factory=CleaningOptions)
     """What is removed from the surface."""
 
@@ -121,7 +122,8 @@ def reconstruct(
     colmap_model: Path | None = None,
     progress: Progress = silent,
 ) -> tuple[Reconstruction, Mesh]:
-    """Images and calibration to poses and a mesh. With a COLMAP model its poses are taken instead of found."""
+    """Reconstruct poses and a mesh from images and calibration. With a COLMAP model, its poses are taken instead of
+    found."""
     found = find_poses(capture, folder, options, colmap_model=colmap_model, progress=progress)
     return found, surface(capture, found, folder, options, progress=progress)[0]
 
@@ -134,7 +136,7 @@ def find_poses(
     colmap_model: Path | None = None,
     progress: Progress = silent,
 ) -> Reconstruction:
-    """Where the frames were, and the calibration as the images want it (first part of :func:`reconstruct`)."""
+    """The poses of the frames, and the calibration adjusted to the images (first part of :func:`reconstruct`)."""
     options = _settled(options)
     handpiece = as_known(capture.handpiece, options)
     capture = replace(capture, handpiece=handpiece)
@@ -151,8 +153,8 @@ def surface(
     *,
     progress: Progress = silent,
 ) -> tuple[Mesh, Float[np.ndarray, "v"]]:
-    """The mesh, once it is known where the frames were (second part of :func:`reconstruct`), and how well each of its
-    vertices is known: standard deviation along the normal, um."""
+    """The mesh, given the poses of the frames (second part of :func:`reconstruct`), and how well each of its vertices
+    is known: standard deviation along the normal, um."""
     options = _settled(options)
     assert options.left_share is not None
     capture = replace(capture, handpiece=replace(capture.handpiece, rig=found.rig))
@@ -214,7 +216,7 @@ def _settled(options: ReconstructionOptions) -> ReconstructionOptions:
 
 
 def as_known(handpiece: Handpiece, options: ReconstructionOptions) -> Handpiece:
-    """A handpiece with how well it is taken to be known."""
+    """The handpiece with the uncertainty that is assumed for it."""
     if options.calibration == "fixed":
         return held(handpiece)
     return options.nominal.of(handpiece).fill(handpiece)
@@ -229,11 +231,11 @@ class StitchOptions(OrthoOptions):
     homographies chained from normal map to normal map, as a baseline. PATENT NOTICE: the method thesis appears to be
     claimed by US 11,044,400; check the law where you are before you use it. The method ortho does not use it."""
     motion: SingleOptions = field(default_factory=SingleOptions)
-    """Where the camera was (method ortho)."""
+    """How the trajectory of the camera is found (method ortho)."""
     examination: bool = True
     """Leave out frames that fail the examination of the thesis (method thesis)."""
     thesis: ThesisOptions = field(default_factory=ThesisOptions)
-    """The method thesis."""
+    """Settings of the method thesis."""
 
 
 def stitch(sequence: ImageSequence, options: StitchOptions, *, progress: Progress = silent) -> tuple[Stitched, ...]:
@@ -270,11 +272,11 @@ class Reference:
     jaw: Jaw
     """The surface, and tooth labels where there are any."""
     scannable: Bool[np.ndarray, "f"] | None
-    """The faces that at least two cameras of one frame could see; None where that is not known."""
+    """The faces that at least two cameras of one frame could see; None if that is not known."""
     crown: OpenCrown | None
-    """The open crown surface; None where nothing is crown or looks like it."""
+    """The open crown surface; None if nothing is crown or looks like it."""
     hashes: Mapping[str, str]
-    """SHA-256 of the files, by what they are."""
+    """SHA-256 of the files, by what they contain."""
 
 
 def load_reference(path: Path, *, unit: storage.Unit = "mm", arch: Arch | None = None) -> Reference:
@@ -306,11 +308,11 @@ def _loaded_reference(path: Path, unit: storage.Unit, arch: Arch | None) -> Refe
 def crown_surface(
     jaw: Jaw, occlusal_from_jaw: Rigid3 = Rigid3.identity(), *, seen: Bool[np.ndarray, "f"] | None = None
 ) -> OpenCrown | None:
-    """The open crown surface of a jaw: of each tooth, or of what looks like crown where it has no tooth labels; None
-    where there is nothing of the kind.
+    """The open crown surface of a jaw: of each tooth, or of whatever looks like crown if it has no tooth labels; None
+    if there is no such surface.
 
-    ``occlusal_from_jaw``: for a mesh that is not in its occlusal frame. ``seen``: teeth of which none of these faces is
-    a part are left out, which saves time.
+    ``occlusal_from_jaw``: for a mesh that is not in its occlusal frame. ``seen``: teeth with none of these faces are
+    left out, which saves time.
     """
     upright = replace(jaw, mesh=jaw.mesh.transformed(occlusal_from_jaw), landmarks={}, lines={}, spheres={})
     crowns = crowns_of(upright)

@@ -16,7 +16,7 @@ from cuspid.geometry import Rigid3, read_only
 from cuspid.rig import Rig
 
 _NEAREST = 4
-"""Points that tell about a vertex."""
+"""Number of nearest points from which a vertex is judged."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -28,19 +28,19 @@ class DepthMap:
     camera_name: str
     """Name of the reference camera in the rig (for messages and file names)."""
     camera: Camera
-    """The pinhole without distortion in which the pixels of ``depth_mm`` lie; may be coarser than the image."""
+    """Distortion-free pinhole camera whose pixels ``depth_mm`` has; may be coarser than the image."""
     cam_from_rig: Rigid3
-    """Its place in the rig."""
+    """Its pose in the rig."""
     depth_mm: Float[np.ndarray, "h w"]
     """Z of the surface at each pixel centre, NaN where unknown. float32."""
     confidence: Float[np.ndarray, "h w"]
-    """0 (unknown) to 1; inverse-variance-like weight relative to the best pixels. float32."""
+    """0 (unknown) to 1: a weight like an inverse variance, relative to the best pixels. float32."""
     color: UInt8[np.ndarray, "h w 3"] | None = None
     """RGB seen at each pixel."""
 
     @property
     def known(self) -> Bool[np.ndarray, "h w"]:
-        """Which pixels have a depth."""
+        """The pixels that have a depth."""
         return np.asarray(np.isfinite(self.depth_mm) & (self.confidence > 0))
 
     def points_in_rig(self) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
@@ -53,12 +53,12 @@ class DepthMap:
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """Points of a surface, and which way it faces there."""
+    """Points on a surface, with its normals there."""
 
     points: Float[np.ndarray, "p 3"]
     """In the world frame, mm."""
     normals: Float[np.ndarray, "p 3"]
-    """Of length 1, outward."""
+    """Outward unit normals."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -66,35 +66,35 @@ class Tracks:
     """Sparse points and where they were seen."""
 
     points: Float[np.ndarray, "p 3"]
-    """World positions, mm; of a :class:`cuspid.sparse_model.SparseModel` in units of its own."""
+    """World positions, mm; in a :class:`cuspid.sparse_model.SparseModel`, in its own units."""
     colors: UInt8[np.ndarray, "p 3"]
     """RGB."""
     point_index: Int[np.ndarray, "o"]
     """For each observation: which point."""
     frame_index: Int[np.ndarray, "o"]
-    """For each observation: which frame, an index into the ``frames`` of what holds them."""
+    """For each observation: which frame, an index into the ``frames`` of the owner."""
     camera_index: Int[np.ndarray, "o"]
     """For each observation: which camera, an index into ``rig.names``."""
     pixels: Float[np.ndarray, "o 2"]
-    """For each observation: where, in px of the (distorted) image."""
+    """For each observation: the place, in px of the (distorted) image."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Refinement:
-    """How far the images moved the calibration, and what is left open of it."""
+    """How far the images moved the calibration, and what remains uncertain."""
 
     rms_sigmas: float
-    """Of all numbers that were free, in standard deviations of the given covariance; where these are right, 1 or less:
-    what no image tells stays where it was."""
+    """RMS change of all free parameters, in standard deviations of the given covariance; if that is right, 1 or less:
+    parameters that no image determines stay where they were."""
     camera_sigmas: Mapping[str, float]
-    """The same of each camera."""
+    """The same for each camera."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "camera_sigmas", MappingProxyType(dict(self.camera_sigmas)))
 
     @property
     def summary(self) -> str:
-        """In one line."""
+        """One line for the user."""
         name, most = max(self.camera_sigmas.items(), key=lambda item: item[1])
         return (
             f"refined, {self.rms_sigmas:.2f} of its standard deviations from the file (root mean square; camera {name} "
@@ -104,26 +104,26 @@ class Refinement:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Expectation:
-    """How far the surface may lie from where it is, as far as poses and calibration tell."""
+    """How far the surface may be off, according to poses and calibration."""
 
     points: Float[np.ndarray, "n 3"]
     """Some of the sparse points, mm in the world frame."""
     covariance: Float[np.ndarray, "n 3 3"]
-    """Of each, mm^2, once all of them are fitted onto the truth by a rigid motion, as an evaluation does. The error of
-    the keypoints of the point itself is not in it."""
+    """Covariance of each of them, mm^2, once all are fitted to the truth by a rigid motion, as an evaluation does. The
+    error of the point's own keypoints is not included."""
     scale_sigma_ppm: float
-    """Standard deviation of the scale; a surface that lies too far out everywhere is not in it."""
+    """Standard deviation of the scale; a surface that lies too far out everywhere is not included."""
     span_mm: float
-    """Length of the scan along its longest axis, between the middles of its two ends."""
+    """Length of the scan along its longest axis, between the centres of its two ends."""
     span_sigma_um: float
-    """Its standard deviation."""
+    """Standard deviation of that length."""
 
     def __post_init__(self) -> None:
         for name in ("points", "covariance"):
             object.__setattr__(self, name, read_only(np.asarray(getattr(self, name), dtype=np.float64)))
 
     def sigma_mm(self, vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v"]:
-        """Standard deviation along their normals of vertices nearby: that of the nearest points (mean variance)."""
+        """Standard deviation of vertices nearby, along their normals: that of the nearest points (mean variance)."""
         _, nearest = cKDTree(self.points).query(vertices, k=min(_NEAREST, len(self.points)))
         covariance = self.covariance[nearest.reshape(len(vertices), -1)].mean(axis=1)
         return np.asarray(np.sqrt(np.einsum("vi,vij,vj->v", normals, covariance, normals)))
@@ -134,26 +134,26 @@ class Reconstruction:
     """Located frames, in millimetres. The world frame is the rig frame of the first located frame."""
 
     rig: Rig
-    """Refined calibration (the given one where it was held fixed)."""
+    """Refined calibration (the given one if it was held fixed)."""
     refinement: Refinement | None = None
-    """What was refined of it; None where it was held fixed."""
+    """What was refined of it; None if it was held fixed."""
     expectation: Expectation | None = None
-    """What to expect of the surface; None where the frames were not located by an adjustment of ours."""
+    """Expected accuracy of the surface; None if the frames were not located by cuspid's own adjustment."""
     rig_from_world: Mapping[str, Rigid3]
-    """Pose for each located frame, in the order of capture."""
+    """Pose of each located frame, in the order of capture."""
     tracks: Tracks | None = None
-    """Sparse model, where features were used."""
+    """Sparse model, if features were used."""
     dropped: tuple[Dropped, ...] = ()
     """What was left out, each with its reason."""
     pose_covariance: Float[np.ndarray, "n 6 6"] | None = None
-    """Covariance of each pose, relative to the first frame: (rotation vector rad, translation mm) of a small motion
-    on the left of ``rig_from_world``."""
+    """Covariance of each pose, relative to the first frame: of a small motion (rotation vector rad, translation mm) on
+    the left of ``rig_from_world``."""
     reprojection_rms_px: float | None = None
     """RMS reprojection error of the sparse model."""
     log: Mapping[str, float | int] = field(default_factory=dict)
-    """Counts and seconds of the stages, units in the keys."""
+    """Counts, and durations of the stages in seconds; units are in the keys."""
     notes: tuple[str, ...] = ()
-    """What a user must know of it, one line each; empty where nothing is doubtful."""
+    """What a user must know about it, one line each; empty if nothing is doubtful."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rig_from_world", MappingProxyType(dict(self.rig_from_world)))
@@ -164,7 +164,7 @@ class Reconstruction:
         return tuple(self.rig_from_world)
 
     def with_cameras_as(self, names: Sequence[str]) -> Reconstruction:
-        """The same with its cameras in another order."""
+        """The same reconstruction with its cameras in another order."""
         tracks = self.tracks
         if tracks is not None:
             place = np.array([names.index(name) for name in self.rig.names])

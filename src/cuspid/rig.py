@@ -1,7 +1,7 @@
-"""A handpiece: cameras rigidly mounted together, lights and the sensor's character.
+"""A handpiece: cameras rigidly mounted together, lights, and the properties of the sensors.
 
 Frames: ``rig`` is the frame of the handpiece, ``cam`` that of one camera; ``cam_from_rig`` is constant. The rig frame
-is free; COLMAP wants it to be the frame of a reference camera, see :meth:`Rig.rebased`.
+is arbitrary; COLMAP requires it to be the frame of a reference camera, see :meth:`Rig.rebased`.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from cuspid.geometry import Rigid3, axes_about, read_only, unit
 from cuspid.values import checked_name, one_line
 
 _NO_SIDE = 1e-3
-"""Length of the mean of unit vectors that have no direction in common."""
+"""Length of the mean of unit vectors below which they have no common direction."""
 
 
 @dataclass(frozen=True, eq=False)
 class MountedCamera:
-    """A camera and its place in the handpiece."""
+    """A camera and its pose in the handpiece."""
 
     camera: Camera
     """Intrinsic calibration."""
@@ -34,7 +34,7 @@ class MountedCamera:
     """Extrinsic calibration."""
     covariance: Float[np.ndarray, "6 6"] | None = None
     """Covariance of a small motion (rotation vector rad, translation mm) applied on the left of ``cam_from_rig``; zero
-    for an exact one, None where nobody has said how well it is known (an adjustment holds it)."""
+    for an exact one, None if its uncertainty is not stated (an adjustment then holds it fixed)."""
 
     @property
     def centre_in_rig(self) -> Float[np.ndarray, "3"]:
@@ -72,7 +72,7 @@ class Rig:
         return self.cameras[name]
 
     def in_own_order(self) -> Rig:
-        """The same rig with its cameras ordered by where they are, whatever order and names they were given."""
+        """The same rig with its cameras ordered by position, whatever their given order and names."""
         ordered = sorted(self.cameras, key=lambda name: self[name].cam_from_rig.matrix[:3, ::-1].T.ravel().tolist())
         return Rig({name: self[name] for name in ordered})
 
@@ -83,8 +83,8 @@ class Rig:
 
     def over_surface(self, distance_mm: float) -> Rig:
         """The same rig in a frame on the surface that it looks at from a distance: +Z back to the cameras, against
-        their mean axis, +X to the right of the image of the one that looks most along it. Raises InputError for cameras
-        that look in all directions."""
+        their mean axis, +X to the right in the image of the camera that looks most nearly along that axis. Raises
+        InputError for cameras that look in all directions."""
         mounted = list(self.cameras.values())
         axes = np.array([each.axis_in_rig for each in mounted])
         if np.linalg.norm(axes.mean(axis=0)) < _NO_SIDE:
@@ -107,8 +107,8 @@ class Rig:
         )
 
     def largest_shift_px(self, other: Rig, distance_mm: float) -> float:
-        """How far at most points at a distance lie from each other in the images of this calibration and of another one
-        of the same cameras."""
+        """Largest shift of points at a distance between the images of this calibration and of another one of the same
+        cameras."""
         shares = np.array([[0.1, 0.1], [0.9, 0.1], [0.1, 0.9], [0.9, 0.9], [0.5, 0.5]])
         largest = 0.0
         for name, mounted in self.cameras.items():
@@ -119,7 +119,8 @@ class Rig:
         return largest
 
     def overlap(self, first: str, second: str, distance_mm: float) -> float:
-        """Share (0 to 1) of a plane across the first camera's axis, filling its image, that the second sees too."""
+        """Share (0 to 1) of a plane perpendicular to the first camera's axis, filling its image, that the second also
+        sees."""
         one, other = self[first], self[second]
         cells = (np.arange(24) + 0.5) / 24  # middles: on the border rounding would decide
         grid = np.stack(np.meshgrid(cells * one.camera.width, cells * one.camera.height), -1)
@@ -138,7 +139,7 @@ class Light:
     """A small LED on the handpiece: a point with a cosine-power lobe and 1/d^2 falloff."""
 
     position_mm: Float[np.ndarray, "3"]
-    """Place in the rig frame."""
+    """Position in the rig frame."""
     direction: Float[np.ndarray, "3"]
     """Unit axis of the lobe in the rig frame."""
     power: float = 1.0
@@ -148,8 +149,7 @@ class Light:
     lobe_exponent: float = 1.0
     """Intensity falls as cos(angle)^exponent; 1 is a bare Lambertian LED."""
     covariance: Float[np.ndarray, "4 4"] | None = None
-    """Covariance of the place (mm) and of the logarithm of the power; None where nobody has said how well they are
-    known."""
+    """Covariance of the position (mm) and of the logarithm of the power; None if their uncertainty is not stated."""
 
     def __post_init__(self) -> None:
         direction = np.asarray(self.direction, dtype=np.float64)
@@ -162,8 +162,8 @@ class Light:
     def irradiance(
         self, points: Float[np.ndarray, "*n 3"], normals: Float[np.ndarray, "*n 3"]
     ) -> Float[np.ndarray, "*n"]:
-        """Light on a surface at points of the rig frame (mm) with unit normals; that of a power of 1 at 1 mm, both
-        facing each other, is 1. 0 behind the light and on the back of the surface; nothing is in the way."""
+        """Irradiance of a surface at points of the rig frame (mm) with unit normals; that of a light of power 1 at 1
+        mm, both facing each other, is 1. 0 behind the light and on the back of the surface; occlusion is ignored."""
         towards = self.position_mm - points
         distance = np.linalg.norm(towards, axis=-1)
         leaving = np.maximum(-(towards @ self.direction) / distance, 0.0)
@@ -183,7 +183,7 @@ class Light:
 
     @property
     def light_from_rig(self) -> Rigid3:
-        """A frame at the light whose +Z is its axis."""
+        """A frame at the light whose +Z is the axis of the lobe."""
         turn = axes_about(self.direction)
         return Rigid3(turn, -turn @ self.position_mm)
 
@@ -193,7 +193,7 @@ MID_GREY_DN = 127.5
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Sensor:
-    """What turns light into numbers, the losses of the lens included."""
+    """What turns light into digital numbers, including the losses of the lens."""
 
     noise_dn: float = 1.5
     """Standard deviation of the noise at mid grey, in digital numbers of 255."""
@@ -202,13 +202,13 @@ class Sensor:
     gamma: float = 2.2
     """Encoding exponent from linear light to digital numbers."""
     gain: float = 1.0
-    """How much brighter than those of the other cameras its images are, in linear light."""
+    """Brightness of its images relative to those of the other cameras, in linear light."""
     falloff: tuple[float, float] = (0.0, 0.0)
     """(a, b) of the share ``exp(a r^2 + b r^4)`` of the light that reaches a pixel, where r is its distance from the
-    principal point in halves of the diagonal of the image (vignetting; as a logarithm, after S. J. Kim, M. Pollefeys,
-    IEEE Trans. PAMI 30, 2008)."""
+    principal point in units of half the image diagonal (vignetting; as a logarithm, after S. J. Kim, M. Pollefeys, IEEE
+    Trans. PAMI 30, 2008)."""
     covariance: Float[np.ndarray, "4 4"] | None = None
-    """Covariance of (log gain, a, b, log gamma); None where nobody has said how well they are known."""
+    """Covariance of (log gain, a, b, log gamma); None if their uncertainty is not stated."""
 
     def __post_init__(self) -> None:
         if self.covariance is not None:
@@ -225,12 +225,12 @@ class Sensor:
         return np.asarray(self.noise_dn * np.sqrt(1 - share + share * level_dn / MID_GREY_DN))
 
     def transmitted(self, camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
-        """Linear light that pixels of a camera show, over that which a camera of gain 1 without falloff would."""
+        """Linear light that pixels of a camera show, relative to a camera of gain 1 without falloff."""
         return np.asarray(self.gain * np.exp(falloff_terms(camera, pixels) @ self.falloff))
 
 
 def falloff_terms(camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-    """r^2 and r^4 of pixels, see :attr:`Sensor.falloff`."""
+    """r^2 and r^4 of pixels; see :attr:`Sensor.falloff`."""
     half_diagonal_px = np.hypot(camera.width, camera.height) / 2
     squared = (((pixels - camera.principal_point_px) / half_diagonal_px) ** 2).sum(axis=-1)
     return np.stack([squared, squared**2], axis=-1)
@@ -250,11 +250,11 @@ _IN_FOCUS = (0.5, 1.8)
 
 
 def depth_of_field_mm(working_distance_mm: float) -> tuple[float, float]:
-    """Nearest and farthest depth that a lens of a handpiece's size keeps usefully sharp, where nothing else is known.
+    """Nearest and farthest depth that a lens of a handpiece's size keeps usefully sharp, if nothing else is known.
 
     Its blur disc is f A |1/Z - 1/Z0| wide and grows with the aperture A, while diffraction shrinks; at f = 416 px the
-    two meet at A = 0.07 mm. For a working distance of 5 mm, focused at Z0 = 3.9 mm, the disc is then 4 px wide at both
-    ends of the 2.5-9 mm that this gives, and narrower between; around a larger distance it is narrower still.
+    two are equal at A = 0.07 mm. For a working distance of 5 mm, focused at Z0 = 3.9 mm, the disc is then 4 px wide at
+    both ends of the 2.5-9 mm that this gives, and narrower between; around a larger distance it is narrower still.
     """
     near, far = _IN_FOCUS
     return near * working_distance_mm, far * working_distance_mm
@@ -262,26 +262,26 @@ def depth_of_field_mm(working_distance_mm: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Handpiece:
-    """Everything that is built into the probe."""
+    """Everything that is built into the handpiece."""
 
     rig: Rig
     """The cameras."""
     lights: Mapping[str, Light] = field(default_factory=dict)
     """Lights by name."""
     lightings: tuple[Lighting, ...] = ()
-    """Lighting patterns, in the order in which they take turns; empty where nothing is known of them."""
+    """Lighting patterns, in the order in which they alternate; empty if none are known."""
     sensor: Sensor = field(default_factory=Sensor)
-    """Of the cameras that have none of their own."""
+    """Sensor of the cameras that have none of their own."""
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
-    """By camera, of those that are not like the others."""
+    """Sensors by camera, for those that differ from the others."""
     working_distance_mm: float = 5.0
     """Nominal distance from a camera to the surface that it looks at."""
     depth_range_mm: tuple[float, float] = (2.5, 9.0)
-    """Nearest and farthest depth in a camera that is in focus."""
+    """Nearest and farthest depth from a camera that is in focus."""
     body: Body | None = None
-    """What takes up room; None where that is not known."""
+    """The space that it occupies; None where that is not known."""
     name: str = "handpiece"
-    """For people."""
+    """Human-readable name."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lights", MappingProxyType(dict(self.lights)))
@@ -300,7 +300,7 @@ class Handpiece:
 
     @cached_property
     def solid(self) -> Body:
-        """The body; where it is not known, a box behind each lens and each LED, of the size of miniature ones."""
+        """The body; if it is not known, a box of the size of a miniature module behind each lens and each LED."""
         if self.body is not None:
             return self.body
         cameras = {f"camera {name}": module(each.cam_from_rig, CAMERA_MM) for name, each in self.rig.cameras.items()}
@@ -309,13 +309,13 @@ class Handpiece:
 
     @property
     def thickness_mm(self) -> float:
-        """How far the body reaches out of the gum beyond the working distance, with the rig frame over the teeth as in
-        :mod:`cuspid.handpiece.designs`."""
+        """How far the body extends, out of the gum, beyond the working distance, with the rig frame over the teeth as
+        in :mod:`cuspid.handpiece.designs`."""
         return float(self.solid.bounds[1, 2]) - self.working_distance_mm
 
     @property
     def footprint_mm(self) -> float:
-        """Side of what a pixel sees of a surface at the working distance, mm: median of the cameras."""
+        """Side of the surface patch that a pixel sees at the working distance, mm: median over the cameras."""
         focal_px = [mounted.camera.focal_px.mean() for mounted in self.rig.cameras.values()]
         return self.working_distance_mm / float(np.median(focal_px))
 

@@ -1,8 +1,8 @@
 """The room that a jaw leaves for the body of a handpiece.
 
-A pose *fits* where no part of the body comes nearer to the surface than the clearance and no part lies inside the jaw.
-Inside is where the generalised winding number (Jacobson et al., SIGGRAPH 2013) exceeds one half, which open sheets such
-as scans answer as well as closed models: faces far away subtend little, whether they are there or not.
+A pose *fits* if no part of the body comes nearer to the surface than the clearance and no part lies inside the jaw.
+Inside is where the generalised winding number (Jacobson et al., SIGGRAPH 2013) exceeds one half. This works for open
+surfaces such as scans as well as for closed models: distant faces subtend little, whether they are there or not.
 """
 
 from __future__ import annotations
@@ -29,14 +29,15 @@ from cuspid.rig import Handpiece
 _LOG = logging.getLogger("cuspid")
 
 _APART_MM = 0.3
-"""Points on the surface lie no farther apart along an edge."""
+"""Largest distance between points on the surface along an edge."""
 _PITCH_MM = 0.15
-"""Of the grid of distances to the body: their errors stay below a hundredth of a millimetre off its edges."""
+"""Spacing of the grid of distances to the body: their errors stay below a hundredth of a millimetre away from its
+edges."""
 _INSIDE_PITCH_MM = 1.0
-"""Of the grid of winding numbers; nearer to the surface than this the distance decides."""
+"""Spacing of the grid of winding numbers; nearer to the surface than this, the distance decides."""
 _INSIDE = 0.5
 FAR_MM = 3.0
-"""Distances are told so far beyond the clearance."""
+"""Distances are computed up to this far beyond the clearance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,17 +58,17 @@ class _Grid:
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """A jaw and the body of a handpiece that moves about it."""
+    """A jaw, and the body of a handpiece that moves around it."""
 
     mesh: Mesh
     """In the occlusal frame."""
     body: Body
     """In the rig frame."""
     clearance_mm: float
-    """That they are to keep from each other."""
+    """Distance that they must keep from each other."""
 
     def fits(self, rig_from_world: Rigid3, pose_from_rig: Sequence[Rigid3]) -> Bool[np.ndarray, "n"]:
-        """Whether the body fits at each of several poses, given relative to one."""
+        """Whether the body fits at each of several poses, given relative to one pose."""
         rotations = np.stack([each.rotation for each in pose_from_rig])
         translations = np.stack([each.translation for each in pose_from_rig])
         swept = np.einsum("nji,nkj->nki", rotations, self._corners - translations[:, None]).reshape(-1, 3)
@@ -83,9 +84,10 @@ class Room:
         return free
 
     def clearance(self, rig_from_world: Rigid3) -> tuple[float, str]:
-        """Distance in mm between body and surface, minus infinity where a part lies inside the jaw, and which part.
+        """Distance in mm between body and surface, minus infinity if a part lies inside the jaw, and the name of that
+        part.
 
-        Infinite where they are some millimetres apart.
+        Infinite if they are some millimetres apart.
         """
         inside = self._inside([rig_from_world])[0]
         if inside.any():
@@ -154,7 +156,7 @@ def _winding_of(mesh: Mesh) -> _Grid:
 
 
 def surface_points(mesh: Mesh, apart_mm: float) -> Float[np.ndarray, "n 3"]:
-    """The vertices of a mesh, and on faces with longer edges a lattice of points no farther apart than asked."""
+    """The vertices of a mesh and, on faces with longer edges, a lattice of points no farther apart than required."""
     corners = mesh.vertices[mesh.faces]
     longest = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).max(axis=1)
     steps = np.ceil(longest / apart_mm).astype(int)
@@ -167,7 +169,7 @@ def surface_points(mesh: Mesh, apart_mm: float) -> Float[np.ndarray, "n 3"]:
 
 
 def room_about(mesh: Mesh, handpiece: Handpiece, clearance_mm: float) -> Room:
-    """The room for a handpiece. Where its body is not known, what is assumed goes to the log."""
+    """The room for a handpiece. If its body is not known, what is assumed is logged."""
     if handpiece.body is None:
         camera, led = (" x ".join(f"{side:.1f}" for side in size) for size in (CAMERA_MM, LED_MM))
         _LOG.info(

@@ -17,14 +17,14 @@ from cuspid.jaw import Jaw, Landmark
 
 @dataclass(frozen=True, kw_only=True)
 class MeanStep:
-    """One round of the iteration: the current mean laid on all samples, and their mean taken."""
+    """One round of the iteration: the current mean is fitted to all samples, and their mean is taken."""
 
     change_um: float
     """How far the vertices of the mean moved, root mean square."""
     surface_change_um: float
     """How far they moved along the normals of the mean: what changes its surface, root mean square."""
     largest_change_um: float
-    """How far the vertex that moved most did."""
+    """How far the vertex that moved most moved."""
     covered_pct: float
     """Share of the vertices, over all samples, that lie on the sample's surface."""
 
@@ -42,21 +42,21 @@ class ShapeModel:
     standard_deviations_mm: Float[np.ndarray, "k"]
     """Standard deviation of each mode over the samples: root mean square displacement of the surface, mm."""
     variance_shares: Float[np.ndarray, "k"]
-    """Share of each mode in the variance of all, also of those that were left out."""
+    """Share of each mode in the total variance, including the modes that were left out."""
     scores: Float[np.ndarray, "n k"]
     """Weights of each sample, in standard deviations."""
     names: tuple[str, ...]
     """The samples."""
     scales: Float[np.ndarray, "n"]
-    """By which each sample was scaled; ones where the size was kept."""
+    """Factor by which each sample was scaled; ones if the size was kept."""
     scaled: bool
     """Whether the samples were scaled to a common size."""
     first: str
-    """The sample whose faces and labels the mean has."""
+    """The sample that gave the mean its faces and labels."""
     correspondence: str
     """How corresponding points were found: ``surface`` or ``landmarks``."""
     converged: bool
-    """Whether the mean stopped moving."""
+    """Whether the iteration converged."""
     log: tuple[MeanStep, ...]
     """Each round of the iteration."""
     notes: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""Signals that end the program, and libraries that would rather handle them themselves."""
+"""Signals that end the program, and libraries that would handle them themselves."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ _ENDING = (signal.SIGINT, signal.SIGTERM)
 
 @contextmanager
 def handlers_kept() -> Iterator[None]:
-    """What is loaded in the block leaves no handlers of its own behind; a signal that comes meanwhile waits till its
-    end. Signals are the main thread's: in others nothing happens."""
+    """Nothing that is loaded in the block leaves signal handlers behind; a signal that arrives meanwhile is delivered
+    at its end. Only the main thread handles signals: in other threads nothing happens."""
     if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "pthread_sigmask"):
         yield
         return

@@ -1,6 +1,6 @@
-"""What one camera tells of its trajectory and of the surface: no scale, so a model in lengths of its own.
+"""What one camera tells about its trajectory and the surface: without scale, hence a model in its own units of length.
 
-Frames: ``cam`` is the frame of the camera; the world is any.
+Frames: ``cam`` is the frame of the camera; the world frame is arbitrary.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from cuspid.reconstruction import Tracks
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SparseModel:
-    """Located frames of one camera and points that they see. Its lengths are in a unit of its own, until they are
-    :meth:`scaled` to millimetres by what else is known."""
+    """Located frames of one camera and the points that they see. Its lengths are in its own unit, until they are
+    :meth:`scaled` to millimetres from other knowledge."""
 
     camera: Camera
-    """Refined calibration (the given one where it was held fixed)."""
+    """Refined calibration (the given one if it was held fixed)."""
     cam_from_world: Mapping[str, Rigid3]
-    """Pose for each located frame, in the order of capture; translations in units of the model."""
+    """Pose of each located frame, in the order of capture; translations in units of the model."""
     tracks: Tracks
-    """The points, in units of the model, and where they were seen, always by camera 0."""
+    """The points, in units of the model, and where they were seen; the camera is always number 0."""
     reprojection_rms_px: float | None = None
-    """RMS reprojection error, where it was adjusted."""
+    """RMS reprojection error, if the model was adjusted."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cam_from_world", MappingProxyType(dict(self.cam_from_world)))
@@ -42,8 +42,8 @@ class SparseModel:
 
     @property
     def depths(self) -> Float[np.ndarray, "o"]:
-        """Z in the camera of the point of every observation, in units of the model. Raises ReconstructionError where
-        there is none."""
+        """Depth (Z) in the camera of the point of every observation, in units of the model. Raises ReconstructionError
+        if there is none."""
         tracks = self.tracks
         if not len(tracks.point_index):
             raise ReconstructionError("motion: nothing that several frames see is consistent; more detail is needed")
@@ -53,6 +53,6 @@ class SparseModel:
         return np.asarray(along + shifts[tracks.frame_index])
 
     def scaled(self, scale: float) -> SparseModel:
-        """The same in a unit that is so many times smaller."""
+        """The same model in a unit that is smaller by this factor."""
         poses = {name: Rigid3(pose.rotation, scale * pose.translation) for name, pose in self.cam_from_world.items()}
         return replace(self, cam_from_world=poses, tracks=replace(self.tracks, points=scale * self.tracks.points))

@@ -1,4 +1,5 @@
-"""How far a built handpiece is from its file: as the file says, as is assumed where it says nothing, or not at all."""
+"""How far a built handpiece may differ from its file: as the file says, as is assumed if it says nothing, or not at
+all."""
 
 from __future__ import annotations
 
@@ -14,19 +15,19 @@ from cuspid.options import Options, Range
 from cuspid.rig import Handpiece, MountedCamera, Rig
 
 _NOMINAL_PLACE = 0.006
-"""Of a camera, as a share of the working distance: 30 um at 5 mm."""
+"""Position of a camera, as a share of the working distance: 30 um at 5 mm."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tolerances:
-    """Standard deviations of what a built handpiece is off from the drawn one, each camera for itself."""
+    """Standard deviations of a built handpiece from the drawn one, independent for each camera."""
 
     place_mm: float = 0.0
-    """Place of a camera, each axis."""
+    """Position of a camera, each axis."""
     turn_deg: float = 0.0
-    """Turn of a camera, about each axis."""
+    """Rotation of a camera, about each axis."""
     focal_share: float = 0.0
-    """Focal length, as a share of it; both go together."""
+    """Focal length, as a share of it; the same for fx and fy."""
     centre_px: float = 0.0
     """Principal point, each axis."""
     k1: float = 0.0
@@ -34,11 +35,11 @@ class Tolerances:
 
     @property
     def motion_sigma(self) -> Float[np.ndarray, "6"]:
-        """Of a small motion on the left of ``cam_from_rig``: rad, mm."""
+        """Standard deviations of a small motion on the left of ``cam_from_rig``: rad, mm."""
         return np.repeat([np.deg2rad(self.turn_deg), self.place_mm], 3)
 
     def lens_factor(self, camera: Camera) -> Float[np.ndarray, "8 4"]:
-        """What (focal length, cx, cy, k1) of unit deviation make of the parameters."""
+        """Change of the camera parameters for a unit deviation of (focal length, cx, cy, k1)."""
         factor = np.zeros((8, 4))
         factor[:2, 0] = self.focal_share * camera.focal_px
         factor[2, 1] = factor[3, 2] = self.centre_px
@@ -46,7 +47,7 @@ class Tolerances:
         return factor
 
     def fill(self, handpiece: Handpiece) -> Handpiece:
-        """The handpiece with these as covariances of whatever has none."""
+        """The handpiece with these as the covariances of everything that has none."""
         return with_cameras(handpiece, self._filled)
 
     def _filled(self, mounted: MountedCamera) -> MountedCamera:
@@ -61,21 +62,21 @@ EXACT = Tolerances()
 
 @dataclass(frozen=True, kw_only=True)
 class NominalOptions(Options):
-    """How far a camera may be from what its file says, where the file does not say it (standard deviations)."""
+    """How far a camera may be from what its file says, if the file does not state it (standard deviations)."""
 
     place_um: Annotated[float | None, Range(0, 10_000_000)] = None
-    """Place of a camera, each axis; default: 0.6 % of the working distance, 30 um at 5 mm."""
+    """Position of a camera, each axis; default: 0.6 % of the working distance, 30 um at 5 mm."""
     turn_deg: Annotated[float, Range(0, 10)] = 0.2
-    """Turn of a camera, about each axis."""
+    """Rotation of a camera, about each axis."""
     focal_pct: Annotated[float, Range(0, 20)] = 0.3
-    """Focal length."""
+    """Focal length, per cent."""
     centre_px: Annotated[float, Range(0, 1000)] = 1.0
     """Principal point, each axis."""
     k1: Annotated[float, Range(0, 1)] = 0.01
     """First term of the radial distortion."""
 
     def of(self, handpiece: Handpiece) -> Tolerances:
-        """The same for a handpiece."""
+        """The tolerances for a handpiece."""
         share = _NOMINAL_PLACE * handpiece.working_distance_mm
         return Tolerances(
             place_mm=share if self.place_um is None else self.place_um / 1000,
@@ -87,13 +88,13 @@ class NominalOptions(Options):
 
 
 def is_nominal(handpiece: Handpiece) -> bool:
-    """Whether nobody has said how well some number of the handpiece is known."""
+    """Whether the uncertainty of some parameter of the handpiece is not stated."""
     cameras = handpiece.rig.cameras.values()
     return any(each.covariance is None or each.camera.covariance is None for each in cameras)
 
 
 def held(handpiece: Handpiece) -> Handpiece:
-    """Without covariances: as if it were built as its file says."""
+    """The handpiece without covariances: as if it were built exactly as its file says."""
     return with_cameras(
         handpiece, lambda each: replace(each, camera=replace(each.camera, covariance=None), covariance=None)
     )

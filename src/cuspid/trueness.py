@@ -1,6 +1,6 @@
-"""What is true, and how far a scan is from it.
+"""The ground truth, and how far a scan is from it.
 
-Deviations are measured as the field does (ISO 5725), in micrometres throughout.
+Deviations follow the terms of ISO 5725 and are in micrometres throughout.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from cuspid.rig import Handpiece
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GroundTruth:
-    """What only the simulator knows. Reconstruction never sees it. The world frame is the jaw's occlusal frame."""
+    """What only the simulator knows. The reconstruction never sees it. The world frame is the jaw's occlusal frame."""
 
     jaw: Jaw
     """What was scanned."""
     handpiece: Handpiece
-    """The handpiece as it really was (the capture may hold a nominal one)."""
+    """The handpiece as it was built (the capture may hold a nominal one)."""
     rig_from_world: Mapping[str, Rigid3]
     """Pose of the handpiece for each frame."""
 
@@ -34,26 +34,26 @@ NOTHING = -1
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ReferenceRender:
-    """A reference render: a jaw as one image from above, as a panorama should show it. Columns run along +X, rows
-    along -Y.
+    """A reference render: one image of a jaw from above, as a panorama should show it. Columns run along +X, rows along
+    -Y.
 
-    Pixel (u, v), the centre of the first one at (0.5, 0.5), shows x = (u - u0) s, y = (v0 - v) s of the occlusal frame,
-    where (u0, v0) is ``origin_px`` and s ``mm_per_px``; a camera at a finite height shows what lies above or below the
-    occlusal plane elsewhere.
+    Pixel (u, v), with the centre of the first one at (0.5, 0.5), shows x = (u - u0) s, y = (v0 - v) s of the occlusal
+    frame, where (u0, v0) is ``origin_px`` and s is ``mm_per_px``; a camera at a finite height shows points above or
+    below the occlusal plane displaced.
     """
 
     image: UInt8[np.ndarray, "h w 3"]
-    """RGB; black where nothing is."""
+    """RGB; black where there is nothing."""
     labels: Int16[np.ndarray, "h w"]
     """FDI number of the tooth at each pixel, 0 for gum, `NOTHING` for none."""
     height_mm: Float[np.ndarray, "h w"]
     """Height (z) of the surface at each pixel, NaN for none; float32."""
     mm_per_px: float
-    """Millimetres a pixel, in the occlusal plane."""
+    """Millimetres per pixel, in the occlusal plane."""
     origin_px: Float[np.ndarray, "2"]
     """Pixel of the origin of the occlusal frame."""
     camera_height_mm: float | None = None
-    """Of the camera above the occlusal plane; None for an orthographic view."""
+    """Height of the camera above the occlusal plane; None for an orthographic view."""
 
     def __post_init__(self) -> None:
         for name in ("image", "labels", "height_mm", "origin_px"):
@@ -61,19 +61,19 @@ class ReferenceRender:
 
     @property
     def teeth(self) -> Bool[np.ndarray, "h w"]:
-        """Where teeth are; the whole surface where the jaw has no labels."""
+        """Pixels that show teeth; the whole surface if the jaw has no labels."""
         on_teeth = self.labels > GUM
         return on_teeth if on_teeth.any() else self.labels != NOTHING
 
     def points_at(self, where: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "n 3"]:
-        """The points of the surface that some pixels show, in mm."""
+        """The points of the surface that the given pixels show, in mm."""
         rows, columns = np.nonzero(where)
         z = self.height_mm[where].astype(np.float64)
         plane = (np.column_stack([columns, rows]) + 0.5 - self.origin_px) * [1, -1] * self.mm_per_px
         return np.column_stack([plane / self._spread(z)[:, None], z])
 
     def on_plane(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-        """Where points are seen on the occlusal plane, mm."""
+        """Where points appear on the occlusal plane, mm."""
         return points[:, :2] * self._spread(points[:, 2])[:, None]
 
     def _spread(self, z: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
@@ -109,20 +109,22 @@ class DeviationStatistics:
 
 @dataclass(frozen=True, kw_only=True)
 class CrownCompleteness:
-    """How much of the crown surface that is open to some direction a scan has, whether or not a camera could see it."""
+    """How much of the crown surface that is open to some direction the scan covers, whether or not a camera could see
+    it."""
 
     completeness_pct: Mapping[str, float]
-    """Share of the open crown surface of the teeth that count within 50, 100, 200 um of the scan, keys "50", ..."""
+    """Share of the open crown surface of the evaluated teeth within 50, 100, 200 um of the scan, keys "50", ..."""
     open_mm2: float
     """Area of that surface."""
     teeth: tuple[int, ...]
-    """FDI numbers of the teeth that count in ``completeness_pct``: those that the scan was meant for."""
+    """FDI numbers of the teeth evaluated in ``completeness_pct``: those that the scan was meant for."""
     per_tooth_pct: Mapping[int, Mapping[str, float]]
-    """As ``completeness_pct``, by FDI number, of each tooth of which anything was in reach."""
+    """As ``completeness_pct``, by FDI number, for each tooth with any surface in reach."""
     estimated: bool
-    """Whether crowns were told from gum by shape, for want of tooth labels; then nothing is said tooth by tooth."""
+    """Whether crowns were separated from gum by shape, for lack of tooth labels; there are then no figures per
+    tooth."""
     note: str
-    """What is evaluated, for people."""
+    """What is evaluated, in one human-readable line."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -130,9 +132,9 @@ class Trueness:
     """Result of an evaluation."""
 
     accuracy: DeviationStatistics
-    """Scan to reference, where the reference is evaluated (what two cameras could see, where that is known)."""
+    """Scan to reference, where the reference is evaluated (what two cameras could see, if that is known)."""
     everything: DeviationStatistics
-    """Scan to reference, with everything that was scanned but what lies past an open border of the reference."""
+    """Scan to reference, for everything that was scanned except what lies past an open border of the reference."""
     completeness: DeviationStatistics
     """Reference to scan."""
     completeness_pct: Mapping[str, float]
@@ -144,11 +146,11 @@ class Trueness:
     per_tooth_completeness_pct: Mapping[int, Mapping[str, float]]
     """As ``completeness_pct``, by FDI number."""
     crown: CrownCompleteness | None
-    """Of all open crown surface; None where nothing of a crown was in reach or none is known."""
+    """For all open crown surface; None if no crown was in reach or none is known."""
     scale_error_ppm: float
-    """Best similarity's scale minus one, reported apart and never applied."""
+    """Scale of the best similarity, minus one; reported separately and never applied."""
     inter_molar_error_um: float | None
-    """Error of the distance between the first molars (else second), or None without labels for both."""
+    """Error of the distance between the first molars (otherwise the second), or None without labels for both."""
     inter_canine_error_um: float | None
     """Error of the distance between the canines, or None."""
     drift_um: Mapping[int, float]
@@ -158,7 +160,7 @@ class Trueness:
     deviation_um: Float[np.ndarray, "v"]
     """Signed deviation of each vertex of the scan; NaN where the vertex is not evaluated."""
     within_sigmas_pct: Mapping[str, float] | None = None
-    """Share of the evaluated vertices within 1 and 2 of the standard deviations that the scan itself expected, keys "1"
-    and "2" (68 and 95 where all errors are random and accounted for); None where it expected nothing."""
+    """Share of the evaluated vertices within 1 and 2 of the standard deviations that the scan itself predicted, keys
+    "1" and "2" (68 and 95 if all errors are random and accounted for); None if it predicted none."""
     notes: tuple[str, ...] = field(default=())
-    """What a reader should know, for example how the scannable surface was chosen."""
+    """What a reader should know, for example how the scannable surface was determined."""

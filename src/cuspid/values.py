@@ -1,4 +1,4 @@
-"""Values from outside, checked once where they come in: numbers that can be reckoned with, names that can be files.
+"""Values from outside, checked once where they come in: numbers that can be computed with, names that can be files.
 
 ``what`` names the value in the one line that an error shows, for example ``rig.json: camera a: focal_px``.
 """
@@ -14,21 +14,22 @@ from jaxtyping import Float
 from cuspid.errors import InputError
 
 LONGEST_MM = 1e5
-"""No place, distance or size of a handpiece or of a jaw is farther than this."""
+"""Upper limit of every position, distance or size of a handpiece or a jaw."""
 MOST_PX = 65_535
-"""Sides of an image; what PNG and JPEG files of cameras stay below."""
+"""Largest side of an image; PNG and JPEG files of cameras stay below."""
 _LONGEST_NAME = 100
 _NOT_IN_FILES = '/\\:*?"<>|'
 _SHOWN = 40
 _ROUNDING = 1e-6
-"""Least eigenvalue of a covariance, as a share of the largest, that counts as zero."""
+"""Smallest eigenvalue of a covariance, as a share of the largest, that counts as zero."""
 
 
 def checked_name(what: str, value: object) -> str:
-    """A name that can be the stem of a file, or of one in folders (``rig/left``), on any system and nowhere else.
+    """A name that can be the stem of a file, or of one in subfolders (``rig/left``), on any system, and leads nowhere
+    else.
 
     Raises InputError for one that is empty or too long, or where a part of it is empty, begins with a dot, or has a
-    character that no system's files may have.
+    character that some system does not allow in file names.
     """
     if not (isinstance(value, str) and len(value) <= _LONGEST_NAME and all(map(_can_be_a_file, value.split("/")))):
         raise InputError(f"{what}: {shown(value)} cannot be a name; use letters, digits, - and _")
@@ -42,7 +43,7 @@ def _can_be_a_file(part: str) -> bool:
 
 
 def number(what: str, value: object, low: float, high: float) -> float:
-    """A finite number between two bounds (inclusive). Raises InputError."""
+    """A finite number between two bounds (inclusive). Raises InputError otherwise."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise InputError(f"{what} is {shown(value)}; it must be a number")
     if not low <= value <= high:
@@ -51,7 +52,7 @@ def number(what: str, value: object, low: float, high: float) -> float:
 
 
 def whole(what: str, value: object, low: int, high: int) -> int:
-    """A whole number between two bounds (inclusive). Raises InputError."""
+    """An integer between two bounds (inclusive). Raises InputError otherwise."""
     found = number(what, value, float(low), float(high))
     if found != int(found):
         raise InputError(f"{what} is {shown(value)}; it must be a whole number")
@@ -59,7 +60,7 @@ def whole(what: str, value: object, low: int, high: int) -> int:
 
 
 def numbers(what: str, value: Any, shape: tuple[int, ...], low: float, high: float) -> Float[np.ndarray, "..."]:
-    """Finite numbers of a shape, each between two bounds (inclusive). Raises InputError."""
+    """Finite numbers of a given shape, each between two bounds (inclusive). Raises InputError otherwise."""
     try:
         found = np.asarray(value)
         plain = found.dtype.kind in "iuf" and not _has_truth(value)
@@ -80,7 +81,7 @@ def _has_truth(value: Any) -> bool:
 
 
 def covariance(what: str, value: Any, size: int) -> Float[np.ndarray, "n n"]:
-    """A covariance matrix: symmetric, without a negative eigenvalue. Raises InputError."""
+    """A covariance matrix: symmetric, without a negative eigenvalue. Raises InputError otherwise."""
     found = numbers(what, value, (size, size), -math.inf, math.inf)
     if not np.isfinite(found).all():
         raise InputError(f"{what} is not finite; leave it out where it is not known")
@@ -98,7 +99,7 @@ def printable(text: str) -> str:
 
 
 def one_line(said: object) -> str:
-    """What a library or a file says, cut to one short line."""
+    """A message from a library or a file, cut to one short line."""
     return shown(" ".join(str(said).split()), longest=120)[1:-1]
 
 

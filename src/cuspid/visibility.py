@@ -1,9 +1,9 @@
-"""What of a surface the cameras of a handpiece could see: the rule for what is scannable, and tables of it.
+"""Which parts of a surface the cameras of a handpiece could see: the rule for what is scannable, and tables of it.
 
-A face is seen by a camera if its centre lies in the image and in the depth range of the lens, if nothing is in the way,
-and if the line of sight meets it from the front no flatter than the largest incidence (0 degrees is square on). It is
-scannable if, at one position of the handpiece at least, enough cameras see it at once. The world is the frame of the
-mesh.
+A face is seen by a camera if its centre lies in the image and in the depth range of the lens, if nothing occludes it,
+and if the line of sight meets it from the front at no more than the largest angle of incidence (0 degrees is
+perpendicular). It is scannable if, from at least one position of the handpiece, enough cameras see it at once. The
+world is the frame of the mesh.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from cuspid.options import Options, Range
 from cuspid.rig import Handpiece
 
 _AT_ONCE = (1, 2, 3)
-"""Numbers of cameras that the tables tell of."""
+"""Numbers of cameras that the tables list."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class VisibilityOptions(Options):
-    """When a face is seen."""
+    """When a face counts as seen."""
 
     maximum_incidence_deg: Annotated[float, Range(1, 90)] = 75.0
-    """Largest angle between the line of sight and the face's normal."""
+    """Largest angle between the line of sight and the normal of the face."""
     cameras: Annotated[int, Range(1, 1000)] = 2
-    """How many cameras must see a face at once."""
+    """Number of cameras that must see a face at once."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -45,11 +45,11 @@ class Visibility:
     most_at_once: Int[np.ndarray, "f"]
     """Largest number of cameras that saw it at once."""
     images: Int[np.ndarray, "f"]
-    """In how many images it was seen, of all cameras at all positions."""
+    """Number of images that show it, over all cameras and positions."""
     by_camera: Bool[np.ndarray, "f c"]
     """Whether each camera saw it from at least one position."""
     incidence_deg: Float[np.ndarray, "f"]
-    """Mean angle between the line of sight and its normal over those images; NaN where there is none."""
+    """Mean angle between the line of sight and the normal, over those images; NaN where there is none."""
 
     def __post_init__(self) -> None:
         for name in ("most_at_once", "images", "by_camera", "incidence_deg"):
@@ -77,7 +77,7 @@ def visible_counts(
     options: VisibilityOptions,
     among: Bool[np.ndarray, "f"] | None = None,
 ) -> Int[np.ndarray, "f"]:
-    """For each face: the largest number of cameras that see it at once; 0 for those that are not ``among`` them."""
+    """For each face, the largest number of cameras that see it at once; 0 for faces that are not in ``among``."""
     most = np.zeros(len(mesh.faces), dtype=np.int64)
     views = _views(handpiece)
     for pose in rig_from_world:
@@ -90,7 +90,7 @@ def visible_counts(
 def survey_visibility(
     mesh: Mesh, handpiece: Handpiece, rig_from_world: Iterable[Rigid3], options: VisibilityOptions
 ) -> Visibility:
-    """What each camera sees of each face, and how steeply, over all poses."""
+    """What each camera sees of each face, and at what incidence, over all poses."""
     count, names = len(mesh.faces), handpiece.rig.names
     most, images = np.zeros((2, count), dtype=np.int64)
     by_camera, angles_deg = np.zeros((count, len(names)), dtype=bool), np.zeros(count)
@@ -114,7 +114,7 @@ def visible_faces(
     options: VisibilityOptions,
     among: Int[np.ndarray, "m"] | None = None,
 ) -> Int[np.ndarray, "n"]:
-    """Indices of the faces that one camera sees; only those ``among`` are asked for, but all are in the way."""
+    """Indices of the faces that one camera sees; only those in ``among`` are tested, but all can occlude."""
     view = _view(camera, Rigid3.identity(), depth_range_mm)
     return _visible_among(mesh, view, cam_from_world, options, np.arange(len(mesh.faces)) if among is None else among)
 
@@ -128,7 +128,7 @@ def surface_rows(
     """One flat row for each surface that has any area: shares of it that at least 1, 2 and 3 cameras see at once.
 
     ``cameras_mean``: mean over the area of the largest number of cameras at once; ``incidence_mean_deg``: mean over the
-    area that is seen, None where nothing is.
+    area that is seen, None if none is.
     """
     return [
         {"surface": name, **_row(visibility, np.where(mask, areas_mm2, 0.0))}

@@ -1,4 +1,4 @@
-"""How many cores this process may use, and work that is spread over them."""
+"""How many cores this process may use, and the distribution of work over them."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _Result = TypeVar("_Result")
 
 
 def core_numbers(thread: int = 0) -> list[int]:
-    """The cores that a thread may run on, by their numbers: the calling one's, or those of a process by its id.
+    """The numbers of the cores that a thread may run on: those of the calling thread, or of a process given its id.
 
-    All cores where the system does not tell.
+    All cores if the system does not tell.
     """
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(thread))
@@ -28,17 +28,17 @@ def core_numbers(thread: int = 0) -> list[int]:
 
 
 def usable_cores() -> int:
-    """Number of cores that the calling thread, and those that it starts, may run on: a case of a study has one."""
+    """Number of cores that the calling thread, and those that it starts, may run on; a case of a study has one."""
     return len(core_numbers())
 
 
 def map_in_threads(
     work: Callable[[_Item], _Result], items: Iterable[_Item], *, stage: str = "", progress: Progress = silent
 ) -> list[_Result]:
-    """``work`` on each item, in a thread for each usable core; results in the order of the items.
+    """``work`` on each item, in one thread per usable core; results in the order of the items.
 
-    Of errors the first in that order is raised, and items that were not begun are left. ``progress`` is called
-    with ``stage`` after each.
+    If there are errors, the first in that order is raised, and items that were not started are skipped. ``progress`` is
+    called with ``stage`` after each.
     """
     results: list[_Result] = []
     with ThreadPoolExecutor(usable_cores()) as pool:
@@ -53,7 +53,7 @@ def map_in_threads(
 
 
 def map_ahead(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
-    """``work`` on each item, in threads that run one item for each usable core ahead of what was taken; results in the
+    """``work`` on each item, in threads that run one item per usable core ahead of what was consumed; results in the
     order of the items, which are read as they are needed."""
     ahead = usable_cores()
     jobs = deque[Future[_Result]]()
@@ -70,7 +70,8 @@ def map_ahead(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> Itera
 
 
 def beside_work_ahead() -> int:
-    """Into how many parts to cut what is done with each result of :func:`map_ahead`, whose threads go on meanwhile."""
+    """Number of parts into which to cut what is done with each result of :func:`map_ahead`, whose threads run
+    meanwhile."""
     return max(usable_cores() // 2, 1)
 
 
@@ -79,8 +80,8 @@ def map_slices(
 ) -> list[_Result]:
     """``work``, which must release the GIL, on consecutive slices of ``count`` items, in threads; results in order.
 
-    One slice for each usable core, or so many ``parts`` where the result depends on where they are cut. Of fewer items
-    than ``few`` the slices are worked on one after the other: they are done before threads have started.
+    One slice per usable core, or so many ``parts`` if the result depends on where they are cut. For fewer items than
+    ``few``, the slices are processed one after the other: they are done before threads have started.
     """
     bounds = np.linspace(0, count, (parts or usable_cores()) + 1).astype(int)
     slices = [slice(*ends) for ends in pairwise(bounds.tolist())]

@@ -253,30 +253,32 @@ class Anatomy:
 
 @dataclass(frozen=True, kw_only=True)
 class MouthOptions(Options):
-    """The handpiece, and whom it is to fit."""
+    """The handpiece, and the people whom it should fit."""
 
     thickness_mm: Annotated[float, Range(0, 1000)] = 7.0
     """Thickness of the handpiece between the jaws."""
     working_distance_mm: Annotated[float, Range(0, 1000)] = 5.0
-    """From its cameras to the teeth."""
+    """Distance from its cameras to the teeth."""
     clearance_mm: Annotated[float, Range(0, 1000)] = 0.0
-    """Room to spare."""
+    """Spare room."""
     study: Study = "india-2012"
-    """Whose mouth openings: a survey of 894 adults, of 452 young adults, or the thesis' (Rieder's intervals)."""
+    """Source of the mouth openings: a survey of 894 adults, one of 452 young adults, or the thesis (Rieder's
+    intervals)."""
     held: Annotated[float, Range(0.01, 1)] = 1.0
-    """Part of the maximal opening that is held during a scan; the condyles slide in proportion."""
+    """Share of the maximal opening that is held during a scan; the condyles slide in proportion."""
     overlap: bool = True
     """Add the vertical overlap of the incisors to the opening; without it the room is underestimated."""
     ramus: bool = False
-    """Take the ramus height for the depth of the occlusal plane, as the thesis does."""
+    """Use the ramus height as the depth of the occlusal plane, as the thesis does."""
     vertical: bool = False
-    """Judge by the vertical distance of the occlusal planes, V, instead of the straight one of the teeth, L."""
+    """Judge by the vertical distance between the occlusal planes, V, instead of the straight distance between the
+    teeth, L."""
     correlation: Annotated[float, Range(-1, 1)] = 0.0
-    """Correlation between opening and condyle-incisor distance; not known, so none is assumed."""
+    """Correlation between opening and condyle-incisor distance; it is not known, so the default assumes none."""
     people: Annotated[int, Range(1, 10_000_000)] = 20_000
-    """How many men and how many women are drawn."""
+    """Number of men, and of women, that are drawn."""
     seed: Annotated[int, SEED] = 0
-    """Seed of the draw."""
+    """Seed of the random draw."""
 
     @property
     def total_mm(self) -> float:

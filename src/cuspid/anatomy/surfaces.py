@@ -50,7 +50,7 @@ Local = Float[np.ndarray, "n 3"]
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceOptions(Options):
-    """Where surfaces end."""
+    """Where the named surfaces of a tooth end."""
 
     incisal_mm: Annotated[float, Range(0.01, 100)] = 1.0
     """Height of the incisal surface."""

@@ -1,13 +1,13 @@
-"""One adjustment of cameras, of the places of the board, and of its bending.
+"""One adjustment of the cameras, the poses of the board, and its bending.
 
 A corner X of the board is seen by camera c at instant i at ``project(c, cam_from_rig[c] @ rig_from_board[i] @ X)``.
-Unknowns and how a step changes them: of each camera (fx, fy, cx, cy, k1, k2, p1, p2) by addition, and its place by a
-small motion (rotation vector rad, translation mm) on the left of ``cam_from_rig``; the place of the board at each
-instant by one on the left of ``rig_from_board``; and three numbers of a board that is not quite flat: out of its plane
-by b1 u^2 + b2 u v + b3 v^2 mm at the distances u and v, in units of half its diagonal, from its middle. One with
-terraces is a solid body and not bent: there b1 is by how much each step is higher than given, and b2 and b3 are 0.
+Unknowns and how a step changes them: for each camera, (fx, fy, cx, cy, k1, k2, p1, p2) by addition, and its pose by a
+small motion (rotation vector rad, translation mm) on the left of ``cam_from_rig``; the pose of the board at each
+instant, by one on the left of ``rig_from_board``; and three parameters of a board that is not quite flat: out of its
+plane by b1 u^2 + b2 u v + b3 v^2 mm at the distances u and v, in units of half its diagonal, from its middle. A board
+with terraces is a solid body and not bent: there b1 is how much higher than given each step is, and b2 and b3 are 0.
 
-The rig is where the first camera is; for the covariance it is where the cameras are on the whole (inner constraints,
+The rig frame is that of the first camera; for the covariance it is defined by all cameras together (inner constraints,
 Triggs et al. 2000, section 9.2), so that no camera counts as exact.
 """
 
@@ -31,48 +31,50 @@ from cuspid.rig import MountedCamera
 
 _INTRINSICS, _PLACE, _BENDING = 8, 6, 3
 _DISTORTION_SIGMA = np.array([0.5, 0.5, 0.01, 0.01])
-"""Standard deviation of (k1, k2, p1, p2) about 0, of lenses as they are made: it decides where the images do not."""
+"""Standard deviation of (k1, k2, p1, p2) about 0, for lenses as they are made: it matters only where the images do not
+decide."""
 _CENTRE_SHARE = 0.05
-"""Standard deviation of the principal point about the middle of the image, as a share of its width."""
+"""Standard deviation of the principal point about the image centre, as a share of the image width."""
 _BENDING_SHARE = 0.01
 """Standard deviation of the bending, as a share of half the diagonal of the board."""
 _KNEE = 2.5
-"""Residuals, in standard deviations, beyond which they count less (Huber)."""
+"""Residuals beyond this, in standard deviations, have less weight (Huber)."""
 _STEPS, _SETTLED = 100, 0.01
-"""Most steps; and the fall of the cost, in squared standard deviations, that is not worth another one."""
+"""Maximum number of steps; and the decrease of the cost, in squared standard deviations, below which iteration ends."""
 _MOST_DAMPING = 1e8
-"""Of a step, as a share of the diagonal of the normal equations."""
+"""Largest damping of a step, as a share of the diagonal of the normal equations."""
 _LEAST_SIGMA_PX = 1e-6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BoardScene:
-    """Cameras, and where the board was."""
+    """Cameras, and the poses of the board."""
 
     cameras: Mapping[str, Camera]
-    """By name; the first one is where the rig is."""
+    """Cameras by name; the frame of the first one is the rig frame."""
     cam_from_rig: Mapping[str, Rigid3]
-    """Their places."""
+    """Poses of the cameras."""
     rig_from_board: Mapping[str, Rigid3]
-    """Of the board at each instant."""
+    """Pose of the board at each instant."""
     bending_mm: Float[np.ndarray, "3"]
-    """Out of the plane, of u^2, u v and v^2; with terraces that by which each step is higher than given, and zeros."""
+    """Deviation from the plane, of u^2, u v and v^2; with terraces, how much higher than given each step is, and
+    zeros."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Adjusted:
-    """What an adjustment found."""
+    """Result of an adjustment."""
 
     scene: BoardScene
-    """The best one."""
+    """The best scene."""
     sigma_px: float
-    """Standard deviation of a coordinate of a corner."""
+    """Standard deviation of one coordinate of a corner."""
     residuals: Mapping[tuple[str, str], Float[np.ndarray, "n 2"]]
-    """Seen minus projected, px, by camera and instant."""
+    """Observed minus projected, px, by camera and instant."""
     covariance: Float[np.ndarray, "k k"]
-    """Of the cameras: the parameters of each in order, then the motion of each."""
+    """Covariance of the cameras: the parameters of each in order, then the motion of each."""
     settled: bool
-    """Whether the search for the best one came to its end."""
+    """Whether the search for the minimum converged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,18 +120,18 @@ def _basis(board: Board, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, 
 def bent(
     board: Board, points: Float[np.ndarray, "n 3"], bending_mm: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Places on a board as it is given, where they are on the bent one, mm."""
+    """Points of the board as it is given, moved to where they are on the bent one, mm."""
     return points + (_basis(board, points) @ bending_mm)[:, None] * [0.0, 0.0, 1.0]
 
 
 def bending_coordinates(board: Board, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-    """u and v of places on a board."""
+    """u and v of points on a board."""
     size = np.array(board.size_mm)
     return np.asarray((points[:, :2] - size / 2) / (np.linalg.norm(size) / 2))
 
 
 def of_instants(scene: BoardScene, instants: set[str]) -> BoardScene:
-    """With the board at these instants alone."""
+    """The scene with the board at these instants only."""
     kept = {name: pose for name, pose in scene.rig_from_board.items() if name in instants}
     return replace(scene, rig_from_board=kept)
 
@@ -271,10 +273,10 @@ def _bending_sigma_mm(board: Board) -> float:
 
 
 def adjust_board(start: BoardScene, views: Views, board: Board, *, only_boards: bool = False) -> Adjusted:
-    """The scene under which the corners are seen where they were, and how well that is known (Levenberg-Marquardt on
-    Huber's loss; its scale is found from the residuals). With ``only_boards`` the cameras and the bending stay.
+    """The scene that best explains the observed corners, and its uncertainty (Levenberg-Marquardt on the Huber loss;
+    its scale is found from the residuals). With ``only_boards``, cameras and bending are held fixed.
 
-    Raises ReconstructionError where the images leave something open to rounding, or a corner lies behind a camera.
+    Raises ReconstructionError where the images leave something undetermined, or a corner lies behind a camera.
     """
     seen = _Observations.of(views, board, list(start.cameras), list(start.rig_from_board))
     free = _Free.of(start, board, only_boards=only_boards)
@@ -293,7 +295,7 @@ def adjust_board(start: BoardScene, views: Views, board: Board, *, only_boards: 
 
 
 def in_front(scene: BoardScene, views: Views, board: Board) -> dict[tuple[str, str], BoardView]:
-    """The views of which every corner lies before the camera."""
+    """The views of which every corner lies in front of the camera."""
     seen = _Observations.of(views, board, list(scene.cameras), list(scene.rig_from_board))
     residuals = np.split(_project(scene, seen)[2], seen.starts[1:-1])
     return {key: views[key] for key, each in zip(seen.keys, residuals, strict=True) if np.isfinite(each).all()}
@@ -430,7 +432,7 @@ def _camera_covariance(matrix: Float[np.ndarray, "k k"], scene: BoardScene, free
 
 
 def common_free(scene: BoardScene, motions: Sequence[Float[np.ndarray, "6"]]) -> Float[np.ndarray, "c 6"]:
-    """Small motions of the cameras without what the rig as a whole has of them."""
+    """Small motions of the cameras without the part that is common to the rig as a whole."""
     return np.asarray((_without_common_motion(scene) @ np.concatenate(motions)).reshape(-1, _PLACE))
 
 

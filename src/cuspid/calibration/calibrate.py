@@ -1,5 +1,5 @@
-"""From views of a board to a rig that knows how well it is known: start, adjust, leave out what does not fit, and
-try the result on views that it was not made from."""
+"""From views of a board to a rig with its uncertainty: initialise, adjust, leave out what does not fit, and test the
+result on views that were not used for it."""
 
 from __future__ import annotations
 
@@ -30,68 +30,69 @@ from cuspid.options import Options, Range
 from cuspid.rig import MountedCamera, Rig
 
 _DOUBTFUL = 2.0
-"""Standard deviations between two halves that chance hardly explains."""
+"""Difference between two halves, in standard deviations, that chance hardly explains."""
 _MUCH_MORE = 3.0
-"""Residuals together with other cameras, over those alone."""
+"""Ratio of the residuals together with other cameras to those alone, beyond which a note is given."""
 _OPEN_SHARE = 0.01
-"""Standard deviation of a focal length, as a share of it, of which is told."""
+"""Standard deviation of a focal length, as a share of it, beyond which a note is given."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrationOptions(Options):
-    """What is left out."""
+    """Which views are left out."""
 
     outlier_sigmas: Annotated[float, Range(2, 1000)] = 4.0
-    """A view whose residuals have an RMS beyond this, in standard deviations of all or of its camera's, is left out."""
+    """A view is left out if the RMS of its residuals is beyond this, in standard deviations of all residuals or of its
+    camera's."""
     rounds: Annotated[int, Range(1, 100)] = 5
-    """Number of times that views are left out, at most."""
+    """Maximum number of times that views are left out."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraCheck:
-    """How a camera did."""
+    """Quality of the calibration of one camera."""
 
     views: int
-    """Of the board that were used."""
+    """Number of views of the board that were used."""
     corners: int
-    """In them."""
+    """Number of corners in them."""
     rms_px: float
-    """Of the residuals."""
+    """RMS of the residuals."""
     alone_px: float
-    """Standard deviation of the residuals where the camera is calibrated from its views alone."""
+    """Standard deviation of the residuals if the camera is calibrated from its own views alone."""
     held_out_px: float | None
-    """RMS in views that the calibration was not made from; None where there were too few to make two."""
+    """RMS in views that the calibration was not made from; None if there were too few views for halves."""
     parameters_apart: float | None
-    """Difference of the parameters from two halves of the instants, in the standard deviations that both state; about
-    1 where these are true."""
+    """Difference between the parameters from two halves of the instants, in the standard deviations that both state;
+    about 1 if these are right."""
     place_apart: float | None
-    """The same of the place in the rig."""
+    """The same for the pose in the rig."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RigCalibration:
-    """A rig, and how well its images of the board agree with it."""
+    """A rig, and how well the images of the board agree with it."""
 
     rig: Rig
-    """With covariances, in the frame of its first camera."""
+    """The rig with covariances, in the frame of its first camera."""
     sigma_px: float
-    """Standard deviation of a coordinate of a corner."""
+    """Standard deviation of one coordinate of a corner."""
     bending_mm: Float[np.ndarray, "3"]
-    """Of the board, or the error of its steps, see :mod:`cuspid.calibration.bundle`."""
+    """Bending of the board, or the error of its steps; see :mod:`cuspid.calibration.bundle`."""
     cameras: Mapping[str, CameraCheck]
-    """By name."""
+    """Checks by camera."""
     pixels: Mapping[str, Float[np.ndarray, "n 2"]]
-    """Where each camera saw corners."""
+    """Where each camera saw corners, px."""
     residuals: Mapping[str, Float[np.ndarray, "n 2"]]
-    """Seen minus projected, px."""
+    """Observed minus projected, px."""
     views: Views
-    """That were used."""
+    """The views that were used."""
     rig_from_board: Mapping[str, Rigid3]
-    """Of the board at each instant."""
+    """Pose of the board at each instant."""
     distance_mm: float
     """Median distance of the board from the cameras."""
     notes: tuple[str, ...]
-    """What was left out and why, a line each."""
+    """What was left out and why, one line each."""
 
 
 def calibrate_rig(
@@ -181,9 +182,10 @@ def _rms(residuals: Float[np.ndarray, "n 2"]) -> float:
 
 
 def in_frame_of(found: RigCalibration, drawn: Rig) -> RigCalibration:
-    """A calibration in the frame of the drawn rig: with its cameras where those are, on the whole.
+    """A calibration in the frame of the drawn rig, fitted so that its cameras on the whole lie where the drawn ones
+    are.
 
-    Raises InputError where these are not the same cameras.
+    Raises InputError if the two rigs do not have the same cameras.
     """
     if set(drawn.names) != set(found.rig.names):
         raise InputError(
@@ -313,7 +315,7 @@ def _apart(one: Adjusted, other: Adjusted) -> dict[str, tuple[float, float]]:
 
 
 def known(covariance: Float[np.ndarray, "n n"] | None) -> Float[np.ndarray, "n n"]:
-    """Of a camera that was calibrated here, which always has one."""
+    """The covariance of a camera that was calibrated here, which always has one."""
     if covariance is None:
         raise ValueError("a calibration without covariance")
     return covariance

@@ -13,7 +13,7 @@ from cuspid.board import Board
 from cuspid.camera import OPENCV_PIXEL_OFFSET
 
 LEAST_CORNERS = 6
-"""A view of fewer tells nothing."""
+"""Minimum number of corners in a usable view."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,7 @@ class BoardView:
     corner: Int[np.ndarray, "n"]
     """Their numbers on the board."""
     pixels: Float[np.ndarray, "n 2"]
-    """Where they lie, px."""
+    """Positions in the image, px."""
 
     def renumbered(self, order: Int[np.ndarray, "k"]) -> BoardView:
         """The same view under another numbering of the corners (``Board.orders``)."""
@@ -31,15 +31,15 @@ class BoardView:
 
 
 Views = Mapping[tuple[str, str], BoardView]
-"""Of the board, by camera and instant."""
+"""Views of the board, by camera and instant."""
 
 
 def find_corners(gray: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | None:
-    """The corners of the board in an image, to a fraction of a pixel; None where too few are found.
+    """The corners of the board in an image, to a fraction of a pixel; None if too few are found.
 
-    A plain chessboard must be seen whole (A. Duda, U. Frese, BMVC 2018); of a ChArUco board any part may
-    (S. Garrido-Jurado et al., Pattern Recognition 47, 2014). Each corner is looked for where the two markers beside
-    it say, so that steps elsewhere do not matter.
+    A plain chessboard must be seen completely (A. Duda, U. Frese, BMVC 2018); of a ChArUco board any part may be seen
+    (S. Garrido-Jurado et al., Pattern Recognition 47, 2014). Each corner is searched for where the two markers beside
+    it predict it, so that steps elsewhere do not matter.
     """
     image = 255 - gray if board.inverted else gray
     found = _charuco(image, board) if board.kind == "charuco" else _chessboard(image, board)

@@ -1,4 +1,4 @@
-"""The noise of a camera, from how the pixels of uniform patches scatter."""
+"""The noise of a camera, from the scatter of the pixels in uniform patches."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ _ROUNDING_DN2 = 1 / 12
 """Variance that rounding to whole numbers adds."""
 _ROUNDS = 8
 _TOO_MUCH = 4.0
-"""Of the expected variance: more is no noise."""
+"""Multiple of the expected variance above which it is not noise."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Noise:
-    """Variance that grows with the level: that of :class:`cuspid.rig.Sensor`."""
+    """Variance that grows with the level, as in :class:`cuspid.rig.Sensor`."""
 
     read_dn2: float
-    """At level 0, rounding included."""
+    """Variance at level 0, including rounding."""
     per_dn: float
-    """What each digital number of the level adds."""
+    """Increase of the variance per digital number of level."""
     noise_sigma_dn: float
-    """Standard deviation of the noise at mid grey, of what is found."""
+    """Standard deviation of the estimated noise at mid grey."""
     levels_dn: Float[np.ndarray, "n"]
-    """Of the patches."""
+    """Levels of the patches."""
     variances_dn2: Float[np.ndarray, "n"]
-    """Of the patches."""
+    """Variances of the patches."""
 
     @property
     def noise_dn(self) -> float:
@@ -45,13 +45,13 @@ class Noise:
         return float(np.clip(self.per_dn * MID_GREY_DN / self.noise_dn**2, 0, 1))
 
     def sigma_dn(self, level_dn: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """Standard deviation of a pixel in a channel."""
+        """Standard deviation of one pixel in one channel."""
         return np.asarray(np.sqrt(np.maximum(self.read_dn2 + self.per_dn * level_dn, _ROUNDING_DN2)))
 
 
 def noise_of(patches: Patches) -> Noise:
-    """A line through the variances of patches over their levels; each is weighted by how well it is known (the variance
-    of a variance goes with its square), and what is far too large is left out."""
+    """A line fitted to the variances of patches over their levels; each is weighted by how well it is known (the
+    variance of a variance goes with its square), and variances that are far too large are left out."""
     by = np.column_stack([np.ones(len(patches.level_dn)), patches.level_dn])
     expected = _usual(patches)
     for _ in range(_ROUNDS):

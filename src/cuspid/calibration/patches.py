@@ -1,4 +1,4 @@
-"""Grey values of paper and ink in an image of a board whose place is known: windows well inside what is uniform."""
+"""Grey values of paper and ink in an image of a board whose pose is known, in windows well inside uniform areas."""
 
 from __future__ import annotations
 
@@ -17,54 +17,54 @@ from cuspid.geometry import Rigid3
 from cuspid.options import Options, Range
 
 BRIGHTEST_DN, DARKEST_DN = 245.0, 8.0
-"""Beyond these a mean may have been clipped."""
+"""Beyond these levels, a mean may have been clipped."""
 _CELLS = 32
-"""Cells of a square along each side, in which places are looked for."""
+"""Number of cells along each side of a square, among which places are searched for."""
 _APART = 4
-"""Cells between two places at least."""
+"""Minimum number of cells between two places."""
 _HALF_CELL = 0.75
-"""From the middle of a cell to its corners at most, a little more."""
+"""Distance from the middle of a cell to its corners, rounded up."""
 _LEAST_CELLS = 1.0
-"""Clearance of a place at least."""
+"""Minimum clearance of a place, in cells."""
 _WINDOW = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), axis=-1).reshape(-1, 2)
-"""Rows and columns of a window about its middle."""
+"""Rows and columns of a window relative to its middle."""
 VALUES = 3 * len(_WINDOW)
-"""That are averaged: three channels of a window."""
+"""Number of values that are averaged: three channels of a window."""
 _PLANE = np.column_stack([np.ones(len(_WINDOW)), _WINDOW])
 _OFF_PLANE = np.eye(len(_WINDOW)) - _PLANE @ np.linalg.pinv(_PLANE)
-"""Takes from a window the plane that fits it best."""
+"""Subtracts from a window the plane that fits it best."""
 FREEDOM = 3 * (len(_WINDOW) - _PLANE.shape[1])
 """Degrees of freedom of the variance of a patch."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PatchOptions(Options):
-    """Where grey values are taken."""
+    """Where grey values are measured."""
 
     clear_px: Annotated[float, Range(2, 100)] = 3.0
-    """From the middle of a patch to where paper and ink meet; more where images are blurred."""
+    """Minimum distance from the middle of a patch to where paper and ink meet; larger if images are blurred."""
     patches: Annotated[int, Range(6, 10_000)] = 60
-    """Of an image at most, of paper and ink together."""
+    """Maximum number of patches per image, of paper and ink together."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Places:
-    """Where a board is uniform around."""
+    """Places on the board with uniform surroundings."""
 
     points: Float[np.ndarray, "n 2"]
-    """Seen from straight above, mm."""
+    """Positions, seen from straight above, mm."""
     clearance_mm: Float[np.ndarray, "n"]
-    """To where paper and ink meet, or an edge."""
+    """Distance to where paper and ink meet, or to an edge."""
     dark: Bool[np.ndarray, "n"]
     """Whether it is ink."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Patches:
-    """Windows of 3 x 3 pixels that see paper or ink alone."""
+    """Windows of 3 x 3 pixels that see only paper or only ink."""
 
     pixels: Float[np.ndarray, "n 2"]
-    """Their middles, px."""
+    """Centres of the windows, px."""
     points: Float[np.ndarray, "n 3"]
     """What they see, in the frame of the board, mm."""
     dark: Bool[np.ndarray, "n"]
@@ -72,25 +72,25 @@ class Patches:
     level_dn: Float[np.ndarray, "n"]
     """Mean of the pixels and channels."""
     variance_dn2: Float[np.ndarray, "n"]
-    """Of a pixel in a channel, about the plane that fits the window best."""
+    """Variance of one pixel in one channel, about the plane that fits the window best."""
 
     @property
     def usable(self) -> Bool[np.ndarray, "n"]:
-        """Neither burnt out nor black."""
+        """Which patches are neither burnt out nor black."""
         return (self.level_dn < BRIGHTEST_DN) & (self.level_dn > DARKEST_DN)
 
     def take(self, chosen: Bool[np.ndarray, "n"] | Int[np.ndarray, "m"]) -> Patches:
-        """Some of them."""
+        """A selection of them."""
         return Patches(**{each.name: getattr(self, each.name)[chosen] for each in fields(self)})
 
 
 def joined_patches(parts: Sequence[Patches]) -> Patches:
-    """All of several, in order."""
+    """All patches of several sets, in order."""
     return Patches(**{each.name: np.concatenate([getattr(p, each.name) for p in parts]) for each in fields(Patches)})
 
 
 def clear_places(board: Board) -> Places:
-    """The middles of what is uniform: the clearest cells of a fine grid, none next to another."""
+    """The centres of uniform areas: the cells of a fine grid with the largest clearance, none next to another."""
     dark = _cells(board)
     far = np.where(dark, _to_edge(dark), _to_edge(~dark))
     far = np.minimum(far, _to_step(board)[None])

@@ -1,6 +1,7 @@
-"""From images of a board whose places are known to what the cameras make of light, and where the lights are.
+"""Photometric calibration from images of a board whose poses are known: how cameras respond to light, and where the
+lights are.
 
-What cannot be told from the images keeps what was given, and a note says so.
+What the images do not determine keeps its given value, and a note says so.
 """
 
 from __future__ import annotations
@@ -46,74 +47,76 @@ from cuspid.workers import map_in_threads
 
 Image = UInt8[np.ndarray, "h w 3"]
 ViewPatches = Mapping[tuple[str, str], Patches]
-"""By camera and instant."""
+"""Patches by camera and instant."""
 
 _LEAST_PATCHES = 50
-"""A camera with fewer is left out."""
+"""Minimum number of patches of a camera; one with fewer is left out."""
 _LEAST_INSTANTS = 4
-"""To be divided into halves that both say something."""
+"""Minimum number of instants for two halves that are both meaningful."""
 _FALLOFF_SIGMA = 1.0
-"""Of the terms of a falloff about none (logarithm of light)."""
+"""Prior standard deviation of the terms of a falloff, about none (logarithm of light)."""
 _OUTLYING = 5.0
-"""Standard deviations of a residual that is not of noise: a highlight, dirt."""
+"""Residual, in standard deviations, beyond which it is not noise: a highlight, dirt."""
 _MANY_BURNT, _MANY_OUTLYING = 0.2, 0.05
-"""Shares of the patches of a camera (of paper, and of all) that are told of."""
+"""Shares of burnt-out patches (of those of paper) and of outliers (of all) of a camera, beyond which a note is
+given."""
 _FOREIGN = 0.1
-"""Deviation of the light from that of the lamps (logarithm) beyond which it is not theirs."""
+"""Deviation of the light from that of the lamps (logarithm) beyond which it comes from elsewhere."""
 _OPEN_CORNER = 0.05
-"""Standard deviation of the light in the corners of which is told."""
+"""Standard deviation of the light in the corners beyond which a note is given."""
 _TOLD = 0.7
-"""A standard deviation that is less than this share of what it was before: the images have told something."""
+"""The images have determined a parameter if its standard deviation is less than this share of what it was before."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PhotometryOptions(PatchOptions):
-    """What is found of gain, falloff, noise and lights, and what is known of them before (standard deviations)."""
+    """Which of gain, falloff, noise and lights are calibrated, and what is known of them beforehand (standard
+    deviations)."""
 
     photometry: bool = True
-    """Find what the cameras make of light, too."""
+    """Also calibrate the response of the cameras to light."""
     gamma: Annotated[float | None, Range(0.1, 10)] = None
-    """Encoding exponent of the images; default: of the drawn handpiece, or 2.2."""
+    """Encoding exponent of the images; default: that of the drawn handpiece, or 2.2."""
     gamma_pct: Annotated[float, Range(0, 50)] = 5.0
-    """How well that is known; 0 is exactly."""
+    """Uncertainty of gamma, per cent; 0 is exact."""
     led_um: Annotated[float, Range(0.1, 100_000)] = 200.0
-    """How well the places of drawn lights are known, each axis."""
+    """Uncertainty of the positions of drawn lights, each axis."""
     led_power_pct: Annotated[float, Range(0.01, 100)] = 20.0
-    """How well their powers are known, against each other."""
+    """Uncertainty of the powers of drawn lights relative to each other, per cent."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraLight:
-    """What a camera makes of light, with standard deviations."""
+    """Response of one camera to light, with standard deviations."""
 
     patches: int
-    """That were used."""
+    """Number of patches that were used."""
     clipped_pct: float
-    """Of all patches: burnt out or black, and not used."""
+    """Percentage of all patches that were burnt out or black, and not used."""
     gain: float
-    """Over the geometric mean of the cameras, in linear light."""
+    """Gain relative to the geometric mean of the cameras, in linear light."""
     gain_sigma_pct: float
-    """Of it."""
+    """Standard deviation of the gain."""
     corner_loss_pct: float
     """Light that is lost in the corners of the image."""
     corner_loss_sigma_pct: float
-    """In the same unit."""
+    """Standard deviation of the corner loss, in the same unit."""
     gamma: float
     """Encoding exponent."""
     gamma_sigma_pct: float
-    """Of it."""
+    """Standard deviation of gamma."""
     noise_dn: float
-    """Standard deviation at mid grey."""
+    """Standard deviation of the noise at mid grey."""
     noise_sigma_dn: float
-    """Of that."""
+    """Standard deviation of that value."""
     shot_noise_share: float
     """See :attr:`cuspid.rig.Sensor.shot_noise_share`."""
     before_pct: float
-    """Residuals, of the grey value, of cameras that are all alike, without falloff, and lights as drawn (RMS)."""
+    """RMS of the residuals, relative to the grey value, for identical cameras without falloff and lights as drawn."""
     after_pct: float
-    """With what was found."""
+    """The same with what was found."""
     held_out_pct: float | None
-    """The same at instants that it was not found from; None where there are too few to make halves."""
+    """The same at instants that were not used for it; None if there are too few for halves."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -121,21 +124,22 @@ class Photometry:
     """What was found, and how well it agrees with the images."""
 
     sensors: Mapping[str, Sensor]
-    """Of the cameras of which enough was seen."""
+    """Sensors of the cameras of which enough was seen."""
     lights: Mapping[str, Light]
-    """In the frame of the rig; as drawn where nothing was found of them, none where none were given."""
+    """Lights in the frame of the rig; as drawn where nothing was determined, empty if none were given."""
     cameras: Mapping[str, CameraLight]
     light_deviation_pct: Float[np.ndarray, "3"] | None
-    """Of the level, the slopes and the curvatures of the light at an instant from that of the lamps; None where these
-    were not known."""
+    """Deviation of the level, the slopes and the curvatures of the light at an instant from that of the lamps; None if
+    these were not known."""
     halves_apart: float | None
-    """Difference of what two halves of the instants tell of the cameras, in the standard deviations that both state."""
+    """Difference between the camera parameters from two halves of the instants, in the standard deviations that both
+    state."""
     noise: Mapping[str, Noise]
-    """And the patches that tell of it."""
+    """Noise by camera, with the patches that it was estimated from."""
     residuals_pct: Mapping[str, tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]]
-    """Of each camera: r of the patches, residuals before and after."""
+    """For each camera: r of the patches, residuals before and after."""
     notes: tuple[str, ...]
-    """What cannot be told or was not as it should be, a line each."""
+    """What could not be determined or was not as it should be, one line each."""
 
 
 def look_at_patches(
@@ -146,7 +150,7 @@ def look_at_patches(
     *,
     progress: Progress = silent,
 ) -> ViewPatches:
-    """The patches of every image that was used; ``image`` gives that of a camera at an instant."""
+    """The patches of every image that was used; ``image`` returns that of a camera at an instant."""
     places = clear_places(board)
 
     def look(key: tuple[str, str]) -> Patches:
@@ -166,7 +170,7 @@ def calibrate_light(
     options: PhotometryOptions = PhotometryOptions(),
 ) -> Photometry:
     """Gain, falloff, gamma and noise of each camera that saw enough; with a drawn handpiece, in whose frame the rig is,
-    the places and the powers of its lights."""
+    also the positions and powers of its lights."""
     looked_at = {name: _of_camera(patches, name) for name in found.rig.names}
     sound = {key: each.take(each.usable) for key, each in patches.items()}
     counts = {name: len(_of_camera(sound, name).level_dn) for name in found.rig.names}

@@ -1,16 +1,16 @@
-"""What cameras make of light, and where the light comes from, in one adjustment.
+"""The response of the cameras to light, and the lights themselves, in one adjustment.
 
 A patch of a board shows a grey value y, of which ``gamma_c log(y / 255)`` is a sum of logarithms of linear light: a
-level common to all, what ink lacks, ``log g_c + a_c r^2 + b_c r^4`` of the camera (:class:`cuspid.rig.Sensor`),
+level common to all, the loss by ink, ``log g_c + a_c r^2 + b_c r^4`` of the camera (:class:`cuspid.rig.Sensor`),
 ``log E(X)`` of the lights that are on (:meth:`cuspid.rig.Light.irradiance`), and a polynomial in the place (u, v) on
-the board at this instant, by which the light differs from that: a surface that scatters light evenly looks the same
-from all sides, so all cameras share it. Where no lights are known it alone is the light, of degree 4 and free. Where
-they are it is of degree 2 and small, and how small is found with the rest (D. J. C. MacKay, Neural Computation 4,
-1992): it takes in errors of the places of the board, which all patches of an instant share.
+the board at this instant, by which the light differs from that: a diffuse (Lambertian) surface looks equally bright
+from all sides, so all cameras share it. If no lights are known, it alone is the light, of degree 4 and free. If they
+are, it is of degree 2 and small, and how small is estimated with the rest (D. J. C. MacKay, Neural Computation 4,
+1992): it absorbs errors of the poses of the board, which all patches of an instant share.
 
 Unknowns are deviations from what was given: of each camera (log g, a, b, log gamma), kind by kind; level, ink; of each
-light its place (mm, in the rig) and the logarithm of its power. A prior of mean 0 decides what images leave open.
-The mean of the logarithms of the gains is 0, and so is that of the powers, for the level is open.
+light its position (mm, in the rig) and the logarithm of its power. A prior with mean 0 decides what the images leave
+open. The mean of the logarithms of the gains is 0, and so is that of the powers, because the level is free.
 """
 
 from __future__ import annotations
@@ -26,17 +26,19 @@ from cuspid.rig import Light
 PER_CAMERA, PER_LIGHT = 4, 4
 _COMMON = 2
 KNOWN_DEGREE, UNKNOWN_DEGREE = 2, 4
-"""Of the polynomial of the light at an instant, where the lamps are known and where not."""
+"""Degree of the polynomial of the light at an instant, if the lamps are known and if not."""
 _KNEE = 2.5
-"""Residuals, in standard deviations, beyond which they count less (Huber)."""
+"""Residuals beyond this, in standard deviations, have less weight (Huber)."""
 _STEPS, _SETTLED, _STEADY = 60, 0.01, 0.03
-"""Most steps; the fall of the cost that is not worth another one; and the change of a deviation, as a share of it."""
+"""Maximum number of steps; the decrease of the cost below which iteration ends; and the change of a deviation, as a
+share of it."""
 _UNKNOWN, _DOUBTED = 10.0, 0.1
-"""Standard deviation of the terms of a light that is not known, and at first of one that is (logarithm of light)."""
+"""Standard deviation of the terms of a light that is not known, and the initial one of a light that is (logarithm of
+light)."""
 _STEADIEST = 1e-3
-"""That of the light at an instant at least: no lamp is steadier."""
+"""Minimum standard deviation of the light at an instant: no lamp is steadier."""
 _LEAST = 1e-4
-"""That of what is held."""
+"""Standard deviation of what is held fixed."""
 _DIMMEST = 1e-12
 
 
@@ -50,16 +52,16 @@ class Samples:
     value: Float[np.ndarray, "n"]
     """Logarithm of the grey value, as a share of full scale."""
     sigma: Float[np.ndarray, "n"]
-    """Standard deviation of that, of noise."""
+    """Standard deviation of that value due to noise."""
     dark: Bool[np.ndarray, "n"]
     terms: Float[np.ndarray, "n 2"]
-    """Of the falloff: r^2 and r^4."""
+    """Terms of the falloff: r^2 and r^4."""
     basis: Float[np.ndarray, "n t"]
-    """Of the light at an instant (:func:`polynomials`)."""
+    """Terms of the light at an instant (:func:`polynomials`)."""
     points: Float[np.ndarray, "n 3"]
-    """In the rig, mm."""
+    """Positions in the rig frame, mm."""
     normals: Float[np.ndarray, "n 3"]
-    """Of the board there."""
+    """Normals of the board there."""
     lit: tuple[tuple[int, ...], ...]
     """The lights that are on at each instant."""
 
@@ -71,30 +73,30 @@ class Samples:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Given:
-    """What was known before."""
+    """What was known beforehand."""
 
     gamma: Float[np.ndarray, "c"]
-    """Of each camera."""
+    """Gamma of each camera."""
     lights: tuple[Light, ...]
-    """None where the light is not known."""
+    """Empty if the light is not known."""
     precision: Float[np.ndarray, "g g"]
-    """Of the prior of the unknowns."""
+    """Precision matrix of the prior of the unknowns."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Shading:
-    """What was found."""
+    """Result of the adjustment."""
 
     unknowns: Float[np.ndarray, "g"]
     covariance: Float[np.ndarray, "g g"]
     extra: Float[np.ndarray, "i t"]
-    """Of the light at each instant."""
+    """Terms of the light at each instant."""
     extra_sigma: Float[np.ndarray, "d"]
-    """Standard deviations of its terms of degree 0, 1, ... over all."""
+    """Standard deviations of its terms of degree 0, 1, ... over all instants."""
     residuals: Float[np.ndarray, "n"]
-    """Of the values."""
+    """Residuals of the values."""
     scale: float
-    """Standard deviation of the residuals over what noise would make them."""
+    """Standard deviation of the residuals relative to what noise would make it."""
     settled: bool
 
 
@@ -110,25 +112,25 @@ def _degrees(terms: int) -> Int[np.ndarray, "t"]:
 
 
 def camera_columns(camera: int, cameras: int) -> Int[np.ndarray, "4"]:
-    """The unknowns of a camera."""
+    """Indices of the unknowns of a camera."""
     return camera + cameras * np.arange(PER_CAMERA)
 
 
 def light_columns(light: int, cameras: int) -> Int[np.ndarray, "4"]:
-    """The unknowns of a light."""
+    """Indices of the unknowns of a light."""
     return PER_CAMERA * cameras + _COMMON + PER_LIGHT * light + np.arange(PER_LIGHT)
 
 
 def common_columns(cameras: int) -> Int[np.ndarray, "2"]:
-    """The level and the ink."""
+    """Indices of the level and the ink."""
     return PER_CAMERA * cameras + np.arange(_COMMON)
 
 
 def prior(
     cameras: int, light_covariances: Sequence[Float[np.ndarray, "4 4"]], falloff_sigma: float, gamma_sigma: float
 ) -> Float[np.ndarray, "g g"]:
-    """Precision of the unknowns: gains and powers are free but for their mean, the gammas are off together and each for
-    itself by as much."""
+    """Precision matrix of the prior: gains and powers are free except for their mean; the gammas deviate together, and
+    each individually by as much."""
     size = PER_CAMERA * cameras + _COMMON + PER_LIGHT * len(light_covariances)
     precision = np.zeros((size, size))
     every = np.arange(cameras)
@@ -222,10 +224,10 @@ def adjust_shading(
     held: Float[np.ndarray, "g"] | None = None,
     extra_sigma: Float[np.ndarray, "d"] | None = None,
 ) -> Shading:
-    """The unknowns under which the patches are as bright as they are (Gauss-Newton on Huber's loss).
+    """The unknowns that best explain the brightness of the patches (Gauss-Newton on the Huber loss).
 
-    Where numbers are held (NaN where they are free), these are not adjusted. How far the light at an instant is from
-    that of the lamps is found, unless it is given; where no lamps are known it may be anything.
+    Values in ``held`` are held fixed (NaN where they are free). How far the light at an instant deviates from that of
+    the lamps is estimated, unless it is given; if no lamps are known, it is unconstrained.
     """
     start = np.zeros(len(given.precision)) if held is None else np.nan_to_num(held)
     free = np.flatnonzero(np.ones(len(start), dtype=bool) if held is None else np.isnan(held))

@@ -1,7 +1,7 @@
-"""Where the adjustment begins: each camera for itself, then the cameras joined by what they saw at once.
+"""Initial values for the adjustment: each camera by itself, then the cameras joined by what they saw at once.
 
-A plain chessboard looks the same from two sides, or four. Each camera numbers its corners as it comes; the numbering
-is chosen under which the places of any two cameras agree from instant to instant.
+A plain chessboard looks the same from two sides, or four. Each camera numbers its corners arbitrarily; the numbering is
+then chosen for which the relative poses of any two cameras agree from instant to instant.
 """
 
 from __future__ import annotations
@@ -23,18 +23,19 @@ from cuspid.graph import parts_of
 LEAST_VIEWS = 3
 """A camera that saw the board at fewer instants cannot be calibrated."""
 _MOST_VIEWS = 40
-"""From which a camera is calibrated to begin with: more take long, and the adjustment uses all."""
+"""Maximum number of views for the initial calibration of a camera: more take long, and the adjustment uses all of
+them."""
 _AGREE_DEG, _AGREE_SHARE = 5.0, 0.1
-"""Places of a camera beside another one, from two instants, that may be the same: the turn between them, and the
+"""Relative poses of two cameras, from two instants, that may be the same: largest rotation between them, and largest
 distance as a share of that of the board."""
 _NO_FIT_SHARE = 0.01
-"""Residuals of a camera alone, as a share of the width of its images, beyond which it is no camera."""
+"""Residuals of a single camera, as a share of its image width, beyond which no camera model fits."""
 
 
 def calibrated_alone(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> Adjusted:
-    """One camera from its own views; how the board was held to others plays no part.
+    """One camera from its own views; the poses of the board relative to other cameras play no part.
 
-    Raises ReconstructionError where the views fit no camera, or do not tell its focal length.
+    Raises ReconstructionError where the views fit no camera, or do not determine its focal length.
     """
     try:
         camera = first_camera(views, board, size)
@@ -55,8 +56,8 @@ def calibrated_alone(views: Sequence[BoardView], board: Board, size: tuple[int, 
 
 
 def first_camera(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> Camera:
-    """A camera from its views of the board, each terrace as a plane for itself (Z. Zhang, IEEE PAMI 22, 2000), with the
-    first term of distortion alone."""
+    """A camera from its views of the board, with each terrace as a separate plane (Z. Zhang, IEEE PAMI 22, 2000), with
+    only the first term of distortion."""
     planes = [piece for view in views for piece in pieces(view, board)]
     spread = np.unique(np.linspace(0, len(planes) - 1, _MOST_VIEWS).astype(int))
     chosen = [planes[k] for k in spread]
@@ -96,10 +97,10 @@ def board_pose(view: BoardView, board: Board, camera: Camera) -> Rigid3:
 def joined(
     views: Views, board: Board, cameras: Mapping[str, Camera], instants: Sequence[str]
 ) -> tuple[BoardScene, dict[tuple[str, str], BoardView]]:
-    """The cameras in the frame of the first one, the board at each instant, and the views under one numbering.
+    """The cameras in the frame of the first one, the board at each instant, and the views with a common numbering.
 
-    Raises ReconstructionError where two groups of cameras never saw the board at once, or the instants do not agree on
-    where the cameras are.
+    Raises ReconstructionError where two groups of cameras never saw the board at the same instant, or the instants do
+    not agree on where the cameras are.
     """
     numbered = {key: [view.renumbered(order) for order in board.orders] for key, view in views.items()}
     poses = {key: [board_pose(each, board, cameras[key[0]]) for each in numbered[key]] for key in views}
@@ -124,7 +125,7 @@ Poses = Mapping[tuple[str, str], Sequence[Rigid3]]
 
 
 def groups(views: Collection[tuple[str, str]], cameras: Sequence[str]) -> list[list[str]]:
-    """The cameras, given who saw the board when: those of one group are joined by instants that they share."""
+    """Groups of cameras, given who saw the board when: those of one group are connected by instants that they share."""
     instants = sorted({instant for _, instant in views})
     pairs = [(cameras.index(camera), len(cameras) + instants.index(instant)) for camera, instant in views]
     part = parts_of(np.array(pairs, dtype=np.int64).reshape(-1, 2), len(cameras) + len(instants))[: len(cameras)]
@@ -132,7 +133,7 @@ def groups(views: Collection[tuple[str, str]], cameras: Sequence[str]) -> list[l
 
 
 def require_one_group(views: Collection[tuple[str, str]], cameras: Sequence[str]) -> None:
-    """Raise ReconstructionError where two groups of cameras never saw the board at once."""
+    """Raise ReconstructionError where two groups of cameras never saw the board at the same instant."""
     apart = groups(views, cameras)
     if len(apart) > 1:
         raise ReconstructionError(

@@ -1,6 +1,6 @@
-"""The body that a board is put on: a plate, with a terrace over each of its runs of columns.
+"""The body that a board is mounted on: a plate, with a terrace for each of the board's runs of columns.
 
-Frame: ``body``: +X as the board's, +Y up its columns, +Z out of it, towards the cameras. The plate lies on Z = 0; the
+Frame: ``body``: +X as for the board, +Y up its columns, +Z out of it, towards the cameras. The plate lies on Z = 0; the
 origin is below the bottom left corner of the squares.
 """
 

@@ -1,4 +1,4 @@
-"""The command line: a verb is load, one call, save."""
+"""The command line: each verb loads its inputs, makes one call and saves the results."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ COMMANDS: Mapping[str, Callable[..., Any]] = _Verbs(
 
 
 def commands(arguments: Sequence[str]) -> dict[str, Callable[..., None]]:
-    """The verb that the arguments begin with, none for ``--version``, or else all; what they need is loaded."""
+    """The verb that the arguments begin with, none for ``--version``, otherwise all verbs; their modules are loaded."""
     first = arguments[0] if arguments else ""
     named = [first] if first in COMMANDS else [] if first == "--version" else COMMANDS
     return {verb: _checked(verb, COMMANDS[verb]) for verb in named}
@@ -104,7 +104,7 @@ class _Notes(logging.Handler):
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run a verb; a known error is one line on stderr and exit status 1."""
+    """Run a verb; a known error prints one line on stderr and exits with status 1."""
     log = logging.getLogger("cuspid")
     log.setLevel(logging.INFO)
     log.handlers = [_Notes()]

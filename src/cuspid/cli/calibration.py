@@ -31,10 +31,11 @@ from cuspid.workers import map_in_threads
 
 
 def target(*, out: Path, board: Annotated[Board, Flat] = Board()) -> None:
-    """Draw a ChArUco board or a chessboard in its true size, to print, or make the body that it is put on.
+    """Draw a ChArUco board or a chessboard at true size for printing, or make the body that the print is mounted on.
 
     Args:
-        out: PDF, SVG or PNG file of the pattern, with terraces a strip to be folded over them; STL file of the body.
+        out: PDF, SVG or PNG file for the pattern (with terraces, a strip to be folded over them), or STL file for the
+            body.
     """
     width, height = board.size_mm
     if out.suffix.lower() == ".stl":
@@ -59,7 +60,7 @@ def photograph(
 
     Args:
         handpiece: A handpiece.json, or COLMAP's rig_config.json.
-        out: Folder for images/, which cuspid calibrate takes, and truth/handpiece.json, the one that took them.
+        out: Folder for images/, the input of cuspid calibrate, and truth/handpiece.json, the handpiece that took them.
     """
     settings = {"board": board, "options": options, "manufacturing": manufacturing}
     hashes = {"handpiece": storage.hash_file(handpiece)}
@@ -79,16 +80,17 @@ def calibrate(
     options: Annotated[CalibrationOptions, Flat] = CalibrationOptions(),
     photometry: Annotated[PhotometryOptions, Flat] = PhotometryOptions(),
 ) -> None:
-    """Calibrate the cameras of a rig from images of a board: handpiece.json with the covariance of every number.
+    """Calibrate the cameras of a rig from images of a board: handpiece.json, with the covariance of every parameter.
 
     Args:
-        images: Folder with a folder of images, or a video, for each camera; what was taken at once has one name.
-        out: Folder for handpiece.json, rig_config.json, calibration.json (how each camera did), residuals.png and
-            photometry.png.
-        working_distance_mm: From the cameras to the teeth; without it that of the drawn handpiece, or the median
-            distance of the board.
-        drawn: handpiece.json of the handpiece as it was drawn, whose lights, and no others, lit the board: they are
-            calibrated, too.
+        images: Folder with a subfolder of images, or a video, for each camera; images taken at the same instant share a
+            name.
+        out: Folder for handpiece.json, rig_config.json, calibration.json (the quality of each camera), residuals.png
+            and photometry.png.
+        working_distance_mm: Distance from the cameras to the teeth; default: that of the drawn handpiece, or else the
+            median distance of the board.
+        drawn: handpiece.json of the handpiece as it was drawn (its design). Its lights, and no others, must have lit
+            the board; they are calibrated too.
     """
     settings = {
         "board": board,

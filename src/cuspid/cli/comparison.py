@@ -1,4 +1,4 @@
-"""What buys more: handpieces beside each other."""
+"""Which handpiece gives more: designs compared with each other."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from cuspid.studies.grid import Outcome, check_workers
 from cuspid.studies.trial import TrialOptions
 
 CASE_OPTIONS = ("edge_mm", "image_scale", "minimum_openness", "samples", "thickness_mm")
-"""Options that a scan depends on: with others its results cannot be kept."""
+"""Options that a scan depends on: if they change, its results cannot be kept."""
 
 
 def compare(
@@ -53,16 +53,17 @@ def compare(
     workers: Annotated[int | None, WORKERS] = None,
     cluster: str | None = None,
 ) -> None:
-    """Compare handpieces on the same teeth: size, images, time, error, completeness; six cameras turned against twelve.
+    """Compare handpieces on the same teeth, by default twelve cameras with six that are turned: size, images, time,
+    error and completeness.
 
     Args:
-        out: Folder for results.csv, comparison.json, comparison.md and pictures. A killed run goes on when the same
-            command is given again, and more designs, turns, teeth or seeds are added to what is there.
+        out: Folder for results.csv, comparison.json, comparison.md and pictures. A killed run resumes when the same
+            command is given again; further designs, turns, teeth or seeds are added to the existing results.
         texture: Surface of the teeth.
-        supersampling: Rays through a pixel along each side; 2 takes twice as long.
+        supersampling: Rays per pixel along each side; 2 takes twice as long.
         reconstruction: How images become a mesh.
         workers: Processes on this machine, one core each (default: one for each core).
-        cluster: Address of a Dask scheduler, whose workers see the folder too.
+        cluster: Address of a Dask scheduler, tcp://host:port, whose workers can access the folder too.
     """
     check_workers(workers, "compare")
     simulation = SimulationOptions(texture=texture, supersampling=supersampling)
@@ -105,7 +106,7 @@ def _save(out: Path, outcomes: Sequence[Outcome], options: ComparisonOptions) ->
 
 
 def save_pictures(out: Path, rows: Sequence[Row], options: ComparisonOptions) -> None:
-    """comparison.png and surfaces.png."""
+    """Write comparison.png and surfaces.png."""
     panels: dict[str, dict[str, list[Row]]] = {}
     for row in rows:
         panels.setdefault(f"{row['jaw']}, tooth {row['tooth']}", {}).setdefault(str(row["design"]), []).append(row)

@@ -23,14 +23,14 @@ def film(
     options: Annotated[FilmOptions, Flat, OmitArgPrefixes] = FilmOptions(),
     video: bool = False,
 ) -> None:
-    """Render what an intra-oral camera sees that a shaky hand moves over the arch: OUT/capture and OUT/truth.
+    """Render what an intra-oral camera sees while a shaky hand moves it over the arch: OUT/capture and OUT/truth.
 
     Args:
-        jaw: Mesh of a jaw (STL, PLY, OBJ); without it the built-in phantom.
-        out: Folder.
+        jaw: Mesh of a jaw (STL, PLY, OBJ); default: the built-in phantom.
+        out: Output folder.
         camera: The camera and its LEDs.
-        handpiece: A handpiece.json of your own, instead of that camera.
-        video: Write OUT/film.mp4 too, from the first camera (lossy; the images are not).
+        handpiece: Your own handpiece.json, instead of that camera.
+        video: Also write OUT/film.mp4, from the first camera (lossy, unlike the images).
     """
     settings = {"source": source, "camera": camera, "film": options}
     given = {"jaw": jaw, "handpiece": handpiece}

@@ -1,4 +1,4 @@
-"""A capture of what cameras recorded: folders of images, or videos."""
+"""Make a capture from what cameras recorded: folders of images, or videos."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from cuspid.footage.synchronise import SyncOptions
 from cuspid.options import Range
 
 _SHOWN = 5
-"""Names of frames for each reason; import.json has all."""
+"""Number of frames named for each reason; import.json lists all."""
 
 
 def import_(
@@ -35,14 +35,16 @@ def import_(
     development: Annotated[DevelopmentOptions, Flat] = DevelopmentOptions(),
     selection: Annotated[SelectionOptions, Flat] = SelectionOptions(),
 ) -> None:
-    """Make a capture of footage: synchronise the cameras, and leave out what is blurred, dark, burnt or twice there.
+    """Make a capture from footage: synchronise the cameras, and drop blurred, dark, burnt-out and duplicate images.
 
     Args:
-        footage: Folder with a folder of images, or a video, for each camera, of the name that the handpiece gives it.
+        footage: Folder with a subfolder of images, or a video, for each camera, named like the camera in the handpiece.
         handpiece: A handpiece.json, or COLMAP's rig_config.json.
-        out: Folder of the capture, for cuspid reconstruct.
-        times: CSV with columns camera, frame, time (s); times.csv or timestamps.csv in the footage unless given.
-        working_distance_mm: Of a rig_config.json, from the cameras to the teeth.
+        out: Folder for the capture, the input of cuspid reconstruct.
+        times: CSV file with the columns camera, frame and time (s); default: times.csv or timestamps.csv in the footage
+            folder, if there is one.
+        working_distance_mm: Distance from the cameras to the teeth, for a rig_config.json, which does not contain it
+            (guessed unless given).
     """
     options = ImportOptions(sync=sync, quality=quality, selection=selection)
     known = storage.read_handpiece(handpiece, working_distance_mm)

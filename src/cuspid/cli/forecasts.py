@@ -42,9 +42,9 @@ def optics(
     """Compare miniature cameras: footprint, um per px, depth of field, diffraction, overlap of a parallel pair.
 
     Args:
-        distance_mm: From the lens to the surface.
-        blur_px: Widest blur disc that counts as sharp.
-        baseline_mm: Between the two cameras of a pair.
+        distance_mm: Distance from the lens to the surface.
+        blur_px: Diameter of the largest blur disc that still counts as sharp.
+        baseline_mm: Distance between the two cameras of a pair.
         out: CSV file for the table.
     """
     if not (distance_mm > 0 and blur_px > 0 and baseline_mm >= 0):
@@ -86,12 +86,12 @@ def visibility(
     seed: Annotated[int, SEED] = 0,
     options: Annotated[VisibilityOptions, Flat] = VisibilityOptions(),
 ) -> None:
-    """Tell what of each surface a handpiece sees along its scan path, camera by camera.
+    """Find how much of each surface a handpiece sees along its scan path, camera by camera.
 
     Args:
-        jaw: Mesh of a jaw (STL, PLY, OBJ); without it the built-in phantom.
+        jaw: Mesh of a jaw (STL, PLY, OBJ); default: the built-in phantom.
         out: Folder for surfaces.csv, cameras.csv and pictures.
-        seed: Of the hand's drift.
+        seed: Seed of the hand's drift.
     """
     settings = {"source": source, "probe": probe, "path": path, "seed": seed, "visibility": options}
     with storage.claimed_folder(out, "visibility", settings, _hashes(jaw, probe), replace=True):
@@ -122,11 +122,12 @@ def precision(
     """Map how precisely a handpiece could measure a tooth: the Cramer-Rao bound of all its cameras.
 
     Args:
-        jaw: Mesh of a jaw (STL, PLY, OBJ) with tooth labels; without it the built-in phantom.
-        tooth: FDI number.
-        out: Folder for precision.csv (each face), surfaces.csv and precision.png.
-        turns: Passes over the tooth, as in `cuspid run`. Each face counts at the best of five places of each pass.
-        visibility: When a camera sees a face.
+        jaw: Mesh of a jaw (STL, PLY, OBJ) with tooth labels; default: the built-in phantom.
+        tooth: FDI number of the tooth.
+        out: Folder for precision.csv (one row per face), surfaces.csv and precision.png.
+        turns: Passes over the tooth, as in `cuspid run`. Each face is measured from the best of five positions on each
+            pass.
+        visibility: When a camera counts as seeing a face.
     """
     settings = {"source": source, "probe": probe, "tooth": tooth, "turns": turns, "noise": noise, "rule": visibility}
     with storage.claimed_folder(out, "precision", settings, _hashes(jaw, probe), replace=True):

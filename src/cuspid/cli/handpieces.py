@@ -1,4 +1,4 @@
-"""What scans it."""
+"""Handpieces: the built-in designs, the search for new ones, and their holders."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def handpiece(
     options: Annotated[DesignOptions, Flat] = DesignOptions(),
     printing: Annotated[PrintOptions, Flat] = PrintOptions(),
 ) -> None:
-    """Write a built-in handpiece as handpiece.json and COLMAP's rig_config.json, and its holder to be printed.
+    """Write a built-in handpiece as handpiece.json and COLMAP's rig_config.json, and a printable holder for it.
 
     Args:
-        out: Folder.
-        design: A stereo pair, the essential four cameras, six to be turned, or the twelve.
-        handpiece: A handpiece.json, or COLMAP's rig_config.json, of your own, instead of a built-in design.
-        body: STL, PLY or OBJ file for the holder: one solid with seats, channels for cables, neck and grip, in mm in
-            the rig frame; a picture of it goes beside it. The handpiece then has its body.
+        out: Output folder.
+        design: Built-in design: a stereo pair, the essential four cameras, six cameras (to be turned), or all twelve.
+        handpiece: Your own handpiece.json, or COLMAP's rig_config.json, instead of a built-in design.
+        body: STL, PLY or OBJ file for the holder: one solid with seats, cable channels, neck and grip, in mm in the rig
+            frame, with a picture beside it. The handpiece is then written with this body.
     """
     made = DESIGNS[design](options) if handpiece is None else storage.read_handpiece(handpiece)
     if body is not None:
@@ -83,14 +83,14 @@ def design(
     mouth: MouthOptions = MouthOptions(),
     search: Annotated[SearchOptions, Flat] = SearchOptions(),
 ) -> None:
-    """Find a handpiece for a brief: a TOML file with sensor, size, mouth and the surfaces that must be seen.
+    """Search for a handpiece that meets a brief: a TOML file with sensor, size, mouth and the surfaces it must see.
 
     Args:
         brief: The brief (docs/designs.md).
-        out: Folder for handpiece.json, rig_config.json, design.json (what each condition reached) and design.png.
-        jaw: Mesh of a jaw with tooth labels; without it the built-in phantom.
-        teeth: FDI numbers of the teeth for which the handpiece is sought.
-        mouth: People whom it is to fit.
+        out: Folder for handpiece.json, rig_config.json, design.json (how each condition is met) and design.png.
+        jaw: Mesh of a jaw with tooth labels; default: the built-in phantom.
+        teeth: FDI numbers of the teeth that the handpiece is designed for.
+        mouth: The people whom it should fit.
     """
     wanted = read_brief(brief)
     settings = {"search": search, "mouth": mouth, "teeth": teeth, "source": source}

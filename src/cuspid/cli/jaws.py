@@ -41,14 +41,14 @@ def phantom(
     spheres: bool = False,
     sphere: SphereArchOptions = SphereArchOptions(),
 ) -> None:
-    """Make the built-in phantom jaw, with tooth labels and landmarks, or a population of them, or the sphere arch.
+    """Make the built-in phantom jaw, with tooth labels and landmarks, or a population of phantoms, or the sphere arch.
 
     Args:
-        out: Mesh file to write (.ply keeps the labels; .stl, .obj), with landmarks as JSON and a picture beside it; for
-            a population a folder.
+        out: Mesh file to write (.ply, which keeps the labels, .stl or .obj), with landmarks as JSON and a picture
+            beside it; for a population, a folder.
         group: Draw a population from this group of Table 2.1 of the thesis instead; --seed seeds the draw.
-        count: How many jaws of the population.
-        spheres: Make the sphere arch instead, a metrology object: spheres of known centres along the arch.
+        count: Number of jaws in the population.
+        spheres: Make the sphere arch instead, a metrology object: spheres with known centres along the arch.
         sphere: Size of the sphere arch.
     """
     if group is not None:
@@ -86,17 +86,18 @@ def prepare(
         | Annotated[InlayOptions, subcommand("mod-inlay")]
     ] = None,
 ) -> None:
-    """Prepare teeth of a labelled jaw: a crack, a crown preparation, a full-contour crown, a MOD inlay; or a preset.
+    """Prepare teeth of a labelled jaw: a crack, a crown preparation, a full-contour crown or a MOD inlay; or a preset.
 
-    One tooth: cuspid prepare JAW --tooth 45 --out FILE crown --taper-deg 8. Several: give the result to the next run.
+    For one tooth: cuspid prepare JAW --tooth 45 --out FILE crown --taper-deg 8. For several, pass the result to
+    the next run.
 
     Args:
-        jaw: Mesh of a jaw with tooth labels; without it the built-in phantom.
+        jaw: Mesh of a jaw with tooth labels; default: the built-in phantom.
         out: Mesh file to write (.ply keeps the labels), with margins and landmarks as JSON and a picture beside it.
         preset_name: thesis-reference: the mandible of Fig. 3.20 (46 cracked, 45 crown, 42 full-contour crown, 35 and 36
             MOD inlays).
         tooth: FDI number of the one tooth to prepare.
-        how: What is done to it.
+        how: Kind of preparation.
     """
     asked = _asked(preset_name, tooth, how)
     title = f"prepared: {', '.join(map(str, asked))}"
@@ -121,10 +122,10 @@ def box(
     out: Path,
     source: Annotated[Source, Flat] = Source(),
 ) -> None:
-    """Make a box of every crown, of its own size: the hardest jaw for a handpiece that turns (thesis 3.5.3.2).
+    """Turn every crown into a box of its own size: the hardest jaw for a handpiece that turns (thesis 3.5.3.2).
 
     Args:
-        jaw: Mesh of a jaw with tooth labels, for example the mean of a shape model; without it the built-in phantom.
+        jaw: Mesh of a jaw with tooth labels, for example the mean of a shape model; default: the built-in phantom.
         out: Mesh file to write, with a picture beside it.
     """
     _write_jaw(out, lambda: boxed(load_source(jaw, source)), "boxed jaw")

@@ -1,4 +1,4 @@
-"""How much room there is."""
+"""How much room there is in the mouth."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from cuspid.reporting.figures.mouth import TOOTH_NAMES, save_fit_picture, save_g
 
 
 def mouth(*, out: Path, handpiece: Path | None = None, options: Annotated[MouthOptions, Flat] = MouthOptions()) -> None:
-    """Find how much room there is between the jaws, and for how many people a handpiece fits at each tooth.
+    """Find how much room there is between the jaws, and how many people a handpiece fits at each tooth.
 
     Args:
         out: Folder for mouth.json and the pictures: the sagittal plane, whom a handpiece fits, the gap at the molars.
-        handpiece: A handpiece.json with a body: its thickness and working distance, in place of those given.
+        handpiece: A handpiece.json with a body, whose thickness and working distance are used instead of those given.
     """
     inputs = {} if handpiece is None else {"handpiece": storage.hash_file(handpiece)}
     if handpiece is not None:

@@ -28,14 +28,14 @@ def stitch(
     calibration: Path | None = None,
     options: Annotated[StitchOptions, Flat] = StitchOptions(),
 ) -> None:
-    """Frames of one hand-held camera to a panorama of the arch: the occlusal view in true scale, the unrolled strip,
-    what became of each frame, and the camera's path.
+    """Stitch the frames of one hand-held camera into a panorama of the arch: the occlusal view at true scale, the
+    unrolled strip, what became of each frame, and the camera's path.
 
     Args:
         frames: Folder of images, a video (mp4, avi, mov, mkv), or a capture with one camera.
-        out: Folder for the results; part-1/, part-2/ ... in it where the sequence broke.
+        out: Folder for the results; if the sequence broke, it has a subfolder for each part: part-1/, part-2/ ...
         calibration: handpiece.json or rig_config.json of one camera, COLMAP's cameras.txt, or OpenCV's YAML; without
-            one (and without a capture's own) the focal length is found from the images.
+            one (and without that of a capture) the focal length is found from the images.
     """
     with show_progress() as progress:
         sequence = _read(frames, out, calibration, progress)
@@ -92,7 +92,7 @@ def _print(parts: tuple[Stitched, ...], folders: list[Path]) -> None:
 
 
 def left_out(frames: Iterable[FrameUse]) -> list[str]:
-    """The frames that are in no part, a line for each reason."""
+    """The frames that are in no part, one line for each reason."""
     names: dict[str, list[str]] = {}
     for frame in frames:
         if not frame.used and frame.reason is not None and not frame.reason.startswith("in part "):
@@ -101,7 +101,7 @@ def left_out(frames: Iterable[FrameUse]) -> list[str]:
 
 
 def named(names: list[str], most: int = 6) -> str:
-    """Names in a row, the middle of many left out."""
+    """Names on one line; if there are many, those in the middle are left out."""
     if len(names) <= most:
         return ", ".join(names)
     return f"{', '.join(names[: most - 1])} ... {names[-1]}"

@@ -34,11 +34,12 @@ def stitch_eval(
     out: Path,
     options: Annotated[PanoramaEvaluationOptions, Flat] = PanoramaEvaluationOptions(),
 ) -> None:
-    """How far a panorama is from the arch that was filmed: score.json, a table, and score.png beside the truth.
+    """Evaluate a panorama against the arch that was filmed: score.json, a table, and score.png, where both are shown.
 
     Args:
-        panorama: Folder that cuspid stitch wrote, or a picture of another program (black or transparent is nothing).
-        truth: The folder truth/ of cuspid film.
+        panorama: Folder that cuspid stitch wrote, or a picture from another program (black or transparent pixels count
+            as empty).
+        truth: The folder truth/ that cuspid film wrote.
         out: Folder for the results.
     """
     known, view = storage.read_truth(truth), storage.read_reference_render(truth / "occlusal")
@@ -56,7 +57,7 @@ def stitch_eval(
 
 
 def read_picture(path: Path) -> Panorama:
-    """A picture that nothing is known of. Raises InputError where it cannot be read or shows nothing."""
+    """A panorama from a picture alone. Raises InputError where it cannot be read or shows nothing."""
     pixels = read_rgba(path)
     opaque = pixels[..., 3] > 0
     covered = opaque & (pixels[..., :3].max(axis=2) > 0) if opaque.all() else opaque

@@ -35,16 +35,16 @@ def repeat(
     cluster: str | None = None,
     retry_failed: bool = False,
 ) -> None:
-    """Scan the same jaw several times with another hand and other noise: trueness and precision (ISO 5725) together.
+    """Scan the same jaw several times, each with new hand motion and noise: trueness and precision (ISO 5725) together.
 
-    A killed run goes on with the same command; more --scans are added to those that are there.
+    A killed run resumes with the same command; with a larger --scans, further scans are added to the existing ones.
 
     Args:
-        jaw: Mesh of a jaw (STL, PLY, OBJ); without it the built-in phantom.
+        jaw: Mesh of a jaw (STL, PLY, OBJ); default: the built-in phantom.
         out: Folder for scans/ (each mesh, in the frame of the reference), repeat.json, results.csv, and a report.
         workers: Processes on this machine, one core each (default: one for each core).
-        cluster: Address of a Dask scheduler, tcp://host:port, whose workers see the folder too.
-        retry_failed: Run again what failed before.
+        cluster: Address of a Dask scheduler, tcp://host:port, whose workers can access the folder too.
+        retry_failed: Repeat scans that failed before.
     """
     check_workers(workers, "repeat")
     trial = TrialOptions(simulation=simulation, reconstruction=reconstruction)

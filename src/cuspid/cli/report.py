@@ -21,14 +21,14 @@ def report(
     unit: storage.Unit = "mm",
     options: Annotated[ReportOptions, Flat] = ReportOptions(),
 ) -> None:
-    """Write one HTML page of what lies in a folder: the surface in 3-D, figures, pictures, and what it was made of.
+    """Write one HTML page on the results in a folder: the surface in 3-D, figures, pictures, and how they were made.
 
     The page is one file that opens without a network.
 
     Args:
-        folder: What run, reconstruct, evaluate, shape, sweep, compare, repeat, stitch or stitch-eval wrote.
+        folder: Folder that run, reconstruct, evaluate, shape, sweep, compare, repeat, stitch or stitch-eval wrote.
         out: The page (default: report.html in the folder).
-        reference: Mesh that a scan was compared with, where the folder does not hold it (evaluate).
+        reference: Mesh that the scan was compared with, if the folder does not contain it (after evaluate).
         unit: Length unit of the reference.
     """
     path = out or folder / "report.html"

@@ -1,4 +1,4 @@
-"""The thesis beside ours."""
+"""The results of the thesis beside the reproduced ones."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ def reproduce(
     run: bool = True,
     workers: Annotated[int | None, WORKERS] = None,
 ) -> None:
-    """Set every table, figure and equation of the thesis beside ours: reproduction.md and reproduction.html.
+    """Set every table, figure and equation of the thesis beside our result: reproduction.md and reproduction.html.
 
-    What has no results yet is run: hours for all, or a quarter of an hour on two cores with --quick. A killed run goes
-    on when the same command is given again.
+    Whatever has no results yet is run, which takes hours for all items, or a quarter of an hour on two cores with
+    --quick. A killed run resumes when the same command is given again.
 
     Args:
         out: Folder for the pages, the results (results/, results-quick/) and what they were made from (work/).
         quick: Run a reduced version: fewer jaws, settings and subjects; the complete arch is left out.
-        only: Items, for example fig-2.5 table-3.2 eq-3.9 (default: all).
-        results: Folder with results that are there already, for example benchmarks/results; they are not run again.
-        images: Folder with pictures that were made before, for example docs/images.
-        run: Run what is missing; --no-run only makes the pages of what is there.
-        workers: Runs at once, one core each (default: one for each core).
+        only: Items to include, for example fig-2.5 table-3.2 eq-3.9 (default: all).
+        results: Folder with existing results, for example benchmarks/results; these are not run again.
+        images: Folder with existing pictures, for example docs/images.
+        run: Run what is missing; --no-run only makes the pages, from the existing results.
+        workers: Number of parallel runs, one core each (default: one for each core).
     """
     items = asked_items(only)
     check_workers(workers, "reproduce")
@@ -72,7 +72,7 @@ def reproduce(
 
 
 def asked_items(only: Sequence[str]) -> tuple[Item, ...]:
-    """Items by their ids, in the order of the page; all where none is asked for. Raises InputError for another id."""
+    """Items by their ids, in the order of the page; all if none is asked for. Raises InputError for an unknown id."""
     for name in only:
         if name not in BY_ID:
             near = get_close_matches(name, BY_ID, n=3)

@@ -48,8 +48,8 @@ def run(
     """Scan a jaw in simulation, reconstruct it, and measure the trueness.
 
     Args:
-        jaw: Mesh of a jaw or of a part of one (STL, PLY, OBJ); without it the built-in phantom.
-        out: Folder for everything that is made. A killed run goes on when the same command is given again.
+        jaw: Mesh of a jaw or of a part of one (STL, PLY, OBJ); default: the built-in phantom.
+        out: Folder for everything that is made. A killed run resumes when the same command is given again.
         evaluation: How the trueness is measured.
     """
     _simulate(jaw, out, source, probe, simulation)
@@ -68,8 +68,8 @@ def simulate(
     """Render what the handpiece sees: OUT/capture (images, calibration) and OUT/truth (what only the simulator knows).
 
     Args:
-        jaw: Mesh of a jaw or of a part of one (STL, PLY, OBJ); without it the built-in phantom.
-        out: Folder.
+        jaw: Mesh of a jaw or of a part of one (STL, PLY, OBJ); default: the built-in phantom.
+        out: Output folder.
     """
     _simulate(jaw, out, source, probe, simulation)
 
@@ -83,15 +83,15 @@ def reconstruct(
     from_poses: Path | None = None,
     reconstruction: Annotated[ReconstructionOptions, Flat] = ReconstructionOptions(),
 ) -> None:
-    """Images and a handpiece file to poses and a mesh in millimetres.
+    """Reconstruct poses and a mesh in millimetres from images and a handpiece file.
 
     Args:
         capture: Folder with images/<camera>/<frame>.png.
         out: Folder for depth/, motion/, mesh.ply and mesh.stl.
         handpiece: Calibration (default: handpiece.json in the capture folder).
-        working_distance_mm: From the cameras to the teeth, for a rig_config.json, which does not have it (guessed
-            unless given).
-        from_poses: Folder of a COLMAP model whose poses are used instead of our own.
+        working_distance_mm: Distance from the cameras to the teeth, for a rig_config.json, which does not contain it
+            (guessed unless given).
+        from_poses: Folder of a COLMAP model whose poses are used instead of finding them.
     """
     _reconstruct(storage.read_capture(capture, handpiece, working_distance_mm), out, reconstruction, from_poses)
 
@@ -104,11 +104,11 @@ def evaluate(
     source: Annotated[Source, Flat] = Source(),
     options: Annotated[EvaluationOptions, Flat] = EvaluationOptions(),
 ) -> None:
-    """Trueness of a mesh against a reference: trueness.json, and the colour map as PLY and PNG.
+    """Measure the trueness of a mesh against a reference: trueness.json, and the colour map as PLY and PNG.
 
     Args:
         mesh: The scan (STL, PLY, OBJ), in any pose.
-        reference: A mesh, or the folder truth/ of a simulation, which knows what could be seen.
+        reference: A mesh, or the folder truth/ of a simulation, which also tells what could be seen.
         out: Folder for the results.
     """
     _evaluate(mesh, reference, out, source, options)

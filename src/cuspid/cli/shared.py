@@ -1,4 +1,4 @@
-"""What the verbs have in common: what is scanned, with what, and how progress is shown."""
+"""What the verbs share: what is scanned, with which handpiece, and how progress is shown."""
 
 from __future__ import annotations
 
@@ -46,22 +46,22 @@ class Source(Options):
     unit: storage.Unit = "mm"
     """Length unit of the mesh file."""
     arch: Arch | None = None
-    """Which jaw the file holds, where its teeth are to be numbered; of the phantom: lower unless said otherwise."""
+    """Which jaw the file contains, if its teeth are to be numbered; for the phantom, lower by default."""
     jaw_seed: Annotated[int, SEED] = 0
-    """Individual of the built-in phantom."""
+    """Seed that selects the individual of the built-in phantom."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Probe(Options):
-    """What scans it."""
+    """The handpiece that scans."""
 
     design: Literal["two", "four", "six", "twelve"] = "twelve"
-    """Built-in design: a stereo pair, the essential four cameras, six (give --turns 3), or the twelve."""
+    """Built-in design: a stereo pair, the essential four cameras, six cameras (use with --turns 3), or all twelve."""
     handpiece: Path | None = None
-    """A handpiece.json, or COLMAP's rig_config.json, of your own, instead of a built-in design."""
+    """Your own handpiece.json, or COLMAP's rig_config.json, instead of a built-in design."""
     working_distance_mm: Annotated[float | None, Range(0.1, 100_000)] = None
-    """From the cameras to the teeth: of a design (5 unless given), or of a rig_config.json, which does not have it
-    (guessed unless given)."""
+    """Distance from the cameras to the teeth, for a built-in design (5 unless given) or for a rig_config.json, which
+    does not contain it (guessed unless given)."""
 
 
 @contextmanager
@@ -80,7 +80,7 @@ def show_progress() -> Iterator[Progress]:
 
 
 def load_source(mesh: Path | None, source: Source) -> Jaw:
-    """The jaw of a file in the occlusal frame, or the phantom; prints what was found or is unsure."""
+    """The jaw of a file in the occlusal frame, or the phantom; prints notes on what was found or is uncertain."""
     if mesh is None:
         return build_phantom(PhantomOptions(arch=source.arch or "lower", seed=source.jaw_seed))
     jaw, notes = load_jaw(mesh, unit=source.unit, arch=source.arch)

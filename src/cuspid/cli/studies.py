@@ -1,4 +1,4 @@
-"""Experiments made of many whole scans."""
+"""Experiments that consist of many complete scans."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _TITLES: dict[Term, tuple[str, int]] = {
     "mean_abs_um": ("mean absolute deviation / µm", 2),
 }
 _LISTED = 4
-"""So many settings that are level are named on the screen; sweep.json has all."""
+"""Number of equally good settings that are printed; sweep.json lists all."""
 
 
 def sweep(
@@ -41,17 +41,18 @@ def sweep(
     cluster: str | None = None,
     retry_failed: bool = False,
 ) -> None:
-    """Find the best baseline and angle of a pair of cameras for a surface of a tooth, by scanning with each setting.
+    """Find the best baseline and angle of a camera pair for one surface of a tooth, by scanning with each setting.
 
-    Each setting is a whole scan: rendered, reconstructed and evaluated on that surface. The best ones are repeated with
-    other textures, hands and noise, to tell which are level. A killed sweep goes on with the same command.
+    Each setting is a complete scan: rendered, reconstructed and evaluated on that surface. The best ones are repeated
+    with other textures, hand motions and noise, to tell which are equally good. A killed sweep resumes with the same
+    command.
 
     Args:
-        jaw: Mesh of a jaw with tooth labels; without it the built-in phantom.
+        jaw: Mesh of a jaw with tooth labels; default: the built-in phantom.
         out: Folder for results.csv (a row for each scan), sweep.json (the best settings) and sweep.png (maps).
         workers: Processes on this machine, one core each (default: one for each core).
-        cluster: Address of a Dask scheduler, tcp://host:port, to work on its workers instead.
-        retry_failed: Run again what failed before.
+        cluster: Address of a Dask scheduler, tcp://host:port, whose workers are used instead.
+        retry_failed: Repeat scans that failed before.
     """
     inputs = {} if jaw is None else {"jaw": storage.hash_file(jaw)}
     with storage.claimed_folder(out, "sweep", {"options": options, "source": source}, inputs):
@@ -85,7 +86,7 @@ def _save(out: Path, outcomes: Sequence[Outcome], options: SweepOptions) -> None
 
 
 def save_maps(path: Path, outcomes: Sequence[Outcome], options: SweepOptions) -> None:
-    """sweep.png: the terms over baseline and angle. Of the first seed, which all settings have in common."""
+    """Write sweep.png: the terms over baseline and angle, for the first seed, which all settings have in common."""
     maps = []
     for term, sign in TERMS.items():
         found, (title, digits) = best_setting(outcomes, term), _TITLES[term]

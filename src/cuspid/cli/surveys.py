@@ -46,16 +46,16 @@ def measure(
     unit: storage.Unit = "mm",
     arch: Arch | None = None,
 ) -> None:
-    """Measure the arch dimensions a, b, c and f of a jaw or of a folder of jaws, and the table of their groups.
+    """Measure the arch dimensions a, b, c and f of a jaw or of a folder of jaws, and tabulate them by group.
 
     Args:
         jaws: A jaw mesh, or a folder of them. Landmarks are read from <name>.landmarks.json or <name>.mrk.json (3D
-            Slicer) beside a mesh, or come with the jaw; those that lack are estimated from the tooth labels.
+            Slicer) beside a mesh, or come with the jaw; missing ones are estimated from the tooth labels.
         out: Folder for jaws.csv, groups.csv (in the form of Table 2.1), measure.json, and a picture and the landmarks
             of each jaw.
-        landmarks: Landmarks of the one jaw, in another file.
+        landmarks: File with the landmarks, for a single jaw whose landmarks are not beside it.
         unit: Length unit of the mesh files.
-        arch: Which jaws they are, where neither the files nor their names say.
+        arch: Upper or lower, if neither the files nor their names say so.
     """
     files = jaw_files(jaws)
     if landmarks is not None and len(files) > 1:
@@ -137,10 +137,10 @@ def shape(
     """Find the mean jaw of a folder of labelled jaws, and the principal modes in which they vary.
 
     Args:
-        jaws: Folder of jaw meshes. Landmarks stand in the JSON file beside a mesh, or are estimated from its labels.
+        jaws: Folder of jaw meshes. Landmarks are read from the JSON file beside a mesh, or estimated from its labels.
         out: Folder for mean.ply, modes.npz, shape.json and pictures.
         unit: Length unit of the mesh files.
-        arch: Which jaws they are, where the files do not say.
+        arch: Upper or lower, if the files do not say so.
     """
     files = jaw_files(jaws)
     hashes = {path.name: storage.hash_file(path) for path in _of_different_names(files)}

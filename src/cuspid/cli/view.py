@@ -22,14 +22,14 @@ def view(
     host: str = "127.0.0.1",
     port: Annotated[int, Range(1, 65_535)] = 8080,
 ) -> None:
-    """Show a scan or a shape model in the browser, with all its faces, until Ctrl-C. Needs the extra: cuspid[view].
+    """Show a scan or a shape model in the browser, with all its faces, until Ctrl-C. Needs the extra cuspid[view].
 
     Args:
-        folder: What run, reconstruct, evaluate or shape wrote.
-        reference: Mesh that a scan was compared with, where the folder does not hold it (evaluate).
+        folder: Folder that run, reconstruct, evaluate or shape wrote.
+        reference: Mesh that the scan was compared with, if the folder does not contain it (after evaluate).
         unit: Length unit of the reference.
-        host: Address to listen at; 0.0.0.0 lets other machines in.
-        port: Port; the next free one is taken where it is busy.
+        host: Address to listen on; 0.0.0.0 accepts connections from other machines.
+        port: Port to listen on; if it is in use, the next free one is taken.
     """
     server = serve(storage.read_result(folder, reference, unit), host, port)
     console.print(f"http://{host}:{server.get_port()} shows {folder}; Ctrl-C ends it", highlight=False, soft_wrap=True)

@@ -1,11 +1,11 @@
-"""Crown surface that is open to some direction, and how much of it a scan has, whether or not a camera could see it.
+"""Crown surface that is open to some direction, and how much of it a scan covers, whether or not a camera could see it.
 
 A face is open if a share of at least `LEAST_OPENNESS` of the directions above the occlusal plane (XY) is free, where
-only what lies within 15 mm of the tooth is in the way.
+only what lies within 15 mm of the tooth can occlude it.
 
-Over all, the teeth are evaluated that the scan was meant for: of which at least three quarters as much of the open
-crown was *in reach* as of the tooth that was best in reach. In reach is what two cameras could see at once where that
-is known, else what lies within 200 um of the scan.
+The overall figures include the teeth that the scan was meant for: those of whose open crown at least three quarters as
+large a share was *in reach* as of the tooth that was best in reach. In reach is what two cameras could see at once if
+that is known, otherwise what lies within 200 um of the scan.
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ from cuspid.mesh import Mesh
 from cuspid.trueness import CrownCompleteness
 
 LEAST_OPENNESS = 0.05
-"""Share of the directions above the occlusal plane that must be free for a face of a crown to be open."""
+"""Share of the directions above the occlusal plane that must be free for a face of a crown to count as open."""
 WITHIN_UM = (50, 100, 200)
-"""Distances at which completeness is asked."""
+"""Distances at which completeness is evaluated."""
 _OPENNESS_RAYS = 64
 _NEIGHBOURHOOD_MM = 15.0
-"""What lies farther from a tooth does not cover it."""
+"""What lies farther than this from a tooth does not occlude it."""
 _IN_REACH_MM = 0.2
 _PIECE_MM = 10.0
-"""Side of the squares of the occlusal plane that stand for teeth where these have no names."""
+"""Side of the squares of the occlusal plane that stand in for teeth if these have no labels."""
 _MEANT = 0.75
-"""Share in reach, in proportion to that of the tooth best in reach, from which on a tooth is evaluated over all."""
+"""Minimum share in reach, relative to that of the tooth best in reach, for a tooth to be included in the overall
+figures."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,17 +42,18 @@ class OpenCrown:
     mesh: Mesh
     """The surface of the jaw, in the frame of the reference."""
     parts: Int[np.ndarray, "f"]
-    """For each open face of a crown the FDI number of its tooth, or the number of a piece of the size of a tooth where
-    crowns were told from gum by shape; 0 for all other faces."""
+    """For each open face of a crown, the FDI number of its tooth, or the number of a tooth-sized piece if crowns were
+    separated from gum by shape; 0 for all other faces."""
     estimated: bool = False
-    """Whether crowns were told from gum by shape, for want of tooth labels."""
+    """Whether crowns were separated from gum by shape, for lack of tooth labels."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parts", read_only(self.parts))
 
 
 def open_parts(mesh: Mesh, parts: Int[np.ndarray, "f"]) -> Int[np.ndarray, "f"]:
-    """The parts of crowns of a mesh with +Z out of the gum, as in :class:`OpenCrown`; 0 where a face is not open."""
+    """The parts of the crowns of a mesh with +Z out of the gum, as in :class:`OpenCrown`; 0 where a face is not
+    open."""
     is_open = np.zeros(len(parts), dtype=bool)
     for part in np.unique(parts[parts != GUM]):
         is_open |= open_faces(mesh, parts == part, LEAST_OPENNESS)
@@ -59,7 +61,7 @@ def open_parts(mesh: Mesh, parts: Int[np.ndarray, "f"]) -> Int[np.ndarray, "f"]:
 
 
 def pieces(mesh: Mesh, crown: Bool[np.ndarray, "f"]) -> Int[np.ndarray, "f"]:
-    """Numbers of pieces of the size of a tooth for the faces of crowns that have no names, 0 for the others."""
+    """Numbers of tooth-sized pieces for the faces of crowns without labels, 0 for the others."""
     cells = np.floor(mesh.face_centres[crown, :2] / _PIECE_MM).astype(np.int64)
     parts = np.full(len(mesh.faces), GUM)
     parts[crown] = 1 + np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
@@ -67,7 +69,7 @@ def pieces(mesh: Mesh, crown: Bool[np.ndarray, "f"]) -> Int[np.ndarray, "f"]:
 
 
 def open_faces(mesh: Mesh, tooth: Bool[np.ndarray, "f"], least_openness: float) -> Bool[np.ndarray, "f"]:
-    """The open faces of a tooth, of a mesh with +Z out of the gum."""
+    """The open faces of a tooth, for a mesh with +Z out of the gum."""
     middle = mesh.face_centres[tooth].mean(axis=0)
     near = np.linalg.norm(mesh.face_centres - middle, axis=1) < _NEIGHBOURHOOD_MM
     wanted = near & tooth
@@ -77,7 +79,8 @@ def open_faces(mesh: Mesh, tooth: Bool[np.ndarray, "f"], least_openness: float) 
 
 
 def openness(mesh: Mesh, faces: Int[np.ndarray, "n"] | None = None) -> Float[np.ndarray, "n"]:
-    """Share of the directions above the occlusal plane (XY) from which the centres of faces (None: all) can be seen."""
+    """Share of the directions above the occlusal plane (XY) from which the centres of some faces (None: all) can be
+    seen."""
     steps = np.arange(_OPENNESS_RAYS) + 0.5
     z, azimuth = steps / _OPENNESS_RAYS, steps * np.pi * (3 - np.sqrt(5))
     directions = np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], axis=1)
@@ -93,7 +96,7 @@ def openness(mesh: Mesh, faces: Int[np.ndarray, "n"] | None = None) -> Float[np.
 
 
 def within_pct(distances_mm: Float[np.ndarray, "n"]) -> dict[str, float]:
-    """Share within each of `WITHIN_UM`."""
+    """Percentage within each of `WITHIN_UM`."""
     return {str(um): float(100 * np.mean(np.abs(distances_mm) <= um / 1000)) for um in WITHIN_UM}
 
 
@@ -104,9 +107,9 @@ def crown_completeness(
     samples: int,
     rng: np.random.Generator,
 ) -> CrownCompleteness | None:
-    """How much of the open crown an aligned scan has; None where nothing of it was in reach.
+    """How much of the open crown an aligned scan covers; None if none of it was in reach.
 
-    ``scannable``: the faces that two cameras could see at once, where that is known. ``samples``: points on the crowns
+    ``scannable``: the faces that two cameras could see at once, if that is known. ``samples``: points on the crowns
     that were in reach.
     """
     reach = _in_reach(aligned, crown, scannable)

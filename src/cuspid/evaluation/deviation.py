@@ -1,10 +1,10 @@
-"""Trueness of a scan, as the field measures it, in both directions. Positive is outside the reference.
+"""Trueness of a scan, by the usual measures, in both directions. Positive is outside the reference.
 
-Accuracy: signed distances from points even by area on the scan to the reference. Completeness: from points even by area
-on the reference to the scan. What is evaluated:
+Accuracy: signed distances from points on the scan, uniform by area, to the reference. Completeness: from points on the
+reference, uniform by area, to the scan. What is evaluated:
 
 - Of the reference, the faces of the ``scannable`` mask, which the pipeline sets where at least two cameras could see.
-  Without a mask all of it, less what ``min_openness`` and ``crop_mm`` take away.
+  Without a mask, all of it except what ``min_openness`` and ``crop_mm`` exclude.
 - Of the scan, every point, except
   (a) a point whose closest reference face is not evaluated and that lies within ``margin_mm`` of it: the scan has
       surface where nothing could be measured, but where surface is. A point farther off is an error and is evaluated;
@@ -12,11 +12,11 @@ on the reference to the scan. What is evaluated:
       more. With a mask the reference is all there was to see, and a point is left out only if it lies past the border,
       farther sideways than up or down, and within ``margin_mm``, as where a scan frays at its rim.
 
-Beside this stand a figure of everything scanned (all points but those of (b)), and the completeness of all
+In addition there are figures for everything scanned (all points except those of (b)), and the completeness of all
 crown surface that is open to some direction (:mod:`cuspid.evaluation.crown`).
 
-A point is always measured to the closest surface, whether that is evaluated or not. ``Trueness.notes`` says how much
-was left out by each rule.
+The distance of a point is always that to the closest surface, whether this is evaluated or not. ``Trueness.notes``
+states how much was left out by each rule.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from cuspid.options import SHARE, Options, Range
 from cuspid.trueness import DeviationStatistics, Trueness
 
 _LEAST_TOOTH_PCT = 30.0
-"""Share of a tooth's surface that must lie within 200 um of the scan for its place to be evaluated."""
+"""Share of a tooth's surface that must lie within 200 um of the scan for its position to be evaluated."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,18 +47,18 @@ class EvaluationOptions(Options):
     """How a scan is compared with its reference."""
 
     align: bool = True
-    """Align the scan rigidly first, from any pose; off if it lies in the frame of the reference."""
+    """Align the scan rigidly first, from any pose; turn off if it is already in the frame of the reference."""
     registration: RegistrationOptions = field(default_factory=RegistrationOptions)
     """How it is aligned."""
     samples: Annotated[int, Range(100, 20_000_000)] = 200_000
-    """Points on each of the two surfaces, even by area."""
+    """Sample points on each of the two surfaces, uniform by area."""
     margin_mm: Annotated[float, Range(0, 1000)] = 0.5
-    """A point of the scan over surface that is not evaluated is left out only within this distance."""
+    """A point of the scan over surface that is not evaluated is left out only if it lies within this distance."""
     crop_mm: Annotated[float | None, Range(0.001, 1000)] = None
-    """Reference surface farther than this from the scan is regarded as not scanned; by default all is evaluated."""
+    """Reference surface farther than this from the scan is considered not scanned; default: everything is evaluated."""
     min_openness: Annotated[float, SHARE] = 0.0
     """Without a mask: share of the directions above the occlusal plane that must be free for a face to be evaluated.
-    0.05 leaves out the hidden insides and the base of a model; 0 evaluates everything."""
+    0.05 excludes the hidden insides and the base of a model; 0 evaluates everything."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -118,12 +118,12 @@ def evaluate(
     sigma_um: Float[np.ndarray, "v"] | None = None,
     rng: np.random.Generator | None = None,
 ) -> Trueness:
-    """Compare a scan in any pose with a reference of which the faces in ``scannable`` count (None: see the module).
+    """Compare a scan in any pose with a reference, of which the faces in ``scannable`` are evaluated (None: see the
+    module).
 
-    ``crown``: the open crown surface of the reference, whose completeness is asked, too. ``sigma_um``: the standard
-    deviation that the scan expects of each of its vertices, along its normal. ``rng`` draws the samples; the
-    same ones each time where there is none. Raises InputError where the two do not belong together or nothing is left
-    to compare.
+    ``crown``: the open crown surface of the reference, whose completeness is evaluated too. ``sigma_um``: the standard
+    deviation that the scan predicts for each of its vertices, along its normal. ``rng`` draws the samples; without it
+    they are the same each time. Raises InputError where the two do not belong together or nothing is left to compare.
     """
     rng = rng or np.random.default_rng(0)
     surface = SignedDistance(reference.mesh)
@@ -171,7 +171,7 @@ def _within_sigmas_pct(deviation_um: Float[np.ndarray, "v"], sigma_um: Float[np.
 
 
 def statistics(signed_mm: Float[np.ndarray, "n"]) -> DeviationStatistics:
-    """Statistics of signed distances (mm) that are even by area. Raises InputError where there are none."""
+    """Statistics of signed distances (mm) that are uniform by area. Raises InputError where there are none."""
     if len(signed_mm) == 0:
         raise InputError("evaluation: no surface is left to compare; check the scannable mask and --crop-mm")
     signed_um = 1000 * signed_mm

@@ -1,8 +1,8 @@
 """Signed distances to a surface, and where a surface ends.
 
-The sign comes from the angle-weighted pseudo-normal at the closest point (Baerentzen and Aanaes 2005), which is right
-on faces, edges and corners alike: positive on the outer side. An open border has an outside only where a point lies
-over the surface, not where it lies past its edge: such points are told apart.
+The sign comes from the angle-weighted pseudo-normal at the closest point (Baerentzen and Aanaes 2005), which is
+correct on faces, edges and corners alike: positive on the outer side. At an open border, the sign has a meaning only
+for points over the surface, not for points past its edge: these are reported separately.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from jaxtyping import Bool, Float, Int
 from cuspid.mesh import Mesh
 
 _ON_EDGE = 1e-7
-"""Barycentric weight below which a point of a face lies on the opposite edge."""
+"""Barycentric weight below which a point of a face is considered to lie on the opposite edge."""
 _BLOCK = 1 << 18
-"""Points that are reckoned at once: of millions, what is on the way to the result would take gigabytes."""
+"""Points that are processed at once: for millions, the intermediate results would take gigabytes."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ClosestPoints:
-    """The closest points of a surface to some points."""
+    """The closest points on a surface to some points."""
 
     signed_mm: Float[np.ndarray, "n"]
     """Distances, positive outside."""
@@ -35,7 +35,7 @@ class ClosestPoints:
     on_border: Bool[np.ndarray, "n"]
     """True where the closest point lies on an open border."""
     past_border: Bool[np.ndarray, "n"]
-    """True where, besides, the point is farther sideways past the border than it is above or below the surface."""
+    """True where, in addition, the point is farther sideways past the border than it is above or below the surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class SignedDistance:
     """Signed distances to a mesh."""
 
     mesh: Mesh
-    """The surface, outward normals counter-clockwise."""
+    """The surface; faces are counter-clockwise seen from outside."""
 
     @cached_property
     def _edges(self) -> tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]]:
@@ -88,7 +88,7 @@ class SignedDistance:
         return summed
 
     def closest_points(self, points: Float[np.ndarray, "n 3"]) -> ClosestPoints:
-        """Closest points of the surface to ``points`` (mm)."""
+        """Closest points on the surface to ``points`` (mm)."""
         blocks = [self._closest(points[begin : begin + _BLOCK]) for begin in range(0, max(len(points), 1), _BLOCK)]
         if len(blocks) == 1:
             return blocks[0]

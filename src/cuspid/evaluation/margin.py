@@ -1,12 +1,12 @@
 """How far the edge of a preparation in a scan lies from the true margin line.
 
-At points along the line, scan and reference are cut by the plane square to it. In the section the edge is found as the
-point of the section nearest to where its two flanks, each a fitted straight line, would meet: not as the point nearest
-to the line. A rounded edge therefore lies inwards of the line, by r (1 / sin(a / 2) - 1) for a radius r and an angle a.
+At points along the line, scan and reference are cut by the plane perpendicular to it. In the section, the edge is the
+point of the section nearest to where its two flanks, each a fitted straight line, would meet: not the point nearest to
+the line. A rounded edge therefore lies inwards of the line, by r (1 / sin(a / 2) - 1) for a radius r and an angle a.
 
-Axes of a section: *outward* bisects the reference's edge and points out of the tooth; *lateral* is square to it and
-points away from the preparation (towards the root at a crown, onto the enamel at an inlay). The detector is run on the
-reference as well: what it finds there is its floor.
+Axes of a section: *outward* bisects the reference's edge and points out of the tooth; *lateral* is perpendicular to
+it and points away from the preparation (towards the root at a crown, onto the enamel at an inlay). The detector is also
+run on the reference: what it finds there is its floor.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ _FINE_MM = 0.01
 _TANGENT_MM = 0.15
 """Half the chord from which the direction of the line is taken."""
 _STRAIGHT = 0.93
-"""A line is evaluated where that chord is at least this share of its arc: not at the corners of an inlay."""
+"""A line is evaluated where that chord is at least this share of its arc, which excludes the corners of an inlay."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MarginOptions(Options):
-    """How edges are looked for."""
+    """How edges are searched for."""
 
     step_mm: Annotated[float, Range(0.001, 10)] = 0.1
     """Distance between sections along the line."""
     reach_mm: Annotated[float, Range(0.001, 10)] = 0.4
-    """An edge farther than this from the line is not found."""
+    """Largest distance of an edge from the line."""
     flank_from_mm: Annotated[float, Range(0, 10)] = 0.08
-    """The straight flanks begin this far from the edge, measured along the section."""
+    """The straight flanks begin at this distance from the edge, measured along the section."""
     flank_to_mm: Annotated[float, Range(0, 10)] = 0.3
-    """The flanks end this far from the edge."""
+    """The flanks end at this distance from the edge."""
     least_bend_deg: Annotated[float, Range(0, 180)] = 25.0
-    """Least angle by which the flanks differ in direction."""
+    """Minimum angle between the directions of the flanks."""
     most_floor_um: Annotated[float, Range(0.001, 10_000)] = 20.0
     """A section is evaluated only if the edge of the reference itself is found within this distance of the line."""
 
@@ -58,14 +58,14 @@ class MarginOptions(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class MarginStatistics:
-    """Distances of the edge that was found from the true line."""
+    """Distances of the detected edge from the true line."""
 
     sections: int
     """Number of sections in which the reference has an edge."""
     found_pct: float
     """Share of them in which an edge was found."""
     mean_um: float
-    """Mean distance in the section; NaN where nothing was found, as are all that follow."""
+    """Mean distance in the section; NaN, like all that follow, where nothing was found."""
     std_um: float
     """Standard deviation of the distance."""
     p95_um: float
@@ -80,14 +80,14 @@ class MarginStatistics:
 
 @dataclass(frozen=True, kw_only=True)
 class MarginError:
-    """Of one preparation."""
+    """Margin error of one preparation."""
 
     scan: MarginStatistics
-    """The scan's edge."""
+    """For the edge of the scan."""
     evaluated_pct: float
-    """Share of the sections that are evaluated: not those at corners, nor where the reference's edge is unclear."""
+    """Share of the sections that are evaluated: excluding corners, and places where the reference's edge is unclear."""
     floor: MarginStatistics
-    """The reference's own edge by the same detector: what it cannot tell apart from zero."""
+    """For the reference's own edge, with the same detector: errors that cannot be distinguished from zero."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -114,7 +114,7 @@ def margin_errors(
 def margin_error(
     scan: Mesh, reference: Mesh, line: Float[np.ndarray, "n 3"], options: MarginOptions = MarginOptions()
 ) -> MarginError:
-    """Error of one margin, a closed line on the reference (its last point is its first), in a scan that is aligned.
+    """Error of one margin, a closed line on the reference (its last point is its first), in an aligned scan.
 
     Raises InputError where the line is too short or the reference has no edge along it.
     """

@@ -2,10 +2,10 @@
 
 A panorama that knows which frame each of its pixels came from is evaluated by geometry: the pixel's ray, from where the
 frame truly was, meets the true jaw in a point, and the panorama places that point somewhere in the occlusal plane. The
-best similarity (least squares, Umeyama 1991) of all tooth pixels is taken away; what remains is the geometric error.
+best similarity (least squares, Umeyama 1991) of all tooth pixels is removed; what remains is the geometric error.
 The same similarity lays the panorama over the reference render of the true jaw
-(:class:`cuspid.trueness.ReferenceRender`), where the pictures are compared. A panorama without that knowledge is laid
-over it by image features, and only the pictures are compared.
+(:class:`cuspid.trueness.ReferenceRender`), where the pictures are compared. A panorama without that knowledge is
+aligned with it by image features, and only the pictures are compared.
 
 Pictures are compared in grey (Rec. 601), where the panorama shows nothing as black: ZNCC over the pixels of the teeth,
 SSIM (Wang et al. 2004, Gaussian window of 1.5 px) as the mean of its map over the teeth, and over the whole canvas as
@@ -34,35 +34,35 @@ from cuspid.trueness import NOTHING, GroundTruth, ReferenceRender
 from cuspid.values import shown
 
 FEWEST_TEETH_PX = 200
-"""Of the sampled pixels must show teeth, for an alignment by geometry."""
+"""Minimum number of sampled pixels that show teeth, for an alignment by geometry."""
 _LEAST_EXTENT_MM = 5.0
-"""A panorama that covers less of the jaw is none: its alignment rests on one place."""
+"""A panorama that covers less of the jaw than this counts as failed: its alignment would rest on one place."""
 FEWEST_MATCHES = 25
-"""Image features that must agree, for an alignment by pictures."""
+"""Minimum number of consistent image features, for an alignment by pictures."""
 _MATCH_MM = 0.5
-"""Features agree where they lie within this distance of each other after the alignment."""
+"""Features are consistent if they lie within this distance of each other after the alignment."""
 _WINDOW_PX = 1.5
 """Standard deviation of the window of SSIM."""
 _FEATURES = 6000
-"""Features in each picture, at most."""
+"""Maximum number of features in each picture."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PanoramaEvaluationOptions(Options):
-    """How a panorama is evaluated, and when it is taken for failed."""
+    """How a panorama is evaluated, and when it counts as failed."""
 
     samples: Annotated[int, Range(1000, 20_000_000)] = 200_000
-    """Pixels of the panorama that are followed to the true jaw, at most, evenly spread."""
+    """Maximum number of pixels of the panorama that are traced to the true jaw, evenly distributed."""
     complete_pct: Annotated[float, Range(0, 100)] = 90.0
-    """The arch is complete where this share of each tooth is shown, of what the frames saw of it."""
+    """The arch is complete if, of each tooth, this share of what the frames saw is shown."""
     fewest_frames_pct: Annotated[float, Range(0, 100)] = 10.0
-    """A panorama of a smaller share of the frames failed."""
+    """A panorama of a smaller share of the frames counts as failed."""
     largest_scale: Annotated[float, Range(1.01, 100)] = 2.0
-    """A panorama whose millimetres are wrong by more than this factor failed."""
+    """A panorama whose scale is wrong by more than this factor counts as failed."""
     coarsest_mm: Annotated[float, Range(0.001, 10)] = 0.5
-    """A panorama in whose pixels more than this many millimetres lie collapsed."""
+    """A panorama whose pixels are larger than this counts as collapsed."""
     worst_median_mm: Annotated[float, Range(0.01, 100)] = 5.0
-    """A panorama whose median error is larger shows no arch."""
+    """A panorama whose median error is larger than this does not show an arch."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,17 +78,17 @@ class GeometricError:
     max_mm: float
     """Largest."""
     pixels: int
-    """Tooth pixels that were asked."""
+    """Number of tooth pixels that were evaluated."""
     scale_error_pct: float | None
-    """By how much the panorama's millimetres are too small (positive) or large; None where it has none."""
+    """How much the panorama's millimetres are too small (positive) or too large; None if it has none."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImageScores:
-    """How like a picture is to the reference render."""
+    """How similar a picture is to the reference render."""
 
     zncc: float
-    """Zero-mean normalised cross-correlation over the teeth; gain and offset do not change it."""
+    """Zero-mean normalised cross-correlation over the teeth; independent of gain and offset."""
     ssim_teeth: float
     """Structural similarity over the teeth."""
     ssim_full: float
@@ -106,20 +106,20 @@ class PanoramaScore:
     method: str
     """How it was made."""
     failure: str | None
-    """Why it is taken for failed: such a panorama has no scores. None where it does not."""
+    """Why it counts as failed; such a panorama has no scores. None if it did not fail."""
     aligned_by: Literal["geometry", "pictures"] | None
-    """What laid it over the reference render."""
+    """How it was aligned with the reference render."""
     geometry: GeometricError | None
-    """Error of the places of tooth pixels; None where it cannot be known."""
+    """Error of the positions of tooth pixels; None if it cannot be known."""
     inter_molar_error_mm: float | None
-    """Distance between the first molars (else second) in the panorama minus the true one; with the panorama's own
-    millimetres where it has any, else after the similarity. None where it does not show both."""
+    """Distance between the first molars (otherwise the second) in the panorama minus the true one; in the panorama's
+    own millimetres if it has any, otherwise after the similarity. None if it does not show both."""
     coverage_pct: float | None
     """Share of the reference render's tooth pixels that it shows."""
     seen_pct: float
-    """Share of them that any frame saw: the most that could be shown."""
+    """Share of them that any frame saw: the maximum that could be shown."""
     tooth_coverage_pct: Mapping[int, float]
-    """Share of what the frames saw of each tooth that it shows, by FDI number."""
+    """Share of what the frames saw of each tooth that is shown, by FDI number."""
     complete: bool
     """Whether it shows every tooth, in one piece."""
     frames: int
@@ -127,58 +127,58 @@ class PanoramaScore:
     frames_used: int
     """Frames that are placed in it."""
     parts: int
-    """Pieces into which the sequence broke."""
+    """Number of pieces into which the sequence broke."""
     picture: ImageScores | None
-    """Against the orthographic reference render."""
+    """Scores against the orthographic reference render."""
     shot: ImageScores | None
-    """Against the reference render of a camera at a height, aligned anew."""
+    """Scores against the reference render from a camera at a finite height, aligned separately."""
     trivial: Mapping[str, ImageScores]
-    """What pictures score that show no work: empty, constant grey on the whole canvas and in the outline of the jaw,
-    and the truth shifted by 1 mm."""
+    """Scores of trivial pictures: empty, constant grey on the whole canvas and in the outline of the jaw, and the truth
+    shifted by 1 mm."""
     notes: tuple[str, ...] = ()
     """What a reader should know."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PanoramaComparison:
-    """The figures, and what a picture of them needs."""
+    """The figures, and what is needed to draw them."""
 
     score: PanoramaScore
     """The figures."""
     aligned: Float[np.ndarray, "h w 3"] | None
-    """The panorama on the pixels of the reference render, RGB 0 to 1; None where it failed."""
+    """The panorama resampled to the pixels of the reference render, RGB 0 to 1; None if it failed."""
     points_mm: Float[np.ndarray, "n 2"]
-    """True places of the tooth pixels that were asked."""
+    """True positions of the tooth pixels that were evaluated."""
     errors_mm: Float[np.ndarray, "n"]
     """Their errors."""
 
 
 @dataclass(frozen=True, eq=False)
 class Similarity2:
-    """A turn, a scale and a shift of the plane."""
+    """A rotation, scale and translation of the plane."""
 
     linear: Float[np.ndarray, "2 2"]
     """Scale times rotation."""
     shift: Float[np.ndarray, "2"]
-    """Added after."""
+    """Added afterwards."""
 
     @property
     def scale(self) -> float:
-        """Lengths are multiplied by this."""
+        """Factor by which lengths are multiplied."""
         return float(np.sqrt(abs(np.linalg.det(self.linear))))
 
     @staticmethod
     def best(source: Float[np.ndarray, "n 2"], target: Float[np.ndarray, "n 2"]) -> Similarity2:
-        """That which lays points on others (least squares)."""
+        """The similarity that best maps points onto others (least squares)."""
         scale, rotation, shift = best_similarity(source, target)
         return Similarity2(scale * rotation, shift)
 
     def apply(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-        """Move points."""
+        """Transform points."""
         return points @ self.linear.T + self.shift
 
     def inverse(self) -> Similarity2:
-        """The way back."""
+        """The inverse transform."""
         back = np.linalg.inv(self.linear)
         return Similarity2(back, -back @ self.shift)
 
@@ -191,7 +191,7 @@ class TracedPixels:
     """Pixels of a panorama and what they truly show."""
 
     placed: Float[np.ndarray, "n 2"]
-    """Where the panorama places them: its world, mm (px where it has no scale)."""
+    """Where the panorama places them, in its world: mm (px if it has no scale)."""
     true_mm: Float[np.ndarray, "n 3"]
     """The points of the jaw that they show."""
     labels: Int[np.ndarray, "n"]
@@ -199,15 +199,15 @@ class TracedPixels:
 
     @property
     def teeth(self) -> TracedPixels:
-        """Those on teeth; all, where the jaw has no labels."""
+        """Those on teeth, or all if the jaw has no labels."""
         keep = self.labels > 0 if (self.labels > 0).any() else np.ones(len(self.labels), dtype=bool)
         return TracedPixels(self.placed[keep], self.true_mm[keep], self.labels[keep])
 
 
 def trace_pixels(panorama: Panorama, truth: GroundTruth, samples: int) -> TracedPixels:
-    """Follow pixels of a panorama through the frames to the true jaw.
+    """Trace pixels of a panorama through the frames to the true jaw.
 
-    Frames are found by name, or by number where the names are others (a video). Raises InputError where the panorama's
+    Frames are identified by name, or by number if the names differ (a video). Raises InputError where the panorama's
     frames are not those of the truth.
     """
     poses = _poses_of(panorama, truth)
@@ -252,7 +252,8 @@ def _spread_pixels(where: Bool[np.ndarray, "h w"], most: int) -> tuple[Int[np.nd
 
 
 def seen_by_frames(view: ReferenceRender, truth: GroundTruth, samples: int = 10_000) -> Bool[np.ndarray, "h w"]:
-    """The pixels of the reference render's teeth that some frame saw, asked on a grid and spread to the nearest."""
+    """The pixels of the reference render's teeth that some frame saw, sampled on a grid and assigned to the nearest
+    sample."""
     rows, columns = _spread_pixels(view.teeth, samples)
     asked = np.zeros_like(view.teeth)
     asked[rows, columns] = True
@@ -287,7 +288,7 @@ def image_scores(
     truth: Float[np.ndarray, "h w"],
     teeth: Bool[np.ndarray, "h w"],
 ) -> ImageScores:
-    """Compare a grey picture (0 to 1) with the truth; what is not ``shown`` is taken for black."""
+    """Compare a grey picture (0 to 1) with the truth; pixels that are not ``shown`` count as black."""
     black = np.where(shown, picture, 0.0)
     raw = _ssim_map(black, truth)
     on_teeth = _ssim_map(np.where(shown, _fitted(picture, truth, shown & teeth), 0.0), truth)
@@ -333,7 +334,7 @@ def _inner_mean(similarity: Float[np.ndarray, "h w"]) -> float:
 
 
 def trivial_scores(view: ReferenceRender) -> dict[str, ImageScores]:
-    """What pictures score that show no work."""
+    """Scores of trivial pictures."""
     truth, everywhere, nowhere = grey(view.image), np.ones_like(view.teeth), np.zeros_like(view.teeth)
     jaw, level = view.labels != NOTHING, float(truth[view.teeth].mean())
     step = round(1.0 / view.mm_per_px)
@@ -351,10 +352,10 @@ def trivial_scores(view: ReferenceRender) -> dict[str, ImageScores]:
 def lay_over(
     panorama: Panorama, view: ReferenceRender, plane_from_panorama: Similarity2
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """The panorama on the pixels of the reference render (RGB, 0 to 1), and where it shows something.
+    """The panorama resampled to the pixels of the reference render (RGB, 0 to 1), and where it shows something.
 
-    ``plane_from_panorama`` takes the panorama's world to the occlusal plane, mm. A finer panorama is averaged over the
-    pixels first.
+    ``plane_from_panorama`` maps the panorama's world to the occlusal plane, mm. A finer panorama is first averaged over
+    the pixels.
     """
     shrink = max(1.0, view.mm_per_px / (plane_from_panorama.scale * (panorama.mm_per_px or 1.0)))
     size = tuple(max(1, round(side / shrink)) for side in panorama.covered.shape[::-1])
@@ -370,7 +371,7 @@ def lay_over(
 
 
 def align_by_pictures(panorama: Panorama, view: ReferenceRender) -> Similarity2 | None:
-    """``plane_from_panorama`` by SIFT features and RANSAC; None where too few agree."""
+    """``plane_from_panorama`` by SIFT features and RANSAC; None if too few are consistent."""
     sift = cv2.SIFT.create(_FEATURES)
     masks = (panorama.covered, view.labels != NOTHING)
     found = [
@@ -410,10 +411,10 @@ def evaluate_panorama(
     shot: ReferenceRender | None = None,
     options: PanoramaEvaluationOptions = PanoramaEvaluationOptions(),
 ) -> PanoramaComparison:
-    """All figures of a panorama against the truth of its film.
+    """All figures of a panorama against the ground truth of its film.
 
-    ``view`` is the orthographic reference render and ``shot`` that of a camera at a height. Raises InputError where the
-    panorama's frames are not those of the truth.
+    ``view`` is the orthographic reference render and ``shot`` the one from a camera at a finite height. Raises
+    InputError where the panorama's frames are not those of the truth.
     """
     if view.camera_height_mm is not None:
         raise InputError("evaluation: the first reference render must be orthographic")
@@ -551,10 +552,10 @@ class _Comparison:
 
 
 def inter_molar_error(traced: TracedPixels, scale: float) -> float | None:
-    """Distance between the first molars (else second) where they are placed, times the scale, minus the true one, mm.
+    """Distance between the first molars (otherwise the second) as placed, times the scale, minus the true one, mm.
 
-    A molar's place is the mean of its pixels' places, and its true one the mean over the same pixels. None where no
-    pair of molars has `FEWEST_TEETH_PX` pixels each.
+    A molar's position is the mean of its pixels' positions, and its true position the mean over the same pixels. None
+    if no pair of molars has `FEWEST_TEETH_PX` pixels each.
     """
     for position in (6, 7):
         for left, right in ((30, 40), (10, 20)):

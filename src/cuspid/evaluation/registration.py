@@ -1,7 +1,7 @@
-"""Rigid registration of a scan onto a reference, from any pose, of a part of the arch as well as of all of it.
+"""Rigid registration of a scan with a reference, from any pose, for a part of the arch as well as for all of it.
 
 A search over all poses (:mod:`cuspid.evaluation.search`), then Gauss-Newton on exact closest-point distances with
-Tukey's weights, to convergence. Never with scale: the best similarity's scale is reported apart.
+Tukey's weights, to convergence. The scale is never changed: that of the best similarity is reported separately.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _NARROWEST_MM, _WIDEST_MM = 1e-3, 2.0
 """Bounds of the distance at which a sample loses its weight."""
 _LEAST_OVERLAP = 0.25
 _FEW = 2000
-"""Samples that suffice to tell good poses from bad ones."""
+"""Number of samples that suffice to tell good poses from bad ones."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,16 +31,16 @@ class RegistrationOptions(Options):
     """How a scan is aligned with its reference."""
 
     search: SearchOptions = field(default_factory=SearchOptions)
-    """How densely poses are tried."""
+    """How densely poses are sampled."""
     samples: Annotated[int, Range(100, 10_000_000)] = 60_000
-    """Points of the scan, even by area, on which the alignment rests."""
+    """Points of the scan, uniform by area, that the alignment is based on."""
     outlier_mm: Annotated[float, Range(0.0001, 100)] = 0.3
-    """Samples nearer than this count as overlap. What weighs in the fit follows from the errors: nothing that is
-    farther off than six robust standard deviations."""
+    """Samples nearer than this count as overlap. The weights in the fit follow from the errors: samples farther off
+    than six robust standard deviations have none."""
     tolerance_um: Annotated[float, Range(1e-06, 1000)] = 0.01
     """The alignment has converged when no sample moves more than this in a step."""
     iterations: Annotated[int, Range(1, 100_000)] = 100
-    """Upper bound of the steps."""
+    """Maximum number of steps."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -50,19 +50,19 @@ class Alignment:
     reference_from_scan: Rigid3
     """The rigid motion that was found."""
     scale: float
-    """Size of the scan over that of the reference, by the best similarity. Not applied anywhere."""
+    """Size of the scan relative to the reference, by the best similarity. Never applied."""
     rms_um: float
-    """Weighted RMS distance where they meet."""
+    """Weighted RMS distance where the two surfaces overlap."""
     overlap: float
     """Share of the smaller surface that lies within ``outlier_mm`` of the larger one."""
     notes: tuple[str, ...] = ()
-    """Why the alignment is doubtful; empty where it is not."""
+    """Why the alignment is doubtful; empty if it is not."""
 
 
 def register(
     scan: Mesh, surface: SignedDistance, options: RegistrationOptions, *, rng: np.random.Generator
 ) -> Alignment:
-    """Align a scan in any pose with a reference surface; the smaller of the two is laid on the larger one.
+    """Align a scan in any pose with a reference surface; the smaller of the two is fitted to the larger one.
 
     Raises InputError where no pose brings a quarter of the smaller surface near the larger one.
     """
@@ -92,7 +92,7 @@ def _lay(scan: Mesh, surface: SignedDistance, options: RegistrationOptions, rng:
 def fit(
     points: Float[np.ndarray, "n 3"], surface: SignedDistance, start: Rigid3, options: RegistrationOptions
 ) -> Alignment:
-    """Align points of a scan with a surface from a pose nearby."""
+    """Align points of a scan with a surface, starting from a pose nearby."""
     pose = refine(points, surface, start, options)
     closest = surface.closest_points(pose.apply(points))
     weights = _weights(closest)
@@ -107,7 +107,7 @@ def fit(
 def refine(
     points: Float[np.ndarray, "n 3"], surface: SignedDistance, start: Rigid3, options: RegistrationOptions
 ) -> Rigid3:
-    """``reference_from_scan`` with the least weighted sum of squared distances, from a pose nearby."""
+    """``reference_from_scan`` with the smallest weighted sum of squared distances, starting from a pose nearby."""
     pose = start
     for _ in range(options.iterations):
         moved = pose.apply(points)
@@ -124,7 +124,7 @@ def refine(
 def best_scale(
     points: Float[np.ndarray, "n 3"], surface: SignedDistance, reference_from_scan: Rigid3, options: RegistrationOptions
 ) -> float:
-    """Scale of the scan that the best similarity near an alignment would take away."""
+    """Scale of the scan that the best similarity near an alignment would remove."""
     moved, shrinking = reference_from_scan.apply(points), 1.0
     for _ in range(options.iterations):
         closest = surface.closest_points(moved)

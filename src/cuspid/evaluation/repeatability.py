@@ -4,13 +4,13 @@ Terms of ISO 5725-1: *trueness* is how near the mean of many results lies to the
 results lie to one another; here under repeatability conditions (the same object, handpiece and software). Two views:
 
 - *All pairs*, the usual one in dentistry (for example Schimmel et al. 2021, doi:10.1007/s00784-020-03486-z: 45 pairs of
-  10 scans): each scan is laid on each other one and their distances are taken, here in both directions. No reference is
-  needed.
+  10 scans): each scan is aligned with each other scan and their distances are measured, here in both directions. No
+  reference is needed.
 - *At each place* of the reference, with d_k the deviation of scan k there along the normal, positive outside: the
   mean over the scans is the systematic part, their standard deviation s the random one. Over the surface,
   s_r = sqrt(mean s^2) is the repeatability standard deviation and 2.8 s_r the repeatability limit (ISO 5725-6), which
-  the difference of two scans at one place exceeds in 5 % of cases. The mean of n scans still holds s_r^2 / n of the
-  random part, which is taken away from the systematic one.
+  the difference of two scans at one place exceeds in 5 % of cases. The mean of n scans still contains s_r^2 / n of
+  the random part, which is subtracted from the systematic one.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ class PairOptions(Options):
     """How scans are compared with each other."""
 
     align: bool = True
-    """Lay one on the other first; off for what lies in a common frame already."""
+    """Align the two scans first; turn off if they are already in a common frame."""
     registration: RegistrationOptions = field(default_factory=RegistrationOptions)
-    """How."""
+    """How they are aligned."""
     samples: Annotated[int, Range(100, 20_000_000)] = 100_000
-    """Points on each surface, even by area."""
+    """Sample points on each surface, uniform by area."""
     farthest_mm: Annotated[float, Range(0.0001, 1000)] = 0.5
-    """A point farther than this from the other scan shows something that the other one does not."""
+    """A point farther than this from the other scan counts as surface that the other one does not show."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,27 +56,27 @@ class PairDeviation:
     deviation: DeviationStatistics
     """Signed distances in both directions; positive where the second lies outside the first."""
     common_pct: float
-    """Share of their surfaces that both show."""
+    """Share of their surfaces that both scans show."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Spread:
-    """Deviations of several scans over the reference, in um."""
+    """Deviations of several scans from the reference, in um."""
 
     mean_um: Float[np.ndarray, "v"]
     """Mean over the scans, around each vertex of the reference; NaN where not all of them have surface."""
     sd_um: Float[np.ndarray, "v"]
-    """Standard deviation over the scans, with n - 1, likewise."""
+    """Sample standard deviation over the scans (n - 1), likewise."""
     scans: int
-    """How many."""
+    """Number of scans."""
     repeatability_sd_um: float
     """s_r: root mean square of the standard deviation over the surface."""
     median_sd_um: float
-    """Standard deviation at the median place: a few rough places, which rule s_r, hardly change it."""
+    """Standard deviation at the median place; unlike s_r, it is hardly affected by a few rough places."""
     bias_rms_um: float
-    """Root mean square of the systematic part over the surface; 0 where it drowns in the random one."""
+    """Root mean square of the systematic part over the surface; 0 where it is lost in the random one."""
     common_pct: float
-    """Share of the asked surface that all scans have."""
+    """Share of the given surface that all scans have."""
 
     @property
     def repeatability_limit_um(self) -> float:
@@ -85,7 +85,7 @@ class Spread:
 
 
 def compare_pair(first: Mesh, second: Mesh, options: PairOptions, *, rng: np.random.Generator) -> PairDeviation:
-    """Distances between two scans that lie nearly on each other.
+    """Distances between two scans that are already nearly aligned.
 
     What lies past the border of the other scan, or far from it, is not evaluated. Raises InputError where they have no
     surface in common.
@@ -119,7 +119,7 @@ def spread(
     *,
     rng: np.random.Generator,
 ) -> Spread:
-    """How the scans deviate at points even by area on the asked faces of the reference, in whose frame they lie.
+    """How the scans deviate from the reference, in whose frame they are, at points on the given faces, uniform by area.
 
     Raises InputError for fewer than two scans, or where no place is on all of them.
     """

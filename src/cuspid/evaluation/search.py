@@ -1,6 +1,6 @@
-"""Poses that may lay one surface on another, from any start: an exhaustive search.
+"""Poses that may align one surface with another, from any start: an exhaustive search.
 
-Anchors of the moving surface (a point with its normal) are laid on points all over the fixed one and turned about the
+Anchors of the moving surface (points with normals) are placed on points all over the fixed one and rotated about the
 normal in steps. Each of these millions of poses is scored by truncated distances that are looked up in a voxel table of
 nearest points; the best are refined together on the same table. Nothing is assumed about the start, and the moving
 surface may be a small part of the fixed one.
@@ -27,25 +27,25 @@ from cuspid.workers import map_in_threads
 
 _MAX_VOXELS = 1e6
 _TESTED = 144
-"""Points that score a pose in the search, fewer where it soon looks hopeless."""
+"""Maximum number of points that score a pose in the search; fewer if it soon looks hopeless."""
 _AGREE = 0.2
-"""Least cosine between the normals of two points that may be the same place."""
+"""Minimum cosine between the normals of two points that may be the same place."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SearchOptions(Options):
-    """How densely poses are tried."""
+    """How densely poses are sampled."""
 
     anchors: Annotated[int, Range(1, 1000)] = 12
-    """Points of the moving surface that are laid on the fixed one."""
+    """Points of the moving surface that are placed on the fixed one."""
     targets: Annotated[int, Range(10, 100_000)] = 5000
-    """Points of the fixed surface on which each anchor is laid."""
+    """Points of the fixed surface on which each anchor is placed."""
     turn_step_deg: Annotated[float, Range(1, 90)] = 10.0
-    """Step of the turn about the normal."""
+    """Step of the rotation about the normal."""
     candidates: Annotated[int, Range(1, 100_000)] = 600
-    """Poses that are refined."""
+    """Number of poses that are refined."""
     finalists: Annotated[int, Range(1, 1000)] = 8
-    """Distinct poses that are returned, at most."""
+    """Maximum number of distinct poses that are returned."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,6 +1,6 @@
-"""Spheres fitted in a scan, and all distances between them: accuracy without a best fit to the reference.
+"""Spheres fitted to a scan, and all distances between them: accuracy without a best fit to the reference.
 
-The scan stays in its own frame. A rough alignment only says which of its points belong to which sphere; the spheres are
+The scan stays in its own frame. A rough alignment only determines which points belong to which sphere; the spheres are
 fitted to these points alone, and distances between their centres do not depend on where the scan lies. Terms are those
 of VDI/VDE 2634 parts 2 and 3, without any claim to follow their procedure:
 
@@ -8,10 +8,10 @@ of VDI/VDE 2634 parts 2 and 3, without any claim to follow their procedure:
 - probing error of size PS: diameter of the fitted sphere (least squares, radius free) minus the nominal one;
 - probing error of form PF: range of the points' radial distances from the fitted sphere.
 
-Points of a sphere are the vertices of the scan, weighted by the surface that they stand for, within ``band_mm`` of the
-nominal radius and within ``polar_deg`` of the occlusal direction, both about the fitted centre: the choice is repeated
-until it no longer changes, so that it keeps no memory of the rough alignment but for the occlusal direction. The fit is
-plain least squares of the radial distances over the points within ``outlier_sigmas`` robust standard deviations.
+Points of a sphere are the vertices of the scan, weighted by the surface that they represent, within ``band_mm`` of the
+nominal radius and within ``polar_deg`` of the occlusal direction, both about the fitted centre. The selection is
+repeated until it no longer changes, so that it depends on the rough alignment only through the occlusal direction. The
+fit is plain least squares of the radial distances over the points within ``outlier_sigmas`` robust standard deviations.
 """
 
 from __future__ import annotations
@@ -33,17 +33,18 @@ from cuspid.mesh import Mesh
 from cuspid.options import Options, Range
 
 _ROUNDS = 30
-"""Choices of points after which a sphere that has not settled is given up."""
+"""Number of selections of points after which a sphere that has not settled is given up."""
 _FREE_ROUNDS = 10
-"""Choices after which points that once belonged to a sphere stay with it, for a few at the rim may come and go."""
+"""Number of selections after which points that once belonged to a sphere stay with it, because a few at the rim may
+alternate."""
 _SETTLED_MM = 1e-5
-"""A sphere has settled when a new choice of points moves it by less than this."""
+"""A sphere has settled when a new selection of points moves it by less than this."""
 _LEAST_SIGMA_MM = 1e-4
 """Robust standard deviation below which nothing is an outlier."""
 _DIRECTIONS = 400
-"""Directions over the whole sphere at which coverage is asked."""
+"""Number of directions over the whole sphere at which coverage is evaluated."""
 _COVERED_DEG = 8.0
-"""A direction is covered where a point lies this near; neighbouring directions are 10 deg apart."""
+"""A direction is covered if a point lies this near; neighbouring directions are 10 deg apart."""
 _SIGMA_OF_MAD = 1.4826
 _SIDES = (("3", "4"), ("1", "2"))
 """FDI quadrants that face each other, lower and upper."""
@@ -51,18 +52,18 @@ _SIDES = (("3", "4"), ("1", "2"))
 
 @dataclass(frozen=True, kw_only=True)
 class SphereOptions(Options):
-    """Which points of a scan make a sphere, and when it counts as measured."""
+    """Which points of a scan belong to a sphere, and when it counts as measured."""
 
     band_mm: Annotated[float, Range(0.0001, 100)] = 0.5
-    """Points nearer than this to the surface of the sphere belong to it; more than the scan is wrong by."""
+    """Points nearer than this to the surface of the sphere belong to it; must exceed the errors of the scan."""
     polar_deg: Annotated[float, Range(1, 180)] = 100.0
-    """Points within this angle of the occlusal direction belong to it; the rest is too near to what it stands in."""
+    """Points within this angle of the occlusal direction belong to it; the rest is too near to the base."""
     outlier_sigmas: Annotated[float, Range(0.01, 1000)] = 5.0
-    """Points farther from the fitted sphere than this many robust standard deviations are left out of the fit."""
+    """Points farther than this from the fitted sphere, in robust standard deviations, are left out of the fit."""
     least_points: Annotated[int, Range(4, 10_000_000)] = 200
     """A sphere with fewer points is not measured."""
     least_coverage_pct: Annotated[float, Range(0, 100)] = 50.0
-    """A sphere of which less of the cap within ``polar_deg`` has points is not measured."""
+    """A sphere is not measured if its points cover less than this of the cap within ``polar_deg``."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -70,19 +71,19 @@ class SphereMeasurement:
     """A sphere that was found in the scan."""
 
     centre: Float[np.ndarray, "3"]
-    """In the frame of the scan, mm."""
+    """Centre in the frame of the scan, mm."""
     size_error_um: float
-    """Diameter minus nominal (PS)."""
+    """Measured minus nominal diameter (PS)."""
     form_range_um: float
-    """Range of the radial distances of the fitted points (PF), outliers left out."""
+    """Range of the radial distances of the fitted points (PF), without outliers."""
     form_95_um: float
-    """Range of the middle 95 % (by area) of the radial distances of all points, outliers included."""
+    """Range of the middle 95 % (by area) of the radial distances of all points, including outliers."""
     form_rms_um: float
     """Root mean square (by area) of the radial distances of the fitted points."""
     points: int
-    """Number of vertices, outliers included."""
+    """Number of vertices, including outliers."""
     outliers_pct: float
-    """Share of them that was left out of the fit."""
+    """Share of them that were left out of the fit."""
     coverage_pct: float
     """Share of the cap within ``polar_deg`` where the scan has points."""
 
@@ -95,13 +96,13 @@ class SphereSpacing:
     """The distance between two spheres."""
 
     first: str
-    """Label of the one."""
+    """Label of the first sphere."""
     second: str
-    """Label of the other."""
+    """Label of the second sphere."""
     nominal_mm: float
-    """In the reference."""
+    """Distance in the reference."""
     error_um: float
-    """Measured minus nominal (SD)."""
+    """Measured minus nominal distance (SD)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -109,9 +110,9 @@ class SphereReport:
     """What the spheres say about a scan."""
 
     spheres: Mapping[str, SphereMeasurement]
-    """By label."""
+    """Measured spheres, by label."""
     not_measured: Mapping[str, str]
-    """Why, by label, for spheres that the scan does not show well enough."""
+    """For spheres that the scan does not show well enough, the reason, by label."""
     spacings: tuple[SphereSpacing, ...]
     """All pairs of measured spheres, the shortest nominal distance first."""
     spacing_max_um: float
@@ -119,11 +120,11 @@ class SphereReport:
     spacing_rms_um: float
     """Root mean square of the sphere-spacing errors of all pairs."""
     scale_ppm: float
-    """Error in proportion to distance that fits all pairs best: a line through zero, least squares."""
+    """Error proportional to distance that fits all pairs best: a line through zero, least squares."""
     spacing_rms_without_scale_um: float
-    """Root mean square of what the line leaves: errors of shape."""
+    """Root mean square of the residuals from that line: errors of shape."""
     inter_canine_um: float | None
-    """Error of the distance between the canines; None where one was not measured."""
+    """Error of the distance between the canines; None if one was not measured."""
     inter_first_molar_um: float | None
     """Error of the distance between the first molars."""
     inter_second_molar_um: float | None
@@ -131,11 +132,11 @@ class SphereReport:
     cross_arch_um: Mapping[str, float]
     """Errors of the distances between a canine and the first molar of the other side, as "33-46"."""
     notes: tuple[str, ...]
-    """How it was measured, for people."""
+    """How it was measured, as human-readable lines."""
 
     @property
     def named_um(self) -> dict[str, float]:
-        """Errors of the distances across the arch that have a name, by "<label>-<label>"."""
+        """Errors of the named distances across the arch, by "<label>-<label>"."""
         pairs = {f"{one}{position}-{other}{position}" for one, other in _SIDES for position in (3, 6, 7)}
         named = {f"{each.first}-{each.second}": each.error_um for each in self.spacings}
         return {name: error for name, error in named.items() if name in pairs} | dict(self.cross_arch_um)
@@ -146,8 +147,8 @@ def evaluate_spheres(
 ) -> SphereReport:
     """Find the spheres of a reference in a scan and compare all distances between them.
 
-    ``reference_from_scan`` is a rough alignment, good to about ``band_mm``; it chooses points and does nothing else.
-    Raises InputError where the reference has no spheres or the scan shows fewer than two of them.
+    ``reference_from_scan`` is a rough alignment, good to about ``band_mm``; it only selects points. Raises InputError
+    where the reference has no spheres or the scan shows fewer than two of them.
     """
     if not reference.spheres:
         raise InputError("spheres: the reference has none; give the jaw that 'cuspid phantom --spheres' wrote")
@@ -185,7 +186,7 @@ class _Fit:
 def fit_sphere(
     points: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, "n"], outlier_sigmas: float = np.inf
 ) -> tuple[Float[np.ndarray, "3"], float]:
-    """Centre (mm) and radius (mm) of the sphere with the least weighted squares of orthogonal distances."""
+    """Centre (mm) and radius (mm) of the sphere with the smallest weighted sum of squared orthogonal distances."""
     fit = _fit(points, weights, outlier_sigmas)
     return fit.centre, fit.radius
 

@@ -1,7 +1,8 @@
-"""How well the teeth of a scan stand to each other.
+"""How well the teeth of a scan are placed relative to each other.
 
-The scanned surface of each tooth is laid on its reference by a rigid motion of its own, ``reference_from_scan`` of that
-tooth alone. What these motions do to the centroids of the teeth gives the errors of the distances across the arch.
+The scanned surface of each tooth is aligned with its reference by a separate rigid motion, ``reference_from_scan`` of
+that tooth alone. The effect of these motions on the centroids of the teeth gives the errors of the distances across the
+arch.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from cuspid.geometry import Rigid3
 _ARCH_ORDER = (*range(48, 40, -1), *range(31, 39), *range(18, 10, -1), *range(21, 29))
 """FDI numbers along the lower and the upper arch."""
 MOLARS = ((46, 36), (16, 26), (47, 37), (17, 27))
-"""Pairs whose distance is the inter-molar one, the first that was scanned."""
+"""Pairs of molars for the inter-molar distance; the first pair that was scanned is used."""
 CANINES = ((43, 33), (13, 23))
 LEAST_SAMPLES = 300
-"""Samples of a tooth below which nothing is said about it."""
+"""Number of samples of a tooth below which it is not evaluated."""
 _MOST_SAMPLES = 10_000
 
 
@@ -33,13 +34,13 @@ class ScannedTooth:
     points: Float[np.ndarray, "n 3"]
     """Samples of the aligned scan on this tooth, mm."""
     reference_from_scan: Rigid3
-    """What lays them best on the reference; the identity where the tooth stands right."""
+    """The rigid motion that best aligns them with the reference; the identity if the tooth is placed correctly."""
     centroid: Float[np.ndarray, "3"]
     """Centroid of the tooth in the reference, mm."""
 
     @property
     def scanned_centroid(self) -> Float[np.ndarray, "3"]:
-        """Where the aligned scan has it."""
+        """Position of the centroid in the aligned scan."""
         return self.reference_from_scan.inverse().apply(self.centroid)
 
 
@@ -50,9 +51,9 @@ def find_teeth(
     surface: SignedDistance,
     options: RegistrationOptions,
 ) -> dict[int, ScannedTooth]:
-    """Teeth with enough samples in an aligned scan, in the order along the arch.
+    """Teeth with enough samples in an aligned scan, in order along the arch.
 
-    ``labels`` are the FDI numbers of the samples; ``centroids`` those of the teeth that may be evaluated.
+    ``labels`` are the FDI numbers of the samples; ``centroids`` are those of the teeth that may be evaluated.
     """
     teeth = {}
     for fdi in (tooth for tooth in _ARCH_ORDER if tooth in centroids):
@@ -65,7 +66,7 @@ def find_teeth(
 
 
 def distance_error_um(teeth: Mapping[int, ScannedTooth], pairs: tuple[tuple[int, int], ...]) -> float | None:
-    """Error of the distance between the centroids of the first pair that was scanned; positive: too wide."""
+    """Error of the distance between the centroids of the first pair that was scanned; positive if too wide."""
     for right, left in pairs:
         if right in teeth and left in teeth:
             a, b = teeth[right], teeth[left]

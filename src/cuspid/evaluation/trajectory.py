@@ -1,8 +1,8 @@
 """Errors of a trajectory: absolute and relative pose errors, named and defined as by evo (Grupp 2017) and in the
 benchmark of Sturm et al. (IROS 2012), but in um.
 
-What is aligned is the surface: the poses are compared where the registration of the scan has put them, so that they
-tell why the surface errs, and not how well a rigid motion hides it.
+The alignment is that of the surface: the poses are compared where the registration of the scan puts them, so that they
+explain the errors of the surface, and do not show how well a rigid motion hides them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from cuspid.geometry import Rigid3
 
 @dataclass(frozen=True, kw_only=True)
 class ErrorStatistics:
-    """Of errors that are not negative."""
+    """Statistics of non-negative errors."""
 
     rmse: float
     mean: float
@@ -35,13 +35,13 @@ class TrajectoryError:
     """How far the poses of a handpiece are from the true ones."""
 
     frames: int
-    """Frames whose pose was found and is known."""
+    """Number of frames with a pose that was found and whose true pose is known."""
     ape_um: ErrorStatistics
-    """Absolute pose error, translation part: distance of the handpiece's origin from where it was."""
+    """Absolute pose error, translation part: distance of the handpiece's origin from its true position."""
     ape_deg: ErrorStatistics
     """Absolute pose error, rotation part: angle to the true orientation."""
     rpe_um: ErrorStatistics
-    """Relative pose error, translation part: how far the motion from one of these frames to the next is off."""
+    """Relative pose error, translation part: error of the motion from one of these frames to the next."""
     rpe_deg: ErrorStatistics
     """Relative pose error, rotation part."""
 
@@ -51,7 +51,7 @@ def trajectory_error(
 ) -> TrajectoryError:
     """Errors of ``rig_from_world`` by frame; the worlds are those of the scan and of its reference.
 
-    Raises InputError where fewer than two frames are in both.
+    Raises InputError if fewer than two frames are in both.
     """
     frames = [name for name in true if name in found]
     if len(frames) < 2:

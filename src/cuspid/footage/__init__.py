@@ -1,1 +1,1 @@
-"""Videos and folders of images become a capture: synchronised, without what is blurred, dark, burnt or twice there."""
+"""Videos and folders of images become a capture: synchronised, without blurred, dark, burnt-out or duplicate images."""

@@ -25,12 +25,13 @@ Image = UInt8[np.ndarray, "h w *c"] | UInt16[np.ndarray, "h w *c"]
 
 @dataclass(frozen=True, kw_only=True)
 class DevelopmentOptions(Options):
-    """How images are made of what the sensor gave."""
+    """How images are made from the sensor's data."""
 
     bayer: Literal["none", "RGGB", "BGGR", "GRBG", "GBRG"] = "none"
-    """Colours of the first four pixels (two rows) of images that are not demosaiced yet."""
+    """Colours of the first four pixels (two rows) of images that have not been demosaiced; none: they are ordinary
+    images."""
     bits: Annotated[int | None, Range(9, 16)] = None
-    """How many bits the values of 16-bit images really have; 16 unless given."""
+    """Number of significant bits in 16-bit images; 16 unless given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,23 +39,23 @@ class Film:
     """What one camera recorded."""
 
     camera: str
-    """Its name."""
+    """Name of the camera."""
     source: Path
     """A folder of images, or a video."""
     images: tuple[Path, ...]
-    """The images of a folder, in their order; none of a video."""
+    """The images of a folder, in order; empty for a video."""
     length: VideoLength
-    """How many frames there should be."""
+    """Expected number of frames."""
     digest: str
-    """SHA-256 of all of it."""
+    """SHA-256 of the whole film."""
 
     @property
     def is_video(self) -> bool:
-        """Whether it is one file."""
+        """Whether it is a single file."""
         return not self.images
 
     def name(self, number: int) -> str:
-        """Of a frame: of its image file, or its number in the video."""
+        """Name of a frame: that of its image file, or its number in the video."""
         return f"{number:05d}" if self.is_video else self.images[number].stem
 
 
@@ -63,15 +64,15 @@ class FilmFrame:
     """A frame of a film."""
 
     number: int
-    """From 0, in the order of the film."""
+    """Number, from 0, in the order of the film."""
     time_s: float | None
-    """When it was shown, or None where the film does not say."""
+    """Presentation time, or None where the film does not state it."""
     where: str
-    """For messages."""
+    """Where it is, for messages."""
     stored: Callable[[], Image]
-    """Reads what is stored: grey or RGB. Raises InputError where it is damaged."""
+    """Reads the stored image: grey or RGB. Raises InputError where it is damaged."""
     png: Path | None = None
-    """The file that it is, where that is a PNG."""
+    """The file itself, if it is a PNG."""
 
 
 def open_film(camera: str, source: Path) -> Film:
@@ -89,7 +90,7 @@ def open_film(camera: str, source: Path) -> Film:
 
 
 def sizes_of(film: Film) -> Iterator[tuple[str, tuple[int, int]]]:
-    """Where an image lies and its width and height, as far as can be told at a glance: of a video the first one."""
+    """The place of each image and its width and height, as far as the headers tell; for a video, of the first frame."""
     for path in film.images:
         try:
             yield str(path), image_size(path)
@@ -100,7 +101,7 @@ def sizes_of(film: Film) -> Iterator[tuple[str, tuple[int, int]]]:
 
 
 def frames_of(film: Film, options: DevelopmentOptions) -> Iterator[FilmFrame]:
-    """The frames of a film that there are, in their order."""
+    """The existing frames of a film, in order."""
     if film.is_video:
         for frame in read_video(film.source):
             where = f"{film.source}: frame {frame.number}"
@@ -118,7 +119,8 @@ def _of_video(frame: VideoFrame, where: str, *, is_grey: bool) -> Image:
 
 
 def developed(stored: Image, options: DevelopmentOptions, where: str) -> Image:
-    """The image of what is stored: colours made, values of the full range. Raises InputError where it cannot be."""
+    """The image made from the stored one: demosaiced, and scaled to the full range. Raises InputError where it cannot
+    be made."""
     if options.bits is not None and stored.dtype == np.uint16:
         if stored.max() >> options.bits:
             raise InputError(

@@ -1,4 +1,4 @@
-"""Which images of the films make which frame of the capture, and what is left out and why."""
+"""Which images of the films form which frame of the capture, and what is left out and why."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ from cuspid.options import Options, Range
 from cuspid.rig import Handpiece
 
 FrameTimes = Mapping[str, Mapping[str, float]]
-"""For each camera the time in s of its frames, by number or name."""
+"""For each camera, the times in s of its frames, by number or name."""
 Films = Mapping[str, Film]
-"""By camera."""
+"""Films by camera."""
 _ROUNDING_S = 1e-6
-"""Of times."""
+"""Rounding error of times."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,11 +47,11 @@ class SelectionOptions(Options):
     """Which part of the footage is taken."""
 
     every: Annotated[int, Range(1, 100_000)] = 1
-    """Only every so manyth frame."""
+    """Take only every n-th frame."""
     start_s: Annotated[float | None, Range(0, 1e6)] = None
-    """From so long after the first frame."""
+    """Take frames from this time after the first frame."""
     end_s: Annotated[float | None, Range(0, 1e6)] = None
-    """Until so long after the first frame."""
+    """Take frames up to this time after the first frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,49 +68,50 @@ class ImportOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Bad:
-    """An image that is of no use."""
+    """An unusable image."""
 
     frame: str
-    """Name of the frame of the capture."""
+    """Name of its frame in the capture."""
     camera: str
-    """That took it."""
+    """Camera that took it."""
     reason: str
-    """Kind and figure, as ``dark: 95 % of it is below 9 of 255``."""
+    """Kind and value, for example ``dark: 95 % of it is below 9 of 255``."""
 
     @property
     def kind(self) -> str:
-        """Of the reason, a word."""
+        """Kind of the reason, as one word."""
         return self.reason.partition(":")[0]
 
     def dropped(self) -> Dropped:
-        """As a capture has it."""
+        """The image in the form that a capture stores."""
         return Dropped(what=f"camera {self.camera} of frame {self.frame}", reason=self.reason)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Plan:
-    """What is to be made of footage."""
+    """What is to be made from the footage."""
 
     frames: tuple[Frame, ...]
-    """Of the capture, with the cameras whose images are of use."""
+    """Frames of the capture, with the cameras whose images are usable."""
     numbers: Mapping[str, Mapping[str, int]]
-    """For each frame by name, and each camera that has an image of it, used or not, its number in the film."""
+    """For each frame, by name, and each camera that has an image of it, used or not: its number in the film."""
     bad: tuple[Bad, ...]
-    """Images of these frames that are of no use."""
+    """Unusable images of these frames."""
     times_s: Mapping[str, Float[np.ndarray, "_"]]
-    """For each camera when its frames were taken by its own clock; NaN where that is not known."""
+    """For each camera, the times of its frames by its own clock; NaN where they are not known."""
     starts_frames: Mapping[str, int] | None
-    """How many frames after the first camera each began, where that was found."""
+    """How many frames after the first camera each one began, if that was determined."""
     apart_ms: Float[np.ndarray, "f"] | None
-    """How far the images of each frame are apart in time, where they were synchronised by that."""
+    """Time differences within each frame, if the images were synchronised by their times."""
     notes: tuple[str, ...]
-    """What was found, one line each."""
+    """Findings, one line each."""
 
 
 def plan_import(
     films: Films, looks: Mapping[str, Looks], handpiece: Handpiece, options: ImportOptions, times: FrameTimes | None
 ) -> Plan:
-    """Synchronise and choose. Raises InputError where that cannot be trusted, or nothing of use is left."""
+    """Synchronise and select. Raises InputError where the synchronisation cannot be trusted, or nothing usable is
+    left."""
     times_s = {
         camera: each.time_s if times is None else _times_of(films[camera], len(each.time_s), times.get(camera, {}))
         for camera, each in looks.items()
@@ -249,7 +250,7 @@ def _judged(
 
 
 def kinds_of(bad: Sequence[Bad]) -> dict[str, int]:
-    """How many images are of no use for which kind of reason, the most frequent first."""
+    """Number of unusable images for each kind of reason, the most frequent first."""
     return dict(Counter(each.kind for each in bad).most_common())
 
 

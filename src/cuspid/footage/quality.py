@@ -1,4 +1,4 @@
-"""Which images are of use: not blurred, dark, burnt, damaged, or the one before once more."""
+"""Which images are usable: not blurred, dark, burnt out, damaged, or duplicates of the previous one."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from scipy.ndimage import median_filter
 from cuspid.options import SHARE, Options, Range
 
 _LOOKED_AT_PX = 640
-"""Longer side of what is judged; noise is less in a smaller image, blur that matters is not."""
+"""Longer side of the reduced image that is judged; it has less noise, and still shows any blur that matters."""
 _BURNT_DN = 250
-"""Of 255."""
+"""Grey value of 255 from which a pixel counts as white."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,35 +23,35 @@ class QualityOptions(Options):
     """Which images are left out."""
 
     blurred_below: Annotated[float, SHARE] = 0.4
-    """Of the usual sharpness of the frames about it (0: none is)."""
+    """An image is blurred below this share of the usual sharpness of the frames around it (0: never)."""
     dark_below_dn: Annotated[float, Range(0, 255)] = 20.0
-    """Grey value of 255 that the brightest twentieth of an image reaches (0: none is)."""
+    """An image is dark if its brightest twentieth does not reach this grey value of 255 (0: never)."""
     burnt_above: Annotated[float, SHARE] = 0.3
-    """Share of an image that is white (1: none is)."""
+    """An image is burnt out if more than this share of it is white (1: never)."""
     same_below_dn: Annotated[float, Range(0, 255)] = 0.1
-    """Mean difference from the frame before, of 255 (0: none is the same)."""
+    """An image is a duplicate if its mean difference from the previous frame, of 255, is below this (0: never)."""
     window_frames: Annotated[int, Range(3, 1001)] = 51
-    """How many frames say what is usual."""
+    """Number of frames that determine the usual sharpness."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Looks:
-    """What each frame of a camera looks like; NaN where it could not be read."""
+    """Measures of each frame of a camera; NaN where it could not be read."""
 
     time_s: Float[np.ndarray, "n"]
-    """When it was taken; NaN where the file does not say."""
+    """Time of capture; NaN where the file does not state it."""
     level_dn: Float[np.ndarray, "n"]
     """Mean grey value of 255."""
     bright_dn: Float[np.ndarray, "n"]
-    """Grey value that a twentieth of the image exceeds."""
+    """Grey value that the brightest twentieth of the image exceeds."""
     burnt: Float[np.ndarray, "n"]
     """Share of white pixels."""
     sharpness: Float[np.ndarray, "n"]
     """Standard deviation of the Laplacian over the mean grey value."""
     change_dn: Float[np.ndarray, "n"]
-    """Mean difference from the frame before; NaN where there is none."""
+    """Mean difference from the previous frame; NaN if there is none."""
     peak: Float[np.ndarray, "n"]
-    """Largest value as it is stored."""
+    """Largest stored value."""
 
     @property
     def readable(self) -> Bool[np.ndarray, "n"]:
@@ -60,7 +60,7 @@ class Looks:
 
 
 def seen(image: UInt8[np.ndarray, "h w *c"] | UInt16[np.ndarray, "h w *c"]) -> Float32[np.ndarray, "a b"]:
-    """An image, RGB or grey, as it is judged: grey values up to 255, small."""
+    """An image, RGB or grey, in the form in which it is judged: small, with grey values up to 255."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     scale = min(1.0, _LOOKED_AT_PX / max(grey.shape))
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey
@@ -70,7 +70,7 @@ def seen(image: UInt8[np.ndarray, "h w *c"] | UInt16[np.ndarray, "h w *c"]) -> F
 def look(
     shown: Float32[np.ndarray, "a b"], before: Float32[np.ndarray, "a b"] | None
 ) -> tuple[float, float, float, float, float]:
-    """Level, brightness, burnt share, sharpness and change of an image as :func:`seen`, as in :class:`Looks`."""
+    """Level, brightness, burnt-out share, sharpness and change of an image from :func:`seen`, as in :class:`Looks`."""
     level = float(shown.mean())
     edges = cv2.Laplacian(cv2.GaussianBlur(shown, (0, 0), 1.0), cv2.CV_32F)
     change = float(np.abs(shown - before).mean()) if before is not None else np.nan
@@ -84,7 +84,7 @@ def look(
 
 
 def faults(looks: Looks, options: QualityOptions) -> dict[int, str]:
-    """What is wrong with the frames that are of no use, by their number."""
+    """What is wrong with the unusable frames, by number."""
     usual = _usual_sharpness(looks, options)
     found = {}
     for number in range(len(looks.level_dn)):

@@ -1,8 +1,8 @@
 """From footage to a capture: look at every frame once (:func:`survey`), plan (:mod:`cuspid.footage.plan`), and make the
-images that are of use (:func:`develop`).
+usable images (:func:`develop`).
 
-What each frame looks like is kept, and so is what each image was made from: an import that was ended goes on, and
-another try at synchronising does not look at the films again.
+The measures of each frame are kept, and so is what each image was made from: an interrupted import resumes, and another
+attempt at synchronising does not read the films again.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ _CODE = ("footage", "storage/videos.py")
 
 
 def open_films(sources: Mapping[str, Path], handpiece: Handpiece) -> dict[str, Film]:
-    """The films of the cameras, by name. Raises InputError where a name is no camera of the handpiece, a film has no
-    frame, or its images are not of the size of the camera."""
+    """The films of the cameras, by name. Raises InputError where a name is not a camera of the handpiece, a film has no
+    frame, or its images do not have the camera's size."""
     unknown = sorted(set(sources) - set(handpiece.rig.names))
     if unknown:
         raise InputError(
@@ -57,7 +57,7 @@ def _check_size(where: str, size: tuple[int, int], expected: tuple[int, int], ca
 
 
 def survey(films: Films, folder: Path, options: DevelopmentOptions, progress: Progress = silent) -> dict[str, Looks]:
-    """What each frame looks like, by camera; kept in ``survey/``. Raises InputError where a film changes its size."""
+    """Measures of each frame, by camera; kept in ``survey/``. Raises InputError where a film changes its image size."""
     stage = Stage("survey", folder, options, _CODE)
 
     def of(film: Film) -> Looks:
@@ -111,7 +111,7 @@ def develop(
     options: DevelopmentOptions,
     progress: Progress = silent,
 ) -> Capture:
-    """The capture of a plan, in a folder; images that are there already are kept."""
+    """The capture made by a plan, in a folder; existing images are kept."""
     images = ImageFolder(folder)
     stage = Stage("images", folder, options, _CODE)
     wanted: dict[str, dict[int, Path]] = {camera: {} for camera in films}

@@ -1,4 +1,4 @@
-"""Which images of several cameras were taken at once, from their times or from what they saw.
+"""Which images of several cameras were taken at the same instant, from their times or from what they saw.
 
 An instant is numbered from the first frame of the camera that began first; a camera *starts* at the instant of its
 first frame. Frames of a camera are numbered from 0. Nothing here depends on the order of the cameras.
@@ -22,64 +22,66 @@ from cuspid.storage.sequences import name_order
 
 Sync = Literal["names", "times", "flash", "motion", "none"]
 Signals = Mapping[str, Float[np.ndarray, "_"]]
-"""A number for each frame of each camera; NaN where there is none."""
+"""One number for each frame of each camera; NaN where there is none."""
 
 _SLOW = 31
-"""Frames; what changes more slowly than that is no sign of one moment."""
+"""Number of frames; slower changes do not mark a moment."""
 _RISE = 0.25
-"""Of the largest jump; the frame before it has a part of the flash where it jumped by more than that."""
+"""Share of the largest jump; a preceding frame with a larger jump than this already contains part of the flash."""
 _LEAST_DN = 4.0
-"""No flash is weaker."""
+"""Minimum brightness of a flash."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SyncOptions(Options):
-    """How the cameras are synchronised, and when that is to be trusted."""
+    """How the cameras are synchronised, and when the result is trusted."""
 
     sync: Sync = "names"
-    """What was taken at once: images of one name and video frames of one number (names), of about one time (times), as
-    far from a flash that all cameras saw (flash) or as the motion in the images says (motion); or nothing (none)."""
+    """Which images belong together: those with the same name, and video frames with the same number (names); with
+    nearly the same time (times); at the same number of frames from a flash that all cameras saw (flash), or by the
+    motion in the images (motion); or none (none)."""
     apart_share: Annotated[float, Range(0.01, 0.5)] = 0.25
-    """Of the time between frames; images that are farther apart were not taken at once (times)."""
+    """Images that are farther apart than this share of the time between frames were not taken at the same instant
+    (times)."""
     flash_sigmas: Annotated[float, Range(3, 1000)] = 10.0
-    """By how many standard deviations of the usual changes of brightness a flash stands out."""
+    """Number of standard deviations of the usual changes of brightness by which a flash must stand out."""
     motion_sigmas: Annotated[float, Range(3, 1000)] = 6.0
-    """By how many standard deviations of all other offsets the best one stands out."""
+    """Number of standard deviations of all other offsets by which the best one must stand out."""
     second_share: Annotated[float, SHARE] = 0.6
-    """A flash, or an offset, is clear where the second best reaches no more of it than this."""
+    """A flash, or an offset, is unambiguous if the second best reaches at most this share of it."""
     overlap_share: Annotated[float, Range(0.1, 1)] = 0.5
-    """Of the shorter film that an offset leaves in common, at least (motion)."""
+    """Minimum share of the shorter film that two films must have in common at an offset (motion)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Instant:
-    """Images that were taken at once."""
+    """Images that were taken at the same instant."""
 
     name: str
-    """Of the frame."""
+    """Name of the frame."""
     numbers: Mapping[str, int]
-    """For each camera that has an image of it the number of its frame."""
+    """For each camera that has an image of it, the number of its frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Offset:
-    """How much later one camera began than another, by the motion in their images."""
+    """How much later one camera began than another, from the motion in their images."""
 
     frames: int
-    """Frames; frame 0 of the later one is frame ``frames`` of the first one."""
+    """Number of frames; frame 0 of the later camera is frame ``frames`` of the first one."""
     correlation: float
-    """Of the changes of both cameras at this offset."""
+    """Correlation of the changes of both cameras at this offset."""
     sigmas: float
-    """By which it stands out from the other offsets."""
+    """Number of standard deviations by which it stands out from the other offsets."""
     doubt: str | None
-    """Why it is not to be trusted."""
+    """Why it is not trusted, or None."""
 
 
 # --- by name, number and time --------------------------------------------------------------------------------------
 
 
 def by_names(names: Mapping[str, Sequence[str]]) -> tuple[Instant, ...]:
-    """Images of one name, for each camera the names of its frames, in the order of the numbers in them."""
+    """Images with the same name, given for each camera the names of its frames, in the order of the numbers in them."""
     numbers = {camera: {name: k for k, name in enumerate(each)} for camera, each in names.items()}
     every = sorted(set().union(*names.values()), key=name_order)
     return tuple(
@@ -89,7 +91,7 @@ def by_names(names: Mapping[str, Sequence[str]]) -> tuple[Instant, ...]:
 
 
 def by_starts(starts: Mapping[str, int], counts: Mapping[str, int]) -> tuple[Instant, ...]:
-    """Frames of one instant, from the instant of each camera's first frame and its number of frames."""
+    """Frames of the same instant, given the instant of each camera's first frame and its number of frames."""
     last = max(starts[camera] + count for camera, count in counts.items())
     running = [
         {camera: k - start for camera, start in starts.items() if 0 <= k - start < counts[camera]} for k in range(last)
@@ -100,8 +102,9 @@ def by_starts(starts: Mapping[str, int], counts: Mapping[str, int]) -> tuple[Ins
 def by_times(times_s: Signals, options: SyncOptions) -> tuple[Instant, ...]:
     """Images that are no farther apart in time than a share of the time between frames.
 
-    From the earliest image on, each takes with it the next ones of other cameras; one without a time has no instant.
-    Raises InputError where times run backwards, or the times of a camera have nothing in common with the others'.
+    Starting from the earliest image, each takes the next ones of other cameras with it; an image without a time belongs
+    to no instant. Raises InputError where times run backwards, or the times of a camera have nothing in common with the
+    others'.
     """
     for camera, times in times_s.items():
         _check_times(camera, times)
@@ -130,7 +133,7 @@ def by_times(times_s: Signals, options: SyncOptions) -> tuple[Instant, ...]:
 
 
 def one_by_one(counts: Mapping[str, int], times_s: Signals) -> tuple[Instant, ...]:
-    """Each image for itself, in the order of their times where all have one, else camera by camera."""
+    """Each image by itself, in the order of their times if all have one, otherwise camera by camera."""
     images = [(camera, number) for camera, count in counts.items() for number in range(count)]
     if all(np.isfinite(each).all() for each in times_s.values()):
         images.sort(key=lambda image: float(times_s[image[0]][image[1]]))
@@ -163,7 +166,7 @@ def _check_times(camera: str, times_s: Float[np.ndarray, "_"]) -> None:
 
 
 def jumps_in(times_s: Float[np.ndarray, "_"]) -> tuple[int, ...]:
-    """The frames before which more than half a frame's time is missing."""
+    """The frames before which more than half a frame interval is missing."""
     known = np.flatnonzero(np.isfinite(times_s))
     steps = np.diff(times_s[known]) / np.diff(known)
     return tuple(known[1:][steps > 1.5 * np.median(steps)].tolist()) if len(steps) else ()
@@ -171,20 +174,21 @@ def jumps_in(times_s: Float[np.ndarray, "_"]) -> tuple[int, ...]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Clock:
-    """The cameras' times on one clock."""
+    """The times of the cameras on a common clock."""
 
     times_s: Float[np.ndarray, "i"]
-    """Of the instants; NaN where no image has a time."""
+    """Times of the instants; NaN where no image has a time."""
     apart_s: Float[np.ndarray, "i"]
-    """How far the images of each instant are from each other, once the clocks are set."""
+    """Time difference within each instant, once the clocks are set."""
     interval_s: float
     """The usual time between frames."""
 
 
 def one_clock(instants: Sequence[Instant], times_s: Signals, *, is_set: bool) -> Clock | None:
-    """The times of instants. Clocks of cameras are set by the median difference, unless they are already (``is_set``).
+    """The times of instants. The clocks of the cameras are set by the median difference, unless they already are
+    (``is_set``).
 
-    None where no camera, or not every one, has times.
+    None unless every camera has times.
     """
     if any(np.isfinite(each).sum() < 2 for each in times_s.values()):
         return None
@@ -209,12 +213,12 @@ def one_clock(instants: Sequence[Instant], times_s: Signals, *, is_set: bool) ->
 
 
 def flash_starts(brightness: Signals, options: SyncOptions) -> dict[str, int]:
-    """When each camera started, from a flash that all saw. Raises InputError where one saw none, or several."""
+    """When each camera started, from a flash that all of them saw. Raises InputError where one saw none, or several."""
     return _from_zero({camera: -flash_of(camera, each, options) for camera, each in brightness.items()})
 
 
 def flash_of(camera: str, brightness: Float[np.ndarray, "_"], options: SyncOptions) -> int:
-    """The first frame that a flash is in. Raises InputError where there is none, or no clear one."""
+    """The first frame that contains a flash. Raises InputError where there is none, or no unambiguous one."""
     if len(brightness) < 6:
         raise InputError(f"{camera}: {len(brightness)} frames are too few to find a flash in")
     rises = _rises(_filled(brightness))
@@ -247,10 +251,10 @@ def _rises(brightness: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
 
 
 def motion_starts(motion: Signals, options: SyncOptions) -> dict[str, int]:
-    """When each camera started, from when the images of each change much and little.
+    """When each camera started, from the times of much and little change in its images.
 
-    Every two cameras are compared, and those offsets that can be trusted must agree. Raises InputError where a
-    camera's motion is like that of no other, or they do not agree.
+    All pairs of cameras are compared, and the offsets that can be trusted must agree. Raises InputError where a
+    camera's motion resembles that of no other, or they do not agree.
     """
     offsets = {
         pair: offset_between(motion[pair[0]], motion[pair[1]], options) for pair in combinations(sorted(motion), 2)
@@ -281,7 +285,7 @@ def motion_starts(motion: Signals, options: SyncOptions) -> dict[str, int]:
 
 
 def offset_between(one: Float[np.ndarray, "m"], other: Float[np.ndarray, "n"], options: SyncOptions) -> Offset:
-    """How much later the other camera began, by the correlation of what changes quickly in both signals."""
+    """How much later the other camera began, by the correlation of the quick changes in both signals."""
     first, second = _quick(one), _quick(other)
     offsets, found, overlaps = _correlations(first, second)
     usable = overlaps >= max(2 * _SLOW, options.overlap_share * min(len(one), len(other)))

@@ -40,21 +40,23 @@ class DesignOptions(Options):
     field_of_view_deg: Annotated[float, Range(1, 170)] = 62.0
     """Full horizontal angle of view."""
     working_distance_mm: Annotated[float, Range(0.1, 1000)] = 5.0
-    """From the cameras to the surface that they look at."""
+    """Distance from the cameras to the surface that they look at."""
     baseline_across_mm: Annotated[float, Range(0.01, 1000)] = 2.5
-    """Between the two cameras across the arch (up and down the tooth for the side groups)."""
+    """Distance between the two cameras across the arch (up and down the tooth for the side groups)."""
     baseline_along_mm: Annotated[float, Range(0.01, 1000)] = 1.5
-    """Between the two cameras along the curve of Spee."""
+    """Distance between the two cameras along the curve of Spee."""
     side_tilt_deg: Annotated[float, Range(-90, 90)] = 60.0
     """Angle between the occlusal axis and the axes of the buccal and lingual groups (twelve cameras only)."""
     side_offset_mm: Annotated[float, Range(-1000, 1000)] = 4.5
-    """From the middle of the crown to where the side groups' axes meet its side (twelve cameras only)."""
+    """Distance from the middle of the crown to where the axes of the side groups meet its side (twelve cameras
+    only)."""
     side_depth_mm: Annotated[float, Range(-1000, 1000)] = 2.5
-    """From the cusp tips down to where the side groups' axes meet the side (twelve cameras only)."""
+    """Depth below the cusp tips at which the axes of the side groups meet the side (twelve cameras only)."""
     outer_distance_mm: Annotated[float, Range(0.01, 1000)] = 2.0
-    """From the outer of the four cameras across the arch to the one more on either side (six cameras only)."""
+    """Distance from the outer of the four cameras across the arch to the additional one on each side (six cameras
+    only)."""
     outer_tilt_deg: Annotated[float, Range(-89, 89)] = 0.0
-    """How far the axes of these two lean towards the middle of the tooth (six cameras only)."""
+    """How far the axes of these two tilt towards the middle of the tooth (six cameras only)."""
     holder: HolderOptions = field(default_factory=HolderOptions)
     """What carries cameras and LEDs."""
 

@@ -29,14 +29,14 @@ class HolderOptions(Options):
     camera_mm: Annotated[tuple[float, float, float], Range(0.01, 1000)] = CAMERA_MM
     """Width, height and depth of a camera module, from its lens backwards."""
     led_mm: Annotated[tuple[float, float, float], Range(0.01, 1000)] = LED_MM
-    """The same of an LED."""
+    """The same for an LED."""
     wall_mm: Annotated[float, Range(0.01, 100)] = 0.8
     """Thickness of the plates and bars."""
     bar_mm: Annotated[float, Range(0.01, 1000)] = 3.0
     """Width of the bars that join the plates."""
     neck_mm: Annotated[float, Range(0, 1000)] = 0.0
-    """Length of a neck that leaves the middle of the holder backwards along the path; 0 leaves it out, for where the
-    handpiece leaves the mouth is not known."""
+    """Length of a neck that leaves the middle of the holder backwards along the path; 0 omits it, as it is not known
+    where the handpiece leaves the mouth."""
     neck_width_mm: Annotated[float, Range(0.01, 1000)] = 6.0
     """Width and height of the neck."""
 

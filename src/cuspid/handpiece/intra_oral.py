@@ -29,9 +29,9 @@ class IntraOralOptions(Options):
     field_of_view_deg: Annotated[float, Range(1, 170)] = 62.0
     """Full horizontal angle of view."""
     working_distance_mm: Annotated[float, Range(0.1, 1000)] = 14.0
-    """From the camera to the cusp tips."""
+    """Distance from the camera to the cusp tips."""
     leds: Annotated[int, Range(1, 100)] = 4
-    """LEDs around the lens."""
+    """Number of LEDs around the lens."""
     led_ring_mm: Annotated[float, Range(0, 1000)] = 3.0
     """Radius of the ring of LEDs."""
     holder: HolderOptions = field(default_factory=HolderOptions)

@@ -51,24 +51,24 @@ _BOUND_UM = 20.0
 
 @dataclass(frozen=True, kw_only=True)
 class SearchOptions(Options):
-    """How long and how finely is searched."""
+    """How long and how finely the search runs."""
 
     noise: NoiseModel = field(default_factory=lambda: NoiseModel(sigma_px=0.5, convergence_deg=25.0))
-    """Of matched points. That matching has lost half of its precision at 25 deg is an assumption."""
+    """Noise of matched points. That matching loses half of its precision at 25 deg is an assumption."""
     visibility: VisibilityOptions = field(default_factory=VisibilityOptions)
     """When a camera sees a face."""
     pairing: PairingOptions = field(default_factory=PairingOptions)
-    """Which cameras depth is measured from."""
+    """Which cameras form the stereo pairs that depth is measured from."""
     points: Annotated[int, Range(1, 100_000)] = 80
-    """Faces of each section at which the bound is asked."""
+    """Faces of each section at which the bound is evaluated."""
     samples: Annotated[int, Range(0, 64)] = 4
-    """Shapes drawn for each layout, beside the thesis' own."""
+    """Random shapes tried for each layout, besides the thesis' own."""
     finalists: Annotated[int, Range(1, 1000)] = 3
-    """Layouts whose shape is refined."""
+    """Layouts whose shape is then refined."""
     evaluations: Annotated[int, Range(1, 1_000_000)] = 80
-    """Designs tried while a shape is refined."""
+    """Designs tried while refining one shape."""
     seed: Annotated[int, SEED] = 0
-    """Chooses the drawn shapes."""
+    """Seed of the random shapes."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

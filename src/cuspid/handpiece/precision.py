@@ -34,17 +34,17 @@ from cuspid.visibility import VisibilityOptions, survey_visibility
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseModel(Options):
-    """Standard deviation of a matched image point, as its circumstances make it worse; the terms add up."""
+    """Standard deviation of a matched image point, and what increases it; the terms add up."""
 
     sigma_px: Annotated[float, Range(1e-06, 1000)] = 0.5
-    """In each image and each direction, on matching a sharp point that all cameras see squarely."""
+    """In each image and direction, when matching a sharp point that all cameras see perpendicularly."""
     convergence_deg: Annotated[float | None, Range(0.001, 1000)] = None
-    """Convergence that doubles the variance: sigma^2 (1 + (gamma / this)^4); None: no influence."""
+    """Convergence that doubles the variance: sigma^2 (1 + (gamma / this)^4); default: no influence."""
     deformation: Annotated[float | None, Range(1e-06, 1000)] = None
-    """Deformation (no unit) that doubles the variance: sigma^2 (1 + (g / this)^2). Needs the normals of the surface;
-    None: no influence."""
+    """Deformation (dimensionless) that doubles the variance: sigma^2 (1 + (g / this)^2). Needs the surface normals;
+    default: no influence."""
     blur_px: Annotated[float | None, Range(1e-06, 1000)] = None
-    """Diameter of the blur disc that doubles the variance: sigma^2 (1 + (c / this)^2); None: no influence."""
+    """Diameter of the blur disc that doubles the variance: sigma^2 (1 + (c / this)^2); default: no influence."""
 
 
 def projection_jacobian(

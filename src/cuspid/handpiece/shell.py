@@ -48,33 +48,33 @@ class PrintOptions(Options):
     """A holder that can be printed."""
 
     seat_clearance_mm: Annotated[float, Range(0, 10)] = 0.05
-    """Between a module and the walls of its seat; none behind it, where it rests."""
+    """Gap between a module and the walls of its seat; there is none behind it, where it rests."""
     wall_mm: Annotated[float, Range(0.05, 100)] = 0.8
-    """Least thickness of what is between a hollow and the outside, or behind a seat."""
+    """Minimum wall thickness between a hollow and the outside, or behind a seat."""
     web_mm: Annotated[float, Range(0.01, 100)] = 0.1
-    """Least thickness of what is between two seats."""
+    """Minimum wall thickness between two seats."""
     shoulder_mm: Annotated[float, Range(0.01, 100)] = 0.1
     """Width of the rim on which a module rests, around the channel for its cable."""
     duct_mm: Annotated[float, Range(0.1, 100)] = 1.0
-    """Depth of the ducts for cables behind the modules."""
+    """Depth of the cable ducts behind the modules."""
     arm_width_mm: Annotated[float, Range(0.2, 1000)] = 4.0
     """Width of the tubes that join the heads."""
     neck_mm: Annotated[float, Range(1, 1000)] = 50.0
-    """From the middle of the first head to the grip."""
+    """Distance from the middle of the first head to the grip."""
     neck_width_mm: Annotated[float, Range(0.2, 1000)] = 6.0
     """Width and height of the neck."""
     neck_towards: Towards = "left"
-    """Where the neck leaves the first head, in the images of its first camera."""
+    """Direction in which the neck leaves the first head, in the images of its first camera."""
     grip_mm: Annotated[float, Range(0, 1000)] = 90.0
-    """Length of the grip; 0 leaves it out."""
+    """Length of the grip; 0 omits it."""
     grip_width_mm: Annotated[float, Range(0.2, 1000)] = 14.0
     """Width and height of the grip."""
     handle_wall_mm: Annotated[float, Range(0.05, 100)] = 1.5
-    """Thickness of the walls of neck and grip."""
+    """Wall thickness of the neck and the grip."""
     light_half_angle_deg: Annotated[float, Range(0, 85)] = 35.0
-    """How far from its axis the light of an LED must be free."""
+    """Angle around the axis of an LED within which its light must not be blocked."""
     mouth_opening_mm: Annotated[float | None, Range(0.1, 1000)] = None
-    """Room between the teeth that there is for working distance and holder; not checked unless given."""
+    """Space available between the teeth for working distance and holder; not checked unless given."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -5,13 +5,13 @@ Unknowns and how a step changes them:
 
 - a pose, by a small motion on the left (rotation vector rad, translation mm); the first frame stays: it is the world;
 - a point, by a displacement (mm);
-- the calibration of a camera, by 14 whitened numbers z of prior N(0, 1): cam_from_rig = exp(L_e z_e) prior and
-  parameters = prior + L_i z_i, where L L^T is the covariance of the prior. Without one L = 0: the calibration is held.
+- the calibration of a camera, by 14 whitened parameters z with prior N(0, 1): cam_from_rig = exp(L_e z_e) prior and
+  parameters = prior + L_i z_i, where L L^T is the covariance of the prior. Without one L = 0: the calibration is fixed.
 
 Levenberg-Marquardt on the Huber loss of the residuals in units of their standard deviation. The points are eliminated
 (Schur complement); what remains is a dense system of 6 unknowns a frame and 14 a camera. After each step the points
-are put where their rays then meet (variable projection, Golub and Pereyra 1973), for along the bending of an arch they
-move far and not in a straight line; and the similarity of the whole rig, which no image sees, is set by the prior alone
+are put where their rays then meet (variable projection, Golub and Pereyra 1973), because as an arch bends they move far
+and not in a straight line; and the similarity of the whole rig, which no image determines, is set by the prior alone
 (:mod:`cuspid.motion.gauge`). The sums run over a fixed number of parts in a fixed order, so the result does not depend
 on the number of threads.
 """
@@ -54,23 +54,23 @@ from cuspid.sparse_model import SparseModel
 
 _LEAST_SIGMA_PX = 1e-6
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
-"""Of a step, as shares of the diagonal of the normal equations. What moves everything at once, as the scale and the
-bending of an arch, stands out so little from that diagonal that 1e-4 of it would freeze it."""
+"""Damping of a step, as shares of the diagonal of the normal equations. What moves everything at once, such as the
+scale and the bending of an arch, stands out so little from that diagonal that 1e-4 of it would freeze it."""
 _GAUGE_STEPS = 5
 _DRAWS, _MOST_DRAWN = 64, 2000
-"""Draws from the covariance of what was found, and points whose motion in them is followed."""
+"""Number of draws from the covariance of the result, and of points whose motion is followed in them."""
 _END = 0.02
-"""Of the length of a scan, what counts as its end."""
+"""Share of the length of a scan that counts as its end."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AdjustmentOptions(Options):
-    """How the bundle adjustment weighs and rejects observations and when it stops."""
+    """How the bundle adjustment weights and rejects observations, and when it stops."""
 
     sigma_px: Annotated[float, Range(0.0001, 100)] = 0.4
-    """Standard deviation of a keypoint to start with, px; the adjustment estimates it anew in each round."""
+    """Initial standard deviation of a keypoint, px; the adjustment re-estimates it in each round."""
     huber_sigmas: Annotated[float, Range(0.01, 1000)] = 2.0
-    """Residual length, in standard deviations, beyond which an observation counts less."""
+    """Residual length, in standard deviations, beyond which an observation is down-weighted (Huber)."""
     outlier_sigmas: Annotated[float, Range(0.1, 1000)] = 4.0
     """Residual length, in standard deviations, beyond which an observation is dropped after a round."""
     start_px: Annotated[float, Range(0.01, 1_000_000_000)] = 20.0
@@ -78,10 +78,10 @@ class AdjustmentOptions(Options):
     rounds: Annotated[int, Range(1, 1000)] = 3
     """Number of times that the minimum is sought, with outliers dropped in between."""
     iterations: Annotated[int, Range(1, 100_000)] = 30
-    """Most steps in a round."""
+    """Maximum number of steps in a round."""
     tolerance: Annotated[float, Range(1e-12, 1000)] = 0.01
     """A round ends when the cost, in squared standard deviations, would fall by less than this: all unknowns together
-    are then within the root of it of their best values, measured in their standard deviations."""
+    are then within its square root of their best values, measured in their standard deviations."""
     minimum_angle_deg: Annotated[float, Range(0, 90)] = 1.0
     """Points whose rays meet at less than this angle are dropped."""
 
@@ -90,7 +90,7 @@ class AdjustmentOptions(Options):
 
 
 def covariance_factor(covariance: Float[np.ndarray, "n n"] | None, size: int) -> Float[np.ndarray, "n n"]:
-    """L with L L^T = covariance, which may be singular (what has no variance is held); zero for None."""
+    """L with L L^T = covariance, which may be singular (parameters without variance are held fixed); zero for None."""
     if covariance is None:
         return np.zeros((size, size))
     scale = np.sqrt(np.diag(covariance))
@@ -370,7 +370,8 @@ def _as_tracks(state: State, observations: Observations, colors: Any) -> Tracks:
 
 
 def calibration_sigma_px(rig: Rig, distance_mm: float) -> float:
-    """How far (px, one standard deviation, worst camera) the rig's covariance moves points at a distance; 0 if held."""
+    """How far (px, one standard deviation, worst camera) the rig's covariance moves points at a distance; 0 if it is
+    held fixed."""
     prior, sigma = _Prior.of(rig), 0.0
     if not prior.is_free:
         return sigma
@@ -521,11 +522,11 @@ class _Adjusted:
 def adjust(
     reconstruction: Reconstruction, options: AdjustmentOptions | None = None, *, judge: bool = True
 ) -> Reconstruction:
-    """Refine poses, points and free calibration together; the tracks come back without outliers.
+    """Refine poses, points and free calibration together; the tracks are returned without outliers.
 
-    The covariance of the poses is relative to the first frame, that of the calibration replaces its prior. Both take
-    the tracks for independent, not the keypoints of one. Unless it is to ``judge`` what it found, there is neither a
-    covariance nor a word on a calibration that does not fit, which takes half of the time. Raises ReconstructionError
+    The covariance of the poses is relative to the first frame; that of the calibration replaces its prior. Both assume
+    that tracks are independent of each other, but not the keypoints within a track. Without ``judge`` there is neither
+    a covariance nor a note on a calibration that does not fit, which saves half of the time. Raises ReconstructionError
     where the observations do not determine every pose.
     """
     poses = tuple(reconstruction.rig_from_world.values())
@@ -545,8 +546,8 @@ def adjust(
 
 
 def adjust_model(model: SparseModel, options: AdjustmentOptions | None = None) -> SparseModel:
-    """As :func:`adjust`, for one camera. Its images leave the scale free, so no covariance is found, and the scale may
-    change a little."""
+    """As :func:`adjust`, for one camera. Its images leave the scale free, so no covariance is computed, and the scale
+    may change a little."""
     name = "camera"
     rig = Rig({name: MountedCamera(model.camera, Rigid3.identity())})
     poses = tuple(model.cam_from_world.values())

@@ -1,4 +1,4 @@
-"""Loop closure: images that see the same surface again, long after the tracks of the first time have ended."""
+"""Loop closure: images that see the same surface again, long after the tracks of the first pass have ended."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from cuspid.reconstruction import Tracks
 from cuspid.rig import Handpiece
 
 Image = tuple[int, str]
-"""Index of a frame, and a camera."""
+"""Index of a frame, and a camera name."""
 
 _LARGEST_ANGLE_DEG = 25.0
 _LARGEST_SHIFT = 0.4
-"""Distance of the places that two images look at, as a share of the smaller side of what an image sees."""
+"""Largest distance between the places that two images look at, as a share of the smaller side of what an image sees."""
 _PARTNERS = 2
-"""An image is matched again with so many others, the nearest ones."""
+"""Number of other images, the nearest ones, with which an image is matched again."""
 
 
 def closing_pairs(handpiece: Handpiece, poses: Sequence[Rigid3], tracks: Tracks) -> list[tuple[Image, Image]]:
-    """Pairs of images that see the same surface from about the same side although no track joins their frames."""
+    """Pairs of images that see the same surface from about the same side, although no track connects their frames."""
     names = handpiece.rig.names
     images = [(frame, camera) for frame in range(len(poses)) for camera in names]
     looked_at, axes = _looks(handpiece, poses)

@@ -35,11 +35,11 @@ MODEL_FILES = ("cameras", "images", "points3D")
 """Files of a sparse model, ``.bin`` or ``.txt``; newer ones also have ``rigs`` and ``frames``."""
 
 SCALE_SPREAD = 0.02
-"""Largest relative spread of the scale between the frames of a model that is still taken for this handpiece."""
+"""Largest relative spread of the scale between frames for a model that is accepted as made with this handpiece."""
 
 
 def colmap_camera(camera: Camera, camera_id: int = 0) -> pycolmap.Camera:
-    """COLMAP's OPENCV camera; it has the same parameters and pixel origin."""
+    """The same camera as COLMAP's OPENCV camera, which has the same parameters and pixel origin."""
     return pycolmap.Camera(
         camera_id=camera_id,
         model="OPENCV",
@@ -50,12 +50,12 @@ def colmap_camera(camera: Camera, camera_id: int = 0) -> pycolmap.Camera:
 
 
 def colmap_rigid(transform: Rigid3) -> pycolmap.Rigid3d:
-    """The transform as COLMAP has it."""
+    """The transform as a COLMAP object."""
     return pycolmap.Rigid3d(transform.matrix[:3])
 
 
 def rigid_from_colmap(transform: pycolmap.Rigid3d) -> Rigid3:
-    """COLMAP's transform as a value."""
+    """A COLMAP transform as a :class:`Rigid3`."""
     return Rigid3.from_matrix(np.asarray(transform.matrix()))
 
 
@@ -123,9 +123,9 @@ def _add_points(model: pycolmap.Reconstruction, tracks: Tracks, cameras: int, wi
 def to_colmap(
     found: Reconstruction, frames: Sequence[Frame] | None = None, suffix: str = ".png"
 ) -> pycolmap.Reconstruction:
-    """The reconstruction as COLMAP's, with one rig; observations that it knows become the images' keypoints.
+    """The reconstruction as COLMAP's, with one rig; its observations become the images' keypoints.
 
-    ``frames`` tell which cameras have an image of each located frame; None: all of them.
+    ``frames`` specify which cameras have an image of each located frame; None: all of them.
     """
     every = dict.fromkeys(found.frames, found.rig.names)
     taken = every if frames is None else {frame.name: frame.cameras for frame in frames}
@@ -141,7 +141,7 @@ def to_colmap(
 
 
 def write_model(folder: Path, found: Reconstruction, capture: Capture) -> None:
-    """Write COLMAP's sparse model (binary) to a folder, whole or not at all. Raises OutputError."""
+    """Write COLMAP's sparse model (binary) to a folder, completely or not at all. Raises OutputError."""
     model = to_colmap(found, capture.frames, capture.source.suffix)
     with whole_files(folder) as part:
         try:
@@ -176,7 +176,7 @@ def _model_folder(folder: Path) -> Path:
 
 
 def hash_model(folder: Path) -> str:
-    """SHA-256 of a sparse model. Raises InputError where the folder holds none."""
+    """SHA-256 of a sparse model. Raises InputError where the folder contains none."""
     files = sorted(path for path in _model_folder(folder).iterdir() if path.stem in (*MODEL_FILES, "rigs", "frames"))
     return digest_of({path.name: hash_file(path) for path in files})
 
@@ -340,8 +340,8 @@ def _tracks(
 def from_colmap(model: pycolmap.Reconstruction, capture: Capture, source: str) -> Reconstruction:
     """Metric poses of a capture from a COLMAP model made with or without the rig; the rig's baselines set the scale.
 
-    The log holds ``mm_per_model_unit`` and ``scale_spread``, by which a caller judges whether the model fits the
-    handpiece. Raises InputError where the image names do not match or the scale cannot be found.
+    The log contains ``mm_per_model_unit`` and ``scale_spread``, from which a caller can judge whether the model fits
+    the handpiece. Raises InputError where the image names do not match or the scale cannot be found.
     """
     rig, images = capture.handpiece.rig, _match_names(model, capture, source)
     by_frame: dict[str, dict[str, Rigid3]] = {}
@@ -377,10 +377,10 @@ def _rms(residuals: Float[np.ndarray, "o 2"]) -> float:
 
 
 def read_model(folder: Path, capture: Capture) -> Reconstruction:
-    """Poses of a capture from a folder with a COLMAP model (``--from-poses``), metric by the handpiece's rig.
+    """Poses of a capture from a folder with a COLMAP model (``--from-poses``), made metric by the handpiece's rig.
 
-    Raises InputError where the folder holds no model, its image names are not those of the capture, or its cameras do
-    not keep the distances that they have in the handpiece.
+    Raises InputError where the folder contains no model, its image names are not those of the capture, or its cameras
+    do not have the distances that they have in the handpiece.
     """
     found = from_colmap(_read(folder), capture, str(folder))
     if found.log["scale_spread"] > SCALE_SPREAD:
@@ -421,7 +421,7 @@ def _mapper_options(with_rig: bool, seed: int) -> pycolmap.IncrementalPipelineOp
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """COLMAP without its log lines, its errors too: what they mean is said by the caller."""
+    """COLMAP without its log messages, including errors: the caller reports what they mean."""
     before, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, 3
     try:
         yield
@@ -454,8 +454,8 @@ def _map(
 def locate_with_colmap(capture: Capture, folder: Path, *, with_rig: bool, seed: int = 0) -> Reconstruction:
     """COLMAP as a user would run it: default features, sequential matching, incremental mapper; for comparison.
 
-    Without the rig the largest of its models is returned, scaled by the rig's baselines. The log tells how many models
-    there were, the images placed, and the seconds of each step. Raises ReconstructionError where there is no model.
+    Without the rig, the largest of its models is returned, scaled by the rig's baselines. The log contains the number
+    of models, the images placed, and the seconds of each step. Raises ReconstructionError where there is no model.
     """
     shutil.rmtree(folder, ignore_errors=True)
     (folder / "sparse").mkdir(parents=True)

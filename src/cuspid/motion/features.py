@@ -34,32 +34,33 @@ class FeatureOptions(Options):
     """Which keypoints are taken from an image."""
 
     count: Annotated[int | None, Range(10, 1_000_000)] = None
-    """Most keypoints in an image; the strongest of each cell come first. By default 2.5 times the number of cells, 1000
-    to 2000: at 500 x 500 px 2000 gave no truer path over an arch than 1000."""
+    """Maximum number of keypoints in an image; the strongest of each cell come first. Default: 2.5 times the number of
+    cells, between 1000 and 2000; at 500 x 500 px, 2000 gave no truer path over an arch than 1000."""
     contrast: Annotated[float, Range(0, 1)] = 0.02
-    """Least contrast of a keypoint, share of the grey range (OpenCV's ``contrastThreshold``)."""
+    """Minimum contrast of a keypoint, as a share of the grey range (OpenCV's ``contrastThreshold``)."""
     edge: Annotated[float, Range(1, 1_000_000)] = 10.0
-    """Largest ratio of the curvatures of a keypoint (OpenCV's ``edgeThreshold``); more takes in points on edges."""
+    """Largest ratio of the curvatures of a keypoint (OpenCV's ``edgeThreshold``); larger values admit points on
+    edges."""
     cell_px: Annotated[int, Range(1, 10_000)] = 25
-    """Size of the cells over which keypoints are spread."""
+    """Size of the cells over which keypoints are distributed."""
     halved_from_px: Annotated[int | None, Range(16, 1_000_000)] = None
-    """Images whose shorter side has so many px are searched at half their size, which takes a third of the time; the
-    places are half as exact. None: never."""
+    """Images whose shorter side has at least this many px are searched at half their size, which takes a third of the
+    time; positions are half as accurate. None: never."""
     halvings: Annotated[int | None, Range(1, 2)] = None
-    """How many times over they are halved. By default once, for a draft twice."""
+    """How many times such images are halved. Default: once, for a draft twice."""
     upright: bool = True
-    """Descriptors along the image's axes; False estimates an orientation for each keypoint, for free-hand turns of
-    more than about 20 degrees about the optical axis between frames."""
+    """Descriptors aligned with the image axes; False estimates an orientation for each keypoint, for free-hand
+    rotations of more than about 20 degrees about the optical axis between frames."""
 
     def size_for(self, width: int, height: int) -> tuple[int, int]:
-        """At which size (px) an image is searched."""
+        """Size (px) at which an image is searched."""
         if self.halved_from_px is not None and min(width, height) >= self.halved_from_px:
             for _ in range(self.halvings or 1):
                 width, height = halved_size(width, height)
         return width, height
 
     def count_for(self, width: int, height: int) -> int:
-        """Most keypoints in an image of a size in px."""
+        """Maximum number of keypoints for an image of the given size in px."""
         usual = 2.5 * (width / self.cell_px) * (height / self.cell_px)
         return int(min(max(usual, 1000), 2000)) if self.count is None else self.count
 
@@ -69,11 +70,11 @@ class Features:
     """Keypoints of one image."""
 
     pixels: Float[np.ndarray, "n 2"]
-    """Places in the distorted image, px, COLMAP's origin."""
+    """Positions in the distorted image, px, COLMAP's origin."""
     descriptors: UInt8[np.ndarray, "n 128"]
-    """Square roots of SIFT's histograms (RootSIFT), of length about 512."""
+    """Square roots of SIFT's histograms (RootSIFT), with a length of about 512."""
     colors: UInt8[np.ndarray, "n 3"]
-    """RGB of the image there."""
+    """RGB of the image at the keypoint."""
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -108,7 +109,7 @@ def _colors_at(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "n 2
 
 
 def detect(image: UInt8[np.ndarray, "h w 3"], options: FeatureOptions | None = None) -> Features:
-    """Keypoints of an RGB image, well spread."""
+    """Keypoints of an RGB image, evenly distributed."""
     options = options or FeatureOptions()
     height, width = image.shape[:2]
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)

@@ -1,11 +1,11 @@
-"""What no image sees of a rig whose calibration is free: its own frame and its scale.
+"""What no image determines of a rig whose calibration is free: its own frame and its scale.
 
 If a similarity is applied to the rig frame, that is to every camera of the rig, every pose and every point, no pixel
-moves: seven directions in which the prior of the calibration alone decides. They move everything at once, so that a
-damped step of the adjustment hardly follows them; here the least of the prior along them is found by itself.
+moves: seven directions in which the prior of the calibration alone decides. They move everything at once, so a
+damped step of the adjustment hardly follows them; here the minimum of the prior along them is found separately.
 
 Notation: ``new = scale turn old + shift`` in the rig frame; a small motion (rotation vector, translation) acts on the
-left of ``cam_from_rig``, and z are the whitened numbers of :mod:`cuspid.motion.adjustment`.
+left of ``cam_from_rig``, and z are the whitened parameters of :mod:`cuspid.motion.adjustment`.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ from cuspid.epipolar import skew
 from cuspid.motion.normal_equations import State
 
 PLACE = 6
-"""Numbers of a camera's place in the rig, the first of its whitened ones."""
+"""Number of parameters of a camera's pose in the rig, the first of its whitened ones."""
 _HELD = 1e-6
-"""A direction of a camera's place is held whose standard deviation is less than this share of those of its parts."""
+"""A direction of a camera's pose is held fixed if its standard deviation is less than this share of those of its
+parts."""
 
 
 class Gauge(NamedTuple):
@@ -40,8 +41,8 @@ class Gauge(NamedTuple):
 
 
 def best_gauge(state: State) -> Gauge:
-    """The similarity that lessens the prior's cost of the cameras' places most, to first order; it moves none of the
-    places in a direction in which it is held."""
+    """The similarity that most reduces the prior cost of the cameras' poses, to first order; it moves no pose in a
+    direction in which it is held fixed."""
     motions = np.stack(
         [
             _motion_by_gauge(turn, place)
@@ -75,7 +76,8 @@ def _split(basis: Float[np.ndarray, "6 6"]) -> tuple[Float[np.ndarray, "6 6"], F
 
 
 def moved_world(state: State, gauge: Gauge) -> State:
-    """Poses and points of a state after a gauge, with the first frame where it was; the cameras are the caller's."""
+    """Poses and points of a state after a gauge change, with the first frame where it was; the caller moves the
+    cameras."""
     rotation = gauge.turn @ state.frame_rotation
     translation = gauge.scale * state.frame_translation @ gauge.turn.T + gauge.shift
     # The world is redefined so that the first pose stays: new_from_old = before^-1 after.
@@ -91,6 +93,6 @@ def moved_world(state: State, gauge: Gauge) -> State:
 
 
 def moved_places(state: State, gauge: Gauge) -> tuple[Float[np.ndarray, "c 3 3"], Float[np.ndarray, "c 3"]]:
-    """Rotations and translations of ``cam_from_rig`` after a gauge."""
+    """Rotations and translations of ``cam_from_rig`` after a gauge change."""
     rotation = state.camera_rotation @ gauge.turn.T
     return rotation, gauge.scale * state.camera_translation - rotation @ gauge.shift

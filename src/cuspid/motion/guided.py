@@ -1,6 +1,7 @@
-"""One camera's trajectory made precise: matched anew where the first poses say, joined to tracks, adjusted; in rounds.
+"""Refinement of one camera's trajectory: frames are matched again near where the first poses predict, matches are
+joined to tracks, and everything is adjusted, in rounds.
 
-The first rounds look far beyond what the poses say, so that their errors are not matched into place.
+The first rounds search far around the prediction, so that errors of the poses do not select the matches.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ from cuspid.sparse_model import SparseModel
 from cuspid.workers import map_in_threads
 
 _DEPTH = 14.0
-"""Depth to which a model is scaled here: guided matching takes lengths for millimetres."""
+"""Depth to which a model is scaled here: guided matching assumes millimetres."""
 _NEIGHBOURS = 5
-"""Points near a keypoint whose depths tell its own."""
+"""Number of neighbouring points from whose depths that of a keypoint is predicted."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,22 +36,22 @@ class GuidedOptions(Options):
     """How the first poses are refined."""
 
     steps: Annotated[tuple[int, ...], Range(1, 100_000)] = (1, 2, 3, 4, 5, 6, 8)
-    """A frame is matched with those so many frames later."""
+    """Each frame is matched with the frames that are this many frames later."""
     tolerances_px: Annotated[tuple[float, ...], Range(0.01, 1000)] = (8.0, 4.0, 4.0)
-    """Largest distance of a match from the epipolar line in each round."""
+    """Largest distance of a match from the epipolar line, for each round."""
     depth_shares: Annotated[tuple[float, ...], Range(0.001, 10)] = (0.28, 0.12, 0.06)
-    """A point's depth is looked for within this share of the depth that its neighbours have, in each round: along edges
-    there are keypoints enough to match a wrong one farther off."""
+    """A point's depth is searched for within this share of the depth of its neighbours, for each round: along edges
+    there are enough keypoints to match a wrong one farther away."""
     matching: MatchingOptions = field(default_factory=lambda: MatchingOptions(ratio=0.8, similarity=0.85))
-    """What else counts as a match."""
+    """Further criteria for a match."""
     minimum_views: Annotated[int, Range(2, 1000)] = 4
-    """Shorter tracks are left out, but where a frame would lose all."""
+    """Tracks with fewer views are left out, except where a frame would lose all of its tracks."""
     start_px: Annotated[float, Range(0.01, 10_000)] = 12.0
-    """Residual beyond which an observation is dropped before the first adjustment; half of it later."""
+    """Residual beyond which an observation is dropped before the first adjustment; half of it in later rounds."""
     adjustment: AdjustmentOptions = field(
         default_factory=lambda: AdjustmentOptions(sigma_px=0.5, outlier_sigmas=3.0, rounds=4, iterations=60)
     )
-    """The adjustment."""
+    """Final adjustment of each round."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -68,7 +69,7 @@ def refine(
     *,
     progress: Progress = silent,
 ) -> SparseModel:
-    """The model of one camera with refined poses and new tracks; ``features`` of its frames, in their order.
+    """The model of one camera with refined poses and new tracks; ``features`` are those of its frames, in their order.
 
     The scale is free and changes. Raises ReconstructionError where too little is consistent.
     """

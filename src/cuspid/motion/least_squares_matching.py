@@ -1,9 +1,9 @@
-"""Tracks whose places are those of one and the same patch: least squares matching (Gruen 1985).
+"""Tracks whose positions are those of one and the same patch: least squares matching (Gruen 1985).
 
-A keypoint is found in each image by itself, to a quarter of a pixel, and its error hangs on the direction of view: so
-the errors of neighbouring images hang together, and a path bends. Once poses and points are known about, the patch
-around each point, from the image that looks at it most nearly as all do on average, is laid over the other images as
-the plane through the neighbouring points says, and shifted until it fits.
+A keypoint is found in each image separately, to a quarter of a pixel, and its error depends on the direction of view:
+the errors of neighbouring images are therefore correlated, and the path bends. Once poses and points are approximately
+known, the patch around each point, from the image whose direction of view is nearest to the mean, is projected into the
+other images by the plane through the neighbouring points, and shifted until it fits.
 """
 
 from __future__ import annotations
@@ -23,32 +23,33 @@ from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.workers import map_in_threads
 
 _NEIGHBOURS = 12
-"""Points, with the one itself, whose plane a patch lies in."""
+"""Number of points, including the point itself, that define the plane of a patch."""
 _LEAST_COS = 0.35
-"""Of the angle between a plane's normal and the ray of the patch; a plane seen at a flatter angle is not believed."""
+"""Minimum cosine of the angle between a plane's normal and the ray of the patch; a plane seen more obliquely is not
+trusted."""
 _STEP_PX = 2.0
 _CROSS = _STEP_PX * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
-"""The middle of a patch, and places around it that tell how it is warped."""
+"""The middle of a patch, and positions around it from which its warp is derived."""
 
 _DECIMALS = 9
-"""Of the cosine that chooses the image of a patch."""
+"""Decimals of the cosine that selects the image of a patch."""
 
 Image = tuple[int, int]
 """Indices of a frame and of a camera."""
 ReadGray = Callable[[str, str], UInt8[np.ndarray, "h w"]]
-"""The grey picture of a frame and a camera by their names."""
+"""Reads the grey image of a frame and a camera, given their names."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LeastSquaresOptions(AlignmentOptions):
-    """Exact places of keypoints, by patches that are aligned once the poses are known about."""
+    """Accurate keypoint positions, from patches that are aligned once the poses are approximately known."""
 
     enabled: bool = True
-    """Whether keypoints are put in exact places at all."""
+    """Whether to refine keypoint positions at all."""
     radius_px: Annotated[int, Range(1, 100)] = 5
-    """Half the width of a patch; the surface of a wide one is no plane, which shifts it."""
+    """Half the width of a patch; the surface in a wide patch is not planar, which shifts it."""
     blur_px: Annotated[float, Range(0, 100)] = 0.8
-    """Standard deviation of the Gaussian filter before."""
+    """Standard deviation of the Gaussian filter that is first applied to the images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +77,8 @@ class _Views:
 
 
 def own_observations(tracks: Tracks, towards: Float[np.ndarray, "o 3"]) -> Int[np.ndarray, "p"]:
-    """Of each point that was seen, in the order of the points: the observation whose ray is nearest to their mean."""
+    """For each point that was seen, in the order of the points: the observation whose ray is nearest to the mean of its
+    rays."""
     mean = np.zeros_like(tracks.points)
     np.add.at(mean, tracks.point_index, towards)
     along = np.einsum("oi,oi->o", towards, mean[tracks.point_index])
@@ -86,7 +88,7 @@ def own_observations(tracks: Tracks, towards: Float[np.ndarray, "o 3"]) -> Int[n
 
 
 def normals_of(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
-    """Normals, of either sign, of the planes that fit each point and its neighbours best."""
+    """Normals, of either sign, of the planes that best fit each point and its neighbours."""
     _, near = cKDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))
     off = points[near.reshape(len(points), -1)]
     off = off - off.mean(axis=1, keepdims=True)
@@ -175,10 +177,10 @@ class _Matching:
 def match_patches(
     found: Reconstruction, read: ReadGray, options: AlignmentOptions, *, progress: Progress = silent
 ) -> Tracks:
-    """The tracks of a reconstruction, which has some, with their places put where the patch of each point is seen;
-    without observations in which it is not found, and points that are seen nowhere else.
+    """The tracks of a reconstruction, which must have some, with positions where the patch of each point is found;
+    observations in which it is not found, and points that are then seen nowhere else, are left out.
 
-    ``read`` may be asked twice for each picture.
+    ``read`` may be called twice for each image.
     """
     tracks = found.tracks
     assert tracks is not None

@@ -41,42 +41,42 @@ from cuspid.rig import Handpiece, Rig
 from cuspid.workers import map_in_threads
 
 _LOOSE_SCALE_PPM, _LOOSE_SPAN_PPM = 1000.0, 300.0
-"""Standard deviations of the scale and, apart from it, of the length of a scan, beyond which there is advice."""
+"""Standard deviations of the scale and, apart from it, of the length of a scan, above which advice is given."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotionOptions(Options):
-    """How the handpiece's way is found from features."""
+    """How the trajectory of the handpiece is found from features."""
 
     features: FeatureOptions = field(default_factory=lambda: FeatureOptions(halved_from_px=400))
-    """Keypoints; images are halved only where patches make the places exact afterwards."""
+    """Keypoints; images are halved only where patches make the positions accurate afterwards."""
     pairing: PairingOptions = field(default_factory=PairingOptions)
     """Which cameras are matched within a frame."""
     within: MatchingOptions = field(default_factory=MatchingOptions)
     """Matching of the cameras of a group within a frame."""
     odometry: OdometryOptions = field(default_factory=OdometryOptions)
-    """First poses."""
+    """How the first poses are found."""
     across_frames: MatchingOptions = field(default_factory=lambda: MatchingOptions(tolerance_px=3.0))
-    """Matching of a camera with itself across frames (motion stereo), once the poses are known about."""
+    """Matching of a camera with itself across frames (motion stereo), once the poses are approximately known."""
     reach: Annotated[int, Range(1, 1000)] = 3
-    """A camera is matched with itself at +1 to +reach frames."""
+    """A camera is matched with itself in the following frames, up to this many."""
     depth_slack: Annotated[float, Range(0, 100_000)] = 8.3
-    """Uncertainty of the depth of a point triangulated within a frame, when it is looked for in another, in resolutions
-    of the handpiece (0.1 mm at 12 um)."""
+    """Uncertainty of the depth of a point triangulated within one frame, when it is searched for in another, in
+    resolutions of the handpiece (0.1 mm at 12 um)."""
     least_squares: LeastSquaresOptions = field(default_factory=LeastSquaresOptions)
-    """Patches that make the places of keypoints exact."""
+    """Patches that make the keypoint positions accurate."""
     cell_px: Annotated[float | None, Range(0, 10_000)] = None
-    """Every cell of this size of an image keeps its longest track for the adjustment; 0 keeps all tracks. By default a
+    """In each cell of this size, an image keeps its longest track for the adjustment; 0 keeps all tracks. Default: a
     tenth of the shorter side."""
     minimum_located: Annotated[float, SHARE] = 0.5
-    """Least share (0 to 1) of the frames that must be located for a result."""
+    """Minimum share (0 to 1) of the frames that must be located."""
     adjustment: AdjustmentOptions = field(default_factory=AdjustmentOptions)
     """The final refinement."""
     seed: Annotated[int, SEED] = 0
-    """Of the random samples of the pose estimation."""
+    """Seed of the random samples in pose estimation."""
 
     def cell_for(self, rig: Rig) -> float:
-        """Size of the cells that keep their longest track, px."""
+        """Size of the cells that each keep their longest track, px."""
         sides = [min(each.camera.width, each.camera.height) for each in rig.cameras.values()]
         return min(sides) / 10 if self.cell_px is None else self.cell_px
 
@@ -258,9 +258,9 @@ def locate_features(
 ) -> Reconstruction:
     """As :func:`locate`, from the keypoints by (frame, camera) of the frames ``names`` in the order of capture.
 
-    A camera without keypoints of a frame is left out of that frame. In what order the handpiece has its cameras decides
-    nothing but their order in the result. ``read`` gives the grey picture of a frame and a camera by their names;
-    without it the places of keypoints stay as they are.
+    A camera without keypoints of a frame is left out of that frame. The order of the cameras in the handpiece affects
+    only their order in the result. ``read`` returns the grey image of a frame and a camera, given their names; without
+    it, keypoint positions are not refined.
     """
     given, handpiece = handpiece.rig.names, replace(handpiece, rig=handpiece.rig.in_own_order())
     rig, log = handpiece.rig, dict[str, float]()
@@ -337,7 +337,8 @@ def _advice(found: Reconstruction) -> Iterator[str]:
 
 
 def stereo_ties(tracks: Tracks, frames: int) -> Int[np.ndarray, "k"]:
-    """For each frame but the last: points that two cameras see at once in it or before, and again in a later one."""
+    """For each frame except the last: the number of points that two cameras see at once in it or earlier, and again in
+    a later frame."""
     seen = np.unique(np.stack([tracks.point_index, tracks.frame_index, tracks.camera_index], axis=1), axis=0)
     sightings, cameras = np.unique(seen[:, :2], axis=0, return_counts=True)
     point, frame = sightings[cameras >= 2].T

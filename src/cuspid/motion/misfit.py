@@ -1,14 +1,15 @@
-"""Whether the images fit a calibration that is held: a score test.
+"""Whether the images fit a calibration that is held fixed: a score test.
 
-What is held cannot follow the images, but the images pull at it. The pull is the gradient s of the cost by the held
-numbers, once poses, points and what is free of the calibration follow them. Where the calibration is right, it has the
-covariance S that the gradients of independent tracks show (generalised score test: Boos, The American Statistician 46,
-1992); S is taken where the images want the calibration, for a wrong one scatters them, too. No calibration is exact,
-and keypoints are a little biased, so each number is allowed to be off by what moves the images by some hundredths of a
-pixel. In such units, with H the curvature of the cost, s has the covariance S + H H, and s^T (S + H H)^-1 s is
-chi-squared. What the images tell nothing of, as the similarity of the whole rig, is left out.
+Parameters that are held fixed cannot follow the images, but the images pull at them. The pull is the gradient s of the
+cost with respect to these parameters, once poses, points and the free part of the calibration have followed. If the
+calibration is right, s has the covariance S that the gradients of independent tracks show (generalised score test:
+Boos, The American Statistician 46, 1992); S is evaluated at the calibration that the images favour, because a wrong one
+scatters the gradients too. No calibration is exact, and keypoints are slightly biased, so each parameter is allowed to
+be off by what moves the images by some hundredths of a pixel. In such units, with H the curvature of the cost, s has
+the covariance S + H H, and s^T (S + H H)^-1 s is chi-squared. What the images do not determine, such as the similarity
+of the whole rig, is left out.
 
-Everything is counted in pixels of the images themselves: neither the size of a handpiece nor its unit matters.
+Everything is measured in pixels of the images themselves: neither the size of a handpiece nor its unit matters.
 """
 
 from __future__ import annotations
@@ -41,17 +42,18 @@ from cuspid.motion.normal_equations import (
 )
 
 CHANCE = 1e-6
-"""A calibration that would come about with less than this chance is not that of the handpiece."""
+"""A calibration that would occur with less than this probability is rejected as not being that of the handpiece."""
 _ALLOWED_PX = 0.03
-"""How far each number that is held may be off: one standard deviation, as RMS shift of the keypoints of its camera."""
+"""How far each parameter that is held fixed may be off: one standard deviation, as RMS shift of the keypoints of its
+camera."""
 _GENEROUS = 50.0
-"""So many times as far each number may go where it is asked what would be left."""
+"""Factor by which each parameter may go farther when determining what would be left."""
 _TOLD = 1e-3
-"""The images tell of a direction of numbers that is known to 1 / sqrt(this) of what is allowed."""
+"""The images determine a direction of the parameters that is known to 1 / sqrt(this) of what is allowed."""
 
 
 class Pull(NamedTuple):
-    """How the images pull at the numbers that are held, once the rest has followed."""
+    """How the images pull at the parameters that are held fixed, once the rest has followed."""
 
     score: Float[np.ndarray, "k"]
     curvature: Float[np.ndarray, "k k"]
@@ -59,12 +61,12 @@ class Pull(NamedTuple):
 
     @property
     def told(self) -> Float[np.ndarray, "k t"]:
-        """Directions of which the images tell."""
+        """Directions that the images determine."""
         values, vectors = np.linalg.eigh(self.curvature)
         return np.asarray(vectors[:, values > _TOLD])
 
     def wanted(self) -> tuple[Float[np.ndarray, "k"], float, int]:
-        """Where the images want the numbers, how far that is (chi-squared), and in how many directions."""
+        """The parameters that the images favour, how far away they are (chi-squared), and in how many directions."""
         told = self.told
         covariance = told.T @ (self.scatter + self.curvature @ self.curvature) @ told
         weighed = told @ np.linalg.solve(covariance, told.T @ self.score)
@@ -115,9 +117,9 @@ class _Numbers:
 def held_misfit(
     state: State, observations: Observations, weighting: Weighting, names: Sequence[str]
 ) -> tuple[str, ...]:
-    """A note where the images hardly fit what is held of the calibration of the cameras ``names``.
+    """A note if the images hardly fit the part of the calibration of the cameras ``names`` that is held fixed.
 
-    Poses, and what is free of the calibration, are where an adjustment left them.
+    Poses, and the free part of the calibration, are as an adjustment left them.
     """
     held, tracks = _held(state), len(state.points)
     if not held.any():

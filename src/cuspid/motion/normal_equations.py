@@ -19,16 +19,16 @@ from cuspid.workers import map_slices
 POSE = 6
 """Unknowns of a frame."""
 CALIBRATION = 14
-"""Unknowns of a camera: 6 of its place in the rig, 8 of its lens."""
+"""Unknowns of a camera: 6 of its pose in the rig, 8 of its lens."""
 _COLUMNS = 3 + POSE + CALIBRATION
 _PARTS = 4
-"""Fixed, for the order of a sum shows in its last bits: the result must not depend on the number of cores."""
+"""Fixed, because the order of a sum shows in its last bits: the result must not depend on the number of cores."""
 _FEW = 1000
-"""Points that are not worth threads."""
+"""Number of points below which threads are not worthwhile."""
 _FLATTEST = 1e-3
-"""Depth of a point, as a share of its distance from the axis, from which it counts as before the camera."""
+"""Depth of a point, as a share of its distance from the axis, above which it counts as in front of the camera."""
 _SETTLING = 4
-"""Most steps of a point after the rest has moved."""
+"""Maximum number of steps of a point after the rest has moved."""
 
 
 class State(NamedTuple):
@@ -57,7 +57,7 @@ class Observations(NamedTuple):
 
 
 class Weighting(NamedTuple):
-    """What a residual counts for, and which unknowns there are."""
+    """The weight of each residual, and which unknowns there are."""
 
     sigma_px: float
     huber_sigmas: float
@@ -165,7 +165,8 @@ def linearise(state, point, frame, camera, calibrated, scratch, pixel, jacobian)
 @kernel
 @no_type_check
 def pose_equations(lenses, rotations, translations, pose, points, pixels, cameras):
-    """Normal equations of the pose of one frame alone, with Cauchy's weights at 1 px; a small motion on its left.
+    """Normal equations of the pose of one frame alone, with Cauchy weights at 1 px; the step is a small motion on its
+    left.
 
     ``pose`` is (rotation, translation); an observation is a point, a pixel and the camera that saw it.
     """
@@ -466,9 +467,9 @@ def normal_equations(state: State, observations: Observations, weighting: Weight
 
 
 def scatter_of_tracks(state: State, observations: Observations, weighting: Weighting) -> Float[np.ndarray, "k k"]:
-    """Sum over the tracks of g g^T, g being the share of a track in the gradient of the reduced unknowns without the
-    prior, where every point lies where its rays meet best. It is what independent tracks make of the gradient's
-    covariance, however the errors within a track hang together (Liang and Zeger, Biometrika 73, 1986)."""
+    """Sum over the tracks of g g^T, where g is the contribution of a track to the gradient of the reduced unknowns
+    without the prior, with every point where its rays meet best. It estimates the covariance of the gradient from
+    independent tracks, however the errors within a track are correlated (Liang and Zeger, Biometrika 73, 1986)."""
     size = POSE * (len(state.frame_rotation) - 1)
     total = size + (state.whitened.size if weighting.calibrated else 0)
     blocks = np.zeros((len(observations.frame), POSE + CALIBRATION))
@@ -501,7 +502,7 @@ def influence(state: State, observations: Observations, weighting: Weighting) ->
 
 
 def with_poses_moved(state: State, step: Float[np.ndarray, "n"]) -> State:
-    """The state after small motions on the left of all poses but the first."""
+    """The state after small motions on the left of all poses except the first."""
     motions = np.vstack([np.zeros((1, POSE)), step.reshape(-1, POSE)])
     turns = Rotation.from_rotvec(motions[:, :3]).as_matrix()
     return state._replace(
@@ -513,7 +514,7 @@ def with_poses_moved(state: State, step: Float[np.ndarray, "n"]) -> State:
 def substitute(
     state: State, observations: Observations, weighting: Weighting, step: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "p 3"]:
-    """The points after the reduced unknowns have made their step."""
+    """The points after the step of the reduced unknowns."""
     moved = np.empty_like(state.points)
 
     def part(points: slice) -> None:
@@ -524,7 +525,7 @@ def substitute(
 
 
 def settle(state: State, observations: Observations, weighting: Weighting) -> State:
-    """The state with each point where its rays meet best, poses and calibration being held."""
+    """The state with each point where its rays meet best, with poses and calibration held fixed."""
     settled = state._replace(points=state.points.copy())
     held = weighting._replace(calibrated=False)
 

@@ -1,8 +1,8 @@
-"""The way of the handpiece, frame by frame: points triangulated within one frame are found again in the next.
+"""The motion of the handpiece, frame by frame: points triangulated within one frame are found again in the next.
 
-The points of a frame stand in its rig frame, in millimetres, for the rig fixes the scale; the pose of another frame
-relative to it follows from where all cameras see them there (generalised absolute pose). Frames that the neighbour at
-+1 does not tie to the others are tried at +2, +3, ...; what stays apart is listed with its reason.
+The points of a frame are given in its rig frame, in millimetres, because the rig fixes the scale; the pose of another
+frame relative to it follows from where all cameras see them there (generalised absolute pose). Frames that the next
+frame (+1) does not connect to the others are tried at +2, +3, ...; what remains unconnected is listed with its reason.
 """
 
 from __future__ import annotations
@@ -32,14 +32,13 @@ FrameFeatures = Mapping[str, IndexedFeatures]
 """Keypoints of one frame by camera."""
 
 _SEARCHED = 8.0
-"""Within a frame, matches are sought up to so many times the far end of the depth of field. A camera sees the jaw
-beyond as well; where the true match lies out of reach, a wrong one is found, and such points look consistent and move
-too little.
-"""
+"""Within a frame, matches are searched for up to this many times the far end of the depth of field. A camera sees the
+jaw beyond it as well; if the true match were out of range, a wrong one would be found, and such points look consistent
+and move too little."""
 _CELL_PX = 40
 _POLISHING_ROUNDS = 12
 _DECIMALS = 9
-"""Of a polished pose, in rad and in mean distances of the points."""
+"""Decimals of a polished pose, in rad and in mean distances of the points."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,17 +46,18 @@ class OdometryOptions(Options):
     """How a frame is placed relative to its neighbours."""
 
     reach: Annotated[int, Range(1, 1000)] = 3
-    """Frames are tied to those at +1, where that fails to those at +2, and so on up to this."""
+    """Frames are connected to the next one, failing that to the second next, and so on up to this many frames on."""
     minimum_matches: Annotated[int, Range(4, 100_000)] = 15
-    """Fewest consistent matches that place a frame."""
+    """Minimum number of consistent matches that locate a frame."""
     minimum_share: Annotated[float, SHARE] = 0.4
-    """Least share (0 to 1) of the matches to a neighbour that must be consistent."""
+    """Minimum share (0 to 1) of the matches to a neighbour that must be consistent."""
     error_px: Annotated[float, Range(0.01, 1000)] = 4.0
     """Largest reprojection error of a consistent match, px."""
     most_per_camera: Annotated[int, Range(4, 1_000_000)] = 200
-    """Points of a frame that are looked for in a camera of another; those that most cameras saw come first."""
+    """Maximum number of points of a frame that are searched for in a camera of another frame; those that most cameras
+    saw come first."""
     unguided: MatchingOptions = field(default_factory=lambda: MatchingOptions(ratio=0.8))
-    """Matching where nothing is known of the motion."""
+    """Matching where nothing is known about the motion."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -67,12 +67,12 @@ class Cloud:
     points: Float[np.ndarray, "p 3"]
     """In the rig frame, mm."""
     point_of: Mapping[str, Int[np.ndarray, "_"]]
-    """By camera: the point of each keypoint, -1 for none."""
+    """For each camera: the point of each keypoint, -1 for none."""
     matches: tuple[tuple[str, str, Int[np.ndarray, "_ 2"]], ...]
     """(camera, camera, pairs of keypoints) that the points were made from."""
 
     def depths(self, rig: Rig, camera: str) -> Float[np.ndarray, "n"]:
-        """Depth of each keypoint in its camera, mm; NaN where it has no point."""
+        """Depth of each keypoint in its camera, mm; NaN if it has no point."""
         in_rig = np.vstack([self.points, np.full((1, 3), np.nan)])[self.point_of[camera]]
         return np.asarray(rig[camera].cam_from_rig.apply(in_rig)[:, 2])
 
@@ -82,17 +82,17 @@ class Edge:
     """Relative pose of two frames."""
 
     target_from_source: Rigid3 | None
-    """Pose of the later frame relative to the earlier one, None where it could not be found."""
+    """Pose of the later frame relative to the earlier one, None if it could not be found."""
     matches: int
     """Number of consistent matches."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Trajectory:
-    """The largest set of frames that are tied to each other."""
+    """The largest set of connected frames."""
 
     rig_from_world: Mapping[int, Rigid3]
-    """Pose by index of the frame; the world is the rig frame of the first one."""
+    """Poses by frame index; the world is the rig frame of the first one."""
     dropped: tuple[Dropped, ...]
     """The other frames."""
 
@@ -123,7 +123,7 @@ def _consistent(
 
 
 def rays_in_rig(rig: Rig, views: FrameFeatures) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Centre and direction, in the rig frame, of every keypoint of a frame, camera after camera."""
+    """Centre and direction, in the rig frame, of the ray of every keypoint of a frame, camera after camera."""
     centres, directions = [], []
     for camera, view in views.items():
         rig_from_cam = rig[camera].cam_from_rig.inverse()
@@ -203,10 +203,10 @@ def polish(
     pixels: Float[np.ndarray, "k 2"],
     cameras: Int[np.ndarray, "k"],
 ) -> Rigid3:
-    """The pose that fits best near a given one: Gauss-Newton with Cauchy's weights at 1 px, without the last bits.
+    """The best-fitting pose near a given one: Gauss-Newton with Cauchy weights at 1 px, rounded.
 
     COLMAP's estimate differs from call to call, and its refinement, of the same sum, stops some nanometres before the
-    end.
+    optimum.
     """
     unit_mm = float(np.linalg.norm(points, axis=1).mean())
     scale = np.array([1.0, 1.0, 1.0, unit_mm, unit_mm, unit_mm])
@@ -228,7 +228,7 @@ def polish(
 def relative_pose(
     rig: Rig, cloud: Cloud, source: FrameFeatures, target: FrameFeatures, options: OdometryOptions, seed: int
 ) -> Edge:
-    """Pose of the target frame relative to the frame of the cloud."""
+    """Pose of the target frame relative to the frame of the point cloud."""
     points, pixels, cameras = _sightings(rig, cloud, source, target, options)
     if len(points) < options.minimum_matches:
         return Edge(target_from_source=None, matches=len(points))
@@ -261,7 +261,8 @@ def _parts(edges: Mapping[tuple[int, int], Edge], count: int) -> Int[np.ndarray,
 def find_edges(
     rig: Rig, frames: Sequence[FrameFeatures], clouds: Sequence[Cloud], options: OdometryOptions, seed: int
 ) -> dict[tuple[int, int], Edge]:
-    """Relative poses at +1 and, between parts that are still apart, at +2 and farther."""
+    """Relative poses of neighbouring frames (+1) and, between components that are still unconnected, at +2 and
+    farther."""
 
     def find(pair: tuple[int, int]) -> Edge:
         i, j = pair
@@ -289,7 +290,7 @@ def _reason(
 
 
 def chain(edges: Mapping[tuple[int, int], Edge], names: Sequence[str], options: OdometryOptions) -> Trajectory:
-    """Poses of the largest part by following the edges from its first frame."""
+    """Poses of the largest component, by following the edges from its first frame."""
     part = _parts(edges, len(names))
     largest = int(np.argmax(np.bincount(part)))
     located = np.flatnonzero(part == largest)

@@ -1,8 +1,8 @@
-"""Which images are matched, and matching along what the geometry leaves open.
+"""Which images are matched, and guided matching where the geometry allows a match.
 
 A keypoint of one image with a depth between two bounds lies on a segment of a line in another image whose relative
 pose is known. Only the keypoints near that segment are compared: within a frame the rig gives the pose and the depth of
-field the bounds; across frames the odometry gives the pose, and a point that is already triangulated narrow bounds.
+field the bounds; across frames the odometry gives the pose, and an already triangulated point narrow bounds.
 
 *Ideal* coordinates are normalised, without distortion: (X/Z, Y/Z).
 """
@@ -23,7 +23,7 @@ from cuspid.options import SHARE, Options, Range
 
 _CELL_PX = 12.0
 _NEAREST_SHARE = 0.01
-"""Of a segment, what is nearer to the other camera than this share of its farthest depth is left out."""
+"""The part of a segment that is nearer to the other camera than this share of its farthest depth is left out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,11 +33,11 @@ class MatchingOptions(Options):
     tolerance_px: Annotated[float, Range(0.01, 1000)] = 2.0
     """Largest distance from the epipolar segment, px."""
     similarity: Annotated[float, SHARE] = 0.8
-    """Least cosine between two descriptors, 0 to 1."""
+    """Minimum cosine between two descriptors, 0 to 1."""
     ratio: Annotated[float, Range(0.01, 1)] = 0.85
-    """Largest ratio of the distance to the best descriptor over that to the second best elsewhere."""
+    """Largest ratio of the distance to the best descriptor to that to the second best elsewhere (ratio test)."""
     apart_px: Annotated[float, Range(0, 1000)] = 3.0
-    """A second-best keypoint nearer than this to the best one, px, does not count as elsewhere."""
+    """A second-best keypoint closer than this to the best one, px, does not count as elsewhere."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -49,7 +49,7 @@ class IndexedFeatures:
     ideal: Float[np.ndarray, "n 2"]
     """Ideal coordinates of the keypoints."""
     focal_px: float
-    """Turns ideal distances into px."""
+    """Converts ideal distances to px."""
     order: Int[np.ndarray, "n"]
     """Keypoints sorted by cell."""
     cell_starts: Int[np.ndarray, "m"]
@@ -226,7 +226,7 @@ def match_guided(
 
 
 def match_unguided(a: Features, b: Features, options: MatchingOptions | None = None) -> Int[np.ndarray, "k 2"]:
-    """Mutually best pairs of all keypoints, where nothing is known of the relative pose."""
+    """Mutually best pairs among all keypoints, if nothing is known about the relative pose."""
     options = options or MatchingOptions()
     if len(a) < 2 or len(b) < 2:
         return np.zeros((0, 2), dtype=np.int64)
@@ -239,5 +239,5 @@ def match_unguided(a: Features, b: Features, options: MatchingOptions | None = N
 
 
 def frame_pairs(count: int, reach: int) -> tuple[tuple[int, int], ...]:
-    """Pairs of frames at +1 to +``reach``."""
+    """Pairs of frames that are 1 to ``reach`` frames apart."""
     return tuple((i, i + k) for i in range(count) for k in range(1, reach + 1) if i + k < count)

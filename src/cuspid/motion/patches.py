@@ -1,8 +1,8 @@
-"""Tracks of one camera, followed into the frames where no keypoint of theirs was found, by aligning patches.
+"""Tracks of one camera, followed by patch alignment into the frames where none of their keypoints was found.
 
-Keypoints of plain enamel come and go: a track of them is short and its places are uncertain by about a pixel, and so an
-arch bends. Once the poses are known, the patch around each point, from the frame that has it nearest to the middle of
-the picture, is laid over all frames around where it should be seen, and shifted until it fits (Lucas and Kanade 1981,
+Keypoints on plain enamel come and go: their tracks are short and their positions uncertain by about a pixel, so an arch
+bends. Once the poses are known, the patch around each point, from the frame that shows it nearest to the image centre,
+is projected into the neighbouring frames where it should be seen, and shifted until it fits (Lucas and Kanade 1981,
 with the template's gradients, Baker and Matthews 2004; gain, offset and slope of the light are free).
 """
 
@@ -26,11 +26,11 @@ from cuspid.sparse_model import SparseModel
 from cuspid.workers import map_in_threads
 
 _LEAST_CONTRAST = 0.5
-"""Standard deviation of the grey levels of a patch, below which it says nothing."""
+"""Standard deviation of the grey levels of a patch, below which it carries no information."""
 _LEAST_AREA = 1e-3
-"""Of the picture of a patch, as a share of its own, so that there is anything to lay it over."""
+"""Smallest area of the image of a patch, as a share of its own, that can be aligned."""
 _STILL_PX = 0.003
-"""The alignment ends when a step is shorter."""
+"""The alignment ends when a step is shorter than this."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,13 +40,13 @@ class AlignmentOptions(Options):
     radius_px: Annotated[int, Range(1, 100)] = 7
     """Half the width of a patch."""
     blur_px: Annotated[float, Range(0, 100)] = 1.0
-    """Standard deviation of the Gaussian filter before."""
+    """Standard deviation of the Gaussian filter that is first applied to the images."""
     limit_px: Annotated[float, Range(0.01, 1000)] = 3.0
-    """Farthest from where it should be."""
+    """Largest distance from the predicted position."""
     correlation: Annotated[float, Range(-1, 1)] = 0.85
-    """Least correlation (-1 to 1) of the patch with where it is found."""
+    """Minimum correlation (-1 to 1) between the patch and the place where it is found."""
     iterations: Annotated[int, Range(1, 10_000)] = 15
-    """Most steps of an alignment."""
+    """Maximum number of steps of an alignment."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,15 +54,15 @@ class PatchOptions(AlignmentOptions):
     """Which patches are followed, and what counts as found."""
 
     reach: Annotated[int, Range(1, 10_000)] = 12
-    """A patch is looked for so many frames before and after its own."""
+    """A patch is searched for in this many frames before and after its own."""
     turn_deg: Annotated[float, Range(0, 180)] = 40.0
-    """Not in frames that look at it from a direction that differs by more."""
+    """Frames whose direction of view differs by more than this are skipped."""
     minimum_views: Annotated[int, Range(2, 1000)] = 4
-    """Points that are found in fewer frames are left as they were."""
+    """Points that are found in fewer frames are left unchanged."""
 
 
 def smooth(picture: UInt8[np.ndarray, "h w"], sigma_px: float) -> Float32[np.ndarray, "h w"]:
-    """Grey levels without the noise of single pixels."""
+    """Grey levels, smoothed against the noise of single pixels."""
     levels = picture.astype(np.float32)
     return levels if sigma_px == 0 else np.asarray(cv2.GaussianBlur(levels, (0, 0), sigma_px))
 
@@ -177,7 +177,7 @@ def _aligned(patches, image, there, warps, limit, iterations, shifts, correlatio
 def cut_patches(
     picture: Float32[np.ndarray, "h w"], places_px: Float[np.ndarray, "n 2"], radius_px: int
 ) -> Float32[np.ndarray, "n s s"]:
-    """The patches around places of a picture, with a px more on each side, for their slopes; NaN outside."""
+    """The patches around positions in an image, one px larger on each side, for their gradients; NaN outside."""
     patches = np.empty((len(places_px), 2 * radius_px + 3, 2 * radius_px + 3), dtype=np.float32)
     _cut(picture, np.ascontiguousarray(places_px - OPENCV_PIXEL_OFFSET), patches)
     return patches
@@ -190,10 +190,11 @@ def align_patches(
     warps: Float[np.ndarray, "n 2 2"],
     options: AlignmentOptions,
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
-    """Where patches (:func:`cut_patches`) are in another picture, px, and their correlation there (NaN where they are
+    """Positions of patches (:func:`cut_patches`) in another image, px, and their correlation there (NaN where they are
     not found).
 
-    ``warps`` take an offset from the middle of a patch to the one in the other picture; ``there_px`` is where to start.
+    ``warps`` map an offset from the middle of a patch to the one in the other image; ``there_px`` are the starting
+    positions.
     """
     shifts, correlations = np.empty_like(there_px), np.empty(len(there_px))
     start = np.ascontiguousarray(there_px - OPENCV_PIXEL_OFFSET)
@@ -235,7 +236,7 @@ def lengthen(
 ) -> SparseModel:
     """The model of one camera with a second track for each point whose patch was found in enough frames.
 
-    ``read`` gives the picture of a frame by its name; only those within reach are held at a time.
+    ``read`` returns the image of a frame, given its name; only those within reach are in memory at a time.
     """
     own = _own_observations(model)
     tracks, names = model.tracks, model.frames

@@ -1,4 +1,4 @@
-"""Grey pictures of a capture that are looked at again once its keypoints were sought."""
+"""Grey images of a capture that are used again after their keypoints were detected."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from jaxtyping import UInt8
 from cuspid.capture import Capture, Frame
 
 _BYTES = 400_000_000
-"""Memory for the pictures that are kept."""
+"""Memory for the images that are kept."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """Reads the images of a capture, and keeps the first of them in grey, as many as there is memory for."""
+    """Reads the images of a capture, and keeps the first of them in grey, as many as fit in memory."""
 
     capture: Capture
-    """Whose images."""
+    """The capture whose images are read."""
     most_bytes: int = _BYTES
-    """Memory for what is kept."""
+    """Memory for the images that are kept, in bytes."""
     _kept: dict[tuple[str, str], UInt8[np.ndarray, "h w"]] = field(default_factory=dict, init=False, repr=False)
 
     def image(self, frame: Frame, camera: str) -> UInt8[np.ndarray, "h w 3"]:
-        """As :meth:`cuspid.capture.Capture.image`, and raises what that does."""
+        """As :meth:`cuspid.capture.Capture.image`, with the same errors."""
         image = self.capture.image(frame, camera)
         if (len(self._kept) + 1) * image.shape[0] * image.shape[1] <= self.most_bytes:
             self._kept[frame.name, camera] = _grey(image)
         return image
 
     def grey(self, frame: Frame, camera: str) -> UInt8[np.ndarray, "h w"]:
-        """The grey picture of an image, read again where it was not kept. Raises InputError as :meth:`image`."""
+        """The grey image, read again if it was not kept. Raises InputError as :meth:`image` does."""
         kept = self._kept.get((frame.name, camera))
         return _grey(self.image(frame, camera)) if kept is None else kept
 

@@ -1,5 +1,5 @@
-"""Where one hand-held camera was: features on contrast-normalised frames, COLMAP's incremental mapper, broken models
-joined again.
+"""Where one hand-held camera was: features on contrast-normalised frames, COLMAP's incremental mapper, and broken
+models joined again.
 
 Frames: as in :mod:`cuspid.sparse_model`. One camera does not know the scale: lengths are in units of the model, not
 millimetres.
@@ -36,17 +36,17 @@ from cuspid.sparse_model import SparseModel
 from cuspid.workers import map_in_threads
 
 _DARK, _BURNT = 16, 245
-"""Grey levels outside of which an image says nothing: noise below, burnt-out highlights above."""
+"""Grey levels outside of which an image carries no information: noise below, burnt-out highlights above."""
 _BLACK = 24
 """A frame is black where its 99th percentile lies below this level."""
 _SAME = 0.8
-"""Mean difference, in grey levels of eightfold smaller images, below which a frame repeats the one before."""
+"""Mean difference, in grey levels of images reduced eightfold, below which a frame repeats the previous one."""
 _SMALLER = 8
 _LIT, _PALE, _WARM = 40, 50, (35, 165)
-"""Brighter pixels are lit; of them those less saturated are pale like enamel and plaster, and those whose hue (0 to
-180) lies below the first or above the second are red to yellow, like gums and dentine."""
+"""Brighter pixels are lit; of these, the less saturated ones are pale like enamel and plaster, and those whose hue (0
+to 180) lies below the first or above the second value are red to yellow, like gums and dentine."""
 _WINDOW = 15
-"""Frames with whose sharpness that of a frame is compared."""
+"""Number of frames with whose sharpness that of a frame is compared."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,46 +60,47 @@ class SingleOptions(Options):
     clahe_tiles: Annotated[int, Range(1, 100)] = 4
     """Tiles of the contrast normalisation along each side."""
     matching: MatchingOptions = field(default_factory=lambda: MatchingOptions(ratio=0.85))
-    """First matching, when nothing is known of the motion."""
+    """First matching, when nothing is known about the motion."""
     steps: Annotated[tuple[int, ...], Range(1, 100_000)] = (1, 2, 3, 4, 6)
-    """A frame is matched with those so many frames later."""
+    """Each frame is matched with the frames that are this many frames later."""
     guided: GuidedOptions = field(default_factory=GuidedOptions)
     """How the mapper's poses are refined."""
     patches: PatchOptions = field(default_factory=PatchOptions)
-    """How points are followed into more frames at the end."""
+    """How points are finally followed into more frames."""
     focal_share: Annotated[float, Range(0.0001, 10)] = 0.03
     """Without a calibration: standard deviation of the mapper's focal length, as a share (0 to 1) of it."""
     bridge_steps: Annotated[tuple[int, ...], Range(1, 100_000)] = (1, 2, 3, 4, 5, 6, 8, 10)
-    """Where the model broke: frames to match with instead, at a looser ratio."""
+    """Where the model broke, each frame is matched instead, with a looser ratio, with the frames that are this many
+    frames later."""
     bridge_ratio: Annotated[float, Range(0.01, 1)] = 0.95
     """Ratio test of the matching where the model broke."""
     error_px: Annotated[float, Range(0.01, 1000)] = 2.0
     """Largest distance of a match from its epipolar line, px."""
     minimum_matches: Annotated[int, Range(4, 100_000)] = 15
-    """Fewest consistent matches that verify a pair of frames, or place a frame in the model."""
+    """Minimum number of consistent matches that verify a pair of frames, or locate a frame in the model."""
     minimum_share: Annotated[float, SHARE] = 0.3
-    """Least share (0 to 1) of the matches of two frames that must be consistent."""
+    """Minimum share (0 to 1) of the matches of two frames that must be consistent."""
     blurred_share: Annotated[float, SHARE] = 0.4
     """A frame with less than this share (0 to 1) of the sharpness of its neighbours is left out."""
     field_of_view_deg: Annotated[float, Range(1, 170)] = 60.0
-    """First guess of the horizontal angle of view where there is no calibration."""
+    """Initial guess of the horizontal angle of view if there is no calibration."""
     seed: Annotated[int, SEED] = 0
-    """Of the random samples."""
+    """Seed of the random samples."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SingleMotion:
-    """What is known of the camera's trajectory: one model, or several that no verified pair joins."""
+    """What is known about the camera's trajectory: one model, or several that no verified pair connects."""
 
     parts: tuple[SparseModel, ...]
     """Largest first; lengths in the model's units."""
     frames: tuple[FrameUse, ...]
-    """Every frame of the sequence; used means that it is in one of the parts."""
+    """Every frame of the sequence; used means that it belongs to one of the parts."""
     notes: tuple[str, ...] = ()
-    """What a user must know of it, one line each."""
+    """What a user must know about it, one line each."""
 
     def frames_of(self, part: int) -> tuple[FrameUse, ...]:
-        """Every frame of the sequence as one part sees it; those of other parts are not used."""
+        """Every frame of the sequence from the point of view of one part: those of other parts are not used."""
         mine = set(self.parts[part].frames)
         elsewhere = {name: n + 1 for n, other in enumerate(self.parts) for name in other.frames if name not in mine}
         return tuple(
@@ -112,7 +113,7 @@ class SingleMotion:
 
 
 def normalise_contrast(image: UInt8[np.ndarray, "h w 3"], options: SingleOptions) -> UInt8[np.ndarray, "h w"]:
-    """Grey image of even local contrast; noise in the dark and burnt-out highlights are levelled first."""
+    """Grey image with even local contrast; dark noise and burnt-out highlights are levelled first."""
     gray = np.clip(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), _DARK, _BURNT)
     tiles = (options.clahe_tiles, options.clahe_tiles)
     return np.asarray(cv2.createCLAHE(options.clahe_clip, tiles).apply(gray), dtype=np.uint8)
@@ -130,7 +131,7 @@ class _Look:
 
 
 def mouth_share(image: UInt8[np.ndarray, "h w 3"]) -> float:
-    """Share (0 to 1) of the lit pixels that have a colour of teeth, gums or plaster; 1 where nothing is lit."""
+    """Share (0 to 1) of the lit pixels with a colour of teeth, gums or plaster; 1 if none are lit."""
     hue, saturation, value = np.moveaxis(cv2.cvtColor(image, cv2.COLOR_RGB2HSV), -1, 0)
     alike = (saturation < _PALE) | (hue <= _WARM[0]) | (hue >= _WARM[1])
     lit = value > _LIT

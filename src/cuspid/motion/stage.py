@@ -1,4 +1,4 @@
-"""Where the handpiece was, found once and kept on disk, or taken from a COLMAP model."""
+"""The poses of the handpiece, found once and kept on disk, or taken from a COLMAP model."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def locate(
 ) -> Reconstruction:
     """Metric poses of the frames, kept in ``folder`` together with a COLMAP model.
 
-    ``method``: ``rig`` is ours; COLMAP's own mapper without (``colmap``) or with the rig (``colmap-rig``).
+    ``method``: ``rig`` is cuspid's own; COLMAP's mapper without (``colmap``) or with the rig (``colmap-rig``).
     """
 
     def find() -> Reconstruction:

@@ -1,4 +1,4 @@
-"""Matches joined to tracks, and the place where the rays of a track meet."""
+"""Joining matches into tracks, and intersecting the rays of a track."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ def _joined(matches, image_of, images):
 
 
 def join(matches: Int[np.ndarray, "m 2"], image_of: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
-    """Track of each of n keypoints, -1 for one without a match; no track has two keypoints of an image.
+    """Track of each of n keypoints, -1 for one without a match; no track has two keypoints in one image.
 
-    Matches are joined in their order, so the surer ones come first; one that would give a track two keypoints of an
-    image is left out. To give up such tracks as a whole would cost a long film half of its points and gain a rig
-    nothing.
+    Matches are joined in the given order, so the more reliable ones should come first; a match that would give a track
+    two keypoints in one image is left out. Dropping such tracks entirely would cost a long film half of its points and
+    gain a rig nothing.
     """
     root = _joined(matches, image_of, image_of.max(initial=-1) + 1)
     _, label, sizes = np.unique(root, return_inverse=True, return_counts=True)
@@ -66,7 +66,7 @@ def intersect_rays(
     track: Int[np.ndarray, "o"],
     count: int,
 ) -> Float[np.ndarray, "p 3"]:
-    """For each of ``count`` tracks the point nearest to its rays (least squares); NaN where they are parallel."""
+    """For each of ``count`` tracks, the point nearest to its rays (least squares); NaN if they are parallel."""
     unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     across = np.eye(3) - unit[:, :, None] * unit[:, None, :]
     flat = np.concatenate([across.reshape(-1, 9), np.einsum("oij,oj->oi", across, centres)], axis=1)
@@ -94,7 +94,7 @@ def _claim(order, start, cell_of):
 def thin(
     track: Int[np.ndarray, "o"], image: Int[np.ndarray, "o"], pixels: Float[np.ndarray, "o 2"], cell_px: float
 ) -> Bool[np.ndarray, "o"]:
-    """Observations of the longest tracks that together leave no cell of an image empty.
+    """Observations of the longest tracks that together leave no cell of any image empty.
 
     Neighbouring keypoints share their errors: more of them cost time and add little.
     """

@@ -1,7 +1,7 @@
 """What teeth and gums look like: two materials and a solid (3-D) procedural texture in jaw coordinates.
 
 The albedo at a point is mixed from two colours by a sum of octaves of gradient noise (Perlin 2002), so that it depends
-on the point of the jaw alone, never on the camera. Colours are linear RGB.
+only on the point of the jaw, never on the camera. Colours are linear RGB.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ class Material:
     light: Colour
     """Linear RGB albedo where the texture is at its highest."""
     wavelengths_mm: tuple[float, ...]
-    """Wavelength of each octave of the noise; all octaves weigh the same."""
+    """Wavelength of each octave of the noise; all octaves have the same weight."""
     hardness: float = 1.0
-    """How quickly the texture goes from dark to light: the slope of the logistic curve over the noise's sd."""
+    """How abruptly the texture changes from dark to light: the slope of the logistic curve over the noise's SD."""
     reflectance: float = 0.0
     """Fresnel reflectance of the coat at normal incidence; 0 is matte, water 0.02, enamel 0.05."""
     roughness: float = 0.3
-    """GGX roughness (alpha) of the coat; small is a sharp highlight."""
+    """GGX roughness (alpha) of the coat; small values give a sharp highlight."""
     scattering_mm: Colour = (0.0, 0.0, 0.0)
-    """How far red, green and blue light travels under the surface; only Blender renders it."""
+    """How far red, green and blue light travels below the surface; only Blender renders it."""
     applied: bool = False
-    """Whether the texture is sprayed or painted on, as fine as the cameras need it, and not the surface's own."""
+    """Whether the texture is sprayed or painted on, as fine as the cameras need it, rather than the surface's own."""
 
     def seen_by(self, footprint_mm: float) -> Material:
-        """With an applied texture that suits cameras whose pixels see so much of the surface: the one for 12 um, unless
-        its finest octave has less than 1 px or more than 25 there; then coarser or finer by whole octaves."""
+        """With an applied texture that suits cameras whose pixels have this footprint: the one for 12 um, unless its
+        finest octave has less than 1 px or more than 25 px there; then it is coarser or finer by whole octaves."""
         octaves = np.log2(footprint_mm / _SUITED_MM)
         if not self.applied or abs(octaves) < _ALIKE_OCTAVES:
             return self
@@ -58,7 +58,7 @@ class Appearance:
     """Materials of a jaw."""
 
     enamel: Material
-    """Teeth; everything, where the jaw has no labels."""
+    """Teeth; everything, if the jaw has no labels."""
     gum: Material
     """Gingiva."""
 
@@ -101,7 +101,7 @@ APPEARANCES: Mapping[str, Appearance] = MappingProxyType(
     }
 )
 """Presets: ``artificial`` is a strong matte texture on everything (the thesis' condition), ``powder`` a weak matte
-speckle as of scanning spray, ``enamel`` plain, glossy and wet."""
+speckle like that of scanning spray, ``enamel`` plain, glossy and wet."""
 
 
 class Palette(NamedTuple):
@@ -115,11 +115,11 @@ class Palette(NamedTuple):
     octaves: np.ndarray
     """Number of octaves of each material."""
     noise_from_jaw: np.ndarray
-    """(material, octave, 3, 4): turn, scale and shift of each octave, so that their lattices never line up."""
+    """(material, octave, 3, 4): rotation, scale and shift of each octave, so that their lattices never coincide."""
 
 
 NO_MATERIAL = 255
-"""In place of the index of a material: nothing is there."""
+"""In place of the index of a material: there is no surface."""
 
 
 def face_materials(jaw: Jaw) -> UInt8[np.ndarray, "f"]:
@@ -130,7 +130,7 @@ def face_materials(jaw: Jaw) -> UInt8[np.ndarray, "f"]:
 
 
 def palette(appearance: Appearance, seed: int) -> Palette:
-    """The arrays that the shading needs. ``seed`` chooses the texture."""
+    """The arrays that the shading needs. ``seed`` selects the texture."""
     materials = (appearance.enamel, appearance.gum)
     rng = np.random.default_rng(seed)
     most = max(len(material.wavelengths_mm) for material in materials)
@@ -173,7 +173,7 @@ def _corner(ix, iy, iz, x, y, z):
 @kernel(fastmath=True, inline="always")
 @no_type_check
 def gradient_noise(x, y, z):
-    """Perlin's improved noise, about -1 to 1, zero mean, one feature a unit."""
+    """Perlin's improved noise, roughly -1 to 1, zero mean, one feature per unit."""
     fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
     ix, iy, iz = np.int64(fx), np.int64(fy), np.int64(fz)
     x, y, z = x - fx, y - fy, z - fz

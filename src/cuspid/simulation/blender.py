@@ -1,8 +1,8 @@
-"""The second renderer: Blender Cycles with light that scatters under the surface, run as a program of its own.
+"""The second renderer: Blender Cycles with subsurface scattering, run as a separate program.
 
 It takes the same scene as :mod:`cuspid.simulation.raycast` and gives images through the same sensor. Its texture has
-the same statistics but another pattern, for Blender draws its own noise; interreflection is traced. bpy wants its own
-environment (another licence and an old numpy), so nothing of it is imported here.
+the same statistics but another pattern, because Blender generates its own noise; interreflection is traced. bpy needs
+its own environment (another licence and an old numpy), so nothing of it is imported here.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from cuspid.simulation.raycast import Scene, Sink, image_rng, metered_gains
 from cuspid.simulation.sensor import record
 
 PYTHON_VARIABLE = "CUSPID_BLENDER_PYTHON"
-"""Environment variable with the path of the Python that has bpy."""
+"""Environment variable with the path of the Python interpreter that has bpy."""
 SAMPLES = 64
-"""Paths traced through each pixel."""
+"""Paths traced per pixel."""
 LED_DIAMETER_MM = 0.2
-"""Diameter of the discs that the lights are."""
+"""Diameter of the discs that represent the lights."""
 
 _SCRIPT = Path(__file__).with_name("blender_script.py")
 _HOW_TO = (
@@ -50,10 +50,10 @@ def render_with_blender(
     skip: Callable[[str, str], bool] = lambda frame, camera: False,
     processes: int = 1,
 ) -> Iterator[tuple[str, str]]:
-    """As :func:`cuspid.simulation.raycast.render_capture`, by Blender on ``processes`` threads.
+    """As :func:`cuspid.simulation.raycast.render_capture`, by Blender with ``processes`` threads.
 
-    Raises MissingDependencyError where Blender is not there, InputError where a camera has lens distortion or a light
-    another lobe than Lambert's, which Blender does not offer.
+    Raises MissingDependencyError where Blender is not installed, InputError where a camera has lens distortion or a
+    light has a lobe other than Lambert's, which Blender does not offer.
     """
     python = blender_python()
     tasks = [(frame, camera) for frame in frames for camera in frame.cameras if not skip(frame.name, camera)]
@@ -73,7 +73,7 @@ def render_with_blender(
 
 
 def blender_python() -> Path:
-    """The Python that has bpy. Raises MissingDependencyError, saying how to get it."""
+    """The Python interpreter that has bpy. Raises MissingDependencyError, saying how to get it."""
     given = os.environ.get(PYTHON_VARIABLE)
     if not given:
         raise MissingDependencyError(f"Blender is not set up: {_HOW_TO}")

@@ -66,7 +66,7 @@ def add_jaw(path: Path, materials: list[Any]) -> None:
 
 
 def build_material(description: dict[str, Any]) -> Any:
-    """A principled material whose colour is mixed by the octaves of a solid noise."""
+    """A principled material whose colour is mixed by octaves of a solid noise."""
     material = bpy.data.materials.new("material")
     material.use_nodes = True
     nodes, links = material.node_tree.nodes, material.node_tree.links
@@ -121,7 +121,7 @@ def arithmetic(nodes: Any, links: Any, operation: str, first: Any, second: Any) 
 
 
 def place_camera(description: dict[str, Any]) -> Any:
-    """A camera with any focal lengths and principal point. Blender's looks along -Z with +Y up."""
+    """A camera with any focal lengths and principal point. Blender's cameras look along -Z with +Y up."""
     width, height = description["width"], description["height"]
     (fx, fy), (cx, cy) = description["focal_px"], description["principal_point_px"]
     scene = bpy.context.scene
@@ -141,7 +141,7 @@ def place_camera(description: dict[str, Any]) -> Any:
 
 
 def add_light(description: dict[str, Any]) -> Any:
-    """A small disc that shines as Lambert's law says, like a bare LED."""
+    """A small disc that emits according to Lambert's law, like a bare LED."""
     data = bpy.data.lights.new("led", "AREA")
     data.shape, data.size = "DISK", description["diameter_mm"]
     data.energy = np.pi**2 * description["power"]

@@ -1,8 +1,8 @@
-"""Photographs of a board with a handpiece, in simulation: to rehearse a calibration, and to try one against the truth.
+"""Simulated photographs of a board with a handpiece: to rehearse a calibration, and to test one against the truth.
 
-The board lies before one camera after the other, at about its working distance, tilted and turned at random, and all
-cameras take it at once. Light is even, which is all that corners need, or comes from the lights of the handpiece: from
-points, on a surface that scatters it evenly (Lambert), without shadows. Nothing is blurred.
+The board is held in front of one camera after the other, at about its working distance, tilted and rotated at random,
+and all cameras photograph it at once. The light is even, which suffices for corners, or comes from the lights of the
+handpiece: point lights, on a diffuse (Lambertian) surface, without shadows. Nothing is blurred.
 """
 
 from __future__ import annotations
@@ -33,13 +33,14 @@ from cuspid.storage.stages import Stage
 _LIGHT, _DARK = 0.75, 0.03
 """Linear light of paper and of ink; full scale is 1."""
 _BRIGHT_PERCENTILE = 98.0
-"""Of the light on the corners of the board in all images of an exposure: what is brighter may burn out."""
+"""Percentile of the light on the corners of the board, over all images of an exposure, above which they may burn
+out."""
 _NEAR, _FAR = 0.9, 1.3
 """Distance of the board, in working distances."""
 _HIGHEST = 0.5
-"""Height of the terraces at most, in working distances."""
+"""Maximum height of the terraces, in working distances."""
 _ASIDE = 0.15
-"""How far the middle of the board is from the axis of the camera, in working distances (standard deviation)."""
+"""Standard deviation of the distance of the board's middle from the axis of the camera, in working distances."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,16 +48,16 @@ class PhotographOptions(Options):
     """How a board is shown to a handpiece."""
 
     instants: Annotated[int, Range(1, 10_000)] = 36
-    """How many times."""
+    """Number of times that the board is shown."""
     most_tilt_deg: Annotated[float, Range(0, 70)] = 40.0
-    """Of the board, from facing the camera."""
+    """Maximum tilt of the board from facing the camera."""
     supersampling: Annotated[int, Range(1, 16)] = 3
-    """Rays through a pixel along each side."""
+    """Rays per pixel along each side."""
     lit: Literal["evenly", "together", "one-by-one"] = "evenly"
-    """By even light, by all lights of the handpiece, or by one of them after the other, which the names of the images
-    then end in."""
+    """How the board is lit: by even light, by all lights of the handpiece together, or by one after the other, whose
+    names are then appended to those of the images."""
     seed: Annotated[int, SEED] = 0
-    """Chooses how the board is held, and the sensor noise."""
+    """Seed of the poses of the board and of the sensor noise."""
 
 
 def board_poses(handpiece: Handpiece, board: Board, options: PhotographOptions) -> list[Rigid3]:
@@ -84,8 +85,8 @@ def take_photographs(
 ) -> None:
     """Photograph a board: ``folder/truth/handpiece.json`` and ``folder/images/<camera>/<instant>.png``.
 
-    Images that are there already are kept; a run that goes on gives the same bits as one that was not interrupted.
-    Raises InputError for terraces that would reach the cameras.
+    Existing images are kept; a run that is resumed gives the same bits as one that was not interrupted. Raises
+    InputError for terraces that would reach the cameras.
     """
     if board.height_mm > _HIGHEST * handpiece.working_distance_mm:
         raise InputError(
@@ -159,8 +160,8 @@ def board_light(
     lights: Sequence[Light] = (),
 ) -> Float[np.ndarray, "h w 3"]:
     """Linear light of each pixel that looks at a board, lit evenly or by lights in its frame; paper where it looks past
-    it or at its back, which lights do not reach. Risers are as between the squares. The rays of a pixel follow each
-    other (:func:`cuspid.simulation.raycast.pixel_rays`)."""
+    it or at its back, which lights do not reach. Risers are as between the squares. The rays of a pixel are
+    consecutive (:func:`cuspid.simulation.raycast.pixel_rays`)."""
     rays = rays_in_cam @ cam_from_board.rotation
     eye = cam_from_board.inverse().translation
     reach, on_terrace = _first_hits(board, eye, rays)

@@ -1,4 +1,4 @@
-"""Lights for a handpiece of which none are known."""
+"""Lights for a handpiece that has none."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera
 
 _BESIDE = 0.1
-"""Of the working distance: how far a light lies from its camera."""
+"""Distance of a light from its camera, as a share of the working distance."""
 
 _log = logging.getLogger("cuspid")
 
 
 def lit(handpiece: Handpiece) -> Handpiece:
-    """The handpiece, or, said aloud, with one light beside each camera where it has none."""
+    """The handpiece; if it has no lights, with one beside each camera, which is logged."""
     if handpiece.lights:
         return handpiece
     _log.info(f"handpiece {handpiece.name}: it has no lights; one beside each camera is assumed")

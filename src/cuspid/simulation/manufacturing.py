@@ -1,6 +1,6 @@
-"""A handpiece as it was built, beside the one that was drawn: no camera sits where it should, no lens is as it should.
+"""A handpiece as built, as opposed to the one that was drawn: no camera and no lens is exactly as it should be.
 
-The images are those of the built one; what a user has is the drawn one, and the tolerances that it was built to.
+The images are those of the built one; a user has the drawn one, and the tolerances to which it was built.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from cuspid.rig import Handpiece, Light, MountedCamera, Sensor
 from cuspid.tolerances import Tolerances, with_cameras
 
 _DARKEST = 0.95
-"""Light that a corner lacks at most."""
+"""Maximum loss of light in a corner."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ManufacturingOptions(Options):
-    """Standard deviations of what a built handpiece is off from the drawn one, each camera for itself; 0 for a perfect
+    """Standard deviations of the built handpiece from the drawn one, independent for each camera; 0 for a perfect
     one."""
 
     manufacturing_um: Annotated[float, Range(0, 10_000)] = 0.0
-    """Place of a camera, each axis."""
+    """Position of a camera, each axis."""
     manufacturing_deg: Annotated[float, Range(0, 10)] = 0.0
-    """Turn of a camera, about each axis."""
+    """Rotation of a camera, about each axis."""
     manufacturing_focal_pct: Annotated[float, Range(0, 20)] = 0.0
     """Focal length."""
     manufacturing_centre_px: Annotated[float, Range(0, 1000)] = 0.0
@@ -37,19 +37,19 @@ class ManufacturingOptions(Options):
     manufacturing_gain_pct: Annotated[float, Range(0, 50)] = 0.0
     """Brightness of the images of a camera."""
     manufacturing_falloff_pct: Annotated[float, Range(0, 80)] = 0.0
-    """Not a deviation: light that the corners of an image lack, on the average; each lens has 0.5 to 1.5 times that."""
+    """Not a deviation: average loss of light in the corners of an image; each lens has 0.5 to 1.5 times that."""
     manufacturing_gamma_pct: Annotated[float, Range(0, 20)] = 0.0
     """Encoding exponent of a camera."""
     manufacturing_led_um: Annotated[float, Range(0, 10_000)] = 0.0
-    """Place of a light, each axis."""
+    """Position of a light, each axis."""
     manufacturing_led_power_pct: Annotated[float, Range(0, 50)] = 0.0
     """Power of a light."""
     manufacturing_seed: Annotated[int, SEED] = 0
-    """Which of the handpieces that were built."""
+    """Seed that selects one of the handpieces that could be built."""
 
     @property
     def tolerances(self) -> Tolerances:
-        """The same as a value."""
+        """The tolerances of the cameras."""
         return Tolerances(
             place_mm=self.manufacturing_um / 1000,
             turn_deg=self.manufacturing_deg,
@@ -60,7 +60,7 @@ class ManufacturingOptions(Options):
 
 
 def built(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:
-    """One of the handpieces that are built to tolerances; the drawn one where there are none."""
+    """One of the handpieces that are built to the tolerances; the drawn one if there are none."""
     rng = np.random.default_rng([options.manufacturing_seed, 3])
     placed = with_cameras(drawn, lambda mounted: _off(mounted, options.tolerances, rng))
     return _lit_anew(_exposing_anew(placed, options), options)
@@ -106,7 +106,8 @@ def _light(drawn: Light, options: ManufacturingOptions, rng: np.random.Generator
 
 
 def told(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:
-    """The drawn handpiece with the tolerances as covariances; where there are none it keeps its own, or is exact."""
+    """The drawn handpiece with the tolerances as covariances; without tolerances it keeps its own covariances, or is
+    exact."""
     return options.tolerances.fill(with_cameras(drawn, lambda mounted: _open(mounted, options.tolerances)))
 
 

@@ -1,7 +1,7 @@
 """The default renderer: Embree rays, compiled shading.
 
-For each of the rays through a pixel: the albedo of the solid texture at the hit, lit by the lights that are on, each a
-point with a lobe and 1/d^2 falloff, through a GGX coat with Schlick's Fresnel term (Walter et al. 2007). Shadows are
+Each ray through a pixel gives the albedo of the solid texture at the hit, lit by the lights that are on, each a point
+light with a lobe and 1/d^2 falloff, through a GGX coat with Schlick's Fresnel term (Walter et al. 2007). Shadows are
 traced once for each surface in a pixel. Interreflection is a constant share of the light that reaches a point. Radiance
 is linear RGB in units in which a white diffuse surface facing a light of power 1 at 1 mm has radiance 1 plus that
 share. The world is the frame of the jaw.
@@ -32,13 +32,15 @@ from cuspid.simulation.appearance import NO_MATERIAL, Appearance, Palette, albed
 from cuspid.simulation.sensor import record
 
 AMBIENT = 0.08
-"""Share of the light reaching a point that arrives from all around after reflection in the mouth, unshadowed."""
+"""Share of the light reaching a point that arrives from all directions after reflection in the mouth, unshadowed."""
 
 NOTICEABLE = 0.005
-"""A light that gives less than this share of the light at a point is left out there, and no shadow ray is traced."""
+"""A light that contributes less than this share of the light at a point is ignored there, and no shadow ray is
+traced."""
 
 SAME_SURFACE = 0.03
-"""Rays through a pixel whose lengths differ by less than this share see one surface (12 um at 5 mm, up to 85 deg)."""
+"""Rays through a pixel whose lengths differ by less than this share hit the same surface (12 um at 5 mm, up to 85
+deg)."""
 
 BRIGHT_PERCENTILE, BRIGHT_LEVEL = 98.0, 0.75
 """The exposure puts this percentile of the metered pixels at this share of full scale (linear)."""
@@ -47,7 +49,7 @@ METERED_POSES = 5
 """The exposure is metered at this many poses, spread over the capture."""
 
 _BLOCK = 1 << 15
-"""Rays that are traced and shaded at once: what passes between the steps takes some 300 bytes a ray."""
+"""Number of rays that are traced and shaded at once: intermediate results take some 300 bytes per ray."""
 
 Sink = Callable[[str, str, UInt8[np.ndarray, "h w 3"]], None]
 """Takes frame, camera and image; called in the process that rendered it."""
@@ -64,9 +66,9 @@ class Scene:
     appearance: Appearance
     """Materials."""
     supersampling: int = 2
-    """Rays through a pixel along each side."""
+    """Rays per pixel along each side."""
     seed: int = 0
-    """Chooses the texture and the sensor noise."""
+    """Seed of the texture and the sensor noise."""
 
     @cached_property
     def surface(self) -> ShadedMesh:
@@ -76,8 +78,8 @@ class Scene:
 
     @cached_property
     def rays(self) -> Callable[[Camera], Float[np.ndarray, "n 3"]]:
-        """:func:`pixel_rays` of a camera, remembered for the last one: through a lens that distorts they cost more
-        than the rest of an image, and those of twelve cameras of 500 x 500 px would take 300 MB in each process."""
+        """:func:`pixel_rays` of a camera, cached for the last one: through a lens with distortion they cost more than
+        the rest of an image, and those of twelve cameras of 500 x 500 px would take 300 MB in each process."""
         return lru_cache(maxsize=1)(partial(pixel_rays, supersampling=self.supersampling))
 
     @cached_property
@@ -119,7 +121,7 @@ def lamps(handpiece: Handpiece, lighting: str | None, rig_from_world: Rigid3) ->
 
 
 def pixel_rays(camera: Camera, supersampling: int) -> Float[np.ndarray, "n 3"]:
-    """Directions (Z = 1, camera frame) on a regular grid within each pixel; the rays of one pixel follow each other."""
+    """Directions (Z = 1, camera frame) on a regular grid within each pixel; the rays of one pixel are consecutive."""
     offsets = (np.arange(supersampling) + 0.5) / supersampling - 0.5
     within = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(1, 1, -1, 2)
     return camera.rays((camera.pixel_centres()[:, :, None] + within).reshape(-1, 2))
@@ -145,7 +147,7 @@ def radiance(scene: Scene, camera: Camera, cam_from_world: Rigid3, lights: Lamps
 def radiance_along(
     scene: Scene, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"], lights: Lamps
 ) -> Float[np.ndarray, "m 3"]:
-    """Linear light (float32) of pixels, given their rays, ``supersampling**2`` in a row for each."""
+    """Linear light (float32) of pixels, given their rays, ``supersampling**2`` consecutive ones for each pixel."""
     samples = scene.supersampling**2
     out = np.zeros((len(directions) // samples, 3), dtype=np.float32)
     pixels = max(1, _BLOCK // samples)
@@ -395,7 +397,7 @@ def _shade(rays, albedos, surface, palette, lights, lit, ambient, row, out):
 
 
 def auto_gain(scene: Scene, poses: Iterable[Rigid3], lighting: str | None = None, stride: int = 10) -> float:
-    """The gain for a lighting pattern, metered over all cameras at some poses, on images ``stride`` times coarser."""
+    """The gain for a lighting pattern, metered over all cameras at some poses, on images reduced by ``stride``."""
     levels = []
     for rig_from_world in poses:
         lights = lamps(scene.handpiece, lighting, rig_from_world)
@@ -410,7 +412,7 @@ def auto_gain(scene: Scene, poses: Iterable[Rigid3], lighting: str | None = None
 
 
 def metered_gains(scene: Scene, frames: Sequence[Frame], poses: Mapping[str, Rigid3]) -> dict[str | None, float]:
-    """The one gain of each lighting pattern of a capture, metered at a few of its frames spread over it."""
+    """The common gain of each lighting pattern of a capture, metered at a few frames spread over it."""
     gains: dict[str | None, float] = {}
     for lighting in dict.fromkeys(frame.lighting for frame in frames):
         lit = [poses[frame.name] for frame in frames if frame.lighting == lighting]
@@ -434,7 +436,7 @@ def lit_frames(
 ) -> tuple[tuple[Frame, ...], dict[str, Rigid3]]:
     """The frames taken at some poses, under each lighting pattern of the handpiece in turn, and the pose of each.
 
-    With one pattern, or none, a frame has the name of its pose; with more a letter follows it.
+    With one pattern, or none, a frame has the name of its pose; with more, a letter is appended.
     """
     patterns: list[str | None] = [each.name for each in handpiece.lightings] or [None]
     letters = [chr(ord("a") + index) for index in range(len(patterns))] if len(patterns) > 1 else [""]
@@ -457,7 +459,7 @@ def render_image(
 
 
 def image_rng(scene: Scene, frame: str, camera_name: str) -> np.random.Generator:
-    """The sensor noise of one image, whatever was rendered before."""
+    """Random generator for the sensor noise of one image, independent of what was rendered before."""
     return np.random.default_rng([scene.seed, zlib.crc32(frame.encode()), zlib.crc32(camera_name.encode())])
 
 
@@ -496,10 +498,11 @@ def render_capture(
     skip: Callable[[str, str], bool] = lambda frame, camera: False,
     processes: int = 1,
 ) -> Iterator[tuple[str, str]]:
-    """Render the cameras of every frame but those that ``skip`` names, and yield (frame, camera) as each is done.
+    """Render the cameras of every frame, except those that ``skip`` excludes, and yield (frame, camera) as each is
+    done.
 
-    Embree holds the interpreter lock, so the work is spread over processes. They are forked, and only trace rays in the
-    scene that the parent built (a forked child could not build one) and run kernels that the parent compiled.
+    Embree holds the interpreter lock, so the work is distributed over processes. They are forked, and only trace rays
+    in the scene that the parent built (a forked child could not build one) and run kernels that the parent compiled.
     """
     tasks = [(frame, camera) for frame in frames for camera in frame.cameras if not skip(frame.name, camera)]
     tasks.sort(key=lambda task: task[1])  # one camera after the other, for whose rays a process remembers

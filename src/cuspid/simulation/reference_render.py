@@ -1,7 +1,7 @@
-"""A reference render: a jaw as a single image from above shows it, the ground truth of a panorama (thesis 4.3).
+"""A reference render: a single image of a jaw from above, the ground truth for a panorama (thesis 4.3).
 
-The camera looks straight down on the occlusal plane, orthographic or from a height, and its light shines beside it, as
-the thesis assumes of the frames. Pixels: see :class:`cuspid.trueness.ReferenceRender`.
+The camera looks straight down on the occlusal plane, orthographic or from a height, with its light beside it, as the
+thesis assumes for the frames. Pixels: see :class:`cuspid.trueness.ReferenceRender`.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ from cuspid.simulation.sensor import expose
 from cuspid.trueness import NOTHING, ReferenceRender
 
 FAR_LIGHT_MM = 1000.0
-"""Height of the light of an orthographic view; from here it comes within 2 deg of straight down on all of an arch."""
+"""Height of the light for an orthographic view, from which its direction is within 2 deg of straight down over the
+whole arch."""
 _ABOVE_MM = 5.0
-"""Orthographic rays start so far above the jaw."""
+"""Height above the jaw from which orthographic rays start."""
 _ROWS = 64
-"""Rows of the picture that are traced at once; bounds the memory."""
+"""Rows of the picture that are traced at once; limits the memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,15 +33,15 @@ class ReferenceRenderOptions(Options):
     """How the jaw is rendered from above."""
 
     mm_per_px: Annotated[float, Range(0.001, 10)] = 0.05
-    """Millimetres a pixel, in the occlusal plane."""
+    """Millimetres per pixel, in the occlusal plane."""
     margin_mm: Annotated[float, Range(0, 1000)] = 2.0
-    """Room around the jaw."""
+    """Margin around the jaw."""
     camera_height_mm: Annotated[float | None, Range(0.1, 100_000)] = None
-    """Of the camera and its light above the occlusal plane; None for an orthographic view."""
+    """Height of the camera and its light above the occlusal plane; None for an orthographic view."""
 
 
 def render_reference(scene: Scene, options: ReferenceRenderOptions = ReferenceRenderOptions()) -> ReferenceRender:
-    """The jaw from above, with the materials, the texture and the sensor's gamma of its scene, without noise."""
+    """The jaw from above, with the materials, texture and sensor gamma of its scene, without noise."""
     low, high = scene.jaw.mesh.bounds
     height = options.camera_height_mm
     if height is not None and height < high[2] + _ABOVE_MM:

@@ -21,7 +21,7 @@ def expose(
 def record(
     radiance: Float[np.ndarray, "h w 3"], gain: float, handpiece: Handpiece, name: str, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The image that a camera of a handpiece records, its own gain and the falloff of its lens included."""
+    """The image that a camera of a handpiece records, including its own gain and the falloff of its lens."""
     sensor, camera = handpiece.sensor_of(name), handpiece.rig[name].camera
     if sensor.gain != 1 or any(sensor.falloff):
         radiance = radiance * sensor.transmitted(camera, camera.pixel_centres())[..., None]

@@ -1,4 +1,4 @@
-"""What a handpiece records of a jaw, in simulation: images on disk, and beside them what only the simulator knows."""
+"""What a handpiece records of a jaw, in simulation: images on disk, and what only the simulator knows beside them."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ class RenderOptions(Options):
     texture: Preset = "artificial"
     """Surface: artificial (strong matte texture, the thesis' condition), powder (weak speckle), enamel (plain, wet)."""
     renderer: Literal["embree", "blender"] = "embree"
-    """Embree rays (default), or Blender Cycles with subsurface scattering (needs an environment of its own)."""
+    """embree: ray casting (default). blender: Blender Cycles with subsurface scattering (needs its own environment)."""
     supersampling: Annotated[int, Range(1, 16)] = 2
-    """Rays through a pixel along each side."""
+    """Rays per pixel along each side."""
     seed: Annotated[int, SEED] = 0
-    """Chooses texture, hand jitter and sensor noise."""
+    """Seed of texture, hand jitter and sensor noise."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ class SimulationOptions(RenderOptions):
     path: ScanPathOptions = field(default_factory=ScanPathOptions)
     """How the handpiece moves."""
     manufacturing: ManufacturingOptions = field(default_factory=ManufacturingOptions)
-    """How far the handpiece that takes the images is from the one that reconstruction is told of."""
+    """How the handpiece that takes the images differs from the one that the reconstruction is given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +70,7 @@ class FilmOptions(RenderOptions):
 
 
 REFERENCE_RENDERS: Mapping[str, float | None] = MappingProxyType({"occlusal": None, "shot": 300.0})
-"""Height in mm of the camera of each picture of the true jaw; None for an orthographic view."""
+"""Camera height in mm of each picture of the true jaw; None for an orthographic view."""
 
 
 def simulate(
@@ -78,9 +78,9 @@ def simulate(
 ) -> tuple[Capture, GroundTruth]:
     """Scan a jaw: images to ``folder/capture``, what only the simulator knows to ``folder/truth``.
 
-    A handpiece without lights is given one beside each camera (:func:`cuspid.simulation.lights.lit`). Where it is not
-    built as it was drawn, the capture has the drawn one with its tolerances, and the truth the built one.
-    Images that are there already are kept; a run that goes on gives the same bits as one that was not interrupted.
+    A handpiece without lights is given one beside each camera (:func:`cuspid.simulation.lights.lit`). If it is not
+    built as it was drawn, the capture has the drawn one with its tolerances, and the truth the built one. Existing
+    images are kept; a run that is resumed gives the same bits as one that was not interrupted.
     """
     handpiece = lit(handpiece)
     path = plan_scan_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
@@ -95,7 +95,8 @@ def film(
 ) -> tuple[Capture, GroundTruth]:
     """As :func:`simulate`, with a camera that a shaky hand moves freely over the arch.
 
-    Also reference renders of the arch from above: ``truth/occlusal``, orthographic, and ``truth/shot``, from far above.
+    Also writes reference renders of the arch from above: ``truth/occlusal``, orthographic, and ``truth/shot``, from far
+    above.
     """
     handpiece = lit(handpiece)
     poses = plan_free_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
@@ -125,8 +126,8 @@ def take_images(
     known: Handpiece | None = None,
     progress: Progress = silent,
 ) -> tuple[Capture, GroundTruth]:
-    """As :func:`simulate`, from given poses of the handpiece, by the name of the frame. The capture has the handpiece
-    that is ``known``, the true one and exactly unless given."""
+    """As :func:`simulate`, from given poses of the handpiece by frame name. The capture has the handpiece ``known``; by
+    default the true one, as exact."""
     handpiece = lit(handpiece)
     frames, poses = lit_frames(handpiece, rig_from_world)
     truth = GroundTruth(jaw=jaw, handpiece=handpiece, rig_from_world=poses)

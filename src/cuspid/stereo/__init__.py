@@ -1,4 +1,4 @@
-"""Depth from one frame, which needs the rig alone, and from two, which needs the motion too."""
+"""Depth from one frame, which needs only the rig, and from two, which also needs the motion."""
 
 from cuspid.stereo.matching import DepthEstimator, StereoOptions
 from cuspid.stereo.temporal import TemporalOptions, measure_temporal

@@ -1,8 +1,8 @@
-"""Which depths to believe: agreement between the cameras of a group, speckle, and a weight per pixel.
+"""Which depths to trust: agreement between the cameras of a group, speckle, and a weight per pixel.
 
-Limits that are lengths count in *resolutions*: what the handpiece resolves (:func:`cuspid.pairing.resolved_mm`,
-12 um for the built-in ones) at the working distance; at another depth it is in the ratio of the squared depths, as is
-the depth of a pixel of disparity.
+Limits that are lengths are given in *resolutions*: what the handpiece resolves (:func:`cuspid.pairing.resolved_mm`,
+12 um for the built-in ones) at the working distance. At other depths the resolution scales with the square of the
+depth, as does the depth step of a pixel of disparity.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ class ConfidenceOptions(Options):
     """What is kept of the measured depth and how it is weighted."""
 
     pair_agreement: Annotated[float, Range(0, 100)] = 0.9
-    """The same where only two cameras look, whom no third one contradicts."""
+    """Largest difference, in resolutions, between depths that agree, where only two cameras look and no third one can
+    contradict them."""
     agreement: Annotated[float, Range(0.01, 1000)] = 2.5
-    """Depths of two cameras agree within this many resolutions (0.03 mm at 12 um), or within three standard deviations
-    where that is more."""
+    """Largest difference, in resolutions (0.03 mm at 12 um), between the depths of two cameras that agree, where three
+    or more look; or three standard deviations if that is more."""
     largest_sigma: Annotated[float, Range(0.001, 1000)] = 5 / 6
-    """A depth with a standard deviation of more resolutions (0.01 mm at 12 um) is dropped."""
+    """A depth with a larger standard deviation, in resolutions (0.01 mm at 12 um), is dropped."""
     best_sigma: Annotated[float, Range(0.0001, 100)] = 1 / 6
-    """Standard deviation, in resolutions at the working distance (0.002 mm at 12 um), that has confidence 1; the
+    """Standard deviation, in resolutions at the working distance (0.002 mm at 12 um), that gives confidence 1; the
     confidence falls with its inverse square."""
     border_px: Annotated[int, Range(0, 1000)] = 2
-    """Of two cameras, pixels so near to the border of a surface that lies before another one are dropped: no third
-    camera looks past it."""
+    """Where only two cameras look, pixels this close to the border of a surface in front of another one are dropped, as
+    no third camera looks past it."""
     border_jump: Annotated[float, Range(0, 1000)] = 2.0
-    """How far the other one lies behind, in resolutions, to be another one."""
+    """How far behind, in resolutions, the other surface must lie to count as another one."""
     speckle_px: Annotated[int, Range(0, 1_000_000)] = 100
     """Connected pieces of fewer depth pixels are dropped."""
     speckle_jump: Annotated[float, Range(0.01, 10_000)] = 5.0
-    """Neighbours that differ by more resolutions (0.06 mm at 12 um), in proportion to their depth, are not
-    connected."""
+    """Neighbours that differ by more resolutions (0.06 mm at 12 um), scaled with their depth, are not connected."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,10 @@ class Resolution:
     mm: float
     """At the working distance."""
     working_distance_mm: float
-    """The distance where that holds."""
+    """The distance at which that holds."""
 
     def at(self, depth_mm: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """Depth that shifts the images as much as one resolution at the working distance does, mm."""
+        """Change of depth, in mm, that shifts the images as much as one resolution does at the working distance."""
         return self.mm * (depth_mm / self.working_distance_mm) ** 2
 
 
@@ -65,20 +65,20 @@ class Measured:
     """Depth of one camera on its grid, before the checks."""
 
     camera: Camera
-    """Pinhole of the grid."""
+    """Pinhole camera of the grid."""
     cam_from_rig: Rigid3
-    """Its place."""
+    """Its pose in the rig."""
     depth_mm: Float[np.ndarray, "h w"]
     """NaN where unknown."""
     sigma_mm: Float[np.ndarray, "h w"]
-    """Standard deviation as the refinement estimates it."""
+    """Standard deviation estimated by the refinement."""
 
 
 def sample_inverse_depth(
     depth_mm: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n"]:
-    """Inverse depth (exact for planes) between pixel centres, of the known ones of the four around; NaN outside, and
-    where the known ones have less than a quarter of the weight."""
+    """Inverse depth (exact for planes) between pixel centres, from those of the four neighbours that are known; NaN
+    outside, and where the known ones have less than a quarter of the weight."""
     height, width = depth_mm.shape
     place = np.nan_to_num(pixels - 0.5, nan=-1.0)
     base = np.floor(place).astype(int)
@@ -99,7 +99,7 @@ def sample_inverse_depth(
 def agreement(
     measured: Sequence[Measured], index: int, resolution: Resolution, options: ConfidenceOptions
 ) -> Int[np.ndarray, "h w"]:
-    """For each pixel of one camera: cameras whose depth agrees, minus cameras that look through the point."""
+    """For each pixel of one camera: number of cameras whose depth agrees, minus those that see through the point."""
     one = measured[index]
     votes = np.zeros(one.depth_mm.shape, dtype=np.int64)
     known = np.isfinite(one.depth_mm)
@@ -127,7 +127,7 @@ def at_near_borders(
     one: Measured, radius: int, resolution: Resolution, options: ConfidenceOptions
 ) -> Bool[np.ndarray, "h w"]:
     """True where there is another surface behind within a few pixels of the grid: a window there sees mostly the nearer
-    one, whose depth reaches over its border."""
+    one, whose depth extends past its border."""
     inverse = np.where(np.isfinite(one.depth_mm), 1 / one.depth_mm, np.finfo(np.float32).max).astype(np.float32)
     around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     step = options.border_jump * resolution.mm / resolution.working_distance_mm**2
@@ -135,7 +135,7 @@ def at_near_borders(
 
 
 def sure_enough(one: Measured, resolution: Resolution, options: ConfidenceOptions) -> Bool[np.ndarray, "h w"]:
-    """True where the standard deviation of a depth is small enough."""
+    """True where the standard deviation of the depth is small enough."""
     return np.asarray(one.sigma_mm <= options.largest_sigma * resolution.at(one.depth_mm))
 
 

@@ -1,8 +1,8 @@
 """Where depth left holes, and which images would fill them.
 
-The sparse points of the motion stand for the surface: they are spread evenly over the images, and they lie also where
-only one camera of a group sees it. They are too few to tell of a narrow strip, as on the slope of a cusp; there the
-places stand for it that a coarse fusion leaves open.
+The sparse points of the motion represent the surface: they are spread evenly over the images, and also lie where only
+one camera of a group sees it. They are too few to represent a narrow strip, such as the slope of a cusp; there, the
+places that a coarse fusion leaves open represent it.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from cuspid.geometry import Rigid3
 from cuspid.reconstruction import DepthMap, Reconstruction, SurfacePoints, Tracks
 
 Image = tuple[str, str]
-"""A frame and a camera of it."""
+"""Names of a frame and of one of its cameras."""
 _STEEPEST_DEG = 70.0
-"""Between the line of sight and the normal of a place that is worth another look."""
+"""Largest angle between the line of sight and the normal of a place that is worth another look."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,13 +28,13 @@ class Sightings:
     """Which sparse points each image shows."""
 
     points: Float[np.ndarray, "p 3"]
-    """In the world frame, mm."""
+    """Sparse points in the world frame, mm."""
     shown: Mapping[Image, Int[np.ndarray, "_"]]
-    """Indices of the points of an image, increasing."""
+    """Indices of the points in each image, ascending."""
 
     @staticmethod
     def of(found: Reconstruction, tracks: Tracks) -> Sightings:
-        """Of the sparse model of a reconstruction."""
+        """The sightings in the sparse model of a reconstruction."""
         cameras = found.rig.names
         seen = np.unique(
             np.stack([tracks.frame_index * len(cameras) + tracks.camera_index, tracks.point_index], axis=1), axis=0
@@ -49,7 +49,7 @@ class Sightings:
         return np.intersect1d(self.shown.get(one, ()), self.shown.get(other, ()), assume_unique=True).astype(np.int64)
 
     def in_stereo(self, frame: str, cameras: Sequence[str]) -> Int[np.ndarray, "_"]:
-        """Points that two or more of some cameras show in a frame."""
+        """Points that at least two of the given cameras show in a frame."""
         shown = [self.shown[frame, camera] for camera in cameras if (frame, camera) in self.shown]
         points, count = np.unique(np.concatenate([np.zeros(0, np.int64), *shown]), return_counts=True)
         return points[count >= 2]
@@ -57,8 +57,8 @@ class Sightings:
     def confirmed(
         self, depth_maps: Iterable[DepthMap], rig_from_world: Mapping[str, Rigid3], agreement_mm: float
     ) -> Int[np.ndarray, "p"]:
-        """How many depth maps of located frames have each point on their surface, whether their image shows it or
-        not: keypoints come and go."""
+        """For each point, the number of depth maps of located frames that have it on their surface, whether or not
+        their image shows it (keypoints come and go)."""
         count = np.zeros(len(self.points), dtype=np.int64)
         for depth_map in depth_maps:
             if depth_map.frame in rig_from_world:
@@ -82,7 +82,7 @@ class Views:
     """Which of some places on a surface each image shows."""
 
     count: int
-    """Of the places."""
+    """Number of places."""
     shown: Mapping[Image, Bool[np.ndarray, "p"]]
 
     @staticmethod
@@ -93,8 +93,8 @@ class Views:
         depth_maps: Iterable[DepthMap],
         agreement_mm: float,
     ) -> Views:
-        """Of images of located frames. A place is hidden behind a depth that is nearer by more than ``agreement_mm``;
-        where an image has no depth map, nothing is."""
+        """The views of images of located frames. A place is hidden by a depth that is nearer by more than
+        ``agreement_mm``; if an image has no depth map, nothing is hidden."""
         shown = dict[Image, Bool[np.ndarray, "p"]]()
         for depth_map in depth_maps:
             if depth_map.frame in found.rig_from_world:
@@ -129,8 +129,8 @@ def _hidden(depth_map: DepthMap, in_cam: Float[np.ndarray, "n 3"], agreement_mm:
 
 
 def covering(candidates: Sequence[Int[np.ndarray, "_"]], count: int, left: float = 0, *, least: int = 1) -> list[int]:
-    """Which sets of points, of ``count``, cover what the sets cover together, but for ``left`` points at most: greedily
-    the one that adds most, again and again, while it adds ``least`` (>= 1). Indices of sets, increasing."""
+    """Indices (ascending) of sets of points, out of ``count``, that cover what all sets cover together, except for at
+    most ``left`` points: greedily the set that adds most, as long as it adds at least ``least`` (>= 1)."""
     missing = np.zeros(count, dtype=bool)
     for points in candidates:
         missing[points] = True

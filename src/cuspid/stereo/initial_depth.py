@@ -1,7 +1,7 @@
 """An initial depth for each pixel: semi-global matching of rectified pairs at half resolution, checked both ways.
 
 A *pair matcher* is any function from two rectified images and a range of disparities to the disparity of the first
-image's pixels; :func:`semi_global` is one. Matching by something else than grey values stands beside it.
+image's pixels; :func:`semi_global` is one. Matching by something other than grey values can take its place.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ class SemiGlobalOptions(Options):
     large_jump_penalty: Annotated[int, Range(0, 10_000)] = 32
     """Penalty for a larger change, per pixel of the block."""
     uniqueness_percent: Annotated[int, Range(0, 100)] = 5
-    """By how much the best cost must beat the second best."""
+    """Margin by which the best cost must beat the second best."""
     left_right_tolerance_px: Annotated[float, Range(0, 1000)] = 1.0
-    """Largest difference between the disparities found in the two directions."""
+    """Largest difference between the disparities from the two matching directions."""
 
 
 def semi_global(
@@ -47,7 +47,7 @@ def semi_global(
     disparities: tuple[float, float],
     options: SemiGlobalOptions = SemiGlobalOptions(),
 ) -> Float[np.ndarray, "h w"]:
-    """A :class:`PairMatcher`: semi-global matching in both directions, kept where they agree."""
+    """A :class:`PairMatcher`: semi-global matching in both directions; disparities are kept where the two agree."""
     forward = _semi_global_one_way(first, second, disparities, options)
     backward = _semi_global_one_way(second[:, ::-1], first[:, ::-1], disparities, options)[:, ::-1]
     columns = np.arange(first.shape[1])
@@ -82,7 +82,7 @@ def _semi_global_one_way(
 
 
 def initial_pairs(rig: Rig, group: Sequence[str], pairs: Sequence[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
-    """For each camera of a group the partner with the widest baseline among the stereo pairs; no pair twice."""
+    """For each camera of a group, the stereo pair with its widest-baseline partner; no pair twice."""
     chosen: dict[frozenset[str], tuple[str, str]] = {}
     for name in group:
         partners = [pair for pair in pairs if name in pair]

@@ -38,11 +38,11 @@ class StereoOptions(Options):
     """Depth within one frame."""
 
     spacing_px: Annotated[int, Range(1, 100)] = 3
-    """Depth is measured at every so many pixels."""
+    """Depth is measured at every n-th pixel, in each direction."""
     initial_scale: Annotated[float, Range(0.05, 1)] = 0.5
     """Resolution of the initial matching relative to the images."""
     pairing: PairingOptions = field(default_factory=PairingOptions)
-    """Which cameras make a group."""
+    """Which cameras form a group."""
     refinement: RefinementOptions = field(default_factory=RefinementOptions)
     """Multi-camera refinement."""
     confidence: ConfidenceOptions = field(default_factory=ConfidenceOptions)
@@ -51,20 +51,20 @@ class StereoOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Cameras that see the same surface, prepared once."""
+    """Cameras that see the same surface, with everything that is computed only once."""
 
     views: tuple[IdealView, ...]
-    """The cameras without distortion."""
+    """The cameras, without distortion."""
     pairs: tuple[RectifiedPair, ...]
     """Pairs that give the initial depths."""
     geometry: tuple[GroupGeometry, ...]
-    """For each camera as the reference."""
+    """Geometry with each camera as the reference."""
     grids: tuple[Camera, ...]
-    """For each camera the pinhole of its depth map."""
+    """The pinhole camera of the depth map of each camera."""
 
 
 def coarser(camera: Camera, spacing_px: int) -> Camera:
-    """The pinhole whose pixel centres are every ``spacing_px``-th pixel centre, from ``spacing_px // 2`` on."""
+    """The pinhole camera with every ``spacing_px``-th pixel centre, starting from ``spacing_px // 2``."""
     first = spacing_px // 2 + 0.5
     return replace(
         camera,
@@ -76,7 +76,7 @@ def coarser(camera: Camera, spacing_px: int) -> Camera:
 
 
 def group_geometry(views: Sequence[IdealView], reference: int) -> GroupGeometry:
-    """How pixels of a reference view and their inverse depth map into the other views."""
+    """How pixels of a reference view, with their inverse depth, map into the other views."""
     others = [index for index in range(len(views)) if index != reference]
     inverse_matrix = np.linalg.inv(views[reference].camera.opencv_matrix)
     rig_from_reference = views[reference].cam_from_rig.inverse()
@@ -113,7 +113,7 @@ def stack_images(
 
 
 class DepthEstimator:
-    """Measures depth in the frames of one handpiece. Holds only what the handpiece fixes; safe to share by threads."""
+    """Measures depth in the frames of one handpiece. Depends only on the handpiece; safe to share between threads."""
 
     def __init__(
         self,
@@ -125,7 +125,7 @@ class DepthEstimator:
     ) -> None:
         """Prepare the groups. Raises InputError where no two cameras see the same surface.
 
-        ``resolution_mm`` is what limits and confidences count in, by default what the handpiece resolves.
+        ``resolution_mm`` is the unit of limits and confidences, by default what the handpiece resolves.
         """
         self.handpiece = handpiece
         self.options = options or StereoOptions()
@@ -159,7 +159,7 @@ class DepthEstimator:
         )
 
     def measure(self, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], frame: str) -> tuple[DepthMap, ...]:
-        """Depth maps of a frame, one for each camera that has company, from RGB or grey images by camera name.
+        """Depth maps of a frame, one for each camera with a stereo partner, from RGB or grey images by camera name.
 
         A camera of the handpiece that is not among them, or whose image is blank, saw nothing of the frame.
         """

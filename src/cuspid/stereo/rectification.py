@@ -23,7 +23,7 @@ from cuspid.rig import MountedCamera
 def resampling_map(
     source: MountedCamera, target: Camera, target_from_rig: Rigid3
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-    """Where each pixel of a camera at the same centre lies in the source image, as ``cv2.remap`` wants it."""
+    """Place of each pixel of a camera with the same centre in the source image, as maps for ``cv2.remap``."""
     rays = target.rays(target.pixel_centres())
     source_from_target = source.cam_from_rig.rotation @ target_from_rig.rotation.T
     pixels = source.camera.project(rays @ source_from_target.T) - OPENCV_PIXEL_OFFSET
@@ -38,11 +38,11 @@ class IdealView:
     name: str
     """Name in the rig."""
     camera: Camera
-    """Same matrix and size as the real one, no distortion."""
+    """Same matrix and size as the real camera, without distortion."""
     cam_from_rig: Rigid3
-    """As the real one."""
+    """As for the real camera."""
     maps: tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]] | None
-    """For ``cv2.remap``; None where the real camera is ideal already."""
+    """For ``cv2.remap``; None if the real camera has no distortion."""
 
     @staticmethod
     def of(name: str, mounted: MountedCamera) -> IdealView:
@@ -64,18 +64,18 @@ class RectifiedPair:
     names: tuple[str, str]
     """The first camera is the left one: its disparities are positive."""
     camera: Camera
-    """Common to both."""
+    """Intrinsics of both cameras."""
     first_from_rig: Rigid3
-    """Place of the virtual first camera."""
+    """Pose of the first virtual camera."""
     second_from_rig: Rigid3
-    """Place of the virtual second camera."""
+    """Pose of the second virtual camera."""
     maps: tuple[tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]], ...]
-    """For ``cv2.remap`` of the first and of the second image."""
+    """For ``cv2.remap``, of the first and the second image."""
     baseline_mm: float
-    """Distance of the two centres."""
+    """Distance between the two projection centres."""
 
     def disparity(self, depth_mm: float) -> float:
-        """Shift in px of a point at this depth."""
+        """Disparity in px of a point at this depth."""
         return float(self.camera.focal_px[0] * self.baseline_mm / depth_mm)
 
     def resample(
@@ -87,7 +87,8 @@ class RectifiedPair:
 
 
 def rectify(names: tuple[str, str], first: MountedCamera, second: MountedCamera, scale: float) -> RectifiedPair:
-    """Rectify a pair to ``scale`` times the resolution of the images. Raises InputError for a pair that cannot be."""
+    """Rectify a pair at ``scale`` times the resolution of the images. Raises InputError if a pair cannot be
+    rectified."""
     baseline = second.centre_in_rig - first.centre_in_rig
     length = float(np.linalg.norm(baseline))
     rotation = _rectified_rotation(baseline, first.axis_in_rig + second.axis_in_rig)

@@ -1,7 +1,7 @@
 """Sub-pixel depth from all cameras of a group: slanted patches, Gauss-Newton on normalised intensities.
 
-For a pixel (u, v) of the reference image a small window is taken as a plane in space, for which inverse depth is
-affine in the pixel: with an offset (du, dv) from the centre
+For a pixel (u, v) of the reference image, a small window is treated as a plane in space, whose inverse depth is affine
+in the pixel coordinates: with an offset (du, dv) from the centre
 
     q(du, dv) = q + q_u du + q_v dv,      x_j ~ A_j (u + du, v + dv, 1) + q(du, dv) b_j,
 
@@ -9,10 +9,11 @@ where x_j is the pixel in camera j, A_j = K_j R_j K_ref^-1, b_j = K_j t_j / s, a
 s, the longest of the K_j t_j, so that q counts pixels of disparity in the widest pair. Patches are brought to weighted
 mean 0 and norm 1, so that gain and offset of a camera do not matter; their inner product is the ZNCC. (q, q_u, q_v)
 minimises the summed squared differences over the cameras that see the patch; a camera whose ZNCC falls behind is
-taken to be occluded and left out. Pixels are OpenCV's here: the first centre is 0.
+considered occluded and left out. Pixels are OpenCV's here: the first centre is 0.
 
-A window over an edge sees two planes, and rounds it off. So where the planes around a pixel differ, halves of its
-window are tried as well, each from the plane on its side, and the one that leaves the least unexplained is taken.
+A window across an edge sees two planes, and rounds the edge off. Where the planes around a pixel differ, halves of its
+window are therefore tried as well, each from the plane on its side, and the one that leaves the least unexplained is
+taken.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from cuspid.kernels import kernel
 from cuspid.options import Options, Range
 
 Q, Q_U, Q_V, SCORE, VARIANCE, SUPPORT = range(6)
-"""Channels of a refined field: the plane, mean ZNCC of the cameras used, variance of q, how many cameras."""
+"""Channels of a refined field: the plane, mean ZNCC of the cameras used, variance of q, number of cameras."""
 
 _ROUNDING_DN = 12**-0.5
 
@@ -46,35 +47,36 @@ class RefinementOptions(Options):
     radius_px: Annotated[int, Range(1, 50)] = 3
     """Half the side of the window (3: 7 x 7 px)."""
     window_sigma_px: Annotated[float, Range(0.1, 100)] = 2.0
-    """Width of the Gaussian weight over the window."""
+    """Standard deviation of the Gaussian weight over the window."""
     iterations: Annotated[int, Range(0, 1000)] = 10
-    """Most Gauss-Newton steps."""
+    """Maximum number of Gauss-Newton steps."""
     converged_px: Annotated[float, Range(1e-06, 10)] = 0.06
     """A step below this many px of disparity ends the iterations."""
     camera_zncc: Annotated[float, Range(-1, 1)] = 0.5
-    """A camera below this correlation is taken to be occluded."""
+    """A camera whose correlation (ZNCC) is below this is considered occluded."""
     camera_zncc_lag: Annotated[float, Range(0, 2)] = 0.25
-    """A camera that falls this much behind the best is taken to be occluded."""
+    """A camera whose correlation is below the best one by more than this is considered occluded."""
     accept_zncc: Annotated[float, Range(-1, 1)] = 0.75
-    """Mean correlation from which a plane is kept and handed to neighbours, where the texture drowns the noise."""
+    """Minimum mean correlation for a plane to be kept and propagated to neighbours, where the texture is much stronger
+    than the noise."""
     weak_zncc: Annotated[float, Range(-1, 1)] = 0.6
-    """The same at most where it does not: noise of standard deviation n leaves of the correlation of a texture of
-    standard deviation c the share c^2 / (c^2 + n^2)."""
+    """Lower bound of that limit in weaker texture: noise of standard deviation n reduces the correlation of a texture
+    of standard deviation c to the share c^2 / (c^2 + n^2)."""
     least_contrast: Annotated[float, Range(0, 1000)] = 1.2
-    """Standard deviation of a window, in those of the noise, below which it carries no texture."""
+    """Standard deviation of a window, in multiples of that of the noise, below which it has no texture."""
     propagations: Annotated[int, Range(0, 100)] = 1
-    """How often planes are propagated to neighbours without one, in each direction."""
+    """Number of times that planes are propagated to neighbours without one, in each direction."""
     bend_px: Annotated[float | None, Range(0, 1000)] = None
-    """Planes on two sides of a window that differ by so much disparity at its border are taken to meet in an edge, and
-    halves of the window are tried. By default 0.75, of a draft 1000: nowhere."""
+    """If the planes on two sides of a window differ by this much disparity at its border, they are assumed to meet in
+    an edge, and halves of the window are tried. Default: 0.75, for a draft 1000, that is, nowhere."""
     half_sigmas: Annotated[float, Range(0, 100)] = 2.5
-    """The half of a window is taken where it leaves less of the texture unexplained (1 - ZNCC) than the whole one does,
-    by so many of the standard deviations that noise gives to what a half leaves."""
+    """Half a window is taken if it leaves less of the texture unexplained (1 - ZNCC) than the whole window does, by
+    this many standard deviations of what noise makes half a window leave."""
 
 
 @dataclass(frozen=True, eq=False)
 class GroupGeometry:
-    """One reference camera and the others of its group, as the kernels want them."""
+    """One reference camera and the others of its group, as arrays for the kernels."""
 
     infinite: Float[np.ndarray, "j 3 3"]
     """A_j."""
@@ -134,15 +136,15 @@ class _Buffers(NamedTuple):
 
 
 def image_noise(image: Float[np.ndarray, "h w"]) -> float:
-    """Standard deviation of the noise of an image (Immerkaer 1996), taken from its smoothest tenth; at least what
-    rounding to whole numbers leaves."""
+    """Standard deviation of the noise of an image (Immerkaer 1996), from its smoothest tenth; at least that of rounding
+    to integers."""
     mask = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]).astype(np.float32) / 6
     power = cv2.boxFilter(cv2.filter2D(image, -1, mask) ** 2, -1, (15, 15))
     return max(float(np.sqrt(np.quantile(power[::5, ::5], 0.1))), _ROUNDING_DN)
 
 
 def patch_window(options: RefinementOptions) -> Float[np.ndarray, "3 k"]:
-    """Offsets du and dv over the window, row by row, and Gaussian weights of sum 1."""
+    """Offsets du and dv over the window, row by row, and Gaussian weights with sum 1."""
     offsets = np.arange(-options.radius_px, options.radius_px + 1)
     du, dv = np.meshgrid(offsets, offsets)
     weights = np.exp(-0.5 * (du**2 + dv**2) / options.window_sigma_px**2)
@@ -150,7 +152,7 @@ def patch_window(options: RefinementOptions) -> Float[np.ndarray, "3 k"]:
 
 
 def half_window(window: Float[np.ndarray, "3 k"], side: tuple[int, int]) -> Float[np.ndarray, "3 h"]:
-    """The part of a window that lies towards some rows and columns, the middle included, with weights of sum 1."""
+    """The part of a window on one side, given by rows and columns, including the middle, with weights of sum 1."""
     half = np.ascontiguousarray(window[:, window[1] * side[0] + window[0] * side[1] >= 0])
     half[2] /= half[2].sum()
     return half

@@ -28,28 +28,28 @@ from cuspid.workers import map_ahead, map_in_threads
 
 _CODE = ("stereo",)
 _LEFT_SHARE = 0.005
-"""Of the sparse points, that temporal stereo need not reach."""
+"""Share of the sparse points that temporal stereo need not reach."""
 _LEAST_PLACES = 5
-"""Of a surface, that make it worth matching a camera with itself."""
+"""Number of places on a surface that make it worth matching a camera with itself."""
 _TIMES = 2
-"""That a place in a hole should be matched."""
+"""How often a place in a hole should be matched."""
 _ENOUGH_MAPS = 4
-"""Depth maps of every second frame that make those between superfluous."""
+"""Number of depth maps of every second frame that make those between superfluous."""
 
 
 @dataclass(frozen=True)
 class StoredDepthMaps:
-    """Depth maps on disk, read while they are iterated, as often as need be."""
+    """Depth maps on disk, read during iteration, as often as needed."""
 
     made: Mapping[Path, str]
-    """Files of one frame after those of another, in the order of the frames, and the key that each was made under."""
+    """Files, frame by frame in the order of the frames, and the key under which each was made."""
 
     def __iter__(self) -> Iterator[DepthMap]:
         for maps in map_ahead(read_depth_maps, self.made):
             yield from maps
 
     def __or__(self, other: StoredDepthMaps) -> StoredDepthMaps:
-        """These and others, frame by frame."""
+        """These and the others, frame by frame."""
         made = {**self.made, **other.made}
         place = {name: k for k, name in enumerate(StoredDepthMaps(made).frames)}
         return StoredDepthMaps(dict(sorted(made.items(), key=lambda item: place[item[0].stem])))
@@ -61,14 +61,14 @@ class StoredDepthMaps:
 
     @property
     def digest(self) -> str:
-        """Of what they were all made from."""
+        """Digest of everything that they were made from."""
         return digest_of(list(self.made.values()))
 
 
 def measure_depth(
     capture: Capture, folder: Path, options: StereoOptions, *, progress: Progress = silent
 ) -> StoredDepthMaps:
-    """Depth maps of every frame, from that frame alone, kept in ``folder``."""
+    """Depth maps of every frame, each from that frame alone, kept in ``folder``."""
     estimator = DepthEstimator(capture.handpiece, options)
 
     def measure(frame: Frame) -> tuple[DepthMap, ...]:
@@ -91,10 +91,10 @@ def measure_enough_depth(
     progress: Progress = silent,
 ) -> StoredDepthMaps:
     """Depth maps of every second frame, and of those groups of cameras in the frames between that show surface which
-    few of these confirm within ``agreement_mm``, kept in ``folder``.
+    few of these depth maps confirm within ``agreement_mm``, kept in ``folder``.
 
-    Frames between are measured until, of the sparse points that they could confirm, no more than ``left_share`` (0 to
-    1) of all points is left: none at 1; all at 0, and where there are no sparse points.
+    Frames between are measured until the sparse points that they could still confirm are no more than ``left_share`` (0
+    to 1) of all points: none are measured at 1; all at 0, or if there are no sparse points.
     """
     if left_share == 0 or (found.tracks is None and left_share < 1):
         return measure_depth(capture, folder, options, progress=progress)
@@ -156,9 +156,10 @@ def measure_temporal_depth(
     holes: SurfacePoints | None = None,
     progress: Progress = silent,
 ) -> StoredDepthMaps:
-    """Depth maps of cameras together with themselves at the next located frame of the same lighting pattern, kept in
-    ``folder``: of those that fill holes (:attr:`TemporalOptions.left_share`), which are where fewer than ``least_maps``
-    of ``depths`` confirm the sparse points within ``agreement_mm``, and further ones given as ``holes``."""
+    """Depth maps of cameras matched with themselves at the next located frame of the same lighting pattern, kept in
+    ``folder``, for those cameras that fill holes (:attr:`TemporalOptions.left_share`). Holes are where fewer than
+    ``least_maps`` of ``depths`` confirm the sparse points within ``agreement_mm``, and the further places given as
+    ``holes``."""
     steps = _steps(capture, found.rig_from_world, options)
     left_share = _LEFT_SHARE if options.left_share is None else options.left_share
     if found.tracks is not None and left_share > 0:

@@ -1,8 +1,8 @@
-"""Temporal stereo: depth from two frames, once the motion is known, each camera together with itself a moment later.
+"""Temporal stereo: depth from two frames, once the motion is known, from each camera and itself a moment later.
 
-It reaches surface that only one camera of a group sees within a frame: the strips at the borders of what the
-group sees in common, for example cusps between the occlusal and the buccal view. It leans on the motion, which is less
-sure than the rig, so it gets little weight where depth from one frame is at hand.
+It reaches surface that only one camera of a group sees within a frame: the strips at the borders of what the group
+sees in common, for example cusps between the occlusal and the buccal view. It relies on the motion, which is less
+certain than the rig, so it gets little weight where depth from a single frame is available.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ class TemporalOptions(Options):
     """Temporal stereo of consecutive frames."""
 
     enabled: bool = True
-    """Whether to measure it at all."""
+    """Whether to use it at all."""
     left_share: Annotated[float | None, SHARE] = None
-    """Cameras are matched with themselves where that fills holes: until, of the sparse points that depth within the
-    frames leaves without a surface, no more than this share (0 to 1) of all points is left to be filled. 0: wherever a
-    camera moved enough. By default 0.005, of a draft 0.03."""
+    """Cameras are matched with themselves where that fills holes, until the sparse points that depth within the frames
+    leaves without a surface, and that could still be filled, are no more than this share (0 to 1) of all points. 0:
+    wherever a camera moved enough. Default: 0.005, for a draft 0.03."""
     small_holes: bool | None = None
-    """Also where that fills holes in the surface which are too small to be told by sparse points. By default so, but
-    not of a draft."""
+    """Also fill holes in the surface that are too small for sparse points to reveal. Default: yes, but not for a
+    draft."""
     confidence_share: Annotated[float, SHARE] = 0.05
-    """Its confidence relative to depth from one frame."""
+    """Confidence relative to that of depth from a single frame."""
     least_baseline_share: Annotated[float, Range(0, 10)] = 0.08
     """Smallest movement of a camera relative to the working distance."""
     largest_turn_deg: Annotated[float, Range(0, 180)] = 20.0
-    """Largest turn of the handpiece between the frames."""
+    """Largest rotation of the handpiece between the frames."""
     stereo: StereoOptions = field(default_factory=StereoOptions)
     """Matching and checks, as within a frame."""
 
@@ -53,9 +53,9 @@ def measure_temporal(
     frame: str,
     options: TemporalOptions | None = None,
 ) -> tuple[DepthMap, ...]:
-    """Depth maps of each camera that moved enough, in its place at ``frame`` and a moment later.
+    """Depth maps of each camera that moved enough, at its pose at ``frame`` and a moment later.
 
-    ``next_from_rig`` moves points of the rig frame at ``frame`` to that at the next frame. All depth maps are given
+    ``next_from_rig`` moves points from the rig frame at ``frame`` to that at the next frame. All depth maps are given
     in the rig frame at ``frame``; those of the moved cameras have ``+`` after the camera's name.
     """
     options = options or TemporalOptions()
@@ -75,7 +75,7 @@ def measure_temporal(
 
 
 def moving_pair(handpiece: Handpiece, name: str, next_from_rig: Rigid3, options: TemporalOptions) -> Handpiece | None:
-    """A handpiece of one camera and itself at the next frame; None where that makes no stereo pair."""
+    """A handpiece of one camera and the same camera at the next frame; None where they are no stereo pair."""
     mounted = handpiece.rig[name]
     moved = MountedCamera(mounted.camera, mounted.cam_from_rig @ next_from_rig)
     shift = mounted.cam_from_rig.rotate(moved.centre_in_rig - mounted.centre_in_rig)

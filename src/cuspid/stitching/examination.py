@@ -28,9 +28,9 @@ class ExaminationOptions(Options):
     largest_angle_deg: Annotated[float, Range(90, 180)] = 110.0
     """Largest inner angle at a warped corner."""
     largest_translation: Annotated[float, Range(0.001, 100)] = 0.10
-    """Shift of the frame's centre as a share (0 to 1) of the fixed frame's width, and of its height."""
+    """Largest shift of the frame's centre, as a share (0 to 1) of the fixed frame's width and of its height."""
     smallest_scale: Annotated[float, Range(0.001, 0.999)] = 0.85
-    """Scale (root of the ratio of areas); the largest is 1 over this."""
+    """Smallest scale (square root of the ratio of areas); the largest is 1 over this."""
 
 
 def frame_corners(size: tuple[int, int]) -> Float[np.ndarray, "4 2"]:

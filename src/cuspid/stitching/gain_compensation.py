@@ -23,12 +23,12 @@ _STRIDE = 3
 
 @dataclass(frozen=True, kw_only=True)
 class GainOptions(Options):
-    """How brightness is evened out."""
+    """How brightness differences are evened out."""
 
     gains: bool = True
-    """Whether each frame has its own gain."""
+    """Estimate a gain for each frame."""
     falloff: bool = True
-    """Whether the falloff of the light is taken out."""
+    """Compensate the falloff of the light."""
     gain_sd: Annotated[float, Range(0.0001, 100)] = 0.2
     """Prior standard deviation of the logarithm of the gains."""
     noise_sd: Annotated[float, Range(0.0001, 100)] = 0.1

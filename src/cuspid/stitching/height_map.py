@@ -54,13 +54,13 @@ _CROWN_MM = 1.5
 
 @dataclass(frozen=True, kw_only=True)
 class ScaleOptions(Options):
-    """What one camera cannot know: how large things are."""
+    """What a single camera cannot determine: the scale."""
 
     working_distance_mm: Annotated[float | None, Range(0.1, 10_000)] = None
-    """Median height of the camera over the tips of the cusps; None takes it from the calibration file, and where that
-    does not say it, no millimetres are claimed."""
+    """Median height of the camera above the cusp tips; default: that of the calibration file. Without either, no
+    millimetres are stated."""
     width_mm: Annotated[float | None, Range(1, 1000)] = None
-    """Known greatest width of the arch over the teeth, left to right; goes before the working distance."""
+    """Known greatest width of the arch across the teeth, left to right; takes precedence over the working distance."""
 
 
 @dataclass(frozen=True, kw_only=True)

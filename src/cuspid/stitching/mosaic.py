@@ -49,15 +49,15 @@ class MosaicOptions(Options):
     """How frames become one picture."""
 
     mm_per_px: Annotated[float | None, Range(0.001, 10)] = None
-    """Size of a pixel in mm; None for that of the frames where they look straight down."""
+    """Size of a pixel in mm; default: that of the frames where they look straight down."""
     border_px: Annotated[int, Range(0, 10_000)] = 6
-    """This much at the border of the frames is not used."""
+    """Width of the border of each frame that is not used."""
     bands_px: Annotated[tuple[float, ...], Range(0.1, 1000)] = (1.5, 6.0, 24.0)
-    """Standard deviations in px of the Gaussians between the bands of frequencies."""
+    """Standard deviations in px of the Gaussians that separate the frequency bands."""
     seams: SeamOptions = field(default_factory=SeamOptions)
     """How the frame of each pixel is chosen."""
     gain_compensation: GainOptions = field(default_factory=GainOptions)
-    """How brightness is evened out."""
+    """How brightness differences are evened out."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -23,7 +23,7 @@ class OrthoOptions:
     """From located frames to a panorama."""
 
     scale: ScaleOptions = field(default_factory=ScaleOptions)
-    """How large things are."""
+    """What sets the scale."""
     height_map: HeightMapOptions = field(default_factory=HeightMapOptions)
     """The smooth surface through the sparse points of the motion."""
     plane_sweep: PlaneSweepOptions = field(default_factory=PlaneSweepOptions)

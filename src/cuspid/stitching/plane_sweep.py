@@ -64,28 +64,29 @@ class PlaneSweepOptions(Options):
     """The dense surface."""
 
     enabled: bool = True
-    """Whether to look for it; else a smooth surface through the sparse points of the motion serves."""
+    """Whether to compute it; otherwise a smooth surface through the sparse points of the motion is used."""
     cell_mm: Annotated[float, Range(0.01, 10)] = 0.1
-    """Spacing of the places at which frames are compared, if it is not less than a pixel; the height map has twice as
-    much."""
+    """Spacing of the places at which frames are compared, but at least one pixel; that of the height map is twice as
+    large."""
     step_mm: Annotated[float, Range(0.01, 10)] = 0.2
-    """Distance of the planes, if from one to the next what is compared shifts by half a pixel at least."""
+    """Distance between the planes, but at least what shifts the compared frames by half a pixel."""
     depth_mm: Annotated[float, Range(0.1, 100)] = 11.0
-    """The lowest plane lies so far below the occlusal one."""
+    """Depth of the lowest plane below the occlusal plane."""
     window: Annotated[int, Range(3, 101)] = 5
-    """Side of the window that is compared, in cells."""
+    """Side of the compared window, in cells."""
     detail_px: Annotated[float, Range(0.1, 1000)] = 4.0
-    """Fine detail is what a Gaussian filter of this standard deviation takes from a frame, px."""
+    """Fine detail is what a Gaussian filter of this standard deviation removes from a frame, px."""
     baseline_share: Annotated[float, Range(0.001, 10)] = 0.2
-    """Frames are compared that lie about this share of the distance to the teeth apart."""
+    """Baseline of the frames that are compared, as a share of the distance to the teeth (approximate)."""
     small_jump: Annotated[float, Range(0, 1000)] = 0.03
-    """Penalty of a height that differs by one plane from its neighbour's; the ZNCC costs 1 to 0."""
+    """Penalty for a height that differs by one plane from its neighbour's; matching costs lie between 0 (full
+    agreement) and 1."""
     large_jump: Annotated[float, Range(0, 1000)] = 0.5
-    """Penalty of a height that differs by more."""
+    """Penalty for a height that differs by more."""
     smoothing_mm: Annotated[float, Range(0.001, 100)] = 0.24
     """Standard deviation of the Gaussian filter over the heights."""
     agreement: Annotated[float, Range(-1, 1)] = 0.15
-    """Places with a lower mean ZNCC (0 to 1) at their height show nothing that is known."""
+    """Places where the frames agree less than this (0 to 1, by ZNCC) at the height found count as unknown."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

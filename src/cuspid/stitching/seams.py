@@ -19,28 +19,28 @@ _ROUNDS = 10
 
 @dataclass(frozen=True, kw_only=True)
 class SeamOptions(Options):
-    """What makes a frame a good choice for a place, and what a seam costs."""
+    """What makes a frame a good choice for a place, and what seams cost."""
 
     candidates: Annotated[int, Range(1, 1000)] = 4
-    """Best frames that are kept for each cell."""
+    """Number of best frames that are kept for each cell."""
     oblique: Annotated[float, Range(0, 1_000_000)] = 1.0
     """Cost of looking at 45 degrees instead of straight down; it grows with the square of the tangent."""
     glare: Annotated[float, Range(0, 1_000_000)] = 2.0
-    """Cost of a place that is burnt out by a highlight, or lies in the dark."""
+    """Cost of a place that is burnt out by a highlight or too dark."""
     border_px: Annotated[float, Range(0.01, 10_000)] = 20.0
-    """Distance from the border of a frame over which its cost falls to a third."""
+    """Distance from the border of a frame over which the border's cost falls to a third."""
     border: Annotated[float, Range(0, 1_000_000)] = 0.1
     """Cost at the border of a frame."""
     seam: Annotated[float, Range(0, 1_000_000)] = 0.02
-    """Cost of a seam along the side of one cell."""
+    """Cost of a seam along the side of a cell."""
     jump: Annotated[float, Range(0, 1_000_000)] = 0.002
-    """Cost of each grey level by which the colours differ across a seam."""
+    """Cost of each grey level of colour difference across a seam."""
 
     def cost(
         self, tangent2: Float[np.ndarray, "r c"], border_px: Float[np.ndarray, "r c"], glare: Float[np.ndarray, "r c"]
     ) -> Float[np.ndarray, "r c"]:
-        """Cost of a frame in each cell, from the square of the tangent of its obliquity, the distance to its border and
-        the share of it that is burnt out or dark."""
+        """Cost of a frame in each cell, from the squared tangent of its obliquity, the distance to its border and the
+        share of the cell that is burnt out or dark."""
         near = np.exp(-np.maximum(border_px, 0) / self.border_px)
         return np.asarray(self.oblique * tangent2 + self.border * near + self.glare * np.minimum(glare, 1))
 

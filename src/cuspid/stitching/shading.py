@@ -43,11 +43,11 @@ class ShadingOptions(Options):
     iterations: Annotated[int, Range(1, 100_000)] = 40
     """Jacobi iterations at each size of the image."""
     smoothing_px: Annotated[float, Range(0.01, 1000)] = 1.5
-    """Standard deviation in px of the Gaussian over the image before."""
+    """Standard deviation in px of the Gaussian filter that is first applied to the image."""
     gamma: Annotated[float, Range(0.01, 100)] = 2.2
-    """Light is the grey level to this power."""
+    """Linear light is the grey level to this power."""
     dark: Annotated[int, Range(1, 254)] = 20
-    """Grey levels below this one show nothing."""
+    """Darker grey levels carry no information."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -28,11 +28,11 @@ class StripOptions(Options):
     """The unrolled strip."""
 
     half_width_mm: Annotated[float, Range(0.1, 100)] = 8.0
-    """The strip reaches so far to either side of the arch curve."""
+    """How far the strip extends to either side of the arch curve."""
     smoothing_mm: Annotated[float, Range(0.01, 1000)] = 5.0
     """Standard deviation of the Gaussian filter along the arch curve."""
     occlusal_mm: Annotated[float, Range(0, 100)] = 2.5
-    """The occlusal zone ends where the surface lies this much below the ridge of the cross-section."""
+    """The occlusal zone ends where the surface lies this far below the ridge of the cross-section."""
 
 
 _STEP_MM = 0.25

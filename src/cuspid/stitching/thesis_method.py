@@ -56,13 +56,14 @@ class ThesisOptions(Options):
     limits: ExaminationOptions = field(default_factory=ExaminationOptions)
     """The examination of frames."""
     patience: Annotated[int, Range(1, 10_000)] = 5
-    """After so many frames in a row that cannot be used, the panorama breaks, and a new part begins with them."""
+    """After this many unusable frames in a row the panorama breaks, and a new part begins with them."""
     largest_stretch: Annotated[float, Range(1.01, 1_000_000)] = 10.0
-    """Where the chain lengthens or shortens a frame more than this, it has collapsed: a new part begins."""
+    """If the chain of homographies stretches or shrinks a frame by more than this factor, it has collapsed, and a new
+    part begins."""
     largest_canvas_mpx: Annotated[float, Range(0.01, 1000)] = 25.0
-    """Nor may the panorama grow larger than this, in millions of px."""
+    """Largest size of the panorama, in millions of px; beyond it a new part begins."""
     field_of_view_deg: Annotated[float, Range(1, 170)] = 60.0
-    """Horizontal angle of view where there is no calibration."""
+    """Horizontal angle of view if there is no calibration."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,19 +32,20 @@ class WarpOptions(Options):
     """Features, matches and warps."""
 
     kaze_threshold: Annotated[float, Range(1e-09, 1)] = 1e-4
-    """Detector response from which KAZE takes a point of the grey normal map."""
+    """Detector response above which KAZE accepts a point of the grey normal map."""
     features: Annotated[int, Range(10, 1_000_000)] = 2000
-    """Features of a frame, at most, the strongest."""
+    """Maximum number of features in a frame; the strongest are kept."""
     ratio: Annotated[float, Range(0.01, 1)] = 0.8
-    """A match must be nearer than the second best by this factor."""
+    """A match must be nearer than the second best by this factor (ratio test)."""
     error_px: Annotated[float, Range(0.01, 1000)] = 3.0
-    """Distance in px within which a match agrees with a homography."""
+    """Distance in px within which a match is consistent with a homography."""
     fewest_inliers: Annotated[int, Range(5, 100_000)] = 12
-    """Matches that must agree."""
+    """Minimum number of consistent matches."""
     near_px: Annotated[float, Range(0.01, 100_000)] = 40.0
-    """A match counts fully up to this distance from a segment's centroid, beyond it inversely to the distance."""
+    """A match has full weight up to this distance from a segment's centroid; beyond, its weight falls inversely with
+    distance."""
     floor: Annotated[float, Range(1e-06, 1)] = 0.05
-    """No match counts less than this (1 makes every segment follow the homography of the frame)."""
+    """Minimum weight of a match (1 makes every segment follow the homography of the frame)."""
     segment_px: Annotated[int, Range(1, 100_000_000)] = 2500
     """Smallest area of a segment of the normal map, px."""
     segment_scale: Annotated[float, Range(0.01, 1_000_000)] = 100.0

@@ -81,23 +81,23 @@ class CameraPairOptions(Options):
     tooth: Annotated[int, TOOTH] = 47
     """FDI number of the tooth."""
     facing: tuple[str, ...] = _FACED
-    """Surfaces that the pair looks at squarely, each in turn: occlusal, buccal, lingual."""
+    """Surfaces that the pair faces perpendicularly, each in turn: occlusal, buccal, lingual."""
     direction: Direction = "across"
-    """How the baseline lies."""
+    """Direction of the baseline."""
     baselines_mm: Annotated[tuple[float, ...], Range(0.01, 1000)] = (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
     """Distances between the projection centres."""
     axis_angles_deg: Annotated[tuple[float, ...], Range(-179, 179)] = (0.0, 10.0, 20.0, 30.0, 40.0)
-    """Angles between the optical axes; positive turns the cameras to each other."""
+    """Angles between the optical axes; positive turns the cameras towards each other."""
     distances_mm: Annotated[tuple[float, ...], Range(0.1, 1000)] = tuple(map(float, range(3, 14)))
-    """From the middle of the pair to the middle of the surface."""
+    """Distances from the middle of the pair to the middle of the surface."""
     sensor: str = "thesis"
-    """Name of the optics (a preset), of which the image and the angle of view count."""
+    """Name of the optics (a preset), of which image size and angle of view are used."""
     matcher: Matcher = "slanted"
-    """Whose noise counts."""
+    """Matcher whose noise is assumed."""
     visibility: VisibilityOptions = field(default_factory=VisibilityOptions)
     """When a face counts as seen by a camera; both must see it."""
     budget_um: Annotated[float, Range(0.001, 100_000)] = 10.0
-    """RMS error that a point may have."""
+    """RMS error that a point may have at most."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

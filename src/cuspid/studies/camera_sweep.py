@@ -70,45 +70,46 @@ _ANY_DISTANCE_MM = 1e3
 
 @dataclass(frozen=True, kw_only=True)
 class SweepOptions(Options):
-    """The grid, the pair and how it moves."""
+    """The grid, the camera pair and how it moves."""
 
     surface: str = "occlusal"
     """Named surface of the tooth: occlusal, incisal, buccal, labial, lingual, mesial, distal or gingival (the gum on
     the outer side)."""
     tooth: Annotated[int | None, TOOTH] = None
-    """FDI number; None for 41 with incisal and labial, and 47 with the others."""
+    """FDI number; default: 41 with incisal and labial, 47 with the others."""
     baseline_mm: Annotated[tuple[float, ...], Range(0.01, 1000)] = (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
     """Distances between the projection centres."""
     angle_deg: Annotated[tuple[float, ...], Range(-89, 89)] = (0.0, 3.0, 6.0, 9.0)
-    """Angles between the optical axes; positive turns the cameras to each other."""
+    """Angles between the optical axes; positive turns the cameras towards each other."""
     direction: Direction | None = None
-    """How the baseline lies: along the arch, or across it (for a side of a tooth: up and down); None for along with
+    """Direction of the baseline: along the arch, or across it (for a side of a tooth: up and down); default: along with
     incisal and across with the others, as in the thesis."""
     distance_mm: Annotated[float, Range(0.1, 1000)] = 5.0
-    """From the middle of the pair to the middle of the surface."""
+    """Distance from the middle of the pair to the middle of the surface."""
     depth_of_field_mm: Annotated[float, Range(0.01, 1000)] = 5.0
-    """Depth that is in focus, half of it before and half behind the distance."""
+    """Depth range in focus, half of it before and half behind the distance."""
     image_px: Annotated[int, Range(32, 10_000)] = 512
     """Width and height of an image."""
     field_of_view_deg: Annotated[float, Range(1, 170)] = 62.0
-    """Full angle of view along the width."""
+    """Full angle of view across the width."""
     supersampling: Annotated[int, Range(1, 16)] = 1
-    """Rays through a pixel along each side; more cost time and change little here (docs/sweep.md)."""
+    """Rays per pixel along each side; more take longer and change little here (docs/sweep.md)."""
     path_mm: Annotated[float, Range(0.1, 1000)] = 5.0
     """Length of the path along the arch."""
     frames: Annotated[int, Range(2, 100_000)] = 6
-    """Positions of the pair on it; consecutive images must overlap by more than 75 %."""
+    """Positions of the pair on the path; consecutive images must overlap by more than 75 %."""
     texture: Preset = "artificial"
     """Surface of the teeth: artificial (the thesis' condition), powder, enamel."""
     pairing: PairingOptions = field(default_factory=lambda: PairingOptions(minimum_overlap=0.0))
-    """When the two are matched at all: whatever they share at the distance, for a wide, parallel pair shares more
-    behind it."""
+    """When the two cameras are matched at all. By default whatever their overlap at the distance is, because a wide,
+    parallel pair overlaps more behind it."""
     temporal: bool = False
-    """Also measure depth from consecutive frames, which shows less of what the pair itself can do."""
+    """Also measure depth from consecutive frames, which reveals less of what the pair itself can do."""
     contenders: Annotated[int, Range(1, 1000)] = 2
-    """So many settings that are best by completeness, and as many by accuracy, are repeated, and that of the thesis."""
+    """How many of the best settings by completeness, and as many by accuracy, are repeated, besides that of the
+    thesis."""
     repeats: Annotated[int, Range(0, 1000)] = 2
-    """How often: with other textures, hands and noise. 0 leaves the noise of the study unknown."""
+    """Number of repeats, with other textures, hand motions and noise. 0 leaves the noise of the study unknown."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -119,12 +120,12 @@ class SweepOptions(Options):
 
     @property
     def chosen_tooth(self) -> int:
-        """The tooth that is asked for or usual."""
+        """The given or the default tooth."""
         return self.tooth or (41 if self.surface in _FRONT_TEETH else 47)
 
     @property
     def chosen_direction(self) -> Direction:
-        """The direction that is asked for or the thesis'."""
+        """The given direction, or that of the thesis."""
         return self.direction or ("along" if self.surface in _ALONG_THE_ARCH else "across")
 
     @property
@@ -134,12 +135,12 @@ class SweepOptions(Options):
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """All of the grid."""
+        """All settings of the grid."""
         return tuple(product(self.baseline_mm, self.angle_deg))
 
     @property
     def thesis(self) -> Setting | None:
-        """The thesis' best setting, where it is on the grid and the baseline lies as there."""
+        """The thesis' best setting, if it is on the grid and the baseline has the same direction."""
         found = THESIS.get(self.surface)
         return found if self.direction is None and found in self.settings else None
 

@@ -69,33 +69,34 @@ class ComparisonOptions(Options):
     """What is compared."""
 
     designs: tuple[str, ...] = ("twelve", "six")
-    """Built-in designs (two, four, six, twelve) and handpiece.json files, named after their file."""
+    """Built-in designs (two, four, six, twelve) and handpiece.json files; the latter are named after their file."""
     turned: tuple[str, ...] = ("four", "six")
-    """Designs that are also turned, by name; the others are only moved along the teeth."""
+    """Names of the designs that are also turned; the others only move along the teeth."""
     turns: Annotated[tuple[int, ...], Range(1, 99)] = (1, 3, 5)
-    """Numbers of passes for the designs that are turned: odd."""
+    """Numbers of passes for the designs that are turned (odd)."""
     jaws: tuple[str, ...] = ("phantom",)
-    """phantom, thesis-reference (its prepared teeth), boxed-mean (a box of each crown of the mean of five phantoms),
-    and files of jaws with tooth labels."""
+    """phantom, thesis-reference (with its prepared teeth), boxed-mean (a box for each crown of the mean of five
+    phantoms), and files of jaws with tooth labels."""
     tooth: Annotated[tuple[int, ...], TOOTH] = (46,)
-    """FDI numbers of the teeth, each scanned by itself."""
+    """FDI numbers of the teeth, each scanned separately."""
     seeds: Annotated[tuple[int, ...], SEED] = (0,)
-    """Each chooses texture, hand and noise of a scan."""
+    """Each seed selects texture, hand motion and noise of a scan."""
     edge_mm: Annotated[float, Range(0.05, COARSEST_MM)] = 0.3
-    """Length of the edges of the phantom."""
+    """Edge length of the phantom's mesh."""
     image_scale: Annotated[float, Range(0.01, 1)] = 1.0
-    """All images are made smaller by this factor: 0.5 takes a quarter of the time, but more than doubles the errors and
+    """Factor by which all images are reduced: 0.5 takes a quarter of the time, but more than doubles the errors and
     loses steep faces."""
     minimum_openness: Annotated[float, Range(0, 0.99)] = LEAST_OPENNESS
-    """A face is evaluated for completeness if so large a share of the directions above the occlusal plane is free."""
+    """A face is evaluated for completeness if at least this share of the directions above the occlusal plane is
+    free."""
     samples: Annotated[int, Range(1, 20_000_000)] = 60_000
-    """Points on the tooth at which completeness is asked."""
+    """Points on the tooth at which completeness is evaluated."""
     enough_pct: Annotated[float, Range(0, 100)] = 0.5
-    """More turns are no gain where completeness grows by less than so many points."""
+    """More turns count as no gain if completeness grows by fewer percentage points than this."""
     thickness_mm: Annotated[float, Range(0.01, 1000)] = 7.0
-    """Of the holder behind the cameras."""
+    """Thickness of the holder behind the cameras."""
     frame_rate_hz: Annotated[float, Range(0.001, 100_000)] = 30.0
-    """Positions of the handpiece that are taken in a second."""
+    """Positions of the handpiece that are captured per second."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

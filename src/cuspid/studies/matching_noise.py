@@ -50,30 +50,30 @@ _LED_MM = 1.5
 
 @dataclass(frozen=True, kw_only=True)
 class MatchingNoiseOptions(Options):
-    """The rendered pairs."""
+    """The rendered camera pairs."""
 
     tooth: Annotated[int, TOOTH] = 47
     """FDI number of the tooth, seen from the occlusal side."""
     baselines_mm: Annotated[tuple[float, ...], Range(0.01, 1000)] = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)
     """Distances between the projection centres; the axes meet on the tooth."""
     distance_mm: Annotated[float, Range(0.1, 1000)] = 5.0
-    """From the pair to the middle of the occlusal surface."""
+    """Distance from the pair to the middle of the occlusal surface."""
     sensor: str = "thesis"
     """Name of the optics."""
     texture: Preset = "artificial"
     """Appearance of the tooth."""
     seed: Annotated[int, SEED] = 0
-    """Of texture and noise."""
+    """Seed of the texture and the noise."""
     spacing_px: Annotated[int, Range(1, 1000)] = 4
-    """Every so many pixels a point is matched."""
+    """Spacing of the matched points in the image."""
     start_px: Annotated[float, Range(0, 1000)] = 1.0
-    """Standard deviation of the start along the epipolar line."""
+    """Standard deviation of the starting position along the epipolar line."""
     window_px: Annotated[int, Range(3, 1001)] = 7
-    """Side of the upright window; the slanted one is as large."""
+    """Side of the upright window; the slanted one has the same size."""
     largest_error_px: Annotated[float, Range(0.01, 1000)] = 1.0
-    """A match farther off than this has failed and does not count as noise."""
+    """A match farther off than this counts as failed, not as noise."""
     maximum_incidence_deg: Annotated[float, Range(1, 90)] = 75.0
-    """Points seen flatter than this by a camera are not asked for."""
+    """Points that a camera sees at a larger angle of incidence are left out."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -45,13 +45,13 @@ class RepeatOptions(Options):
     """How a scan is repeated."""
 
     scans: Annotated[int, Range(2, 10_000)] = 5
-    """How many times."""
+    """Number of scans."""
     new_texture: bool = False
-    """Each scan has another texture, too, as powder that is sprayed again; off: the object stays the same."""
+    """Give each scan a new texture too, like powder that is sprayed on again; off: the object stays the same."""
     farthest_mm: Annotated[float, Range(0.0001, 1000)] = 0.5
-    """Of two scans, what is farther apart than this is not regarded as the same surface."""
+    """Two scans do not show the same surface where they are farther apart than this."""
     pair_samples: Annotated[int, Range(100, 20_000_000)] = 100_000
-    """Points on each scan of a pair."""
+    """Sample points on each scan of a pair."""
 
     @property
     def pairs(self) -> PairOptions:

@@ -36,7 +36,7 @@ class TrialOptions:
     simulation: SimulationOptions = field(default_factory=SimulationOptions)
     """How the images are made."""
     reconstruction: ReconstructionOptions = field(default_factory=ReconstructionOptions)
-    """How they become a mesh."""
+    """How the images become a mesh."""
     evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)
     """How the mesh is compared with the jaw."""
 

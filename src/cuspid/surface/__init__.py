@@ -1,4 +1,4 @@
-"""Depth maps to one clean mesh."""
+"""From depth maps to one clean mesh."""
 
 from cuspid.surface.cleaning import CleaningOptions, CleaningReport, clean
 from cuspid.surface.fusion import FusionOptions, fuse

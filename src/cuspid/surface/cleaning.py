@@ -1,4 +1,4 @@
-"""Take away from a fused mesh what is no surface of the jaw, and tell what is left open.
+"""Remove from a fused mesh what is not surface of the jaw, and report the holes that remain.
 
 Faces are *connected* across edges that exactly two of them share.
 """
@@ -19,14 +19,14 @@ from cuspid.options import Options, Range
 
 @dataclass(frozen=True, kw_only=True)
 class CleaningOptions(Options):
-    """Cleaning of a fused mesh. Lengths count in resolutions of the handpiece, 12 um for the built-in ones."""
+    """Cleaning of a fused mesh. Lengths are given in working distances of the handpiece."""
 
     least_piece_width: Annotated[float, Range(0, 1000)] = 0.283
-    """Connected pieces of less area than a square of so many working distances (2 mm2 at 5 mm) are removed."""
+    """Connected pieces with less area than a square of this side, in working distances (2 mm2 at 5 mm), are removed."""
     least_piece_share: Annotated[float, Range(0, 1)] = 0.005
-    """Connected pieces of a smaller share of the whole area are removed."""
+    """Connected pieces with less than this share of the total area are removed."""
     ghost_depth: Annotated[float, Range(0, 1000)] = 0.1
-    """A face that looks at the back of another one within so many working distances (0.5 mm at 5 mm) is removed."""
+    """A face that looks at the back of another one within this many working distances (0.5 mm at 5 mm) is removed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,7 @@ class Hole:
 
 @dataclass(frozen=True, kw_only=True)
 class CleaningReport:
-    """What was removed and what is left open."""
+    """What was removed and which holes remain."""
 
     removed_pieces: int
     """Floating pieces."""
@@ -50,9 +50,9 @@ class CleaningReport:
     removed_ghost_faces: int
     """Faces behind the surface."""
     removed_non_manifold_faces: int
-    """Faces that shared an edge with two others or more."""
+    """Faces that shared an edge with two or more others."""
     split_vertices: int
-    """Vertices that were doubled where two fans of faces met in a point."""
+    """Vertices that were duplicated where two fans of faces met in a point."""
     holes: tuple[Hole, ...]
     """Open places inside the surface, largest first."""
     outer_boundary_mm: float
@@ -64,7 +64,7 @@ def clean(
 ) -> tuple[Mesh, CleaningReport]:
     """A manifold mesh without floating pieces and ghosts, and a report. An empty mesh stays empty.
 
-    ``working_distance_mm`` is that of the handpiece; lengths count in it.
+    ``working_distance_mm`` is that of the handpiece; it is the unit of lengths.
     """
     options = options or CleaningOptions()
     ghosts = ghost_faces(mesh, options.ghost_depth * working_distance_mm)
@@ -88,7 +88,7 @@ def clean(
 
 
 def ghost_faces(mesh: Mesh, depth_mm: float) -> Bool[np.ndarray, "f"]:
-    """Faces whose outward normal soon meets the back of another face: they lie below the surface."""
+    """Faces whose outward normal meets the back of another face within that depth: they lie below the surface."""
     if len(mesh.faces) == 0:
         return np.zeros(0, dtype=bool)
     start = mesh.face_centres + depth_mm / 500 * mesh.face_normals
@@ -152,7 +152,8 @@ def _joined(low, high, vertices):
 
 
 def non_manifold_faces(mesh: Mesh) -> Bool[np.ndarray, "f"]:
-    """Faces with an edge that three or more faces share, or that two share in the same direction, or without area."""
+    """Faces with an edge that three or more faces share, or that two share in the same direction, and faces without
+    area."""
     sides = _Sides.of(mesh)
     forward = sides.ends[:, 0] < sides.ends[:, 1]
     count = sides.uses
@@ -169,7 +170,8 @@ def face_pieces(mesh: Mesh) -> Int[np.ndarray, "f"]:
 
 
 def floating_faces(mesh: Mesh, least_mm2: float, least_share: float) -> tuple[Bool[np.ndarray, "f"], int]:
-    """Faces of pieces that are smaller than an area or than a share of the whole, and the number of such pieces."""
+    """Faces of pieces that are smaller than a given area or than a share of the total, and the number of such
+    pieces."""
     if len(mesh.faces) == 0:
         return np.zeros(0, dtype=bool), 0
     piece = face_pieces(mesh)
@@ -179,7 +181,7 @@ def floating_faces(mesh: Mesh, least_mm2: float, least_share: float) -> tuple[Bo
 
 
 def with_split_fans(mesh: Mesh) -> tuple[Mesh, int]:
-    """The mesh with a vertex of its own for each fan of faces around a point, and how many vertices were added."""
+    """The mesh with a separate vertex for each fan of faces around a point, and how many vertices were added."""
     corners = mesh.faces.size
     if corners == 0:
         return mesh, 0
@@ -199,7 +201,7 @@ def with_split_fans(mesh: Mesh) -> tuple[Mesh, int]:
 
 
 def boundaries(mesh: Mesh) -> tuple[float, tuple[Hole, ...]]:
-    """Length of the outer boundaries (the longest of each piece, mm), and the other ones as holes, largest first."""
+    """Length of the outer boundaries (the longest of each piece, mm), and the others as holes, largest first."""
     sides, loop, outer = _open_loops(mesh)
     perimeter, area = _loop_measures(mesh.vertices[sides], loop)
     holes = [
@@ -211,7 +213,7 @@ def boundaries(mesh: Mesh) -> tuple[float, tuple[Hole, ...]]:
 
 
 def hole_rims(mesh: Mesh) -> Int[np.ndarray, "n"]:
-    """Indices of the vertices on the rims of holes, which are all boundaries but the longest of each piece."""
+    """Indices of the vertices on the rims of holes, that is, of all boundaries except the longest of each piece."""
     sides, loop, outer = _open_loops(mesh)
     return np.unique(sides[~outer[loop]])
 

@@ -1,9 +1,9 @@
-"""What one depth map says about a point in space: its distance to the surface that was seen, and how sure that is.
+"""What one depth map says about a point in space: its distance to the surface that was seen, and how certain that is.
 
 Around a pixel the surface is a plane. With normalised coordinates (x, y) inverse depth is affine there,
 1/Z = a x + b y + c, so that a X + b Y + c Z = 1: with the normal n = -(a, b, c) / |(a, b, c)| and the distance of the
 camera d = 1 / |(a, b, c)| a point X of the camera frame lies at the signed distance n.X + d from it, positive on the
-side of the camera. The pixel nearest to a point answers.
+side of the camera. A point is evaluated at the pixel nearest to its projection.
 """
 
 from __future__ import annotations
@@ -19,15 +19,17 @@ from cuspid.kernels import kernel
 from cuspid.reconstruction import DepthMap
 
 DISTANCE, WEIGHT, NORMAL_X, NORMAL_Y, NORMAL_Z, PIXEL = range(6)
-"""What :func:`observe` writes: signed distance (mm), weight, unit normal in the camera, flat index of the pixel."""
+"""Outputs of :func:`observe`: signed distance (mm), weight, unit normal in the camera frame, flat index of the
+pixel."""
 
 _SAME_SURFACE = 0.5
-"""A foot that lies farther from the plane of its own pixel, as a share of the farthest distance, is on no surface."""
+"""A foot that lies farther than this from the plane of its own pixel, as a share of the farthest distance, is not on
+the surface."""
 
 _BEND = 0.25
-"""Tangents of the surface on both sides of a pixel differ by so much at an edge."""
+"""At an edge, the tangents of the surface on both sides of a pixel differ by this much."""
 _STRAIGHTER = 0.5
-"""At an edge, a side whose own tangent changes by less than this share of what the other's does is taken alone."""
+"""At an edge, a side whose own tangent changes by less than this share of the other's change is used alone."""
 
 EXTRAPOLATED = 0.1
 """Weight of a pixel without depth beside pixels with depth, relative to theirs."""
@@ -35,28 +37,28 @@ EXTRAPOLATED = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """A depth map prepared for questions."""
+    """A depth map prepared for queries."""
 
     plane: Float[np.ndarray, "h w 4"]
     """Hessian normal form (n, d) of the plane at each pixel, in the camera frame, d in mm. float32."""
     weight: Float[np.ndarray, "h w"]
-    """Confidence times the cosine between ray and normal, 0 where nothing is known. float32."""
+    """Confidence times the cosine between ray and normal, 0 where the depth is unknown. float32."""
     intrinsics: Float[np.ndarray, "4"]
     """fx, fy, cx, cy with the first pixel centre at 0."""
 
     @property
     def arrays(self) -> tuple[Any, ...]:
-        """For numba."""
+        """The arrays for numba."""
         return self.plane, self.weight, self.intrinsics
 
     def nearest(self, reach_px: int) -> Int[np.ndarray, "h w"]:
-        """Flat index of the nearest pixel that is known, -1 where none lies within the reach."""
+        """Flat index of the nearest pixel with a known depth, -1 if none is within reach."""
         apart, (row, column) = distance_transform_edt(self.weight <= 0, return_indices=True)
         return np.where(apart <= reach_px, row * self.weight.shape[1] + column, -1)
 
     @staticmethod
     def of(depth_map: DepthMap, largest_jump_mm: float) -> Evidence:
-        """Prepare a depth map; neighbours that differ by more than the jump do not belong to one surface."""
+        """Prepare a depth map; neighbours that differ by more than the jump do not belong to the same surface."""
         known = depth_map.known
         inverse = np.where(known, 1 / depth_map.depth_mm, np.nan).astype(np.float32)
         focal, centre = depth_map.camera.focal_px, depth_map.camera.principal_point_px - 0.5
@@ -148,7 +150,7 @@ def _grown(plane, weight):
 @kernel(inline="always")
 @no_type_check
 def observe(plane, weight, intrinsics, right, down, depth, seen):
-    """Ask about a point of the camera frame in front of the camera; False where the map has no answer."""
+    """Evaluate a point of the camera frame in front of the camera; False where the map has no answer."""
     inverse = 1 / depth
     u = intrinsics[0] * right * inverse + intrinsics[2] + 0.5
     v = intrinsics[1] * down * inverse + intrinsics[3] + 0.5
@@ -168,11 +170,11 @@ def observe(plane, weight, intrinsics, right, down, depth, seen):
 @kernel
 @no_type_check
 def observe_foot(plane, weight, intrinsics, nearest, farthest, right, down, depth, seen):
-    """As :func:`observe` for a point whose own pixel tells nothing: what the pixel tells at the foot of its
-    perpendicular, where the surface is seen there and is not farther away than ``farthest``. A camera that looks along
-    a slope sees past it what lies outside of it.
+    """As :func:`observe`, for a point whose own pixel has no answer: the pixel at the foot of its perpendicular is
+    used, if the surface is seen there and is not farther away than ``farthest``. A camera that looks along a slope
+    looks past it through points that lie outside of it.
 
-    ``nearest`` is what :meth:`Evidence.nearest` gives.
+    ``nearest`` is the result of :meth:`Evidence.nearest`.
     """
     height, width = weight.shape
     u = intrinsics[0] * right / depth + intrinsics[2] + 0.5

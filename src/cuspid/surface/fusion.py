@@ -1,10 +1,10 @@
 """Depth maps to one mesh, in two passes over the maps.
 
-The first pass blends signed distances in a sparse volume, whose zero level gives the topology. The second asks every
-depth map about every vertex and moves the vertex along its normal to the robust weighted mean of the surfaces that were
-seen, which takes out what the voxels rounded; it also counts who saw the vertex, and in which colour. A vertex that
-too few maps confirm from its outer side, or that none has a depth for, is not kept: that takes away ghosts, back walls,
-and what is only carried on past the borders of all maps.
+The first pass blends signed distances in a sparse volume, whose zero level gives the topology. The second evaluates
+every depth map at every vertex and moves the vertex along its normal to the robust weighted mean of the surfaces that
+were seen, which removes the rounding by the voxels; it also counts the maps that saw the vertex, and averages its
+colour. A vertex that too few maps confirm from its outer side, or for which none has a depth, is dropped: this removes
+ghosts, back walls, and what is only extrapolated past the borders of all maps.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from cuspid.workers import beside_work_ahead, map_ahead, map_slices
 
 @dataclass(frozen=True, eq=False)
 class Fused:
-    """A mesh, and how well its depth is known."""
+    """A mesh, and the uncertainty of its depth."""
 
     mesh: Mesh
     """In the world frame, coloured."""
     sigma_mm: Float[np.ndarray, "v"]
-    """Standard deviation of each vertex along its normal, from how the depth maps scatter about it. The maps of one
-    frame share its images: they count as one. What all frames see alike is not in it."""
+    """Standard deviation of each vertex along its normal, from the scatter of the depth maps about it. The maps of one
+    frame share its images, so they count as one. Errors common to all frames are not included."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,16 +46,17 @@ class FusionOptions(Options):
     """Fusion of depth maps into a mesh."""
 
     voxel_mm: Annotated[float | None, Range(0.001, 1000)] = None
-    """Spacing of the grid, about the spacing of the mesh's vertices; by default 4.16 resolutions of the handpiece, 0.05
+    """Spacing of the grid, about the spacing of the mesh's vertices; default: 4.16 resolutions of the handpiece, 0.05
     mm for the built-in ones."""
     truncation_voxels: Annotated[float, Range(1, 100)] = 3.0
-    """Distance from a surface, in voxels, up to which it is blended."""
+    """Distance from a surface, in voxels, up to which depth maps are blended."""
     largest_jump: Annotated[float, Range(0.01, 10_000)] = 12.5
-    """Neighbouring depths that differ by more resolutions (0.15 mm at 12 um) do not belong to one surface."""
+    """Neighbouring depths that differ by more resolutions than this (0.15 mm at 12 um) do not belong to the same
+    surface."""
     least_weight: Annotated[float, Range(0, 1_000_000)] = 0.01
-    """Weight (sum of confidences) from which a voxel counts as observed."""
+    """Minimum weight (sum of confidences) for a voxel to count as observed."""
     agreement: Annotated[float, Range(0.01, 10_000)] = 6.65
-    """A depth map confirms a vertex within this many resolutions (0.08 mm at 12 um); nearer ones count more."""
+    """A depth map confirms a vertex within this many resolutions (0.08 mm at 12 um); nearer ones have more weight."""
     least_maps: Annotated[int, Range(1, 10_000)] = 2
     """Number of depth maps that must confirm a vertex."""
 
@@ -72,11 +73,12 @@ def fuse(
     *,
     progress: Progress = silent,
 ) -> Fused:
-    """One coloured mesh in the world frame from the depth maps whose frame was located; no faces if they hold nothing.
+    """One coloured mesh in the world frame from the depth maps of located frames; without faces if they contain
+    nothing.
 
-    ``resolution_mm`` is what the handpiece resolves (:func:`cuspid.pairing.resolved_mm`); lengths count in it.
-    ``depth_maps`` is gone through twice and may read its items lazily, but a generator, which is spent after the first
-    time, will not do. The maps of a frame follow each other. The same maps in the same order give the same mesh.
+    ``resolution_mm`` is what the handpiece resolves (:func:`cuspid.pairing.resolved_mm`), the unit of lengths.
+    ``depth_maps`` is iterated twice and may read its items lazily, so it must not be a generator, which is exhausted
+    after the first pass. The maps of a frame must be consecutive. The same maps in the same order give the same mesh.
     """
     options = options or FusionOptions()
     return _votes(depth_maps, rig_from_world, resolution_mm, options, "fusion", progress).outcome(options.least_maps)
@@ -90,8 +92,8 @@ def find_holes(
     *,
     progress: Progress = silent,
 ) -> SurfacePoints:
-    """Places on the rims of the holes of the mesh that :func:`fuse` would give on a grid of twice the spacing.
-    Arguments as there."""
+    """Places on the rims of the holes of the mesh that :func:`fuse` would give on a grid of twice the spacing. Same
+    arguments as there."""
     options = options or FusionOptions()
     coarse = replace(options, voxel_mm=2 * options.voxel_for(resolution_mm))
     votes = _votes(depth_maps, rig_from_world, resolution_mm, coarse, "holes", progress)
@@ -160,14 +162,14 @@ def _located(depth_maps: Iterable[DepthMap], rig_from_world: Mapping[str, Rigid3
 
 
 _USUAL = 3
-"""The scatter of a vertex is told as if so many frames more had the usual one, for those that see it are few."""
+"""The scatter of a vertex is estimated as if this many more frames had the usual one, because few frames see it."""
 CHUNK = 256
-"""Vertices that are tested together for being in the view of a depth map."""
+"""Number of vertices that are tested together for being in the view of a depth map."""
 
 
 @dataclass(frozen=True, eq=False)
 class Votes:
-    """What the depth maps say about each vertex of a rough mesh; filled map by map."""
+    """What the depth maps say about each vertex of a rough mesh; accumulated map by map."""
 
     rough: Mesh
     """The zero level of the volume."""
@@ -180,13 +182,13 @@ class Votes:
     maps: Int[np.ndarray, "v"]
     """Number of depth maps that confirm the vertex."""
     measured: Bool[np.ndarray, "v"]
-    """Whether one of them has a depth there itself; others may only carry on what they have nearby."""
+    """Whether one of them has a depth there itself; others may only extrapolate from nearby depths."""
     frames: Int[np.ndarray, "v 2"]
-    """Number of frames that do, and the last of them: the maps of a frame follow each other."""
+    """Number of frames that confirm it, and the last of them: the maps of a frame are consecutive."""
 
     @staticmethod
     def on(rough: Mesh) -> Votes:
-        """No votes yet."""
+        """An empty tally for a mesh."""
         count = len(rough.vertices)
         chunks = [rough.vertices[start : start + CHUNK] for start in range(0, count, CHUNK)]
         balls = np.zeros((len(chunks), 4))
@@ -200,7 +202,8 @@ class Votes:
     def collect(
         self, evidence: Evidence, depth_map: DepthMap, cam_from_world: Rigid3, agreement_mm: float, frame: int
     ) -> None:
-        """Let one depth map vote on the vertices that it sees; ``frame`` is the number of its frame, from 1 on."""
+        """Let one depth map vote on the vertices that it sees; ``frame`` is the number of its frame, starting from
+        1."""
         chunks = self._in_view(depth_map.camera, cam_from_world)
         colors, known = colors_of(depth_map), depth_map.known.ravel()
         map_slices(
@@ -236,7 +239,7 @@ class Votes:
         return np.flatnonzero((centres @ inward.T > -radii[:, None]).all(axis=1))
 
     def outcome(self, least_maps: int) -> Fused:
-        """The mesh with its vertices on the mean of the depth maps, coloured, without what too few maps confirm."""
+        """The mesh with its vertices at the mean of the depth maps, coloured, without what too few maps confirm."""
         total = np.maximum(self.moment[:, :1], 1e-12)
         vertices = self.rough.vertices + self.rough.vertex_normals * self.moment[:, 1:2] / total
         colors: UInt8[np.ndarray, "v 3"] = np.rint(self.color / total).clip(0, 255).astype(np.uint8)

@@ -127,7 +127,7 @@ def _faces(distance, weight, neighbours, index_of_cell, least_weight, faces):
 
 
 def extract(volume: SparseVolume, least_weight: float) -> Mesh:
-    """The zero level where all voxels around it weigh at least ``least_weight``."""
+    """The zero level of the volume, where all voxels around it have at least the weight ``least_weight``."""
     keys = volume.keys
     distance, weight = volume.distance[: len(keys)], volume.weight[: len(keys)]
     if len(keys) == 0:

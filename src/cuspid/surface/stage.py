@@ -1,4 +1,4 @@
-"""The mesh of a capture, and where a rough one has holes, each made once and kept on disk."""
+"""The mesh of a capture, and the holes of a rough one, each computed once and kept on disk."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def find_holes(
     *,
     progress: Progress = silent,
 ) -> SurfacePoints:
-    """Places on the rims of the holes that :func:`cuspid.surface.fusion.find_holes` finds: ``holes.npz``. Arguments as
-    of :func:`fuse`."""
+    """Places on the rims of the holes found by :func:`cuspid.surface.fusion.find_holes`: ``holes.npz``. Same arguments
+    as :func:`fuse`."""
     stage, file = Stage("holes", folder, [fusion, resolution_mm], _CODE), folder / "holes.npz"
 
     def write() -> None:
@@ -62,12 +62,12 @@ def fuse(
     progress: Progress = silent,
 ) -> tuple[Mesh, Float[np.ndarray, "v"]]:
     """One clean mesh: ``mesh.ply`` with colour and ``sigma_um``, ``mesh.stl``, and what was removed in ``mesh.json``.
-    With the standard deviation of each vertex along its normal (um): of its depth and, where they are ``expected``, of
-    the poses and the calibration.
+    Also returns the standard deviation of each vertex along its normal (um): that of its depth and, if they are
+    ``expected``, of the poses and the calibration.
 
-    ``made_from`` is the digest of the depth maps, which may be gone through more than once; ``resolution_mm`` is what
-    the handpiece resolves, ``working_distance_mm`` how far it is held. Raises ReconstructionError where they hold
-    nothing.
+    ``made_from`` is the digest of the depth maps, which may be iterated more than once; ``resolution_mm`` is what the
+    handpiece resolves, ``working_distance_mm`` how far it is held from the teeth. Raises ReconstructionError where they
+    contain nothing.
     """
     stage = Stage("mesh", folder, [fusion, cleaning, resolution_mm, working_distance_mm], _CODE)
     files = [folder / name for name in ("mesh.json", "mesh.stl", "mesh.ply")]

@@ -22,11 +22,11 @@ BLOCK = 8
 """Voxels along the side of a block."""
 
 _OFFSET = 1 << 20
-"""Added to block coordinates so that packed keys are positive: room for a million blocks either way."""
+"""Added to block coordinates so that packed keys are positive: room for a million blocks in each direction."""
 
 
 def pack(blocks: Int[np.ndarray, "*n 3"]) -> Int[np.ndarray, "*n"]:
-    """One integer per block coordinate triple."""
+    """One integer key for each triple of block coordinates."""
     shifted = blocks.astype(np.int64) + _OFFSET
     return (shifted[..., 0] << 42) | (shifted[..., 1] << 21) | shifted[..., 2]
 
@@ -39,10 +39,10 @@ def unpack(keys: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n 3"]:
 
 @dataclass(frozen=True, eq=False)
 class Reached:
-    """Where a depth map tells something."""
+    """Where a depth map has information."""
 
     keys: Int[np.ndarray, "b"]
-    """Of the blocks around its points, sorted."""
+    """Keys of the blocks around its points, sorted."""
     nearest: Int[np.ndarray, "h w"]
     """As :meth:`Evidence.nearest` within the truncation distance."""
 
@@ -54,7 +54,7 @@ class SparseVolume:
     voxel_mm: float
     """Spacing of the voxels."""
     truncation_mm: float
-    """Distances are cut at this, and voxels farther behind a surface learn nothing of it."""
+    """Distances are clipped at this value, and voxels farther behind a surface are not affected by it."""
 
     def __post_init__(self) -> None:
         self._slot_of_key: dict[int, int] = {}
@@ -67,11 +67,11 @@ class SparseVolume:
         return np.fromiter(self._slot_of_key, dtype=np.int64, count=len(self._slot_of_key))
 
     def reached(self, evidence: Evidence, cam_from_world: Rigid3, points: Float[np.ndarray, "n 3"]) -> Reached:
-        """What a depth map with these points (world, mm) will change; asks nothing of what was blended before."""
+        """What a depth map with these points (world, mm) will change; independent of what was blended before."""
         return Reached(self._keys_around(points), evidence.nearest(self._reach_px(evidence, cam_from_world, points)))
 
     def integrate(self, evidence: Evidence, cam_from_world: Rigid3, reached: Reached) -> None:
-        """Blend in one depth map."""
+        """Blend a depth map into the volume."""
         slots = self._allocate(reached.keys)
         origins = unpack(reached.keys).astype(np.float64) * BLOCK
         map_slices(
@@ -119,7 +119,7 @@ class SparseVolume:
         return slots
 
     def neighbours(self) -> Int[np.ndarray, "b 27"]:
-        """Slot of each block at offsets (-1..1)^3 around each block, -1 where there is none."""
+        """Slot of each neighbouring block at offsets (-1..1)^3, -1 where there is none."""
         keys = self.keys
         order = np.argsort(keys)
         ranked = keys[order]

@@ -101,9 +101,9 @@ class LandmarkingOptions(Options):
     grid_mm: Annotated[float, Range(0.01, 5)] = 0.1
     """Spacing of the height field of a tooth."""
     smoothing_mm: Annotated[float, Range(0, 10)] = 0.2
-    """Standard deviation of the smoothing of the height field before cusps are looked for."""
+    """Standard deviation of the smoothing of the height field before the search for cusps."""
     tilt_deg: Annotated[float, Range(0, 45)] = 4.0
-    """Tilt of the jaw by which the uncertainty is tried."""
+    """Tilt of the jaw with which the uncertainty is estimated."""
 
 
 def estimate_landmarks(jaw: Jaw, options: LandmarkingOptions = LandmarkingOptions()) -> dict[str, Landmark]:

@@ -15,31 +15,31 @@ class PhantomOptions(Options):
     """What the phantom looks like and how finely it is meshed."""
 
     arch: Arch = "lower"
-    """Which jaw."""
+    """Upper or lower jaw."""
     seed: Annotated[int, SEED] = 0
-    """Individual variation of size, shape, rotation and height of the teeth, and of the gum."""
+    """Seed of the individual variation of size, shape, rotation and height of the teeth, and of the gum."""
     edge_mm: Annotated[float, Range(0.05, COARSEST_MM)] = 0.2
-    """Spacing of the sampling grid, about the edge length of the faces; 0.2 gives some 400 000 faces."""
+    """Spacing of the sampling grid, roughly the edge length of the faces; 0.2 gives some 400 000 faces."""
     spee_mm: Annotated[float, Range(-5, 10)] = 1.5
     """Depth of the curve of Spee between the incisors and the second molar."""
     variation: Annotated[float, Range(0, 10)] = 1.0
     """Strength of the individual variation: 0 = the textbook arch, 1 = natural."""
     inter_canine_mm: Annotated[float | None, Range(5, 100)] = None
-    """Distance a between the cusp tips of the canines; the mean of adults unless said otherwise."""
+    """Distance a between the cusp tips of the canines; default: the mean of adults."""
     inter_first_molar_mm: Annotated[float | None, Range(5, 150)] = None
-    """Distance b between the buccal grooves of the first molars; the mean unless said otherwise, or, where a premolar
-    is missing, what the row of teeth makes of it."""
+    """Distance b between the buccal grooves of the first molars; default: the mean or, if a premolar is missing, what
+    results from the row of teeth."""
     inter_second_molar_mm: Annotated[float | None, Range(5, 150)] = None
-    """Distance c between the buccal grooves of the second molars; as for b."""
+    """Distance c between the buccal grooves of the second molars; default as for b."""
     arch_length_mm: Annotated[float | None, Range(5, 150)] = None
-    """Distance f from the papilla to the middle between the buccal grooves of the second molars; what the teeth make of
-    the widths unless said otherwise."""
+    """Distance f from the papilla to the midpoint between the buccal grooves of the second molars; default: what
+    results from the teeth and the widths."""
     tooth_size: Annotated[float | None, Range(0.2, 5)] = None
-    """Size of all teeth relative to the textbook's; 1, or what fits dimensions or crowding that are asked for."""
+    """Size of all teeth relative to the textbook's; default: 1, or what fits the given dimensions or crowding."""
     missing: Annotated[tuple[int, ...], TOOTH] = ()
-    """Teeth (FDI) that are missing; their space is closed. 34 44: extracted premolars. 37 47: no second molars."""
+    """Missing teeth (FDI); their space is closed. 34 44: extracted premolars. 37 47: no second molars."""
     crowding_mm: Annotated[float, Range(-20, 20)] = 0.0
-    """By how much the front is too short for its six teeth: they stand rotated and overlapping."""
+    """How much the front is too short for its six teeth, which therefore stand rotated and overlapping."""
     rotate_deg: Annotated[dict[int, float], Range(-180, 180)] = field(default_factory=dict)
     """Tooth (FDI) and its rotation about the long axis, distal end towards buccal: 33 20 43 -15."""
     displace_mm: Annotated[dict[int, float], Range(-20, 20)] = field(default_factory=dict)

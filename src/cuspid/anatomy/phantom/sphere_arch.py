@@ -52,15 +52,15 @@ class SphereArchOptions(Options):
     radius_mm: Annotated[float, Range(0.1, 20)] = 2.5
     """Radius of the spheres."""
     edge_mm: Annotated[float, Range(0.01, 5)] = 0.11
-    """Longest edge of the spheres' faces. A face lies inside the sphere by edge^2 / (6 radius) at most: 0.8 um."""
+    """Longest edge of the spheres' faces. A face lies at most edge^2 / (6 radius) inside the sphere: 0.8 um."""
     rise_mm: Annotated[float, Range(0, 20)] = 1.25
-    """Height of the centres above the ridge: 0 leaves a hemisphere free, the radius all of it but a point."""
+    """Height of the centres above the ridge: 0 exposes a hemisphere, the radius the whole sphere but a point."""
     depth_mm: Annotated[float, Range(1, 200)] = 41.0
     """Depth of the arch form, from the front to the line between the second molars (chosen, not measured)."""
     spee_mm: Annotated[float, Range(-20, 20)] = 1.5
-    """Depth of the curve of Spee that the centres follow, so that they do not lie in a plane."""
+    """Depth of the curve of Spee that the centres follow, so that they are not coplanar."""
     ridge_mm: Annotated[float, Range(0.1, 100)] = 8.0
-    """Height of the ridge below the lowest sphere's foot."""
+    """Height of the ridge below the foot of the lowest sphere."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

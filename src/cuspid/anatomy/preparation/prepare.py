@@ -46,7 +46,8 @@ class CrackOptions(Options):
     """A V-shaped crack that runs mesiodistally over the occlusal surface and over one marginal ridge."""
 
     width_um: Annotated[float, Range(20, 1000)] = 150.0
-    """Width at the surface. Cracks below 100 um are reported to escape conventional diagnosis; this one is visible."""
+    """Width at the surface. Cracks below 100 um are reported to escape conventional diagnosis; the default is
+    visible."""
     depth_um: Annotated[float, Range(50, 3000)] = 1000.0
     """Depth along the axis of the tooth (assumption: within the enamel of a molar's occlusal surface)."""
     ridge: Literal["mesial", "distal"] = "mesial"
@@ -60,16 +61,18 @@ class CrownOptions(Options):
     occlusal_reduction_mm: Annotated[float, Range(0.3, 4)] = 1.5
     """Reduction of the occlusal surface, or of the incisal edge, along the axis."""
     axial_reduction_mm: Annotated[float, Range(0.2, 3)] = 1.2
-    """Least distance of the walls from the former surface, from 1.2 mm above the finish line upwards."""
+    """Minimum distance of the walls from the former surface, from 1.2 mm above the finish line upwards."""
     taper_deg: Annotated[float, Range(1, 20)] = 6.0
-    """Lean of each axial wall: half of the total occlusal convergence."""
+    """Inclination of each axial wall: half of the total occlusal convergence."""
     finish_line: Literal["shoulder", "chamfer"] = "shoulder"
     """Form of the finish line: a level shoulder with a rounded inner edge, or a chamfer that rises by 30 degrees."""
     finish_width_mm: Annotated[float, Range(0.2, 2)] = 1.0
-    """Width of the finish line: from the margin inwards, square to it, to the line of the axial wall at its height."""
+    """Width of the finish line: from the margin inwards, perpendicular to it, to the line of the axial wall at its
+    height."""
     above_gum_mm: Annotated[float, Range(0.2, 3)] = 0.5
-    """Height of the finish line above the gum margin. Towards the contacts it rises no more than the cervical line of
-    such a tooth; there the papilla is cut back (as it is retracted in the mouth), so that the line can be seen."""
+    """Height of the finish line above the gum margin. Towards the contacts it rises no more than the cervical line
+    of such a tooth; there the papilla is cut back (as it is retracted in the mouth), so that the finish line can be
+    seen."""
     edge_radius_mm: Annotated[float, Range(0.1, 1)] = 0.5
     """Rounding between the axial walls and the occlusal surface."""
 
@@ -109,7 +112,7 @@ class InlayOptions(Options):
     box_depth_mm: Annotated[float, Range(0.3, 4)] = 1.2
     """Height of the axial wall: from the pulpal to the gingival floor."""
     divergence_deg: Annotated[float, Range(0, 20)] = 8.0
-    """Lean of each wall: they diverge towards occlusal."""
+    """Inclination of each wall; the walls diverge towards occlusal."""
     edge_radius_mm: Annotated[float, Range(0.05, 2)] = 0.3
     """Rounding of the internal edges between walls and floors."""
 

@@ -36,9 +36,9 @@ class BoxOptions(Options):
     """What the boxes look like."""
 
     edge_mm: Annotated[float, Range(0.01, 100)] = 0.3
-    """Longest side of the right-angled faces that the sides of a box are divided into."""
+    """Longest side of the right-angled triangles that the sides of a box are divided into."""
     sink_mm: Annotated[float, Range(0, 100)] = 0.0
-    """How far a box goes on into the gum below the lowest point of the crown."""
+    """How far a box extends into the gum below the lowest point of the crown."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -40,14 +40,14 @@ Border = tuple[int, int]
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions(Options):
-    """How a warped template is drawn onto a sample."""
+    """How a warped template is fitted to a sample."""
 
     smoothing_mm: Annotated[tuple[float, ...], Range(0.001, 100)] = (2.0, 1.0, 0.5, 0.25)
-    """Smoothing of the displacements in each round, as the standard deviation of a Gaussian over the surface, mm."""
+    """Smoothing of the displacements in each round: standard deviation of a Gaussian over the surface, mm."""
     reach_mm: Annotated[float, Range(0.01, 100)] = 3.0
-    """A nearest point farther off is no partner."""
+    """A nearest point farther away than this is no match."""
     least_cosine: Annotated[float, Range(-1, 1)] = 0.5
-    """A nearest point whose normal differs by more than this allows is no partner."""
+    """Minimum cosine between the normals; a nearest point whose normal differs by more is no match."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -40,20 +40,21 @@ class MeanShapeOptions(Options):
     """How the mean of a set of jaws is found."""
 
     scale: bool = False
-    """Scale all jaws to their mean size, so that the model is of shape alone; otherwise size counts as shape."""
+    """Scale all jaws to their mean size, so that the model describes shape alone; otherwise size is part of the
+    shape."""
     first: str | None = None
     """The sample whose faces and labels the mean gets; default: the first by name."""
     correspondence: Literal["surface", "landmarks"] = "surface"
-    """``surface``: thin-plate spline, then onto the surface. ``landmarks``: the thin-plate spline alone, as in the
+    """surface: thin-plate spline, then projection onto the surface. landmarks: thin-plate spline alone, as in the
     thesis; its mean keeps the detail of the first sample."""
     tolerance_um: Annotated[float, Range(0.001, 10_000)] = 5.0
-    """The mean has converged when its surface moves less than this, root mean square."""
+    """The mean has converged when its surface moves by less than this (root mean square)."""
     most_rounds: Annotated[int, Range(1, 1000)] = 10
-    """The iteration ends after this many rounds, converged or not."""
+    """Maximum number of rounds; the iteration then ends, converged or not."""
     modes: Annotated[int, Range(1, 1000)] = 10
-    """How many modes are kept at most."""
+    """Maximum number of modes to keep."""
     fit: FitOptions = field(default_factory=FitOptions)
-    """How the warped mean is drawn onto a sample."""
+    """How the warped mean is fitted to a sample."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

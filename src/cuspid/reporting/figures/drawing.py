@@ -42,9 +42,9 @@ class FigureOptions(Options):
     """How deviations are drawn."""
 
     range_um: Annotated[float, Range(0.01, 1_000_000)] = 100.0
-    """Ends of the colour bar; the range is fixed and symmetric so that pictures can be compared."""
+    """Ends of the colour bar; fixed and symmetric, so that pictures can be compared."""
     tolerance_um: Annotated[float, Range(0.001, 1_000_000)] = 25.0
-    """Green within this deviation to either side."""
+    """Deviations within this, to either side, are green."""
     width_px: Annotated[int, Range(100, 20_000)] = 1000
     """Width of the main view."""
 

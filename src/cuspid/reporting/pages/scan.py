@@ -56,15 +56,15 @@ class ReportOptions(Options):
     """What a page shows."""
 
     most_faces: Annotated[int, Range(100, 10_000_000)] = 300_000
-    """Faces of the shown surface; a finer one is simplified, and the page says so."""
+    """Faces of the shown surface at most; a finer one is simplified, and the page says so."""
     most_reference_faces: Annotated[int, Range(100, 10_000_000)] = 120_000
-    """The same of the reference."""
+    """The same for the reference."""
     range_um: Annotated[float | None, Range(0.01, 100_000)] = None
-    """Ends of the colour bar; None for the smallest of 5, 10, 25 ... that is 2.5 times the 95th percentile."""
+    """Ends of the colour bar; default: the smallest of 5, 10, 25 ... that is at least 2.5 times the 95th percentile."""
     frames: Annotated[int, Range(0, 100)] = 4
-    """So many frames are shown as pictures, evenly spaced."""
+    """Number of frames shown as pictures, evenly spaced."""
     worst: Annotated[int, Range(0, 100)] = 8
-    """So many of the worst places are listed."""
+    """Number of the worst places that are listed."""
 
 
 def scan_page(result: ScanResult, options: ReportOptions = ReportOptions()) -> str:

@@ -27,11 +27,11 @@ _ROUND_MM = 3.0
 _SAMPLE_MM = 0.1
 """Spacing of the samples of the curve."""
 _LEAST_CUTS = 5
-"""A spline needs so many cuts across the arch."""
+"""Minimum number of cuts across the arch for a spline."""
 _ARC_DEG, _SHORT_MM = 110.0, 30.0
-"""Crowns that span a smaller arc of their circle, or lie within a square of this side, are part of an arch."""
+"""Crowns that span a smaller arc of their circle, or lie within a square of this side, form only a part of an arch."""
 _WAVELENGTH_MM = 35.0
-"""Bends of the arch of this wavelength are halved: the path keeps to the arch, but not to one crooked tooth."""
+"""Bends of the arch with this wavelength are halved: the path follows the arch, but not a single crooked tooth."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,11 +56,11 @@ class ArchCurve:
         return float(first), float(last)
 
     def place(self, length_mm: float) -> Float[np.ndarray, "3"]:
-        """Where the curve is at a length from its start; its ends beyond them."""
+        """The point of the curve at a length from its start; beyond the ends, the end points."""
         return np.array([np.interp(length_mm, self.lengths_mm, self.points[:, axis]) for axis in range(3)])
 
     def rig_from_world(self, length_mm: float) -> Rigid3:
-        """A handpiece held upright over a place of the curve; straight on beyond its ends."""
+        """A handpiece held upright over a point of the curve; straight on beyond its ends."""
         lengths = self.lengths_mm
         tangents = np.gradient(self.points, lengths, axis=0)
         at = np.clip(length_mm, 0, lengths[-1])
@@ -74,7 +74,7 @@ class ArchCurve:
 
 
 def arch_curve(jaw: Jaw) -> ArchCurve:
-    """The arch of a jaw in its occlusal frame, from the mesh; labels, where there are any, keep the gum out of it."""
+    """The arch of a jaw in its occlusal frame, from the mesh; labels, if there are any, exclude the gum."""
     crowns = _crown_tops(jaw)
     points = _rough_curve(crowns)
     for _ in range(3):

@@ -1,7 +1,7 @@
 """What a handpiece sees of the crowns from many poses, quickly: for planning, not for evaluation.
 
 Whether something occludes a point is looked up in its *sky*, the directions in which nothing stands within reach, so
-that thousands of poses are asked at the cost of one round of rays. The evaluation of a plan casts its rays:
+that thousands of poses are evaluated at the cost of one round of rays. The evaluation of a plan casts actual rays:
 :func:`cuspid.visibility.visible_counts`.
 """
 
@@ -23,19 +23,19 @@ from cuspid.simulation.path.arch import ArchCurve
 from cuspid.visibility import slope_bounds
 
 _AREA_MM2 = 0.7
-"""Of the surface that each point stands for."""
+"""Area of the surface that each point represents."""
 _DIRECTIONS = 256
 _LEAST_COSINE = float(np.cos(np.deg2rad(75.0)))
-"""A line of sight flatter than this sees nothing; as in :mod:`cuspid.visibility`."""
+"""Minimum cosine of the incidence at which a point is seen; as in :mod:`cuspid.visibility`."""
 _LEAST_OPEN = 0.05
-"""A point with a smaller share of the directions above the occlusal plane open is hidden for good."""
+"""A point with a smaller share of the directions above the occlusal plane open is considered hidden."""
 _ASIDE_MM, _BELOW_MM = 7.0, 8.0
-"""Without labels, the crowns are what lies so near to the arch, seen from above, and below its line."""
+"""Without labels, crowns are what lies this near to the arch, seen from above, and this far below its line."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CrownPoints:
-    """Points evenly on the crown surface that is open to some direction."""
+    """Points, uniform on the crown surface that is open to some direction."""
 
     points: Float[np.ndarray, "n 3"]
     """In the occlusal frame, mm."""
@@ -49,14 +49,14 @@ class CrownPoints:
     """The direction nearest to a height above the plane XY and an angle in it."""
 
     def within(self, places: Float[np.ndarray, "p 3"], radius_mm: float) -> Int[np.ndarray, "k"]:
-        """Points that lie so near to one of the places."""
+        """Points that lie within the radius of one of the places."""
         near = KDTree(places).query(self.points, distance_upper_bound=radius_mm)[0]
         return np.flatnonzero(np.isfinite(near))
 
     def cameras_at(
         self, which: Int[np.ndarray, "k"], handpiece: Handpiece, rig_from_world: Sequence[Rigid3]
     ) -> Int[np.ndarray, "p k"]:
-        """From each pose, how many cameras see each of some points."""
+        """From each pose, the number of cameras that see each of some points."""
         cameras = handpiece.rig.cameras.values()
         bounds = np.array([np.concatenate(slope_bounds(each.camera)) for each in cameras])
         return np.asarray(
@@ -77,7 +77,7 @@ class CrownPoints:
 
 
 def crown_faces(jaw: Jaw, curve: ArchCurve) -> Bool[np.ndarray, "f"]:
-    """Faces of crowns: by their labels; without any, those about the arch."""
+    """Faces of crowns, by their labels; without labels, those around the arch."""
     if jaw.face_labels is not None and np.any(jaw.face_labels != GUM):
         return np.asarray(jaw.face_labels != GUM)
     aside, nearest = KDTree(curve.points[:, :2]).query(jaw.mesh.face_centres[:, :2])
@@ -86,7 +86,7 @@ def crown_faces(jaw: Jaw, curve: ArchCurve) -> Bool[np.ndarray, "f"]:
 
 
 def crown_points(jaw: Jaw, curve: ArchCurve, reach_mm: float) -> CrownPoints:
-    """Points on the crowns, and what stands within ``reach_mm`` of them in which direction."""
+    """Points on the crowns, and in which directions something stands within ``reach_mm`` of them."""
     wanted = crown_faces(jaw, curve)
     crowns = jaw.mesh.submesh(wanted)
     labels = np.full(len(wanted), GUM) if jaw.face_labels is None else jaw.face_labels

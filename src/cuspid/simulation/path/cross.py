@@ -1,9 +1,9 @@
 """A sweep from one side of the arch straight to the other, over what lies between them, which ties the two ends.
 
-A pass along an arch knows the distance of its ends by the bending of a long chain; a sweep across measures it directly.
-It begins over the crowns of one side as a pass does, follows the surface between the sides, tilted with its slope, and
-ends over the crowns of the other side as a pass comes by there. On the way the handpiece turns by half a turn, as along
-the arch: what it sees at the ends then looks as in the passes, and is found again.
+A pass along the arch determines the distance between its ends only through a long chain, which bends; a sweep across
+measures it directly. It begins over the crowns of one side like a pass, follows the surface between the sides, tilted
+with its slope, and ends over the crowns of the other side like a pass there. On the way the handpiece rotates by half a
+turn, as along the arch: what it sees at the ends then looks the same as in the passes, and is recognised.
 
 It goes as far back as there is surface all the way that two cameras see in focus where the handpiece fits.
 """
@@ -28,7 +28,7 @@ from cuspid.simulation.path.detour import lifts_needed, up
 from cuspid.simulation.path.overlap import image_overlap
 
 _STEP_MM = 1.0
-"""Spacing of the places of a sweep."""
+"""Spacing of the positions of a sweep."""
 _INSET_MM, _APART_MM = 4.0, 2.0
 """Sweeps are tried from so far before the end of the arch, and this far apart along it ..."""
 _NARROWEST = 0.5
@@ -40,13 +40,13 @@ _SMOOTH_MM = 3.0
 _EASE_MM = 5.0
 """Length over which the sweep leaves the pose of a pass at its ends."""
 _STEEPEST_DEG = 40.0
-"""It tilts with the surface so far at most."""
+"""Maximum tilt with the surface."""
 _ABOVE_MM = 8.0
-"""Whence the rays come that find the surface."""
+"""Height from which the rays start that find the surface."""
 _SLOPE = 4
-"""Places over which it lifts where the body would touch."""
+"""Number of positions over which it lifts where the body would touch."""
 _GRID = 12
-"""Rays along each side of an image that tell whether it shows surface."""
+"""Rays along each side of an image that determine whether it shows surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class Crossing:
     end_mm: float
     """... and where it ends."""
     length_mm: float
-    """Of the way between them; at first of the straight one."""
+    """Length of the way between them; initially of the straight one."""
     rig_from_world: tuple[Rigid3, ...]
 
     def after(self, pose: Rigid3) -> Crossing:
@@ -68,7 +68,7 @@ class Crossing:
         return replace(self, length_mm=self.length_mm + step, rig_from_world=poses)
 
     def at(self, travel_mm: float) -> Rigid3:
-        """The handpiece so far along the sweep."""
+        """The handpiece after this travel along the sweep."""
         place = np.clip(travel_mm / self.length_mm, 0, 1) * (len(self.rig_from_world) - 1)
         before = min(int(place), len(self.rig_from_world) - 2)
         return _between(self.rig_from_world[before], self.rig_from_world[before + 1], float(place - before))
@@ -83,7 +83,7 @@ def _between(one: Rigid3, other: Rigid3, share: float) -> Rigid3:
 
 
 def plan_crossing(mesh: Mesh, room: Room, handpiece: Handpiece, curve: ArchCurve, near_mm: float) -> Crossing | None:
-    """The sweep that lies farthest back, from the side on which a place of the curve lies; None where there is none."""
+    """The sweep that lies farthest back, from the side of the given point of the curve; None if there is none."""
     length = float(curve.lengths_mm[-1])
     for inset in np.arange(_INSET_MM, length / 2, _APART_MM):
         ends = (float(inset), length - float(inset))

@@ -1,11 +1,11 @@
 """How a path is changed where the body of the handpiece does not fit.
 
-Along the path lie *stations*. Where the steady handpiece does not fit, and a little before and after, each station has
-candidates: the handpiece is lifted, shifted to the cheek or the tongue, rolled, pitched (about the axis across the
-arch) and yawed, all about the place that it looks at. Of those that fit, the chain is taken that costs least: each
-candidate costs by how far it is off the steady pose and by what two cameras then miss of the crowns nearby, and each
-step by how far its candidates lie apart (Viterbi's shortest path). Elsewhere the path stays as it is, to the last bit.
-A hand that would touch nonetheless, by its drift, is lifted.
+Along the path there are *stations*. Where the steady handpiece does not fit, and a little before and after, each
+station has candidates: the handpiece is lifted, shifted towards the cheek or the tongue, rolled, pitched (about the
+axis across the arch) and yawed, all about the place that it looks at. Of those that fit, the cheapest chain is chosen:
+the cost of a candidate is how far it is off the steady pose and what two cameras then miss of the crowns nearby, and
+that of a step is how far apart its candidates are (Viterbi's shortest path). Elsewhere the path is unchanged, to the
+last bit. Where the drift of the hand would still make it touch, it is lifted.
 """
 
 from __future__ import annotations
@@ -26,34 +26,35 @@ from cuspid.room import Room
 from cuspid.simulation.path.coverage import CrownPoints
 
 PoseAt = Callable[[float], Rigid3]
-"""``rig_from_world`` at a travel."""
+"""``rig_from_world`` at a given travel."""
 
 _SHIFTS_MM, _LIFTS_MM = (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0), (0.0, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 13.0)
 _ROLLS_DEG = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0)
 _TILTS_DEG = ((0.0, 0.0), (12.0, 0.0), (-12.0, 0.0), (0.0, 12.0), (0.0, -12.0))
-"""Pitch and yaw."""
+"""Pitch and yaw of the candidates."""
 _UNITS = np.array([1.0, 1.0, *np.deg2rad([12.0, 12.0, 12.0])])
-"""A shift, a lift and a turn that cost alike."""
+"""A shift, a lift and a rotation of equal cost."""
 _OFF, _MISSED, _APART = 0.05, 10.0, 0.5
-"""Cost of being off by one unit, of missing all that is to be seen, and of one unit between neighbours (squares)."""
+"""Cost of being off by one unit, of missing all that there is to see, and of one unit between neighbours (squares)."""
 _KEPT = 150
-"""Candidates per station that the shortest path chooses from."""
+"""Number of candidates per station from which the shortest path chooses."""
 _STATION_MM = 1.0
 _EASE = 4
-"""So many stations before and after those where the steady handpiece does not fit may differ, too."""
+"""Number of stations before and after those where the steady handpiece does not fit that may also be changed."""
 _BESIDE_MM = 3.0
-"""What a station is to see lies so near to it along the arch."""
+"""What a station must see lies this near to it along the arch ..."""
 _REACH_MM = 9.0
-"""... and so near to it at all."""
+"""... and this near to it in space."""
 _HIGHEST_MM, _RISE_MM, _SPARE_MM = 30.0, 0.1, 0.05
-"""A hand lifts by these steps, this high at most, and by a little more than needed."""
+"""Maximum height to which a hand lifts, the step, and the margin beyond what is needed."""
 _SLOPE_MM = 4.0
 """Length of travel over which it lifts."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Detour:
-    """Changes to a path: shift to the cheek and lift in mm; roll, pitch and yaw in rad, about what is looked at."""
+    """Changes to a path: shift towards the cheek and lift in mm; roll, pitch and yaw in rad, about what is looked
+    at."""
 
     travel_mm: Float[np.ndarray, "n"]
     changes: Float[np.ndarray, "n 5"]
@@ -87,7 +88,7 @@ def plan_detour(
     steady: PoseAt,
     span_mm: tuple[float, float],
 ) -> Detour:
-    """The changes with which a steady handpiece fits everywhere."""
+    """The changes that make a steady handpiece fit everywhere."""
     travel = np.linspace(*span_mm, max(2, 1 + round((span_mm[1] - span_mm[0]) / _STATION_MM)))
     poses = [steady(float(at)) for at in travel]
     blocked = np.array([not room.fits(pose, [Rigid3.identity()])[0] for pose in poses])
@@ -170,7 +171,7 @@ def up(lift_mm: float) -> Rigid3:
 
 
 def lifts_needed(room: Room, rig_from_world: Sequence[Rigid3], reach: int) -> Float[np.ndarray, "n"]:
-    """By how much each of consecutive poses must be lifted to fit, mm, rising and falling over ``reach`` poses.
+    """How much each of consecutive poses must be lifted to fit, mm, rising and falling over ``reach`` poses.
 
     Raises InputError where lifting does not help.
     """

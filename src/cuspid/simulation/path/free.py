@@ -1,10 +1,10 @@
-"""Where a camera goes that a shaky hand moves over the teeth, unrestricted (thesis chapter 4, Fig. 4.2).
+"""The trajectory of a camera that a shaky hand moves over the teeth, unrestricted (thesis chapter 4, Fig. 4.2).
 
-The steady trajectory is the arch curve of :mod:`cuspid.simulation.path.arch`, from the first crown to the last. To it
-the hand adds a random shift, tilt and turn, and it goes at a random speed. Each of these is smooth noise over the
-frames: a slow drift and a quick tremor, both Gaussian and of the asked standard deviation together, and none beyond
-`REACH` of it, for who holds the camera watches the picture. The camera is shifted and turned about the place on the
-teeth that it looks at, in the rig frame: X along the arch, Y to the cheek, Z out of the gum.
+The steady trajectory is the arch curve of :mod:`cuspid.simulation.path.arch`, from the first crown to the last. The
+hand adds a random shift, tilt and rotation to it, and moves at a random speed. Each of these is smooth noise over the
+frames: a slow drift and a quick tremor, both Gaussian and together of the given standard deviation, and never beyond
+`REACH` of it, because whoever holds the camera watches the picture. The camera is shifted and rotated about the place
+on the teeth that it looks at, in the rig frame: X along the arch, Y towards the cheek, Z out of the gum.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from cuspid.simulation.path.detour import lifts_needed, up
 _LOG = logging.getLogger("cuspid")
 
 REACH = 2.5
-"""The hand never goes farther than this many standard deviations from where it should be."""
+"""Maximum distance of the hand from where it should be, in standard deviations."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +40,7 @@ class FreePathOptions(Options):
     frames: Annotated[int, Range(2, 100_000)] = 120
     """Frames from the first crown to the last."""
     shake: Annotated[float, Range(0, 20)] = 1.0
-    """Multiplies all standard deviations below: 1 is a full shake, 0 a steady hand at an even speed."""
+    """Factor for all standard deviations below: 1 is a full shake, 0 a steady hand at constant speed."""
     position_mm: Annotated[float, Range(0, 100)] = 1.0
     """Standard deviation of the shift along and across the arch."""
     distance_mm: Annotated[float, Range(0, 100)] = 1.5
@@ -48,17 +48,17 @@ class FreePathOptions(Options):
     tilt_deg: Annotated[float, Range(0, 90)] = 6.0
     """Standard deviation of the tilt along and across the arch."""
     turn_deg: Annotated[float, Range(0, 180)] = 8.0
-    """Standard deviation of the turn about the viewing axis."""
+    """Standard deviation of the rotation about the viewing axis."""
     speed: Annotated[float, Range(0, 0.95)] = 0.35
     """Standard deviation of the logarithm of the speed."""
     drift_frames: Annotated[float, Range(0.1, 10_000)] = 6.0
-    """Frames over which the drift changes (standard deviation of its Gaussian filter)."""
+    """Number of frames over which the drift changes (standard deviation of its Gaussian filter)."""
     tremor_frames: Annotated[float, Range(0.1, 10_000)] = 1.0
-    """Frames over which the tremor changes, likewise."""
+    """Number of frames over which the tremor changes, likewise."""
     tremor: Annotated[float, SHARE] = 0.15
     """Share of the standard deviation that is tremor."""
     clearance_mm: Annotated[float, Range(0, 100)] = 2.0
-    """Camera and lights keep this distance from the jaw; the hand lifts them where they would not."""
+    """Minimum distance of camera and lights from the jaw; the hand lifts them where they would come nearer."""
 
 
 def plan_free_path(
@@ -97,7 +97,7 @@ def plan_free_path(
 
 
 def hand_noise(options: FreePathOptions, channels: int, rng: np.random.Generator) -> Float[np.ndarray, "f c"]:
-    """Independent smooth noise of unit standard deviation, within `REACH`: a drift and a tremor."""
+    """Independent smooth noise of unit standard deviation, limited to `REACH`: a drift and a tremor."""
     drift = _smooth_noise(options.frames, channels, options.drift_frames, rng)
     tremor = _smooth_noise(options.frames, channels, options.tremor_frames, rng)
     both = np.sqrt(1 - options.tremor**2) * drift + options.tremor * tremor

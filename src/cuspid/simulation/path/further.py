@@ -1,7 +1,7 @@
-"""Further passes over what the first ones leave unseen of the crowns.
+"""Further passes over the parts of the crowns that the first ones leave unseen.
 
-For each roll, a pass along the whole path is tried; of what it would add, the stretch is kept on which it adds most
-beyond what its frames cost (the subarray of largest sum). The best of all is added, and so on until none pays.
+For each roll, a pass along the whole path is tried, and the stretch is kept on which it adds most in excess of the cost
+of its frames (the maximum-sum subarray). The best of all is added, and so on until none is worthwhile.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from cuspid.simulation.path.legs import Leg, SteadyPath, steady_path
 _ROLLS_DEG = (-60.0, -45.0, -30.0, 30.0, 45.0, 60.0)
 _STATION_MM = 1.5
 _WORTH = 2e-4
-"""A millimetre of path must add this share of the crown surface."""
+"""Share of the crown surface that a millimetre of path must add."""
 _ARM_MM = 16.0
-"""A pass more costs as much as this length for each radian of its roll: the turns to it and back."""
+"""A further pass costs as much as this length of path for each radian of its roll: the turns to it and back."""
 _ROUND_MM = 2.0
-"""A pass begins and ends so much before and after where it is wanted."""
+"""A pass begins and ends this far before and after where it is wanted."""
 _MOST = 6
 _LIFTS_MM = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)
 
@@ -61,7 +61,7 @@ def _largest_sum(values: Float[np.ndarray, "n"]) -> tuple[int, int]:
 
 
 def further_legs(mesh: Mesh, room: Room, crowns: CrownPoints, handpiece: Handpiece, steady: SteadyPath) -> SteadyPath:
-    """The path with the further passes that pay."""
+    """The path with the further passes that are worthwhile."""
     unseen = np.asarray(~seen_from(crowns, handpiece, list(_stations(steady))).any(axis=0))
     trials = [_trial(mesh, room, crowns, handpiece, steady, roll) for roll in _ROLLS_DEG]
     legs = list[Leg]()

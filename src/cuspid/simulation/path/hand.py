@@ -13,7 +13,7 @@ from cuspid.geometry import Rigid3
 
 @dataclass(frozen=True, eq=False)
 class HandMotion:
-    """Smooth random drift along the path, independent of where the frames are taken."""
+    """Smooth random drift along the path, independent of where frames are taken."""
 
     travel_mm: Float[np.ndarray, "n"]
     """Places on the path."""
@@ -34,7 +34,7 @@ def hand_motion(
     jitter_deg: float,
     jitter_length_mm: float,
 ) -> HandMotion:
-    """Gaussian noise smoothed over ``jitter_length_mm``, with the asked standard deviations in expectation."""
+    """Gaussian noise smoothed over ``jitter_length_mm``, with the given standard deviations in expectation."""
     sigma, padding = 10, 60
     step = jitter_length_mm / (2 * sigma)
     travel = np.arange(span_mm[0], span_mm[1] + step, step)

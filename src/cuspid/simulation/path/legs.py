@@ -2,7 +2,7 @@
 
 A handpiece with few cameras is also rolled about the tangent of the arch (thesis 3.5.3), to scan a cross-section from
 several sides. ``hold`` is the rig frame of a handpiece held upright, which sinks where teeth are missing; a roll is
-positive when the cameras turn to the cheek. The *travel* is the length of it, passes and turns, in mm.
+positive when the cameras turn towards the cheek. *Travel* is the length along the trajectory, passes and turns, in mm.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from cuspid.simulation.path.arch import NEAR_MM, ArchCurve
 from cuspid.simulation.path.cross import Crossing
 
 _SIDE_DEG, _SIDE_MM = 60.0, (4.5, 2.5)
-"""A handpiece rolled so far looks at this place: across from the middle of the crown, and down from the cusp tips."""
+"""At this roll, a handpiece looks at this place: across from the middle of the crown, and down from the cusp tips."""
 _TURN_RADIUS_MM = 8.0
-"""A turn by an angle is as long as the arc of a circle of this radius: about that of the cameras around the crown."""
+"""A turn by an angle has the length of an arc with this radius: about that of the cameras around the crown."""
 _STATION_MM = 1.0
 """Spacing of the places at which the room beside the teeth is measured."""
 _PATCH_MM = 1.5
 """Half the side of the patch of rays that measures it."""
 _FAR_MM = 8.0
-"""Whence these rays come, from the place that the handpiece looks at; they end as far behind it."""
+"""Distance from which these rays start, from the place that the handpiece looks at; they end as far behind it."""
 _LIFT_MM = 3.0
-"""The nominal crown is corrected by this much at most."""
+"""Maximum correction of the nominal crown."""
 _GAP_MM = 2.0
-"""A surface that lies so far below the cusp tips is still seen well; below that the handpiece follows it down."""
+"""A surface this far below the cusp tips is still seen well; if it is lower, the handpiece follows it down."""
 _GAP_PATCH_MM = 3.0
-"""Half the width, across the arch, of the strip in which it is looked for."""
+"""Half the width, across the arch, of the strip in which that surface is searched for."""
 _GAP_NEAR_MM = 5.0
-"""The handpiece keeps up while a tooth is nearer than half of this."""
+"""The handpiece stays up while a tooth is nearer than half of this."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,15 +45,15 @@ class Leg:
     """One pass along the arch or a stretch of it."""
 
     roll_deg: float
-    """Positive to the cheek."""
+    """Roll; positive towards the cheek."""
     start_mm: float
     """Where it begins on the arch curve."""
     end_mm: float
-    """Where it ends; before the start where it goes back."""
+    """Where it ends; before the start if the pass runs backwards."""
 
     @property
     def length_mm(self) -> float:
-        """Of the stretch."""
+        """Length of the stretch."""
         return abs(self.end_mm - self.start_mm)
 
 
@@ -63,19 +63,19 @@ class SteadyPath:
 
     curve: ArchCurve
     legs: tuple[Leg, ...]
-    """In order; from the end of each the handpiece goes straight to the start of the next."""
+    """Legs in order; from the end of each, the handpiece goes straight to the start of the next."""
     travel_mm: Float[np.ndarray, "k"]
-    """At the start and the end of each leg."""
+    """Travel at the start and the end of each leg."""
     stations_mm: Float[np.ndarray, "s"]
     """Places on the curve at which the room was measured."""
     rolls_deg: Float[np.ndarray, "r"]
-    """The rolls, ascending, for which it was."""
+    """The rolls, ascending, for which it was measured."""
     lifts_mm: Float[np.ndarray, "r s"]
-    """How far the surface there lies outside of the nominal crown."""
+    """How far the surface there lies outside the nominal crown."""
     sinks_mm: Float[np.ndarray, "s"]
-    """How far the handpiece sinks there, for teeth are missing."""
+    """How far the handpiece sinks there because teeth are missing."""
     crossing: Crossing | None = None
-    """A sweep from one side to the other behind the last leg; it begins where that ends."""
+    """A sweep from one side to the other after the last leg; it begins where that ends."""
 
     @property
     def span_mm(self) -> tuple[float, float]:
@@ -88,7 +88,7 @@ class SteadyPath:
         return float(self.travel_mm[-1])
 
     def place(self, travel_mm: float) -> tuple[float, float]:
-        """Place on the curve in mm and roll in degrees."""
+        """Position on the curve in mm and roll in degrees."""
         lengths = [at for leg in self.legs for at in (leg.start_mm, leg.end_mm)]
         rolls = [leg.roll_deg for leg in self.legs for _ in range(2)]
         return float(np.interp(travel_mm, self.travel_mm, lengths)), float(np.interp(travel_mm, self.travel_mm, rolls))
@@ -107,7 +107,7 @@ class SteadyPath:
 
 
 def there_and_back(rolls_deg: Sequence[float], start_mm: float, end_mm: float) -> tuple[Leg, ...]:
-    """A leg for each roll over the same stretch, there and back in turn."""
+    """A leg for each roll over the same stretch, alternately there and back."""
     ends = [(start_mm, end_mm) if number % 2 == 0 else (end_mm, start_mm) for number in range(len(rolls_deg))]
     return tuple(
         Leg(roll_deg=roll, start_mm=start, end_mm=end) for roll, (start, end) in zip(rolls_deg, ends, strict=True)
@@ -115,7 +115,7 @@ def there_and_back(rolls_deg: Sequence[float], start_mm: float, end_mm: float) -
 
 
 def steady_path(mesh: Mesh, curve: ArchCurve, legs: tuple[Leg, ...]) -> SteadyPath:
-    """The trajectory along all legs; where the surface stands out or falls back, a rolled handpiece follows it."""
+    """The trajectory along all legs; a rolled handpiece follows the surface where it protrudes or recedes."""
     low, high = (pick(at for leg in legs for at in (leg.start_mm, leg.end_mm)) for pick in (min, max))
     stations = np.linspace(low, high, max(2, round((high - low) / _STATION_MM)))
     rolls = np.unique([leg.roll_deg for leg in legs])

@@ -1,4 +1,4 @@
-"""How much of what an image shows the next image of the same camera shows again."""
+"""How much of what an image shows is shown again by the next image of the same camera."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
 
 _LEAST_SURFACE = 0.1
-"""An image on less of which there is surface says nothing."""
+"""An image with surface on a smaller share of it is not evaluated."""
 
 
 def image_overlap(
     mesh: Mesh, handpiece: Handpiece, rig_from_world: Sequence[Rigid3], grid: int = 24
 ) -> Float[np.ndarray, "n c"]:
-    """Share of the surface in each camera's image that its next image also sees: in its field of view, not hidden.
+    """Share of the surface in each camera's image that its next image also sees: in its field of view, not occluded.
 
-    The surface in an image is what lies within the depth range of the lens. It is asked on a grid of rays over the
-    image, so the share is of the image's area. NaN where fewer than a tenth of the rays meet it.
+    The surface in an image is what lies within the depth range of the lens. It is sampled on a grid of rays over the
+    image, so the share is one of the image's area. NaN if fewer than a tenth of the rays hit it.
     """
     rays = _ray_grids(handpiece, grid)
     steps = [_step_overlap(mesh, handpiece, rays, now, following) for now, following in pairwise(rig_from_world)]

@@ -3,10 +3,10 @@
 Frames: the world is the jaw's occlusal frame. Rig frame as in :mod:`cuspid.handpiece.designs`: the origin rides on the
 arch curve, +X along it, +Y towards the cheek, +Z out of the gum. Seen from above (+Z), the path runs clockwise.
 
-A path is made in layers, each a function of the travel: a steady hand on its passes
+A path is built in layers, each a function of the travel: a steady hand on its passes
 (:mod:`~cuspid.simulation.path.legs`), changed where the body of the handpiece does not fit
 (:mod:`~cuspid.simulation.path.detour`), the drift of the hand (:mod:`~cuspid.simulation.path.hand`), and a lift where
-that would touch. Frames are then taken so that they overlap about evenly.
+it would touch. Frames are then taken so that they overlap roughly evenly.
 """
 
 from __future__ import annotations
@@ -43,17 +43,17 @@ TOOTH_PATH_MM = 9.0
 """Length of the path over a tooth: ten positions 1 mm apart, which overlap by some 80 %."""
 
 _ARCH_MM = 80.0
-"""What is longer is a whole arch."""
+"""A longer path is one over a whole arch."""
 _GROWTH = 1.15
-"""By so much at most the number of frames is raised at once, where there are turns."""
+"""Maximum factor by which the number of frames is raised at once, where there are turns."""
 _LEAD_MM = 2.0
-"""A handpiece rides so far along the arch before it leaves it for the other side."""
+"""How far a handpiece travels along the arch before it leaves it for the other side."""
 _MOST = 2
-"""So many times the usual number of frames are taken at most for the overlap's sake."""
+"""Maximum number of frames for the sake of overlap, as a multiple of the usual number."""
 _COARSE = 12
-"""Rays along each side of an image that tell how fast it changes."""
+"""Rays along each side of an image that measure how fast it changes."""
 _LOW_SHARE = 0.9
-"""Teeth of which less can be seen get a note."""
+"""Teeth of which less than this share can be seen get a note."""
 
 _LOG = logging.getLogger("cuspid")
 
@@ -63,36 +63,38 @@ class ScanPathOptions(Options):
     """How the jaw is scanned."""
 
     tooth: Annotated[int | None, TOOTH] = None
-    """FDI number of the one tooth to scan; None for the whole arch, or what the mesh has of one."""
+    """FDI number of the one tooth to scan; default: the whole arch, or as much of one as the mesh has."""
     frames: Annotated[int | None, Range(2, 100_000)] = None
-    """Positions of the handpiece; None for 10 over a tooth, 100 over an arch and one per millimetre over a part of one,
-    or more where the overlap needs it."""
+    """Positions of the handpiece; default: 10 over a tooth, 100 over an arch and one per millimetre over a part of an
+    arch, or more if the overlap requires it."""
     length_mm: Annotated[float | None, Range(0.1, 1000)] = None
-    """Length of the path over the middle of the tooth or arch; None for 9 mm over a tooth (the images see 3 mm farther
-    on both sides) and from the first crown to the last over an arch."""
+    """Length of the path over the middle of the tooth or arch; default: 9 mm over a tooth (the images see 3 mm more on
+    both sides), and from the first crown to the last over an arch."""
     jitter_mm: Annotated[float, Range(0, 20)] = 0.15
     """Standard deviation of the hand's drift along each axis."""
     jitter_deg: Annotated[float, Range(0, 90)] = 1.5
-    """Standard deviation of the hand's turning about each axis."""
+    """Standard deviation of the hand's rotation about each axis."""
     jitter_length_mm: Annotated[float, Range(0.01, 10_000)] = 6.0
     """Length of path over which the hand's drift changes."""
     minimum_overlap: Annotated[float, Range(0, 0.99)] = 0.75
-    """Share (0 to 1) of the surface in the images of a frame that the next frame must see, by the same cameras."""
+    """Minimum share (0 to 1) of the surface in the images of a frame that the next frame must also see, with the same
+    cameras."""
     clearance_mm: Annotated[float, Range(0, 100)] = 0.5
-    """The body of the handpiece keeps this distance from the jaw; where it does not fit, it is lifted, shifted and
+    """Minimum distance of the body of the handpiece from the jaw; where it does not fit, it is lifted, shifted and
     tilted."""
     turns: Annotated[int, Range(1, 99)] = 1
-    """Passes over the teeth, an odd number: 1 looks down only, 3 look from the cheek, down and from the tongue, more
-    look in finer steps between."""
+    """Passes over the teeth, an odd number: with 1 the handpiece only looks down; with 3 it looks from the cheek, down
+    and from the tongue; with more, also in finer steps between."""
     turn_deg: Annotated[float, Range(0.1, 89)] = 60.0
-    """How far the handpiece is rolled to either side in the first and the last pass."""
+    """How far the handpiece is rolled to either side in the first and last pass."""
     passes: Literal["turns", "auto"] | None = None
-    """turns: those that --turns says; auto: also others, rolled differently, over what two cameras did not see; a note
-    tells how many frames they take. None for auto over a whole arch of which nothing else is said, else turns."""
+    """turns: the passes given by --turns. auto: also further ones, with other rolls, over what two cameras did not see;
+    a note says how many frames they take. Default: auto for a whole arch if neither the turns, the frames nor the
+    length are given, otherwise turns."""
     cross_sweep: bool = False
     """After the passes of a whole arch, sweep from one side straight to the other, as over the palate, as far back as
-    there is surface between them: it ties the two ends, and so the width of the arch. A note tells where there is none.
-    """
+    there is surface between them: this ties the two ends together, and so the width of the arch. A note says if there
+    is none."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -109,7 +111,7 @@ class ScanPathOptions(Options):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScanPath:
-    """Poses of the handpiece and the overlap that they give."""
+    """Poses of the handpiece and the resulting overlap."""
 
     rig_from_world: Mapping[str, Rigid3]
     """Pose by frame name, in order."""
@@ -121,8 +123,8 @@ class ScanPath:
     steady: SteadyPath = field(repr=False)
     """The trajectory of a steady hand."""
     seen: Mapping[int, float] = field(default_factory=dict)
-    """About which share (0 to 1) of the open surface of each crown that the path passes two cameras see at once, by FDI
-    number; by 0 of all crowns together."""
+    """Approximate share (0 to 1) of the open surface of each crown along the path that two cameras see at once, by FDI
+    number; under 0, that of all crowns together."""
 
     @property
     def curve(self) -> ArchCurve:
@@ -138,20 +140,20 @@ class ScanPath:
 
     @property
     def minimum_overlap(self) -> float:
-        """Mean over the cameras of the frame that overlaps least with the next."""
+        """Overlap of the frame that overlaps least with the next one, as the mean over its cameras."""
         return float(frame_overlap(self.overlap).min())
 
     @property
     def mean_overlap(self) -> float:
-        """The same, of all frames."""
+        """Mean overlap over all frames."""
         return float(frame_overlap(self.overlap).mean())
 
 
 def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng: np.random.Generator) -> ScanPath:
     """A path over the arch or one tooth on which the handpiece fits and consecutive images overlap enough.
 
-    What a user should know of it goes to the log. Raises InputError where the jaw has no such tooth, the handpiece does
-    not fit even when lifted, or the asked number of frames is too small for the overlap.
+    What a user should know about it is logged. Raises InputError where the jaw has no such tooth, the handpiece does
+    not fit even when lifted, or the given number of frames is too small for the overlap.
     """
     curve, room = arch_curve(jaw), room_about(jaw.mesh, handpiece, options.clearance_mm)
     crowns = crown_points(jaw, curve, _reach_mm(handpiece))
@@ -194,7 +196,8 @@ def _seen(crowns: CrownPoints, handpiece: Handpiece, path: ScanPath, tooth: int 
 
 
 def steady_poses(jaw: Jaw, options: ScanPathOptions, per_pass: int) -> tuple[Rigid3, ...]:
-    """``rig_from_world`` at so many places on each pass, evenly spaced, without the drift of a hand or the turns."""
+    """``rig_from_world`` at this many positions on each pass, evenly spaced, without the drift of a hand or the
+    turns."""
     curve = arch_curve(jaw)
     steady = steady_path(jaw.mesh, curve, _legs(jaw, curve, options))
     ends = steady.travel_mm.reshape(-1, 2)
