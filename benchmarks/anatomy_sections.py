@@ -42,13 +42,13 @@ def spheres(result: Result) -> str:
         ("scale, ppm", f"{report['scale_ppm']:+.0f}"),
         ("RMS without scale, um", f"{report['spacing_rms_without_scale_um']:.1f}"),
         *((f"{name}, um", f"{error:+.1f}") for name, error in named.items()),
-        ("form error of a sphere, RMS, worst, um", f"{max(form):.1f}"),
+        ("form error of the worst sphere, RMS, um", f"{max(form):.1f}"),
         ("size error (diameter), mean, um", f"{sum(size) / len(size):+.1f}"),
-        ("beside it, best fit: mean abs. deviation, um", f"{trueness['mean_abs_um']:.1f}"),
+        ("for comparison, with a best fit: mean abs. deviation, um", f"{trueness['mean_abs_um']:.1f}"),
         ("images to mesh, s", f"{result['images_to_mesh']['wall_s']:.0f}"),
     ]
     return "\n".join(
-        ["Spheres fitted in the scan, all distances between their centres, no best fit (docs/sphere-arch.md).", ""]
+        ["Spheres fitted to the scan; all distances between their centres, no best fit (docs/sphere-arch.md).", ""]
         + [markdown_table(("figure", "value"), rows)]
     )
 
@@ -73,9 +73,9 @@ def prepared(results: Sequence[Result]) -> str:
     margin_head = ("scan", "FDI", "evaluated %", "found %", "mean", "SD", "P95", "max", "outward", "detector's floor")
     return "\n".join(
         [
-            "Absolute deviations in um, all points of the scan on the tooth, 120 images for a tooth"
+            "Absolute deviations in um of all points of the scan on the tooth; 120 images for a tooth"
             + (f", {by_case[arch]['images']} for the arch" if arch in by_case else "")
-            + " (the thesis measured lines with few points).",
+            + " (the thesis measured line distances at few points).",
             "",
             markdown_table(head, rows),
             "",
@@ -116,17 +116,17 @@ def measured(result: Result) -> str:
     flags = [f"- {name}: {', '.join(why)}" for name, why in result["real"]["beyond_3_sd_of_table_2_1"].items()]
     return "\n".join(
         [
-            "Worst error in mm over the phantoms, by landmarks that are given (bar 0.05) or estimated from tooth "
-            f"labels (bar 0.5), meshes with edges of {result['phantom_edge_mm']} mm:",
+            "Worst error in mm over the phantoms, with landmarks given (bar 0.05) or estimated from tooth labels "
+            f"(bar 0.5); meshes with edges of {result['phantom_edge_mm']} mm:",
             "",
             markdown_table(("arch, landmarks", "a", "b", "c", "f"), rows),
             "",
-            f"Twenty real intra-oral scans, estimated landmarks, mean ± SD in mm; not measured: "
+            f"Twenty real intra-oral scans with estimated landmarks, mean ± SD in mm; not measured: "
             f"{len(result['real']['failures'])}.",
             "",
             markdown_table(("group", "jaws", "a", "b", "c", "f"), real),
             "",
-            "Farther than 3 SD from Table 2.1 of the thesis:",
+            "More than 3 SD from Table 2.1 of the thesis:",
             "",
             *flags,
         ]
@@ -154,11 +154,11 @@ def populations(result: Result) -> str:
     build = result["build"]
     return "\n".join(
         [
-            "Drawn from the distribution before the colon, measured after it, mean ± SD in mm:",
+            "Mean ± SD in mm, of the distribution drawn from (before the colon) and as measured (after it):",
             "",
-            markdown_table(("group", "jaws", "a", "b", "c", "f", "drawn again", "worst, asked - measured"), rows),
+            markdown_table(("group", "jaws", "a", "b", "c", "f", "redrawn", "worst, requested - measured"), rows),
             "",
-            f"A phantom of {build['faces']:,} faces takes {build['cpu_s']} CPU-s.",
+            f"Building a phantom of {build['faces']:,} faces takes {build['cpu_s']} CPU-s.",
         ]
     )
 
@@ -176,14 +176,15 @@ def mean_shape(result: Result) -> str:
     angles = ", ".join(f"{angle:.1f}" for angle in known["largest_angle_between_modes_deg"])
     return "\n".join(
         [
-            f"{population['count']} phantoms of {population['group']}, edges of {population['edge_mm']} mm (some "
-            "200,000 faces each), from two different first samples:",
+            f"The mean of {population['count']} phantoms of {population['group']} with edges of "
+            f"{population['edge_mm']} mm (about 200,000 faces each), from two different first samples:",
             "",
             markdown_table(head, rows),
             "",
-            f"The two means lie {_quantiles(apart)} apart, on teeth {_quantiles(teeth)}; their landmarks at most "
-            f"{population['landmarks_apart_um']:.2g} um. Known mean, {known['count']} samples meshed anew: the mean "
-            f"lies {_quantiles(mean_to_known)} from it; angles between known and found modes {angles} deg.",
+            f"The two means are {_quantiles(apart)} apart, on the teeth {_quantiles(teeth)}; their landmarks are at "
+            f"most {population['landmarks_apart_um']:.2g} um apart. With a known mean and {known['count']} remeshed "
+            f"samples, the mean found is {_quantiles(mean_to_known)} from it; the angles between known and found modes "
+            f"are {angles} deg.",
         ]
     )
 
@@ -209,7 +210,7 @@ def mouth(result: Result) -> str:
     ]
     head = ("openings", "sex", "tooth", "L: median (5-95 %), mm", "L fits, %", "V fits, %")
     return "\n".join(
-        [f"A handpiece that needs {result['needed_mm']:g} mm, {result['people']:,} drawn of each sex:", ""]
+        [f"A handpiece that needs {result['needed_mm']:g} mm, for {result['people']:,} people drawn of each sex:", ""]
         + [markdown_table(head, rows)]
     )
 
@@ -218,16 +219,16 @@ _LONGEST_PLAN_S = 60.0
 _JAW_COLUMNS = {
     "faces": "faces",
     "frames": "frames",
-    "planned in s": "plan_s",
-    "least overlap %": "minimum_overlap_pct",
+    "planning s": "plan_s",
+    "smallest overlap %": "minimum_overlap_pct",
     "open crown that two cameras see %": "seen_pct",
     "frames located": "located",
     "trajectory, RMSE um": "trajectory_um",
     "mean um": "mean_um",
     "P95 um": "p95_um",
     "mean of everything um": "everything_mean_um",
-    "what could be seen within 50 um %": "seen_complete_50_um_pct",
-    "open crown within 50 um %": "crown_complete_50_um_pct",
+    "of what could be seen, within 50 um %": "seen_complete_50_um_pct",
+    "of open crown, within 50 um %": "crown_complete_50_um_pct",
     "images to mesh, CPU s": "reconstruction_cpu_s",
     "peak GB": "peak_gb",
 }
@@ -246,13 +247,13 @@ def jaws(result: Result) -> str:
     of = f"commit {commits[0]}" if len(commits) == 1 else f"commits {', '.join(commits)}"
     return "\n".join(
         [
-            f"{len(scans)} of {result['cases']} were tried (at {of}); {len(planned)} came to the end. A name with "
-            "*smooth* is a coarse jaw after two Loop subdivisions; quadrants, single teeth and jaws with gaps are cut "
-            "from smooth ones, turned at random and without labels. Twelve cameras, seed 0; bar of planning: "
-            f"{_LONGEST_PLAN_S:g} s; load of the machine at the end: {result['load'][0]:g}. "
+            f"{len(scans)} of {result['cases']} cases were tried (at {of}); {len(planned)} finished. A name with "
+            "*smooth* stands for a coarse jaw after two Loop subdivisions; quadrants, single teeth and jaws with gaps "
+            "are cut from smooth ones, rotated at random and without labels. Twelve cameras, seed 0; bar for planning: "
+            f"{_LONGEST_PLAN_S:g} s; machine load at the end: {result['load'][0]:g}. "
             "`python benchmarks/jaws.py`.",
             "",
-            markdown_table(("jaw", *heads, "failed because, or note"), rows),
+            markdown_table(("jaw", *heads, "failure or note"), rows),
         ]
     )
 

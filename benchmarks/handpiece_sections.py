@@ -65,8 +65,8 @@ def camera_pair(result: Result) -> str:
     ]
     return "\n".join(
         [
-            f"{result['cases']} pairs, {result['cpu_s']} CPU-s; the largest share of the surface within 10 um, by "
-            "distance (whether a smaller baseline is more accurate: docs/precision.md):",
+            f"{result['cases']} pairs, {result['cpu_s']} CPU-s. For each distance, the pair with the largest share of "
+            "the surface within 10 um (docs/precision.md discusses whether a smaller baseline is more accurate):",
             "",
             markdown_table(head, rows),
         ]
@@ -108,7 +108,7 @@ def _sweep_row(surface: str, found: Result) -> tuple[object, ...]:
         found["cases"],
         found["failed"],
         f"{found['cases_cpu_s']:.0f}",
-        "in several goes" if run is None else f"{mark(run['wall_s'], 1800, 0)} (load {run['load_before']:.0f})",
+        "in several runs" if run is None else f"{mark(run['wall_s'], 1800, 0)} (load {run['load_before']:.0f})",
     )
 
 
@@ -125,9 +125,9 @@ def grid(result: Result) -> str:
     load = result["load_average_before"][0]
     return "\n".join(
         [
-            f"{result['cases']} cases of the sweep, {len(result['rounds'])} rounds, load average before: {load:.1f}.",
+            f"{result['cases']} cases of the sweep, {len(result['rounds'])} rounds; load average before: {load:.1f}.",
             "",
-            markdown_table(("workers", "two against one, median (bar >= 1.7)", "each round"), rows),
+            markdown_table(("workers", "speed-up of two over one, median (bar >= 1.7)", "each round"), rows),
         ]
     )
 
@@ -163,8 +163,8 @@ def design_comparison(result: Result) -> str:
     scale = result["options"]["image_scale"]
     return "\n".join(
         [
-            f"One tooth a scan, images scaled by {scale:g}; the share is of all faces of the tooth that are open to "
-            "the occlusal side, the same for all designs (docs/six-or-twelve.md).",
+            f"One tooth per scan, images scaled by {scale:g}; the share refers to all faces of the tooth that are "
+            "open to the occlusal side, the same for all designs (docs/six-or-twelve.md).",
             "",
             markdown_table(head, rows),
         ]
@@ -175,9 +175,9 @@ def any_rig(result: Result) -> str:
     """One molar, scanned with many rigs."""
     scans = result["scans"]
     parts = [
-        f"Tooth {result['tooth']} of the phantom, each rig without options of its own. The share within 50 um is of "
-        "what two cameras of one frame could see, which differs between the rigs: *seen* is how much of the tooth "
-        "that is. Eight and ten cameras are those that a search found (docs/designs.md).",
+        f"Tooth {result['tooth']} of the phantom, without options specific to a rig. The share within 50 um refers to "
+        "what two cameras of one frame could see, which differs between the rigs; *seen* is how much of the tooth "
+        "that is. The rigs of eight and ten cameras were found by a search (docs/designs.md).",
     ]
     for title, names in result["tables"].items():
         found = [scans[name] for name in names if name in scans]
@@ -199,14 +199,14 @@ def targets(result: Result) -> str:
             corners = f"{mean(each[f'{kind}_corners'] for each in found):.0f}"
             rows.append((tilt, f"{board}{steps}", f"{len(found)} of {len(made)}", corners, *spans))
     heads = (
-        *("most tilt, deg", "board", "calibrated", "corners", "focal lengths, stated, per mille"),
-        *("true error, per mille", "places, true error, um"),
+        *("largest tilt, deg", "board", "calibrated", "corners", "focal lengths, stated, per mille"),
+        *("true error, per mille", "positions, true error, um"),
     )
     return "\n".join(
         [
             f"Six cameras of {result['pixels']} px, built within tolerances, {result['instants']} instants; root mean "
-            "squares over the handpieces, and the least and the largest of them (docs/calibration.md). Steps are "
-            "*known* to 1 um, *off* by 10 um and known to as much, or off and *trusted* to 1 um.",
+            "squares over the handpieces, with the smallest and the largest value (docs/calibration.md). Steps are "
+            "*known* to 1 um; *off* by 10 um, and known to that accuracy; or off and *trusted* to 1 um.",
             "",
             markdown_table(heads, rows),
         ]
@@ -231,9 +231,10 @@ def stereo_pairs(result: Result) -> str:
     ]
     return "\n".join(
         [
-            "Rectified photographs of Middlebury's, which are no part of the project, as a handpiece of two cameras "
-            "whose working distance is that of the middle disparity; beside it OpenCV's StereoSGBM. Aimed at are depth "
-            "on 70 % of the pixels, a median of 0.15 px and 3 % above 1 px. `python benchmarks/stereo_pairs.py`.",
+            "Rectified photographs from Middlebury, which are not part of the project, taken as those of a handpiece "
+            "with two cameras whose working distance is that of the middle disparity; OpenCV's StereoSGBM for "
+            "comparison. Targets: depth on 70 % of the pixels, a median of 0.15 px and 3 % above 1 px. "
+            "`python benchmarks/stereo_pairs.py`.",
             "",
             markdown_table(heads, rows),
         ]
@@ -277,7 +278,7 @@ _BUILT_BARS_UM = {"fine": 3, "usual": 5, "rough": 10}
 """Mean deviation after the refinement."""
 _BUILT = (
     *("handpiece", "calibration", "mean um", "P95 um", "within 50 um %", "mean after a similarity um"),
-    *("path um", "its shape um", "inter-molar um", "scale ppm (one sigma)", "within 1, 2 expected sigmas %"),
+    *("path um", "path shape um", "inter-molar um", "scale ppm (one sigma)", "within 1, 2 expected sigmas %"),
 )
 
 
@@ -294,13 +295,13 @@ def manufacturing(result: Result) -> str:
                 rows.append((name, how, *_built_figures(scan, how, bar if how == "refined" else None)))
     return "\n".join(
         [
-            f"{result['what']}, twelve cameras. Standard deviations of the places, turns, focal lengths, principal "
-            "points and k1 of the built cameras: fine 3 um, 0.02 deg; usual 10 um, 0.05 deg, 0.3 %, 1 px, 0.01; rough "
-            "30 um, 0.2 deg, and lenses as usual. *Held*: the file is taken as exact; *refined*: within these "
-            "tolerances. The images are those of the drawn handpiece, the file is off. Bars, refined: mean 3, 5 and 10 "
-            "um, 2.5 um after a similarity, 2 um for the shape of the path (RMS, after a similarity). Last the "
-            "share of the surface within one and two of the standard deviations that the scan expects of itself. "
-            "`python benchmarks/manufacturing.py`.",
+            f"{result['what']}, twelve cameras. Standard deviations of the positions, rotations, focal lengths, "
+            "principal points and k1 of the built cameras: fine 3 um, 0.02 deg; usual 10 um, 0.05 deg, 0.3 %, 1 px, "
+            "0.01; rough 30 um, 0.2 deg, and lenses as in usual. *Held*: the file is taken as exact; *refined*: within "
+            "these tolerances. The images are those of the drawn handpiece; it is the file that is off. Bars, refined: "
+            "mean 3, 5 and 10 um, 2.5 um after a similarity transform, 2 um for the shape of the path (RMS, after a "
+            "similarity transform). The last column is the share of the surface within one and two of the standard "
+            "deviations that the scan states. `python benchmarks/manufacturing.py`.",
             "",
             markdown_table(_BUILT, rows),
         ]

@@ -22,9 +22,9 @@ def panoramas(results: Sequence[Result]) -> str:
     return "\n".join(
         [
             "Phantoms of the population and real jaws (`benchmarks/panorama.py`), each filmed in 120 frames of "
-            "640 x 480 px by a hand with full shake, texture `enamel`; docs/panorama-evaluation.md says what the "
-            "figures mean. *No arch* counts the panoramas that failed: too few frames, collapsed, or nowhere near the "
-            "jaw. Medians are over those that did not.",
+            "640 x 480 px with full hand shake, texture `enamel`; docs/panorama-evaluation.md explains the figures. "
+            "*No arch* counts the panoramas that failed: too few frames, collapsed, or nowhere near the jaw. Medians "
+            "are over those that did not fail.",
             "",
             markdown_table(
                 (
@@ -35,9 +35,9 @@ def panoramas(results: Sequence[Result]) -> str:
             ),
             "",
             f"The default method, subject by subject. Bars: median {MEDIAN_MM} mm, P95 {P95_MM} mm, SSIM on teeth "
-            f"{SSIM_TEETH}, on the canvas {SSIM_CANVAS}, {WALL_S:.0f} s on 2 cores, complete, in one part. Where SSIM "
-            "is fitted, one gain and offset (canvas: a gain) is taken out; `grey jaw` is what constant grey in the "
-            "outline of the jaw scores.",
+            f"{SSIM_TEETH}, on the canvas {SSIM_CANVAS}, {WALL_S:.0f} s on 2 cores, complete, in one part. For a "
+            "fitted SSIM, one gain and offset (on the canvas: a gain) is removed first; `grey jaw` is the score of "
+            "constant grey in the outline of the jaw.",
             "",
             markdown_table(
                 (

@@ -20,8 +20,8 @@ _EXPECTED = (
     "scale ppm (one sigma)",
     "span mm (one sigma, um)",
     "pose errors in sigmas: rotation",
-    "place",
-    "place um (one sigma)",
+    "position",
+    "position um (one sigma)",
 )
 
 
@@ -33,11 +33,11 @@ def expectations(result: Result) -> str:
     rows.append(("all", *[""] * 5, *(f"{each:.2f}" for each in together), ""))
     return "\n".join(
         [
-            "Teeth of the phantom, each seed another jaw, texture and hand; exact calibration; *short*: six frames "
-            "over 3 mm. Right would be 68.3, 95.4 and 99.7 % of the surface within one, two and three of its own "
-            "sigmas, and 1 for the errors of the poses (root mean square; those of one scan hang together, so that a "
-            "single scan is anywhere from a half to two). The sigma of the scale is of poses and calibration "
-            "alone: a surface that lies too far out everywhere is not in it. `python benchmarks/expectations.py`.",
+            "Teeth of the phantom, with another jaw, texture and hand for each seed; exact calibration; *short*: six "
+            "frames over 3 mm. Correct would be 68.3, 95.4 and 99.7 % of the surface within one, two and three of its "
+            "own sigmas, and 1 for the errors of the poses (root mean square; those of one scan are correlated, so a "
+            "single scan may be anywhere from a half to two). The sigma of the scale covers poses and calibration "
+            "alone, not a surface that lies too far out everywhere. `python benchmarks/expectations.py`.",
             "",
             markdown_table(_EXPECTED, rows),
         ]
@@ -77,10 +77,10 @@ def fuzz(result: Result) -> str:
     seeds = ", ".join(f"{first} to {last}" for first, last in result["seeds"])
     return "\n".join(
         [
-            "Small inputs, damaged by a seed: bytes, lines, numbers and names changed, files cut, emptied, left out or "
-            "swapped, and nonsense of formats' own (`tests/fuzzing.py`). Right is success, or one short line and "
-            "status 1 or 2. Wrong are tracebacks, more than 10 CPU seconds or 2 GiB, noise of libraries, whatever is "
-            "left half-written or outside of `--out`. Bar: 0 of 10,000. "
+            "Small inputs with seeded damage: bytes, lines, numbers and names changed; files cut, emptied, left out or "
+            "swapped; and nonsense specific to a format (`tests/fuzzing.py`). Right is success, or one short line and "
+            "status 1 or 2. Wrong are tracebacks, more than 10 CPU seconds or 2 GiB, noise from libraries, and "
+            "anything left half-written or outside `--out`. Bar: 0 of 10,000. "
             f"`OPENBLAS_NUM_THREADS=1 python benchmarks/fuzz.py`, seeds {seeds}.",
             "",
             markdown_table(("what reads them", "cases", "wrong", "slowest, s"), rows),
@@ -97,11 +97,11 @@ def kill(result: Result) -> str:
     rows.append(("all", "", sum(result["kills"].values()), mark(len(result["wrong"]), 0, 0)))
     return "\n".join(
         [
-            "Runs of a small scan and a small film are ended by KILL, TERM and INT at random moments, up to "
-            f"three times each, and then finish ({result['runs']} runs). All files must equal those of an undisturbed "
-            "run, times and keys of results aside. Bar: 0 of 100. `python benchmarks/kill.py`.",
+            "Runs of a small scan and a small film are ended by KILL, TERM and INT at random moments, up to three "
+            f"times each, and then left to finish ({result['runs']} runs). All files must equal those of an "
+            "undisturbed run, except for times and keys of results. Bar: 0 of 100. `python benchmarks/kill.py`.",
             "",
-            markdown_table(("verb", "undisturbed, s", "kills", "runs that differ"), rows),
+            markdown_table(("command", "undisturbed, s", "kills", "runs that differ"), rows),
         ]
     )
 
@@ -118,10 +118,10 @@ def large(result: Result) -> str:
     ]
     return "\n".join(
         [
-            f"A jaw of {result['faces']:,} faces. `evaluate` lays it on itself, without labels; from `view` a client "
-            f"takes all that is shown. Bar: {MOST_GIB:g} GiB. `python benchmarks/large.py`.",
+            f"A jaw of {result['faces']:,} faces. `evaluate` compares it with itself, without labels; from `view` a "
+            f"client fetches all that is shown. Bar: {MOST_GIB:g} GiB. `python benchmarks/large.py`.",
             "",
-            markdown_table(("verb", "peak memory, GiB", "wall s", "CPU s"), rows),
+            markdown_table(("command", "peak memory, GiB", "wall s", "CPU s"), rows),
         ]
     )
 
@@ -162,9 +162,9 @@ def qualities(result: Result) -> str:
         )
     return "\n".join(
         [
-            f"One scan ({result['jaw']}, {result['images']} images) by each `--quality`, on one core and on all. *Of "
-            "ideal*: the time on one core, shared among them all, beside the time that it took. *Mapping*: from the "
-            "images to the poses. `python benchmarks/qualities.py`.",
+            f"One scan ({result['jaw']}, {result['images']} images) at each `--quality`, on one core and on all. *Of "
+            "ideal*: the time on one core divided by the number of cores, relative to the time that it took. "
+            "*Mapping*: from the images to the poses. `python benchmarks/qualities.py`.",
             "",
             markdown_table(_QUALITIES, rows),
         ]

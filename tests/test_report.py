@@ -314,10 +314,10 @@ def test_what_a_folder_lacks_is_said(scan_folder):
 def test_a_note_of_the_reconstruction_stands_at_the_top(scan_folder):
     result = storage.read_result(scan_folder)
     noted = replace(result, reconstruction=replace(result.reconstruction, notes=("motion: <parts> may be displaced",)))
-    assert "Not certain" not in report_page(result)
+    assert "Warnings" not in report_page(result)
     page = report_page(noted)
     assert "<li>motion: &lt;parts&gt; may be displaced</li>" in page
-    assert page.index("Not certain") < page.index("Trueness")
+    assert page.index("Warnings") < page.index("Trueness")
 
 
 def test_a_scan_before_its_evaluation_is_seen_from_where_its_cameras_were(scan_folder):

@@ -20,28 +20,30 @@ WORDS: dict[Verdict, str] = {
     "not known": "cannot be known",
 }
 MEANINGS: dict[Verdict, str] = {
-    "better": "a smaller error under the same condition",
-    "reproduced": "what the thesis states holds, or its number comes out",
-    "differs": "another number, or the statement does not hold; the reason is given",
+    "better": "a smaller error under the same conditions",
+    "reproduced": "the thesis' statement holds, or its number is obtained",
+    "differs": "a different number, or the statement does not hold; the reason is given",
     "falls short": "at least one figure is worse than the thesis'",
-    "not run": "the results are not there yet; the command is given",
-    "not known": "lost in our copy of the thesis, and not told by its text",
+    "not run": "there are no results yet; the command is given",
+    "not known": "lost in our copy of the thesis, and not stated in its text",
 }
 INTRO = (
     "Every figure, table and numbered equation of the thesis (M. Ghanoum, Passive method for 3D reconstruction of "
     "human jaw: theory and application, University of Louisville, 2021) beside what cuspid finds. Our copy of the "
-    "thesis lacks all pictures, Tables 1.1 and 3.1 and the references; what its text still tells of them is compared.",
-    "Verdicts are given by rules, which stand below each item; nobody types them. An item has the least favourable "
-    "verdict of its figures, and the count of all stands beside it. What is not there yet counts as nothing.",
-    "All of ours is simulation: ideal optics, an artificial texture on the teeth as in the thesis unless said "
+    "thesis lacks all pictures, Tables 1.1 and 3.1 and the references; what its text still says about them is "
+    "compared.",
+    "Verdicts follow from rules, which are listed below each item; none is set by hand. An item has the least "
+    "favourable verdict of its figures, with the count of each verdict beside it. Figures that have not been run yet "
+    "do not count.",
+    "All our results are simulated: ideal optics, an artificial texture on the teeth as in the thesis unless stated "
     "otherwise, an exactly known rig. The thesis' jaws are not public; ours are the built-in phantom and others named "
     "below. Teeth have FDI numbers (the thesis' 30, 29, 26, 20 and 19 are 46, 45, 42, 35 and 36).",
 )
-MADE = "Made by `cuspid reproduce`. What has been run in a reduced version (`--quick`) is marked."
+MADE = "Made by `cuspid reproduce`. Results of reduced runs (`--quick`) are marked."
 GENERATED = (
     "Generated from `benchmarks/results/` by `python benchmarks/reproduction.py`; do not edit. `cuspid reproduce --out "
-    "FOLDER` runs everything anew, `--quick` a reduced version in a quarter of an hour, `--only table-3.2` a part; a "
-    "killed run goes on."
+    "FOLDER` runs everything again, `--quick` a reduced version in a quarter of an hour, `--only table-3.2` a part; an "
+    "interrupted run resumes where it stopped."
 )
 """Of the page in the documentation."""
 

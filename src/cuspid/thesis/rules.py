@@ -79,9 +79,9 @@ class Equals:
     def text(self) -> str:
         """How it decides."""
         if self.within < 1e-6:
-            return "reproduced: the same number; else it differs"
+            return "reproduced: the same number; otherwise it differs"
         each = " at each end" if isinstance(self.thesis, tuple) else ""
-        return f"reproduced: no farther than {self.meaning or f'{self.within:.3g}'} from it{each}; else it differs"
+        return f"reproduced: within {self.meaning or f'{self.within:.3g}'} of it{each}; otherwise it differs"
 
     def verdict(self, ours: float | tuple[float, ...]) -> Verdict:
         """Of a figure of the same kind. Raises InputError for one of another kind."""
@@ -101,7 +101,7 @@ class AtMost:
     @property
     def text(self) -> str:
         """How it decides."""
-        return f"reproduced: at most {self.limit:.3g}; else it differs"
+        return f"reproduced: at most {self.limit:.3g}; otherwise it differs"
 
     def verdict(self, ours: float) -> Verdict:
         """Of a figure."""
@@ -118,7 +118,7 @@ class AtLeast:
     @property
     def text(self) -> str:
         """How it decides."""
-        return f"reproduced: at least {self.limit:.3g}; else it differs"
+        return f"reproduced: at least {self.limit:.3g}; otherwise it differs"
 
     def verdict(self, ours: float) -> Verdict:
         """Of a figure."""
@@ -135,7 +135,7 @@ class Holds:
     @property
     def text(self) -> str:
         """How it decides."""
-        return f"reproduced: {self.condition}; else it differs"
+        return f"reproduced: {self.condition}; otherwise it differs"
 
     def verdict(self, ours: bool) -> Verdict:
         """Of the statement."""

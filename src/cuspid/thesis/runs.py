@@ -122,7 +122,8 @@ def _mean_shape(task: Task) -> Iterator[tuple[str, Result]]:
     result, mean = find_mean_shape(task.work, count, edge_mm)
     (task.folder / "images").mkdir(parents=True, exist_ok=True)
     save_picture(task.folder / "images" / "shape-mean.png", mean.mesh, title=f"Mean of {count} phantoms")
-    save_picture(task.folder / "images" / "shape-boxed.png", boxed(mean).mesh, title="The same with boxes")
+    title = f"Mean of {count} phantoms, with a box for each tooth"
+    save_picture(task.folder / "images" / "shape-boxed.png", boxed(mean).mesh, title=title)
     yield "mean_shape", result
 
 

@@ -125,7 +125,7 @@ def save_residuals_picture(
         _draw_residuals(axes, camera, pixels[name], residuals[name] * _LONGEST * camera.width / largest)
         rms = float(np.sqrt(np.mean(residuals[name] ** 2)))
         axes.set_title(f"{name}: {rms:.2f} px RMS", fontsize=10, color=_INK)
-    figure.suptitle(f"{title}\nthe longest line is {largest:.2g} px", fontsize=11, color=_INK)
+    figure.suptitle(f"{title}\nlongest line: {largest:.2g} px", fontsize=11, color=_INK)
     figure.tight_layout()
     save_figure(figure, path)
 
@@ -160,7 +160,7 @@ def save_photometry_picture(
         _draw_noise(axes[2], sensor, *variances[name], colour)
     _draw_left_over(axes[1], residuals)
     _label(axes[0], "gain and falloff", "distance from the principal point, half diagonals", "share of the light")
-    _label(axes[1], "left over", "distance from the principal point, half diagonals", "residual, % of the grey value")
+    _label(axes[1], "residuals", "distance from the principal point, half diagonals", "residual, % of the grey value")
     _label(axes[2], "noise", "grey value, DN", "standard deviation, DN")
     axes[0].legend(fontsize=7, ncols=-(-len(sensors) // 6), frameon=False)
     axes[1].legend(fontsize=8, frameon=False)

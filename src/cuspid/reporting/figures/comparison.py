@@ -74,7 +74,7 @@ def save_comparison_picture(
             _draw_curve(complete, curve.images, curve.complete_pct, curve.turns, colours[design])
             _draw_curve(error, curve.images, curve.error_um, curve.turns, colours[design])
         complete.set_title(name, loc="left", fontsize=12, color=_INK)
-        error.set_xlabel("images (at the points: turns)", color=_INK)
+        error.set_xlabel("images (numbers at the points: turns)", color=_INK)
         for axes in (complete, error):
             _label_images(axes)
         error.set_ylim(0.0, 1.15 * max(np.nanmax(curve.error_um) for curve in curves.values()))

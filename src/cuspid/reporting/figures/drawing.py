@@ -209,7 +209,7 @@ def save_expected_picture(path: Path, mesh: Mesh, sigma_um: Float[np.ndarray, "v
     bar.ax.tick_params(labelsize=11, color=_INK, labelcolor=_INK)
     bar.outline.set_visible(False)
     bar.set_label("expected deviation along the normal / µm (one standard deviation)", fontsize=12, color=_INK)
-    _draw_title(figure, "What to expect of the scan")
+    _draw_title(figure, "Expected deviation of the scan")
     save_figure(figure, path)
 
 

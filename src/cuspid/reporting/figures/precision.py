@@ -106,7 +106,7 @@ def save_ellipsoids_picture(
         panel.add_patch(_ellipse(mesh.face_centres[face] @ axes.T, axes @ covariance_mm2[face] @ axes.T, magnification))
     panel.set_axis_off()
     panel.set_aspect("equal")
-    figure.text(0.03, 0.03, f"ellipses: one standard deviation, {magnification:g} times as large", color=_INK)
+    figure.text(0.03, 0.03, f"ellipses: one standard deviation, magnified {magnification:g} times", color=_INK)
     _finish(figure, path, title)
 
 

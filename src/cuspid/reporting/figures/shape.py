@@ -67,7 +67,7 @@ def save_variance_picture(path: Path, model: ShapeModel) -> None:
     together = axes.twinx()
     together.plot(numbers, 100 * np.cumsum(model.variance_shares), color="#c2410c", marker="o", markersize=4)
     together.set_ylim(0, 105)
-    together.set_ylabel("variance explained up to here / %", color="#c2410c")
+    together.set_ylabel("cumulative variance explained / %", color="#c2410c")
     for side in (axes, together):
         side.spines["top"].set_visible(False)
     figure.tight_layout()

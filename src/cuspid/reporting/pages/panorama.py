@@ -103,5 +103,5 @@ def _tiles(score: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         ]
     if score["inter_molar_error_mm"] is not None:
         tiles.append(("inter-molar error", signed(score["inter_molar_error_mm"], 2), "mm"))
-    tiles.append(("shown of the teeth", number(score["coverage_pct"], 1), "%"))
+    tiles.append(("share of the teeth shown", number(score["coverage_pct"], 1), "%"))
     return tiles

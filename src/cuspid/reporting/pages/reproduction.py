@@ -101,7 +101,7 @@ def markdown(page: Page, *, images: str = "images/") -> str:
     parts += [*_markdown_table(heads, glance), ""]
     for entry in page.entries:
         parts += _markdown_entry(entry, images)
-    parts += ["## Conditions", "", *_markdown_table(("results", "how they came about"), page.conditions), ""]
+    parts += ["## Conditions", "", *_markdown_table(("results", "how they were made"), page.conditions), ""]
     return "\n".join(parts)
 
 

@@ -191,7 +191,7 @@ def _tiles(result: ScanResult) -> list[tuple[str, str, str]]:
         tiles.append(("frames located", f"{located}", f"of {located + dropped}" if dropped else ""))
         tiles += _expected_tiles(result.reconstruction)
     if result.trajectory is not None:
-        tiles.append(("position of the handpiece, RMSE", f"{result.trajectory['ape_um']['rmse']:.1f}", "µm"))
+        tiles.append(("position error of the handpiece, RMSE", f"{result.trajectory['ape_um']['rmse']:.1f}", "µm"))
     if result.capture is not None:
         tiles.append(("images", f"{len(result.capture.frames) * len(result.capture.handpiece.rig.names)}", ""))
     return tiles
@@ -200,10 +200,10 @@ def _tiles(result: ScanResult) -> list[tuple[str, str, str]]:
 def _expected_tiles(found: Reconstruction) -> list[tuple[str, str, str]]:
     tiles = []
     if found.refinement is not None:
-        tiles.append(("calibration refined by, RMS", f"{found.refinement.rms_sigmas:.2f}", "σ"))
+        tiles.append(("refinement of the calibration, RMS", f"{found.refinement.rms_sigmas:.2f}", "σ"))
     if found.expectation is not None:
-        tiles.append(("scale by poses and calibration, one σ", f"±{found.expectation.scale_sigma_ppm:.0f}", "ppm"))
-        span = f"{found.expectation.span_mm:.0f} mm from end to end by them, one σ"
+        tiles.append(("scale, from poses and calibration, one σ", f"±{found.expectation.scale_sigma_ppm:.0f}", "ppm"))
+        span = f"{found.expectation.span_mm:.0f} mm from end to end, from these, one σ"
         tiles.append((span, f"±{found.expectation.span_sigma_um:.1f}", "µm"))
     return tiles
 

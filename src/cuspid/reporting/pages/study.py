@@ -33,7 +33,7 @@ _TITLES = {
     "repeat": "Repeated scans: trueness and precision",
 }
 _REPEATED = (
-    "In µm, positive outside the reference: the mean over the scans is systematic, their SD is random. Grey: not on "
+    "In µm, positive outside the reference: the mean over the scans is systematic, their SD is random. Grey: not in "
     "all scans."
 )
 """What the colours tell."""
@@ -134,7 +134,7 @@ def _lead(verb: str, summary: Mapping[str, Any], cases: int, failed: int) -> lis
             ("trueness: mean |d|, mean of the scans", number(trueness["mean_abs_um"]["mean"], 2), "µm"),
             ("precision: mean |d|, mean of all pairs", number(precision["mean_abs_um"]["mean"], 2), "µm"),
             ("repeatability SD at a point", number(summary["spread"]["repeatability_sd_um"], 2), "µm"),
-            ("the same at the median point", number(summary["spread"]["median_sd_um"], 2), "µm"),
+            ("repeatability SD at the median point", number(summary["spread"]["median_sd_um"], 2), "µm"),
             ("systematic part at a point, RMS", number(summary["spread"]["bias_rms_um"], 2), "µm"),
         ]
     if verb == "sweep" and summary:
@@ -222,8 +222,8 @@ def _column(values: Sequence[float | int | None]) -> list[str]:
 def _repeat_tables(summary: Mapping[str, Any]) -> list[Table]:
     tables = []
     for name, title, caption in (
-        ("trueness", "Trueness", "Each scan to the reference, in µm, as in the report of a scan."),
-        ("precision", "Precision", "Each pair of scans, one to the other after rigid alignment, both ways, in µm."),
+        ("trueness", "Trueness", "Each scan against the reference, in µm, as in the report of a scan."),
+        ("precision", "Precision", "Each pair of scans against each other after rigid alignment, both ways, in µm."),
     ):
         if summary.get(name):
             heads = ["figure", "mean", "SD", "smallest", "largest"]

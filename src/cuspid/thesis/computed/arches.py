@@ -15,7 +15,7 @@ from cuspid.thesis.rules import Equals
 
 _SE = 3.0
 """Means that are so many standard errors apart differ; with a dozen rows, two happen by chance."""
-_COPY = "the printed column f repeats column b to 0.06 mm and is very likely a copy of it"
+_COPY = "the printed column f repeats column b to within 0.06 mm and is very likely a copy of it"
 _CT_MODELS = MappingProxyType({"Lower-14": 90, "Upper-14": 259, "Lower-12": 39, "Upper-12": 44})
 """How many jaws the thesis measured."""
 
@@ -39,7 +39,7 @@ def phantoms_drawn(results: Results) -> tuple[Row, ...]:
 def _drawn(group: str, name: str, jaws: int) -> Row:
     error = PRINTED_TABLE[group][name][1] / np.sqrt(jaws)
     path = f"groups.{group.lower()}.{name}.measured"
-    because = "drawn jaws that cannot stand are drawn again"
+    because = "impossible draws are rejected and drawn again"
     shown = f"{{{path}.mean_mm:.2f}} ± {{{path}.sd_mm:.2f}}"
     return _row(group, name, "phantoms", "populations", f"{path}.mean_mm", shown, error, because)
 
@@ -60,7 +60,7 @@ def _scanned(path: str, entry: Mapping[str, Any], name: str) -> Row:
     printed_sd = PRINTED_TABLE[group][name][1]
     error = np.hypot((sd or 0.0) / np.sqrt(max(count, 1)), printed_sd / np.sqrt(_CT_MODELS[group]))
     shown = f"{{{path}.{name}_mean_mm:.2f}}" + ("" if sd is None else f" ± {{{path}.{name}_sd_mm:.2f}}")
-    because = "other people, few of them"
+    because = "different people, and few of them"
     return _row(group, name, f"{count} scans", "measure", f"{path}.{name}_mean_mm", shown, float(error), because)
 
 

@@ -48,7 +48,7 @@ def least_ssim(results: Results, method: str) -> Mapping[str, Any] | None:
     scores = {name: canvas_ssim(result) for name, result in found.items()}
     failed = [name for name, result in found.items() if result.get("failure")]
     worst = min(scores, key=scores.__getitem__)
-    because = f"no panorama of {', '.join(failed)}" if failed else f"the least is that of {worst}"
+    because = f"no panorama of {', '.join(failed)}" if failed else f"the smallest is that of {worst}"
     return {"ours": scores[worst], "median": np.median(list(scores.values())), "because": because}
 
 
@@ -96,7 +96,7 @@ def beats_stitcher(results: Results) -> Mapping[str, Any] | None:
 def panoramas_table(results: Results) -> Table | None:
     """Likeness and error of every panorama."""
     head = (
-        *("subject", "method", "SSIM canvas", "grey outline scores", "SSIM teeth, fitted", "ZNCC teeth"),
+        *("subject", "method", "SSIM canvas", "SSIM canvas of a grey outline", "SSIM teeth, fitted", "ZNCC teeth"),
         *("teeth shown, %", "error median, mm", "P95, mm"),
     )
     rows = [

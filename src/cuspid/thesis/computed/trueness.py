@@ -26,7 +26,7 @@ def trueness(results: Results, parts: str, statistics: Sequence[str]) -> tuple[R
 def _statistic(row: TruenessRow, statistic: str) -> Row:
     rms_um = float(np.hypot(row.mean_um, row.std_um))
     printed = {"max": row.max_um, "mean": row.mean_um, "SD": row.std_um, "RMS": rms_um}[statistic]
-    because = "of all points of the scan the worst one; the thesis measured at few points" if statistic == "max" else ""
+    because = "the worst of all points of the scan; the thesis measured at few points" if statistic == "max" else ""
     return Row(
         quantity=f"{row.part}, {row.what}: {statistic}",
         unit="µm",
@@ -51,7 +51,7 @@ def _images(row: TruenessRow) -> Row:
         source=(row.result,),
         ours=("images",),
         rule=Equals(thesis=thesis, within=0.1 * thesis),
-        because="as many as an overlap of more than 75 % needs on our path",
+        because="as many as our path needs for an overlap of more than 75 %",
     )
 
 
