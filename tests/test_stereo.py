@@ -328,11 +328,41 @@ def test_two_cameras_alone_must_agree_better() -> None:
 def test_the_near_side_of_a_border_is_found() -> None:
     depth = np.full((20, 20), 5.0)
     depth[:, :10], depth[:3] = 4.0, np.nan
-    one = replace(flat((0, 0), 5.0), depth_mm=depth)
-    borders = at_near_borders(one, 2, RESOLUTION, ConfidenceOptions())
+    pair = [replace(flat((0, 0), 5.0), depth_mm=depth), flat((2.5, 0), 5.0)]
+    borders = at_near_borders(pair, 0, 2, RESOLUTION, ConfidenceOptions())
     assert borders[3:, 8:10].all()
     assert not borders[:, :8].any()
     assert not borders[:, 10:].any()
+
+
+def sloping(slant_deg: float, towards_deg: float) -> np.ndarray:
+    """Depth on the grid of :func:`flat` of a plane 5 mm away, tilted away from the camera in one direction."""
+    camera = flat((0, 0), 5.0).camera
+    x, y, _ = camera.rays(camera.pixel_centres().reshape(-1, 2)).T
+    downhill = np.cos(np.deg2rad(towards_deg)) * x + np.sin(np.deg2rad(towards_deg)) * y
+    return (5.0 / (1 - np.tan(np.deg2rad(slant_deg)) * downhill)).reshape(20, 20)
+
+
+@given(slant_deg=st.floats(0, 55), towards_deg=st.floats(0, 360), baseline_mm=st.floats(0.3, 5))
+def test_a_steep_surface_has_no_borders_within(slant_deg: float, towards_deg: float, baseline_mm: float) -> None:
+    pair = [replace(flat((0, 0), 5.0), depth_mm=sloping(slant_deg, towards_deg)), flat((baseline_mm, 0), 5.0)]
+    borders = at_near_borders(pair, 0, 2, RESOLUTION, ConfidenceOptions())
+    assert not borders[2:-2, 2:-2].any()
+
+
+@pytest.mark.parametrize("slope", [lambda x, y: 5 + y, lambda x, y: 5 + 0.8 * x], ids=["across", "along"])
+def test_a_pair_of_cameras_measures_a_steep_surface(slope) -> None:
+    """It falls by more between two pixels of the grid than lies between two surfaces at a border."""
+    rig, mesh = diamond().rig, height_field(slope)
+    pair = replace(diamond(), rig=Rig({name: rig[name] for name in ("west", "east")}))
+    for one, other in zip(DepthEstimator(pair).measure(photograph(pair, mesh), "0"), ("east", "west"), strict=True):
+        rays = one.camera.rays(one.camera.pixel_centres())
+        truth = cast_depth(mesh, one.camera, one.cam_from_rig)
+        in_other = rig[other].cam_from_rig.apply(one.cam_from_rig.inverse().apply(rays * truth[..., None]))
+        pixels, size = rig[other].camera.project(in_other), rig[other].camera.width
+        shared = (np.abs(pixels - size / 2) < size / 2 - 8).all(axis=-1) & (np.abs(truth - 5) < 1.2)
+        assert np.isfinite(one.depth_mm[shared]).mean() > 0.8
+        assert 0 < np.median(np.abs(errors_um(one, mesh))) < 10
 
 
 @given(noise=st.floats(0.5, 5.0))

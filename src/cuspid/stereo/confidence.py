@@ -19,6 +19,11 @@ from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.options import Options, Range
 
+GRADIENT_LIMIT = 2 / 3
+"""Largest change of disparity of one surface, px per px of one of the images: a disparity gradient of 1 (P. Burt,
+B. Julesz, Science 208, 1980), which is measured between the two images."""
+_TINY = float(np.finfo(np.float64).tiny)
+
 
 @dataclass(frozen=True, kw_only=True)
 class ConfidenceOptions(Options):
@@ -39,7 +44,7 @@ class ConfidenceOptions(Options):
     """Where only two cameras look, pixels this close to the border of a surface in front of another one are dropped, as
     no third camera looks past it."""
     border_jump: Annotated[float, Range(0, 1000)] = 2.0
-    """How far behind, in resolutions, the other surface must lie to count as another one."""
+    """How far behind, in resolutions, the other surface must lie at least to count as another one."""
     speckle_px: Annotated[int, Range(0, 1_000_000)] = 100
     """Connected pieces of fewer depth pixels are dropped."""
     speckle_jump: Annotated[float, Range(0.01, 10_000)] = 5.0
@@ -124,14 +129,40 @@ def _tolerance_mm(
 
 
 def at_near_borders(
-    one: Measured, radius: int, resolution: Resolution, options: ConfidenceOptions
+    pair: Sequence[Measured], index: int, radius: int, resolution: Resolution, options: ConfidenceOptions
 ) -> Bool[np.ndarray, "h w"]:
-    """True where there is another surface behind within a few pixels of the grid: a window there sees mostly the nearer
-    one, whose depth extends past its border."""
-    inverse = np.where(np.isfinite(one.depth_mm), 1 / one.depth_mm, np.finfo(np.float32).max).astype(np.float32)
-    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    step = options.border_jump * resolution.mm / resolution.working_distance_mm**2
-    return np.asarray(np.isfinite(one.depth_mm) & (inverse - cv2.erode(inverse, around) > step))
+    """True for pixels of one of two cameras where there is another surface behind within ``radius`` pixels of the grid:
+    a window there sees mostly the nearer one, whose depth extends past its border.
+
+    Another surface is what lies farther behind than the disparity gradient limit lets one surface fall, and what is
+    not the slope of a steep surface, which rises on one side as it falls on the other.
+    """
+    one, other = pair[index], pair[1 - index]
+    sideways = (one.cam_from_rig @ other.cam_from_rig.inverse()).translation[:2]
+    gradient_limit = GRADIENT_LIMIT / max(float(one.camera.focal_px.mean() * np.linalg.norm(sideways)), _TINY)
+    least = options.border_jump * resolution.mm / resolution.working_distance_mm**2
+    inverse = 1 / one.depth_mm
+    near = np.zeros(inverse.shape, dtype=bool)
+    for down, right in _disc(radius):
+        falls, rises = inverse - _moved(inverse, down, right), _moved(inverse, -down, -right) - inverse
+        limit = np.maximum(least, gradient_limit * np.hypot(down, right))
+        with np.errstate(invalid="ignore"):
+            near |= (falls > limit) & ~(rises > falls / 2)
+    return near
+
+
+def _disc(radius: int) -> list[tuple[int, int]]:
+    """Offsets of the pixels within a radius, without the middle."""
+    span = range(-radius, radius + 1)
+    return [(down, right) for down in span for right in span if 0 < down**2 + right**2 <= radius**2]
+
+
+def _moved(values: Float[np.ndarray, "h w"], down: int, right: int) -> Float[np.ndarray, "h w"]:
+    """At each pixel the value of the one so many rows below and columns to the right; NaN where there is none."""
+    height, width = values.shape
+    padded = np.pad(values, ((abs(down),) * 2, (abs(right),) * 2), constant_values=np.nan)
+    top, left = abs(down) + down, abs(right) + right
+    return padded[top : top + height, left : left + width]
 
 
 def sure_enough(one: Measured, resolution: Resolution, options: ConfidenceOptions) -> Bool[np.ndarray, "h w"]:

@@ -218,7 +218,7 @@ class DepthEstimator:
         keep = (agreement(measured, index, resolution, options) > 0) & sure_enough(one, resolution, options)
         if len(measured) == 2:
             radius = -(-options.border_px // self.options.spacing_px)
-            keep &= ~at_near_borders(one, radius, resolution, options)
+            keep &= ~at_near_borders(measured, index, radius, resolution, options)
         keep = without_speckle(np.where(keep, one.depth_mm, np.nan), resolution, options)
         return DepthMap(
             frame=frame,
