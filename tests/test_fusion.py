@@ -35,13 +35,13 @@ POSES = {
 }
 
 
-RESOLUTION_MM = 0.012
+DETAIL_MM = 0.012
 
 
 def fuse(
     maps: Iterable[DepthMap], poses: Mapping[str, Rigid3], options: FusionOptions | None = None, **progress
 ) -> Mesh:
-    return fuse_depth_maps(maps, poses, RESOLUTION_MM, options, **progress).mesh
+    return fuse_depth_maps(maps, poses, DETAIL_MM, options, **progress).mesh
 
 
 def depth_maps(mesh: Mesh, poses=POSES, names=("west", "north")) -> list[DepthMap]:
@@ -99,7 +99,7 @@ def test_depth_is_as_uncertain_as_it_says(noise_mm: float) -> None:
             rng.normal(0, noise_mm, (12, 12)), each.depth_mm.shape[::-1], interpolation=cv2.INTER_NEAREST
         )
         noisy.append(replace(each, depth_mm=each.depth_mm + cv2.GaussianBlur(error, (0, 0), 1.5).astype(np.float32)))
-    fused = fuse_depth_maps(noisy, POSES, RESOLUTION_MM)
+    fused = fuse_depth_maps(noisy, POSES, DETAIL_MM)
     assert len(fused.sigma_mm) == len(fused.mesh.vertices) > 3000
     inside = np.abs(fused.mesh.vertices[:, :2] - fused.mesh.vertices[:, :2].mean(axis=0)).max(axis=1) < 1.5
     off, said = signed_um(fused.mesh, HILLS)[inside], 1000 * fused.sigma_mm[inside]
@@ -111,8 +111,8 @@ def test_depth_is_as_uncertain_as_it_says(noise_mm: float) -> None:
 def test_maps_of_one_frame_count_as_one() -> None:
     """They share its images: the same map a second time tells nothing new, be it of depth within or across frames."""
     maps = [replace(each, depth_mm=each.depth_mm + np.float32(0.004 * k)) for k, each in enumerate(depth_maps(HILLS))]
-    once = fuse_depth_maps(maps, POSES, RESOLUTION_MM).sigma_mm
-    twice = fuse_depth_maps([each for each in maps for _ in range(2)], POSES, RESOLUTION_MM).sigma_mm
+    once = fuse_depth_maps(maps, POSES, DETAIL_MM).sigma_mm
+    twice = fuse_depth_maps([each for each in maps for _ in range(2)], POSES, DETAIL_MM).sigma_mm
     assert np.median(once) > 0.001
     assert np.median(twice) == pytest.approx(np.median(once), rel=0.05)
 
@@ -166,7 +166,7 @@ def without(depth_map: DepthMap, width_mm: float) -> DepthMap:
 
 @pytest.mark.parametrize("width_mm", [0.15, 0.3, 1.0])
 def test_what_no_map_has_a_depth_of_is_a_hole_whose_rim_is_found(width_mm: float) -> None:
-    holes = find_holes([without(each, width_mm) for each in depth_maps(HILLS)], POSES, RESOLUTION_MM)
+    holes = find_holes([without(each, width_mm) for each in depth_maps(HILLS)], POSES, DETAIL_MM)
     x, y, _ = holes.points.T
     near = (np.abs(x) < width_mm / 2 + 0.2) & (np.abs(y) < 1.2)
     assert near.sum() > 20
@@ -179,17 +179,17 @@ def test_what_no_map_has_a_depth_of_is_a_hole_whose_rim_is_found(width_mm: float
 
 
 def test_a_whole_surface_has_a_border_and_no_holes() -> None:
-    assert len(find_holes(depth_maps(HILLS), POSES, RESOLUTION_MM).points) < 10
+    assert len(find_holes(depth_maps(HILLS), POSES, DETAIL_MM).points) < 10
 
 
 def test_holes_are_looked_for_once_and_again_when_the_depth_maps_have_changed(tmp_path: Path) -> None:
     maps = [without(each, 0.3) for each in depth_maps(HILLS)]
 
     def found(maps: list[DepthMap], digest: str) -> np.ndarray:
-        return find_holes_once(maps, digest, POSES, RESOLUTION_MM, tmp_path, FusionOptions()).points
+        return find_holes_once(maps, digest, POSES, DETAIL_MM, tmp_path, FusionOptions()).points
 
     first = found(maps, "a")
-    np.testing.assert_array_equal(first, find_holes(maps, POSES, RESOLUTION_MM).points)
+    np.testing.assert_array_equal(first, find_holes(maps, POSES, DETAIL_MM).points)
     np.testing.assert_array_equal(first, found([], "a"), "nothing is fused")
     assert len(found([], "b")) == 0
 

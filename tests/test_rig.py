@@ -9,7 +9,7 @@ from builders import THESIS_CAMERA, rig_of, shifted
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import essential_four, six_cameras, stereo_pair
-from cuspid.pairing import depth_step_mm, resolved_mm
+from cuspid.pairing import depth_step_mm, detail_mm, resolved_mm
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 from strategies import rigid3s
 
@@ -58,6 +58,10 @@ def test_what_a_handpiece_resolves_is_a_pixel_or_half_a_pixel_of_disparity():
     assert resolved_mm(wide) == pytest.approx(pixel_mm) == pytest.approx(depth_step_mm(wide) / 2)
     assert resolved_mm(narrow) == pytest.approx(5 * pixel_mm)
     assert resolved_mm(Handpiece(rig=rig_of(a=shifted(0)))) == pytest.approx(pixel_mm)
+    # Depth is known far better than to half a pixel, so that it spoils the detail only where cameras are very close.
+    assert detail_mm(wide) == pytest.approx(pixel_mm)
+    assert detail_mm(narrow) == pytest.approx(1.25 * pixel_mm)
+    assert detail_mm(Handpiece(rig=rig_of(a=shifted(0), b=shifted(1.0)))) == pytest.approx(pixel_mm)
 
 
 @given(st.permutations(["a", "b", "c", "d"]))

@@ -35,7 +35,7 @@ from cuspid.motion.location import MotionOptions
 from cuspid.motion.single import SingleOptions, locate_single
 from cuspid.motion.stage import MotionMethod, locate, take_poses
 from cuspid.options import SHARE, Options
-from cuspid.pairing import resolved_mm
+from cuspid.pairing import detail_mm
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
 from cuspid.rig import Handpiece
@@ -160,7 +160,7 @@ def surface(
     capture = replace(capture, handpiece=replace(capture.handpiece, rig=found.rig))
     if options.quality == "draft":
         capture = capture.halved()
-    lengths_mm = resolved_mm(capture.handpiece), capture.handpiece.working_distance_mm
+    lengths_mm = detail_mm(capture.handpiece), capture.handpiece.working_distance_mm
     agreement_mm = options.fusion.agreement * lengths_mm[0]
     depths = measure_enough_depth(
         *(capture, found, folder / "depth", options.stereo),

@@ -46,29 +46,30 @@ class FusionOptions(Options):
     """Fusion of depth maps into a mesh."""
 
     voxel_mm: Annotated[float | None, Range(0.001, 1000)] = None
-    """Spacing of the grid, about the spacing of the mesh's vertices; default: 4.16 resolutions of the handpiece, 0.05
-    mm for the built-in ones."""
+    """Spacing of the grid, about the spacing of the mesh's vertices; default: 4.16 times the detail that the
+    handpiece shows, 0.05 mm for the built-in ones."""
     truncation_voxels: Annotated[float, Range(1, 100)] = 3.0
     """Distance from a surface, in voxels, up to which depth maps are blended."""
     largest_jump: Annotated[float, Range(0.01, 10_000)] = 12.5
-    """Neighbouring depths that differ by more resolutions than this (0.15 mm at 12 um) do not belong to the same
-    surface."""
+    """Neighbouring depths that differ by more than this many times the detail (0.15 mm at 12 um) do not belong to the
+    same surface."""
     least_weight: Annotated[float, Range(0, 1_000_000)] = 0.01
     """Minimum weight (sum of confidences) for a voxel to count as observed."""
     agreement: Annotated[float, Range(0.01, 10_000)] = 6.65
-    """A depth map confirms a vertex within this many resolutions (0.08 mm at 12 um); nearer ones have more weight."""
+    """A depth map confirms a vertex within this many times the detail (0.08 mm at 12 um); nearer ones have more
+    weight."""
     least_maps: Annotated[int, Range(1, 10_000)] = 2
     """Number of depth maps that must confirm a vertex."""
 
-    def voxel_for(self, resolution_mm: float) -> float:
+    def voxel_for(self, detail_mm: float) -> float:
         """Spacing of the grid for a handpiece, mm."""
-        return 4.16 * resolution_mm if self.voxel_mm is None else self.voxel_mm
+        return 4.16 * detail_mm if self.voxel_mm is None else self.voxel_mm
 
 
 def fuse(
     depth_maps: Iterable[DepthMap],
     rig_from_world: Mapping[str, Rigid3],
-    resolution_mm: float,
+    detail_mm: float,
     options: FusionOptions | None = None,
     *,
     progress: Progress = silent,
@@ -76,18 +77,18 @@ def fuse(
     """One coloured mesh in the world frame from the depth maps of located frames; without faces if they contain
     nothing.
 
-    ``resolution_mm`` is what the handpiece resolves (:func:`cuspid.pairing.resolved_mm`), the unit of lengths.
+    ``detail_mm`` is the detail that the handpiece shows (:func:`cuspid.pairing.detail_mm`), the unit of lengths.
     ``depth_maps`` is iterated twice and may read its items lazily, so it must not be a generator, which is exhausted
     after the first pass. The maps of a frame must be consecutive. The same maps in the same order give the same mesh.
     """
     options = options or FusionOptions()
-    return _votes(depth_maps, rig_from_world, resolution_mm, options, "fusion", progress).outcome(options.least_maps)
+    return _votes(depth_maps, rig_from_world, detail_mm, options, "fusion", progress).outcome(options.least_maps)
 
 
 def find_holes(
     depth_maps: Iterable[DepthMap],
     rig_from_world: Mapping[str, Rigid3],
-    resolution_mm: float,
+    detail_mm: float,
     options: FusionOptions | None = None,
     *,
     progress: Progress = silent,
@@ -95,8 +96,8 @@ def find_holes(
     """Places on the rims of the holes of the mesh that :func:`fuse` would give on a grid of twice the spacing. Same
     arguments as there."""
     options = options or FusionOptions()
-    coarse = replace(options, voxel_mm=2 * options.voxel_for(resolution_mm))
-    votes = _votes(depth_maps, rig_from_world, resolution_mm, coarse, "holes", progress)
+    coarse = replace(options, voxel_mm=2 * options.voxel_for(detail_mm))
+    votes = _votes(depth_maps, rig_from_world, detail_mm, coarse, "holes", progress)
     mesh = votes.outcome(options.least_maps).mesh
     rims = hole_rims(mesh)
     return SurfacePoints(mesh.vertices[rims], mesh.vertex_normals[rims])
@@ -105,14 +106,14 @@ def find_holes(
 def _votes(
     depth_maps: Iterable[DepthMap],
     rig_from_world: Mapping[str, Rigid3],
-    resolution_mm: float,
+    detail_mm: float,
     options: FusionOptions,
     stage: str,
     progress: Progress,
 ) -> Votes:
     """What the depth maps say about the rough mesh that they blend to."""
-    voxel_mm = options.voxel_for(resolution_mm)
-    jump_mm, agreement_mm = options.largest_jump * resolution_mm, options.agreement * resolution_mm
+    voxel_mm = options.voxel_for(detail_mm)
+    jump_mm, agreement_mm = options.largest_jump * detail_mm, options.agreement * detail_mm
     volume = SparseVolume(voxel_mm, options.truncation_voxels * voxel_mm)
     half = len(rig_from_world)
 

@@ -30,7 +30,7 @@ def find_holes(
     depths: Iterable[DepthMap],
     made_from: str,
     rig_from_world: Mapping[str, Rigid3],
-    resolution_mm: float,
+    detail_mm: float,
     folder: Path,
     fusion: FusionOptions,
     *,
@@ -38,10 +38,10 @@ def find_holes(
 ) -> SurfacePoints:
     """Places on the rims of the holes found by :func:`cuspid.surface.fusion.find_holes`: ``holes.npz``. Same arguments
     as :func:`fuse`."""
-    stage, file = Stage("holes", folder, [fusion, resolution_mm], _CODE), folder / "holes.npz"
+    stage, file = Stage("holes", folder, [fusion, detail_mm], _CODE), folder / "holes.npz"
 
     def write() -> None:
-        holes = find_holes_of_depth_maps(depths, rig_from_world, resolution_mm, fusion, progress=progress)
+        holes = find_holes_of_depth_maps(depths, rig_from_world, detail_mm, fusion, progress=progress)
         write_surface_points(file, holes)
 
     stage.make({"depths": made_from, "poses": digest_of(dict(rig_from_world))}, [file], write)
@@ -52,7 +52,7 @@ def fuse(
     depths: Iterable[DepthMap],
     made_from: str,
     rig_from_world: Mapping[str, Rigid3],
-    resolution_mm: float,
+    detail_mm: float,
     working_distance_mm: float,
     folder: Path,
     fusion: FusionOptions,
@@ -65,15 +65,15 @@ def fuse(
     Also returns the standard deviation of each vertex along its normal (um): that of its depth and, if they are
     ``expected``, of the poses and the calibration.
 
-    ``made_from`` is the digest of the depth maps, which may be iterated more than once; ``resolution_mm`` is what the
-    handpiece resolves, ``working_distance_mm`` how far it is held from the teeth. Raises ReconstructionError where they
-    contain nothing.
+    ``made_from`` is the digest of the depth maps, which may be iterated more than once; ``detail_mm`` is the detail
+    that the handpiece shows, ``working_distance_mm`` how far it is held from the teeth. Raises ReconstructionError
+    where they contain nothing.
     """
-    stage = Stage("mesh", folder, [fusion, cleaning, resolution_mm, working_distance_mm], _CODE)
+    stage = Stage("mesh", folder, [fusion, cleaning, detail_mm, working_distance_mm], _CODE)
     files = [folder / name for name in ("mesh.json", "mesh.stl", "mesh.ply")]
 
     def write() -> None:
-        raw = fuse_depth_maps(depths, rig_from_world, resolution_mm, fusion, progress=progress)
+        raw = fuse_depth_maps(depths, rig_from_world, detail_mm, fusion, progress=progress)
         if not len(raw.mesh.faces):
             raise ReconstructionError(
                 "no surface: the depth maps are empty; the images need texture (spray, powder) or sharper focus"
