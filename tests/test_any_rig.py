@@ -16,6 +16,7 @@ from cuspid.capture import Capture, Frame
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.motion import MotionOptions, locate
+from cuspid.pairing import detail_mm, resolved_mm
 from cuspid.pipeline import ReconstructionOptions
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece, MountedCamera, Rig
@@ -65,6 +66,20 @@ def scan() -> Capture:
         for name, mounted in handpiece.rig.cameras.items()
     }
     return capture_of(handpiece, images)
+
+
+def far_scan() -> tuple[Capture, Mesh]:
+    """Three frames of the same cameras four times as far away, where depth is less certain than a pixel is wide."""
+    handpiece = replace(diamond(SIZE_PX), working_distance_mm=20.0, depth_range_mm=(14.0, 28.0))
+    hills = height_field(lambda x, y: 20 + 0.8 * np.sin(1.8 * x) * np.cos(1.5 * y), half_width_mm=16.0)
+    way = {frame: Rigid3(pose.rotation, 3 * pose.translation) for frame, pose in WAY.items()}
+    rng = np.random.default_rng(3)
+    images = {
+        (frame, name): render(hills, mounted, pose, rng, cell_mm=0.5)
+        for frame, pose in way.items()
+        for name, mounted in handpiece.rig.cameras.items()
+    }
+    return capture_of(handpiece, images), hills
 
 
 def capture_of(handpiece: Handpiece, images: Images) -> Capture:
@@ -172,6 +187,17 @@ def test_the_same_images_of_a_larger_rig_give_a_larger_scan(factor: float, folde
     assert len(reference.faces) > 4500
     check_poses(found, expected, factor)
     check_mesh(mesh, reference, factor)
+
+
+def test_a_rig_held_far_away_shows_what_its_pixels_see(folder: Path) -> None:
+    """Hills 4 mm apart under pixels of 0.15 mm: fused at half a pixel of disparity, 0.6 mm, they would be lost."""
+    capture, hills = far_scan()
+    assert detail_mm(capture.handpiece) == pytest.approx(0.15, abs=0.01)
+    assert resolved_mm(capture.handpiece) == pytest.approx(0.6, abs=0.01)
+    _, mesh = pipeline.reconstruct(capture, folder / "far", FIXED)
+    assert 0.02 < np.mean(hills.closest(mesh.vertices)[0]) < 0.08
+    seen = hills.vertices[np.abs(hills.vertices[:, :2]).max(axis=1) < 5]
+    assert (mesh.closest(seen)[0] < 0.15).mean() > 0.85
 
 
 @pytest.mark.parametrize("factor", FACTORS)

@@ -115,7 +115,7 @@ def test_without_blender_the_user_is_told_how_to_get_it(monkeypatch: pytest.Monk
     with pytest.raises(MissingDependencyError, match="not set up: make an environment"):
         render(scene)
     monkeypatch.setenv(blender.PYTHON_VARIABLE, "/nowhere/python")
-    with pytest.raises(MissingDependencyError, match="does not run"):
+    with pytest.raises(MissingDependencyError, match="cannot be run"):
         render(scene)
     monkeypatch.setenv(blender.PYTHON_VARIABLE, sys.executable)
     with pytest.raises(MissingDependencyError, match="cannot import bpy"):
@@ -125,7 +125,7 @@ def test_without_blender_the_user_is_told_how_to_get_it(monkeypatch: pytest.Monk
 def test_what_blender_cannot_do_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(blender.PYTHON_VARIABLE, "true")
     distorted = OFF_CENTRE.with_parameters(np.array([*OFF_CENTRE.parameters[:4], 0.1, 0, 0, 0]))
-    with pytest.raises(InputError, match="camera a: Blender has no such lens distortion"):
+    with pytest.raises(InputError, match="camera a: Blender cannot render this lens distortion"):
         render(scene_of([(box((1, 1, 1), (0, 0, 5)), 11)], distorted))
 
 

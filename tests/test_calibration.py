@@ -177,7 +177,7 @@ def test_cameras_that_saw_it_one_after_the_other_are_chained():
     found = calibrated(truth, {key: view for key, view in views.items() if key[0] in shown[key[1]]})
     assert all(np.linalg.norm(between(found, truth, name).translation) < 0.15 for name in names)
     apart = {key: view for key, view in views.items() if (key[0] in names[:2]) == (int(key[1]) % 2 == 0)}
-    with pytest.raises(ReconstructionError, match="cam0, cam1 and cam2, cam3 never saw the board at once"):
+    with pytest.raises(ReconstructionError, match="cam0, cam1 and cam2, cam3 never saw the board at the same time"):
         calibrated(truth, apart)
 
 
@@ -238,11 +238,13 @@ def test_a_camera_that_saw_no_board_is_refused_by_name():
         key: BoardView(view.corner, rng.uniform(0, 480, view.pixels.shape)) if key[0] == "cam2" else view
         for key, view in views.items()
     }
-    with pytest.raises(ReconstructionError, match="camera cam2: its views of the board fit no camera"):
+    with pytest.raises(ReconstructionError, match="camera cam2: no camera model fits its views of the board"):
         calibrated(truth, wild)
-    with pytest.raises(ReconstructionError, match=r"camera cam0: its views of the board fit no camera, by \d+ px"):
+    with pytest.raises(
+        ReconstructionError, match=r"camera cam0: no camera model fits its views of the board \(error \d+ px\)"
+    ):
         calibrated(truth, views_of(truth, BOARD, 20.0, rng))
-    with pytest.raises(ReconstructionError, match="camera cam0: its views of the board fit no camera"):
+    with pytest.raises(ReconstructionError, match="camera cam0: no camera model fits its views of the board"):
         calibrated(truth, {key: BoardView(view.corner[:8], view.pixels[:8]) for key, view in views.items()})
 
 
@@ -252,7 +254,9 @@ def test_cameras_that_were_not_triggered_together_are_refused():
     views = views_of(truth, BOARD, 0.1, np.random.default_rng(0))
     count = len(truth.rig_from_board)
     late = {(name, f"{(int(instant) + (name == 'cam1')) % count:02d}"): view for (name, instant), view in views.items()}
-    with pytest.raises(ReconstructionError, match=r"where cam1 is beside cam0, only \d+ of 16 instants agree"):
+    with pytest.raises(
+        ReconstructionError, match=r"only \d+ of 16 instants agree on the pose of cam1 relative to cam0"
+    ):
         calibrated(truth, late)
 
 
@@ -313,7 +317,7 @@ def test_a_search_that_did_not_end_is_told_of(monkeypatch):
     assert adjust_board(start, views, BOARD).settled
     monkeypatch.setattr(bundle, "_STEPS", 1)
     assert not adjust_board(start, views, BOARD).settled
-    assert any("did not come to its end" in note for note in calibrated(truth, views).notes)
+    assert any("did not converge" in note for note in calibrated(truth, views).notes)
 
 
 def test_too_few_views_are_refused():

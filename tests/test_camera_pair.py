@@ -153,7 +153,7 @@ def test_a_camera_in_the_tooth_sees_nothing(coarse_phantom):
         ({"baselines_mm": (0.0,)}, "baselines-mm is 0"),
         ({"distances_mm": ()}, "given"),
         ({"axis_angles_deg": (190.0,)}, "axis-angles-deg"),
-        ({"sensor": "iphone"}, "no sensor"),
+        ({"sensor": "iphone"}, "unknown sensor"),
         ({"budget_um": 0.0}, "budget"),
     ],
 )

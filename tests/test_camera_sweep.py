@@ -104,9 +104,9 @@ def test_every_setting_of_the_thesis_is_taken_for_a_pair(site, baseline, angle):
     [
         ({"surface": "incisal", "tooth": 47}, "tooth 47 has no incisal surface; it has occlusal, buccal, lingual"),
         ({"tooth": 48}, "no tooth 48"),
-        ({"distance_mm": 0.6, "depth_of_field_mm": 1.0}, "comes as near to the jaw|lies inside"),
-        ({"surface": "mesial"}, "comes as near to the jaw|lies inside"),
-        ({"path_mm": 9.0}, "frames consecutive images overlap by only"),
+        ({"distance_mm": 0.6, "depth_of_field_mm": 1.0}, "mm of the jaw|lies inside"),
+        ({"surface": "mesial"}, "mm of the jaw|lies inside"),
+        ({"path_mm": 9.0}, "frames, consecutive images overlap by only"),
     ],
 )
 def test_what_cannot_be_scanned_is_refused(coarse_phantom, change, message):

@@ -83,7 +83,7 @@ def test_a_handpiece_with_an_unknown_camera(tmp_path, capsys):
     message = refused(
         capsys, "reconstruct", tmp_path / "capture", "--handpiece", tmp_path / "other.json", "--out", tmp_path / "scan"
     )
-    assert "the folder b is no camera of the handpiece" in message
+    assert "no camera of the handpiece matches the folder b" in message
 
 
 def test_a_folder_that_holds_another_run(tmp_path, capsys):

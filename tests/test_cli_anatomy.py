@@ -105,7 +105,7 @@ def test_a_mean_needs_common_landmarks(tmp_path, capsys, coarse_phantom):
         bare = Jaw(mesh=coarse_phantom.mesh, arch="lower", landmarks=dict(some))
         storage.write_jaw(jaws / f"{name}.ply", bare)
     message = refused(capsys, "shape", jaws, "--out", tmp_path / "shape")
-    assert "2 landmarks are common" in message
+    assert "2 landmarks in common" in message
     assert not (tmp_path / "shape").exists()
 
 

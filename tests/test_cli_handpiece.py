@@ -55,7 +55,7 @@ def test_a_rig_of_colmap_is_simulated_and_what_is_assumed_is_said(tmp_path, phan
     short = ("--tooth", 46, "--frames", 2, "--length-mm", 1, "--supersampling", 1)
     run("simulate", phantom_file, "--handpiece", probe / "rig_config.json", *short, "--out", scan)
     notes = " ".join(capsys.readouterr().err.split())
-    assert "mm are guessed from their baselines" in notes
+    assert "mm is assumed, from their baselines" in notes
     assert "it has no lights; one beside each camera is assumed" in notes
     made = storage.read_handpiece(scan / "capture" / "handpiece.json")
     assert len(made.lights) == 2
@@ -65,7 +65,7 @@ def test_a_rig_of_colmap_is_simulated_and_what_is_assumed_is_said(tmp_path, phan
 def test_a_working_distance_is_not_given_twice(tmp_path, phantom_file, capsys):
     run("handpiece", "--design", "two", "--out", tmp_path)
     command = ("visibility", phantom_file, "--handpiece", tmp_path / "handpiece.json", "--out", tmp_path / "seen")
-    assert "has a working distance of its own" in refused(capsys, *command, "--working-distance-mm", 8)
+    assert "already has a working distance" in refused(capsys, *command, "--working-distance-mm", 8)
     assert "must lie between" in refused(capsys, *command, "--working-distance-mm", 0)
 
 

@@ -87,7 +87,7 @@ def test_a_truncated_video_gives_what_it_holds_and_says_so(tmp_path: Path) -> No
     video.write_bytes(data[: len(data) // 2])
     sequence = storage.read_sequence(video, tmp_path / "decoded")
     assert 10 < len(sequence) < 20
-    assert f"truncated, {len(sequence)} of 30 frames" in sequence.notes[0]
+    assert f"truncated, only {len(sequence)} of 30 frames" in sequence.notes[0]
 
 
 CAMERA = Camera(
@@ -128,4 +128,4 @@ def test_a_calibration_of_another_size_is_refused(tmp_path: Path, capsys: pytest
         storage.write_image(tmp_path / "frames" / f"{index}.png", picture(index, (320, 240)))
     calibration = write_calibration(tmp_path, "json")
     arguments = ["stitch", str(tmp_path / "frames"), "--out", str(tmp_path / "out"), "--calibration", str(calibration)]
-    assert "calibration of 160 x 120 px, but the frames have 320 x 240 px" in refused(capsys, *arguments)
+    assert "calibration is for 160 x 120 px, but the frames are 320 x 240 px" in refused(capsys, *arguments)

@@ -149,5 +149,5 @@ def test_a_jaw_without_it_is_scanned_all_the_same(caplog: pytest.LogCaptureFixtu
 def test_a_tooth_or_a_part_has_no_other_side(upper: Jaw, said: dict[str, int]) -> None:
     part = upper.mesh.face_centres[:, 0] > 8
     jaw = upper if said else replace(upper, mesh=upper.mesh.submesh(part), face_labels=upper.face_labels[part])
-    with pytest.raises(InputError, match="a tooth or a part of one; leave --cross-sweep out"):
+    with pytest.raises(InputError, match="a tooth or part of an arch; leave out --cross-sweep"):
         plan_scan_path(jaw, HANDPIECE, replace(SWEEP, **said), np.random.default_rng(0))

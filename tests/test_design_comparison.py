@@ -254,8 +254,8 @@ def test_the_verb_shows_what_is_done_without_scanning_again(files, tmp_path, cap
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (["--designs", "nine"], "no design 'nine'"),
-        (["--jaws", "nowhere.ply"], "no jaw 'nowhere.ply'"),
+        (["--designs", "nine"], "unknown design 'nine'"),
+        (["--jaws", "nowhere.ply"], "unknown jaw 'nowhere.ply'"),
         (["--turns", "2"], "must be odd"),
         (["--workers", "0"], "--workers is 0"),
     ],

@@ -154,9 +154,9 @@ def test_dropped_frames_are_told_by_number_and_right_by_time(tmp_path, probe, ca
         some = kept if camera == "right" else range(60)
         write_film(tmp_path / "footage" / f"{camera}.mkv", [images[k] for k in some], [40 * k for k in some])
     line = refused(capsys, "import", tmp_path / "footage", "--handpiece", probe, "--out", tmp_path / "by-name")
-    assert "frames were dropped, or the rates differ" in line
+    assert "frames were dropped, or the frame rates differ" in line
     capture = storage.read_capture(imported(tmp_path / "footage", probe, "--sync", "times"))
-    assert "right: frames are missing, time jumps before frame 20" in capsys.readouterr().err
+    assert "right: frames are missing; time jumps before frame 20" in capsys.readouterr().err
     assert len(capture.frames) == 60
     assert [frame.name for frame in capture.frames if "right" not in frame.cameras] == [
         f"{k:05d}" for k in range(20, 26)
@@ -229,7 +229,7 @@ def test_noise_and_other_motion_are_no_offset(seed, count):
     hands = [jerks(count, seed), jerks(count, seed + 20_000)]
     for one, other in (noise, hands):
         assert offset_between(one, other, OPTIONS).doubt is not None
-        with pytest.raises(InputError, match="no offset by motion can be trusted"):
+        with pytest.raises(InputError, match="no offset found from motion can be trusted"):
             motion_starts({"a": one, "b": other}, OPTIONS)
 
 
@@ -275,7 +275,7 @@ def test_a_flash_that_is_not_clear_is_refused(wrong):
         level[[20, 50]] += 80
     if wrong == "weak":
         level[20] += 6
-    with pytest.raises(InputError, match="one clear flash" if wrong == "two" else "no flash"):
+    with pytest.raises(InputError, match="no single clear flash" if wrong == "two" else "no flash"):
         flash_starts({"a": level}, OPTIONS)
 
 
@@ -477,7 +477,7 @@ def test_bad_footage_is_one_clear_line_and_nothing_is_written(tmp_path, probe, c
     assert "no folder of images and no video" in line(tmp_path / "empty")
     write_folders(tmp_path / "hole", {"left": short["left"]})
     (tmp_path / "hole" / "right").mkdir()
-    assert "right: no images in it" in line(tmp_path / "hole")
+    assert "right: it contains no images" in line(tmp_path / "hole")
     write_folders(tmp_path / "named", {"lefty": short["left"]})
     assert "no camera of the handpiece is named lefty; it has left, middle, right" in line(tmp_path / "named")
     write_films(tmp_path / "size", {"left": [image[:60, :80] for image in short["left"]]})
@@ -485,12 +485,12 @@ def test_bad_footage_is_one_clear_line_and_nothing_is_written(tmp_path, probe, c
     for said in (b"not a film", b"#EXTM3U\n#EXTINF:1,\nfile:///etc/passwd\n", b""):
         (tmp_path / "text").mkdir(exist_ok=True)
         (tmp_path / "text" / "left.mp4").write_bytes(said)
-        assert "no frame of it can be decoded" in line(tmp_path / "text")
+        assert "no frame can be decoded" in line(tmp_path / "text")
     footage = write_films(tmp_path / "footage", short)
     (footage / "times.csv").write_text("camera,frame\nleft,0\n")
     assert "needs one column 'time'" in line(footage)
     (footage / "times.csv").write_text("camera,frame,time\nother,0,1.0\n")
-    assert "camera 'other' is none of left, middle, right" in line(footage)
+    assert "unknown camera 'other'; the cameras are left, middle, right" in line(footage)
     (footage / "times.csv").write_text("camera,frame,time\nleft,0,nan\n")
     assert "line 2: time is nan" in line(footage)
 
@@ -509,16 +509,16 @@ def test_what_is_found_out_while_looking_is_one_clear_line(tmp_path, probe, caps
     (footage / "times.csv").write_text("\n".join(["camera,frame,time", *apart]))
     assert "no image of right was taken within" in line(footage, "--sync", "times")
     (footage / "times.csv").write_text("\n".join(["camera,frame,time", *rows, "left,9,0.9"]))
-    assert "the table of times has 7 frames of left" in line(footage)
+    assert "the table of times lists 7 frames of left" in line(footage)
     (footage / "times.csv").unlink()
     assert "no frame lies between 9 and inf s" in line(footage, "--start-s", 9)
-    assert "no image of 6 frames is of use: 18 dark" in line(footage, "--dark-below-dn", 255)
+    assert "no image of 6 frames is usable: 18 dark" in line(footage, "--dark-below-dn", 255)
     folders = write_folders(tmp_path / "folders", films)
-    assert "the frames have no times" in line(folders, "--end-s", 2)
+    assert "--start-s and --end-s need frame times" in line(folders, "--end-s", 2)
     assert "left: 0 of 6 frames have a time" in line(folders, "--sync", "times")
     for path in (folders / "right").iterdir():
         path.rename(path.with_stem(f"x{path.stem}"))
-    assert "right: no image has the name of one of another camera" in line(folders)
+    assert "right: no image shares its name with one of another camera" in line(folders)
     write_film(folders / "middle.mkv", films["middle"])
     for path in (folders / "middle").iterdir():
         path.unlink()

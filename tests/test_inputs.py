@@ -41,7 +41,7 @@ def test_a_file_is_as_large_as_its_kind_allows(tmp_path: Path) -> None:
     assert require_file(path, "text") == path
     with path.open("ab") as stream:
         stream.write(b" " * (1 << 20))
-    with pytest.raises(InputError, match="65 MiB are too much for text; at most 64 MiB"):
+    with pytest.raises(InputError, match=r"65 MiB is too large .*\(text\); the limit is 64 MiB"):
         read_text(path)
 
 
@@ -156,7 +156,7 @@ def test_measure_fails_where_nothing_was_measured(tmp_path: Path, capsys: pytest
     jaws = tmp_path / "jaws"
     jaws.mkdir()
     (jaws / "junk.stl").write_bytes(b"junk")
-    assert "none of 1 jaws can be measured; junk: " in refused(capsys, "measure", jaws, "--out", tmp_path / "out")
+    assert "none of the 1 jaws can be measured; junk: " in refused(capsys, "measure", jaws, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

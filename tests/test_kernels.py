@@ -69,3 +69,51 @@ def test_a_kernel_is_compiled_again_when_one_that_it_calls_has_changed(tmp_path:
     assert run(1).startswith("8 Counter()")
     assert run(1).startswith("8 Counter({")
     assert run(2).startswith("10 Counter()")
+
+
+SLOW = """
+from cuspid.kernels import kernel
+
+@kernel
+def inner(x):
+    return x + 1
+
+@kernel
+def outer(x):
+    total = 0.0
+    for k in range(9):
+        total += inner(x) ** k
+    return total
+
+outer(2.0)
+print(sum(outer.stats.cache_misses.values()) + sum(inner.stats.cache_misses.values()))
+"""
+WRONG = """
+from cuspid.kernels import kernel
+
+@kernel
+def wrong(x):
+    return x.nothing
+
+for k in (1, 2.0):
+    try:
+        wrong(k)
+    except Exception as error:
+        print(type(error).__name__)
+"""
+
+
+def test_processes_that_need_kernels_at_once_compile_them_once(tmp_path: Path) -> None:
+    (tmp_path / "slow.py").write_text(SLOW)
+    running = [
+        subprocess.Popen([sys.executable, tmp_path / "slow.py"], stdout=subprocess.PIPE, text=True) for _ in range(4)
+    ]
+    assert sorted(each.communicate(timeout=60)[0].strip() for each in running) == ["0", "0", "0", "2"]
+    assert [each.returncode for each in running] == [0] * 4
+
+
+def test_a_kernel_that_cannot_be_compiled_leaves_no_lock(tmp_path: Path) -> None:
+    (tmp_path / "wrong.py").write_text(WRONG)
+    for _ in range(2):
+        ended = subprocess.run([sys.executable, tmp_path / "wrong.py"], capture_output=True, text=True, timeout=60)
+        assert ended.stdout.split() == ["TypingError", "TypingError"]

@@ -180,7 +180,7 @@ def test_labels_are_checked_against_the_scheme():
         validate(["46.bucal_groove"], source="my.json")
     with pytest.raises(InputError, match=r"unknown landmark 'F-1'; a label is <FDI>.<point>"):
         validate(["F-1"])
-    with pytest.raises(InputError, match=r"'38.buccal_groove' is of no tooth of this jaw; it has 31, 32"):
+    with pytest.raises(InputError, match=r"'38.buccal_groove' belongs to no tooth of this jaw, which has 31, 32"):
         validate(["38.buccal_groove"], LOWER)
 
 

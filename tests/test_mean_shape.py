@@ -275,10 +275,10 @@ def _pair(base: Jaw, **changes: object) -> dict[str, Jaw]:
 
 def test_what_cannot_be_averaged_is_refused(base: Jaw) -> None:
     few = dict(list(base.landmarks.items())[:2])
-    with pytest.raises(InputError, match=r"2 landmarks are common.*two lacks .* more"):
+    with pytest.raises(InputError, match=r"2 landmarks in common.*two lacks .* more"):
         mean_shape(_pair(base, landmarks=few))
     line = {label: Landmark(np.array([k, 0.0, 0.0])) for k, label in enumerate(base.landmarks)}
-    with pytest.raises(InputError, match="line in two"):
+    with pytest.raises(InputError, match="collinear in two"):
         mean_shape(_pair(base, landmarks=line))
     with pytest.raises(InputError, match="one is a lower jaw and two an upper one"):
         mean_shape(_pair(base, arch="upper"))

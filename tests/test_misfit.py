@@ -24,7 +24,7 @@ def notes_of(found: Reconstruction) -> list[str]:
 def figures_of(note: str) -> tuple[float, str, float, float]:
     """Sigmas, the camera that is farthest, reprojection error now and as expected (px)."""
     sigmas, camera, now, left = re.search(
-        r"want it ([\d.]+) standard .* camera (\w+) farthest; reprojection ([\d.]+) px .* about ([\d.]+) px",
+        r"move it ([\d.]+) standard .* camera (\w+) the most; .* error is ([\d.]+) px .* about ([\d.]+) px",
         note,
     ).groups()
     return float(sigmas), camera, float(now), float(left)

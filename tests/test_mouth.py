@@ -137,11 +137,11 @@ def test_many_mouths_are_each_like_one() -> None:
 @pytest.mark.parametrize(
     ("values", "word"),
     [
-        ({"interincisal_mm": 190.0}, "no angle"),
-        ({"interincisal_mm": 5.0}, "no angle"),
+        ({"interincisal_mm": 190.0}, "no rotation"),
+        ({"interincisal_mm": 5.0}, "no rotation"),
         ({"interincisal_mm": -40.0}, "interincisal_mm"),
         ({"interincisal_mm": 40.0, "radius_mm": 0.0}, "radius_mm"),
-        ({"interincisal_mm": 40.0, "depth_mm": 95.0}, "deeper"),
+        ({"interincisal_mm": 40.0, "depth_mm": 95.0}, "distance to the incisors"),
         ({"interincisal_mm": 40.0, "path_mm": -1.0}, "path_mm"),
         ({"interincisal_mm": np.array([40.0, -1.0])}, "-1"),
     ],
@@ -213,7 +213,7 @@ def test_impossible_draws_are_counted_and_a_hopeless_population_refused() -> Non
     narrow = Normal(mean=14.0, sd=2.0, source="made up")
     people = draw_people(narrow, MouthOptions(people=1000, overlap=False), np.random.default_rng(0))
     assert 50 < people.left_out < 900
-    with pytest.raises(InputError, match="none of the drawn"):
+    with pytest.raises(InputError, match="none of the sampled"):
         draw_people(Normal(mean=300.0, sd=1.0, source="made up"), MouthOptions(people=10), np.random.default_rng(0))
 
 

@@ -164,7 +164,7 @@ def test_a_motion_with_which_few_matches_agree_is_none() -> None:
             pixels = seen[key].pixels.copy()
             pixels[mixed] = rng.permutation(pixels[mixed])
             seen[key] = replace(seen[key], pixels=pixels)
-    with pytest.raises(ReconstructionError, match="of its matches to its neighbours agree; too few of all"):
+    with pytest.raises(ReconstructionError, match="of its matches to its neighbours agree; too small a share"):
         locate_features(handpiece, seen, names, MotionOptions())
 
 
@@ -375,7 +375,7 @@ def test_where_no_patch_is_found_keypoints_are_taken(tmp_path: Path) -> None:
     found = locate_features(capture.handpiece, seen, list(path), MotionOptions(), read=read)
     assert found.frames == tuple(path)
     assert 0 < np.abs(errors(found, path)[:, 3:]).max() < 0.01
-    assert "1 frames (00001 first)" in "".join(found.notes)
+    assert "1 frames (first: 00001)" in "".join(found.notes)
     assert not locate(capture).notes
 
 
@@ -397,7 +397,7 @@ def test_what_single_cameras_tie_is_told():
     rig = Rig({"a": MountedCamera(CAMERA, Rigid3.identity()), "b": MountedCamera(CAMERA, Rigid3.identity())})
     poses = {f"{k:05d}": Rigid3.identity() for k in range(4)}
     (note,) = _loose_notes(Reconstruction(rig=rig, rig_from_world=poses, tracks=tracks), 15)
-    assert "tie frames 00001 and 00002 (0): the parts" in note
+    assert "connect frames 00001 and 00002 (0): parts" in note
     assert _loose_notes(Reconstruction(rig=rig, rig_from_world=poses, tracks=tracks), 0) == ()
 
 

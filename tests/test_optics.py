@@ -59,7 +59,7 @@ def test_diffraction_grows_with_the_f_number_and_near_objects():
     [
         ({"pixel_um": 0.0}, "must be positive"),
         ({"field_of_view_deg": 180.0}, "angle of view"),
-        ({"focus_mm": 0.3}, "inside its focal length"),
+        ({"focus_mm": 0.3}, "within its focal length"),
     ],
 )
 def test_impossible_optics_are_refused(change, message):

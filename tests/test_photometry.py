@@ -158,7 +158,7 @@ def test_lights_one_by_one_are_as_far_off_as_is_stated():
         case = rehearsal("one-by-one", seed)
         found = case.calibrated(DRAWN, found=shaken(case, seed))
         assert found.light_deviation_pct.max() < 1
-        assert not any("did not come to its end" in note for note in found.notes)
+        assert not any("did not converge" in note for note in found.notes)
         cameras.append(camera_errors(found, case.true))
         lights.append(light_errors(found, case.true))
         for name, light in found.lights.items():
@@ -178,8 +178,8 @@ def test_lights_all_at_once_are_hardly_told_apart():
     )
     assert 0.025 < sigma <= 0.05
     assert alone < 0.5 * sigma
-    assert any("their places cannot be told" in note for note in found.notes)
-    assert not any("their places cannot be told" in note for note in one_by_one.notes)
+    assert any("their positions cannot be determined" in note for note in found.notes)
+    assert not any("their positions cannot be determined" in note for note in one_by_one.notes)
 
 
 def test_noise_is_the_one_of_the_sensor():
@@ -280,11 +280,11 @@ def test_places_are_uniform_as_far_as_they_say(terraces):
 
 def test_burnt_out_images_are_told():
     found = Rehearsal(rehearsal("evenly", 0).true, "evenly", exposure=1.6).calibrated()
-    assert any("patches of paper are burnt out" in note for note in found.notes)
+    assert any("patches of paper are overexposed" in note for note in found.notes)
     dead = Rehearsal(replace(DRAWN, sensor=Sensor(noise_dn=0.0)), "evenly", exposure=100.0).calibrated(DRAWN)
     assert not dead.sensors
     assert dead.lights == DRAWN.lights
-    assert sum("too few to tell" in note for note in dead.notes) == 4
+    assert sum("too few to determine" in note for note in dead.notes) == 4
 
 
 def test_a_board_that_other_lights_lit_is_told():
@@ -294,14 +294,14 @@ def test_a_board_that_other_lights_lit_is_told():
     assert all(light is DRAWN.lights[name] for name, light in found.lights.items())
     for name, each in plain.sensors.items():
         assert found.sensors[name].falloff == pytest.approx(each.falloff)
-    assert any("light on the board may be anything" in note for note in plain.notes)
+    assert any("light on the board is unknown" in note for note in plain.notes)
 
 
 def test_gamma_is_told_only_where_lights_are_known():
     case = rehearsal("together", 0)
-    assert any("gamma cannot be told" in note for note in case.calibrated().notes)
+    assert any("gamma cannot be determined" in note for note in case.calibrated().notes)
     known = case.calibrated(DRAWN)
-    assert not any("gamma cannot be told" in note for note in known.notes)
+    assert not any("gamma cannot be determined" in note for note in known.notes)
     assert all(each.gamma_sigma_pct < 1 for each in known.cameras.values())
     held = case.calibrated(DRAWN, PhotometryOptions(gamma=2.0, gamma_pct=0.0))
     assert all(each.gamma == pytest.approx(2.0, rel=1e-3) for each in held.sensors.values())

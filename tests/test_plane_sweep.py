@@ -20,7 +20,7 @@ from cuspid.reconstruction import Tracks
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.height_map import HeightMap, HeightMapOptions, height_map, uncovered
 from cuspid.stitching.mosaic import MosaicOptions, compose
-from cuspid.stitching.plane_sweep import PlaneSweepOptions, partners, plane_sweep, semi_global
+from cuspid.stitching.plane_sweep import PlaneSweepOptions, frames_beside, partners, plane_sweep, semi_global
 
 HALF_MM, DEEP_MM, CAMERA_MM = 3.0, 4.0, 14.0
 """A bar of this half width along Y stands so high over a floor; the camera goes along it so high over its top."""
@@ -38,7 +38,9 @@ class Scene(NamedTuple):
 
     def swept(self, **changes: object) -> HeightMap | None:
         sparse = height_map(self.motion, HeightMapOptions())
-        return plane_sweep(self.motion, sparse, self.read, PlaneSweepOptions(**changes))
+        options = PlaneSweepOptions(**changes)
+        compared = frames_beside(self.motion, options.baseline_share)
+        return plane_sweep(self.motion, compared, sparse, self.read, options)
 
 
 def true_places(pose: Rigid3, pixels: np.ndarray) -> np.ndarray:

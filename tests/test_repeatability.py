@@ -121,7 +121,7 @@ def test_a_spread_needs_two_scans_and_a_common_place():
     with pytest.raises(InputError, match="at least two"):
         spread(mesh, asked, [mesh], PAIRS, rng=rng)
     sides = [mesh.submesh(sign * mesh.face_centres[:, 0] > 1) for sign in (1, -1)]
-    with pytest.raises(InputError, match="no place of the reference"):
+    with pytest.raises(InputError, match="no point of the reference"):
         spread(mesh, asked, sides, PAIRS, rng=rng)
     with pytest.raises(InputError, match="no face of the reference"):
         spread(mesh, ~asked, [mesh, mesh], PAIRS, rng=rng)

@@ -302,7 +302,7 @@ def test_what_a_folder_lacks_is_said(scan_folder):
     shutil.rmtree(scan_folder / "truth")
     shutil.rmtree(scan_folder / "capture")
     page = report_page(storage.read_result(scan_folder))
-    for missing in ("the reference", "where the cameras were", "the images"):
+    for missing in ("the reference", "the camera poses", "the images"):
         assert f"<li>{missing}" in page
     (scan_folder / "trueness.json").unlink()
     page = report_page(storage.read_result(scan_folder))
@@ -346,14 +346,14 @@ def test_a_folder_with_nothing_to_report(tmp_path, capsys, scan_folder):
     (tmp_path / "empty").mkdir()
     assert "nothing to report" in refused(capsys, "report", tmp_path / "empty")
     storage.claim_folder(tmp_path / "images", "simulate", {}, {})
-    assert "it holds simulate alone" in refused(capsys, "report", tmp_path / "images")
+    assert "it holds only simulate" in refused(capsys, "report", tmp_path / "images")
     storage.claim_folder(tmp_path / "killed", "reconstruct", {}, {})
-    assert "goes on where it stopped" in refused(capsys, "report", tmp_path / "killed")
+    assert "run the same command again to continue" in refused(capsys, "report", tmp_path / "killed")
     (scan_folder / "trueness.json").write_text("{")
     assert "not valid JSON" in refused(capsys, "report", scan_folder)
     for broken in ("[]", '{"reconstruct": 3}'):
         (tmp_path / "killed" / "run.json").write_text(broken)
-        assert "run.json: not what cuspid writes there" in refused(capsys, "report", tmp_path / "killed")
+        assert "run.json: not written by cuspid" in refused(capsys, "report", tmp_path / "killed")
     assert "--most-faces" in refused(capsys, "report", scan_folder, "--most-faces", 3)
     assert not list(tmp_path.glob("**/report.html"))
 

@@ -123,7 +123,7 @@ def test_the_part_that_touches_is_named() -> None:
     room = Room(plate(0.0, 20.0), CUBE, 0.5)
     check_clearance(room, {"00000": at(0, 0, 2.0)})
     with pytest.raises(
-        InputError, match=r"at frame 00001 the cube .* as near to the jaw as 0\.30 mm, and is to keep 0\.5"
+        InputError, match=r"at frame 00001 the cube .* comes within 0\.30 mm of the jaw, but must keep 0\.5"
     ):
         check_clearance(room, {"00000": at(0, 0, 2.0), "00001": at(0, 0, 1.3)})
 

@@ -75,7 +75,7 @@ def test_a_model_without_points_is_told() -> None:
     model = over_a_relief()
     none = np.zeros(0, np.int64)
     empty = replace(model.tracks, point_index=none, frame_index=none, camera_index=none, pixels=np.zeros((0, 2)))
-    with pytest.raises(ReconstructionError, match="nothing that several frames see"):
+    with pytest.raises(ReconstructionError, match="share no consistent points"):
         _ = replace(model, tracks=empty).depths
     with pytest.raises(ReconstructionError, match="no tracks to adjust"):
         adjust_model(replace(model, tracks=empty))

@@ -276,7 +276,7 @@ def test_a_sphere_that_the_scan_does_not_show_is_listed_with_the_reason(coarse_a
 
 
 def test_what_cannot_be_measured_is_refused_in_one_line(coarse_arch: Jaw) -> None:
-    with pytest.raises(InputError, match="reference has none"):
+    with pytest.raises(InputError, match="reference has no spheres"):
         evaluate_spheres(coarse_arch.mesh, replace(coarse_arch, spheres={}), Rigid3.identity())
     far = Rigid3(np.eye(3), np.array([0, 0, 50.0]))
     with pytest.raises(InputError, match="0 of 14") as caught:

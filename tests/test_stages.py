@@ -68,7 +68,7 @@ def test_a_damaged_result_is_made_again_and_told(maker: Maker, caplog: pytest.Lo
     maker.file.write_bytes(damage)
     with caplog.at_level(logging.INFO, logger="cuspid"):
         assert made_again(maker, stage)
-    assert "result.txt: damaged; it is made again" in caplog.text
+    assert "result.txt: damaged; making it again" in caplog.text
     assert not made_again(maker, stage)
 
 

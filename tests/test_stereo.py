@@ -232,7 +232,7 @@ def test_cameras_that_share_no_view_are_refused() -> None:
 def test_cameras_behind_each_other_are_refused() -> None:
     camera = Camera.from_field_of_view(100, 100, 62.0)
     behind = MountedCamera(camera, Rigid3(np.eye(3), np.array([0, 0, 1.0])))
-    with pytest.raises(InputError, match="behind each other"):
+    with pytest.raises(InputError, match="one behind the other"):
         rectify(("a", "b"), MountedCamera(camera, Rigid3.identity()), behind, 0.5)
 
 

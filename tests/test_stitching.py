@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cuspid import pipeline, storage
+from cuspid import storage
 from cuspid.camera import Camera
 from cuspid.capture import Capture
 from cuspid.cli import main
@@ -20,7 +20,8 @@ from cuspid.image_sequence import ImageSequence
 from cuspid.jaw import GUM, Jaw
 from cuspid.motion.single import SingleOptions, locate_single, mouth_share, normalise_contrast
 from cuspid.panorama import Panorama
-from cuspid.pipeline import RenderOptions, StitchOptions, take_images
+from cuspid.panorama_pipeline import StitchOptions, stitch
+from cuspid.pipeline import RenderOptions, take_images
 from cuspid.reconstruction import Tracks
 from cuspid.simulation.path.arch import arch_curve
 from cuspid.sparse_model import SparseModel
@@ -56,7 +57,7 @@ def sequence(film: tuple[Capture, GroundTruth], tmp_path_factory: pytest.TempPat
 
 @pytest.fixture(scope="module")
 def stitched(sequence: ImageSequence) -> Stitched:
-    (whole,) = pipeline.stitch(sequence, StitchOptions())
+    (whole,) = stitch(sequence, StitchOptions())
     return whole
 
 
@@ -142,7 +143,7 @@ def test_the_strip_is_as_long_as_the_way_of_the_camera(stitched: Stitched) -> No
 
 
 def test_two_runs_on_the_same_frames_are_alike(stitched: Stitched, sequence: ImageSequence) -> None:
-    (again,) = pipeline.stitch(sequence, StitchOptions())
+    (again,) = stitch(sequence, StitchOptions())
     assert stitched.motion is not None
     assert again.motion is not None
     for name, pose in stitched.motion.cam_from_world.items():
@@ -220,7 +221,7 @@ def test_two_films_are_stitched_as_two_parts(sequence: ImageSequence, tmp_path: 
     first = [sequence.image(index) for index in range(5)]
     second = [np.ascontiguousarray(sequence.image(index)[::-1]) for index in range(7, 12)]
     both = replace(images_in(tmp_path, first + second), camera=sequence.camera)
-    parts = pipeline.stitch(both, StitchOptions())
+    parts = stitch(both, StitchOptions())
     assert len(parts) == 2
     assert [part.panorama.part for part in parts] == [1, 2]
     assert all(part.panorama.parts == 2 for part in parts)

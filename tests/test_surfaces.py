@@ -165,7 +165,7 @@ def test_a_jaw_that_does_not_tell_how_its_arch_runs_is_refused(labels: list[int]
     box = trimesh.creation.box((8.0, 6.0, 7.0))
     face_labels = None if labels is None else np.full(len(box.faces), labels[0])
     jaw = Jaw(mesh=Mesh(np.asarray(box.vertices), np.asarray(box.faces)), face_labels=face_labels)
-    with pytest.raises(InputError, match="two at least are needed"):
+    with pytest.raises(InputError, match="at least two are needed"):
         named_surfaces(jaw)
 
 

@@ -85,7 +85,7 @@ def test_the_strip_folds_onto_the_terraces(tmp_path, inverted):
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ({"terraces": 5, "columns": 9}, "5 terraces need 10 columns at least, but it has 9"),
+        ({"terraces": 5, "columns": 9}, "5 terraces need at least 10 columns, but it has 9"),
         ({"terraces": 2, "kind": "chessboard"}, "a chessboard must be flat"),
         ({"terraces": 0}, "--terraces is 0"),
         ({"terraces": 2, "step_mm": 0.0}, "--step-mm is 0"),
@@ -99,7 +99,7 @@ def test_what_cannot_be_built_is_refused(given, told):
 def test_steps_that_reach_the_cameras_are_one_line(tmp_path, capsys):
     storage.write_handpiece(tmp_path / "four.json", essential_four())
     tall = ("photograph", tmp_path / "four.json", "--out", tmp_path / "out", "--terraces", 3, "--step-mm", 2)
-    assert "the last terrace is 4 mm over the first, which is too near the cameras" in refused(capsys, *tall)
+    assert "the last terrace is 4 mm above the first, which is too close to the cameras" in refused(capsys, *tall)
     assert not (tmp_path / "out").exists()
 
 

@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from builders import write_frames
-from cuspid import cli, pipeline, storage
+from cuspid import cli, storage
 from cuspid.camera import Camera
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.panorama import Panorama
-from cuspid.pipeline import StitchOptions
+from cuspid.panorama_pipeline import StitchOptions, stitch
 from cuspid.stitching.examination import ExaminationOptions, examine, frame_corners, inner_angles_deg, warp
 from cuspid.stitching.normal_map import normal_map, rectify
 from cuspid.stitching.placing import Canvas, Placed, frame_pixels, stretch
@@ -269,7 +269,7 @@ def cut(wall: np.ndarray, shift: np.ndarray) -> np.ndarray:
 def stitched(folder: Path, examination: bool = True, **options: object) -> tuple[Panorama, ...]:
     sequence = storage.read_sequence(folder, folder / "decoded")
     chosen = StitchOptions(method="thesis", examination=examination, thesis=ThesisOptions(**options))
-    return tuple(part.panorama for part in pipeline.stitch(sequence, chosen))
+    return tuple(part.panorama for part in stitch(sequence, chosen))
 
 
 def errors_px(panorama: Panorama, shifts: np.ndarray) -> np.ndarray:
@@ -341,7 +341,7 @@ def test_the_lens_is_taken_into_account(wall: np.ndarray, tmp_path: Path) -> Non
     ideal = replace(camera, distortion=np.zeros(4)).project(rays).astype(np.float32) - np.float32(0.5)
     frames = [cv2.remap(wall, ideal + shift.astype(np.float32), None, cv2.INTER_LINEAR) for shift in SHIFTS[:3]]
     sequence = storage.read_sequence(write_frames(tmp_path / "frames", frames), tmp_path / "decoded")
-    (part,) = pipeline.stitch(replace(sequence, camera=camera), StitchOptions(method="thesis"))
+    (part,) = stitch(replace(sequence, camera=camera), StitchOptions(method="thesis"))
     seen = part.panorama.frame_index >= 0
     straight = replace(camera, distortion=np.zeros(4)).project(
         camera.rays(part.panorama.frame_pixel[seen].astype(float))

@@ -26,7 +26,7 @@ GOOD_NAMES = ["o1", "o1+", "left eye", "Kamera-ä", "rig/left", "frame_00001.5",
 
 @pytest.mark.parametrize("bad", [*BAD_NAMES, None, 3, ["a"]])
 def test_what_could_leave_the_folder_is_no_name(bad):
-    with pytest.raises(InputError, match="cannot be a name") as caught:
+    with pytest.raises(InputError, match="cannot be used as a name") as caught:
         checked_name("rig.json: cameras", bad)
     assert str(caught.value).isprintable()
 
@@ -103,9 +103,9 @@ def test_long_values_are_cut_short():
 @pytest.mark.parametrize("bad", BAD_NAMES)
 def test_cameras_and_frames_have_names(bad):
     mounted = next(iter(twelve_cameras().rig.cameras.values()))
-    with pytest.raises(InputError, match="cannot be a name"):
+    with pytest.raises(InputError, match="cannot be used as a name"):
         Rig({bad: mounted})
-    with pytest.raises(InputError, match="cannot be a name"):
+    with pytest.raises(InputError, match="cannot be used as a name"):
         Frame(name=bad, cameras=())
 
 

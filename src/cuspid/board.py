@@ -62,7 +62,7 @@ class Board(Options):
             raise InputError("board: a chessboard must be flat; terraces need the kind charuco")
         if 2 * self.terraces > self.columns:
             raise InputError(
-                f"board: {self.terraces} terraces need {2 * self.terraces} columns at least, but it has {self.columns}"
+                f"board: {self.terraces} terraces need at least {2 * self.terraces} columns, but it has {self.columns}"
             )
 
     @property

@@ -67,7 +67,9 @@ def image_size(path: Path) -> tuple[int, int]:
             stream.seek(max(0, path.stat().st_size - len(PNG_END)))
             end = stream.read()
     except Image.DecompressionBombError as error:
-        raise InputError(f"{path}: too many pixels; at most {2 * (Image.MAX_IMAGE_PIXELS or 0):,} are read") from error
+        raise InputError(
+            f"{path}: too many pixels; at most {2 * (Image.MAX_IMAGE_PIXELS or 0):,} can be read"
+        ) from error
     except UnidentifiedImageError as error:
         raise InputError(f"{path}: not an image, or truncated; copy the image again") from error
     except OSError as error:

@@ -66,7 +66,9 @@ class Rigid3:
         object.__setattr__(self, "rotation", read_only(np.asarray(self.rotation, dtype=np.float64)))
         object.__setattr__(self, "translation", read_only(np.asarray(self.translation, dtype=np.float64)))
         if not _is_rotation(self.rotation):
-            raise InputError(f"rigid motion: {shown(self.rotation)} is not a rotation, a 3 x 3 matrix without scale")
+            raise InputError(
+                f"rigid motion: {shown(self.rotation)} is not a rotation; it must be a 3 x 3 matrix without scale"
+            )
         if self.translation.shape != (3,) or not np.isfinite(self.translation).all():
             raise InputError(f"rigid motion: its translation is {shown(self.translation)}; it must be 3 finite numbers")
 

@@ -42,5 +42,5 @@ class ImageSequence:
         """RGB image of a frame. Raises InputError where the file is missing, damaged, or of another size."""
         image = read_image(self.paths[index])
         if image.shape[1::-1] != self.size:
-            raise InputError(f"{self.paths[index]}: changed its size while it was used; start again")
+            raise InputError(f"{self.paths[index]}: its size changed while it was in use; start again")
         return image

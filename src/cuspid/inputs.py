@@ -32,7 +32,10 @@ def require_file(path: Path, kind: Kind) -> Path:
         what = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe or a device"
         raise InputError(f"{path}: is {what}; give a file")
     if found.st_size > LARGEST_MIB[kind] << 20:
-        raise InputError(f"{path}: {found.st_size >> 20} MiB are too much for {kind}; at most {LARGEST_MIB[kind]} MiB")
+        raise InputError(
+            f"{path}: {found.st_size >> 20} MiB is too large for this kind of file ({kind}); "
+            f"the limit is {LARGEST_MIB[kind]} MiB"
+        )
     return path
 
 
@@ -49,4 +52,4 @@ def read_text(path: Path) -> str:
     try:
         return read_bytes(path, "text").decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a file of text in UTF-8") from error
+        raise InputError(f"{path}: not a UTF-8 text file") from error

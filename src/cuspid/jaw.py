@@ -83,7 +83,7 @@ class Jaw:
             object.__setattr__(self, "face_labels", read_only(np.asarray(self.face_labels, dtype=np.int64)))
             if len(self.face_labels) != len(self.mesh.faces):
                 raise InputError(
-                    f"jaw: {len(self.face_labels)} labels for {len(self.mesh.faces)} faces; one for each is needed"
+                    f"jaw: {len(self.face_labels)} labels for {len(self.mesh.faces)} faces; each face needs exactly one"
                 )
 
     @property

@@ -5,18 +5,25 @@ numba keeps the machine code of a function in numbered files, with an index that
 loads what the index names unchecked, although two processes that compile at the same time may have written each
 other's numbers (numba issue 10128 is such a case), and although a function that is called, and so compiled into it, may
 have changed in another module. Either gives wrong results silently. Here each piece of compiled code records what it
-was compiled from, and is used only if that is what is wanted.
+was compiled from, and is used only if that is what is wanted; and processes that need the same kernel at the same time
+wait for the one that compiles it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial, wraps
+from pathlib import Path
 from typing import Any
 
+from filelock import FileLock
 from numba import njit
 from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
+
+_LONGEST_WAIT_S = 120.0
 
 
 def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
@@ -26,7 +33,19 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     compiled = njit(nogil=True, error_model="numpy", **options)(function)
     if isinstance(compiled, Dispatcher):  # otherwise numba is told not to compile
         compiled._cache = _KernelCache(function)  # type: ignore[attr-defined]
+        compiled.compile = _one_at_a_time(compiled.compile, compiled._cache)  # type: ignore[attr-defined,method-assign]
     return compiled
+
+
+def _one_at_a_time(compile_for: Callable[..., Any], cache: _KernelCache) -> Callable[..., Any]:
+    """``Dispatcher.compile``, which takes what is on disk or compiles and stores it, in one process at a time."""
+
+    @wraps(compile_for)
+    def locked(signature: object) -> Any:
+        with cache.locked():
+            return compile_for(signature)
+
+    return locked
 
 
 class _KernelCache(FunctionCache):  # type: ignore[misc]
@@ -40,6 +59,17 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]
         self._cache_file = CheckedFile(
             cache_path=self._cache_path, filename_base=self._impl.filename_base, source_stamp=self.stamp
         )
+        path = Path(self._cache_path) / f"{self._impl.filename_base}.lock"
+        self._lock = FileLock(path, timeout=_LONGEST_WAIT_S, thread_local=False)
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Let no other thread or process compile this kernel; where files cannot be locked, no other thread."""
+        with global_compiler_lock, ExitStack() as stack:  # in this order: a thread that compiles may wait for files
+            with suppress(OSError):
+                self._impl.locator.ensure_cache_path()
+                stack.enter_context(self._lock)
+            yield
 
 
 class CheckedFile(IndexDataCacheFile):  # type: ignore[misc]

@@ -100,7 +100,7 @@ class Mesh:
         if self.colors is not None:
             object.__setattr__(self, "colors", read_only(np.asarray(self.colors, dtype=np.uint8)))
         if self.faces.size and (self.faces.min() < 0 or self.faces.max() >= len(self.vertices)):
-            raise InputError(f"mesh: a face names a vertex outside 0..{len(self.vertices) - 1}")
+            raise InputError(f"mesh: a face refers to a vertex outside 0..{len(self.vertices) - 1}")
 
     @property
     def face_cross(self) -> Float[np.ndarray, "f 3"]:

@@ -65,13 +65,13 @@ def guess_working_distance_mm(rig: Rig) -> tuple[float, str]:
     """
     pairs = stereo_pairs(rig, 1.0, PairingOptions(minimum_overlap=0.0))
     if not pairs:
-        raise InputError("the cameras do not tell the working distance: no two of them look the same way")
+        raise InputError("the working distance cannot be told from the cameras: no two of them look the same way")
     if min(rig.angle_deg(*pair) for pair in pairs) >= _CONVERGING_DEG:
         distance_mm, source = float(np.median([_meeting_mm(rig, *pair) for pair in pairs])), "where their axes meet"
     else:
         distance_mm, source = _sharing_mm(rig, pairs), "their baselines"
     if not 0 < distance_mm < np.inf:
-        raise InputError("the cameras do not tell the working distance: no two of them look at the same place")
+        raise InputError("the working distance cannot be told from the cameras: no two of them look at the same place")
     return distance_mm, source
 
 

@@ -1,4 +1,4 @@
-"""The whole pipeline. Each verb reads and writes folders (docs/formats.md) and resumes where it stopped.
+"""The whole pipeline of a scan. Each verb reads and writes folders (docs/formats.md) and resumes where it stopped.
 
 handpiece            = DESIGNS["twelve"](DesignOptions())
 capture, truth       = simulate(jaw, handpiece, folder, ...)        images, and what only the simulator knows
@@ -6,9 +6,8 @@ reconstruction       = locate(capture, folder, ...)                 metric poses
 depths               = measure_depth(capture, folder, ...)          frame by frame, from the rig alone
 mesh                 = fuse(depths, ...)
 trueness             = evaluate(mesh, truth.jaw, ...)
-panorama             = stitch(frames, ...)
 
-``measure_depth``, ``locate``, ``fuse`` and ``stitch`` see only images and calibration.
+``measure_depth``, ``locate`` and ``fuse`` see only images and calibration. Panoramas: ``panorama_pipeline``.
 """
 
 from __future__ import annotations
@@ -28,23 +27,19 @@ from cuspid.capture import Capture
 from cuspid.evaluation.crown import OpenCrown, open_parts, pieces
 from cuspid.evaluation.deviation import EvaluationOptions, evaluate
 from cuspid.geometry import Rigid3
-from cuspid.image_sequence import ImageSequence
 from cuspid.jaw import GUM, Arch, Jaw
 from cuspid.mesh import Mesh
 from cuspid.motion.location import MotionOptions
-from cuspid.motion.single import SingleOptions, locate_single
 from cuspid.motion.stage import MotionMethod, locate, take_poses
 from cuspid.options import SHARE, Options
 from cuspid.pairing import detail_mm
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
 from cuspid.rig import Handpiece
-from cuspid.simulation.stage import FilmOptions, RenderOptions, SimulationOptions, film, simulate, take_images
+from cuspid.simulation.stage import RenderOptions, SimulationOptions, simulate, take_images
 from cuspid.stereo.matching import StereoOptions
 from cuspid.stereo.stage import StoredDepthMaps, measure_depth, measure_enough_depth, measure_temporal_depth
 from cuspid.stereo.temporal import TemporalOptions
-from cuspid.stitching.ortho import OrthoOptions, Stitched, orthophoto
-from cuspid.stitching.thesis_method import ThesisOptions, stitch_as_thesis
 from cuspid.surface.cleaning import CleaningOptions
 from cuspid.surface.fusion import FusionOptions
 from cuspid.surface.stage import find_holes, fuse
@@ -54,15 +49,12 @@ from cuspid.visibility import VisibilityOptions, scannable_faces
 
 __all__ = [
     "EvaluationOptions",
-    "FilmOptions",
     "ReconstructionOptions",
     "Reference",
     "RenderOptions",
     "SimulationOptions",
-    "StitchOptions",
     "crown_surface",
     "evaluate",
-    "film",
     "fuse",
     "load_reference",
     "locate",
@@ -72,7 +64,6 @@ __all__ = [
     "reconstruct",
     "scannable",
     "simulate",
-    "stitch",
     "take_images",
 ]
 
@@ -220,41 +211,6 @@ def as_known(handpiece: Handpiece, options: ReconstructionOptions) -> Handpiece:
     if options.calibration == "fixed":
         return held(handpiece)
     return options.nominal.of(handpiece).fill(handpiece)
-
-
-@dataclass(frozen=True, kw_only=True)
-class StitchOptions(OrthoOptions):
-    """How the frames of one hand-held camera become a panorama."""
-
-    method: Literal["ortho", "thesis"] = "ortho"
-    """ortho: frames located by structure from motion and rectified on the surface. thesis: chapter 4 of the thesis,
-    homographies chained from normal map to normal map, as a baseline. PATENT NOTICE: the method thesis appears to be
-    claimed by US 11,044,400; check the law where you are before you use it. The method ortho does not use it."""
-    motion: SingleOptions = field(default_factory=SingleOptions)
-    """How the trajectory of the camera is found (method ortho)."""
-    examination: bool = True
-    """Leave out frames that fail the examination of the thesis (method thesis)."""
-    thesis: ThesisOptions = field(default_factory=ThesisOptions)
-    """Settings of the method thesis."""
-
-
-def stitch(sequence: ImageSequence, options: StitchOptions, *, progress: Progress = silent) -> tuple[Stitched, ...]:
-    """The panorama of an arch from the frames of one camera; several parts where the sequence broke, largest first.
-
-    Raises ReconstructionError, naming the frames, where nothing can be placed.
-    """
-    if options.method == "thesis":
-        panoramas = stitch_as_thesis(sequence, options.thesis, examination=options.examination, progress=progress)
-        return tuple(Stitched(panorama=panorama, motion=None, strip=None) for panorama in panoramas)
-    motion = locate_single(sequence, options.motion, progress=progress)
-    notes = (*sequence.notes, *motion.notes)
-    parts: list[Stitched] = []
-    for number, located in enumerate(motion.parts, start=1):
-        frames = motion.frames_of(number - 1)
-        part = orthophoto(sequence, located, frames, options, progress=progress)
-        numbered = replace(part.panorama, part=number, parts=len(motion.parts), notes=(*notes, *part.panorama.notes))
-        parts.append(replace(part, panorama=numbered))
-    return tuple(parts)
 
 
 # --- What a scan is compared with ------------------------------------------------------------------------------------

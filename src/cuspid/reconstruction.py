@@ -97,8 +97,8 @@ class Refinement:
         """One line for the user."""
         name, most = max(self.camera_sigmas.items(), key=lambda item: item[1])
         return (
-            f"refined, {self.rms_sigmas:.2f} of its standard deviations from the file (root mean square; camera {name} "
-            f"{most:.2f})"
+            f"refined by {self.rms_sigmas:.2f} of its standard deviations from the file (root mean square; at most "
+            f"{most:.2f}, for camera {name})"
         )
 
 

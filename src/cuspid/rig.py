@@ -288,7 +288,7 @@ class Handpiece:
         object.__setattr__(self, "sensors", MappingProxyType(dict(self.sensors)))
         strange = set(self.sensors) - set(self.rig.names)
         if strange:
-            raise InputError(f"handpiece: sensors of unknown cameras {one_line(', '.join(sorted(strange)))}")
+            raise InputError(f"handpiece: sensors are given for unknown cameras {one_line(', '.join(sorted(strange)))}")
         unknown = {light for lighting in self.lightings for light in lighting.lights} - set(self.lights)
         if unknown:
             raise InputError(f"handpiece: lighting patterns name unknown lights {one_line(', '.join(sorted(unknown)))}")

@@ -174,7 +174,7 @@ def room_about(mesh: Mesh, handpiece: Handpiece, clearance_mm: float) -> Room:
         camera, led = (" x ".join(f"{side:.1f}" for side in size) for size in (CAMERA_MM, LED_MM))
         _LOG.info(
             f"{handpiece.name}: its body is not known; a box of {camera} mm is assumed behind each lens and one of "
-            f"{led} mm behind each LED; a body in its handpiece.json sets others (docs/formats.md)"
+            f"{led} mm behind each LED; to change them, add a body to its handpiece.json (docs/formats.md)"
         )
     return Room(mesh, handpiece.solid, clearance_mm)
 
@@ -184,10 +184,10 @@ def check_clearance(room: Room, poses: Mapping[str, Rigid3]) -> None:
     for frame, rig_from_world in poses.items():
         distance, part = room.clearance(rig_from_world)
         if distance < room.clearance_mm:
-            where = "lies inside the jaw" if distance == -np.inf else f"comes as near to the jaw as {distance:.2f} mm"
+            where = "lies inside the jaw" if distance == -np.inf else f"comes within {distance:.2f} mm of the jaw"
             raise InputError(
                 f"scan path: at frame {frame} the {part} of the handpiece {where}, "
-                f"and is to keep {room.clearance_mm:g} mm"
+                f"but must keep {room.clearance_mm:g} mm away"
             )
 
 

@@ -46,7 +46,7 @@ class SparseModel:
         if there is none."""
         tracks = self.tracks
         if not len(tracks.point_index):
-            raise ReconstructionError("motion: nothing that several frames see is consistent; more detail is needed")
+            raise ReconstructionError("motion: the frames share no consistent points; more surface detail is needed")
         axes = np.stack([pose.rotation[2] for pose in self.cam_from_world.values()])
         shifts = np.array([pose.translation[2] for pose in self.cam_from_world.values()])
         along = np.einsum("oj,oj->o", axes[tracks.frame_index], tracks.points[tracks.point_index])

@@ -32,7 +32,7 @@ def checked_name(what: str, value: object) -> str:
     character that some system does not allow in file names.
     """
     if not (isinstance(value, str) and len(value) <= _LONGEST_NAME and all(map(_can_be_a_file, value.split("/")))):
-        raise InputError(f"{what}: {shown(value)} cannot be a name; use letters, digits, - and _")
+        raise InputError(f"{what}: {shown(value)} cannot be used as a name; use letters, digits, - and _")
     return value
 
 
@@ -84,12 +84,12 @@ def covariance(what: str, value: Any, size: int) -> Float[np.ndarray, "n n"]:
     """A covariance matrix: symmetric, without a negative eigenvalue. Raises InputError otherwise."""
     found = numbers(what, value, (size, size), -math.inf, math.inf)
     if not np.isfinite(found).all():
-        raise InputError(f"{what} is not finite; leave it out where it is not known")
+        raise InputError(f"{what} is not finite; leave it out if it is unknown")
     eigenvalues = np.linalg.eigvalsh((found + found.T) / 2)
     if not np.allclose(found, found.T, rtol=0, atol=_ROUNDING * np.abs(found).max()) or eigenvalues[
         0
     ] < -_ROUNDING * abs(eigenvalues[-1]):
-        raise InputError(f"{what} is no covariance: it must be symmetric, without negative eigenvalues")
+        raise InputError(f"{what} is not a covariance matrix: it must be symmetric, without negative eigenvalues")
     return found
 
 

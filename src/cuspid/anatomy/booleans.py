@@ -74,9 +74,9 @@ def subtract(mesh: Mesh, tools: list[tuple[Tool, list[Mesh]]], names: list[str])
             cutter -= stop
         before, result = result.volume(), result - cutter
         if result.status() != manifold3d.Error.NoError or result.is_empty():
-            raise InputError(f"{names[index]}: the boolean left nothing ({result.status().name}); reduce less")
+            raise InputError(f"{names[index]}: nothing is left after the boolean ({result.status().name}); reduce less")
         if before - result.volume() < 1e-6:
-            raise InputError(f"{names[index]}: the preparation takes nothing away; make it deeper")
+            raise InputError(f"{names[index]}: the preparation removes nothing; make it deeper")
     largest = max(result.decompose(), key=lambda part: part.volume())
     out = largest.to_mesh64()
     runs = np.repeat([origin[run] for run in out.run_original_id], run_lengths(out))

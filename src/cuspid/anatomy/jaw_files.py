@@ -45,7 +45,7 @@ def jaw_files(folder: Path) -> list[Path]:
         return [folder]
     found = sorted(path for path in folder.glob("*") if path.suffix.lower() in MESH_SUFFIXES)
     if not found:
-        raise InputError(f"{folder}: no jaw meshes in it; give a folder with STL, PLY or OBJ files")
+        raise InputError(f"{folder}: there are no jaw meshes in it; give a folder with STL, PLY or OBJ files")
     return found
 
 
@@ -71,5 +71,5 @@ def load_landmarked_jaw(
     if jaw.face_labels is not None and missing(jaw.landmarks, jaw.teeth):
         jaw = with_estimates(jaw)
     if not jaw.landmarks:
-        raise InputError(f"{path}: neither landmarks nor tooth labels; give a landmark file or a labelled mesh")
+        raise InputError(f"{path}: it has neither landmarks nor tooth labels; give a landmark file or a labelled mesh")
     return jaw, notes

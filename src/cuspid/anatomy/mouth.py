@@ -67,12 +67,13 @@ class Mouth:
         for name in ("interincisal_mm", "radius_mm", "depth_mm"):
             _check(np.asarray(getattr(self, name)) > 0, getattr(self, name), f"{name} is {{:g}}; it must be positive")
         _check(np.asarray(self.path_mm) >= 0, self.path_mm, "path_mm is {:g}; it must not be negative")
-        deeper = "depth_mm is {:g}; the occlusal plane cannot lie deeper than the incisors are away (radius_mm)"
+        deeper = "depth_mm is {:g}; it must be less than the distance to the incisors (radius_mm)"
         _check(np.asarray(self.depth_mm) < self.radius_mm, self.depth_mm, deeper)
         _check(
             np.isfinite(self.turn_rad),
             self.opening_mm,
-            "no angle opens the incisors by {:g} mm; less than the condyles slide, or more than the jaw is long",
+            "no rotation opens the incisors by {:g} mm; it is less than the condyles slide, or more than the length of "
+            "the jaw",
         )
 
     @property
@@ -332,7 +333,7 @@ def draw_people(
     good = np.isfinite(opening_turn_rad(interincisal + overlap, radius, depth, path, slope))
     good &= (np.minimum.reduce([interincisal, depth, molar]) > 0) & (path >= 0)
     if not good.any():
-        raise InputError("mouth: none of the drawn people is possible; the distributions do not belong together")
+        raise InputError("mouth: none of the sampled people is possible; the distributions do not fit together")
     mouth = Mouth(
         interincisal_mm=interincisal[good],
         radius_mm=radius[good],

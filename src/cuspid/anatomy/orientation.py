@@ -123,7 +123,9 @@ def _upright(mesh: Mesh) -> tuple[Rigid3, tuple[str, ...]]:
     rough = [_roughness(_relief(mesh, side)) for side in sides]
     best = int(np.argmax(rough))
     sure = rough[best] > 1.3 * rough[1 - best]
-    notes = () if sure else ("occlusal frame: unsure which side the crowns are on, both are rough; check the picture",)
+    notes = (
+        () if sure else ("occlusal frame: unsure which side the crowns are on, as both are rough; check the picture",)
+    )
     return sides[best], notes
 
 
@@ -210,7 +212,7 @@ def _anterior(crowns: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "2"],
     best = int(np.argmin(misfits))
     rivals = misfits[directions @ directions[best] < np.cos(np.deg2rad(60))]
     sure = misfits[best] < _ARCH_MISFIT_MM and (len(rivals) == 0 or misfits[best] < 0.85 * rivals.min())
-    note = "occlusal frame: unsure which way is anterior, this does not look like a whole arch; check the picture"
+    note = "occlusal frame: unsure which way is anterior, as this does not look like a whole arch; check the picture"
     return _midline(places, directions[best]), () if sure else (note,)
 
 
@@ -275,10 +277,10 @@ def check_scale(mesh: Mesh, unit: Unit = "mm") -> tuple[str, ...]:
     lower, upper = _JAW_MM
     measured = f"the mesh is {width_mm:.3g} mm wide (--unit {unit}); a jaw is {lower:g}-{upper:g} mm wide"
     if _PART_MM < width_mm < 1.5 * upper:
-        return () if lower < width_mm < upper else (f"scale: {measured}, if this is not a part of one",)
+        return () if lower < width_mm < upper else (f"scale: {measured}, unless it is only part of one",)
     raw = width_mm / MM_PER_UNIT[unit]
     likely = [other for other, factor in MM_PER_UNIT.items() if lower <= raw * factor <= upper]
-    advice = f"give --unit {likely[0]}" if likely else "rescale it, or give the --unit that it is in"
+    advice = f"give --unit {likely[0]}" if likely else "rescale it, or give the correct --unit"
     raise InputError(f"{measured}; {advice}")
 
 

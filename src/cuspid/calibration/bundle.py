@@ -378,7 +378,8 @@ def _solved(matrix: Float[np.ndarray, "k k"], right: Float[np.ndarray, "k *m"]) 
         factor = cho_factor(matrix * scale[:, None] * scale, lower=True)
     except (np.linalg.LinAlgError, ValueError) as error:  # not positive, or not finite
         raise ReconstructionError(
-            "calibration: the images leave something open; show the board from more sides, tilted by 20 to 50 degrees"
+            "calibration: the images do not determine all parameters; show the board from more sides, "
+            "tilted by 20 to 50 degrees"
         ) from error
     return np.asarray((scale * cho_solve(factor, (scale * right.T).T).T).T)
 

@@ -106,8 +106,8 @@ def calibrate_rig(
     few = [name for name in sizes if sum(camera == name for camera, _ in views) < LEAST_VIEWS]
     if few:
         raise ReconstructionError(
-            f"calibration: {', '.join(few)} saw the board at fewer than {LEAST_VIEWS} instants; check that columns, "
-            "rows, dictionary and kind of the board are those of the images"
+            f"calibration: {', '.join(few)} saw the board at fewer than {LEAST_VIEWS} instants; check that the "
+            "columns, rows, dictionary and kind of the board match the images"
         )
     alone = {name: _alone(name, views, board, size) for name, size in sizes.items()}
     cameras = {name: each.scene.cameras[""] for name, each in alone.items()}
@@ -122,8 +122,8 @@ def _alone(name: str, views: Views, board: Board, size: tuple[int, int]) -> Adju
         return calibrated_alone([view for (camera, _), view in views.items() if camera == name], board, size)
     except ReconstructionError as error:
         raise ReconstructionError(
-            f"calibration: camera {name}: {str(error).removeprefix('calibration: ')}; check columns, rows, kind and "
-            "dictionary of the board, and show it tilted by 20 to 50 degrees"
+            f"calibration: camera {name}: {str(error).removeprefix('calibration: ')}; check the columns, rows, kind "
+            "and dictionary of the board, and show it tilted by 20 to 50 degrees"
         ) from error
 
 
@@ -133,7 +133,7 @@ def _without_outliers(
     """Adjust, leave out the views that do not fit, and again."""
     sound = in_front(scene, views, board)
     notes = [
-        f"camera {camera}, {instant}: left out, no place of the board explains it"
+        f"camera {camera}, {instant}: left out, no pose of the board explains it"
         for camera, instant in views
         if (camera, instant) not in sound
     ]
@@ -146,7 +146,7 @@ def _without_outliers(
             return found, tuple(notes)
         notes += [
             f"camera {camera}, {instant}: left out, {rms:.2f} px RMS where {usual:.2f} px is usual; it is "
-            "blurred, or was not taken when the others were"
+            "blurred, or was not taken at the same time as the others"
             for (camera, instant), (rms, usual) in bad.items()
         ]
         views = {key: view for key, view in views.items() if key not in bad}
@@ -171,7 +171,7 @@ def _require_views(views: Views, scene: BoardScene) -> None:
     if few:
         raise ReconstructionError(
             f"calibration: what {', '.join(few)} saw does not fit what the others saw at the same instants; check that "
-            "the cameras were triggered together, and that the files' names say so"
+            "the cameras were triggered together, and that the file names match"
         )
     require_one_group(views, list(scene.cameras))
 
@@ -189,7 +189,7 @@ def in_frame_of(found: RigCalibration, drawn: Rig) -> RigCalibration:
     """
     if set(drawn.names) != set(found.rig.names):
         raise InputError(
-            f"calibration: the drawn handpiece has the cameras {', '.join(drawn.names)}, the images are of "
+            f"calibration: the drawn handpiece has the cameras {', '.join(drawn.names)}, but the images are of "
             f"{', '.join(found.rig.names)}; give them the same names"
         )
     turns = [
@@ -257,13 +257,13 @@ def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Itera
     """Where the search did not end; where the lens or the board is not what the model says, or the cameras were not
     triggered together; where the views leave the focal length open."""
     if not settled:
-        yield "the adjustment did not come to its end; its numbers may be wrong"
+        yield "the adjustment did not converge; its results may be wrong"
     for name, check in checks.items():
         worst = max(check.parameters_apart or 0.0, check.place_apart or 0.0)
         if worst > _DOUBTFUL:
             yield (
                 f"camera {name}: calibrations from two halves of the images differ by {worst:.1f} of their standard "
-                "deviations; its covariance is widened by that; look for a pattern in residuals.png"
+                "deviations; its covariance is widened accordingly; look for a pattern in residuals.png"
             )
         if check.rms_px > _MUCH_MORE * check.alone_px:
             yield (
@@ -273,7 +273,7 @@ def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Itera
     for name, mounted in rig.cameras.items():
         share = float(np.sqrt(known(mounted.camera.covariance)[0, 0])) / mounted.camera.focal_px[0]
         if share > _OPEN_SHARE:
-            yield f"camera {name}: its focal length is known to {share:.0%} only; show the board tilted, near and far"
+            yield f"camera {name}: its focal length is known only to {share:.0%}; show the board tilted, near and far"
 
 
 def _cross_validated(

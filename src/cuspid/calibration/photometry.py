@@ -184,8 +184,9 @@ def calibrate_light(
     fit = case.adjusted()
     if case.lamps and fit.extra_sigma.max() > _FOREIGN:
         notes.append(
-            f"the board was not lit by the drawn lights alone: its light is off from theirs by {fit.extra_sigma[0]:.0%}"
-            " between instants; the lights stay as drawn, and light is taken for anything"
+            "the board was not lit by the drawn lights alone: its light differs from theirs by "
+            f"{fit.extra_sigma[0]:.0%} between instants; the lights stay as drawn, "
+            "and the light on the board is taken as unknown"
         )
         case = replace(case, lamps_known=False)
         fit = case.adjusted()
@@ -218,11 +219,11 @@ def _unseen(counts: Mapping[str, int], looked_at: Mapping[str, Patches]) -> Iter
         paper = looked_at[name].take(~looked_at[name].dark)
         burnt = _share(paper.level_dn >= BRIGHTEST_DN)
         if burnt > _MANY_BURNT:
-            yield f"camera {name}: {burnt:.0%} of its patches of paper are burnt out and tell nothing; expose less"
+            yield f"camera {name}: {burnt:.0%} of its patches of paper are overexposed and unusable; expose less"
         if count < _LEAST_PATCHES:
             yield (
-                f"camera {name}: {count} patches can be used, too few to tell its gain and falloff; come nearer, make "
-                "squares larger or --clear-px smaller"
+                f"camera {name}: {count} patches can be used, too few to determine its gain and falloff; move closer, "
+                "make squares larger or --clear-px smaller"
             )
 
 
@@ -449,26 +450,29 @@ def _rms(residuals: Float[np.ndarray, "n"]) -> float:
 def _doubts(case: _Case, fit: Shading, sensors: Mapping[str, Sensor]) -> Iterator[str]:
     """Where the search did not end, patches are not what the model says, or images leave something open."""
     if not fit.settled:
-        yield "the adjustment of light did not come to its end; its numbers may be wrong"
+        yield "the adjustment of light did not converge; its results may be wrong"
     if not case.lamps:
         yield (
-            "light on the board may be anything: falloffs are told by how cameras differ that see the same place; give "
-            "the --drawn handpiece, if its lights alone lit the board, to find these"
+            "the light on the board is unknown: falloffs come from the differences between cameras that see the same "
+            "place; if the lights of the handpiece alone lit the board, give it as --drawn to find these lights too"
         )
     samples = case.samples(case.instants)
     odd = np.abs(fit.residuals) > _OUTLYING * fit.scale * samples.sigma
     for index, name in enumerate(case.names):
         outlying = _share(odd[samples.camera == index])
         if outlying > _MANY_OUTLYING:
-            yield f"camera {name}: {outlying:.0%} of its patches are not as bright as they should be: highlights, dirt"
+            yield (
+                f"camera {name}: {outlying:.0%} of its patches are not as bright as they should be; "
+                "look for highlights or dirt"
+            )
         open_pct = _numbers(sensors[name], case.noise[name])["corner_loss_sigma_pct"]
         if open_pct > 100 * _OPEN_CORNER:
             yield (
-                f"camera {name}: the light in its corners is known to {open_pct:.0f} % only; show it the board in the "
-                "corners, too, together with other cameras"
+                f"camera {name}: the falloff in its corners is known only to {open_pct:.0f} %; show it the board in "
+                "the corners too, together with other cameras"
             )
     if _gamma_told(case, fit) > _TOLD:
-        yield "gamma cannot be told from these images; it stays about what was given"
+        yield "gamma cannot be determined from these images; it stays close to the given value"
 
 
 def _gamma_told(case: _Case, fit: Shading) -> float:
@@ -490,7 +494,7 @@ def _untold(case: _Case, lamps: Mapping[str, Light]) -> Iterator[str]:
     ]
     if open_ones:
         yield (
-            f"lights {', '.join(open_ones)}: their places cannot be told, and stay about as drawn; light the board by "
-            "one after the other (names of images that end in -NAME)"
+            f"lights {', '.join(open_ones)}: their positions cannot be determined, and stay close to the drawn ones; "
+            "light the board by one at a time (image names that end in -NAME)"
         )
-    yield "powers of lights are against each other: how white paper is, and how long was exposed, is not known"
+    yield "the powers of lights are only relative: the whiteness of the paper and the exposure time are not known"

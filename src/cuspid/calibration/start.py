@@ -46,12 +46,12 @@ def calibrated_alone(views: Sequence[BoardView], board: Board, size: tuple[int, 
         )
         sound = in_front(start, {("", str(k)): view for k, view in enumerate(views)}, board)
         if len(sound) < LEAST_VIEWS:
-            raise ReconstructionError("its views of the board fit no camera")
+            raise ReconstructionError("no camera model fits its views of the board")
         found = adjust_board(of_instants(start, {instant for _, instant in sound}), sound, board)
     except (cv2.error, InputError) as error:  # such as a focal length that is no number
-        raise ReconstructionError("its views of the board fit no camera") from error
+        raise ReconstructionError("no camera model fits its views of the board") from error
     if found.sigma_px > _NO_FIT_SHARE * size[0]:
-        raise ReconstructionError(f"its views of the board fit no camera, by {found.sigma_px:.0f} px")
+        raise ReconstructionError(f"no camera model fits its views of the board (error {found.sigma_px:.0f} px)")
     return found
 
 
@@ -91,7 +91,7 @@ def board_pose(view: BoardView, board: Board, camera: Camera) -> Rigid3:
         if turns:
             turn, shift = cv2.solvePnPRefineLM(points, ideal, np.eye(3), None, turns[0], shifts[0])
             return Rigid3.from_rotation_vector(turn.ravel(), shift.ravel())
-    raise InputError("calibration: a view of the board that no pose explains")
+    raise InputError("calibration: no pose explains a view of the board")
 
 
 def joined(
@@ -137,8 +137,8 @@ def require_one_group(views: Collection[tuple[str, str]], cameras: Sequence[str]
     apart = groups(views, cameras)
     if len(apart) > 1:
         raise ReconstructionError(
-            f"calibration: {' and '.join(', '.join(group) for group in apart)} never saw the board at once; show it to "
-            "cameras of both groups together"
+            f"calibration: {' and '.join(', '.join(group) for group in apart)} never saw the board at the same time; "
+            "show it to cameras of both groups together"
         )
 
 
@@ -171,8 +171,8 @@ def _beside(poses: Poses, known: str, new: str, instants: Sequence[str]) -> Rigi
     best = max((each for options in said for each in options), key=support)
     if 2 * support(best)[0] < len(instants):
         raise ReconstructionError(
-            f"calibration: where {new} is beside {known}, only {support(best)[0]} of {len(instants)} instants agree; "
-            "check that they were triggered together, and that images of one name belong together"
+            f"calibration: only {support(best)[0]} of {len(instants)} instants agree on the pose of {new} relative to "
+            f"{known}; check that they were triggered together, and that images with the same name belong together"
         )
     return best
 

@@ -114,7 +114,7 @@ def main(arguments: list[str] | None = None) -> None:
         console.print(f"cuspid: {error}", style="red", soft_wrap=True, highlight=False)
         sys.exit(1)
     except KeyboardInterrupt:
-        console.print("cuspid: interrupted; the same command goes on where it stopped")
+        console.print("cuspid: interrupted; run the same command again to continue")
         sys.exit(130)
     except BrokenPipeError:  # what reads us, as ``head`` does, has had enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

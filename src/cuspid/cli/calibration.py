@@ -41,7 +41,7 @@ def target(*, out: Path, board: Annotated[Board, Flat] = Board()) -> None:
     if out.suffix.lower() == ".stl":
         storage.write_mesh(out, target_body(board))
         size = f"{width:g} x {height:g} x {PLATE_MM + board.height_mm:g} mm"
-        console.print(f"{out}: {size}; measure the steps of the body, and give them")
+        console.print(f"{out}: {size}; measure its steps, and give the measured values")
         return
     save_board(out, board)
     size = f"{width + board.height_mm:g} x {height:g} mm"
@@ -257,7 +257,7 @@ def _print_light(light: Photometry) -> None:
     if found:
         place, power = 1000 * np.median([each[:3] for each in found]), 100 * np.median([each[3] for each in found])
         console.print(
-            f"{len(found)} lights: places to {place:.0f} um along each axis, powers to {power:.1f} % (medians)"
+            f"{len(found)} lights: positions to {place:.0f} um along each axis, powers to {power:.1f} % (medians)"
         )
 
 

@@ -7,10 +7,10 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from cuspid import pipeline, storage
+from cuspid import panorama_pipeline, storage
 from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
-from cuspid.pipeline import FilmOptions
+from cuspid.panorama_pipeline import FilmOptions
 
 
 def film(
@@ -38,7 +38,7 @@ def film(
     with storage.claimed_folder(out, "film", settings, hashes):
         device = intra_oral_camera(camera) if handpiece is None else storage.read_handpiece(handpiece)
         with show_progress() as progress:
-            capture, _ = pipeline.film(load_source(jaw, source), device, out, options, progress=progress)
+            capture, _ = panorama_pipeline.film(load_source(jaw, source), device, out, options, progress=progress)
         if video:
             storage.write_video(out / "film.mp4", capture)
     console.print(f"{len(capture.frames)} frames in {out / 'capture'}")

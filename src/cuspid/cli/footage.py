@@ -129,7 +129,7 @@ def _print(plan: Plan, looks: Mapping[str, Looks], out: Path) -> None:
     console.print(table)
     if plan.apart_ms is not None:
         apart = f"{_median(plan.apart_ms):.1f} ms apart at the median, {_most(plan.apart_ms):.1f} at most"
-        console.print(f"by their times the images of a frame are {apart}")
+        console.print(f"according to their times, the images of a frame are {apart}")
     console.print(f"{out}: {len(plan.frames)} frames of {len(looks)} cameras")
 
 

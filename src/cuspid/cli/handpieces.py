@@ -46,7 +46,9 @@ def handpiece(
     if body is not None:
         made = _print_holder(body, made, printing)
     elif vars(printing) != vars(PrintOptions()):
-        raise InputError("handpiece: how a holder is printed is given, but not where to; add --body holder.stl")
+        raise InputError(
+            "handpiece: options for printing a holder are given, but no file for it; add --body holder.stl"
+        )
     storage.write_handpiece(out / "handpiece.json", made)
     storage.write_rig_config(out / "rig_config.json", made.rig)
     console.print(f"{out / 'handpiece.json'}: {len(made.rig.names)} cameras, {len(made.lights)} lights")

@@ -111,8 +111,8 @@ def _asked(name: str | None, tooth: int | None, how: PreparationOptions | None) 
     if name is None and tooth is not None and how is not None:
         return {tooth: how}
     raise InputError(
-        "prepare: give either --preset thesis-reference, or --tooth with a kind at the end of the line: crack, crown, "
-        "full-contour-crown or mod-inlay"
+        "prepare: give either --preset thesis-reference, or --tooth with a kind at the end of the command: crack, "
+        "crown, full-contour-crown or mod-inlay"
     )
 
 

@@ -69,7 +69,7 @@ def _sized(options: MouthOptions, path: Path) -> MouthOptions:
     device = storage.read_handpiece(path)
     if device.body is None:
         raise InputError(
-            f"{path}: its body is not known; give --thickness-mm and --working-distance-mm, or a body there"
+            f"{path}: its body is not known; give --thickness-mm and --working-distance-mm, or add a body to it"
         )
     console.print(f"{path}: {device.thickness_mm:.1f} mm thick, {device.working_distance_mm:g} mm over the teeth")
     return replace(options, thickness_mm=device.thickness_mm, working_distance_mm=device.working_distance_mm)

@@ -7,14 +7,15 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
-from cuspid import pipeline, storage
+from cuspid import panorama_pipeline, storage
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
+from cuspid.errors import InputError
 from cuspid.image_sequence import ImageSequence
 from cuspid.panorama import FrameUse
-from cuspid.pipeline import StitchOptions
+from cuspid.panorama_pipeline import MeshViewOptions, StitchOptions
 from cuspid.progress import Progress
 from cuspid.reporting.figures.panorama import save_camera_path
 from cuspid.stitching.ortho import Stitched
@@ -22,31 +23,81 @@ from cuspid.workers import map_in_threads
 
 
 def stitch(
-    frames: Annotated[Path, Positional],
+    frames: Annotated[Path | None, Positional, arg(metavar="[FRAMES]")] = None,
     *,
     out: Path,
+    mesh: Path | None = None,
+    unit: storage.Unit = "mm",
     calibration: Path | None = None,
     options: Annotated[StitchOptions, Flat] = StitchOptions(),
+    view: MeshViewOptions = MeshViewOptions(),
 ) -> None:
-    """Stitch the frames of one hand-held camera into a panorama of the arch: the occlusal view at true scale, the
-    unrolled strip, what became of each frame, and the camera's path.
+    """Stitch the frames of a hand-held camera into a panorama of the arch: the occlusal view at true scale, the
+    unrolled strip, what became of each frame, and the camera's path. Or draw the same views of a finished mesh, and
+    strips from the cheek and from the tongue.
 
     Args:
-        frames: Folder of images, a video (mp4, avi, mov, mkv), or a capture with one camera.
+        frames: Folder of images, a video (mp4, avi, mov, mkv), or a capture; with two or more cameras that see the same
+            surface the panorama is in true millimetres.
         out: Folder for the results; if the sequence broke, it has a subfolder for each part: part-1/, part-2/ ...
+        mesh: Instead of frames: the folder of a scan (its mesh.ply), or a mesh file (STL, PLY, OBJ) in any pose.
+        unit: Length unit of that mesh file.
         calibration: handpiece.json or rig_config.json of one camera, COLMAP's cameras.txt, or OpenCV's YAML; without
             one (and without that of a capture) the focal length is found from the images.
+        view: How the mesh is drawn.
     """
+    if (frames is None) == (mesh is None):
+        raise InputError("stitch: give either FRAMES or --mesh")
+    if frames is not None and calibration is None and _is_rig(frames):
+        _stitch_rig(frames, out, options)
+    elif frames is not None:
+        _stitch_frames(frames, out, calibration, options)
+    elif mesh is not None:
+        _view_mesh(mesh / "mesh.ply" if mesh.is_dir() else mesh, out, unit, view)
+    report(out)
+
+
+def _stitch_frames(frames: Path, out: Path, calibration: Path | None, options: StitchOptions) -> None:
     with show_progress() as progress:
         sequence = _read(frames, out, calibration, progress)
         hashes = _hashes(sequence, calibration)
         with storage.claimed_folder(out, "stitch", {"stitch": options}, hashes, replace=True):
-            parts = pipeline.stitch(sequence, options, progress=progress)
+            parts = panorama_pipeline.stitch(sequence, options, progress=progress)
             folders = [out if len(parts) == 1 else out / f"part-{part.panorama.part}" for part in parts]
             for folder, part in zip(folders, parts, strict=True):
                 _write(folder, part)
     _print(parts, folders)
-    report(out)
+
+
+def _is_rig(frames: Path) -> bool:
+    """Whether this is a capture of several cameras."""
+    file = frames / "handpiece.json"
+    return file.is_file() and len(storage.read_handpiece(file).rig.names) > 1
+
+
+def _stitch_rig(folder: Path, out: Path, options: StitchOptions) -> None:
+    capture = storage.read_capture(folder)
+    with show_progress() as progress:
+        hashes = storage.hash_capture(capture)
+        with storage.claimed_folder(out, "stitch", {"stitch": options}, hashes, replace=True):
+            made = panorama_pipeline.stitch_rig(capture, options, progress=progress)
+            _write(out, made)
+    _print((made,), [out])
+
+
+def _view_mesh(path: Path, out: Path, unit: storage.Unit, options: MeshViewOptions) -> None:
+    mesh, hashes = storage.read_mesh(path, unit), {"mesh": storage.hash_file(path)}
+    with show_progress() as progress, storage.claimed_folder(out, "stitch", {"view": options}, hashes, replace=True):
+        views, occlusal_from_mesh = panorama_pipeline.view_mesh(mesh, options, progress=progress)
+        for name, strip in views.strips.items():
+            storage.write_strip(out if name == "occlusal" else out / name, strip)
+        storage.write_json(out / "orientation.json", {"occlusal_from_mesh": occlusal_from_mesh.matrix})
+        storage.write_panorama(out, views.panorama)
+    width_mm, depth_mm = views.panorama.size_mm or (0.0, 0.0)
+    strips = ", ".join(views.strips) or "none"
+    console.print(f"{out / 'panorama.png'}: {width_mm:.1f} x {depth_mm:.1f} mm; strips: {strips}")
+    for note in views.panorama.notes:
+        console.print(f"note: {note}")
 
 
 def _read(frames: Path, out: Path, calibration: Path | None, progress: Progress) -> ImageSequence:

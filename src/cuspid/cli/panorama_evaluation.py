@@ -62,7 +62,7 @@ def read_picture(path: Path) -> Panorama:
     opaque = pixels[..., 3] > 0
     covered = opaque & (pixels[..., :3].max(axis=2) > 0) if opaque.all() else opaque
     if not covered.any():
-        raise InputError(f"{path}: the picture is black or transparent everywhere; give a panorama")
+        raise InputError(f"{path}: the image is entirely black or transparent; give a panorama")
     frames: tuple[FrameUse, ...] = ()
     return Panorama(
         image=np.ascontiguousarray(pixels[..., :3]),

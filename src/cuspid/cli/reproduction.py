@@ -68,7 +68,9 @@ def reproduce(
     _print(page)
     console.print(f"{out / 'reproduction.html'}, {out / 'reproduction.md'}", highlight=False)
     if failures:
-        raise CuspidError(f"reproduce: {', '.join(failures)} failed, as told above; the same command tries again")
+        raise CuspidError(
+            f"reproduce: {', '.join(failures)} failed, for the reasons above; run the same command to try again"
+        )
 
 
 def asked_items(only: Sequence[str]) -> tuple[Item, ...]:

@@ -125,7 +125,7 @@ def _simulate(mesh: Path | None, out: Path, source: Source, probe: Probe, option
     overlap = storage.read_json(out / "truth" / "path.json")
     console.print(
         f"{len(capture.frames)} frames of {len(device.rig.names)} cameras; consecutive images overlap by "
-        f"{overlap['minimum_overlap']:.1%} at least, {overlap['mean_overlap']:.1%} on average"
+        f"at least {overlap['minimum_overlap']:.1%}, {overlap['mean_overlap']:.1%} on average"
     )
 
 
@@ -258,10 +258,10 @@ def _print_spheres(report: SphereReport) -> None:
 def _print_nominal(handpiece: Handpiece, options: NominalOptions) -> None:
     assumed = options.of(handpiece)
     console.print(
-        "calibration: the handpiece's file does not say how well it is known; taken as nominal, within (one sigma) "
-        f"{1000 * assumed.place_mm:.3g} µm and {assumed.turn_deg:g}° of place, {100 * assumed.focal_share:g} % of the "
-        f"focal length, {assumed.centre_px:g} px of the principal point, {assumed.k1:g} of k1; change it with "
-        "--nominal.*, or hold it with --calibration fixed"
+        "calibration: the handpiece file gives no uncertainties; it is taken as nominal, accurate (one sigma) to "
+        f"{1000 * assumed.place_mm:.3g} µm and {assumed.turn_deg:g}° in the pose of each camera, "
+        f"{100 * assumed.focal_share:g} % in focal length, {assumed.centre_px:g} px in principal point and "
+        f"{assumed.k1:g} in k1; change this with --nominal.*, or hold the calibration with --calibration fixed"
     )
 
 

@@ -59,7 +59,9 @@ def measure(
     """
     files = jaw_files(jaws)
     if landmarks is not None and len(files) > 1:
-        raise InputError(f"{landmarks}: one file of landmarks for {len(files)} jaws; put one beside each mesh instead")
+        raise InputError(
+            f"{landmarks}: a single file of landmarks for {len(files)} jaws; put one beside each mesh instead"
+        )
     hashes = {path.name: storage.hash_file(path) for path in _of_different_names(files)}
     with storage.claimed_folder(out, "measure", {"arch": arch}, hashes, replace=True), show_progress() as progress:
 
@@ -159,7 +161,7 @@ def _print_model(model: ShapeModel) -> None:
     for number, step in enumerate(model.log, start=1):
         console.print(f"round {number}: the mean's surface moved {step.surface_change_um:.1f} µm")
     if not model.converged:
-        console.print("note: the mean has not converged; give more --most-rounds or a larger --tolerance-um")
+        console.print("note: the mean has not converged; increase --most-rounds or --tolerance-um")
     table = Table(title=f"{'Shape' if model.scaled else 'Shape and size'}: modes", title_justify="left")
     for column in ("mode", "SD, mm", "share of variance, %"):
         table.add_column(column, justify="right")

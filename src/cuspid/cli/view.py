@@ -32,7 +32,9 @@ def view(
         port: Port to listen on; if it is in use, the next free one is taken.
     """
     server = serve(storage.read_result(folder, reference, unit), host, port)
-    console.print(f"http://{host}:{server.get_port()} shows {folder}; Ctrl-C ends it", highlight=False, soft_wrap=True)
+    console.print(
+        f"http://{host}:{server.get_port()} shows {folder}; press Ctrl-C to stop", highlight=False, soft_wrap=True
+    )
     try:
         threading.Event().wait()
     except KeyboardInterrupt:

@@ -151,8 +151,8 @@ def _note(crown: OpenCrown, could_be_seen: bool, evaluated: list[int]) -> str:
     """What is evaluated, for people."""
     where = "could be seen by two cameras" if could_be_seen else "lies within 200 µm of the scan"
     named = f"{len(evaluated)} pieces" if crown.estimated else ", ".join(map(str, evaluated))
-    estimated = "; crowns were told from gum by shape, an estimate" if crown.estimated else ""
+    estimated = "; crowns were told from gum by their shape, which is an estimate" if crown.estimated else ""
     return (
-        f"evaluated of the open crown surface: {named}; of each of them at least three quarters as much "
-        f"{where} as of the best one{estimated}"
+        f"evaluated part of the open crown surface: {named}; the share of each that {where} is "
+        f"at least three quarters of the best one's{estimated}"
     )

@@ -204,12 +204,12 @@ def _rules(reference: Mesh, scannable: Bool[np.ndarray, "f"] | None, options: Ev
         note = f"the faces seen from {options.min_openness:.0%} of the directions above the occlusal plane"
     else:
         faces = np.ones(len(reference.faces), dtype=bool)
-        note = "all of it, hidden insides and base included (--min-openness and --crop-mm leave them out)"
+        note = "all of it, including hidden insides and the base (--min-openness and --crop-mm exclude them)"
     return _Rules(
         faces=faces,
         margin_mm=options.margin_mm,
         reference_is_all=scannable is not None,
-        note=f"evaluated of the reference: {note}",
+        note=f"evaluated part of the reference: {note}",
     )
 
 
@@ -218,7 +218,7 @@ def _align(scan: Mesh, surface: SignedDistance, options: EvaluationOptions, rng:
         return register(scan, surface, options.registration, rng=rng)
     points, _ = scan.sample(options.registration.samples, rng)
     scale = best_scale(points, surface, Rigid3.identity(), options.registration)
-    notes = ("alignment: none, the scan was taken to lie in the frame of the reference",)
+    notes = ("alignment: none, the scan was assumed to be in the frame of the reference",)
     return Alignment(reference_from_scan=Rigid3.identity(), scale=scale, rms_um=0.0, overlap=1.0, notes=notes)
 
 
@@ -274,11 +274,11 @@ def _samples_of_reference(
     distances, _, positions = aligned.closest(points)
     signs = np.where(np.sum((positions - points) * reference.face_normals[faces], axis=1) < 0, -1.0, 1.0)
     near = distances <= (np.inf if options.crop_mm is None else options.crop_mm)
-    cropped = "nothing is cropped" if options.crop_mm is None else f"what is over {options.crop_mm:g} mm from the scan"
+    cropped = "none" if options.crop_mm is None else f"all more than {options.crop_mm:g} mm from the scan"
     samples = _Samples(
         points=points[near],
         signed_mm=(signs * distances)[near],
         labels=labels[faces[near]],
-        left_out=f"regarded as not scanned of the reference: {cropped}",
+        left_out=f"part of the reference regarded as not scanned: {cropped}",
     )
     return samples, float(area_pct * near.mean())

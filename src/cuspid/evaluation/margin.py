@@ -131,7 +131,7 @@ def margin_error(
         edge = _edge(slicers[1].section(point, tangent, axes, options), options)
         found.append(np.full(2, np.nan) if edge is None else frame @ edge.point)
     if not own:
-        raise InputError("margin: the reference has no edge along its margin line; does the line belong to this mesh?")
+        raise InputError("margin: the reference has no edge along its margin line; check that it belongs to this mesh")
     evaluated_pct = 100 * len(own) / count
     return MarginError(scan=_statistics(np.array(found)), evaluated_pct=evaluated_pct, floor=_statistics(np.array(own)))
 

@@ -239,7 +239,7 @@ def _poses_of(panorama: Panorama, truth: GroundTruth) -> list[Rigid3]:
         return list(known.values())
     unknown = next(name for name in names if name not in known)
     raise InputError(
-        f"truth: no frame {shown(unknown)} in it, and it has {len(known)} frames where the panorama has {len(names)}; "
+        f"truth: it has no frame {shown(unknown)}, and {len(known)} frames where the panorama has {len(names)}; "
         "give the truth of the film that was stitched"
     )
 
@@ -461,7 +461,7 @@ class _Comparison:
         on_shot = None if self.shot is None else align_by_pictures(self.panorama, self.shot)
         if on_shot is not None and self._collapsed(on_shot.scale, 0.0):
             on_shot = None
-        note = "aligned by image features: without the frames of its pixels, its geometric error is not known"
+        note = "aligned by image features: without the frames of its pixels, its geometric error is unknown"
         made = self._scored(plane_from_panorama, on_shot)
         return replace(made, score=replace(made.score, aligned_by="pictures", notes=(*made.score.notes, note)))
 
@@ -547,7 +547,7 @@ class _Comparison:
             picture=None,
             shot=None,
             trivial=trivial_scores(self.view),
-            notes=("the jaw has no tooth labels: its whole surface is taken for teeth",) if unlabelled else (),
+            notes=("the jaw has no tooth labels: its whole surface counts as teeth",) if unlabelled else (),
         )
 
 

@@ -82,7 +82,7 @@ def _lay(scan: Mesh, surface: SignedDistance, options: RegistrationOptions, rng:
     overlap = _overlap(surface.closest_points(best.apply(few)), options.outlier_mm)
     if overlap < _LEAST_OVERLAP:
         raise InputError(
-            f"registration: at best {overlap:.0%} of the scan comes near the reference; "
+            f"registration: at best {overlap:.0%} of the scan lies close to the reference; "
             "check that both show the same teeth, in the same unit"
         )
     alignment = fit(scan.sample(options.samples, rng)[0], surface, best, options)
@@ -188,7 +188,7 @@ def _truncated_mean_mm(points: Float[np.ndarray, "n 3"], surface: SignedDistance
 def _doubts(alignment: Alignment) -> tuple[str, ...]:
     notes = []
     if alignment.overlap < 0.6:
-        notes.append(f"alignment: doubtful, only {alignment.overlap:.0%} of the scan comes near the reference")
+        notes.append(f"alignment: doubtful, only {alignment.overlap:.0%} of the scan lies close to the reference")
     if alignment.rms_um > 150:
         notes.append(f"alignment: doubtful, the surfaces differ by {alignment.rms_um:.0f} um RMS where they meet")
     return tuple(notes)

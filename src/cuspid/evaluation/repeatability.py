@@ -124,7 +124,7 @@ def spread(
     Raises InputError for fewer than two scans, or where no place is on all of them.
     """
     if len(scans) < 2:
-        raise InputError(f"repeatability: {len(scans)} scan; at least two are needed")
+        raise InputError(f"repeatability: only {len(scans)} scan given; at least two are needed")
     indices = np.flatnonzero(asked)
     if not len(indices):
         raise InputError("repeatability: no face of the reference could be seen in all scans")
@@ -134,7 +134,7 @@ def spread(
     found = np.stack([_deviations_um(points, normals, scan, options.farthest_mm) for scan in scans])
     on_all = np.isfinite(found).all(axis=0)
     if not on_all.any():
-        raise InputError("repeatability: no place of the reference is on all scans; check that they are aligned")
+        raise InputError("repeatability: no point of the reference is on all scans; check that they are aligned")
     means, sds = found[:, on_all].mean(axis=0), found[:, on_all].std(axis=0, ddof=1)
     random = float(np.mean(sds**2))
     corners = reference.faces[faces[on_all]]

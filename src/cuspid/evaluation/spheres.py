@@ -151,7 +151,7 @@ def evaluate_spheres(
     where the reference has no spheres or the scan shows fewer than two of them.
     """
     if not reference.spheres:
-        raise InputError("spheres: the reference has none; give the jaw that 'cuspid phantom --spheres' wrote")
+        raise InputError("spheres: the reference has no spheres; give the jaw that 'cuspid phantom --spheres' wrote")
     scan_from_reference = reference_from_scan.inverse()
     weights = scan.vertex_areas
     spheres: dict[str, SphereMeasurement] = {}
@@ -164,7 +164,7 @@ def evaluate_spheres(
             spheres[label] = found
     if len(spheres) < 2:
         reasons = "; ".join(f"{label}: {reason}" for label, reason in not_measured.items())
-        raise InputError(f"spheres: {len(spheres)} of {len(reference.spheres)} measured, two are needed ({reasons})")
+        raise InputError(f"spheres: {len(spheres)} of {len(reference.spheres)} measured; two are needed ({reasons})")
     return _report(spheres, not_measured, reference.spheres, options)
 
 
@@ -263,19 +263,19 @@ def _measure(
         chosen &= round_ >= _FREE_ROUNDS
         chosen |= _belongs(points, centre, nominal.radius_mm, occlusal, options)
         if chosen.sum() < options.least_points:
-            return f"only {chosen.sum()} points, {options.least_points} are needed"
+            return f"only {chosen.sum()} points; at least {options.least_points} are needed"
         fit = _fit(points[chosen], weights[chosen], options.outlier_sigmas)
         moved = np.linalg.norm(fit.centre - centre)
         centre = fit.centre
         if moved < _SETTLED_MM:
             break
     else:
-        return f"the choice of its points does not settle in {_ROUNDS} rounds"
+        return f"the selection of its points did not settle in {_ROUNDS} rounds"
     if abs(fit.radius - nominal.radius_mm) > options.band_mm:
         return f"the fitted radius is {fit.radius:.2f} mm, nominal {nominal.radius_mm:g} mm"
     coverage = _coverage_pct(points[chosen] - centre, occlusal, options.polar_deg)
     if coverage < options.least_coverage_pct:
-        return f"only {coverage:.0f} % of its cap has points, {options.least_coverage_pct:g} % are needed"
+        return f"only {coverage:.0f} % of its cap has points; at least {options.least_coverage_pct:g} % is needed"
     return _measurement(fit, weights[chosen], nominal, coverage)
 
 
@@ -372,5 +372,5 @@ def _notes(options: SphereOptions) -> tuple[str, ...]:
     return (
         f"spheres: least squares with free radius over vertices within {options.polar_deg:g} deg of the occlusal "
         f"direction, those beyond {options.outlier_sigmas:g} robust standard deviations left out",
-        "spacing: measured minus nominal distance between two centres; no alignment enters it",
+        "spacing: measured minus nominal distance between two centres; independent of the alignment",
     )

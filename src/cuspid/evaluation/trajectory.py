@@ -55,7 +55,7 @@ def trajectory_error(
     """
     frames = [name for name in true if name in found]
     if len(frames) < 2:
-        raise InputError(f"trajectory: {len(frames)} of {len(true)} true poses were found; two at least are needed")
+        raise InputError(f"trajectory: {len(frames)} of {len(true)} true poses were found; at least two are needed")
     placed = [reference_from_scan @ found[name].inverse() for name in frames]
     known = [true[name].inverse() for name in frames]
     absolute = [real.inverse() @ pose for real, pose in zip(known, placed, strict=True)]

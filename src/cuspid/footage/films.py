@@ -79,12 +79,12 @@ def open_film(camera: str, source: Path) -> Film:
     """The film of a camera. Raises InputError where it has no frame."""
     images = tuple(images_in(source)) if source.is_dir() else ()
     if source.is_dir() and not images:
-        raise InputError(f"{source}: no images in it; camera {camera} needs some, or a video")
+        raise InputError(f"{source}: it contains no images; camera {camera} needs images or a video")
     stems = Counter(path.stem for path in images)
     if images and max(stems.values()) > 1:
-        raise InputError(f"{source}: two images are named {stems.most_common(1)[0][0]}; each needs a name of its own")
+        raise InputError(f"{source}: two images are named {stems.most_common(1)[0][0]}; each needs its own name")
     if not images and next(read_video(source), None) is None:
-        raise InputError(f"{source}: no frame of it can be decoded; not a video, or truncated: copy it again")
+        raise InputError(f"{source}: no frame can be decoded; it is not a video, or is truncated: copy it again")
     length = VideoLength(frames=len(images), is_counted=True, seconds=0.0) if images else video_length(source)
     return Film(camera=camera, source=source, images=images, length=length, digest=hash_source(source))
 
@@ -124,11 +124,11 @@ def developed(stored: Image, options: DevelopmentOptions, where: str) -> Image:
     if options.bits is not None and stored.dtype == np.uint16:
         if stored.max() >> options.bits:
             raise InputError(
-                f"{where}: has values of {int(stored.max())}, more than {options.bits} bits; correct --bits"
+                f"{where}: has values up to {int(stored.max())}, more than {options.bits} bits can hold; correct --bits"
             )
         stored = stored << (16 - options.bits)
     if options.bayer == "none":
         return stored
     if stored.ndim != 2:
-        raise InputError(f"{where}: has colours already; --bayer is for images of one channel")
+        raise InputError(f"{where}: already in colour; --bayer is for single-channel images")
     return cv2.cvtColor(stored, getattr(cv2, f"COLOR_Bayer{options.bayer}2RGB"))

@@ -160,8 +160,8 @@ def _by_number(film: Film, count: int, said: Mapping[str, float]) -> dict[str, i
         if len(ordered) == count:
             return {frame: k for k, frame in enumerate(ordered)}
     raise InputError(
-        f"the table of times has {len(said)} frames of {film.camera}, {min(said)} to {max(said)}, but {film.source} "
-        f"has {count} frames and other numbers; give the table that belongs to the films"
+        f"the table of times lists {len(said)} frames of {film.camera}, {min(said)} to {max(said)}, but {film.source} "
+        f"has {count} frames, numbered differently; give the table that belongs to the films"
     )
 
 
@@ -202,8 +202,8 @@ def _names(films: Films, counts: Mapping[str, int]) -> dict[str, list[str]]:
     for camera, each in names.items():
         if len(films) > 1 and all(shared[name] == 1 for name in each):
             raise InputError(
-                f"{films[camera].source}: no image has the name of one of another camera (its first is {each[0]}); "
-                "name alike what was taken at once, or give --sync times, flash, motion or none"
+                f"{films[camera].source}: no image shares its name with one of another camera (first: {each[0]}); "
+                "give images taken at the same time the same name, or give --sync times, flash, motion or none"
             )
     return names
 
@@ -213,12 +213,14 @@ def _selected(instants: Sequence[int], clock: Clock | None, options: SelectionOp
     if options.start_s is None and options.end_s is None:
         return list(instants[:: options.every])
     if clock is None:
-        raise InputError("the frames have no times, which --start-s and --end-s need; give --times, or leave them out")
+        raise InputError(
+            "--start-s and --end-s need frame times, which are missing; give --times, or leave these options out"
+        )
     times = clock.times_s - np.nanmin(clock.times_s)
     start, end = options.start_s or 0.0, np.inf if options.end_s is None else options.end_s
     chosen = [k for k in instants if start - _ROUNDING_S <= times[k] <= end + _ROUNDING_S]
     if not chosen:
-        raise InputError(f"no frame lies between {start:g} and {end:g} s; the footage takes {np.nanmax(times):.2f} s")
+        raise InputError(f"no frame lies between {start:g} and {end:g} s; the footage lasts {np.nanmax(times):.2f} s")
     return chosen[:: options.every]
 
 
@@ -243,7 +245,7 @@ def _judged(
     if not frames:
         kinds = ", ".join(f"{count} {kind}" for kind, count in kinds_of(found).items())
         raise InputError(
-            f"no image of {len(instants)} frames is of use: {kinds}; look at them, and at --blurred-below, "
+            f"no image of {len(instants)} frames is usable: {kinds}; check the images, and --blurred-below, "
             "--dark-below-dn, --burnt-above, --same-below-dn and --bits"
         )
     return tuple(frames), tuple(found)
@@ -260,13 +262,13 @@ def kinds_of(bad: Sequence[Bad]) -> dict[str, int]:
 def _film_notes(films: Films, looks: Mapping[str, Looks], handpiece: Handpiece) -> Iterator[str]:
     for camera in handpiece.rig.names:
         if camera not in films:
-            yield f"camera {camera} has no footage; the capture is without it"
+            yield f"camera {camera} has no footage and is left out of the capture"
     counts = {camera: len(each.level_dn) for camera, each in looks.items()}
     for camera, film in films.items():
         if missing := film.length.missing(counts[camera], float(looks[camera].time_s[-1])):
             yield f"{film.source.name}: {missing}"
     if len(set(counts.values())) > 1:
-        yield f"the films have not one length: {', '.join(f'{name} {count}' for name, count in counts.items())} frames"
+        yield f"the films differ in length: {', '.join(f'{name} {count}' for name, count in counts.items())} frames"
 
 
 def _alone(instants: Sequence[Instant]) -> Iterator[str]:
@@ -275,7 +277,7 @@ def _alone(instants: Sequence[Instant]) -> Iterator[str]:
         counts = Counter(camera for instant in instants for camera in instant.numbers)
         (camera, number), *_ = instants[0].numbers.items()
         each = ", ".join(f"{count} of {name}" for name, count in sorted(counts.items()))
-        yield f"images that none of another camera goes with are left out: {each} (first: frame {number} of {camera})"
+        yield f"images without a match from another camera are left out: {each} (first: frame {number} of {camera})"
 
 
 def _depth_notes(looks: Mapping[str, Looks]) -> Iterator[str]:
@@ -283,7 +285,7 @@ def _depth_notes(looks: Mapping[str, Looks]) -> Iterator[str]:
         peak = float(np.nanmax(each.peak, initial=0.0))
         if 0 < peak < 1 << 14:
             bits = max(9, int(peak).bit_length())
-            yield f"{camera}: 16-bit images with values below {1 << bits}; where that is white, give --bits {bits}"
+            yield f"{camera}: 16-bit images with values below {1 << bits}; if that is white, give --bits {bits}"
 
 
 def _sync_notes(
@@ -296,7 +298,7 @@ def _sync_notes(
     """Raises InputError where the times of the films contradict what was taken for at once."""
     for camera, times in times_s.items():
         if jumps := jumps_in(times):
-            yield f"{camera}: frames are missing, time jumps before frame {jumps[0]} and at {len(jumps)} places in all"
+            yield f"{camera}: frames are missing; time jumps before frame {jumps[0]}, {len(jumps)} times in total"
     if options.sync == "none" or len(looks) == 1:
         return
     if clock is not None and options.sync != "times":
@@ -311,9 +313,9 @@ def _require_one_rate(instants: Sequence[Instant], clock: Clock) -> None:
     worst = int(np.nanargmax(clock.apart_s))
     if clock.apart_s[worst] > clock.interval_s / 2:
         raise InputError(
-            f"by their times the images of frame {instants[worst].name} are {1000 * clock.apart_s[worst]:.0f} ms apart "
-            f"(a frame takes {1000 * clock.interval_s:.0f} ms): frames were dropped, or the rates differ; "
-            "give --sync times"
+            f"according to their times, the images of frame {instants[worst].name} are "
+            f"{1000 * clock.apart_s[worst]:.0f} ms apart (a frame lasts {1000 * clock.interval_s:.0f} ms): "
+            "frames were dropped, or the frame rates differ; give --sync times"
         )
 
 
@@ -326,8 +328,8 @@ def _doubts_by_motion(instants: Sequence[Instant], looks: Mapping[str, Looks], o
         if found.doubt is None and abs(found.frames) > 1:
             later, earlier = (other, one) if found.frames > 0 else (one, other)
             yield (
-                f"by the motion in its images {later} is {abs(found.frames)} frames later than {earlier}, which "
-                f"--sync {options.sync} has together; look at both, or give --sync motion"
+                f"judging by the motion in the images, {later} is {abs(found.frames)} frames later than {earlier}, "
+                f"but --sync {options.sync} treats them as simultaneous; check both, or give --sync motion"
             )
 
 
@@ -340,4 +342,4 @@ def _doubts_by_flash(instants: Sequence[Instant], looks: Mapping[str, Looks], op
             seen[camera] = next(k for k, instant in enumerate(instants) if instant.numbers.get(camera) == flash)
     if seen and max(seen.values()) - min(seen.values()) > 1:
         places = ", ".join(f"{camera} {instants[k].name}" for camera, k in seen.items())
-        yield f"the cameras saw a flash at different frames ({places}); look at them, or give --sync flash"
+        yield f"the cameras saw a flash at different frames ({places}); check them, or give --sync flash"

@@ -90,7 +90,7 @@ def faults(looks: Looks, options: QualityOptions) -> dict[int, str]:
     for number in range(len(looks.level_dn)):
         share = looks.sharpness[number] / usual[number] if usual[number] > 0 else 1.0
         if not looks.readable[number]:
-            found[number] = "damaged: it cannot be read whole"
+            found[number] = "damaged: it cannot be read completely"
         elif looks.bright_dn[number] < options.dark_below_dn:
             found[number] = f"dark: 95 % of it is below {looks.bright_dn[number]:.0f} of 255"
         elif looks.burnt[number] > options.burnt_above:
@@ -98,7 +98,7 @@ def faults(looks: Looks, options: QualityOptions) -> dict[int, str]:
         elif looks.change_dn[number] < options.same_below_dn:
             found[number] = f"duplicate: {looks.change_dn[number]:.2f} of 255 from the frame before"
         elif share < options.blurred_below:
-            found[number] = f"blurred: {share:.2f} of the sharpness of the frames about it"
+            found[number] = f"blurred: {share:.2f} of the sharpness of the frames around it"
     return found
 
 

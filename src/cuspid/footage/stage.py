@@ -77,7 +77,7 @@ def _looks(film: Film, options: DevelopmentOptions, progress: Progress) -> Looks
         if shown is None:
             rows[frame.number] = (time, *[np.nan] * 6)
         elif shown.shape != (size or shown.shape):
-            raise InputError(f"{frame.where}: not of the size of the frames before; cut the film there")
+            raise InputError(f"{frame.where}: its size differs from the frames before it; cut the film there")
         else:
             rows[frame.number] = (time, *look(shown, before), highest)
             size, before = shown.shape, shown

@@ -126,8 +126,8 @@ def by_times(times_s: Signals, options: SyncOptions) -> tuple[Instant, ...]:
     if alone and len(times_s) > 1:
         spans = ", ".join(f"{name} {np.nanmin(each):.3f} to {np.nanmax(each):.3f} s" for name, each in times_s.items())
         raise InputError(
-            f"no image of {alone[0]} was taken within {1000 * apart_s:.0f} ms of one of another camera ({spans}); "
-            "give times of one clock, or --sync flash or motion"
+            f"no image of {alone[0]} was taken within {1000 * apart_s:.0f} ms of an image of another camera ({spans}); "
+            "give times from a single clock, or --sync flash or motion"
         )
     return _numbered(groups)
 
@@ -153,15 +153,15 @@ def _check_times(camera: str, times_s: Float[np.ndarray, "_"]) -> None:
     known = np.flatnonzero(np.isfinite(times_s))
     if len(known) < 2:
         raise InputError(
-            f"{camera}: {len(known)} of {len(times_s)} frames have a time, two at least are needed; give --times, "
-            "or use another --sync"
+            f"{camera}: {len(known)} of {len(times_s)} frames have a time, and at least two are needed; "
+            "give --times, or use another --sync"
         )
     steps = np.diff(times_s[known])
     if (steps <= 0).any():
         at = int(np.argmax(steps <= 0))
         raise InputError(
             f"{camera}: time runs backwards, {times_s[known[at]]:.6g} s at frame {known[at]} and "
-            f"{times_s[known[at + 1]]:.6g} s at frame {known[at + 1]}; mend the times, or use another --sync"
+            f"{times_s[known[at + 1]]:.6g} s at frame {known[at + 1]}; correct the times, or use another --sync"
         )
 
 
@@ -220,7 +220,7 @@ def flash_starts(brightness: Signals, options: SyncOptions) -> dict[str, int]:
 def flash_of(camera: str, brightness: Float[np.ndarray, "_"], options: SyncOptions) -> int:
     """The first frame that contains a flash. Raises InputError where there is none, or no unambiguous one."""
     if len(brightness) < 6:
-        raise InputError(f"{camera}: {len(brightness)} frames are too few to find a flash in")
+        raise InputError(f"{camera}: {len(brightness)} frames are too few to find a flash")
     rises = _rises(_filled(brightness))
     top = int(rises.argmax())
     usual = _spread(np.diff(_filled(brightness)))
@@ -233,7 +233,7 @@ def flash_of(camera: str, brightness: Float[np.ndarray, "_"], options: SyncOptio
     rest[max(0, top - 2) : top + 3] = -np.inf
     if rest.max() > options.second_share * rises[top]:
         raise InputError(
-            f"{camera}: not one clear flash; its brightness rises at frame {top} and about as much at frame "
+            f"{camera}: no single clear flash; its brightness rises at frame {top} and about as much at frame "
             f"{int(rest.argmax())}; cut the film, or use another --sync"
         )
     return top - 1 if rises[top - 1] > _RISE * rises[top] else top
@@ -272,14 +272,14 @@ def motion_starts(motion: Signals, options: SyncOptions) -> dict[str, int]:
             near = {pair: each for pair, each in offsets.items() if camera in pair}
             pair = max(near, key=lambda pair: near[pair].sigmas)
             raise InputError(
-                f"{camera}: no offset by motion can be trusted; the best, with {pair[pair[0] == camera]}: "
+                f"{camera}: no offset found from motion can be trusted; the best, with {pair[pair[0] == camera]}: "
                 f"{near[pair].doubt}; use another --sync"
             )
     for (one, other), each in trusted.items():
         if abs(starts[other] - starts[one] - each.frames) > 1:
             raise InputError(
-                f"{one} and {other}: by motion {each.frames} frames apart, but "
-                f"{starts[other] - starts[one]} over the other cameras; use another --sync"
+                f"{one} and {other}: from motion, {each.frames} frames apart, but "
+                f"{starts[other] - starts[one]} by way of the other cameras; use another --sync"
             )
     return _from_zero(starts)
 
@@ -300,9 +300,9 @@ def offset_between(one: Float[np.ndarray, "m"], other: Float[np.ndarray, "n"], o
     frames = int(offsets[best])
     doubt: str | None
     if sigmas < options.motion_sigmas:
-        doubt = f"{frames} frames stands out by {sigmas:.1f} standard deviations"
+        doubt = f"an offset of {frames} frames stands out by only {sigmas:.1f} standard deviations"
     elif heights[second_best] > options.second_share * heights[best]:
-        doubt = f"{offsets[second_best]} frames is about as good as {frames}"
+        doubt = f"an offset of {offsets[second_best]} frames is about as good as one of {frames}"
     else:
         doubt = _disagreement(first, second, frames)
     return Offset(frames=frames, correlation=float(found[best]), sigmas=sigmas, doubt=doubt)
@@ -319,7 +319,9 @@ def _disagreement(one: Float[np.ndarray, "m"], other: Float[np.ndarray, "n"], fr
         halves.append(frames + int(offsets[heights.argmax()]))
     if max(abs(each - frames) for each in halves) <= 1:
         return None
-    return f"{halves[0]} frames in its first half and {halves[1]} in its second; the rates may differ"
+    return (
+        f"an offset of {halves[0]} frames in the first half and {halves[1]} in the second; the frame rates may differ"
+    )
 
 
 def _correlations(

@@ -122,21 +122,26 @@ class DesignBrief:
 
     def __post_init__(self) -> None:
         low, high = self.working_distance_mm
-        _check(0 < low <= high, f"working_distance_mm is {low:g}-{high:g}; it must be positive and ascending")
+        _check(0 < low <= high, f"working_distance_mm is {low:g}-{high:g}; it must be positive and in ascending order")
         _check(self.thickness_mm > 0, f"thickness_mm is {self.thickness_mm:g}; it must be positive")
         _check(len(self.surfaces) > 0, "[surfaces] is empty; name at least one that must be seen")
         for surface, share in self.surfaces.items():
-            _check(0 < share <= 1, f"the share of surface {shown(surface)} is {share:g}; it must lie in 0-1")
-        _check(self.cameras.most >= 2, f"cameras.most is {self.cameras.most}; two cameras at least measure depth")
+            _check(0 < share <= 1, f"the share of surface {shown(surface)} is {share:g}; it must lie between 0 and 1")
+        _check(self.cameras.most >= 2, f"cameras.most is {self.cameras.most}; depth needs at least two")
         _check(
             self.cameras.spacing_mm >= self.sensor.sensor_width_mm,
             f"cameras.spacing_mm is {self.cameras.spacing_mm:g}, less than the width of the sensor, "
             f"{self.sensor.sensor_width_mm:.2f} mm",
         )
-        _check(1 <= self.mouth.tooth <= 7, f"mouth.tooth is {self.mouth.tooth}; it is counted from 1 to 7")
+        _check(1 <= self.mouth.tooth <= 7, f"mouth.tooth is {self.mouth.tooth}; it must be from 1 to 7")
         _check(0 < self.mouth.people < 1, f"mouth.people is {self.mouth.people:g}; it must lie between 0 and 1")
-        _check(self.motion.turns % 2 == 1 and self.motion.turns > 0, f"motion.turns is {self.motion.turns}; not odd")
-        _check(0 < self.motion.turn_deg < 90, f"motion.turn_deg is {self.motion.turn_deg:g}; it must lie in 0-90")
+        _check(
+            self.motion.turns % 2 == 1 and self.motion.turns > 0,
+            f"motion.turns is {self.motion.turns}; it must be positive and odd",
+        )
+        _check(
+            0 < self.motion.turn_deg < 90, f"motion.turn_deg is {self.motion.turn_deg:g}; it must lie between 0 and 90"
+        )
         weights = (self.weights.coverage, self.weights.precision, self.weights.cameras)
         _check(min(weights) >= 0, "the weights must not be negative")
         near, far = self.depth_range_mm
@@ -164,7 +169,7 @@ class DesignBrief:
         needed = self.thickness_mm + self.working_distance_mm[0]
         _check(
             needed <= gap_mm,
-            f"thickness {self.thickness_mm:g} mm + working distance {self.working_distance_mm[0]:g} mm are {needed:g} "
+            f"thickness {self.thickness_mm:g} mm + working distance {self.working_distance_mm[0]:g} mm is {needed:g} "
             f"mm, more than the gap of {gap_mm:.1f} mm that {self.mouth.people:.0%} of people have at tooth "
             f"{self.mouth.tooth}",
         )
@@ -194,7 +199,10 @@ def parse_brief(content: Mapping[str, Any]) -> DesignBrief:
     for name, kind in tables.items():
         values[name] = _table(values.get(name, {}), kind, name)
     shares = values["surfaces"]
-    _check(isinstance(shares, Mapping) and _are_numbers(list(shares.values())), "[surfaces] must be name = share")
+    _check(
+        isinstance(shares, Mapping) and _are_numbers(list(shares.values())),
+        "[surfaces] must hold lines like name = share",
+    )
     values["surfaces"] = {surface: float(share) for surface, share in shares.items()}
     return DesignBrief(**_typed(values, DesignBrief, ""))
 
@@ -207,15 +215,15 @@ def _sensor(given: object) -> Optics:
     if "preset" not in own:
         return Optics(**{"name": "own sensor", **_figures(own, complete=True)})
     preset = own.pop("preset")
-    _check(preset in PRESETS, f"unknown sensor {shown(preset)}; there are {', '.join(PRESETS)}")
+    _check(preset in PRESETS, f"unknown sensor {shown(preset)}; choose one of {', '.join(PRESETS)}")
     return replace(PRESETS[preset], **_figures(own, complete=False))
 
 
 def _figures(own: dict[str, Any], *, complete: bool) -> dict[str, Any]:
     known = {each.name for each in fields(Optics)}
     needed = {each.name for each in fields(Optics) if each.default is MISSING} - {"name"} if complete else set()
-    _check(not set(own) - known, f"sensor: unknown {one_line(', '.join(sorted(set(own) - known)))}")
-    _check(not needed - set(own), f"sensor: {', '.join(sorted(needed - set(own)))} missing; or name a preset")
+    _check(not set(own) - known, f"sensor: unknown key {one_line(', '.join(sorted(set(own) - known)))}")
+    _check(not needed - set(own), f"sensor: {', '.join(sorted(needed - set(own)))} missing; give them or name a preset")
     return _typed(own, Optics, "sensor.")
 
 
@@ -244,7 +252,7 @@ def _check_keys(values: Mapping[str, Any], kind: type, where: str) -> None:
     known = {each.name for each in fields(kind)}
     needed = {each.name for each in fields(kind) if each.default is MISSING and each.default_factory is MISSING}
     unknown, missing = sorted(set(values) - known), sorted(needed - set(values))
-    _check(not unknown, f"{where}: unknown {one_line(', '.join(unknown))}; there are {', '.join(sorted(known))}")
+    _check(not unknown, f"{where}: unknown key {one_line(', '.join(unknown))}; choose from {', '.join(sorted(known))}")
     _check(not missing, f"{where}: {', '.join(missing)} missing")
 
 

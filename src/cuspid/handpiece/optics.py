@@ -32,8 +32,8 @@ def horizontal_from_diagonal_deg(
     """Full horizontal angle of view of a lens of which the diagonal one is published."""
     if not (0 < diagonal_deg < 180 and width_px > 0 and height_px > 0):
         raise InputError(
-            f"optics: the diagonal angle of view must lie in 0-180 deg and the image have a size, not {diagonal_deg:g} "
-            f"deg and {width_px} x {height_px} px"
+            f"optics: the diagonal angle of view must be between 0 and 180 deg and the image size positive, not "
+            f"{diagonal_deg:g} deg and {width_px} x {height_px} px"
         )
     share = width_px / float(np.hypot(width_px, height_px))
     if projection == "equidistant":
@@ -66,11 +66,13 @@ class Optics:
         sizes = (self.width_px, self.height_px, self.pixel_um, self.f_number, self.focus_mm)
         if min(sizes) <= 0 or not 0 < self.field_of_view_deg < 180:
             raise InputError(
-                f"optics {self.name}: sizes, f-number and focus must be positive and the angle of view in 0-180 deg"
+                f"optics {self.name}: sizes, f-number and focus must be positive and the angle of view "
+                "between 0 and 180 deg"
             )
         if self.focus_mm <= self.focal_mm:
             raise InputError(
-                f"optics {self.name}: focused at {self.focus_mm} mm, inside its focal length of {self.focal_mm:.2f} mm"
+                f"optics {self.name}: focused at {self.focus_mm} mm, which is within its focal length of "
+                f"{self.focal_mm:.2f} mm"
             )
 
     @property
@@ -123,7 +125,7 @@ class Optics:
         """Diameter of the Airy disc in px for green light, at the working f-number N (1 + m) for a distance."""
         if distance_mm <= self.focal_mm:
             raise InputError(
-                f"optics {self.name}: nothing at {distance_mm} mm can be imaged, inside the focal length of "
+                f"optics {self.name}: cannot image anything at {distance_mm} mm, which is within its focal length of "
                 f"{self.focal_mm:.2f} mm"
             )
         magnification = self.focal_mm / (distance_mm - self.focal_mm)

@@ -179,8 +179,8 @@ class Design:
         unmet = self.best.assessment.unmet
         if unmet:
             raise InputError(
-                f"brief: no handpiece of at most {brief.cameras.most} cameras was found that meets it; the best fails "
-                f"in {'; '.join(map(str, unmet))}"
+                f"brief: no handpiece with at most {brief.cameras.most} cameras was found that meets it; the best "
+                f"one fails on {'; '.join(map(str, unmet))}"
             )
 
 

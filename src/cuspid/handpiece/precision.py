@@ -93,11 +93,11 @@ def noise_px(
         growth += (np.rad2deg(convergence(cameras, points, seen)) / model.convergence_deg) ** 4
     if model.deformation is not None:
         if normals is None:
-            raise InputError("noise model: deformation counts, so the normals of the surface must be given")
+            raise InputError("noise model: it includes deformation, so the surface normals must be given")
         growth += (deformation(cameras, points, normals, seen) / model.deformation) ** 2
     if model.blur_px is not None:
         if optics is None:
-            raise InputError("noise model: blur counts, so the optics that blur must be given")
+            raise InputError("noise model: it includes blur, so the optics must be given")
         depths = np.stack([mounted.cam_from_rig.apply(points)[:, 2] for mounted in cameras])
         growth += (optics.blur_px(np.where(depths > 0, depths, np.nan)) / model.blur_px) ** 2
     return model.sigma_px * np.sqrt(growth)

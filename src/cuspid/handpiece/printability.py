@@ -101,7 +101,7 @@ def check_seats(made: Printable, options: PrintOptions) -> None:
     for one, other in near:
         if (blocks[one] ^ blocks[other]).volume() > NOTHING_MM3:
             raise InputError(
-                f"holder: the modules of {one} and {other} overlap; set them farther apart, or give smaller modules "
+                f"holder: the modules of {one} and {other} overlap; move them farther apart, or give smaller modules "
                 "(--holder.camera-mm, --holder.led-mm, or the body in handpiece.json)"
             )
     for one, other in near:
@@ -109,14 +109,14 @@ def check_seats(made: Printable, options: PrintOptions) -> None:
         if gap < options.web_mm - 1e-6:
             raise InputError(
                 f"holder: the wall between the seats of {one} and {other} is {gap:.2f} mm thick, less than --web-mm "
-                f"{options.web_mm:g}; set them farther apart, or give smaller modules, a smaller --seat-clearance-mm "
+                f"{options.web_mm:g}; move them farther apart, or give smaller modules, a smaller --seat-clearance-mm "
                 "or a thinner web"
             )
     for (seat, pocket), (duct, hollow) in product(made.seats.items(), {**made.ducts, **made.channels}.items()):
         own = duct.removeprefix("channel of ") == seat.removeprefix("seat of ")
         if not own and (pocket ^ hollow).volume() > NOTHING_MM3:
             raise InputError(
-                f"holder: the {duct} runs through the {seat}; set the cameras otherwise, or make --duct-mm, "
+                f"holder: the {duct} runs through the {seat}; rearrange the cameras, or make --duct-mm, "
                 "--arm-width-mm or --neck-width-mm smaller"
             )
 
@@ -131,22 +131,22 @@ def _apart_mm(one: Box, other: Box) -> float:
 def check_solid(made: Printable) -> None:
     """Raise InputError unless the holder is one closed solid, also as a file stores it, and its hollows are one."""
     if made.solid.status() != Error.NoError or made.solid.volume() <= 0:
-        raise InputError(f"holder: no solid came of it ({made.solid.status().name}); try other sizes")
+        raise InputError(f"holder: it does not form a solid ({made.solid.status().name}); try other sizes")
     found = pieces(made.solid)
     if len(found) > 1:
         raise InputError(
             f"holder: it falls into {len(found)} pieces, one around {_where(made, found[1])}; make --arm-width-mm, "
-            "--neck-width-mm or the walls larger, or set the cameras otherwise"
+            "--neck-width-mm or the walls larger, or rearrange the cameras"
         )
     for one, other in pairwise(pieces(union(made.hollows))):
         raise InputError(
-            f"holder: no way for a cable leads from {_where(made, other)} to {_where(made, one)}; make --duct-mm or "
+            f"holder: a cable cannot pass from {_where(made, other)} to {_where(made, one)}; make --duct-mm or "
             "--arm-width-mm larger"
         )
     stored = trimesh.Trimesh(made.mesh.vertices.astype(np.float32), made.mesh.faces)
     if not (stored.is_watertight and stored.is_winding_consistent):
         raise InputError(
-            "holder: its surface does not stay closed in single precision, as files keep it; change a size a little"
+            "holder: its surface does not stay closed in the single precision of the files; change a size slightly"
         )
 
 
@@ -165,8 +165,8 @@ def check_insertion(made: Printable) -> None:
         if stopped.volume() > NOTHING_MM3:
             by = [shell for shell, each in made.shells.items() if (stopped ^ each).volume() > NOTHING_MM3 / 10]
             raise InputError(
-                f"holder: {name} cannot be pushed into its seat from the front, past {' and '.join(by)}; "
-                "set the cameras farther apart or turn them less"
+                f"holder: {name} cannot be pushed into its seat from the front, blocked by {' and '.join(by)}; "
+                "move the cameras farther apart or turn them less"
             )
 
 
@@ -184,8 +184,8 @@ def check_sight(solid: Manifold, handpiece: Handpiece, options: PrintOptions) ->
             place = origin + hits.distances[nearest] * rays[nearest]
             part = handpiece.solid.names[int(handpiece.solid.distances(place[None])[1][0])]
             raise InputError(
-                f"holder: {part} is in the way of {name}, {hits.distances[nearest]:.1f} mm before it, for "
-                f"{blocked.mean():.0%} of its rays; move one of them, make {part} smaller, or ask for less light "
+                f"holder: {part} blocks {name}, {hits.distances[nearest]:.1f} mm in front of it, for "
+                f"{blocked.mean():.0%} of its rays; move one of them, make {part} smaller, or require less light "
                 "(--light-half-angle-deg)"
             )
 
@@ -196,9 +196,9 @@ def thinnest(made: Printable, options: PrintOptions) -> tuple[Wall, Wall | None]
     wall, web = (min(each, key=lambda one: one.thickness_mm, default=None) for each in (walls, webs))
     for found, least_mm, option in ((wall, options.wall_mm, "--wall-mm"), (web, options.web_mm, "--web-mm")):
         if found is not None and found.thickness_mm < (1 - _TOLERANCE) * least_mm:
-            raise InputError(f"holder: a wall is {found}, less than {option} {least_mm:g}; set the parts farther apart")
+            raise InputError(f"holder: a wall is only {found}, less than {option} {least_mm:g}; move the parts apart")
     if wall is None:
-        raise InputError("holder: no wall of it could be measured; try other sizes")
+        raise InputError("holder: none of its walls could be measured; try other sizes")
     return wall, web
 
 

@@ -85,10 +85,13 @@ class PrintOptions(Options):
         ):
             if width_mm <= 2 * wall_mm:
                 option = name.replace("_", "-")
-                raise InputError(f"print: --{option} is {width_mm:g}, no wider than two walls of {wall_mm:g} mm")
+                raise InputError(
+                    f"print: --{option} is {width_mm:g}; it must be wider than two walls of {wall_mm:g} mm"
+                )
         if self.handle_wall_mm < self.wall_mm:
             raise InputError(
-                f"print: --handle-wall-mm is {self.handle_wall_mm:g}, less than --wall-mm {self.wall_mm:g}"
+                f"print: --handle-wall-mm is {self.handle_wall_mm:g}; it must not be less than --wall-mm "
+                f"{self.wall_mm:g}"
             )
 
     @property
@@ -192,11 +195,11 @@ def module_boxes(handpiece: Handpiece) -> dict[str, Box]:
     for name, axis in axes.items():
         if name not in parts:
             raise InputError(
-                f"holder: the body of {handpiece.name} has no box named {name!r}; add it, or leave the body out for "
-                "modules of the usual size"
+                f"holder: the body of {handpiece.name} has no box named {name!r}; add it, or leave out the body to "
+                "get modules of the default size"
             )
         if parts[name].box_from_rig.rotation[2] @ axis < np.cos(np.deg2rad(1.0)):
-            raise InputError(f"holder: the box {name!r} of {handpiece.name} has its +Z not where the {name} looks")
+            raise InputError(f"holder: +Z of the box {name!r} of {handpiece.name} must point where {name} looks")
     return {name: parts[name] for name in axes}
 
 
@@ -249,8 +252,8 @@ def _channel(name: str, module: Box, head_from_rig: Rigid3, middle_mm: float, op
     width = module.half_mm[:2] - options.shoulder_mm
     if width.min() <= 0:
         raise InputError(
-            f"print: --shoulder-mm is {options.shoulder_mm:g}; {name} is {2 * module.half_mm[:2].min():g} mm wide, and "
-            "nothing would be left for its cable"
+            f"print: --shoulder-mm is {options.shoulder_mm:g}; {name} is {2 * module.half_mm[:2].min():g} mm wide, "
+            "which leaves no room for its cable"
         )
     head_from_module = head_from_rig @ module.box_from_rig.inverse()
     length = (head_from_module.translation[2] - middle_mm) / head_from_module.rotation[2, 2]

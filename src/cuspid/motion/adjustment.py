@@ -480,9 +480,7 @@ def _known_posterior(state: State, observations: Observations, weighting: Weight
     try:
         return _posterior(state, observations, weighting)
     except LinAlgError as error:
-        raise ReconstructionError(
-            "adjustment: the tracks do not join every frame to the others; more overlap is needed"
-        ) from error
+        raise ReconstructionError("adjustment: the tracks do not connect all frames; more overlap is needed") from error
 
 
 def _adjusted_rig(state: State, prior: _Prior, covariance: Float[np.ndarray, "c 14 14"] | None) -> Rig:
@@ -579,7 +577,7 @@ def _adjusted(
     for _ in range(options.rounds):
         keep = _good(state, observations, limit_px, options.minimum_angle_deg)
         if not keep.any():
-            raise ReconstructionError("adjustment: no point is consistent; check the handpiece's calibration")
+            raise ReconstructionError("adjustment: no consistent points are left; check the handpiece's calibration")
         state, observations, colors = _select(state, observations, colors, keep)
         weighting = Weighting(sigma_px, options.huber_sigmas, prior.is_free)
         minimum = _minimise(state, observations, weighting, prior, options)
@@ -648,7 +646,7 @@ def _implausible(state: State, prior: _Prior) -> tuple[str, ...]:
         return ()
     camera = int(np.argmax(np.sum(state.whitened**2, axis=1)))
     return (
-        f"calibration: the images want it {np.sqrt(cost / numbers):.1f} standard deviations (root mean square of "
-        f"{numbers} numbers) from the file, camera {prior.rig.names[camera]} farthest; is it the file of this "
-        "handpiece, and are its covariances not too small?",
+        f"calibration: the images move it {np.sqrt(cost / numbers):.1f} standard deviations (root mean square of "
+        f"{numbers} numbers) away from the file, camera {prior.rig.names[camera]} the most; is this the file of this "
+        "handpiece, and are its covariances large enough?",
     )

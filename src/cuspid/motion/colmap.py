@@ -150,7 +150,7 @@ def write_model(folder: Path, found: Reconstruction, capture: Capture) -> None:
         except (InputError, RuntimeError, ValueError) as error:
             raise OutputError(f"{folder}: the sparse model cannot be written ({error}); free some space") from error
         if (written.num_points3D(), written.num_reg_images()) != (model.num_points3D(), model.num_reg_images()):
-            raise OutputError(f"{folder}: the sparse model is not whole; free some space")
+            raise OutputError(f"{folder}: the sparse model was not written completely; free some space")
 
 
 # --- reading -----------------------------------------------------------------------------------------------------
@@ -172,7 +172,9 @@ def _model_folder(folder: Path) -> Path:
         for suffix in (".bin", ".txt"):
             if all((candidate / f"{name}{suffix}").is_file() for name in MODEL_FILES):
                 return candidate
-    raise InputError(f"{folder}: no COLMAP model; a folder with cameras, images and points3D (.bin or .txt) is needed")
+    raise InputError(
+        f"{folder}: it contains no COLMAP model; a folder with cameras, images and points3D (.bin or .txt) is needed"
+    )
 
 
 def hash_model(folder: Path) -> str:
@@ -385,8 +387,9 @@ def read_model(folder: Path, capture: Capture) -> Reconstruction:
     found = from_colmap(_read(folder), capture, str(folder))
     if found.log["scale_spread"] > SCALE_SPREAD:
         raise InputError(
-            f"{folder}: the distances between its cameras vary by {100 * found.log['scale_spread']:.1f} % of those in "
-            "the handpiece; give the handpiece file that took these images, or make the model with its rig_config.json"
+            f"{folder}: relative to the handpiece, the distances between its cameras vary by "
+            f"{100 * found.log['scale_spread']:.1f} % from frame to frame; give the file of the handpiece that took "
+            "these images, or make the model with its rig_config.json"
         )
     return found
 

@@ -310,8 +310,8 @@ def _loose_notes(found: Reconstruction, least: int) -> tuple[str, ...]:
     if not loose:
         return ()
     return (
-        f"motion: fewer than {least} points seen in stereo on both sides tie frames {', '.join(loose[:5])}"
-        f"{', ...' if len(loose) > 5 else ''}: the parts of the scan may be displaced; scan there again, slower",
+        f"motion: fewer than {least} points seen in stereo on both sides connect frames {', '.join(loose[:5])}"
+        f"{', ...' if len(loose) > 5 else ''}: parts of the scan may be displaced; scan there again, more slowly",
     )
 
 
@@ -322,17 +322,17 @@ def _advice(found: Reconstruction) -> Iterator[str]:
         return
     if expected.scale_sigma_ppm > _LOOSE_SCALE_PPM:
         yield (
-            f"expected: the scale is known within {expected.scale_sigma_ppm / 1e4:.2g} % only (one sigma), for the "
-            "calibration leaves it open; calibrate the handpiece with a board (cuspid calibrate)"
+            f"expected: the scale is known only to within {expected.scale_sigma_ppm / 1e4:.2g} % (one sigma), because "
+            "the calibration does not fix it; calibrate the handpiece with a board (cuspid calibrate)"
         )
         return
     by_scale_um = expected.scale_sigma_ppm * expected.span_mm / 1000
     bent_um = float(np.sqrt(max(expected.span_sigma_um**2 - by_scale_um**2, 0.0)))
     if 1000 * bent_um > _LOOSE_SPAN_PPM * expected.span_mm:
         yield (
-            f"expected: apart from the scale, the {expected.span_mm:.0f} mm from end to end are known within "
-            f"{bent_um:.0f} um only (one sigma); a sweep straight from one side to the other, as over the palate, "
-            "helps (in simulation --cross-sweep)"
+            f"expected: apart from the scale, the {expected.span_mm:.0f} mm from end to end are known only to "
+            f"within {bent_um:.0f} um (one sigma); a sweep straight from one side to the other, such as over the "
+            "palate, helps (in simulation: --cross-sweep)"
         )
 
 
@@ -385,8 +385,8 @@ def _adjusted(
         few = np.flatnonzero(found < options.odometry.minimum_matches)
         if len(few):
             note = (
-                f"motion: in {len(few)} frames ({adjusted.frames[few[0]]} first) hardly any patch is found again, as "
-                "behind glare or blur: keypoints are taken as they are, and the path is less exact"
+                f"motion: in {len(few)} frames (first: {adjusted.frames[few[0]]}) hardly any patches could be matched, "
+                "as with glare or blur: keypoints are used as detected, and the path is less accurate"
             )
             start, placed = replace(start, notes=(*start.notes, note)), tracks
         exact = replace(start, rig_from_world=adjusted.rig_from_world, tracks=placed)

@@ -134,12 +134,12 @@ def held_misfit(
     if tracks <= directions or square * (1 - directions / tracks) <= chdtri(directions, CHANCE):
         return ()
     return (
-        f"calibration: held, but the images want it {np.sqrt(square / directions):.1f} standard deviations of "
-        f"{_ALLOWED_PX:g} px (root mean square of {directions} numbers) from the file, camera "
-        f"{_farthest(wanted, held, names)} farthest; reprojection {_typical_px(state, observations):.2f} px (median) "
-        f"where about {_typical_px(left, observations):.2f} px is expected. Is it the file of another handpiece, or "
-        "of one built with errors? Calibrate it (cuspid calibrate), or let it be refined, as a file without "
-        "covariances is",
+        f"calibration: held fixed, but the images would move it {np.sqrt(square / directions):.1f} standard deviations "
+        f"of {_ALLOWED_PX:g} px (root mean square of {directions} numbers) away from the file, camera "
+        f"{_farthest(wanted, held, names)} the most; the reprojection error is {_typical_px(state, observations):.2f} "
+        f"px (median) where about {_typical_px(left, observations):.2f} px is expected. Is this the file of another "
+        "handpiece, or of one built with errors? Calibrate the handpiece (cuspid calibrate), or let the calibration "
+        "be refined, as it is for a file without covariances",
     )
 
 

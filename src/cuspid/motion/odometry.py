@@ -282,10 +282,10 @@ def _reason(
     """Why a frame is not in the largest part."""
     fellows = int(np.sum(part == part[frame]))
     if fellows > 1:
-        return f"with {fellows - 1} others in a part of the scan that nothing ties to the rest"
+        return f"with {fellows - 1} others in a part of the scan that nothing connects to the rest"
     most = max((edge.matches for pair, edge in edges.items() if frame in pair), default=0)
     if most >= options.minimum_matches:
-        return f"only {most} of its matches to its neighbours agree; too few of all"
+        return f"only {most} of its matches to its neighbours agree; too small a share"
     return f"only {most} matches to its neighbours; {options.minimum_matches} are needed"
 
 

@@ -49,11 +49,15 @@ _WINDOW = 15
 """Number of frames with whose sharpness that of a frame is compared."""
 
 
+ENAMEL = FeatureOptions(count=2500, contrast=0.004, edge=30.0)
+"""Many keypoints, the weak ones too: plain enamel has little more."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class SingleOptions(Options):
     """How the trajectory of one camera is found."""
 
-    features: FeatureOptions = field(default_factory=lambda: FeatureOptions(count=2500, contrast=0.004, edge=30.0))
+    features: FeatureOptions = field(default_factory=lambda: ENAMEL)
     """Keypoints of the contrast-normalised frames; plain enamel needs a low threshold."""
     clahe_clip: Annotated[float, Range(0.01, 1000)] = 1.5
     """Clip limit of the contrast normalisation (CLAHE)."""
@@ -483,7 +487,7 @@ def _strangers(looks: Sequence[_Look], names: Sequence[str]) -> tuple[str, ...]:
     if not strange:
         return ()
     which = f"{len(strange)} of {len(names)} frames ({strange[0]} to {strange[-1]})"
-    return (f"{which} show little that has the colour of teeth or gums: is this a film of teeth?",)
+    return (f"{which} have few pixels in the colours of teeth or gums: is this a film of teeth?",)
 
 
 def _notes(camera: Camera, calibrated: bool, parts: Sequence[SparseModel]) -> tuple[str, ...]:
@@ -495,7 +499,7 @@ def _notes(camera: Camera, calibrated: bool, parts: Sequence[SparseModel]) -> tu
         )
     if len(parts) > 1:
         sizes = ", ".join(str(len(part.frames)) for part in parts)
-        notes.append(f"the sequence broke into {len(parts)} parts of {sizes} frames that no verified pair joins")
+        notes.append(f"the sequence broke into {len(parts)} parts ({sizes} frames) that no verified pair connects")
     return tuple(notes)
 
 
@@ -506,7 +510,7 @@ def _check_enough(kept: Sequence[int], refused: Mapping[int, str], names: Sequen
     reasons = sorted({reason.split(":")[0].split(" as ")[0] for reason in refused.values()})
     raise ReconstructionError(
         f"{len(refused)} of {len(names)} frames ({names[0]} to {names[-1]}) cannot be used: {', '.join(reasons)}; "
-        "film slowly, with light, and with the teeth in focus"
+        "film slowly, with enough light, and with the teeth in focus"
     )
 
 
@@ -522,8 +526,11 @@ def _why_nothing(
     if np.median(counts) < 50:
         return f"{span} show too little detail ({np.median(counts):.0f} keypoints a frame): out of focus, or no teeth"
     if not verified:
-        return f"{span} have nothing in common with each other; film the arch in one go, each frame over half the last"
-    return f"{span} overlap, but the camera did not move enough between them to tell depth; move it along the arch"
+        return (
+            f"{span} have nothing in common with each other; film the arch in one go, "
+            "with each frame overlapping half of the one before"
+        )
+    return f"{span} overlap, but the camera did not move enough between them to determine depth; move it along the arch"
 
 
 def _uses(

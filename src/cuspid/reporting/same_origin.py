@@ -66,7 +66,9 @@ def only_own_pages(bound: str) -> Iterator[None]:
     finally:
         server.serve = serve  # type: ignore[misc]
     if not started:
-        raise MissingDependencyError("view: this viser cannot be kept from other pages; pip install 'viser==1.1.1'")
+        raise MissingDependencyError(
+            "view: this version of viser cannot be shielded from other web pages; pip install 'viser==1.1.1'"
+        )
 
 
 def _guarded(answer: Answer, bound: str) -> Answer:
@@ -74,6 +76,6 @@ def _guarded(answer: Answer, bound: str) -> Answer:
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
         if len(hosts) == 1 and len(origins) < 2 and is_own(hosts[0], next(iter(origins), None), bound):
             return answer(connection, request)
-        return connection.respond(HTTPStatus.FORBIDDEN, "cuspid: only pages of this server may read from it\n")
+        return connection.respond(HTTPStatus.FORBIDDEN, "cuspid: only pages from this server may access it\n")
 
     return guarded

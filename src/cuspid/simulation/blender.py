@@ -80,7 +80,9 @@ def blender_python() -> Path:
     try:
         found = subprocess.run([given, "-c", "import bpy"], capture_output=True, text=True, check=False)
     except OSError as error:
-        raise MissingDependencyError(f"{PYTHON_VARIABLE}={given} does not run ({error.strerror}): {_HOW_TO}") from error
+        raise MissingDependencyError(
+            f"{PYTHON_VARIABLE}={given} cannot be run ({error.strerror}): {_HOW_TO}"
+        ) from error
     if found.returncode:
         reason = (found.stderr.strip().splitlines() or ["no message"])[-1]
         raise MissingDependencyError(f"{PYTHON_VARIABLE}={given} cannot import bpy ({reason}): {_HOW_TO}")
@@ -137,7 +139,7 @@ def _write_scene(
 def _camera(name: str, mounted: MountedCamera, rig_from_world: Rigid3) -> dict[str, Any]:
     camera = mounted.camera
     if np.any(camera.distortion):
-        raise InputError(f"camera {name}: Blender has no such lens distortion; use the renderer embree")
+        raise InputError(f"camera {name}: Blender cannot render this lens distortion; use the renderer embree")
     return {
         "width": camera.width,
         "height": camera.height,
@@ -149,7 +151,9 @@ def _camera(name: str, mounted: MountedCamera, rig_from_world: Rigid3) -> dict[s
 
 def _light(light: Light, rig_from_world: Rigid3) -> dict[str, Any]:
     if light.lobe_exponent != 1:
-        raise InputError(f"light: Blender's discs shine with lobe exponent 1, not {light.lobe_exponent}; use embree")
+        raise InputError(
+            f"light: Blender's disc lights have lobe exponent 1, not {light.lobe_exponent}; use the renderer embree"
+        )
     world_from_rig = rig_from_world.inverse()
     # Blender's area lights shine along -Z; about that axis any turn will do.
     axis = -world_from_rig.rotate(light.direction)

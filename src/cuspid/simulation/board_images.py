@@ -90,8 +90,8 @@ def take_photographs(
     """
     if board.height_mm > _HIGHEST * handpiece.working_distance_mm:
         raise InputError(
-            f"board: the last terrace is {board.height_mm:g} mm over the first, which is too near the cameras at a "
-            f"working distance of {handpiece.working_distance_mm:g} mm; make --step-mm smaller"
+            f"board: the last terrace is {board.height_mm:g} mm above the first, which is too close to the cameras at "
+            f"a working distance of {handpiece.working_distance_mm:g} mm; make --step-mm smaller"
         )
     truth = folder / "truth" / "handpiece.json"
     write_handpiece(truth, handpiece)
@@ -125,7 +125,7 @@ class _Shot:
 def _shots(handpiece: Handpiece, board: Board, options: PhotographOptions) -> list[_Shot]:
     """Raises InputError where the handpiece has no lights to shine."""
     if options.lit != "evenly" and not handpiece.lights:
-        raise InputError(f"handpiece {handpiece.name}: it has no lights; leave --lit evenly")
+        raise InputError(f"handpiece {handpiece.name}: it has no lights; use --lit evenly")
     digits, lights = len(str(options.instants - 1)), list(handpiece.lights)
     shots = []
     for k, pose in enumerate(board_poses(handpiece, board, options)):

@@ -46,7 +46,8 @@ def render_reference(scene: Scene, options: ReferenceRenderOptions = ReferenceRe
     height = options.camera_height_mm
     if height is not None and height < high[2] + _ABOVE_MM:
         raise InputError(
-            f"reference render: the camera at {height:g} mm stands in the jaw; it reaches to {high[2]:.1f} mm"
+            f"reference render: the camera at {height:g} mm is inside the jaw, which reaches up to "
+            f"{high[2]:.1f} mm; raise the camera"
         )
     sides = (high - low + 2 * options.margin_mm) / options.mm_per_px
     columns, bottom = int(np.ceil(sides[0])), int(np.ceil(sides[1]))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Literal
 
 import numpy as np
@@ -20,14 +19,11 @@ from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.blender import render_with_blender
 from cuspid.simulation.lights import lit
 from cuspid.simulation.manufacturing import ManufacturingOptions, built, told
-from cuspid.simulation.path.free import FreePathOptions, plan_free_path
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 from cuspid.simulation.raycast import Scene, lit_frames, render_capture
-from cuspid.simulation.reference_render import ReferenceRenderOptions, render_reference
 from cuspid.storage.captures import write_capture, write_image
 from cuspid.storage.files import digest_of, hash_file
 from cuspid.storage.handpieces import read_handpiece
-from cuspid.storage.reference_renders import REFERENCE_RENDER_FILES, write_reference_render
 from cuspid.storage.stages import Stage
 from cuspid.storage.truths import write_path, write_truth
 from cuspid.tolerances import EXACT
@@ -59,20 +55,6 @@ class SimulationOptions(RenderOptions):
     """How the handpiece that takes the images differs from the one that the reconstruction is given."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FilmOptions(RenderOptions):
-    """How a jaw is filmed by hand in simulation."""
-
-    texture: Preset = "enamel"
-    """Surface: artificial (strong matte texture, the thesis' condition), powder (weak speckle), enamel (plain, wet)."""
-    path: FreePathOptions = field(default_factory=FreePathOptions)
-    """How the hand moves the camera."""
-
-
-REFERENCE_RENDERS: Mapping[str, float | None] = MappingProxyType({"occlusal": None, "shot": 300.0})
-"""Camera height in mm of each picture of the true jaw; None for an orthographic view."""
-
-
 def simulate(
     jaw: Jaw, handpiece: Handpiece, folder: Path, options: SimulationOptions, *, progress: Progress = silent
 ) -> tuple[Capture, GroundTruth]:
@@ -88,32 +70,6 @@ def simulate(
     write_path(folder / "truth" / "path.json", *overlaps, path.seen, path.cross_sweep)
     true, known = built(handpiece, options.manufacturing), told(handpiece, options.manufacturing)
     return take_images(jaw, true, path.rig_from_world, folder, options, known=known, progress=progress)
-
-
-def film(
-    jaw: Jaw, handpiece: Handpiece, folder: Path, options: FilmOptions, *, progress: Progress = silent
-) -> tuple[Capture, GroundTruth]:
-    """As :func:`simulate`, with a camera that a shaky hand moves freely over the arch.
-
-    Also writes reference renders of the arch from above: ``truth/occlusal``, orthographic, and ``truth/shot``, from far
-    above.
-    """
-    handpiece = lit(handpiece)
-    poses = plan_free_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
-    capture, truth = take_images(jaw, handpiece, poses, folder, options, progress=progress)
-    for done, (name, height_mm) in enumerate(REFERENCE_RENDERS.items(), start=1):
-        _render_reference(truth, folder / "truth", name, ReferenceRenderOptions(camera_height_mm=height_mm), options)
-        progress("reference renders", done, len(REFERENCE_RENDERS))
-    return capture, truth
-
-
-def _render_reference(
-    truth: GroundTruth, folder: Path, name: str, view: ReferenceRenderOptions, options: FilmOptions
-) -> None:
-    stage = Stage("reference render", folder, [view, _look(options)], _CODE)
-    scene = _scene(truth, replace(options, supersampling=max(2, options.supersampling)))
-    files = [folder / name / file for file in REFERENCE_RENDER_FILES]
-    stage.make(_jaw_files(folder), files, lambda: write_reference_render(folder / name, render_reference(scene, view)))
 
 
 def take_images(
@@ -143,16 +99,16 @@ def take_images(
 def _render(folder: Path, capture: Capture, truth: GroundTruth, options: RenderOptions) -> Iterator[tuple[int, int]]:
     """Render what is not there yet; yields how many images are there, and how many there will be."""
     images = ImageFolder(folder / "capture")
-    stage = Stage("images", folder / "truth", _look(options), _CODE)
+    stage = Stage("images", folder / "truth", look_of(options), CODE)
     # The gain is metered over the whole path, so each image depends on all of the truth.
-    key = stage.key({**_jaw_files(folder / "truth"), "poses": digest_of(dict(truth.rig_from_world))})
+    key = stage.key({**jaw_files(folder / "truth"), "poses": digest_of(dict(truth.rig_from_world))})
     there = {
         (frame.name, camera): stage.has(key, [images.path(frame.name, camera)])
         for frame in capture.frames
         for camera in frame.cameras
     }
     rendered = _RENDERERS[options.renderer](
-        _scene(truth, options),
+        scene_of(truth, options),
         capture.frames,
         truth.rig_from_world,
         lambda frame, camera, image: write_image(images.path(frame, camera), image),
@@ -164,20 +120,23 @@ def _render(folder: Path, capture: Capture, truth: GroundTruth, options: RenderO
         yield done, len(there)
 
 
-_CODE = ("simulation",)
+CODE = ("simulation",)
+"""What images are made by: their key has the version of this code."""
 _RENDERERS = {"embree": render_capture, "blender": render_with_blender}
 
 
-def _look(options: RenderOptions) -> dict[str, object]:
+def look_of(options: RenderOptions) -> dict[str, object]:
     """Of the options those that the images depend on besides the poses."""
     return {each.name: getattr(options, each.name) for each in fields(RenderOptions)}
 
 
-def _jaw_files(truth: Path) -> dict[str, str]:
+def jaw_files(truth: Path) -> dict[str, str]:
+    """SHA-256 of the files of the truth that images are made from, besides the poses."""
     return {name: hash_file(truth / name) for name in ("jaw.ply", "jaw.json", "handpiece.json")}
 
 
-def _scene(truth: GroundTruth, options: RenderOptions) -> Scene:
+def scene_of(truth: GroundTruth, options: RenderOptions) -> Scene:
+    """What is rendered."""
     return Scene(
         jaw=truth.jaw,
         handpiece=truth.handpiece,

@@ -22,7 +22,7 @@ from cuspid.options import Options, Range
 GRADIENT_LIMIT = 2 / 3
 """Largest change of disparity of one surface, px per px of one of the images: a disparity gradient of 1 (P. Burt,
 B. Julesz, Science 208, 1980), which is measured between the two images."""
-_TINY = float(np.finfo(np.float64).tiny)
+_TINY = float(np.finfo(np.float32).tiny)
 
 
 @dataclass(frozen=True, kw_only=True)

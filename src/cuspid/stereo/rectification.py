@@ -94,7 +94,7 @@ def rectify(names: tuple[str, str], first: MountedCamera, second: MountedCamera,
     rotation = _rectified_rotation(baseline, first.axis_in_rig + second.axis_in_rig)
     if rotation is None:
         raise InputError(
-            f"rig: cameras {names[0]} and {names[1]} lie behind each other; stereo needs a sideways baseline"
+            f"rig: cameras {names[0]} and {names[1]} lie one behind the other; stereo needs a sideways baseline"
         )
     places = [Rigid3(rotation, -rotation @ mounted.centre_in_rig) for mounted in (first, second)]
     camera = _common_camera([_field_of_view(mounted, rotation) for mounted in (first, second)], first.camera, scale)

@@ -148,18 +148,21 @@ class HeightMap:
 # --- the occlusal frame ------------------------------------------------------------------------------------------
 
 
-def in_occlusal_frame(model: SparseModel, scale: ScaleOptions) -> SparseModel:
+def in_occlusal_frame(model: SparseModel, scale: ScaleOptions | None) -> SparseModel:
     """The motion with the occlusal frame as its world, scaled to the known width of the arch, else to the working
-    distance, else to `NOMINAL_MM`.
+    distance, else to `NOMINAL_MM`; without ``scale`` it is in millimetres and remains so.
 
     Raises ReconstructionError where there are no points.
     """
-    near = model.scaled(NOMINAL_MM / float(np.median(model.depths)))
+    nearer = NOMINAL_MM / float(np.median(model.depths))
+    near = model.scaled(nearer)
     points, (centres, axes) = near.tracks.points, _centres_and_axes(near)
     world_from_model = _upright(points, centres, axes)
     world_from_model = _levelled(world_from_model.apply(points)) @ world_from_model
     front = _facing_front(world_from_model.apply(centres), world_from_model.apply(points))
     found = transformed(near, front @ world_from_model)
+    if scale is None:
+        return found.scaled(1 / nearer)
     if scale.width_mm is not None:
         return found.scaled(scale.width_mm / _width(found.tracks.points))
     heights = _centres_and_axes(found)[0][:, 2]

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import UInt8
 
-from cuspid.image_sequence import ImageSequence
 from cuspid.panorama import FrameUse, Panorama, Strip
 from cuspid.progress import Progress, silent
 from cuspid.sparse_model import SparseModel
-from cuspid.stitching.height_map import HeightMapOptions, ScaleOptions, height_map, in_occlusal_frame, uncovered
+from cuspid.stitching.height_map import (
+    HeightMap,
+    HeightMapOptions,
+    ScaleOptions,
+    height_map,
+    in_occlusal_frame,
+    uncovered,
+)
 from cuspid.stitching.mosaic import Mosaic, MosaicOptions, compose
-from cuspid.stitching.plane_sweep import PlaneSweepOptions, plane_sweep
+from cuspid.stitching.plane_sweep import Compared, PlaneSweepOptions, frames_beside, plane_sweep
 from cuspid.stitching.strip import StripOptions, unroll
 
 
@@ -47,53 +53,75 @@ class Stitched:
 
 
 def orthophoto(
-    sequence: ImageSequence,
     located: SparseModel,
     frames: Sequence[FrameUse],
+    read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
     options: OrthoOptions,
     *,
+    working_distance_mm: float | None = None,
+    beside: Compared | None = None,
     progress: Progress = silent,
 ) -> Stitched:
-    """The panorama of one model of the motion. Raises ReconstructionError where it has no points."""
+    """The panorama of one model of the motion; ``read`` gives an image by its name.
+
+    ``working_distance_mm``: nominal, from the calibration. ``beside``: images of the cameras of one instant, in the
+    world of the model, from which the surface is found; the model then is in millimetres and keeps its scale. Raises
+    ReconstructionError where there are no points.
+    """
     scale = options.scale
     if scale.working_distance_mm is None:
-        scale = replace(scale, working_distance_mm=sequence.working_distance_mm)
-    motion = in_occlusal_frame(located, scale)
-    index = {name: number for number, name in enumerate(sequence.names)}
-
-    def read(name: str) -> UInt8[np.ndarray, "h w 3"]:
-        return sequence.image(index[name])
-
+        scale = replace(scale, working_distance_mm=working_distance_mm)
+    motion = in_occlusal_frame(located, scale if beside is None else None)
     sparse = height_map(motion, options.height_map)
-    dense = (
-        plane_sweep(motion, sparse, read, options.plane_sweep, progress=progress)
-        if options.plane_sweep.enabled
-        else None
-    )
+    dense = _dense(located, motion, sparse, read, beside, options.plane_sweep, progress)
     surface = sparse if dense is None else uncovered(dense, sparse, motion)
     mosaic = compose(motion, surface, read, options.mosaic, progress=progress)
-    metric = scale.working_distance_mm is not None or scale.width_mm is not None
-    panorama = _panorama(mosaic, motion, frames, index, metric)
-    panorama = replace(panorama, notes=(_scale_note(scale, given=scale == options.scale),))
+    metric = beside is not None or scale.working_distance_mm is not None or scale.width_mm is not None
+    panorama = _panorama(mosaic, motion, frames, metric)
+    if beside is None:
+        panorama = replace(panorama, notes=(_scale_note(scale, given=scale == options.scale),))
     strip = unroll(panorama, motion, surface, mosaic.canvas.mm_per_px, options.strip)
     in_its_units = motion if metric else motion.scaled(1 / mosaic.canvas.mm_per_px)
     return Stitched(panorama=panorama, motion=in_its_units, strip=strip)
 
 
+def _dense(
+    located: SparseModel,
+    motion: SparseModel,
+    sparse: HeightMap,
+    read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
+    beside: Compared | None,
+    options: PlaneSweepOptions,
+    progress: Progress,
+) -> HeightMap | None:
+    """The surface on which cameras of one instant agree; without such, frames of one camera."""
+    if not options.enabled:
+        return None
+    if beside is None:
+        compared = frames_beside(motion, options.baseline_share)
+    else:
+        first = motion.frames[0]
+        compared = beside.seen_from(located.cam_from_world[first].inverse() @ motion.cam_from_world[first])
+    return plane_sweep(motion, compared, sparse, read, options, progress=progress)
+
+
 def _scale_note(scale: ScaleOptions, *, given: bool) -> str:
     if scale.width_mm is not None:
-        return f"the scale is that of an arch {scale.width_mm:g} mm wide"
+        return f"the scale assumes an arch {scale.width_mm:g} mm wide"
     if scale.working_distance_mm is None:
-        return "the scale is not known, so no millimetres: give --scale.working-distance-mm or --scale.width-mm"
+        return (
+            "the scale is not known, so nothing is in millimetres: give --scale.working-distance-mm or --scale.width-mm"
+        )
     source = "as given" if given else "as the calibration says"
-    return f"the scale is that of a camera held {scale.working_distance_mm:g} mm over the teeth, {source}: no truer"
+    return (
+        f"the scale assumes a camera held {scale.working_distance_mm:g} mm over the teeth, {source}; "
+        "it is no more accurate than that"
+    )
 
 
-def _panorama(
-    mosaic: Mosaic, motion: SparseModel, frames: Sequence[FrameUse], index: Mapping[str, int], metric: bool
-) -> Panorama:
+def _panorama(mosaic: Mosaic, motion: SparseModel, frames: Sequence[FrameUse], metric: bool) -> Panorama:
     """The mosaic as the noun; its frames are numbered as in the sequence."""
-    canvas = mosaic.canvas
+    canvas, index = mosaic.canvas, {frame.name: number for number, frame in enumerate(frames)}
     number = np.array([index[name] for name in motion.frames] + [-1])
     overlaps = dict(zip(motion.frames, mosaic.overlaps, strict=True))
     return Panorama(

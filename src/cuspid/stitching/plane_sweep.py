@@ -1,19 +1,20 @@
-"""A dense surface under the occlusal plane, by sweeping horizontal planes through the frames of one camera.
+"""A dense surface under the occlusal plane, by sweeping horizontal planes through images.
 
-On each plane z = const all frames are laid down as if the surface were there (Collins 1996); where it is, frames from
+On each plane z = const all images are laid down as if the surface were there (Collins 1996); where it is, images from
 different places agree. What agrees is the zero-mean normalised cross-correlation (ZNCC) of small windows, averaged over
-all pairs of frames a stereo baseline apart: of their grey levels, which tell the outlines of crowns and the gum, and of
-their fine detail alone, because the broad light and shade of a lamp that goes along with the camera moves over the
-surface and pulls what is matched by it below the crowns. The height of each cell then follows from semi-global
-optimisation (Hirschmueller 2008) over the volume of places and heights.
+all pairs of images a stereo baseline apart, frames of one camera or cameras of one instant: of their grey levels, which
+tell the outlines of crowns and the gum, and of their fine detail alone, because the broad light and shade of a lamp
+that goes along with the camera moves over the surface and pulls what is matched by it below the crowns. Cameras of one
+instant see the same light and shade: there it is the brightness itself that agrees. The height of each cell then
+follows from semi-global optimisation (Hirschmueller 2008) over the volume of places and heights.
 
 The volume grows with the arch; of the frames only a few are held at a time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, NamedTuple, no_type_check
 
@@ -29,6 +30,7 @@ from cuspid.geometry import Rigid3
 from cuspid.kernels import kernel
 from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
+from cuspid.reconstruction import Reconstruction
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.height_map import HOLE_MM2, HeightMap
 from cuspid.stitching.mosaic import BURNT, brightest, footprint
@@ -40,6 +42,11 @@ _NOISE_DN = 1.0
 """Contrast (standard deviation in grey levels) below which there is nothing to agree on."""
 _DETAIL = 4
 """Fine detail is held in so many steps to a grey level."""
+_LIT, _UNLIKE_DN, _ALIKE_CELLS = 24, 6.0, 3
+"""Cameras of one instant: grey level above which there is light, difference of grey levels beyond which two places are
+not alike, and the width over which that is averaged."""
+_METERED, _USUAL_DN = 40, (40, 230)
+"""Images of each camera whose brightness is compared, and grey levels that are."""
 _DARKEST = 16
 """Grey levels below are raised to this one: noise."""
 _SPECK_MM2 = 4.0
@@ -97,6 +104,61 @@ class PlaneSweepOptions(Options):
 
 
 # --- which frames are compared -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Compared:
+    """Images, where they were taken from, and which of them are compared."""
+
+    names: tuple[str, ...]
+    """By which the images are read, in order of capture."""
+    cameras: tuple[Camera, ...]
+    cam_from_world: tuple[Rigid3, ...]
+    pairs: tuple[tuple[int, int], ...]
+    """Each a stereo baseline apart; a later image is second."""
+    baseline_share: float
+    """Baseline as a share of the distance to the teeth (approximate)."""
+    same_lights: bool
+    """Whether the two images of a pair were taken at one instant: a place is then as bright in one as in the other."""
+
+    def seen_from(self, world_from_new: Rigid3) -> Compared:
+        """The same in another world."""
+        return replace(self, cam_from_world=tuple(pose @ world_from_new for pose in self.cam_from_world))
+
+
+def frames_beside(motion: SparseModel, share: float) -> Compared:
+    """The frames of one camera, each with a later one a stereo baseline from it."""
+    names = motion.frames
+    poses = tuple(motion.cam_from_world.values())
+    return Compared(
+        names=names,
+        cameras=(motion.camera,) * len(names),
+        cam_from_world=poses,
+        pairs=tuple(partners(motion, share).items()),
+        baseline_share=share,
+        same_lights=False,
+    )
+
+
+def cameras_beside(found: Reconstruction, pairs: Sequence[tuple[str, str]], distance_mm: float) -> Compared:
+    """The images that two cameras of a rig took of the teeth at one instant, named ``camera/frame``. The same lights
+    were on for both, so that their light and shade are of the surface."""
+    cameras = [name for name in found.rig.names if any(name in pair for pair in pairs)]
+    place = {name: k for k, name in enumerate(cameras)}
+    apart = [np.linalg.norm(np.diff([found.rig[name].centre_in_rig for name in pair], axis=0)) for pair in pairs]
+    images = [(frame, name) for frame in found.frames for name in cameras]
+    return Compared(
+        names=tuple(f"{name}/{frame}" for frame, name in images),
+        cameras=tuple(found.rig[name].camera for _, name in images),
+        cam_from_world=tuple(found.rig[name].cam_from_rig @ found.rig_from_world[frame] for frame, name in images),
+        pairs=tuple(
+            (len(cameras) * k + place[one], len(cameras) * k + place[other])
+            for k in range(len(found.frames))
+            for one, other in pairs
+        ),
+        baseline_share=float(np.median(apart)) / distance_mm,
+        same_lights=True,
+    )
 
 
 def partners(motion: SparseModel, share: float) -> dict[int, int]:
@@ -211,29 +273,66 @@ def _zncc(one: _Field, other: _Field, noise: float, window: int) -> Float32[np.n
     return np.clip(common / np.sqrt(power), 0, 1)
 
 
-def _add_agreement(one: _Laid, other: _Laid, window: int, agreement: np.ndarray, pairs: np.ndarray) -> None:
-    """Add what two frames agree on a plane, and where both see it, to the sums over the grid."""
+def _alike(one: Float32[np.ndarray, "h w"], other: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """How alike two images are in brightness, 0 to 1; 0 where it is dark, which looks alike at any height."""
+    lit = np.minimum(one, other) > _LIT
+    return np.asarray(cv2.blur(np.clip(1 - np.abs(one - other) / _UNLIKE_DN, 0, 1) * lit, (_ALIKE_CELLS,) * 2))
+
+
+def _agreed(
+    one: _Laid, a: tuple[slice, slice], other: _Laid, b: tuple[slice, slice], window: int, same_lights: bool
+) -> Float32[np.ndarray, "h w"]:
+    """What two images agree on parts of a plane, 0 to 1."""
+    detail = _zncc(one.detail.cut(a), other.detail.cut(b), _DETAIL * _NOISE_DN, window)
+    if same_lights:
+        return (2 * _alike(one.gray.values[a], other.gray.values[b]) + detail) / 3
+    gray = _zncc(one.gray.cut(a), other.gray.cut(b), _NOISE_DN, window)
+    return (gray * gray + detail) / 2
+
+
+def _add_agreement(
+    one: _Laid, other: _Laid, window: int, same_lights: bool, agreement: np.ndarray, pairs: np.ndarray
+) -> None:
+    """Add what two images agree on a plane, and where both see it, to the sums over the grid."""
     low, high = np.maximum(one.low, other.low), np.minimum(one.high, other.high)
     if np.any(high <= low):
         return
     a, b = one.part(low, high), other.part(low, high)
     weight = np.minimum(one.weight[a], other.weight[b])
-    gray = _zncc(one.gray.cut(a), other.gray.cut(b), _NOISE_DN, window)
-    detail = _zncc(one.detail.cut(a), other.detail.cut(b), _DETAIL * _NOISE_DN, window)
     here = slice(low[1], high[1]), slice(low[0], high[0])
-    agreement[here] += weight * (gray * gray + detail) / 2
+    agreement[here] += weight * _agreed(one, a, other, b, window, same_lights)
     pairs[here] += weight
 
 
 # --- all planes --------------------------------------------------------------------------------------------------
 
 
+def camera_gains(names: Sequence[str], read: Callable[[str], UInt8[np.ndarray, "h w 3"]]) -> dict[str, float]:
+    """How much brighter each camera shows the same surface than the first one, from images ``camera/frame`` in order of
+    capture: cameras of one instant see about the same, under the same lights."""
+    images = dict[str, list[str]]()
+    for name in names:
+        images.setdefault(name.rpartition("/")[0], []).append(name)
+    instants = slice(None, None, max(1, len(names) // len(images) // _METERED))
+    levels = {camera: np.log([_usual_level(read(name)) for name in each[instants]]) for camera, each in images.items()}
+    first = next(iter(levels.values()))
+    ratios = {camera: each - first for camera, each in levels.items()}
+    return {c: float(np.exp(np.nanmedian(each))) if np.isfinite(each).any() else 1.0 for c, each in ratios.items()}
+
+
+def _usual_level(image: UInt8[np.ndarray, "h w 3"]) -> float:
+    """Mean grey level of what is neither dark nor burnt out; NaN where there is nothing."""
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[::4, ::4]
+    usual = gray[(gray > _USUAL_DN[0]) & (gray < _USUAL_DN[1])]
+    return float(usual.mean()) if len(usual) else float("nan")
+
+
 def _compared(
-    image: UInt8[np.ndarray, "h w 3"], maps: tuple[np.ndarray, np.ndarray] | None, detail_px: float
+    image: UInt8[np.ndarray, "h w 3"], maps: tuple[np.ndarray, np.ndarray] | None, gain: float, detail_px: float
 ) -> UInt8[np.ndarray, "h w 3"]:
     """What is compared of a frame, as a camera without distortion sees it: its grey levels, their fine detail (times
     `_DETAIL`, about 128), and what they count for (times 255): in one picture, for that is laid down fastest."""
-    gray = np.maximum(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), _DARKEST)
+    gray = cv2.convertScaleAbs(np.maximum(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), _DARKEST), alpha=1 / gain)
     detail = gray - cv2.GaussianBlur(gray.astype(np.float32), (0, 0), detail_px)
     glare = cv2.dilate((brightest(image) >= BURNT).astype(np.uint8), np.ones((_GLARE_PX, _GLARE_PX), np.uint8))
     weight = np.where(glare > 0, 255 * _GLARE_WEIGHT, 255)
@@ -243,22 +342,22 @@ def _compared(
 
 def plane_sweep(
     motion: SparseModel,
+    compared: Compared,
     sparse: HeightMap,
     read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
     options: PlaneSweepOptions,
     *,
     progress: Progress = silent,
 ) -> HeightMap | None:
-    """The surface on which the frames of a motion in the occlusal frame agree; None where no two frames lie apart.
+    """The surface on which images agree, in the occlusal frame; None where no two of them are compared.
 
-    ``sparse`` is the smooth surface through the points, which tells how high the teeth reach; ``read`` gives the image
-    of a frame by its name.
+    ``motion`` tells where the teeth are; ``sparse`` is the smooth surface through its points, which tells how high they
+    reach; ``read`` gives an image by its name.
     """
-    pairs = partners(motion, options.baseline_share)
-    if not pairs:
+    if not compared.pairs:
         return None
-    grid, levels = _places(motion, float(sparse.heights.max()) + _ABOVE_MM, options)
-    volume = _agreement(motion, pairs, grid, levels, read, options, progress)
+    grid, levels = _places(motion, float(sparse.heights.max()) + _ABOVE_MM, compared.baseline_share, options)
+    volume = _agreement(compared, grid, levels, read, options, progress)
     cell_mm = _POOL * grid.cell_mm
     corner, (rows, columns) = grid.corner + cell_mm / 2, volume.shape[1:]
     places = corner + cell_mm * np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
@@ -278,11 +377,13 @@ def plane_sweep(
     )
 
 
-def _places(motion: SparseModel, top: float, options: PlaneSweepOptions) -> tuple[Grid, Float[np.ndarray, "d"]]:
+def _places(
+    motion: SparseModel, top: float, baseline_share: float, options: PlaneSweepOptions
+) -> tuple[Grid, Float[np.ndarray, "d"]]:
     """Where frames are compared: the cells, and the heights of the planes; not closer than pixels tell apart."""
     camera = motion.camera
     pixel_mm = float(np.median(motion.depths) / np.mean(camera.focal_px))
-    step_mm = max(options.step_mm, 0.5 * pixel_mm / options.baseline_share)
+    step_mm = max(options.step_mm, 0.5 * pixel_mm / baseline_share)
     levels = np.arange(-options.depth_mm, top + step_mm, step_mm)
     return Grid.over(motion, max(options.cell_mm, pixel_mm)), levels
 
@@ -294,37 +395,42 @@ def _bridged(heights: Float32[np.ndarray, "r c"], holes: Bool[np.ndarray, "r c"]
 
 
 def _agreement(
-    motion: SparseModel,
-    pairs: Mapping[int, int],
+    compared: Compared,
     grid: Grid,
     levels: Float[np.ndarray, "d"],
     read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
     options: PlaneSweepOptions,
     progress: Progress,
 ) -> Float32[np.ndarray, "d r c"]:
-    """Mean agreement (0 to 1) of the pairs of frames that see a place, at each height; the less, the fewer they are."""
-    camera, poses, names = motion.camera, list(motion.cam_from_world.values()), motion.frames
-    maps, window = undistortion_maps(camera), options.window
+    """Mean agreement (0 to 1) of the pairs of images that see a place, at each height; the less, the fewer they are."""
+    cameras, poses, names = compared.cameras, compared.cam_from_world, compared.names
+    maps, window = {camera: undistortion_maps(camera) for camera in cameras}, options.window
+    gains = camera_gains(names, read) if compared.same_lights else {}
+
+    def picture(image: int) -> UInt8[np.ndarray, "h w 3"]:
+        name, camera = names[image], cameras[image]
+        return _compared(read(name), maps[camera], gains.get(name.rpartition("/")[0], 1.0), options.detail_px)
+
     sums, counts = np.zeros((2, len(levels), grid.rows // _POOL, grid.columns // _POOL), np.float32)
 
-    def look(block: Mapping[int, int], images: Mapping[int, UInt8[np.ndarray, "h w 3"]], level: int) -> None:
+    def look(block: Sequence[tuple[int, int]], images: Mapping[int, UInt8[np.ndarray, "h w 3"]], level: int) -> None:
         agreement, seen = np.zeros((2, grid.rows, grid.columns), np.float32)
         laid = {
-            frame: _lay(grid, camera, poses[frame], float(levels[level]), each, window)
+            frame: _lay(grid, cameras[frame], poses[frame], float(levels[level]), each, window)
             for frame, each in images.items()
         }
-        for one, other in block.items():
+        for one, other in block:
             first, second = laid[one], laid[other]
             if first is not None and second is not None:
-                _add_agreement(first, second, window, agreement, seen)
+                _add_agreement(first, second, window, compared.same_lights, agreement, seen)
         size = sums.shape[:0:-1]
         sums[level] += cv2.resize(agreement, size, interpolation=cv2.INTER_AREA)
         counts[level] += cv2.resize(seen, size, interpolation=cv2.INTER_AREA)
 
     for start in range(0, len(names), _BLOCK):
-        block = {one: other for one, other in pairs.items() if start <= one < start + _BLOCK}
-        wanted = sorted({*block, *block.values()})
-        images = {frame: _compared(read(names[frame]), maps, options.detail_px) for frame in wanted}
+        block = [pair for pair in compared.pairs if start <= pair[0] < start + _BLOCK]
+        wanted = sorted({image for pair in block for image in pair})
+        images = {frame: picture(frame) for frame in wanted}
         map_in_threads(partial(look, block, images), range(len(levels)))
         progress("surface", min(start + _BLOCK, len(names)), len(names))
     return sums / (counts + np.float32(_PAIRS))

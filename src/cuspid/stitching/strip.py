@@ -51,7 +51,7 @@ def arch_curve(motion: SparseModel, surface: HeightMap, options: StripOptions) -
         return None
     across = np.arange(-options.half_width_mm, options.half_width_mm + _STEP_MM, _STEP_MM)
     for _ in range(2):
-        normals = _normals(curve)
+        normals = sides_of(curve)
         places = curve[:, None] + across[:, None] * normals[:, None]
         heights = surface.at(places)
         weight = np.clip(heights - (heights.max(axis=1, keepdims=True) - options.occlusal_mm), 0, None)
@@ -96,7 +96,7 @@ def _smooth(curve: Float[np.ndarray, "n 2"], sigma_mm: float) -> Float[np.ndarra
     return np.asarray(gaussian_filter1d(longer, sigma_mm / _STEP_MM, axis=0)[pad : pad + len(curve)])
 
 
-def _normals(curve: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+def sides_of(curve: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     """Unit normals towards the cheek: away from the inside of the bend."""
     tangents = np.gradient(curve, axis=0)
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
@@ -118,7 +118,7 @@ def unroll(
     columns = int(_STEP_MM * (len(curve) - 1) / mm_per_px)
     at = np.linspace(0, len(curve) - 1, columns)
     line = np.stack([np.interp(at, np.arange(len(curve)), curve[:, axis]) for axis in range(2)], axis=1)
-    normals = np.stack([np.interp(at, np.arange(len(curve)), _normals(curve)[:, axis]) for axis in range(2)], axis=1)
+    normals = np.stack([np.interp(at, np.arange(len(curve)), sides_of(curve)[:, axis]) for axis in range(2)], axis=1)
     half = int(options.half_width_mm / mm_per_px)
     across = mm_per_px * np.arange(half, -half - 1, -1)
     places = line + across[:, None, None] * normals
@@ -126,7 +126,7 @@ def unroll(
     image = cv2.remap(panorama.image, where, None, cv2.INTER_LINEAR)
     covered = cv2.remap(panorama.covered.astype(np.uint8), where, None, cv2.INTER_NEAREST) > 0
     image[~covered] = 0
-    zones = np.where(covered, _zones(surface.at(places), half, options), -1).astype(np.int16)
+    zones = np.where(covered, zones_of(surface.at(places), half, options), -1).astype(np.int16)
     shown = np.flatnonzero(covered[half])
     if not len(shown):
         return None
@@ -140,8 +140,9 @@ def unroll(
     )
 
 
-def _zones(heights: Float[np.ndarray, "r c"], half: int, options: StripOptions) -> Float[np.ndarray, "r c"]:
-    """Zone of each pixel of a strip from the heights of its cross-sections."""
+def zones_of(heights: Float[np.ndarray, "r c"], half: int, options: StripOptions) -> Float[np.ndarray, "r c"]:
+    """Zone of each pixel of a strip, an index into `ZONES`, from the heights of its cross-sections; ``half`` is the row
+    of the arch curve."""
     rows = np.arange(len(heights))[:, None]
     near = heights > heights.max(axis=0) - options.occlusal_mm
     first = np.where(near.any(axis=0), near.argmax(axis=0), half)

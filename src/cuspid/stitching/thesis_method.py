@@ -169,7 +169,7 @@ def collapse_of(placed: list[Placed], options: ThesisOptions) -> str | None:
     if not np.isfinite(worst):
         return "the next frame reaches beyond the horizon"
     if worst > options.largest_stretch:
-        return f"the next frame is stretched {worst:.3g} times"
+        return f"the next frame is stretched by a factor of {worst:.3g}"
     canvas = Canvas.around(placed)
     if canvas.width * canvas.height > 1e6 * options.largest_canvas_mpx:
         return f"the panorama grows beyond {options.largest_canvas_mpx:g} million px"
@@ -247,7 +247,7 @@ def stitch_as_thesis(
 
 _PLANE_NOTE = (
     "the picture lies in the plane of the first frame, not in the occlusal plane, and its scale is not known: the "
-    "method thesis locates no camera"
+    "thesis method does not locate the camera"
 )
 
 
@@ -288,9 +288,7 @@ def _frame_uses(
 
     def use(index: int, name: str) -> FrameUse:
         if index not in placed:
-            return FrameUse(
-                name=name, used=False, reason=reasons.get(index, "no frame next to it hangs together with it")
-            )
+            return FrameUse(name=name, used=False, reason=reasons.get(index, "no neighbouring frame connects to it"))
         part, found = placed[index]
         if part != mine:
             refused = parts[mine].refused.get(index)
@@ -307,7 +305,7 @@ def _break_notes(sequence: ImageSequence, parts: list[Chain]) -> tuple[str, ...]
         first, last = chain.placed[0].index, chain.placed[-1].index
         span = f"frames {sequence.names[first]} to {sequence.names[last]}"
         if chain.collapse:
-            notes.append(f"{span}: then the chain of homographies collapses, {chain.collapse}")
+            notes.append(f"{span}: then the chain of homographies collapses: {chain.collapse}")
         elif last + 1 < len(sequence):
             notes.append(f"{span}: the next frames could not be used")
     return tuple(notes)
@@ -316,6 +314,6 @@ def _break_notes(sequence: ImageSequence, parts: list[Chain]) -> tuple[str, ...]
 def _nothing(sequence: ImageSequence, reasons: Mapping[int, str]) -> str:
     common, count = Counter(reason.split(":")[0] for reason in reasons.values()).most_common(1)[0]
     return (
-        f"{sequence.source}: no two of {len(sequence)} frames hang together ({count} fail by {common}); they need more "
-        "overlap, light or sharpness"
+        f"{sequence.source}: no two of {len(sequence)} frames could be connected ({count} failed on {common}); "
+        "they need more overlap, light or sharpness"
     )

@@ -46,13 +46,15 @@ def read_capture(folder: Path, handpiece: Path | None = None, working_distance_m
     """
     images = folder / "images"
     if not images.is_dir():
-        raise InputError(f"{folder}: no folder 'images' in it; give the folder that holds images/<camera>/<frame>.png")
+        raise InputError(
+            f"{folder}: it contains no folder 'images'; give the folder that holds images/<camera>/<frame>.png"
+        )
     known = read_handpiece(handpiece or folder / "handpiece.json", working_distance_mm)
     unknown = {path.name for path in images.iterdir() if path.is_dir()} - set(known.rig.names)
     if unknown:
         raise InputError(
-            f"{images}: the folder {', '.join(sorted(unknown))} is no camera of the handpiece, which has "
-            f"{', '.join(known.rig.names)}"
+            f"{images}: no camera of the handpiece matches the folder {', '.join(sorted(unknown))}; the cameras "
+            f"are {', '.join(known.rig.names)}"
         )
     suffix, stems = _image_stems(images, known.rig.names)
     frames, left_out = _present(_listed(folder, known, stems), stems, folder)
@@ -91,12 +93,12 @@ def _present(
     if empty:
         raise InputError(
             f"{folder}: {len(empty)} of {len(frames)} frames have no images (first: {empty[0]}); "
-            "finish the capture with the command that began it"
+            "finish the capture with the command that started it"
         )
     idle = [name for name, known in stems.items() if not known]
     left_out = [Dropped(what=f"camera {name}", reason="it has no images") for name in idle]
     left_out += [
-        Dropped(what=f"camera {name} of frame {frame.name}", reason="it has no image of it")
+        Dropped(what=f"camera {name} of frame {frame.name}", reason="its image is missing")
         for frame, whole in zip(frames, listed, strict=True)
         for name in whole.cameras
         if name not in frame.cameras and name not in idle
@@ -113,7 +115,7 @@ def _image_stems(images: Path, cameras: Sequence[str]) -> tuple[str, dict[str, s
     }
     suffixes = {path.suffix for paths in files.values() for path in paths}
     if not suffixes:
-        raise InputError(f"{images}: no images in it")
+        raise InputError(f"{images}: it contains no images")
     if len(suffixes) > 1:
         raise InputError(f"{images}: mixed image types {', '.join(sorted(suffixes))}; convert them to one")
     return suffixes.pop(), {camera: {path.stem for path in files.get(camera, ())} for camera in cameras}

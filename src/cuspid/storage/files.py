@@ -80,7 +80,7 @@ def _writing(path: Path) -> Iterator[None]:
 
 def _describe(path: Path, error: OSError) -> str:
     if error.errno == errno.ENOSPC:
-        return f"{path}: the disk is full; free some space and run the same command again, it goes on where it stopped"
+        return f"{path}: the disk is full; free some space and run the same command again to continue"
     return f"{path}: cannot be written ({error.strerror or error}); choose another --out"
 
 
@@ -108,7 +108,7 @@ def read_arrays(path: Path, *, remedy: str) -> dict[str, np.ndarray]:
         require_file(path, "arrays")
         with ZipFile(path) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > LARGEST_MIB["arrays"] << 20:
-                raise ValueError("more than it can hold")
+                raise ValueError("larger than the limit when unpacked")
         with np.load(path, allow_pickle=False) as stored:
             return {name: stored[name] for name in stored}
     except InputError as error:
@@ -195,7 +195,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     path = folder / "run.json"
     found = read_json(path) if path.exists() else {}
     if not isinstance(found, dict) or not all(isinstance(entry, dict) for entry in found.values()):
-        raise InputError(f"{path}: not what cuspid writes there; see docs/formats.md")
+        raise InputError(f"{path}: not written by cuspid; see docs/formats.md")
     return found
 
 
@@ -264,7 +264,7 @@ def as_declared(kind: Callable[..., _Made], /, **values: Any) -> _Made:
     hints = get_type_hints(kind)
     for name, value in values.items():
         if name not in hints:
-            raise InputError(f"the field '{name}' is not known; see docs/formats.md")
+            raise InputError(f"unknown field '{name}'; see docs/formats.md")
         if not _fits(value, hints[name]):
             found = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else shown(value)
             raise InputError(f"the field '{name}' cannot be {found}; see docs/formats.md")

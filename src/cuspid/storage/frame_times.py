@@ -38,7 +38,7 @@ def read_frame_times(path: Path, cameras: Sequence[str]) -> dict[str, dict[str, 
             called, frame, time = ((row[columns[each]] or "").strip() for each in _COLUMNS)
             times = found[_camera(called, cameras)]
             if frame in times:
-                raise InputError(f"line {line}: frame {shown(frame)} of {called} stands there twice")
+                raise InputError(f"line {line}: frame {shown(frame)} of {called} is listed twice")
             times[frame] = number(f"line {line}: time", float(time), -_LONGEST_S, _LONGEST_S)
     return found
 
@@ -54,5 +54,5 @@ def _camera(called: str, cameras: Sequence[str]) -> str:
     ending = re.compile(rf"(.*\D)?0*{re.escape(called)}")
     fitting = [called] if called in cameras else [name for name in cameras if called and ending.fullmatch(name)]
     if len(fitting) != 1:
-        raise InputError(f"camera {shown(called)} is none of {', '.join(cameras)}")
+        raise InputError(f"unknown camera {shown(called)}; the cameras are {', '.join(cameras)}")
     return fitting[0]

@@ -22,7 +22,7 @@ _MOST_DISTORTION = 1e3
 _BRIGHTEST, _NARROWEST_LOBE = 1e6, 1e4
 _SHORTEST_QUATERNION = 1e-6
 _log = logging.getLogger("cuspid")
-_SET_BY = "a handpiece.json or, where the verb has it, --working-distance-mm"
+_SET_BY = "a handpiece.json or, where the command has it, --working-distance-mm"
 
 
 def rigid_to_json(target_from_source: Rigid3) -> dict[str, Any]:
@@ -37,7 +37,7 @@ def rigid_from_json(value: Mapping[str, Any], what: str = "pose") -> Rigid3:
     """Inverse of :func:`rigid_to_json`. Raises InputError for what is no rigid motion."""
     quaternion = numbers(f"{what}: rotation_wxyz", value["rotation_wxyz"], (4,), -LONGEST_MM, LONGEST_MM)
     if not np.linalg.norm(quaternion) > _SHORTEST_QUATERNION:
-        raise InputError(f"{what}: rotation_wxyz is {shown(value['rotation_wxyz'])}; it must not be all 0")
+        raise InputError(f"{what}: rotation_wxyz is {shown(value['rotation_wxyz'])}; it must not be all zeros")
     translation = numbers(f"{what}: translation_mm", value["translation_mm"], (3,), -LONGEST_MM, LONGEST_MM)
     return Rigid3.from_quaternion(quaternion, translation)
 
@@ -150,10 +150,10 @@ def write_handpiece(path: Path, handpiece: Handpiece) -> None:
 def _light_from_json(value: Mapping[str, Any], what: str) -> Light:
     strange = sorted(set(value) - {*_LIGHT_FIELDS, _LIGHT_COVARIANCE})
     if strange:
-        raise InputError(f"{what}: the field {shown(strange[0])} is not known; see docs/formats.md")
+        raise InputError(f"{what}: unknown field {shown(strange[0])}; see docs/formats.md")
     direction = numbers(f"{what}: direction", value["direction"], (3,), -LONGEST_MM, LONGEST_MM)
     if not direction.any():
-        raise InputError(f"{what}: direction is {shown(value['direction'])}; it must not be all 0")
+        raise InputError(f"{what}: direction is {shown(value['direction'])}; it must not be all zeros")
     matrix = value.get(_LIGHT_COVARIANCE)
     return Light(
         position_mm=numbers(f"{what}: position_mm", value["position_mm"], (3,), -LONGEST_MM, LONGEST_MM),
@@ -169,7 +169,7 @@ def _sensor_from_json(value: Mapping[str, Any], what: str) -> Sensor:
     known = [*_SENSOR_RANGES, "falloff_r2_r4", _SENSOR_COVARIANCE]
     strange = sorted(set(value) - set(known))
     if strange:
-        raise InputError(f"{what}: the field {shown(strange[0])} is not known; it has {', '.join(known)}")
+        raise InputError(f"{what}: unknown field {shown(strange[0])}; choose from {', '.join(known)}")
     plain = {key: number(f"{what}: {key}", value[key], *_SENSOR_RANGES[key]) for key in _SENSOR_RANGES if key in value}
     falloff = value.get("falloff_r2_r4", (0.0, 0.0))
     a, b = numbers(f"{what}: falloff_r2_r4", falloff, (2,), -_STEEPEST_FALLOFF, _STEEPEST_FALLOFF).tolist()
@@ -198,11 +198,11 @@ def read_handpiece(path: Path, working_distance_mm: float | None = None) -> Hand
     if isinstance(value, list):
         return _of_rig(path, read_rig_config(path), working_distance_mm)
     if working_distance_mm is not None:
-        raise InputError(f"{path}: it has a working distance of its own; change it there, and give none here")
+        raise InputError(f"{path}: it already has a working distance; change it there instead of giving another")
     with reading(path):
         strange = sorted(set(value) - _FIELDS)
         if strange:
-            raise InputError(f"{path}: the field {shown(strange[0])} is not known; it has {', '.join(sorted(_FIELDS))}")
+            raise InputError(f"{path}: unknown field {shown(strange[0])}; choose from {', '.join(sorted(_FIELDS))}")
         cameras = {
             checked_name(f"{path}: cameras", key): _mounted_from_json(camera, f"{path}: camera {shown(key)}")
             for key, camera in value["cameras"].items()
@@ -233,16 +233,16 @@ def read_handpiece(path: Path, working_distance_mm: float | None = None) -> Hand
 
 def _body_from_json(path: Path, value: Any) -> Body:
     if not (isinstance(value, dict) and value):
-        raise InputError(f"{path}: body must be boxes by name, one at least; leave it out where it is not known")
+        raise InputError(f"{path}: body must map names to boxes, at least one; leave it out if it is unknown")
     return Body({name: _box_from_json(f"{path}: body, {name}", box) for name, box in value.items()})
 
 
 def _box_from_json(where: str, value: Any) -> Box:
     if not (isinstance(value, dict) and set(value) == _BOX_FIELDS):
-        raise InputError(f"{where}: a box has the fields {' and '.join(sorted(_BOX_FIELDS))}, no more and no less")
+        raise InputError(f"{where}: a box must have exactly the fields {' and '.join(sorted(_BOX_FIELDS))}")
     pose = value["box_from_rig"]
     if not (isinstance(pose, dict) and set(pose) == {"rotation_wxyz", "translation_mm"}):
-        raise InputError(f"{where}: box_from_rig has the fields rotation_wxyz and translation_mm")
+        raise InputError(f"{where}: box_from_rig must have exactly the fields rotation_wxyz and translation_mm")
     size = numbers(f"{where}: size_mm", value["size_mm"], (3,), 0.0, LONGEST_MM)
     if not size.all():
         raise InputError(f"{where}: size_mm is {shown(value['size_mm'])}; it must be three positive lengths")
@@ -266,8 +266,8 @@ def _guessed_mm(path: Path, rig: Rig) -> float:
         raise InputError(f"{path}: {error}; give {_SET_BY}") from error
     near_mm, far_mm = depth_of_field_mm(distance_mm)
     _log.info(
-        f"{path}: it has no working distance; {distance_mm:.3g} mm are guessed from {source}. Depths of "
-        f"{near_mm:.3g} to {far_mm:.3g} mm are kept; {_SET_BY} sets others"
+        f"{path}: it has no working distance; {distance_mm:.3g} mm is assumed, from {source}. Depths from "
+        f"{near_mm:.3g} to {far_mm:.3g} mm are kept; to change them, give {_SET_BY}"
     )
     return distance_mm
 
@@ -306,7 +306,7 @@ def read_rig_config(path: Path, image_size_px: tuple[int, int] | None = None) ->
     value = read_json(path)
     with reading(path):
         if len(value) != 1:
-            raise InputError(f"{path}: {len(value)} rigs; cuspid works with one")
+            raise InputError(f"{path}: it holds {len(value)} rigs; cuspid supports only one")
         cameras: dict[str, MountedCamera] = {}
         for entry in value[0]["cameras"]:
             key = checked_name(f"{path}: image_prefix", str(entry["image_prefix"]).rstrip("/"))
@@ -335,7 +335,7 @@ def camera_from_colmap(entry: Mapping[str, Any], image_size_px: tuple[int, int] 
     """A camera of ``rig_config.json``; see :func:`read_rig_config`. Raises InputError for what no camera can have."""
     model = entry["camera_model_name"]
     if model not in _COLMAP_PARAMETERS:
-        raise InputError(f"{what}: model {shown(model)} is not known here; use one of {', '.join(_COLMAP_PARAMETERS)}")
+        raise InputError(f"{what}: model {shown(model)} is not supported; use one of {', '.join(_COLMAP_PARAMETERS)}")
     given = np.array(entry["camera_params"], dtype=np.float64)
     parameters = np.zeros(8)
     chosen = given[list(_COLMAP_PARAMETERS[model])]

@@ -33,7 +33,7 @@ def read_labelled_mesh(
     file = read_mesh_file(path, unit)
     labels = _labels_of(path, file)
     if labels is not None and len(labels) != len(file.mesh.faces):
-        raise InputError(f"{path}: {len(labels)} labels for {len(file.mesh.faces)} faces; one for each is needed")
+        raise InputError(f"{path}: {len(labels)} labels for {len(file.mesh.faces)} faces; each face needs exactly one")
     return file.mesh, None if labels is None else _fdi_labels(labels, path), file.face_colors
 
 

@@ -66,7 +66,9 @@ def read_landmarks(path: Path) -> LandmarkFile:
         return _from_markups(content, path)
     if isinstance(content, dict) and content.get("format") == _FORMAT:
         return _from_own(content, path)
-    raise InputError(f"{path}: not a landmark file; give 3D Slicer markups ({MARKUPS_SUFFIX}) or JSON as cuspid writes")
+    raise InputError(
+        f"{path}: not a landmark file; give 3D Slicer markups ({MARKUPS_SUFFIX}) or JSON written by cuspid"
+    )
 
 
 def write_landmarks(path: Path, landmarks: Mapping[str, Landmark], frame: LandmarkFrame) -> None:
@@ -125,7 +127,7 @@ def _from_markups(content: Mapping[str, Any], path: Path) -> LandmarkFile:
     notes: list[str] = []
     for markup in _objects(content["markups"], "markups", path):
         if markup.get("type") != "Fiducial":
-            notes.append(f"{path}: markup of type {markup.get('type')} passed over; landmarks are of type Fiducial")
+            notes.append(f"{path}: skipped a markup of type {markup.get('type')}; landmarks must be of type Fiducial")
             continue
         to_mesh_mm = _to_mesh_mm(markup, path)
         for label, point in _labelled(markup.get("controlPoints", []), "controlPoints", path):
@@ -136,7 +138,7 @@ def _from_markups(content: Mapping[str, Any], path: Path) -> LandmarkFile:
                 position = to_mesh_mm * _position(point.get("position"), label, path)
                 entries.append((label, Landmark(position, _described_sigma(point, label, path))))
             else:
-                notes.append(f"{path}: landmark '{label}' passed over, its position is {status}")
+                notes.append(f"{path}: skipped landmark '{label}': its position is {status}")
     return LandmarkFile(landmarks=_unique(entries, path), frame="mesh", notes=tuple(notes))
 
 
@@ -169,7 +171,7 @@ def _labelled(value: Any, name: str, path: Path) -> Iterable[tuple[str, Mapping[
     for number, entry in enumerate(_objects(value, name, path), start=1):
         label = entry.get("label")
         if not isinstance(label, str) or not label:
-            raise InputError(f"{path}: entry {number} of '{name}' has no label; name it, as 46.buccal_groove")
+            raise InputError(f"{path}: entry {number} of '{name}' has no label; give it one, such as 46.buccal_groove")
         yield label, entry
 
 
@@ -181,9 +183,7 @@ def _one_of(value: Any, allowed: tuple[Any, ...], name: str, path: Path) -> Any:
 
 def _position(value: Any, label: str, path: Path) -> Float[np.ndarray, "3"]:
     if not isinstance(value, list) or len(value) != 3 or not all(_is_finite(number) for number in value):
-        raise InputError(
-            f"{path}: the position of landmark '{label}' must be three finite numbers, it is {shown(value)}"
-        )
+        raise InputError(f"{path}: the position of landmark '{label}' must be three finite numbers, not {shown(value)}")
     return np.array(value, dtype=np.float64)
 
 
@@ -191,7 +191,7 @@ def _sigma(value: Any, label: str, path: Path) -> float | None:
     if value is None or (_is_finite(value) and value >= 0):
         return None if value is None else float(value)
     raise InputError(
-        f"{path}: estimated_sigma_mm of landmark '{label}' must be a number from 0 up, it is {shown(value)}"
+        f"{path}: estimated_sigma_mm of landmark '{label}' must be a number of at least 0, not {shown(value)}"
     )
 
 

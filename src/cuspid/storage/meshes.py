@@ -105,13 +105,13 @@ def _checked(path: Path, loaded: trimesh.Trimesh, declared: int, mm_per_unit: fl
             f"{path}: {len(faces)} of {declared} faces could be read; the file is truncated, copy it again"
         )
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
-        raise InputError(f"{path}: its vertices are not three coordinates each; export the mesh again")
+        raise InputError(f"{path}: its vertices do not have three coordinates each; export the mesh again")
     if not np.isfinite(vertices).all():
         raise InputError(f"{path}: some coordinates are not finite numbers; repair the mesh and export it again")
     if np.abs(vertices).max() * mm_per_unit > LONGEST_MM:
         raise InputError(f"{path}: coordinates beyond {LONGEST_MM / 1000:g} m; repair the mesh, or give its --unit")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(f"{path}: faces name vertices that do not exist; export the mesh again")
+        raise InputError(f"{path}: faces refer to vertices that do not exist; export the mesh again")
     merged, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
     colors = _colors(loaded, "vertex")
     mesh = Mesh(merged * mm_per_unit, inverse.reshape(-1)[faces], None if colors is None else colors[first])

@@ -113,7 +113,7 @@ def _read_tracks(path: Path) -> Tracks:
         return as_declared(Tracks, **{name: arrays[name] for name in _TRACKS})
 
 
-_MADE_ANEW = "run the same command again, it is made anew"
+_MADE_ANEW = "run the same command again to recreate it"
 
 
 def write_depth_maps(path: Path, depth_maps: Sequence[DepthMap]) -> None:

@@ -28,7 +28,7 @@ def read_reference_render(folder: Path) -> ReferenceRender:
     """Read what :func:`write_reference_render` wrote. Raises InputError where a file is missing or damaged."""
     path = folder / "view.json"
     if not path.exists():
-        raise InputError(f"{folder}: no reference render of the jaw in it; make the truth with cuspid film")
+        raise InputError(f"{folder}: it contains no reference render of the jaw; make one with cuspid film")
     value = read_json(path)
     surface = read_arrays(folder / "surface.npz", remedy="run cuspid film again")
     with reading(path):

@@ -137,14 +137,14 @@ def read_result(folder: Path, reference: Path | None = None, unit: Unit = "mm") 
     is another one.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; give one that a verb of cuspid wrote into")
+        raise InputError(f"{folder}: no such folder; give the --out folder of a cuspid command")
     run = read_manifest(folder)
     for is_there, read in _READERS:
         if is_there(folder, run):
             return read(folder, run)
     if _is_scan(folder, run):
         return _read_scan(folder, run, reference, unit)
-    made = f"; it holds {', '.join(run)} alone" if run else ""
+    made = f"; it holds only {', '.join(run)}" if run else ""
     raise InputError(
         f"{folder}: nothing to report{made}; give the --out folder of run, reconstruct, evaluate, shape, sweep, "
         "compare, repeat, stitch or stitch-eval"
@@ -177,7 +177,7 @@ def _read_scan(folder: Path, run: Mapping[str, Any], reference: Path | None, uni
         missing.append("the open crown surface, which an older version did not measure: run cuspid evaluate again")
     located, captured = folder / "motion" / "reconstruction.json", folder / "capture" / "handpiece.json"
     if not located.exists():
-        missing.append("where the cameras were: a folder of cuspid run or reconstruct has it")
+        missing.append("the camera poses: a folder of cuspid run or reconstruct has them")
     if not captured.exists():
         missing.append("the images: a folder of cuspid run has them")
     return ScanResult(
@@ -210,7 +210,7 @@ def _surface(folder: Path, missing: list[str]) -> MeshFile | None:
     for name in ("deviation.ply", "mesh.ply"):
         if (folder / name).exists():
             return read_mesh_file(folder / name)
-    missing.append("the surface: the run is not complete; give the same command again, it goes on where it stopped")
+    missing.append("the surface: the run is not complete; run the same command again to continue")
     return None
 
 
@@ -276,7 +276,7 @@ def _read_study(folder: Path, run: Mapping[str, Any]) -> StudyResult:
     summary, rows = _optional_json(folder / file), _rows(folder)
     missing = []
     if summary is None:
-        missing.append(f"{file}: {len(rows)} cases are done; give the same cuspid {verb} command again to go on")
+        missing.append(f"{file}: {len(rows)} cases are done; run the same cuspid {verb} command again to continue")
     surface, values = _repeated(folder) if verb == "repeat" else (None, {})
     return StudyResult(
         surface=surface,
@@ -335,7 +335,7 @@ def _read_panorama(folder: Path, run: Mapping[str, Any]) -> PanoramaResult:
 
 def _read_score(folder: Path, run: Mapping[str, Any]) -> ScoreResult:
     made, true = (_if_there(folder / name) for name in ("made.png", "true.png"))
-    missing = () if made and true else ("the pictures beside each other: run cuspid stitch-eval again",)
+    missing = () if made and true else ("the side-by-side pictures: run cuspid stitch-eval again",)
     return ScoreResult(
         name=folder.resolve().name,
         run=run,

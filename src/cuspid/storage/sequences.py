@@ -64,10 +64,10 @@ def rig_sources(folder: Path) -> dict[str, Path]:
         raise InputError(f"{folder}: no such folder")
     sources = sorted(path for path in finished(home) if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES)
     if not sources:
-        raise InputError(f"{home}: no folder of images and no video; each camera needs one")
+        raise InputError(f"{home}: it contains no folder of images and no video; each camera needs one")
     named = {checked_name(f"{home}: cameras", path.name if path.is_dir() else path.stem): path for path in sources}
     if len(named) < len(sources):
-        raise InputError(f"{home}: two of the folders and videos have one name; each camera needs a name of its own")
+        raise InputError(f"{home}: two folders or videos have the same name; each camera needs its own")
     return named
 
 
@@ -99,7 +99,8 @@ def _of_capture(folder: Path) -> ImageSequence:
     names = capture.handpiece.rig.names
     if len(names) > 1:
         raise InputError(
-            f"{folder}: a capture of {len(names)} cameras; give the images of one, {folder / 'images' / names[0]}"
+            f"{folder}: a capture of {len(names)} cameras; give the images of one, "
+            f"such as {folder / 'images' / names[0]}"
         )
     images = ImageFolder(folder, capture.source.suffix)
     paths = [images.path(frame.name, names[0]) for frame in capture.frames]
@@ -110,17 +111,19 @@ def _of_capture(folder: Path) -> ImageSequence:
 def _common_size(folder: Path, paths: list[Path]) -> tuple[int, int]:
     """Raises InputError where there are fewer than two frames, or they are tiny or not of one size."""
     if len(paths) < 2:
-        raise InputError(f"{folder}: {len(paths)} image(s); a sequence needs two at least")
+        raise InputError(f"{folder}: {len(paths)} image(s); a sequence needs at least two")
     sizes = {path: image_size(path) for path in paths}
     usual = Counter(sizes.values()).most_common(1)[0][0]
     odd = [path for path, size in sizes.items() if size != usual]
     if odd:
         raise InputError(
             f"{odd[0]}: {sizes[odd[0]][0]} x {sizes[odd[0]][1]} px, but most frames have {usual[0]} x {usual[1]} px "
-            f"({len(odd)} of {len(paths)} differ); take them out, or stitch each size for itself"
+            f"({len(odd)} of {len(paths)} differ); remove them, or stitch each size separately"
         )
     if min(usual) < LEAST_PX:
-        raise InputError(f"{folder}: frames of {usual[0]} x {usual[1]} px show too little; {LEAST_PX} px are the least")
+        raise InputError(
+            f"{folder}: frames of {usual[0]} x {usual[1]} px are too small; each side needs at least {LEAST_PX} px"
+        )
     return usual
 
 
@@ -137,12 +140,14 @@ def _of_video(video: Path, decoded: Path, progress: Progress) -> ImageSequence:
         number, time_s = frame.number + 1, frame.time_s
         progress("decoding", number, max(length.frames, number))
     if len(paths) < 2:
-        raise InputError(f"{video}: {len(paths)} frame(s) could be decoded; not a video, truncated, or of one frame")
+        raise InputError(
+            f"{video}: {len(paths)} frame(s) could be decoded; it is not a video, is truncated, or has a single frame"
+        )
     notes = []
     if missing := length.missing(number, time_s):
         notes.append(f"{video.name}: {missing}")
     if step > 1:
-        notes.append(f"{video.name}: {number} frames; every {step}th is used")
+        notes.append(f"{video.name}: {number} frames; one in every {step} is used")
     return ImageSequence(source=video, paths=tuple(paths), size=_common_size(decoded, paths), notes=tuple(notes))
 
 
@@ -173,15 +178,15 @@ def _with_handpiece(sequence: ImageSequence, handpiece: Handpiece, path: Path) -
 def _with_rig(sequence: ImageSequence, rig: Rig, path: Path) -> ImageSequence:
     cameras = list(rig.cameras.values())
     if len(cameras) > 1:
-        raise InputError(f"{path}: {len(cameras)} cameras; the calibration of one is needed")
+        raise InputError(f"{path}: it holds {len(cameras)} cameras; give the calibration of a single one")
     return _with_camera(sequence, cameras[0].camera, path)
 
 
 def _with_camera(sequence: ImageSequence, camera: Camera, path: Path) -> ImageSequence:
     if (camera.width, camera.height) != sequence.size:
         raise InputError(
-            f"{path}: calibration of {camera.width} x {camera.height} px, but the frames have {sequence.size[0]} x "
-            f"{sequence.size[1]} px; give the calibration that belongs to them, or none"
+            f"{path}: the calibration is for {camera.width} x {camera.height} px, but the frames are "
+            f"{sequence.size[0]} x {sequence.size[1]} px; give the matching calibration, or none"
         )
     return replace(sequence, camera=camera)
 
@@ -189,21 +194,21 @@ def _with_camera(sequence: ImageSequence, camera: Camera, path: Path) -> ImageSe
 def _read_opencv(path: Path) -> Camera:
     """OpenCV's calibration: camera_matrix, distortion_coefficients (k1 k2 p1 p2 [k3 = 0]), image_width and _height."""
     if _is_nested_deeply(read_text(path)):
-        raise InputError(f"{path}: not OpenCV's calibration, nested more than {_DEEPEST} deep")
+        raise InputError(f"{path}: not an OpenCV calibration (nested more than {_DEEPEST} deep)")
     try:
         file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     except (cv2.error, SystemError) as error:
-        raise InputError(f"{path}: not OpenCV's calibration") from error
+        raise InputError(f"{path}: not an OpenCV calibration") from error
     with reading(path):
         matrix, distortion = (
             _small_matrix(file.getNode(name)) for name in ("camera_matrix", "distortion_coefficients")
         )
         width, height = (int(file.getNode(name).real()) for name in ("image_width", "image_height"))
     if matrix is None or matrix.shape != (3, 3) or not width or not height:
-        raise InputError(f"{path}: needs camera_matrix, image_width and image_height, as OpenCV's calibration writes")
+        raise InputError(f"{path}: needs camera_matrix, image_width and image_height, as in OpenCV's calibration files")
     coefficients = np.zeros(5) if distortion is None else np.pad(distortion.ravel().astype(np.float64), (0, 5))
     if np.any(coefficients[4:]):
-        raise InputError(f"{path}: more than four distortion coefficients; calibrate with k1, k2, p1, p2 alone")
+        raise InputError(f"{path}: more than four distortion coefficients; calibrate with only k1, k2, p1, p2")
     return Camera(
         width=width,
         height=height,
@@ -224,11 +229,11 @@ def _small_matrix(node: cv2.FileNode) -> np.ndarray | None:
     if not node.isMap():
         return None
     if not 0 < node.getNode("rows").real() * node.getNode("cols").real() < 100:
-        raise ValueError("a matrix of no such size")
+        raise ValueError("a matrix is empty or too large")
     try:
         return np.asarray(node.mat())
     except cv2.error as error:
-        raise ValueError("a matrix that cannot be read") from error
+        raise ValueError("a matrix cannot be read") from error
 
 
 def _read_cameras_txt(path: Path) -> Camera:
@@ -237,7 +242,7 @@ def _read_cameras_txt(path: Path) -> Camera:
     with reading(path):
         rows = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
         if len(rows) != 1:
-            raise InputError(f"{path}: {len(rows)} cameras; the calibration of one is needed")
+            raise InputError(f"{path}: it holds {len(rows)} cameras; give the calibration of a single one")
         _, model, width, height, *parameters = rows[0]
         entry = {"camera_model_name": model, "camera_params": [float(value) for value in parameters]}
         return camera_from_colmap(entry, (int(width), int(height)))

@@ -51,7 +51,9 @@ def read_shape_model(folder: Path) -> ShapeModel:
     mean = read_jaw(folder / "mean.ply")
     mesh, modes, landmark_modes = _read_modes(folder / "modes.npz")
     if len(mesh.faces) != len(mean.mesh.faces) or landmark_modes.shape[1] != len(mean.landmarks):
-        raise InputError(f"{folder / 'modes.npz'}: not the modes of mean.ply beside it; make the shape model again")
+        raise InputError(
+            f"{folder / 'modes.npz'}: its modes do not match mean.ply beside it; make the shape model again"
+        )
     with reading(summary_path):
         return as_declared(
             ShapeModel,

@@ -77,7 +77,7 @@ class Stage:
         if not self.has(key, files):
             stale = [file for file in files if file.exists() and self._name(file) in self._made]
             if stale:
-                _log.info(f"{stale[0]}: {self._why(stale[0], key)}; it is made again")
+                _log.info(f"{stale[0]}: {self._why(stale[0], key)}; making it again")
             write()
             self.record(key, files)
         return key
@@ -98,7 +98,9 @@ class Stage:
 
     def _why(self, file: Path, key: str) -> str:
         made_under, contents = self._made[self._name(file)]
-        return "made from something else" if made_under != key or contents == _digest(file) else "damaged"
+        return (
+            "made from other inputs, options or code" if made_under != key or contents == _digest(file) else "damaged"
+        )
 
 
 def _digest(file: Path) -> str:

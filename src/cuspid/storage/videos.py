@@ -81,7 +81,7 @@ class VideoLength:
     def missing(self, frames: int, last_s: float | None) -> str | None:
         """What is missing of a video that ends after so many frames, the last one at a time; None where nothing is."""
         if self.is_counted and frames < self.frames - 1:
-            return f"truncated, {frames} of {self.frames} frames could be decoded; the rest is missing"
+            return f"truncated, only {frames} of {self.frames} frames could be decoded; the rest is missing"
         if not self.is_counted and last_s is not None and frames and self.seconds > last_s * (1 + 3 / frames) + 0.1:
             return f"truncated, it ends after {last_s:.2f} of {self.seconds:.2f} s; the rest is missing"
         return None
@@ -160,7 +160,7 @@ def write_video(path: Path, capture: Capture, camera: str | None = None) -> None
             str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES_PER_S, (model.width, model.height)
         )
         if not film.isOpened():
-            raise OutputError(f"{path}: this build of OpenCV cannot write such a film; name it .mp4")
+            raise OutputError(f"{path}: this build of OpenCV cannot write this video format; use .mp4")
         for frame in capture.frames:
             film.write(cv2.cvtColor(capture.image(frame, name), cv2.COLOR_RGB2BGR))
         film.release()

@@ -106,7 +106,7 @@ class CameraPairOptions(Options):
         if not self.facing or set(self.facing) - set(_FACED):
             raise InputError(f"camera pair: it can face {', '.join(_FACED)}, not {', '.join(self.facing) or 'nothing'}")
         if self.sensor not in PRESETS:
-            raise InputError(f"camera pair: no sensor {self.sensor!r}; there are {', '.join(PRESETS)}")
+            raise InputError(f"camera pair: unknown sensor {self.sensor!r}; choose one of {', '.join(PRESETS)}")
 
 
 def camera_pair(baseline_mm: float, axis_angle_deg: float, camera: Camera) -> Rig:
@@ -198,7 +198,9 @@ def _tooth(jaw: Jaw, options: CameraPairOptions) -> _Tooth:
     surfaces = tooth_surfaces(jaw, options.tooth)
     missing = [name for name in options.facing if name not in surfaces]
     if missing:
-        raise InputError(f"camera pair: tooth {options.tooth} has no {missing[0]} surface, but {', '.join(surfaces)}")
+        raise InputError(
+            f"camera pair: tooth {options.tooth} has no {missing[0]} surface; it has {', '.join(surfaces)}"
+        )
     return _Tooth(
         surfaces=surfaces,
         baseline_along={name: baseline_axis(jaw, options.tooth, name, options.direction) for name in options.facing},

@@ -114,7 +114,7 @@ class SweepOptions(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.surface not in SURFACES:
-            raise InputError(f"sweep: no surface {self.surface!r}; there are {', '.join(SURFACES)}")
+            raise InputError(f"sweep: unknown surface {self.surface!r}; choose one of {', '.join(SURFACES)}")
         if not (self.baseline_mm and self.angle_deg):
             raise InputError("sweep: --baseline-mm and --angle-deg need one or more values")
 
@@ -420,7 +420,7 @@ def values_of(outcomes: Sequence[Outcome], column: str) -> dict[Setting, dict[in
 
 def _number(value: Value) -> float:
     if value is None:
-        raise InputError("sweep: a figure is missing in the results; delete the folder")
+        raise InputError("sweep: a value is missing from the results; delete the folder")
     return float(value)
 
 

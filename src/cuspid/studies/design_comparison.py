@@ -103,7 +103,7 @@ class ComparisonOptions(Options):
         given = {"designs": self.designs, "jaws": self.jaws, "tooth": self.tooth, "seeds": self.seeds}
         for name, values in {**given, "turns": self.turns}.items():
             if not values or len(set(values)) < len(values):
-                raise InputError(f"compare: --{name} is empty or names something twice")
+                raise InputError(f"compare: --{name} is empty or lists something twice")
         for number in self.turns:
             ScanPathOptions(turns=number)
 
@@ -117,7 +117,7 @@ def load_design(name: str) -> tuple[str, Handpiece]:
         return name, DESIGNS[name](DesignOptions())
     path = Path(name)
     if not path.is_file():
-        raise InputError(f"compare: no design {name!r}; give {', '.join(DESIGNS)} or a handpiece.json")
+        raise InputError(f"compare: unknown design {name!r}; give {', '.join(DESIGNS)} or a handpiece.json")
     return path.stem, storage.read_handpiece(path)
 
 
@@ -155,7 +155,7 @@ def _jaw_name(given: str) -> str:
     if given in _JAWS:
         return given
     if not Path(given).is_file():
-        raise InputError(f"compare: no jaw {given!r}; give {', '.join(_JAWS)} or a mesh file")
+        raise InputError(f"compare: unknown jaw {given!r}; give {', '.join(_JAWS)} or a mesh file")
     return Path(given).stem
 
 

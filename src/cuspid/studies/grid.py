@@ -231,8 +231,8 @@ def _collect(finished: _Running) -> Outcome:
     except EOFError:
         finished.process.join()
         status = finished.process.exitcode or 0
-        reason = f"killed by signal {-status}" if status < 0 else f"ended with status {status}"
-        outcome = Outcome(case=finished.case, figures={}, failure=f"its process was {reason} (out of memory?)")
+        reason = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
+        outcome = Outcome(case=finished.case, figures={}, failure=f"its process {reason} (out of memory?)")
     finished.process.join()
     finished.answer.close()
     return outcome

@@ -146,7 +146,7 @@ def _sample_pair(
 
 def _handpiece(options: MatchingNoiseOptions, baseline_mm: float) -> Handpiece:
     if options.sensor not in PRESETS:
-        raise InputError(f"matching noise: no sensor {options.sensor!r}; there are {', '.join(PRESETS)}")
+        raise InputError(f"matching noise: unknown sensor {options.sensor!r}; choose one of {', '.join(PRESETS)}")
     angle = convergence_deg(baseline_mm, options.distance_mm)
     ahead = np.array([0.0, 0.0, 1.0])
     lights = {str(side): Light(position_mm=np.array([0.0, side * _LED_MM, 0.0]), direction=ahead) for side in (-1, 1)}

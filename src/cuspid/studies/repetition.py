@@ -212,7 +212,7 @@ def _kept(folder: Path, name: str) -> Mesh:
     file = storage.read_mesh_file(folder / "scans" / f"{name}.ply")
     evaluated = np.isfinite(file.vertex_values["deviation_um"])[file.mesh.faces].all(axis=1)
     if not evaluated.any():
-        raise ReconstructionError(f"{name}: nothing of the scan can be evaluated; see its row in results.csv")
+        raise ReconstructionError(f"{name}: no part of the scan can be evaluated; see its row in results.csv")
     return file.mesh.submesh(evaluated)
 
 

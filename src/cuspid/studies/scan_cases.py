@@ -77,7 +77,7 @@ def _last_words(log: Path) -> str:
     """What a program that failed said last."""
     lines = log.read_text(errors="replace").splitlines()
     said = next((line.strip() for line in reversed(lines) if line.strip()), "nothing")
-    return f": {said.removeprefix('cuspid: ')} (all of it in {log})"
+    return f": {said.removeprefix('cuspid: ')} (full log: {log})"
 
 
 def commit() -> str | None:

@@ -117,7 +117,7 @@ def run_trial(
     reconstruction, mesh = pipeline.reconstruct(capture, folder, options.reconstruction)
     reconstructed, reconstructed_cpu = time.perf_counter(), time.process_time()
     if not len(mesh.faces):
-        raise ReconstructionError("nothing of the surface is left after cleaning")
+        raise ReconstructionError("no surface is left after cleaning")
     scannable = pipeline.scannable(truth, VisibilityOptions())
     start = _true_start(reconstruction, truth) if start_from_truth else None
     return Trial(

@@ -181,7 +181,7 @@ def _item(entry: Any, source: str) -> Item:
     where = f"{source}: {name or 'an item without an id'}"
     _check(entry, _ITEM, ("id", "section", "title", "states"), where)
     if not re.fullmatch(rf"({'|'.join(_KINDS)})-\d+\.\d+", entry["id"]):
-        raise InputError(f"{where}: an id is fig-, table- or eq- and a number, as fig-2.5")
+        raise InputError(f"{where}: an id is fig-, table- or eq- and a number, such as fig-2.5")
     return Item(
         **{key: entry[key] for key in _ITEM if key in entry and _ITEM[key] is str},
         pictures=tuple(_picture(pair, where) for pair in entry.get("pictures", ())),
@@ -193,7 +193,7 @@ def _item(entry: Any, source: str) -> Item:
 
 def _picture(pair: Any, where: str) -> tuple[str, str]:
     if not (isinstance(pair, list) and len(pair) == 2 and all(isinstance(each, str) for each in pair)):
-        raise InputError(f"{where}: a picture is a file and what is in it, not {shown(pair)}")
+        raise InputError(f"{where}: a picture must be a file and what it shows, not {shown(pair)}")
     return pair[0], pair[1]
 
 
@@ -208,7 +208,7 @@ def _row(entry: Any, each: Any, where: str) -> Row | MadeRows:
     row = {**{key: value for key, value in each.items() if not (ruled and key in (*RULES, "within"))}, **entry}
     _check(row, _ROW, ("thesis",), where)
     if ("ours" in row) == ("computed" in row):
-        raise InputError(f"{where}: give ours, a path, or computed, a function")
+        raise InputError(f"{where}: give either 'ours', a path, or 'computed', a function")
     return Row(
         **{key: row[key] for key in ("quantity", "unit", "thesis", "computed", "shown", "because") if key in row},
         source=_several(row.get("source", CHECKED)),
@@ -226,9 +226,9 @@ def _rule(row: Mapping[str, Any], where: str) -> Rule:
     """The one rule among the keys of a row."""
     named = [name for name in RULES if name in row]
     if len(named) != 1:
-        raise InputError(f"{where}: {' and '.join(named) or 'no rule'}; give one of {', '.join(RULES)}")
+        raise InputError(f"{where}: {' and '.join(named) or 'no rule'} given; give exactly one of {', '.join(RULES)}")
     if "within" in row and named != ["equals"]:
-        raise InputError(f"{where}: within goes with equals alone")
+        raise InputError(f"{where}: 'within' can only be used with 'equals'")
     kind, name = RULES[named[0]]
     try:
         values: dict[str, Any] = {name: _as_floats(row[named[0]])}

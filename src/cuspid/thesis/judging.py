@@ -87,7 +87,7 @@ def _compared(row: Row, item: Item, results: Results) -> Comparison:
         found = (None if result is None else look(result)) or {}
         words = in_words(row.shown, result or {}, found) if found else ""
     except (KeyError, TypeError, IndexError, AttributeError, StopIteration) as error:
-        raise InputError(f"results {source}.json: not what is expected there ({shown(error)}); run it again") from error
+        raise InputError(f"results {source}.json: unexpected content ({shown(error)}); run it again") from error
     return Comparison(
         quantity=row.quantity,
         unit=row.unit,
@@ -115,7 +115,7 @@ def _function(
 ) -> Callable[..., Any]:
     """A function of the catalogue, with its arguments but the results. Raises InputError where they do not fit."""
     if name not in functions:
-        raise InputError(f"{item.id}: no function '{name}'; there are {', '.join(functions)}")
+        raise InputError(f"{item.id}: unknown function '{name}'; choose one of {', '.join(functions)}")
     try:
         signature(functions[name]).bind({}, **arguments)
     except TypeError as error:

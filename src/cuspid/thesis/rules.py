@@ -33,7 +33,7 @@ class LessIsBetter:
 
     def __post_init__(self) -> None:
         if not self.thesis > 0:
-            raise InputError(f"rule: only a positive figure can be undercut, not {self.thesis:g}")
+            raise InputError(f"rule: only a positive value can be undercut, not {self.thesis:g}")
 
     @property
     def text(self) -> str:

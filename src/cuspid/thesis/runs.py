@@ -335,7 +335,7 @@ def read_results(folder: Path, quick: bool = False) -> dict[str, Result]:
         if name in (*ALL_RESULTS, *READ_ONLY) or name.startswith(PANORAMA):
             result = storage.read_json(path)
             if not isinstance(result, dict) or (name.startswith(PANORAMA) and "method" not in result):
-                raise InputError(f"{path}: not results of a run; delete it")
+                raise InputError(f"{path}: it does not hold the results of a run; delete it")
             found[name] = {**result, "quick": True} if quick else result
     return found
 
@@ -346,7 +346,7 @@ def gather(folder: Path, given: Path | None) -> dict[str, Result]:
         raise InputError(f"--results {given}: no such folder")
     others = {} if given is None else read_results(given)
     if given is not None and not others:
-        raise InputError(f"--results {given}: no results in it; give a folder like benchmarks/results")
+        raise InputError(f"--results {given}: there are no results in it; give a folder like benchmarks/results")
     return {**read_results(folder / "results-quick", quick=True), **others, **read_results(folder / "results")}
 
 

@@ -157,7 +157,7 @@ def arch_of(jaw: Jaw) -> Arch:
         return jaw.arch
     lower = {fdi >= 30 for fdi in _teeth(jaw)}
     if len(lower) != 1:
-        raise InputError("jaw: upper or lower is not known and the tooth numbers do not tell it; give --arch")
+        raise InputError("jaw: the tooth numbers do not show whether it is upper or lower; give --arch")
     return "lower" if lower.pop() else "upper"
 
 
@@ -196,7 +196,7 @@ def survey(jaws: Mapping[str, Callable[[], tuple[Jaw, tuple[str, ...]]]]) -> Sur
             failures[name] = str(error)
     if not measured:
         first, reason = next(iter(failures.items()))
-        raise InputError(f"none of {len(failures)} jaws can be measured; {first}: {reason}")
+        raise InputError(f"none of the {len(failures)} jaws can be measured; {first}: {reason}")
     return Survey(jaws=tuple(measured), groups=group_statistics(measured), failures=failures)
 
 

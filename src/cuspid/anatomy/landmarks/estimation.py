@@ -112,7 +112,7 @@ def estimate_landmarks(jaw: Jaw, options: LandmarkingOptions = LandmarkingOption
     Raises InputError where the jaw has no labels.
     """
     if not jaw.teeth:
-        raise InputError("landmarks: the jaw has no tooth labels to find them by; give labels or a landmark file")
+        raise InputError("landmarks: the jaw has no tooth labels to estimate them from; give labels or a landmark file")
     arch = arch_of(jaw)
     views = view_teeth(jaw, options.grid_mm)
     margins = _margins(jaw)

@@ -79,14 +79,14 @@ def validate(landmarks: Iterable[str], teeth: Collection[int] = (), *, source: s
             raise InputError(f"{source}: unknown landmark {shown(label)}; {_advice(label, scheme)}")
         if teeth and not set(teeth_named([label])) <= set(teeth):
             has = ", ".join(map(str, sorted(teeth)))
-            raise InputError(f"{source}: landmark '{label}' is of no tooth of this jaw; it has {has} (FDI)")
+            raise InputError(f"{source}: landmark '{label}' belongs to no tooth of this jaw, which has {has} (FDI)")
 
 
 def _advice(label: str, scheme: tuple[str, ...]) -> str:
     near = get_close_matches(label, scheme, n=3, cutoff=0.7)
     if near:
         return f"did you mean {' or '.join(near)}?"
-    return "a label is <FDI>.<point>, as 46.buccal_groove (docs/landmarks.md lists them)"
+    return "a label is <FDI>.<point>, such as 46.buccal_groove (docs/landmarks.md lists them)"
 
 
 def in_frame(landmarks: Mapping[str, Landmark], target_from_source: Rigid3) -> dict[str, Landmark]:

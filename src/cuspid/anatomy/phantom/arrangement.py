@@ -124,7 +124,7 @@ def place_teeth(
     short_mm = options.crowding_mm - _shortened(closing, loose)
     if options.crowding_mm and abs(short_mm) > CROWDING_TOLERANCE_MM:
         raise InputError(
-            f"crowding_mm: these teeth overlap by {options.crowding_mm - short_mm:.1f} mm at most, not by "
+            f"crowding_mm: these teeth can overlap by at most {options.crowding_mm - short_mm:.1f} mm, not "
             f"{options.crowding_mm:g}; ask for less"
         )
     return teeth
@@ -146,9 +146,9 @@ def _rows(options: PhantomOptions, individuals: dict[int, tuple[Tooth, ...]]) ->
     ):
         for fdi in teeth:
             if fdi not in numbers or (name != "missing" and fdi in options.missing):
-                raise InputError(f"{name}: no tooth {fdi} in this {options.arch} jaw; give FDI numbers of teeth it has")
+                raise InputError(f"{name}: no tooth {fdi} in this {options.arch} jaw; give FDI numbers of its teeth")
             if name == "missing" and fdi % 10 in (1, 3):
-                raise InputError(f"missing: {fdi} marks the arch (midline, canine width); leave it in")
+                raise InputError(f"missing: {fdi} defines the arch (midline, canine width); do not remove it")
     rows: Rows = {}
     for side in (-1, 1):
         kept = [(k + 1, tooth) for k, tooth in enumerate(individuals[side])]
@@ -174,9 +174,9 @@ def _aim(options: PhantomOptions, rows: Rows) -> Aim:
     there = {position for position in asked if all(position in dict(row) for row in rows.values())}
     for position in asked:
         if asked[position] is not None and position not in there:
-            raise InputError(f"{OPTION_OF[position]}: a tooth {position} is missing; leave the dimension out")
+            raise InputError(f"{OPTION_OF[position]}: a tooth {position} is missing; leave this dimension out")
     if options.arch_length_mm is not None and 7 not in there:
-        raise InputError("arch_length_mm: a second molar is missing; leave the dimension out")
+        raise InputError("arch_length_mm: a second molar is missing; leave this dimension out")
     shortened = any(set(range(1, 6)) - set(dict(row)) for row in rows.values())
     widths = {
         position: asked[position] or usual[position]
@@ -309,14 +309,14 @@ def _check(teeth: tuple[PlacedTooth, ...], shape: Shape, aim: Aim, papilla_of: P
     if abs(got[worst] - asked[worst]) > TOLERANCE_MM:
         nearest = ", ".join(f"{name} {value:.1f}" for name, value in zip(names, got, strict=True))
         raise InputError(
-            f"{names[worst]}: {asked[worst]:g} does not go with the other dimensions and teeth of size "
+            f"{names[worst]}: {asked[worst]:g} is incompatible with the other dimensions and teeth of size "
             f"{shape.size:.2f}; the nearest arch has {nearest}"
         )
     if shape.kinks_deg.max() > MOST_KINK_DEG:
         raise InputError(
-            f"{', '.join(names)}: {', '.join(f'{value:g}' for value in asked)} bend the row by "
+            f"{', '.join(names)}: {', '.join(f'{value:g}' for value in asked)} would bend the row by "
             f"{shape.kinks_deg.max():.0f} degrees at tooth {int(shape.kinks_deg.argmax()) + 1} from the midline; ask "
-            "for dimensions nearer to the mean, or for another tooth_size"
+            "for dimensions closer to the mean, or for another tooth_size"
         )
 
 

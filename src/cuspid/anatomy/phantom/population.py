@@ -131,7 +131,7 @@ def draw_and_count(
 ) -> tuple[tuple[PhantomOptions, ...], int]:
     """As `draw_population`, and how many draws were put back because no row of teeth can have such dimensions."""
     if count < 1:
-        raise InputError(f"population: {count} jaws; ask for at least one")
+        raise InputError(f"population: {count} jaws requested; ask for at least one")
     jaws: list[PhantomOptions] = []
     tries = 0
     while len(jaws) < count:
@@ -140,7 +140,7 @@ def draw_and_count(
         if can_stand(jaw):
             jaws.append(jaw)
         elif tries > MOST_TRIES + 10 * len(jaws):
-            raise InputError(f"population: no jaw of {group} can stand with these options; change tooth_size")
+            raise InputError(f"population: no jaw of {group} is possible with these options; change tooth_size")
     return tuple(jaws), tries - count
 
 

@@ -66,8 +66,8 @@ class SphereArchOptions(Options):
         super().__post_init__()
         if not self.rise_mm < self.radius_mm:
             raise InputError(
-                f"sphere arch: --rise-mm is {self.rise_mm:g}; it must be below the radius, {self.radius_mm:g} mm, for "
-                "the spheres to stand in the ridge"
+                f"sphere arch: --rise-mm is {self.rise_mm:g}; it must be below the radius, {self.radius_mm:g} mm, so "
+                "that the ridge holds the spheres"
             )
 
     @property
@@ -103,7 +103,7 @@ def place_spheres(arch: Arch, options: SphereArchOptions) -> dict[str, Sphere]:
     gap = np.linalg.norm(np.diff(xy, axis=0), axis=1).min() - 2 * options.radius_mm
     if gap < _LEAST_GAP_MM:
         raise InputError(
-            f"sphere arch: spheres of {options.radius_mm:g} mm radius stand {gap:.2f} mm apart, less than "
+            f"sphere arch: spheres of {options.radius_mm:g} mm radius would be {gap:.2f} mm apart, less than "
             f"{_LEAST_GAP_MM:g} mm; choose a smaller radius_mm"
         )
     quadrants = {"lower": (30, 40), "upper": (10, 20)}[arch]

@@ -39,7 +39,7 @@ class CrackShape:
 def crack_tool(site: ToothSite, shape: CrackShape) -> Tool:
     """The tool for a crack. Raises InputError for a tooth without an occlusal surface, or one too low for the depth."""
     if site.kind not in ("premolar", "molar"):
-        raise InputError(f"tooth {site.fdi}: a crack runs over an occlusal surface; choose a premolar or molar")
+        raise InputError(f"tooth {site.fdi}: a crack needs an occlusal surface; choose a premolar or molar")
     path = _path(site, shape.ridge)
     if path[:, 2].min() - shape.depth_mm < site.gum_margin[:, 2].min():
         raise InputError(

@@ -83,16 +83,17 @@ def inlay_plan(site: ToothSite, shape: InlayShape) -> InlayPlan:
     if gingival < site.gum_margin[:, 2].min() + 0.3:
         raise InputError(
             f"tooth {site.fdi}: a gingival floor {shape.depth_mm + shape.box_depth_mm:g} mm below the central groove "
-            "lies below the lowest gum; make slot or boxes shallower"
+            "would lie below the lowest gum; make the slot or the boxes shallower"
         )
     ends = [_proximal_end(site, sign, centre_y, gingival) for sign in (-1.0, 1.0)]
     axial = (ends[0][0] + shape.box_floor_mm, ends[1][0] - shape.box_floor_mm)
     if axial[1] - axial[0] < 1.0:
-        raise InputError(f"tooth {site.fdi}: gingival floors of {shape.box_floor_mm:g} mm meet; make them narrower")
+        raise InputError(f"tooth {site.fdi}: gingival floors {shape.box_floor_mm:g} mm wide meet; make them narrower")
     room = _room_mm(site, gingival)
     if max(shape.box_width_mm, shape.isthmus_mm) > room - 1.0:
         raise InputError(
-            f"tooth {site.fdi}: it is {room:.1f} mm deep at the gingival floor; boxes and isthmus must leave 1 mm"
+            f"tooth {site.fdi}: it is {room:.1f} mm deep at the gingival floor; boxes and isthmus must be at least "
+            "1 mm narrower"
         )
     return InlayPlan(
         centre_y=centre_y,

@@ -120,12 +120,12 @@ class InlayOptions(Options):
         super().__post_init__()
         if self.box_width_mm < self.isthmus_width_mm:
             raise InputError(
-                f"inlay: --box-width-mm is {self.box_width_mm:g}; it must not be less than the isthmus, "
+                f"inlay: --box-width-mm is {self.box_width_mm:g}; it must not be less than the isthmus width, "
                 f"{self.isthmus_width_mm:g} mm"
             )
         if self.edge_radius_mm > self.isthmus_width_mm / 3:
             raise InputError(
-                f"inlay: --edge-radius-mm is {self.edge_radius_mm:g}; it must not exceed a third of the isthmus, "
+                f"inlay: --edge-radius-mm is {self.edge_radius_mm:g}; it must not exceed a third of the isthmus width, "
                 f"{self.isthmus_width_mm / 3:.2f} mm"
             )
 
@@ -163,14 +163,14 @@ full-contour crown, 35 and 36 for mesio-occluso-distal inlays."""
 def options_of(kind: str) -> PreparationOptions:
     """The default options of a kind. Raises InputError for an unknown one."""
     if kind not in KINDS:
-        raise InputError(f"preparation: no kind {kind!r}; choose one of {', '.join(KINDS)}")
+        raise InputError(f"preparation: unknown kind {kind!r}; choose one of {', '.join(KINDS)}")
     return KINDS[kind]()
 
 
 def preset(name: str) -> Mapping[int, PreparationOptions]:
     """The preparations of a preset. Raises InputError for an unknown one."""
     if name not in PRESETS:
-        raise InputError(f"preparation: no preset {name!r}; choose one of {', '.join(PRESETS)}")
+        raise InputError(f"preparation: unknown preset {name!r}; choose one of {', '.join(PRESETS)}")
     return PRESETS[name]
 
 

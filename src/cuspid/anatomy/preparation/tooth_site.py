@@ -200,7 +200,7 @@ def site_of(jaw: Jaw, fdi: int) -> ToothSite:
     pairs, middles = _seams(jaw.mesh, labels)
     gum = middles[(pairs == sorted((GUM, fdi))).all(axis=1)]
     if len(gum) < 10:
-        raise InputError(f"tooth {fdi}: no gum borders on it, so its cervix is unknown; label the gum 0")
+        raise InputError(f"tooth {fdi}: no gum faces border it, so its cervix is unknown; label the gum 0")
     site_from_jaw, distal = _frame(jaw, fdi, mine, gum)
     surface = jaw.mesh.submesh(mine).transformed(site_from_jaw)
     return ToothSite(

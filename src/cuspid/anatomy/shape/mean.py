@@ -111,14 +111,14 @@ def common_landmarks(jaws: Mapping[str, Jaw]) -> tuple[str, ...]:
         union = set.union(*named.values())
         lacking = "; ".join(f"{name} lacks {_some(union - own)}" for name, own in named.items() if union - own)
         raise InputError(
-            f"mean shape: {len(common)} landmarks are common to all jaws, at least three are needed: "
-            f"{lacking or 'no jaw has any'}; place them or leave that jaw out"
+            f"mean shape: the jaws have {len(common)} landmarks in common, but at least three are needed: "
+            f"{lacking or 'no jaw has any'}; place the missing ones or leave that jaw out"
         )
     for name, jaw in jaws.items():
         if dimension(_positions(jaw, tuple(common))) < 2:
             raise InputError(
-                f"mean shape: the {len(common)} landmarks that are common to all jaws ({_some(set(common))}) lie in a "
-                f"line in {name}; place more of them"
+                f"mean shape: the {len(common)} landmarks common to all jaws ({_some(set(common))}) are collinear in "
+                f"{name}; place more landmarks"
             )
     return tuple(common)
 
@@ -135,7 +135,7 @@ def _positions(jaw: Jaw, labels: tuple[str, ...]) -> Float[np.ndarray, "l 3"]:
 
 def _superposed(jaws: Mapping[str, Jaw], scale: bool) -> _Samples:
     if len(jaws) < 2:
-        raise InputError(f"mean shape: {len(jaws)} jaws; at least two are needed")
+        raise InputError(f"mean shape: {len(jaws)} jaws given; at least two are needed")
     arches = {name: jaw.arch for name, jaw in jaws.items() if jaw.arch is not None}
     if len(set(arches.values())) > 1:
         upper, lower = (next(name for name, arch in arches.items() if arch == which) for which in ("upper", "lower"))
@@ -266,10 +266,10 @@ def _notes(samples: _Samples, first: str) -> tuple[str, ...]:
             notes.append(f"{name} has no tooth {missing}: there the mean follows the neighbouring teeth of {name}")
         if samples.by_tooth and set(jaw.teeth) - teeth:
             extra = ", ".join(map(str, sorted(set(jaw.teeth) - teeth)))
-            notes.append(f"tooth {extra} of {name} is not in the mean, for {first} has none")
+            notes.append(f"tooth {extra} of {name} is not in the mean, because {first} does not have it")
     left_out = set().union(*(jaw.landmarks for jaw in samples.jaws.values())) - set(samples.labels)
     if left_out:
-        notes.append(f"landmarks that not every jaw has were left out: {_some(left_out)}")
+        notes.append(f"landmarks missing from some jaws were left out: {_some(left_out)}")
     if not samples.by_tooth:
-        notes.append("not every jaw has tooth labels: corresponding points were sought without them")
+        notes.append("some jaws have no tooth labels: corresponding points were found without them")
     return tuple(notes)

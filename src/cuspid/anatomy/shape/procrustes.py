@@ -59,7 +59,7 @@ def superpose(samples: Float[np.ndarray, "n l 3"], *, scale: bool = False) -> Su
     for number, sample in enumerate(samples):
         if len(sample) < 3 or dimension(sample) < 2:
             raise InputError(
-                f"Procrustes: the points of configuration {number} lie in a line; three that do not are needed"
+                f"Procrustes: the points of configuration {number} are collinear; three that are not are needed"
             )
     centres = samples.mean(axis=1)
     centred = samples - centres[:, None]

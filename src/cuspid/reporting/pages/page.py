@@ -37,7 +37,7 @@ def render_page(template: str, **values: Any) -> str:
     try:
         return _environment().get_template(template).render(version=cuspid.__version__, **values)
     except UndefinedError as error:
-        raise InputError(f"report: what it shows is incomplete ({one_line(error)}); make it again") from error
+        raise InputError(f"report: its data is incomplete ({one_line(error)}); make it again") from error
 
 
 @cache

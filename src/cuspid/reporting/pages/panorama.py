@@ -21,14 +21,15 @@ def panorama_page(result: PanoramaResult) -> str:
     """The HTML of a panorama, or of its parts."""
     first = result.parts[0]
     size = first.size_mm
-    used = sum(frame.used for part in result.parts[:1] for frame in part.frames)
+    used = sum(frame.used for frame in first.frames)
+    placed = [("frames placed", str(used), f"of {len(first.frames)}")] if first.frames else []
     return render_page(
         "panorama.html.j2",
-        title=f"Panorama, method {first.method}",
+        title=f"Panorama, method {first.method}" if first.frames else "Views of a mesh",
         name=result.name,
         missing=result.missing,
         tiles=[
-            ("frames placed", str(used), f"of {len(first.frames)}"),
+            *placed,
             ("part" if len(result.parts) == 1 else "parts", str(len(result.parts)), ""),
             (
                 "width and height",
@@ -48,14 +49,25 @@ def panorama_page(result: PanoramaResult) -> str:
 
 
 def _part(part: Panorama, folder: Path) -> dict[str, Any]:
-    strip = folder / "strip.png"
     height, width = part.covered.shape
     return {
         "title": "The arch from above" if part.parts == 1 else f"Part {part.part} of {part.parts}",
         "picture": jpeg_uri(_on_ground(part.image, part.covered), widest_px=_WIDEST_PX),
         "caption": f"{width} × {height} px",
-        "strip": photo_uri(strip, widest_px=_WIDEST_PX) if strip.exists() else None,
+        "strips": [
+            (caption, photo_uri(folder / file, widest_px=_WIDEST_PX))
+            for file, caption in _STRIPS.items()
+            if (folder / file).exists()
+        ],
     }
+
+
+_STRIPS = {
+    "buccal/strip.png": "Unrolled along the arch, seen from the cheek.",
+    "strip.png": "Unrolled along the arch, with the cheek side at the top.",
+    "lingual/strip.png": "Unrolled along the arch, seen from the tongue; mirrored, so that all strips show the same "
+    "place of the arch in the same column.",
+}
 
 
 def _on_ground(image: UInt8[np.ndarray, "h w 3"], covered: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:

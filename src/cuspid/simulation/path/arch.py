@@ -156,7 +156,7 @@ def _crown_tops(jaw: Jaw) -> Float[np.ndarray, "n 3"]:
     crown = _is_crown(height)
     if crown.sum() < 100:
         raise InputError(
-            "scan path: no crowns found on the jaw; is it in its occlusal frame (+Z out of the gum), in mm?"
+            "scan path: no crowns found on the jaw; check that it is in its occlusal frame (+Z out of the gum), in mm"
         )
     return np.stack([x[crown], y[crown], height[crown]], axis=1)
 

@@ -109,8 +109,8 @@ def _fitting(
     fits = room.fits(pose, _motions())
     if not fits.any():
         raise InputError(
-            "scan path: the handpiece does not fit over the jaw even when it is lifted by "
-            f"{max(_LIFTS_MM):g} mm; is the jaw in its occlusal frame, or the body of the handpiece too large?"
+            f"scan path: the handpiece does not fit over the jaw even when lifted by {max(_LIFTS_MM):g} mm; check that "
+            "the jaw is in its occlusal frame and that the body of the handpiece is not too large"
         )
     candidates = _CANDIDATES[fits]
     motions = [motion for motion, fit in zip(_motions(), fits, strict=True) if fit]

@@ -84,13 +84,13 @@ def plan_free_path(
     ]
     if options.clearance_mm >= handpiece.depth_range_mm[1]:
         raise InputError(
-            f"free path: at --clearance-mm {options.clearance_mm:g} nothing is in focus; the camera sees sharply up to "
-            f"{handpiece.depth_range_mm[1]:g} mm"
+            f"free path: at --clearance-mm {options.clearance_mm:g} nothing is in focus; the camera is sharp only up "
+            f"to {handpiece.depth_range_mm[1]:g} mm"
         )
     room, reach = room_about(jaw.mesh, handpiece, options.clearance_mm), round(options.drift_frames)
     lifts = lifts_needed(room, poses, reach)
     if lifts.any():
-        _LOG.info(f"free path: the hand lifts the camera by up to {lifts.max():.1f} mm where it would come too near")
+        _LOG.info(f"free path: the hand lifts the camera by up to {lifts.max():.1f} mm where it would come too close")
     return {
         f"{index:05d}": up(lift) @ pose for index, (lift, pose) in enumerate(zip(lifts.tolist(), poses, strict=True))
     }

@@ -175,8 +175,8 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
     check_clearance(room, path.rig_from_world)
     if not np.isfinite(path.overlap).any():
         raise InputError(
-            f"scan path: no camera sees the jaw in focus where the handpiece keeps {options.clearance_mm:g} mm from "
-            "it; use a narrower one, a larger depth of field or a smaller --clearance-mm"
+            f"scan path: with the handpiece {options.clearance_mm:g} mm from the jaw, no camera sees it in focus; "
+            "use a narrower handpiece, a larger depth of field or a smaller --clearance-mm"
         )
     path = replace(path, seen=_seen(crowns, handpiece, path, options.tooth))
     notes = (_gap_notes(steady), _detour_notes(jaw, steady, detour), _further_pass_notes(steady, first, path))
@@ -223,8 +223,8 @@ def _crossed(mesh: Mesh, room: Room, handpiece: Handpiece, steady: SteadyPath, o
     """
     if options.tooth is not None or float(steady.curve.lengths_mm[-1]) <= _ARCH_MM:
         raise InputError(
-            "scan path: a sweep across goes from one side of a whole arch to the other, and this is a tooth or a part "
-            "of one; leave --cross-sweep out"
+            "scan path: a sweep across goes from one side of a whole arch to the other, but this is a tooth or part "
+            "of an arch; leave out --cross-sweep"
         )
     ends_at = steady.legs[-1].end_mm
     crossing = plan_crossing(mesh, room, handpiece, steady.curve, ends_at)
@@ -280,13 +280,13 @@ def _with_frames(
             return path
         needed = _needed(frames, path, options)
         shortfall = (
-            f"with {frames} frames consecutive images overlap by only {path.minimum_overlap:.0%}, less than "
+            f"with {frames} frames, consecutive images overlap by only {path.minimum_overlap:.0%}, less than "
             f"{options.minimum_overlap:.0%}"
         )
         if options.frames:
-            raise InputError(f"scan path: {shortfall}; about {needed} would be needed: give --frames or a shorter path")
+            raise InputError(f"scan path: {shortfall}; raise --frames to about {needed} or shorten the path")
         if needed > _MOST * usual:
-            _LOG.info(f"scan path: {shortfall} somewhere; that may break the scan there")
+            _LOG.info(f"scan path: {shortfall} in places; the scan may break there")
             return path
         frames = needed
 
@@ -330,7 +330,7 @@ def _gap_notes(steady: SteadyPath) -> tuple[str, ...]:
     """How the handpiece follows the gum where teeth are missing."""
     if not steady.sinks_mm.any():
         return ()
-    return (f"scan path: teeth are missing; there the handpiece sinks by up to {steady.sinks_mm.max():.1f} mm",)
+    return (f"scan path: where teeth are missing, the handpiece sinks by up to {steady.sinks_mm.max():.1f} mm",)
 
 
 def _blind_notes(path: ScanPath) -> tuple[str, ...]:
@@ -341,7 +341,7 @@ def _blind_notes(path: ScanPath) -> tuple[str, ...]:
         return ()
     return (
         f"scan path: in {len(blind)} frames ({', '.join(blind[:5])}{', ...' if len(blind) > 5 else ''}) fewer than two "
-        "cameras see the jaw in focus; that may break the scan there",
+        "cameras see the jaw in focus; the scan may break there",
     )
 
 
@@ -375,7 +375,7 @@ def _further_pass_notes(steady: SteadyPath, first: SteadyPath, path: ScanPath) -
     frames, passes_mm = len(path.rig_from_world), steady.legs_end_mm - steady.span_mm[0]
     more = round((frames - len(path.cross_sweep)) * (1 - np.ptp(first.span_mm) / passes_mm))
     what = ", ".join(f"{leg.roll_deg:+.0f} deg over {leg.length_mm:.0f} mm" for leg in further)
-    return (f"scan path: further passes, rolled to the cheek by {what}, take about {more} of {frames} frames",)
+    return (f"scan path: further passes, rolled towards the cheek by {what}, take about {more} of {frames} frames",)
 
 
 def _crossing_notes(jaw: Jaw, path: ScanPath) -> tuple[str, ...]:
@@ -383,14 +383,14 @@ def _crossing_notes(jaw: Jaw, path: ScanPath) -> tuple[str, ...]:
     crossing, swept = path.steady.crossing, path.cross_sweep
     if crossing is None:
         return (
-            "scan path: no sweep across; between the sides of this arch there is nowhere surface all the way that two "
-            "cameras see in focus where the handpiece fits",
+            "scan path: no sweep across; nowhere between the sides of this arch does the handpiece fit with two "
+            "cameras seeing surface in focus all the way",
         )
     ends = np.array([path.curve.place(at) for at in (crossing.start_mm, crossing.end_mm)])
     return (
-        f"scan path: the sweep across{_near_teeth(jaw, ends)} takes the frames {swept[0]} to {swept[-1]}, "
-        f"{len(swept)} of {len(path.rig_from_world)}; from one side to the other it is "
-        f"{np.linalg.norm(ends[1] - ends[0]):.0f} mm",
+        f"scan path: the sweep across{_near_teeth(jaw, ends)} takes frames {swept[0]} to {swept[-1]}, "
+        f"{len(swept)} of {len(path.rig_from_world)}; it covers {np.linalg.norm(ends[1] - ends[0]):.0f} mm from one "
+        "side to the other",
     )
 
 
@@ -399,4 +399,4 @@ def _unseen_notes(path: ScanPath) -> tuple[str, ...]:
     low = [f"{tooth} {100 * share:.0f} %" for tooth, share in path.seen.items() if share < _LOW_SHARE and tooth != GUM]
     if not low:
         return ()
-    return (f"scan path: two cameras see little of some crowns, of what is open to any direction: {', '.join(low)}",)
+    return (f"scan path: two cameras see little of the open surface of some crowns: {', '.join(low)}",)

@@ -1,0 +1,82 @@
+"""Where a handpiece of two or more cameras was that films bare teeth by hand: as :mod:`cuspid.motion.location`, on
+contrast-normalised images with many weak keypoints.
+
+Cameras of one instant see the same lights, and know how far they are apart: the scale is theirs, and does not drift
+along the arch, as it does for one camera alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import UInt8
+
+from cuspid.capture import Capture, ImageSource
+from cuspid.motion.location import MotionOptions, locate
+from cuspid.motion.single import ENAMEL, SingleOptions, normalise_contrast
+from cuspid.progress import Progress, silent
+from cuspid.reconstruction import Reconstruction
+from cuspid.sparse_model import SparseModel
+
+
+@dataclass(frozen=True, eq=False)
+class _EvenContrast:
+    """The images of another source with even local contrast. An :class:`cuspid.capture.ImageSource`."""
+
+    source: ImageSource
+    options: SingleOptions
+
+    @property
+    def suffix(self) -> str:
+        return self.source.suffix
+
+    def read(self, frame: str, camera: str) -> UInt8[np.ndarray, "h w 3"]:
+        return np.dstack([normalise_contrast(self.source.read(frame, camera), self.options)] * 3)
+
+    def size(self, frame: str, camera: str) -> tuple[int, int]:
+        return self.source.size(frame, camera)
+
+    def digest(self, frame: str, camera: str) -> str:
+        return self.source.digest(frame, camera)
+
+    def where(self, frame: str, camera: str) -> str:
+        return self.source.where(frame, camera)
+
+
+def film_options() -> MotionOptions:
+    """The options of :func:`cuspid.motion.location.locate` for bare teeth."""
+    return MotionOptions(features=ENAMEL)
+
+
+def locate_rig_film(
+    capture: Capture, options: MotionOptions, contrast: SingleOptions, *, progress: Progress = silent
+) -> Reconstruction:
+    """Metric poses of the frames, and the points that they see.
+
+    Raises InputError where no two cameras see the same surface, and ReconstructionError where too few frames can be
+    placed.
+    """
+    return locate(replace(capture, source=_EvenContrast(capture.source, contrast)), options, progress=progress)
+
+
+def of_camera(found: Reconstruction, camera: str) -> SparseModel:
+    """The trajectory of one camera of the handpiece, and the points that it sees; in millimetres. Raises
+    ReconstructionError where there are no points."""
+    assert found.tracks is not None
+    tracks, mounted = found.tracks, found.rig[camera]
+    mine = tracks.camera_index == found.rig.names.index(camera)
+    kept, point_index = np.unique(tracks.point_index[mine], return_inverse=True)
+    return SparseModel(
+        camera=mounted.camera,
+        cam_from_world={name: mounted.cam_from_rig @ pose for name, pose in found.rig_from_world.items()},
+        tracks=replace(
+            tracks,
+            points=tracks.points[kept],
+            colors=tracks.colors[kept],
+            point_index=point_index.astype(np.int64),
+            frame_index=tracks.frame_index[mine],
+            camera_index=np.zeros(int(mine.sum()), np.int64),
+            pixels=tracks.pixels[mine],
+        ),
+    )

@@ -1,0 +1,154 @@
+"""The whole pipeline of a panorama.
+
+capture, truth       = film(jaw, camera, folder, ...)               frames, and what only the simulator knows
+panorama             = stitch(frames, ...)                          from the frames alone
+panorama             = stitch_rig(capture, ...)                     from two or more cameras, in true millimetres
+views                = view_mesh(mesh, ...)                         the same views of a finished mesh
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import UInt8
+
+from cuspid.anatomy.orientation import find_occlusal_frame
+from cuspid.capture import Capture
+from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
+from cuspid.image_sequence import ImageSequence
+from cuspid.jaw import Jaw
+from cuspid.mesh import Mesh
+from cuspid.motion.location import MotionOptions
+from cuspid.motion.rig_film import film_options, locate_rig_film, of_camera
+from cuspid.motion.single import SingleOptions, locate_single
+from cuspid.pairing import stereo_pairs
+from cuspid.panorama import FrameUse
+from cuspid.progress import Progress, silent
+from cuspid.reconstruction import Reconstruction
+from cuspid.simulation.film import FilmOptions, film
+from cuspid.simulation.path.arch import arch_curve
+from cuspid.stitching.height_map import ScaleOptions
+from cuspid.stitching.mesh_views import MeshViewOptions, MeshViews, draw_mesh
+from cuspid.stitching.ortho import OrthoOptions, Stitched, orthophoto
+from cuspid.stitching.plane_sweep import cameras_beside
+from cuspid.stitching.thesis_method import ThesisOptions, stitch_as_thesis
+from cuspid.tolerances import NominalOptions
+
+__all__ = ["FilmOptions", "MeshViewOptions", "StitchOptions", "film", "stitch", "stitch_rig", "view_mesh"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StitchOptions(OrthoOptions):
+    """How the frames of one hand-held camera become a panorama."""
+
+    method: Literal["ortho", "thesis"] = "ortho"
+    """ortho: frames located by structure from motion and rectified on the surface. thesis: chapter 4 of the thesis,
+    homographies chained from normal map to normal map, as a baseline. PATENT NOTICE: the method thesis appears to be
+    claimed by US 11,044,400; check the law where you are before you use it. The method ortho does not use it."""
+    motion: SingleOptions = field(default_factory=SingleOptions)
+    """How the trajectory of the camera is found (method ortho)."""
+    examination: bool = True
+    """Leave out frames that fail the examination of the thesis (method thesis)."""
+    rig: MotionOptions = field(default_factory=film_options)
+    """How the trajectory of a handpiece of two or more cameras is found (method ortho)."""
+    thesis: ThesisOptions = field(default_factory=ThesisOptions)
+    """Settings of the method thesis."""
+
+
+def stitch(sequence: ImageSequence, options: StitchOptions, *, progress: Progress = silent) -> tuple[Stitched, ...]:
+    """The panorama of an arch from the frames of one camera; several parts where the sequence broke, largest first.
+
+    Raises ReconstructionError, naming the frames, where nothing can be placed.
+    """
+    if options.method == "thesis":
+        panoramas = stitch_as_thesis(sequence, options.thesis, examination=options.examination, progress=progress)
+        return tuple(Stitched(panorama=panorama, motion=None, strip=None) for panorama in panoramas)
+    motion = locate_single(sequence, options.motion, progress=progress)
+    notes = (*sequence.notes, *motion.notes)
+    index = {name: number for number, name in enumerate(sequence.names)}
+    parts: list[Stitched] = []
+    for number, located in enumerate(motion.parts, start=1):
+        part = orthophoto(
+            *(located, motion.frames_of(number - 1), lambda name: sequence.image(index[name]), options),
+            working_distance_mm=sequence.working_distance_mm,
+            progress=progress,
+        )
+        numbered = replace(part.panorama, part=number, parts=len(motion.parts), notes=(*notes, *part.panorama.notes))
+        parts.append(replace(part, panorama=numbered))
+    return tuple(parts)
+
+
+def stitch_rig(capture: Capture, options: StitchOptions, *, progress: Progress = silent) -> Stitched:
+    """The panorama of an arch from the images of a handpiece of two or more cameras, in true millimetres: the picture
+    is that of its camera which looks down most, the path and the surface are of all.
+
+    Raises InputError where no two cameras see the same surface or a scale is asked for, and ReconstructionError where
+    too few frames can be placed.
+    """
+    if options.method != "ortho":
+        raise InputError("stitch: --method thesis takes the images of one camera; give the folder of one camera")
+    if options.scale != ScaleOptions():
+        raise InputError("stitch: the cameras of the handpiece tell the scale; leave out --scale")
+    handpiece = NominalOptions().of(capture.handpiece).fill(capture.handpiece)
+    capture = replace(capture, handpiece=handpiece)
+    found = locate_rig_film(capture, options.rig, options.motion, progress=progress)
+    camera = _facing_down(found)
+    beside = cameras_beside(
+        found,
+        stereo_pairs(found.rig, handpiece.working_distance_mm, options.rig.pairing),
+        handpiece.working_distance_mm,
+    )
+
+    def read(name: str) -> UInt8[np.ndarray, "h w 3"]:
+        one, _, frame = name.rpartition("/")
+        return capture.source.read(frame, one or camera)
+
+    made = orthophoto(of_camera(found, camera), _uses(capture, found), read, options, beside=beside, progress=progress)
+    return replace(made, panorama=replace(made.panorama, notes=(*_scale_notes(found, camera), *found.notes)))
+
+
+def _facing_down(found: Reconstruction) -> str:
+    """The camera that looks along the mean of the optical axes, as far as a tenth of a right angle tells; of several,
+    the first."""
+    axes = {name: mounted.axis_in_rig for name, mounted in found.rig.cameras.items()}
+    down = np.mean(list(axes.values()), axis=0)
+    along = {name: float(axis @ down / np.linalg.norm(down)) for name, axis in axes.items()}
+    return next(name for name in axes if np.arccos(min(along[name], 1)) < np.arccos(min(max(along.values()), 1)) + 0.16)
+
+
+def _uses(capture: Capture, found: Reconstruction) -> tuple[FrameUse, ...]:
+    """What became of the frames."""
+    reasons = {each.what.removeprefix("frame "): each.reason for each in found.dropped}
+    return tuple(
+        FrameUse(name=frame.name, used=True)
+        if frame.name in found.rig_from_world
+        else FrameUse(name=frame.name, used=False, reason=reasons.get(frame.name, "not located"))
+        for frame in capture.frames
+    )
+
+
+def _scale_notes(found: Reconstruction, camera: str) -> Iterator[str]:
+    """Where the scale and the picture are from."""
+    expected = found.expectation
+    known = "" if expected is None else f", known to within {expected.scale_sigma_ppm / 1e4:.2g} % (one sigma)"
+    yield f"the scale is that of the handpiece{known}; the picture is that of camera {camera}"
+
+
+def view_mesh(mesh: Mesh, options: MeshViewOptions, *, progress: Progress = silent) -> tuple[MeshViews, Rigid3]:
+    """The occlusal view of a mesh and its strips along the arch, and the motion that takes it into its occlusal frame,
+    which is found from its shape.
+
+    Where no crowns are found there are no strips, and a note says so.
+    """
+    found = find_occlusal_frame(mesh)
+    upright = mesh.transformed(found.occlusal_from_mesh)
+    try:
+        curve, notes = arch_curve(Jaw(mesh=upright)).points, found.notes
+    except InputError as error:
+        curve, notes = None, (*found.notes, f"no strips: {error}")
+    views = draw_mesh(upright, curve, options, progress=progress)
+    return replace(views, panorama=replace(views.panorama, notes=notes)), found.occlusal_from_mesh
