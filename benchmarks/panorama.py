@@ -1,11 +1,13 @@
 """Measure panoramas of ten subjects filmed by a shaky hand, by cuspid's methods and by OpenCV's Stitcher.
 
     python benchmarks/panorama.py --out benchmarks/results/panorama [--jaws FILE_OR_FOLDER ...] [--work FOLDER]
-        [--subject lower-14-0 ...] [--method ortho thesis thesis-unexamined opencv-panorama opencv-scans] [--films-only]
+        [--subject lower-14-0 ...] [--method ortho pair thesis thesis-unexamined opencv-panorama opencv-scans]
+        [--films-only]
 
 Subjects are phantoms of the population, and jaws of your own, whose coarse faces are subdivided (Loop) first; the
-subdivided mesh is then the reference. All are filmed in 120 frames with full shake and the texture ``enamel``. One JSON
-a subject and method goes to the results folder; what is there already is not made again.
+subdivided mesh is then the reference. All are filmed in 120 frames with full shake and the texture ``enamel``, for the
+method ``pair`` by two cameras. One JSON a subject and method goes to the results folder; what is there already is not
+made again.
 """
 
 from __future__ import annotations
@@ -35,7 +37,12 @@ from cuspid.evaluation.panorama import PanoramaEvaluationOptions
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 
-PHANTOMS: tuple[tuple[GroupName, int], ...] = (("lower-14", 2), ("upper-14", 2), ("lower-12", 1))
+PHANTOMS: tuple[tuple[GroupName, int], ...] = (
+    ("lower-14", 3),
+    ("upper-14", 3),
+    ("lower-12", 2),
+    ("upper-12", 2),
+)
 """Groups of the population and how many jaws of each."""
 EDGE_MM = 0.25
 """Edge of the phantoms' faces, and about that to which other jaws are subdivided."""
@@ -72,31 +79,40 @@ def subdivided(mesh: Mesh) -> Mesh:
     return Mesh(*igl.loop(mesh.vertices, mesh.faces, rounds))
 
 
-def film(name: str, source: PhantomOptions | Path, folder: Path, seed: int) -> None:
-    """Make the subject and its film, unless they are there."""
+def film(name: str, source: PhantomOptions | Path, folder: Path, seed: int, made: str) -> None:
+    """Make the subject and a film of it, unless they are there."""
     jaw = folder / "jaw.ply"
     if not jaw.with_suffix(".json").exists():
         storage.write_jaw(jaw, build_phantom(source) if isinstance(source, PhantomOptions) else real_jaw(source))
-    if not (folder / "film" / "truth" / "shot" / "view.json").exists():
-        timed = run_timed(*film_command(jaw, folder / "film", seed))
-        print(f"{name}: filmed in {timed['wall_s']} s", flush=True)
+    if not (folder / made / "truth" / "shot" / "view.json").exists():
+        timed = run_timed(*film_command(jaw, folder / made, seed, *FILMS[made]))
+        print(f"{name}: {made} in {timed['wall_s']} s", flush=True)
 
 
-def film_command(jaw: Path, out: Path, seed: int) -> list[str]:
+FILMS: Mapping[str, tuple[str, ...]] = {"film": (), "film-pair": ("--camera.cameras", "2")}
+"""Films of a subject, and by which options."""
+
+
+def film_of(method: str) -> str:
+    """The film that a method takes."""
+    return "film-pair" if method == "pair" else "film"
+
+
+def film_command(jaw: Path, out: Path, seed: int, *options: str) -> list[str]:
     """The arguments that film a subject."""
     numbers = ("--seed", str(seed), "--supersampling", str(SUPERSAMPLING))
-    return ["film", str(jaw), "--out", str(out), *numbers]
+    return ["film", str(jaw), "--out", str(out), *numbers, *options]
 
 
 def measure(name: str, method: str, folder: Path, limit_s: int) -> dict[str, object]:
     """Stitch a film by a method through its command line, and evaluate the panorama."""
-    out = folder / method
-    command = METHODS[method](folder / "film" / "capture", out, limit_s)
+    out, filmed = folder / method, folder / film_of(method)
+    command = METHODS[method](filmed / "capture", out, limit_s)
     status, figures = timed(*command)
     score, failure = None, given_up(status, limit_s) if status else unmade(out)
     if failure is None:
         made = out if (out / "panorama.json").exists() else first_part(out)
-        run_timed("stitch-eval", str(made), str(folder / "film" / "truth"), "--out", str(folder / f"{method}-score"))
+        run_timed("stitch-eval", str(made), str(filmed / "truth"), "--out", str(folder / f"{method}-score"))
         score = json.loads((folder / f"{method}-score" / "score.json").read_text())
     placed = out / "result.json"
     return {
@@ -149,6 +165,7 @@ def opencv(mode: str) -> Callable[[Path, Path, int], list[str]]:
 CUSPID = (sys.executable, "-m", "cuspid")
 METHODS: Mapping[str, Callable[[Path, Path, int], list[str]]] = {
     "ortho": stitched("ortho"),
+    "pair": stitched("ortho"),
     "thesis": stitched("thesis"),
     "thesis-unexamined": stitched("thesis", "--no-examination"),
     "opencv-panorama": opencv("panorama"),
@@ -175,8 +192,8 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     subjects: Mapping[str, PhantomOptions | Path] = {**phantoms(), **named_jaws(options.jaws)}
     wanted = [name for name in subjects if not options.subject or name in options.subject]
-    for name in wanted:
-        film(name, subjects[name], options.work / name, list(subjects).index(name))
+    for name, made in product(wanted, sorted({film_of(method) for method in options.method})):
+        film(name, subjects[name], options.work / name, list(subjects).index(name), made)
     for method, name in product([] if options.films_only else options.method, wanted):
         path = options.out / f"{name}-{method}.json"
         if not path.exists():

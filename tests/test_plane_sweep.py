@@ -20,7 +20,7 @@ from cuspid.reconstruction import Tracks
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.height_map import HeightMap, HeightMapOptions, height_map, uncovered
 from cuspid.stitching.mosaic import MosaicOptions, compose
-from cuspid.stitching.plane_sweep import PlaneSweepOptions, frames_beside, partners, plane_sweep, semi_global
+from cuspid.stitching.plane_sweep import Compared, PlaneSweepOptions, frames_beside, partners, plane_sweep, semi_global
 
 HALF_MM, DEEP_MM, CAMERA_MM = 3.0, 4.0, 14.0
 """A bar of this half width along Y stands so high over a floor; the camera goes along it so high over its top."""
@@ -113,6 +113,32 @@ def test_what_is_textured_is_known_and_what_is_plain_or_beyond_is_not(surface: H
     assert surface.known_at(grid((-2.3, 2.3))).mean() > 0.99
     assert surface.known_at(grid((-2.3, 2.3), (6.0, 9.0))).mean() < 0.05
     assert not surface.known_at(grid((50.0, 51.0))).any()
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.8])
+def test_cameras_of_one_instant_find_the_step_however_bright_they_show_it(scene: Scene, gain: float) -> None:
+    """Every frame with the third one after it, as if two cameras had taken both at once."""
+    frames = scene.motion.frames
+    beside = dict(zip(frames, frames[3:], strict=False))
+    poses = [scene.motion.cam_from_world[name] for pair in beside.items() for name in pair]
+    compared = Compared(
+        names=tuple(f"{camera}/{instant}" for instant in beside for camera in "ab"),
+        cameras=(CAMERA,) * len(poses),
+        cam_from_world=tuple(poses),
+        pairs=tuple((2 * k, 2 * k + 1) for k in range(len(beside))),
+        baseline_share=0.2,
+        same_lights=True,
+    )
+
+    def read(name: str) -> np.ndarray:
+        camera, _, instant = name.rpartition("/")
+        return scene.images[instant] if camera == "a" else (gain * scene.images[beside[instant]]).astype(np.uint8)
+
+    sparse = height_map(scene.motion, HeightMapOptions())
+    found = plane_sweep(scene.motion, compared, sparse, read, PlaneSweepOptions())
+    assert found is not None
+    assert np.percentile(np.abs(found.at(grid((-2.3, 2.3)))), 95) < 0.15
+    assert np.percentile(np.abs(found.at(grid((4.2, 6.0))) + DEEP_MM), 90) < 0.4
 
 
 def test_a_plain_spot_in_a_crown_is_bridged(scene: Scene) -> None:

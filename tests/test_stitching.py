@@ -61,13 +61,15 @@ def stitched(sequence: ImageSequence) -> Stitched:
     return whole
 
 
-def seen_points(panorama: Panorama, truth: GroundTruth, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def seen_points(
+    panorama: Panorama, truth: GroundTruth, camera: Camera, name: str = "camera"
+) -> tuple[np.ndarray, np.ndarray]:
     """World places of some pixels of a panorama that show teeth, and the true places of what they show."""
     rows, columns = np.nonzero(panorama.covered & (panorama.image.max(axis=-1) > 40))
     some = np.random.default_rng(0).choice(len(rows), 1500, replace=False)
     rows, columns = rows[some], columns[some]
     true = np.full((len(rows), 3), np.nan)
-    mounted, labels = truth.handpiece.rig.cameras["camera"], truth.jaw.face_labels
+    mounted, labels = truth.handpiece.rig.cameras[name], truth.jaw.face_labels
     assert labels is not None
     for index, frame in enumerate(panorama.frames):
         mine = panorama.frame_index[rows, columns] == index

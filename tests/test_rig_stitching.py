@@ -1,0 +1,98 @@
+"""Stitching the film of two cameras, against the true poses and in true millimetres."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cuspid import storage
+from cuspid.capture import Capture
+from cuspid.geometry import Rigid3, best_similarity
+from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
+from cuspid.jaw import Jaw
+from cuspid.pipeline import RenderOptions, take_images
+from cuspid.simulation.path.arch import arch_curve
+from cuspid.stitching.plane_sweep import camera_gains
+from cuspid.trueness import GroundTruth
+from test_stitching import seen_points
+from verbs import refused, run
+
+FRAMES = 12
+
+
+@pytest.fixture(scope="module")
+def film(coarse_phantom: Jaw, tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, GroundTruth]:
+    """A small pair of cameras over three teeth of plain enamel, tilting a little."""
+    pair = intra_oral_camera(IntraOralOptions(cameras=2, width_px=320, height_px=240))
+    curve, rng = arch_curve(coarse_phantom), np.random.default_rng(4)
+    poses = {}
+    for index, length in enumerate(np.linspace(12.0, 26.0, FRAMES)):
+        shake = Rigid3.from_rotation_vector(np.deg2rad(rng.normal(0, 2.0, 3)), rng.normal(0, 0.3, 3))
+        poses[f"{index:03d}"] = shake @ curve.rig_from_world(float(length))
+    folder = tmp_path_factory.mktemp("film")
+    return take_images(coarse_phantom, pair, poses, folder, RenderOptions(texture="enamel", supersampling=1))
+
+
+def left_over(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Distances after the best rigid motion: the scale counts."""
+    _, rotation, _ = best_similarity(found, true)
+    moved = (found - found.mean(axis=0)) @ rotation.T + true.mean(axis=0)
+    return np.linalg.norm(moved - true, axis=1)
+
+
+@pytest.fixture(scope="module")
+def pano(film: tuple[Capture, GroundTruth], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("stitched") / "pano"
+    run("stitch", film[0].source.folder, "--out", out)
+    return out
+
+
+def test_the_cameras_were_where_they_are_found_in_true_millimetres(
+    pano: Path, film: tuple[Capture, GroundTruth]
+) -> None:
+    poses = storage.read_poses(pano / "poses.json")
+    assert len(poses) == FRAMES
+    from_rig = film[1].handpiece.rig["left"].cam_from_rig
+    found = np.array([pose.inverse().translation for pose in poses.values()])
+    true = np.array([(from_rig @ pose).inverse().translation for pose in film[1].rig_from_world.values()])
+    assert 1e-4 < left_over(found, true).max() < 0.15
+    length, true_length = (np.linalg.norm(each[-1] - each[0]) for each in (found, true))
+    assert length == pytest.approx(true_length, rel=0.01)
+
+
+def test_pixels_show_what_lies_there_in_true_millimetres(pano: Path, film: tuple[Capture, GroundTruth]) -> None:
+    panorama = storage.read_panorama(pano)
+    camera = film[1].handpiece.rig["left"].camera
+    here, true = seen_points(panorama, film[1], camera, "left")
+    assert 0.001 < np.median(left_over(here, true[:, :2])) < 0.12
+    pixels = np.floor(panorama.pixels_from_world(here)).astype(int)
+    assert panorama.height_mm is not None
+    deep = panorama.height_mm[pixels[:, 1], pixels[:, 0]] - true[:, 2]
+    assert 0.001 < np.median(np.abs(deep - np.median(deep))) < 0.25
+
+
+def test_the_scale_is_that_of_the_handpiece_and_nothing_else(
+    pano: Path, film: tuple[Capture, GroundTruth], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    panorama = storage.read_panorama(pano)
+    assert any("of the handpiece" in note and "camera left" in note for note in panorama.notes)
+    assert sum(frame.used for frame in panorama.frames) == FRAMES
+    for wrong in (["--scale.width-mm", 60], ["--method", "thesis"]):
+        assert wrong[0].split(".")[0] in refused(capsys, "stitch", film[0].source.folder, *wrong, "--out", tmp_path)
+    assert not (tmp_path / "panorama.json").exists()
+
+
+def test_gains_are_those_of_the_cameras() -> None:
+    rng = np.random.default_rng(2)
+    scenes = rng.uniform(60, 150, (20, 12, 12, 1)).repeat(3, axis=-1)
+    gain = {"a": 1.0, "b": 1.3, "c": 0.8}
+    names = [f"{camera}/{frame}" for frame in range(20) for camera in gain]
+
+    def read(name: str) -> np.ndarray:
+        camera, _, frame = name.rpartition("/")
+        return (gain[camera] * scenes[int(frame)]).astype(np.uint8)
+
+    assert camera_gains(names, read) == pytest.approx(gain, rel=0.01)
+    assert camera_gains(names, lambda name: np.zeros((8, 8, 3), np.uint8)) == dict.fromkeys(gain, 1.0)
