@@ -218,6 +218,17 @@ def test_gain_and_offset_do_not_change_the_fitted_scores(known: Known) -> None:
     assert halved.ssim_full < 0.95
 
 
+def test_what_was_not_seen_lowers_only_the_score_of_the_canvas(known: Known) -> None:
+    truth, teeth = grey(known.view.image), known.view.teeth
+    seen = teeth & (np.arange(teeth.shape[1]) < teeth.shape[1] // 2)
+    near = cv2.dilate(seen.astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
+    half = image_scores(truth, near, truth, teeth, seen)
+    assert half.ssim_seen == pytest.approx(1, abs=1e-6)
+    assert half.ssim_full < 0.9
+    assert image_scores(truth, near, truth, teeth).ssim_seen is None
+    assert image_scores(0 * truth, near, truth, teeth, seen).ssim_seen < 0.5
+
+
 def test_trivial_pictures_score_as_they_deserve(known: Known) -> None:
     scores = trivial_scores(known.view)
     assert scores["empty"].zncc == scores["grey canvas"].zncc == 0

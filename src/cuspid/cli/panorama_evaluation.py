@@ -113,14 +113,14 @@ def _measured(score: PanoramaScore) -> str:
 
 def _print(score: PanoramaScore) -> None:
     table = Table(title="Likeness to the reference render", title_justify="left")
-    heads = ("picture", "ZNCC teeth", "SSIM teeth, fitted", "as it is", "SSIM canvas, fitted", "as it is")
+    heads = ("picture", "ZNCC teeth", "SSIM teeth, fitted", "as it is", "SSIM seen, fitted", "SSIM canvas, fitted")
     for head in heads:
         table.add_column(head, justify="left" if head == "picture" else "right")
     rows: dict[str, ImageScores | None] = {score.method: score.picture, f"{score.method}, from a height": score.shot}
     for name, one in {**rows, **score.trivial}.items():
         if one is not None:
-            figures = (one.zncc, one.ssim_teeth_fitted, one.ssim_teeth, one.ssim_full_fitted, one.ssim_full)
-            table.add_row(name, *(f"{figure:.3f}" for figure in figures))
+            figures = (one.zncc, one.ssim_teeth_fitted, one.ssim_teeth, one.ssim_seen_fitted, one.ssim_full_fitted)
+            table.add_row(name, *("-" if figure is None else f"{figure:.3f}" for figure in figures))
     Console().print(table)
     if score.failure:
         console.print(f"failed: {score.failure}", style="red")
@@ -133,7 +133,8 @@ def _print(score: PanoramaScore) -> None:
 
 def _print_extent(score: PanoramaScore) -> None:
     console.print(
-        f"shows {score.coverage_pct:.1f} % of the teeth, of which the frames saw {score.seen_pct:.1f} %; the arch is "
+        f"shows {score.coverage_pct:.1f} % of the teeth, of which the frames saw {score.seen_pct:.1f} %, and "
+        f"{score.coverage_of_seen_pct:.1f} % of what they saw; the arch is "
         f"{'complete' if score.complete else 'not complete'} in {score.parts} part(s)"
     )
     if score.inter_molar_error_mm is not None:

@@ -97,6 +97,10 @@ class ImageScores:
     """As ``ssim_teeth``, after one gain and offset."""
     ssim_full_fitted: float
     """As ``ssim_full``, after one gain."""
+    ssim_seen: float | None = None
+    """As ``ssim_full``, over what the frames saw of the jaw alone; None where that is not known."""
+    ssim_seen_fitted: float | None = None
+    """As ``ssim_seen``, after one gain."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,6 +120,8 @@ class PanoramaScore:
     own millimetres if it has any, otherwise after the similarity. None if it does not show both."""
     coverage_pct: float | None
     """Share of the reference render's tooth pixels that it shows."""
+    coverage_of_seen_pct: float | None
+    """Share of those that any frame saw that it shows."""
     seen_pct: float
     """Share of them that any frame saw: the maximum that could be shown."""
     tooth_coverage_pct: Mapping[int, float]
@@ -251,11 +257,12 @@ def _spread_pixels(where: Bool[np.ndarray, "h w"], most: int) -> tuple[Int[np.nd
     return rows * step + step // 2, columns * step + step // 2
 
 
-def seen_by_frames(view: ReferenceRender, truth: GroundTruth, samples: int = 10_000) -> Bool[np.ndarray, "h w"]:
-    """The pixels of the reference render's teeth that some frame saw, sampled on a grid and assigned to the nearest
+def seen_by_frames(view: ReferenceRender, truth: GroundTruth, samples: int = 20_000) -> Bool[np.ndarray, "h w"]:
+    """The pixels of the reference render's jaw that some frame saw, sampled on a grid and assigned to the nearest
     sample."""
-    rows, columns = _spread_pixels(view.teeth, samples)
-    asked = np.zeros_like(view.teeth)
+    jaw = view.labels != NOTHING
+    rows, columns = _spread_pixels(jaw, samples)
+    asked = np.zeros_like(jaw)
     asked[rows, columns] = True
     points, mesh = view.points_at(asked), truth.jaw.mesh
     mounted = next(iter(truth.handpiece.rig.cameras.values()))
@@ -270,7 +277,7 @@ def seen_by_frames(view: ReferenceRender, truth: GroundTruth, samples: int = 10_
     _, nearest = distance_transform_edt(~asked, return_indices=True)
     answers = np.zeros_like(asked)
     answers[asked] = seen
-    return np.asarray(answers[nearest[0], nearest[1]] & view.teeth)
+    return np.asarray(answers[nearest[0], nearest[1]] & jaw)
 
 
 # --- Pictures --------------------------------------------------------------------------------------------------------
@@ -287,8 +294,10 @@ def image_scores(
     shown: Bool[np.ndarray, "h w"],
     truth: Float[np.ndarray, "h w"],
     teeth: Bool[np.ndarray, "h w"],
+    seen: Bool[np.ndarray, "h w"] | None = None,
 ) -> ImageScores:
-    """Compare a grey picture (0 to 1) with the truth; pixels that are not ``shown`` count as black."""
+    """Compare a grey picture (0 to 1) with the truth; pixels that are not ``shown`` count as black. ``seen``: what the
+    frames saw."""
     black = np.where(shown, picture, 0.0)
     raw = _ssim_map(black, truth)
     on_teeth = _ssim_map(np.where(shown, _fitted(picture, truth, shown & teeth), 0.0), truth)
@@ -300,6 +309,8 @@ def image_scores(
         ssim_full=_inner_mean(raw),
         ssim_teeth_fitted=float(on_teeth[teeth].mean()),
         ssim_full_fitted=_inner_mean(on_canvas),
+        ssim_seen=None if seen is None else float(raw[seen].mean()),
+        ssim_seen_fitted=None if seen is None else float(on_canvas[seen].mean()),
     )
 
 
@@ -333,8 +344,8 @@ def _inner_mean(similarity: Float[np.ndarray, "h w"]) -> float:
     return float(similarity[border:-border, border:-border].mean())
 
 
-def trivial_scores(view: ReferenceRender) -> dict[str, ImageScores]:
-    """Scores of trivial pictures."""
+def trivial_scores(view: ReferenceRender, seen: Bool[np.ndarray, "h w"] | None = None) -> dict[str, ImageScores]:
+    """Scores of trivial pictures; ``seen``: what the frames saw."""
     truth, everywhere, nowhere = grey(view.image), np.ones_like(view.teeth), np.zeros_like(view.teeth)
     jaw, level = view.labels != NOTHING, float(truth[view.teeth].mean())
     step = round(1.0 / view.mm_per_px)
@@ -346,7 +357,7 @@ def trivial_scores(view: ReferenceRender) -> dict[str, ImageScores]:
         "grey jaw": (np.where(jaw, level, 0.0), jaw),
         "truth shifted by 1 mm": (moved, everywhere),
     }
-    return {name: image_scores(picture, shown, truth, view.teeth) for name, (picture, shown) in pictures.items()}
+    return {name: image_scores(picture, shown, truth, view.teeth, seen) for name, (picture, shown) in pictures.items()}
 
 
 def lay_over(
@@ -504,9 +515,10 @@ class _Comparison:
             self._blank(),
             aligned_by="geometry",
             coverage_pct=100 * float(shown[self.view.teeth].mean()),
+            coverage_of_seen_pct=100 * float(shown[self.seen & self.view.teeth].mean()),
             tooth_coverage_pct=teeth,
             complete=self.panorama.parts == 1 and min(teeth.values()) >= self.options.complete_pct,
-            picture=image_scores(grey(laid), shown, grey(self.view.image), self.view.teeth),
+            picture=image_scores(grey(laid), shown, grey(self.view.image), self.view.teeth, self.seen),
             shot=self._against_shot(shot_from_panorama),
             **figures,
         )
@@ -521,7 +533,7 @@ class _Comparison:
 
     def _tooth_coverage(self, shown: Bool[np.ndarray, "h w"]) -> dict[int, float]:
         """Of what was seen of each tooth (FDI; 0 stands for the whole of a jaw without labels), in percent."""
-        numbers = np.where(self.seen, self.view.labels, NOTHING)
+        numbers = np.where(self.seen & self.view.teeth, self.view.labels, NOTHING)
         found = [int(number) for number in np.unique(numbers) if number != NOTHING]
         return {number: 100 * float(shown[numbers == number].mean()) for number in found}
 
@@ -538,6 +550,7 @@ class _Comparison:
             geometry=None,
             inter_molar_error_mm=None,
             coverage_pct=None,
+            coverage_of_seen_pct=None,
             seen_pct=100 * float(self.seen[self.view.teeth].mean()),
             tooth_coverage_pct={},
             complete=False,
@@ -546,7 +559,7 @@ class _Comparison:
             parts=self.panorama.parts,
             picture=None,
             shot=None,
-            trivial=trivial_scores(self.view),
+            trivial=trivial_scores(self.view, self.seen),
             notes=("the jaw has no tooth labels: its whole surface counts as teeth",) if unlabelled else (),
         )
 
