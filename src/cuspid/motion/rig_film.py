@@ -45,9 +45,9 @@ class _EvenContrast:
 
 
 def film_options() -> MotionOptions:
-    """The options of :func:`cuspid.motion.location.locate` for bare teeth, whose tracks are short and uncertain: many of
-    them are needed."""
-    return MotionOptions(features=ENAMEL, cell_px=16, reach=4)
+    """The options of :func:`cuspid.motion.location.locate` for bare teeth. Their tracks are short and uncertain: many
+    are needed."""
+    return MotionOptions(features=ENAMEL, cell_px=16.0, reach=4)
 
 
 def locate_rig_film(
