@@ -323,6 +323,9 @@ SCENARIOS: Mapping[str, Scenario] = {
         verb("import", "@footage", "--handpiece", "@handpiece.json", "--sync", "times", "--out", f"@{_OUT}"),
     ),
     "stitch": Scenario(_film, verb("stitch", "@film/capture/images/camera", "--out", f"@{_OUT}")),
+    "stitch of a mesh": Scenario(
+        _arch, verb("stitch", "--mesh", "@jaw.ply", "--view.mm-per-px", "0.5", "--out", f"@{_OUT}")
+    ),
     "stitch-eval": Scenario(_score, verb("stitch-eval", "@panorama", "@truth", "--out", f"@{_OUT}")),
 }
 

@@ -22,7 +22,8 @@ def panorama_page(result: PanoramaResult) -> str:
     first = result.parts[0]
     size = first.size_mm
     used = sum(frame.used for frame in first.frames)
-    placed = [("frames placed", str(used), f"of {len(first.frames)}")] if first.frames else []
+    parts = ("part" if len(result.parts) == 1 else "parts", str(len(result.parts)), "")
+    placed = [("frames placed", str(used), f"of {len(first.frames)}"), parts] if first.frames else []
     return render_page(
         "panorama.html.j2",
         title=f"Panorama, method {first.method}" if first.frames else "Views of a mesh",
@@ -30,7 +31,6 @@ def panorama_page(result: PanoramaResult) -> str:
         missing=result.missing,
         tiles=[
             *placed,
-            ("part" if len(result.parts) == 1 else "parts", str(len(result.parts)), ""),
             (
                 "width and height",
                 "–" if size is None else f"{size[0]:.1f} × {size[1]:.1f}",
