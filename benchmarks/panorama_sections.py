@@ -28,7 +28,8 @@ def panoramas(results: Sequence[Result]) -> str:
             "Phantoms of the population and real jaws (`benchmarks/panorama.py`), each filmed in 120 frames of "
             "640 x 480 px with full hand shake, texture `enamel`; `pair` is the default method on the film of two "
             "cameras 5 mm apart. docs/panorama-evaluation.md explains the figures. *No arch* counts the "
-            "panoramas that failed: too few frames, collapsed, or nowhere near the jaw. Medians are over those that did not fail.",
+            "panoramas that failed: too few frames, collapsed, or nowhere near the jaw. Medians are over "
+            "those that did not fail.",
             "",
             markdown_table(
                 (
@@ -68,7 +69,8 @@ def pairs(results: Sequence[Result]) -> list[str]:
         f"Two cameras, subject by subject; the scale is theirs. Bars: median {PAIR_MEDIAN_MM} mm, inter-molar distance "
         f"{PAIR_MOLARS_MM} mm, {PAIR_WALL_S:.0f} s on 2 cores. Other work went on during these runs, so that wall "
         "times are too long; CPU times are not. SSIM is fitted; *seen* is what the frames saw of the jaw, and "
-        f"`grey jaw` its score there. Subjects on which the method was developed: {', '.join(sorted(LOOKED_AT))}; all others were "
+        "`grey jaw` its score there. Subjects on which the method was developed: "
+        f"{', '.join(sorted(LOOKED_AT))}; all others were "
         "looked at only at the end.",
         "",
         markdown_table(heads, [pair_row(result) for result in results]),

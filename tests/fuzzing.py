@@ -324,7 +324,7 @@ SCENARIOS: Mapping[str, Scenario] = {
     ),
     "stitch": Scenario(_film, verb("stitch", "@film/capture/images/camera", "--out", f"@{_OUT}")),
     "stitch of a mesh": Scenario(
-        _arch, verb("stitch", "--mesh", "@jaw.ply", "--view.mm-per-px", "0.5", "--out", f"@{_OUT}")
+        _arch, verb("stitch", "--mesh", "@jaw.ply", "--view.mm-per-px", "2", "--out", f"@{_OUT}")
     ),
     "stitch-eval": Scenario(_score, verb("stitch-eval", "@panorama", "@truth", "--out", f"@{_OUT}")),
 }
