@@ -35,7 +35,7 @@ from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.phantom.population import GroupName, draw_population
 from cuspid.evaluation.panorama import PanoramaEvaluationOptions
 from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
+from cuspid.mesh import Mesh, edges_of
 
 PHANTOMS: tuple[tuple[GroupName, int], ...] = (
     ("lower-14", 3),
@@ -75,8 +75,11 @@ def subdivided(mesh: Mesh) -> Mesh:
     rounds = max(0, round(float(np.log2(np.median(edges) / EDGE_MM))))
     if rounds == 0:
         return mesh
-    # trimesh's subdivision throws the open edge of a scan up to 10 mm outwards.
-    return Mesh(*igl.loop(mesh.vertices, mesh.faces, rounds))
+    # trimesh's subdivision throws the open edge of a scan up to 10 mm outwards; libigl's ends the process where more
+    # than two faces meet at an edge.
+    _, edge, sharing = np.unique(np.sort(edges_of(mesh.faces), axis=1), axis=0, return_inverse=True, return_counts=True)
+    clean = mesh.submesh((sharing[edge].reshape(-1, 3) <= 2).all(axis=1))
+    return Mesh(*igl.loop(clean.vertices, clean.faces, rounds))
 
 
 def film(name: str, source: PhantomOptions | Path, folder: Path, seed: int, made: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,11 @@ from cuspid.capture import Capture
 from cuspid.geometry import Rigid3, best_similarity
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
 from cuspid.jaw import Jaw
+from cuspid.motion.rig_film import of_camera
 from cuspid.pipeline import RenderOptions, take_images
+from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.simulation.path.arch import arch_curve
-from cuspid.stitching.plane_sweep import camera_gains
+from cuspid.stitching.plane_sweep import camera_gains, cameras_beside
 from cuspid.trueness import GroundTruth
 from test_stitching import seen_points
 from verbs import refused, run
@@ -82,6 +85,34 @@ def test_the_scale_is_that_of_the_handpiece_and_nothing_else(
     for wrong in (["--scale.width-mm", 60], ["--method", "thesis"]):
         assert wrong[0].split(".")[0] in refused(capsys, "stitch", film[0].source.folder, *wrong, "--out", tmp_path)
     assert not (tmp_path / "panorama.json").exists()
+
+
+def test_a_frame_that_lacks_an_image_is_left_out_where_it_is_missing(film: tuple[Capture, GroundTruth]) -> None:
+    capture, truth = film
+    rig = capture.handpiece.rig
+    frames = list(capture.frames)
+    frames[3], frames[5] = (replace(frames[k], cameras=(name,)) for k, name in ((3, "left"), (5, "right")))
+    tracks = Tracks(
+        points=np.zeros((2, 3)),
+        colors=np.zeros((2, 3), np.uint8),
+        point_index=np.array([0, 1, 1, 0]),
+        frame_index=np.array([3, 5, 6, 6]),
+        camera_index=np.array([0, 1, 0, 1]),
+        pixels=np.zeros((4, 2)),
+    )
+    found = Reconstruction(rig=rig, rig_from_world=truth.rig_from_world, tracks=tracks)
+    beside = cameras_beside(found, frames, [("left", "right")], 14.0)
+    assert len(beside.pairs) == FRAMES - 2
+    assert not {f"{camera}/{frames[k].name}" for k in (3, 5) for camera in rig.names} & set(beside.names)
+    for one, other in beside.pairs:
+        (first, frame), (second, same) = (beside.names[k].split("/") for k in (one, other))
+        assert (first, second, frame) == ("left", "right", same)
+        expected = rig[first].cam_from_rig @ truth.rig_from_world[frame]
+        np.testing.assert_array_equal(beside.cam_from_world[one].matrix, expected.matrix)
+    with_left = {frame.name for frame in frames if "left" in frame.cameras}
+    model = of_camera(found, "left", with_left)
+    assert list(model.frames) == [frame.name for frame in frames if frame.name in with_left]
+    assert [model.frames[k] for k in model.tracks.frame_index] == [frames[3].name, frames[6].name]
 
 
 def test_gains_are_those_of_the_cameras() -> None:

@@ -97,17 +97,16 @@ def stitch_rig(capture: Capture, options: StitchOptions, *, progress: Progress =
     capture = replace(capture, handpiece=handpiece)
     found = locate_rig_film(capture, options.rig, options.motion, progress=progress)
     camera = _facing_down(found)
-    beside = cameras_beside(
-        found,
-        stereo_pairs(found.rig, handpiece.working_distance_mm, options.rig.pairing),
-        handpiece.working_distance_mm,
-    )
+    distance_mm = handpiece.working_distance_mm
+    pairs = stereo_pairs(found.rig, distance_mm, options.rig.pairing)
+    beside = cameras_beside(found, capture.frames, pairs, distance_mm)
+    shown = of_camera(found, camera, {frame.name for frame in capture.frames if camera in frame.cameras})
 
     def read(name: str) -> UInt8[np.ndarray, "h w 3"]:
         one, _, frame = name.rpartition("/")
         return capture.source.read(frame, one or camera)
 
-    made = orthophoto(of_camera(found, camera), _uses(capture, found), read, options, beside=beside, progress=progress)
+    made = orthophoto(shown, _uses(capture, found, camera), read, options, beside=beside, progress=progress)
     return replace(made, panorama=replace(made.panorama, notes=(*_scale_notes(found, camera), *found.notes)))
 
 
@@ -120,15 +119,16 @@ def _facing_down(found: Reconstruction) -> str:
     return next(name for name in axes if np.arccos(min(along[name], 1)) < np.arccos(min(max(along.values()), 1)) + 0.16)
 
 
-def _uses(capture: Capture, found: Reconstruction) -> tuple[FrameUse, ...]:
-    """What became of the frames."""
+def _uses(capture: Capture, found: Reconstruction, camera: str) -> tuple[FrameUse, ...]:
+    """What became of the frames in the picture of a camera."""
     reasons = {each.what.removeprefix("frame "): each.reason for each in found.dropped}
-    return tuple(
-        FrameUse(name=frame.name, used=True)
-        if frame.name in found.rig_from_world
-        else FrameUse(name=frame.name, used=False, reason=reasons.get(frame.name, "not located"))
+    told = {
+        frame.name: None
+        if camera in frame.cameras and frame.name in found.rig_from_world
+        else reasons.get(frame.name, f"no image of camera {camera}")
         for frame in capture.frames
-    )
+    }
+    return tuple(FrameUse(name=name, used=reason is None, reason=reason) for name, reason in told.items())
 
 
 def _scale_notes(found: Reconstruction, camera: str) -> Iterator[str]:

@@ -7,6 +7,7 @@ along the arch, as it does for one camera alone.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -61,22 +62,25 @@ def locate_rig_film(
     return locate(replace(capture, source=_EvenContrast(capture.source, contrast)), options, progress=progress)
 
 
-def of_camera(found: Reconstruction, camera: str) -> SparseModel:
-    """The trajectory of one camera of the handpiece, and the points that it sees; in millimetres. Raises
-    ReconstructionError where there are no points."""
+def of_camera(found: Reconstruction, camera: str, frames: Collection[str]) -> SparseModel:
+    """The trajectory of one camera of the handpiece over those of the frames that were located, and the points that it
+    sees there; in millimetres."""
     assert found.tracks is not None
     tracks, mounted = found.tracks, found.rig[camera]
-    mine = tracks.camera_index == found.rig.names.index(camera)
+    has = np.array([name in frames for name in found.frames], dtype=bool)
+    mine = (tracks.camera_index == found.rig.names.index(camera)) & has[tracks.frame_index]
     kept, point_index = np.unique(tracks.point_index[mine], return_inverse=True)
     return SparseModel(
         camera=mounted.camera,
-        cam_from_world={name: mounted.cam_from_rig @ pose for name, pose in found.rig_from_world.items()},
+        cam_from_world={
+            name: mounted.cam_from_rig @ pose for name, pose in found.rig_from_world.items() if name in frames
+        },
         tracks=replace(
             tracks,
             points=tracks.points[kept],
             colors=tracks.colors[kept],
             point_index=point_index.astype(np.int64),
-            frame_index=tracks.frame_index[mine],
+            frame_index=(np.cumsum(has) - 1)[tracks.frame_index[mine]],
             camera_index=np.zeros(int(mine.sum()), np.int64),
             pixels=tracks.pixels[mine],
         ),

@@ -13,7 +13,7 @@ The volume grows with the arch; of the frames only a few are held at a time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, NamedTuple, no_type_check
@@ -25,6 +25,7 @@ from skimage.morphology import remove_small_holes, remove_small_objects
 from skimage.restoration import inpaint_biharmonic
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera, undistortion_maps
+from cuspid.capture import Frame
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.kernels import kernel
@@ -140,25 +141,35 @@ def frames_beside(motion: SparseModel, share: float) -> Compared:
     )
 
 
-def cameras_beside(found: Reconstruction, pairs: Sequence[tuple[str, str]], distance_mm: float) -> Compared:
+def cameras_beside(
+    found: Reconstruction, frames: Iterable[Frame], pairs: Sequence[tuple[str, str]], distance_mm: float
+) -> Compared:
     """The images that two cameras of a rig took of the teeth at one instant, named ``camera/frame``. The same lights
     were on for both, so that their light and shade are of the surface."""
-    cameras = [name for name in found.rig.names if any(name in pair for pair in pairs)]
-    place = {name: k for k, name in enumerate(cameras)}
+    located = [frame for frame in frames if frame.name in found.rig_from_world]
+    together = [
+        ((frame.name, one), (frame.name, other))
+        for frame in located
+        for one, other in pairs
+        if one in frame.cameras and other in frame.cameras
+    ]
+    images = sorted({image for pair in together for image in pair}, key=_in_order(located, found.rig.names))
+    place = {image: number for number, image in enumerate(images)}
     apart = [np.linalg.norm(np.diff([found.rig[name].centre_in_rig for name in pair], axis=0)) for pair in pairs]
-    images = [(frame, name) for frame in found.frames for name in cameras]
     return Compared(
         names=tuple(f"{name}/{frame}" for frame, name in images),
         cameras=tuple(found.rig[name].camera for _, name in images),
         cam_from_world=tuple(found.rig[name].cam_from_rig @ found.rig_from_world[frame] for frame, name in images),
-        pairs=tuple(
-            (len(cameras) * k + place[one], len(cameras) * k + place[other])
-            for k in range(len(found.frames))
-            for one, other in pairs
-        ),
+        pairs=tuple((place[one], place[other]) for one, other in together),
         baseline_share=float(np.median(apart)) / distance_mm,
         same_lights=True,
     )
+
+
+def _in_order(frames: Sequence[Frame], cameras: Sequence[str]) -> Callable[[tuple[str, str]], tuple[int, int]]:
+    """Sorts images, each by the names of its frame and its camera, in order of capture."""
+    frame_of = {frame.name: number for number, frame in enumerate(frames)}
+    return lambda image: (frame_of[image[0]], cameras.index(image[1]))
 
 
 def partners(motion: SparseModel, share: float) -> dict[int, int]:
