@@ -78,7 +78,7 @@ def subdivided(mesh: Mesh) -> Mesh:
     # trimesh's subdivision throws the open edge of a scan up to 10 mm outwards; libigl's ends the process where more
     # than two faces meet at an edge.
     _, edge, sharing = np.unique(np.sort(edges_of(mesh.faces), axis=1), axis=0, return_inverse=True, return_counts=True)
-    clean = mesh.submesh((sharing[edge].reshape(-1, 3) <= 2).all(axis=1))
+    clean = mesh.submesh(np.asarray((sharing[edge].reshape(-1, 3) <= 2).all(axis=1)))
     return Mesh(*igl.loop(clean.vertices, clean.faces, rounds))
 
 
