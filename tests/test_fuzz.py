@@ -14,7 +14,7 @@ CASES = 19
 FEWER = {
     **{name: 8 for name in SCENARIOS if name.startswith("report") or name == "reconstruct"},
     **dict.fromkeys(("evaluate", "measure", "simulate", "precision"), 4),
-    **dict.fromkeys(("stitch", "stitch-eval"), 3),
+    **dict.fromkeys(("stitch", "stitch of a mesh", "stitch-eval"), 3),
 }
 """Of those that take longest."""
 
