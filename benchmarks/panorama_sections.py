@@ -68,8 +68,8 @@ def pairs(results: Sequence[Result]) -> list[str]:
         "",
         f"Two cameras, subject by subject; the scale is theirs. Bars: median {PAIR_MEDIAN_MM} mm, inter-molar distance "
         f"{PAIR_MOLARS_MM} mm, {PAIR_WALL_S:.0f} s on 2 cores (these runs had one core each, beside other work). "
-        "SSIM is fitted; *seen* is what the frames saw of the jaw, and `grey jaw` its score there. Subjects on which the "
-        f"method was developed: {', '.join(sorted(LOOKED_AT))}; all others were looked at only at the end.",
+        "SSIM is fitted; *seen* is what the frames saw of the jaw, and `grey jaw` its score there. Subjects on which "
+        f"the method was developed: {', '.join(sorted(LOOKED_AT))}; all others were looked at only at the end.",
         "",
         markdown_table(heads, [pair_row(result) for result in results]),
     ]
