@@ -17,6 +17,7 @@ from cuspid.mesh import Mesh
 from cuspid.panorama import ZONES, Panorama
 from cuspid.panorama_pipeline import MeshViewOptions, view_mesh
 from cuspid.stitching.mesh_views import MeshViews, draw_mesh
+from cuspid.stitching.strip import StripOptions
 from verbs import refused, run
 
 RADIUS_MM, HEIGHT_MM, HALF_TOP_MM, HALF_FOOT_MM = 22.0, 7.0, 3.0, 4.5
@@ -130,6 +131,8 @@ def test_a_mesh_without_colours_is_brightest_where_it_faces_the_viewer() -> None
 def test_a_picture_too_large_is_refused() -> None:
     with pytest.raises(InputError, match=r"--view\.mm-per-px"):
         draw_mesh(ridge(), None, MeshViewOptions(mm_per_px=0.001))
+    with pytest.raises(InputError, match=r"--view\.mm-per-px"):
+        draw_mesh(ridge(), middle(), MeshViewOptions(mm_per_px=0.02, strip=StripOptions(half_width_mm=100.0)))
 
 
 def test_how_a_jaw_lies_in_its_file_makes_no_difference(coarse_phantom: Jaw) -> None:
@@ -157,6 +160,13 @@ def test_a_scan_is_drawn_from_the_command_line(tmp_path: Path, capsys: pytest.Ca
     report = (out / "report.html").read_text()
     assert "seen from the cheek" in report
     assert "frames placed" not in report
+    left = [out / name for name in ("poses.json", "camera_path.png", "part-2/panorama.json")]
+    for path in (*left, out / "mine.txt"):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("of an earlier run")
+    run("stitch", "--mesh", scan, "--view.mm-per-px", 0.4, "--out", out)
+    assert not any(path.exists() for path in (*left, out / "part-2"))
+    assert (out / "mine.txt").exists()
     for arguments in (["--mesh", scan, scan], []):
         assert "either FRAMES or --mesh" in refused(capsys, "stitch", *arguments, "--out", tmp_path / "none")
     assert not (tmp_path / "none").exists()

@@ -23,7 +23,7 @@ from cuspid.panorama import ZONES, Panorama, Strip
 from cuspid.progress import Progress, silent
 from cuspid.stitching.strip import StripOptions, sides_of, zones_of
 
-_MOST_PX = 100_000_000
+_MOST_PX = 30_000_000
 """Pixels of the largest picture."""
 _MARGIN_MM = 1.0
 _AMBIENT, _WHITE = 0.25, 235.0
@@ -64,7 +64,7 @@ def draw_mesh(
     """The views of a mesh in its occlusal frame, in its own colours, or shaded from where one looks if it has none.
 
     ``curve``: the middle of the crowns at the height of their tips, finely sampled; without it there are no strips.
-    Raises InputError where a picture would have more than 100 million pixels.
+    Raises InputError where a picture would have more than 30 million pixels.
     """
     steps = 1 if curve is None else 1 + len(ZONES)
     progress("views", 0, steps)
@@ -73,6 +73,8 @@ def draw_mesh(
     strips = dict[str, Strip]()
     if curve is not None:
         line = _columns(curve, options.mm_per_px)
+        widest_mm = max(2 * options.strip.half_width_mm, options.above_mm + options.below_mm)
+        _require_few(len(line), round(widest_mm / options.mm_per_px))
         for name, rays in _strip_rays(mesh, line, options):
             strips[name] = _strip(mesh, line, name, rays, options)
             progress("views", 1 + len(strips), steps)
@@ -93,8 +95,7 @@ def _from_above(mesh: Mesh, options: MeshViewOptions) -> Panorama:
     low, high = mesh.bounds
     step = options.mm_per_px
     columns, rows = np.ceil((high - low + 2 * _MARGIN_MM)[:2] / step).astype(int).tolist()
-    if columns * rows > _MOST_PX:
-        raise InputError(f"stitch: the picture would have {columns} x {rows} px; give a larger --view.mm-per-px")
+    _require_few(columns, rows)
     origin_px = np.array([_MARGIN_MM - low[0], _MARGIN_MM + high[1]]) / step
     u, v = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
     eyes = np.stack([(u - origin_px[0]) * step, (origin_px[1] - v) * step, np.full(u.shape, high[2] + 1)], axis=-1)
@@ -111,6 +112,12 @@ def _from_above(mesh: Mesh, options: MeshViewOptions) -> Panorama:
         mm_per_px=step,
         height_mm=np.where(covered, high[2] + 1 - distance_mm, np.nan).astype(np.float32),
     )
+
+
+def _require_few(columns: int, rows: int) -> None:
+    """Raise InputError where a picture would be too large."""
+    if columns * rows > _MOST_PX:
+        raise InputError(f"stitch: a picture would have {columns} x {rows} px; give a larger --view.mm-per-px")
 
 
 def _drawn(mesh: Mesh, rays: _Rays) -> tuple[UInt8[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
