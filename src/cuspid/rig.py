@@ -148,6 +148,9 @@ class Light:
     """Linear RGB."""
     lobe_exponent: float = 1.0
     """Intensity falls as cos(angle)^exponent; 1 is a bare Lambertian LED."""
+    glare: float = 1.0
+    """Share (0 to 1) of its mirror reflections that the cameras see: 1 without polarisers, what leaks through where the
+    polariser of the LED and those of the cameras are crossed (0.03 for common film)."""
     covariance: Float[np.ndarray, "4 4"] | None = None
     """Covariance of the position (mm) and of the logarithm of the power; None if their uncertainty is not stated."""
 

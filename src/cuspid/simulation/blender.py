@@ -154,6 +154,8 @@ def _light(light: Light, rig_from_world: Rigid3) -> dict[str, Any]:
         raise InputError(
             f"light: Blender's disc lights have lobe exponent 1, not {light.lobe_exponent}; use the renderer embree"
         )
+    if light.glare != 1:
+        raise InputError("light: Blender has no polarisers (glare is not 1); use the renderer embree")
     world_from_rig = rig_from_world.inverse()
     # Blender's area lights shine along -Z; about that axis any turn will do.
     axis = -world_from_rig.rotate(light.direction)

@@ -104,6 +104,7 @@ class Lamps(NamedTuple):
     axes: np.ndarray
     intensities: np.ndarray
     exponents: np.ndarray
+    glare: np.ndarray
 
 
 def lamps(handpiece: Handpiece, lighting: str | None, rig_from_world: Rigid3) -> Lamps:
@@ -117,6 +118,7 @@ def lamps(handpiece: Handpiece, lighting: str | None, rig_from_world: Rigid3) ->
         world_from_rig.rotate(np.array([light.direction for light in on])),
         np.array([light.power * light.colour for light in on]),
         np.array([light.lobe_exponent for light in on]),
+        np.array([light.glare for light in on]),
     )
 
 
@@ -392,18 +394,22 @@ def _shade(rays, albedos, surface, palette, lights, lit, ambient, row, out):
             if lit[row[i], k]:
                 towards, falloff = _incoming(point, k, lights)
                 diffuse, glossy = _reflected(normal, view, towards, palette.reflectance[m], palette.roughness[m])
+                glossy *= lights.glare[k]
                 for c in range(3):
                     out[pixel, c] += falloff * lights.intensities[k, c] * (albedo[c] * diffuse + glossy) / samples
 
 
 def auto_gain(scene: Scene, poses: Iterable[Rigid3], lighting: str | None = None, stride: int = 10) -> float:
-    """The gain for a lighting pattern, metered over all cameras at some poses, on images reduced by ``stride``."""
+    """The gain for a lighting pattern, metered over all cameras at some poses, on images reduced by ``stride``: by their
+    brightness or, under coloured lights, by their brightest channel, for none should burn out."""
+    on = scene.handpiece.lights_on(lighting)
+    level_of = np.mean if all(np.ptp(light.colour) == 0 for light in on) else np.max
     levels = []
     for rig_from_world in poses:
         lights = lamps(scene.handpiece, lighting, rig_from_world)
         for mounted in scene.handpiece.rig.cameras.values():
             coarse = radiance(scene, _coarser(mounted.camera, stride), mounted.cam_from_rig @ rig_from_world, lights)
-            levels.append(coarse.mean(axis=-1).ravel())
+            levels.append(level_of(coarse, axis=-1).ravel())
     seen = np.concatenate(levels)
     seen = seen[seen > 0]
     if not len(seen):

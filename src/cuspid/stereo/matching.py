@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 
 from cuspid.camera import Camera
 from cuspid.options import Options, Range
@@ -31,6 +31,7 @@ from cuspid.stereo.confidence import (
 from cuspid.stereo.initial_depth import PairMatcher, initial_pairs, initial_points, semi_global
 from cuspid.stereo.rectification import IdealView, RectifiedPair, rectify
 from cuspid.stereo.refinement import SCORE, VARIANCE, GroupGeometry, Q, RefinementOptions, image_noise, refine
+from cuspid.stereo.shading import ShadingOptions, brightness, correction, shaded_depth
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +48,12 @@ class StereoOptions(Options):
     """Multi-camera refinement."""
     confidence: ConfidenceOptions = field(default_factory=ConfidenceOptions)
     """Checks and weights."""
+    shading: ShadingOptions = field(default_factory=ShadingOptions)
+    """Depth of plain surfaces, where it is their light and shade that is matched."""
+
+
+Signal = Literal["texture", "shading"]
+"""What is matched: fine detail, whatever its brightness, or the brightness of plain surfaces under common lights."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +68,8 @@ class Group:
     """Geometry with each camera as the reference."""
     grids: tuple[Camera, ...]
     """The pinhole camera of the depth map of each camera."""
+    corrections: tuple[Float32[np.ndarray, "_ _ 1"], ...]
+    """What makes the brightness of each camera comparable (:func:`cuspid.stereo.shading.correction`)."""
 
 
 def coarser(camera: Camera, spacing_px: int) -> Camera:
@@ -121,6 +130,7 @@ class DepthEstimator:
         options: StereoOptions | None = None,
         matcher: PairMatcher = semi_global,
         *,
+        signal: Signal = "texture",
         resolution_mm: float | None = None,
     ) -> None:
         """Prepare the groups. Raises InputError where no two cameras see the same surface.
@@ -129,7 +139,8 @@ class DepthEstimator:
         """
         self.handpiece = handpiece
         self.options = options or StereoOptions()
-        self.matcher = matcher
+        self.matcher, self.signal = matcher, signal
+        self.confidence = self.options.confidence if signal == "texture" else self.options.shading.confidence
         self.resolution = Resolution(resolution_mm or resolved_mm(handpiece), handpiece.working_distance_mm)
         self._prepared: dict[tuple[str, ...], Group] = {}
         require_stereo(handpiece, self.options.pairing)
@@ -156,6 +167,7 @@ class DepthEstimator:
             pairs=tuple(rectify(pair, rig[pair[0]], rig[pair[1]], self.options.initial_scale) for pair in pairs),
             geometry=tuple(group_geometry(views, index) for index in range(len(views))),
             grids=tuple(coarser(view.camera, self.options.spacing_px) for view in views),
+            corrections=tuple(correction(rig[name].camera, self.handpiece.sensor_of(name)) for name in names),
         )
 
     def measure(self, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], frame: str) -> tuple[DepthMap, ...]:
@@ -171,14 +183,26 @@ class DepthEstimator:
     def _measure_group(
         self, group: Group, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], frame: str
     ) -> list[DepthMap]:
+        measured = self._by_shading(group, images) if self.signal == "shading" else self._by_texture(group, images)
+        return [
+            self._depth_map(measured, index, view, images[view.name], frame) for index, view in enumerate(group.views)
+        ]
+
+    def _by_texture(self, group: Group, images: Mapping[str, UInt8[np.ndarray, "h w *c"]]) -> list[Measured]:
         gray = {view.name: _gray(images[view.name]) for view in group.views}
         depth_range = self.handpiece.depth_range_mm
         initial = [initial_points(pair, gray, self.matcher, depth_range) for pair in group.pairs]
         stack, sizes = stack_images([view.resample(gray[view.name]) for view in group.views])
-        measured = [self._measure_reference(group, index, initial, stack, sizes) for index in range(len(group.views))]
-        return [
-            self._depth_map(measured, index, view, images[view.name], frame) for index, view in enumerate(group.views)
-        ]
+        return [self._measure_reference(group, index, initial, stack, sizes) for index in range(len(group.views))]
+
+    def _by_shading(self, group: Group, images: Mapping[str, UInt8[np.ndarray, "h w *c"]]) -> list[Measured]:
+        stack = brightness(group.views, [_rgb(images[view.name]) for view in group.views], group.corrections)
+        how = self.handpiece.depth_range_mm, self.options.spacing_px, self.options.shading
+        measured = []
+        for index, (view, grid, geometry) in enumerate(zip(group.views, group.grids, group.geometry, strict=True)):
+            size = view.camera.height, view.camera.width
+            measured.append(Measured(grid, view.cam_from_rig, *shaded_depth(stack, index, geometry, size, *how)))
+        return measured
 
     def _measure_reference(
         self,
@@ -214,7 +238,7 @@ class DepthEstimator:
         image: UInt8[np.ndarray, "h w *c"],
         frame: str,
     ) -> DepthMap:
-        one, resolution, options = measured[index], self.resolution, self.options.confidence
+        one, resolution, options = measured[index], self.resolution, self.confidence
         keep = (agreement(measured, index, resolution, options) > 0) & sure_enough(one, resolution, options)
         if len(measured) == 2:
             radius = -(-options.border_px // self.options.spacing_px)
@@ -237,6 +261,10 @@ def _gray(image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w"]:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
+def _rgb(image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w 3"]:
+    return np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
+
+
 _BLANK_DN = 2.0
 
 
@@ -249,4 +277,4 @@ def _color_grid(image: UInt8[np.ndarray, "h w *c"], spacing_px: int) -> UInt8[np
     """RGB at the pixels of the grid."""
     start = spacing_px // 2
     picked = image[start::spacing_px, start::spacing_px]
-    return np.repeat(picked[..., None], 3, axis=2) if picked.ndim == 2 else np.ascontiguousarray(picked)
+    return np.ascontiguousarray(_rgb(picked))

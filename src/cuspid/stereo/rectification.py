@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera, undistortion_maps
 from cuspid.errors import InputError
@@ -55,6 +55,12 @@ class IdealView:
         if self.maps is None:
             return image
         return np.asarray(cv2.remap(image, *self.maps, cv2.INTER_CUBIC), dtype=np.uint8)
+
+    def resample_values(self, values: Float32[np.ndarray, "h w 3"], beyond: float) -> Float32[np.ndarray, "h w 3"]:
+        """As :meth:`resample`, for values of pixels, linearly; ``beyond`` where the real camera saw nothing."""
+        if self.maps is None:
+            return values
+        return np.asarray(cv2.remap(values, *self.maps, cv2.INTER_LINEAR, borderValue=(beyond,) * 3))
 
 
 @dataclass(frozen=True, eq=False)

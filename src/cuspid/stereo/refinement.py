@@ -347,7 +347,7 @@ def _combine(buffers, camera_zncc, lag):
 
 @kernel(**FAST)
 @no_type_check
-def _solve(total, step):
+def solve(total, step):
     """Gauss-Newton step from the summed equations; returns the variance factor (H^-1)_00, negative if singular."""
     # A slight damping of the slants, which a window of poor texture leaves open.
     h00, h01, h02, h11, h12, h22 = total[0], total[1], total[2], total[3] + 1e-3, total[4], total[5] + 1e-3
@@ -373,7 +373,7 @@ def _refine_plane(view, limits, buffers, u, v, plane):
         # The start may be a pixel off: let cameras in that do not agree well yet.
         floor = limits.camera_zncc if iteration >= 2 else np.float32(0.4) * limits.camera_zncc
         used, score = _combine(buffers, floor, limits.lag)
-        factor = _solve(buffers.total, step) if used > 0 else -1.0
+        factor = solve(buffers.total, step) if used > 0 else -1.0
         solved = factor >= 0
         if not solved:
             break

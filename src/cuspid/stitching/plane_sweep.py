@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, NamedTuple, no_type_check
+from typing import Annotated, NamedTuple
 
 import cv2
 import numpy as np
@@ -28,10 +28,10 @@ from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera, undistortion_maps
 from cuspid.capture import Frame
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.kernels import kernel
 from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
+from cuspid.semi_global import semi_global
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.height_map import HOLE_MM2, HeightMap
 from cuspid.stitching.mosaic import BURNT, brightest, footprint
@@ -64,7 +64,6 @@ _PAIRS = 1.0
 """So many pairs without any agreement are added, so that what few saw counts little."""
 _POOL = 2
 """Cells of the plane sweep to one cell of the height map, in each direction."""
-_DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -373,7 +372,8 @@ def plane_sweep(
     corner, (rows, columns) = grid.corner + cell_mm / 2, volume.shape[1:]
     places = corner + cell_mm * np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
     volume[levels[:, None, None] > sparse.at(places) + _ABOVE_MM] = 0
-    plane = semi_global(1 - volume, options.small_jump, options.large_jump)
+    cost = np.ascontiguousarray(np.moveaxis(1 - volume, 0, -1))
+    plane = semi_global(cost, options.small_jump, options.large_jump)
     at = np.clip(np.rint(plane), 0, len(levels) - 1).astype(int)
     certainty = cv2.blur(np.take_along_axis(volume, at[None], axis=0)[0], (5, 5))
     heights = cv2.medianBlur(np.interp(plane, np.arange(len(levels)), levels).astype(np.float32), 5)
@@ -445,45 +445,3 @@ def _agreement(
         map_in_threads(partial(look, block, images), range(len(levels)))
         progress("surface", min(start + _BLOCK, len(names)), len(names))
     return sums / (counts + np.float32(_PAIRS))
-
-
-# --- heights -----------------------------------------------------------------------------------------------------
-
-
-@kernel
-@no_type_check
-def _add_path(cost, total, down, right, small, large):
-    """Add the least costs of paths in one direction to their sum over the directions."""
-    depth, rows, columns = cost.shape
-    path = np.zeros((rows, columns, depth), np.float32)
-    for i in range(rows):
-        y = i if down >= 0 else rows - 1 - i
-        for j in range(columns):
-            x = j if right >= 0 else columns - 1 - j
-            v, u = y - down, x - right
-            if v < 0 or v >= rows or u < 0 or u >= columns:
-                for d in range(depth):
-                    path[y, x, d] = cost[d, y, x]
-            else:
-                before = path[v, u]
-                least = before.min()
-                for d in range(depth):
-                    best = min(before[d], least + large)
-                    if d > 0:
-                        best = min(best, before[d - 1] + small)
-                    if d < depth - 1:
-                        best = min(best, before[d + 1] + small)
-                    path[y, x, d] = cost[d, y, x] + best - least
-            for d in range(depth):
-                total[d, y, x] += path[y, x, d]
-
-
-def semi_global(cost: Float32[np.ndarray, "d r c"], small: float, large: float) -> Float[np.ndarray, "r c"]:
-    """Plane of each cell, with fractions, by semi-global optimisation along eight directions."""
-    total = np.zeros_like(cost)
-    for down, right in _DIRECTIONS:
-        _add_path(cost, total, down, right, np.float32(small), np.float32(large))
-    best = np.clip(total.argmin(axis=0), 1, len(cost) - 2)
-    below, here, above = (np.take_along_axis(total, (best + step)[None], axis=0)[0] for step in (-1, 0, 1))
-    bend = np.maximum(below + above - 2 * here, 1e-6)
-    return np.asarray(best + np.clip((below - above) / (2 * bend), -0.5, 0.5), dtype=np.float64)

@@ -110,6 +110,8 @@ _LIGHT_COVARIANCE, _SENSOR_COVARIANCE = "covariance_position_mm_log_power", "cov
 
 def _light_to_json(light: Light) -> dict[str, Any]:
     plain = {name: getattr(light, name) for name in _LIGHT_FIELDS}
+    if light.glare == 1:
+        del plain["glare"]
     return plain if light.covariance is None else {**plain, _LIGHT_COVARIANCE: light.covariance}
 
 
@@ -136,7 +138,7 @@ _FIELDS = {
     "name", "working_distance_mm", "depth_range_mm", "cameras", "lights", "lightings", "sensor", "sensors", "body",
 }  # fmt: skip
 """Of ``handpiece.json``."""
-_LIGHT_FIELDS = ("position_mm", "direction", "power", "colour", "lobe_exponent")
+_LIGHT_FIELDS = ("position_mm", "direction", "power", "colour", "lobe_exponent", "glare")
 _SENSOR_RANGES = {"noise_dn": (0.0, 255.0), "shot_noise_share": (0.0, 1.0), "gamma": (0.1, 10.0), "gain": (1e-3, 1e3)}
 _STEEPEST_FALLOFF = 10.0
 _BOX_FIELDS = {"box_from_rig", "size_mm"}
@@ -161,6 +163,7 @@ def _light_from_json(value: Mapping[str, Any], what: str) -> Light:
         power=number(f"{what}: power", value.get("power", 1.0), 0.0, _BRIGHTEST),
         colour=numbers(f"{what}: colour", value["colour"], (3,), 0.0, _BRIGHTEST),
         lobe_exponent=number(f"{what}: lobe_exponent", value.get("lobe_exponent", 1.0), 0.0, _NARROWEST_LOBE),
+        glare=number(f"{what}: glare", value.get("glare", 1.0), 0.0, 1.0),
         covariance=None if matrix is None else covariance(f"{what}: {_LIGHT_COVARIANCE}", matrix, 4),
     )
 

@@ -1,0 +1,414 @@
+"""Depth of plain surfaces from their light and shade: no texture is needed, but lights that all cameras share.
+
+The cameras of a rig expose at once under the same lights, so that the shade of a matte surface looks the same from all
+of them. Brightness itself is compared here, channel by channel; normalising it, as for texture, would remove what is
+matched. Three lights at different places, one for each channel, give three shades of one exposure (R. Woodham, Optical
+Engineering 19, 1980, has the idea for one camera). Mirror reflections move with the camera and have no place in this:
+crossed polarisers take them away, what burns out is not compared, and a camera that differs from the others is left
+out.
+
+First planes of constant inverse depth are swept (R. Collins, CVPR 1996) over a coarse grid, by clipped absolute
+differences of the better half of the cameras, and the plane of each cell is chosen by semi-global optimisation. Then a
+slanted plane is fitted around each pixel by Gauss-Newton, as in :mod:`cuspid.stereo.refinement`, whose notation is used
+here, with the plain differences of brightness as residuals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, NamedTuple, no_type_check
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+
+from cuspid.camera import Camera
+from cuspid.kernels import kernel
+from cuspid.options import Options, Range
+from cuspid.rig import Sensor
+from cuspid.semi_global import semi_global
+from cuspid.stereo.confidence import ConfidenceOptions
+from cuspid.stereo.rectification import IdealView
+from cuspid.stereo.refinement import FAST, GroupGeometry, solve
+
+_BURNT_DN, _UNUSABLE = 252, np.float32(-1)
+"""A channel from this level on is burnt out, and has this value among those that are compared."""
+_LEAST_SHARE = 0.5
+"""Share of a window that another camera must see for it to be compared."""
+_STRIDE = 2
+"""Distance between the compared pixels of a window."""
+_SMOOTH_PX = 4.0
+"""Neighbours on the swept grid whose disparities differ by more are not on one surface."""
+_SLANT_DAMPING = 3.0
+"""Added to the normal equations of the slants, for each camera: what DN^2 of slope would add."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShadingOptions(Options):
+    """Depth of plain surfaces, from their light and shade."""
+
+    sweep_step_px: Annotated[float, Range(0.1, 100)] = 2.0
+    """Distance between the planes that are swept, in px of disparity of the widest pair."""
+    sweep_spacing: Annotated[int, Range(1, 100)] = 2
+    """The planes are swept at every n-th pixel of the depth map, in each direction."""
+    blur_px: Annotated[float, Range(0.1, 100)] = 2.0
+    """Standard deviation of the Gaussian filter over the images, px. The slopes of shade are small: noise in them would
+    make every step of the refinement too short."""
+    unlike_dn: Annotated[float, Range(0.1, 255)] = 8.0
+    """Difference of brightness (mean of the channels, digital numbers) beyond which places are no more unlike."""
+    small_jump: Annotated[float, Range(0, 1000)] = 0.04
+    """Penalty for a plane that is the next one to its neighbour's; costs lie between 0 and 1 (unlike)."""
+    large_jump: Annotated[float, Range(0, 1000)] = 0.5
+    """Penalty for a plane that is farther from its neighbour's."""
+    radius_px: Annotated[int, Range(1, 50)] = 4
+    """Half the side of the window of the refinement (4: 9 x 9 px)."""
+    window_sigma_px: Annotated[float, Range(0.1, 100)] = 3.0
+    """Standard deviation of the Gaussian weight over the window."""
+    iterations: Annotated[int, Range(1, 1000)] = 10
+    """Maximum number of Gauss-Newton steps."""
+    converged_px: Annotated[float, Range(1e-6, 10)] = 0.03
+    """A step below this many px of disparity ends the iterations."""
+    camera_rms_dn: Annotated[float, Range(0.1, 255)] = 6.0
+    """A camera whose brightness differs by more (RMS over the window, digital numbers) sees something else."""
+    camera_lag_dn: Annotated[float, Range(0, 255)] = 2.0
+    """A camera whose difference exceeds the best one's by more sees something else."""
+    confidence: ConfidenceOptions = field(
+        default_factory=lambda: ConfidenceOptions(agreement=4.0, largest_sigma=3.0, best_sigma=0.5)
+    )
+    """Checks and weights. Shade is broad: the limits are wider than those for texture."""
+
+    @property
+    def window(self) -> Float32[np.ndarray, "k k"]:
+        """Weights of the window of the refinement, at every second pixel: the images are smooth."""
+        offsets = np.arange(-self.radius_px, self.radius_px + 1, _STRIDE)
+        return np.exp(-0.5 * (offsets[:, None] ** 2 + offsets**2) / self.window_sigma_px**2).astype(np.float32)
+
+
+class _View(NamedTuple):
+    """What the kernels see of a reference camera and its group."""
+
+    images: np.ndarray
+    """(camera, row, column, channel), brightness in digital numbers, `_UNUSABLE` where that is not known."""
+    reference: int
+    infinite: np.ndarray
+    parallax: np.ndarray
+    others: np.ndarray
+
+
+class _Fit(NamedTuple):
+    """What the refinement is asked for."""
+
+    window: np.ndarray
+    iterations: int
+    converged: float
+    camera_rms: float
+    lag: float
+    lowest: float
+    highest: float
+    correlation: float
+    """Of weighted samples, by which their normal equations understate a variance."""
+
+
+# --- what is compared --------------------------------------------------------------------------------------------
+
+
+def correction(camera: Camera, sensor: Sensor) -> Float32[np.ndarray, "h w 1"]:
+    """What turns the digital numbers of a camera into those of one of gain 1 without falloff, pixel by pixel."""
+    return sensor.transmitted(camera, camera.pixel_centres())[..., None].astype(np.float32) ** (-1 / sensor.gamma)
+
+
+def brightness(
+    views: Sequence[IdealView],
+    images: Sequence[UInt8[np.ndarray, "_ _ 3"]],
+    corrections: Sequence[Float32[np.ndarray, "_ _ 1"]],
+) -> Float32[np.ndarray, "c h w 3"]:
+    """What the cameras of a group are compared by, in digital numbers; `_UNUSABLE` where a channel burnt out, where the
+    real camera saw nothing, and beyond the smaller images."""
+    sizes = np.array([image.shape[:2] for image in images])
+    stack = np.full((len(images), *sizes.max(axis=0), 3), _UNUSABLE)
+    for slot, view, image, factor in zip(stack, views, images, corrections, strict=True):
+        burnt = cv2.dilate((image >= _BURNT_DN).astype(np.float32), np.ones((3, 3), np.uint8))
+        seen = view.resample_values(image.astype(np.float32) * factor, 0.0)
+        usable = view.resample_values(burnt, 1.0) <= 0
+        slot[: image.shape[0], : image.shape[1]] = np.where(usable, seen, _UNUSABLE)
+    return stack
+
+
+def _blurred(image: Float32[np.ndarray, "h w 3"], sigma_px: float) -> Float32[np.ndarray, "h w 3"]:
+    """Smooth where it is usable."""
+    usable = (image >= 0).astype(np.float32)
+    weight = cv2.GaussianBlur(usable, (0, 0), sigma_px)
+    smooth = cv2.GaussianBlur(image * usable, (0, 0), sigma_px) / np.maximum(weight, np.float32(1e-6))
+    return np.where(image >= 0, smooth, _UNUSABLE)
+
+
+@kernel(inline="always", **FAST)
+@no_type_check
+def _place(view, j, u, v, q):
+    """Where a pixel of the reference lies in another image, and its depth there as a multiple of that here."""
+    a, b = view.infinite, view.parallax
+    z = a[j, 2, 0] * u + a[j, 2, 1] * v + a[j, 2, 2] + q * b[j, 2]
+    x = (a[j, 0, 0] * u + a[j, 0, 1] * v + a[j, 0, 2] + q * b[j, 0]) / z
+    y = (a[j, 1, 0] * u + a[j, 1, 1] * v + a[j, 1, 2] + q * b[j, 1]) / z
+    return x, y, z
+
+
+@kernel(inline="always", **FAST)
+@no_type_check
+def _is_in(view, x, y, z):
+    """Whether a place has four pixels around it."""
+    height, width = view.images.shape[1:3]
+    return z > 1e-6 and x >= 0 and y >= 0 and x < width - 1 and y < height - 1
+
+
+@kernel(inline="always", **FAST)
+@no_type_check
+def _around(view, j, row, column, channel):
+    """The four pixels around a place, and whether all of them are usable."""
+    images, camera = view.images, view.others[j]
+    a, b = images[camera, row, column, channel], images[camera, row, column + 1, channel]
+    c, d = images[camera, row + 1, column, channel], images[camera, row + 1, column + 1, channel]
+    return a, b, c, d, min(min(a, b), min(c, d)) >= 0
+
+
+# --- the sweep ---------------------------------------------------------------------------------------------------
+
+
+@kernel(**FAST)
+@no_type_check
+def _difference(view, j, u, v, q):
+    """Mean difference of brightness of a pixel and another image on a plane; negative where it cannot be told."""
+    x, y, z = _place(view, j, u, v, q)
+    if not _is_in(view, x, y, z):
+        return np.float32(-1)
+    column, row = int(x), int(y)
+    fx, fy = np.float32(x - column), np.float32(y - row)
+    total, count = np.float32(0), 0
+    for channel in range(view.images.shape[3]):
+        here = view.images[view.reference, v, u, channel]
+        a, b, c, d, usable = _around(view, j, row, column, channel)
+        if usable and here >= 0:
+            top, bottom = a + fx * (b - a), c + fx * (d - c)
+            total += abs(top + fy * (bottom - top) - here)
+            count += 1
+    return total / count if count > 0 else np.float32(-1)
+
+
+@kernel(**FAST)
+@no_type_check
+def _costs(view, columns, rows, planes, unlike):
+    """What the better half of the cameras differ by at each place and plane, as a share of ``unlike``, at most 1."""
+    count = view.others.size
+    half = (count + 1) // 2
+    costs = np.empty((rows.size, columns.size, planes.size), np.float32)
+    each = np.empty(count, np.float32)
+    for r in range(rows.size):
+        for c in range(columns.size):
+            for k in range(planes.size):
+                for j in range(count):
+                    difference = _difference(view, j, columns[c], rows[r], planes[k])
+                    each[j] = min(difference, unlike) if difference >= 0 else unlike
+                each.sort()
+                costs[r, c, k] = each[:half].sum() / (half * unlike)
+    return costs
+
+
+def _sweep(
+    view: _View,
+    rows: Int[np.ndarray, "r"],
+    columns: Int[np.ndarray, "c"],
+    planes: Float[np.ndarray, "p"],
+    options: ShadingOptions,
+) -> Float[np.ndarray, "r c"]:
+    """Scaled inverse depth at some rows and columns of the reference."""
+    costs = _costs(view, columns, rows, planes, np.float32(options.unlike_dn))
+    for k in range(len(planes)):
+        costs[..., k] = cv2.blur(costs[..., k], (3, 3))
+    label = semi_global(costs, options.small_jump, options.large_jump)
+    return np.asarray(planes[0] + label * options.sweep_step_px)
+
+
+def _every(count: int, spacing: int) -> Int[np.ndarray, "n"]:
+    return np.arange(spacing // 2, count, spacing)
+
+
+@kernel
+@no_type_check
+def _carried(coarse, spacing, rows, columns, fine):
+    """Planes for a grid of pixels from those of a coarser one: q, and its slopes where the surface is smooth."""
+    out = np.zeros((rows.size, columns.size, 3))
+    height, width = coarse.shape
+    for r in range(rows.size):
+        i = min(r // spacing, height - 1)
+        for c in range(columns.size):
+            j = min(c // spacing, width - 1)
+            right = coarse[i, min(j + 1, width - 1)] - coarse[i, max(j - 1, 0)]
+            down = coarse[min(i + 1, height - 1), j] - coarse[max(i - 1, 0), j]
+            out[r, c, 1] = right / (2 * spacing * fine) if abs(right) < 2 * _SMOOTH_PX else 0.0
+            out[r, c, 2] = down / (2 * spacing * fine) if abs(down) < 2 * _SMOOTH_PX else 0.0
+            away = fine * (c - j * spacing - spacing // 2), fine * (r - i * spacing - spacing // 2)
+            out[r, c, 0] = coarse[i, j] + out[r, c, 1] * away[0] + out[r, c, 2] * away[1]
+    return out
+
+
+# --- the refinement ----------------------------------------------------------------------------------------------
+
+
+@kernel(**FAST)
+@no_type_check
+def _add_sample(view, j, u, v, du, dv, plane, weight, system):
+    """Add a pixel of the window to the normal equations of another camera; returns the number of channels used.
+
+    ``system``: H (upper triangle, row by row), the gradient, the squared differences.
+    """
+    x, y, z = _place(view, j, u + du, v + dv, plane[0] + plane[1] * du + plane[2] * dv)
+    if not _is_in(view, x, y, z):
+        return 0
+    column, row = int(x), int(y)
+    fx, fy, used = x - column, y - row, 0
+    along_x = (view.parallax[j, 0] - x * view.parallax[j, 2]) / z
+    along_y = (view.parallax[j, 1] - y * view.parallax[j, 2]) / z
+    for channel in range(view.images.shape[3]):
+        here = view.images[view.reference, v + dv, u + du, channel]
+        a, b, c, d, usable = _around(view, j, row, column, channel)
+        if not usable or here < 0:
+            continue
+        top, bottom = a + fx * (b - a), c + fx * (d - c)
+        difference = top + fy * (bottom - top) - here
+        slope = ((b - a) + fy * ((d - c) - (b - a))) * along_x + (bottom - top) * along_y
+        ws, wd = weight * slope * slope, weight * slope * difference
+        system[0] += ws
+        system[1] += ws * du
+        system[2] += ws * dv
+        system[3] += ws * du * du
+        system[4] += ws * du * dv
+        system[5] += ws * dv * dv
+        system[6] += wd
+        system[7] += wd * du
+        system[8] += wd * dv
+        system[9] += weight * difference * difference
+        used += 1
+    return used
+
+
+@kernel(**FAST)
+@no_type_check
+def _compare(view, fit, u, v, plane, systems):
+    """The normal equations of each other camera, with its RMS difference in the last column; that is infinite where too
+    little of the window is seen."""
+    size, channels = fit.window.shape[0], view.images.shape[3]
+    radius = _STRIDE * (size // 2)
+    for j in range(view.others.size):
+        seen, whole = 0.0, 0.0
+        systems[j] = 0
+        for row in range(size):
+            for column in range(size):
+                du, dv, weight = _STRIDE * column - radius, _STRIDE * row - radius, fit.window[row, column]
+                used = _add_sample(view, j, u, v, du, dv, plane, weight, systems[j])
+                seen += weight * used
+                whole += weight * channels
+        enough = seen > _LEAST_SHARE * whole / channels
+        systems[j, 9] = np.sqrt(systems[j, 9] / seen) if enough else np.inf
+
+
+@kernel(**FAST)
+@no_type_check
+def _combine(systems, rms, lag, total):
+    """Sum the equations of the cameras that see the same; returns how many, and their mean squared difference."""
+    best = systems[:, 9].min()
+    total[:] = 0
+    used, square = 0, 0.0
+    for j in range(len(systems)):
+        if systems[j, 9] <= rms and systems[j, 9] <= best + lag:
+            used += 1
+            square += systems[j, 9] ** 2
+            for k in range(9):
+                total[k] += systems[j, k]
+    total[3] += used * _SLANT_DAMPING
+    total[5] += used * _SLANT_DAMPING
+    return used, square / max(used, 1)
+
+
+@kernel(**FAST)
+@no_type_check
+def _refine_plane(view, fit, u, v, plane, systems, total, step):
+    """Gauss-Newton from a plane, changed in place; returns the variance of q and the number of cameras, 0 if it
+    failed."""
+    variance, used = 0.0, 0
+    for iteration in range(fit.iterations):
+        _compare(view, fit, u, v, plane, systems)
+        # The start may be some pixels off: let cameras in that do not agree well yet.
+        rms = fit.camera_rms if iteration >= 2 else 3 * fit.camera_rms
+        used, square = _combine(systems, rms, fit.lag, total)
+        factor = solve(total, step) if used > 0 else -1.0
+        if factor < 0:
+            return 0.0, 0
+        variance = square * factor * fit.correlation
+        length = abs(step[0])
+        shrink = 1.0 if length <= 1 else 1 / length
+        for k in range(3):
+            plane[k] += shrink * step[k]
+        if length < fit.converged and iteration >= 2:
+            break
+    return variance, used
+
+
+@kernel(**FAST)
+@no_type_check
+def _refine_all(view, fit, rows, columns, planes):
+    """For each pixel of the grid q, its variance, and the number of cameras; 0 where nothing is found."""
+    height, width = view.images.shape[1:3]
+    radius = _STRIDE * (fit.window.shape[0] // 2)
+    out = np.zeros((rows.size, columns.size, 3))
+    systems, total, step = np.zeros((view.others.size, 10)), np.zeros(9), np.zeros(3)
+    for r in range(rows.size):
+        for c in range(columns.size):
+            u, v = columns[c], rows[r]
+            if radius <= u < width - radius and radius <= v < height - radius:
+                plane = planes[r, c]
+                variance, used = _refine_plane(view, fit, u, v, plane, systems, total, step)
+                if used > 0 and fit.lowest <= plane[0] <= fit.highest:
+                    out[r, c, 0], out[r, c, 1], out[r, c, 2] = plane[0], variance, used
+    return out
+
+
+def shaded_depth(
+    images: Float32[np.ndarray, "c h w 3"],
+    reference: int,
+    geometry: GroupGeometry,
+    size: tuple[int, int],
+    depth_range_mm: tuple[float, float],
+    spacing_px: int,
+    options: ShadingOptions,
+) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
+    """Depth (mm) and its standard deviation on a grid of every ``spacing_px``-th pixel of the reference camera, NaN
+    where nothing is found.
+
+    ``images`` are those of :func:`brightness`; ``size`` is the height and width of the reference's.
+    """
+    blurred = np.stack([_blurred(image, options.blur_px) for image in images])
+    view = _View(blurred, reference, geometry.infinite, geometry.parallax, geometry.others)
+    rows, columns = (_every(count, spacing_px) for count in size)
+    lowest, highest = (geometry.scale / depth for depth in reversed(depth_range_mm))
+    planes = np.arange(lowest, highest + options.sweep_step_px, options.sweep_step_px)
+    every = options.sweep_spacing
+    coarse = _sweep(view, rows[every // 2 :: every], columns[every // 2 :: every], planes, options)
+    starts = _carried(coarse, every, rows, columns, spacing_px)
+    found = _refine_all(view, _fit(options, lowest, highest), rows, columns, starts)
+    depth = geometry.scale / np.where(found[..., 2] > 0, found[..., 0], np.nan)
+    return depth, np.sqrt(found[..., 1]) * depth**2 / geometry.scale
+
+
+def _fit(options: ShadingOptions, lowest: float, highest: float) -> _Fit:
+    window = options.window
+    return _Fit(
+        window=window,
+        iterations=options.iterations,
+        converged=options.converged_px,
+        camera_rms=options.camera_rms_dn,
+        lag=options.camera_lag_dn,
+        lowest=lowest,
+        highest=highest,
+        correlation=float((window**2).sum() / window.sum()),
+    )
