@@ -30,14 +30,16 @@ from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Arch, Jaw
 from cuspid.mesh import Mesh
 from cuspid.motion.location import MotionOptions
-from cuspid.motion.stage import MotionMethod, locate, take_poses
+from cuspid.motion.stage import MotionMethod, locate, locate_by_surfaces, take_poses
+from cuspid.motion.surface_tracking import SurfaceTrackingOptions
 from cuspid.options import SHARE, Options
 from cuspid.pairing import detail_mm
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
 from cuspid.rig import Handpiece
 from cuspid.simulation.stage import RenderOptions, SimulationOptions, simulate, take_images
-from cuspid.stereo.matching import StereoOptions
+from cuspid.stereo.matching import Signal, StereoOptions
+from cuspid.stereo.signal import signal_of
 from cuspid.stereo.stage import StoredDepthMaps, measure_depth, measure_enough_depth, measure_temporal_depth
 from cuspid.stereo.temporal import TemporalOptions
 from cuspid.surface.cleaning import CleaningOptions
@@ -93,12 +95,17 @@ class ReconstructionOptions(Options):
     motion: MotionMethod = "rig"
     """How the frames are located: rig (cuspid's own method), or COLMAP's mapper without the rig (colmap) or with it
     (colmap-rig)."""
+    signal: Literal["auto", "texture", "shading"] = "auto"
+    """What is matched: texture, or the light and shade of plain surfaces, where the frames are then located by their
+    surfaces. auto: texture if the images hold any."""
     stereo: StereoOptions = field(default_factory=StereoOptions)
     """Depth within a frame."""
     temporal: TemporalOptions = field(default_factory=TemporalOptions)
     """Depth from consecutive frames, where only one camera of a group saw the surface."""
     tracking: MotionOptions = field(default_factory=MotionOptions)
     """Features, odometry and adjustment for the method ``rig``."""
+    surfaces: SurfaceTrackingOptions = field(default_factory=SurfaceTrackingOptions)
+    """How plain surfaces are laid onto each other."""
     fusion: FusionOptions = field(default_factory=FusionOptions)
     """How depth maps are fused into one surface."""
     cleaning: CleaningOptions = field(default_factory=CleaningOptions)
@@ -133,6 +140,10 @@ def find_poses(
     capture = replace(capture, handpiece=handpiece)
     if colmap_model is not None:
         return take_poses(capture, colmap_model, folder / "motion")
+    if matched(capture, options) == "shading":
+        depths = _shaded_depth(capture, folder, options, progress)
+        made_from, how = depths.digest, options.surfaces
+        return locate_by_surfaces(capture, depths, made_from, folder / "motion", how, progress=progress)
     return locate(capture, folder / "motion", options.tracking, options.motion, progress=progress)
 
 
@@ -147,34 +158,62 @@ def surface(
     """The mesh, given the poses of the frames (second part of :func:`reconstruct`), and how well each of its vertices
     is known: standard deviation along the normal, um."""
     options = _settled(options)
+    sized = capture.halved() if options.quality == "draft" else capture
+    lengths_mm = detail_mm(sized.handpiece), capture.handpiece.working_distance_mm
+    if matched(capture, options) == "shading":
+        depths = _shaded_depth(capture, folder, options, progress)
+    else:
+        sized = replace(sized, handpiece=replace(sized.handpiece, rig=found.rig))
+        depths = _textured_depth(sized, found, lengths_mm[0], folder, options, progress)
+    how = options.fusion, options.cleaning
+    return fuse(
+        *(depths, depths.digest, _poses(found, depths), *lengths_mm, folder, *how),
+        expected=found.expectation,
+        progress=progress,
+    )
+
+
+def matched(capture: Capture, options: ReconstructionOptions) -> Signal:
+    """What the images of a capture are matched by."""
+    return signal_of(capture) if options.signal == "auto" else options.signal
+
+
+def _shaded_depth(
+    capture: Capture, folder: Path, options: ReconstructionOptions, progress: Progress
+) -> StoredDepthMaps:
+    """Depth within frames, before anything is known of their poses."""
+    sized = capture.halved() if options.quality == "draft" else capture
+    return measure_depth(sized, folder / "depth", options.stereo, "shading", progress=progress)
+
+
+def _textured_depth(
+    capture: Capture,
+    found: Reconstruction,
+    detail: float,
+    folder: Path,
+    options: ReconstructionOptions,
+    progress: Progress,
+) -> StoredDepthMaps:
+    """Depth within frames and, where only one camera of a group saw the surface, from consecutive ones."""
     assert options.left_share is not None
-    capture = replace(capture, handpiece=replace(capture.handpiece, rig=found.rig))
-    if options.quality == "draft":
-        capture = capture.halved()
-    lengths_mm = detail_mm(capture.handpiece), capture.handpiece.working_distance_mm
-    agreement_mm = options.fusion.agreement * lengths_mm[0]
+    agreement_mm = options.fusion.agreement * detail
     depths = measure_enough_depth(
         *(capture, found, folder / "depth", options.stereo),
         agreement_mm=agreement_mm,
         left_share=options.left_share,
         progress=progress,
     )
-    if options.temporal.enabled:
-        holes = None
-        if found.tracks is not None and options.temporal.small_holes is not False and options.temporal.left_share != 0:
-            located = depths, depths.digest, _poses(found, depths)
-            holes = find_holes(*located, lengths_mm[0], folder, options.fusion, progress=progress)
-        depths |= measure_temporal_depth(
-            *(capture, found, depths, folder / "depth-temporal", options.temporal),
-            agreement_mm=agreement_mm,
-            least_maps=options.fusion.least_maps,
-            holes=holes,
-            progress=progress,
-        )
-    how = options.fusion, options.cleaning
-    return fuse(
-        *(depths, depths.digest, _poses(found, depths), *lengths_mm, folder, *how),
-        expected=found.expectation,
+    if not options.temporal.enabled:
+        return depths
+    holes = None
+    if found.tracks is not None and options.temporal.small_holes is not False and options.temporal.left_share != 0:
+        located = depths, depths.digest, _poses(found, depths)
+        holes = find_holes(*located, detail, folder, options.fusion, progress=progress)
+    return depths | measure_temporal_depth(
+        *(capture, found, depths, folder / "depth-temporal", options.temporal),
+        agreement_mm=agreement_mm,
+        least_maps=options.fusion.least_maps,
+        holes=holes,
         progress=progress,
     )
 

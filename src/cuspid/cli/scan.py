@@ -133,7 +133,13 @@ def _reconstruct(capture: Capture, out: Path, options: ReconstructionOptions, mo
     settings = {"reconstruction": options, "from_poses": model}
     inputs = storage.hash_capture(capture) | ({} if model is None else {"poses": hash_model(model)})
     with storage.claimed_folder(out, "reconstruct", settings, inputs):
-        if options.calibration == "refined" and is_nominal(capture.handpiece):
+        signal = pipeline.matched(capture, options)
+        if signal == "shading":
+            console.print(
+                "the images show no texture: their light and shade are matched, and the frames are located by their "
+                "surfaces (--signal texture for the other way)"
+            )
+        elif options.calibration == "refined" and is_nominal(capture.handpiece):
             _print_nominal(capture.handpiece, options.nominal)
         with show_progress() as progress:
             found = pipeline.find_poses(capture, out, options, colmap_model=model, progress=progress)

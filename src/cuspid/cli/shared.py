@@ -57,6 +57,9 @@ class Probe(Options):
 
     design: Literal["two", "four", "six", "twelve"] = "twelve"
     """Built-in design: a stereo pair, the essential four cameras, six cameras (use with --turns 3), or all twelve."""
+    lights: Literal["white", "colour-coded"] = "white"
+    """LEDs of a built-in design: white ones, or red, green and blue ones behind crossed polarisers, for plain enamel
+    (--texture enamel)."""
     handpiece: Path | None = None
     """Your own handpiece.json, or COLMAP's rig_config.json, instead of a built-in design."""
     working_distance_mm: Annotated[float | None, Range(0.1, 100_000)] = None
@@ -94,4 +97,4 @@ def load_probe(probe: Probe) -> Handpiece:
     if probe.handpiece is not None:
         return storage.read_handpiece(probe.handpiece, probe.working_distance_mm)
     distance_mm = probe.working_distance_mm or DesignOptions.working_distance_mm
-    return DESIGNS[probe.design](DesignOptions(working_distance_mm=distance_mm))
+    return DESIGNS[probe.design](DesignOptions(working_distance_mm=distance_mm, lights=probe.lights))

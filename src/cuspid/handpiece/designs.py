@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -57,6 +57,11 @@ class DesignOptions(Options):
     only)."""
     outer_tilt_deg: Annotated[float, Range(-89, 89)] = 0.0
     """How far the axes of these two tilt towards the middle of the tooth (six cameras only)."""
+    lights: Literal["white", "colour-coded"] = "white"
+    """white: four LEDs among the cameras of each group. colour-coded: a red, a green and a blue one about each group,
+    with crossed polarisers before them and the lenses, which scan plain enamel."""
+    ring_mm: Annotated[float, Range(0.01, 1000)] = 3.0
+    """Distance of colour-coded LEDs from the middle of their group."""
     holder: HolderOptions = field(default_factory=HolderOptions)
     """What carries cameras and LEDs."""
 
@@ -87,7 +92,7 @@ def six_cameras(options: DesignOptions = DesignOptions()) -> Handpiece:
     """
     four = _four(options)
     cameras = {f"o{5 + k}": _outer_camera(options, side) for k, side in enumerate((+1, -1))}
-    lights = {f"o{5 + k}": _outer_light(options, side) for k, side in enumerate((+1, -1))}
+    lights = {} if options.lights == "colour-coded" else _outer_lights(options)
     six = replace(
         four,
         rig=Rig({**four.rig.cameras, **cameras}),
@@ -113,7 +118,7 @@ def _handpiece(name: str, views: Mapping[str, Rigid3], options: DesignOptions) -
     lights: dict[str, Light] = {}
     for prefix, group_from_rig in views.items():
         cameras |= _group_cameras(prefix, group_from_rig, options)
-        lights |= _group_lights(prefix, group_from_rig, options)
+        lights |= (_group_lights if options.lights == "white" else _coded_lights)(prefix, group_from_rig, options)
     return Handpiece(
         rig=Rig(cameras),
         lights=lights,
@@ -142,6 +147,10 @@ def _outer_camera(options: DesignOptions, side: int) -> MountedCamera:
     centre = np.array([0, side * _outer_place_mm(options), options.working_distance_mm])
     camera = Camera.from_field_of_view(options.width_px, options.height_px, options.field_of_view_deg)
     return MountedCamera(camera, looking_at(centre, axis, np.array([1.0, 0, 0]), 0.0))
+
+
+def _outer_lights(options: DesignOptions) -> dict[str, Light]:
+    return {f"o{5 + k}": _outer_light(options, side) for k, side in enumerate((+1, -1))}
 
 
 def _outer_light(options: DesignOptions, side: int) -> Light:
@@ -184,3 +193,28 @@ def _group_lights(prefix: str, group_from_rig: Rigid3, options: DesignOptions) -
         f"{prefix}{k + 1}": Light(position_mm=rig_from_group.apply(np.array(corner)), direction=axis)
         for k, corner in enumerate(corners)
     }
+
+
+_CODED = {"r": ((1.0, 0.0, 0.0), 1.0, 90.0), "g": ((0.0, 1.0, 0.0), 1.0, 210.0), "b": ((0.0, 0.0, 1.0), 1.4, 330.0)}
+"""Colour of each LED, its power (enamel is yellowish), and where it stands about its group, deg from the right of the
+image anticlockwise."""
+_CROSSED = 0.03
+"""Share of a mirror reflection that passes crossed polarising films."""
+
+
+def _coded_lights(prefix: str, group_from_rig: Rigid3, options: DesignOptions) -> dict[str, Light]:
+    """Three LEDs in the plane of the cameras, on a ring about them, shining along the axes through polarisers."""
+    rig_from_group = group_from_rig.inverse()
+    axis = rig_from_group.rotate(np.array([0, 0, 1.0]))
+    lights = {}
+    for name, (colour, power, turn_deg) in _CODED.items():
+        turn = np.deg2rad(turn_deg)
+        place = options.ring_mm * np.array([np.cos(turn), -np.sin(turn), 0.0])
+        lights[f"{prefix}{name}"] = Light(
+            position_mm=rig_from_group.apply(place),
+            direction=axis,
+            power=power,
+            colour=np.array(colour),
+            glare=_CROSSED,
+        )
+    return lights

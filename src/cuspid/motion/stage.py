@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -10,8 +10,9 @@ from cuspid.capture import Capture
 from cuspid.motion.colmap import hash_model, locate_with_colmap, read_model, write_model
 from cuspid.motion.location import MotionOptions
 from cuspid.motion.location import locate as locate_with_rig
+from cuspid.motion.surface_tracking import SurfaceTrackingOptions, track_surfaces
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import Reconstruction
+from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.storage.captures import hash_capture
 from cuspid.storage.reconstructions import RECONSTRUCTION_FILES, read_reconstruction, write_reconstruction
 from cuspid.storage.stages import Stage
@@ -34,6 +35,21 @@ def locate(
 
     stage = Stage("motion", folder, {"method": method, "options": options if method == "rig" else None}, ("motion",))
     return _kept(stage, capture, hash_capture(capture), find)
+
+
+def locate_by_surfaces(
+    capture: Capture,
+    depths: Iterable[DepthMap],
+    made_from: str,
+    folder: Path,
+    options: SurfaceTrackingOptions,
+    *,
+    progress: Progress = silent,
+) -> Reconstruction:
+    """As :func:`locate`, from the depth maps of the frames; ``made_from`` is their digest."""
+    stage = Stage("motion", folder, {"method": "surfaces", "options": options}, ("motion",))
+    inputs = {**hash_capture(capture), "depths": made_from}
+    return _kept(stage, capture, inputs, lambda: track_surfaces(capture, depths, options, progress=progress))
 
 
 def take_poses(capture: Capture, model: Path, folder: Path) -> Reconstruction:

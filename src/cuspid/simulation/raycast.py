@@ -400,8 +400,10 @@ def _shade(rays, albedos, surface, palette, lights, lit, ambient, row, out):
 
 
 def auto_gain(scene: Scene, poses: Iterable[Rigid3], lighting: str | None = None, stride: int = 10) -> float:
-    """The gain for a lighting pattern, metered over all cameras at some poses, on images reduced by ``stride``: by their
-    brightness or, under coloured lights, by their brightest channel, for none should burn out."""
+    """The gain for a lighting pattern, metered over all cameras at some poses, on images reduced by ``stride``.
+
+    It is metered by their brightness or, under coloured lights, by their brightest channel, for none should burn out.
+    """
     on = scene.handpiece.lights_on(lighting)
     level_of = np.mean if all(np.ptp(light.colour) == 0 for light in on) else np.max
     levels = []

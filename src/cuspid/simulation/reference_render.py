@@ -93,7 +93,7 @@ def _rays(
 
 def _light(scene: Scene, plane: Float[np.ndarray, "r w s 2"], height_mm: float | None) -> Float[np.ndarray, "r w 3"]:
     lamp_mm = height_mm or FAR_LIGHT_MM
-    lamp = Lamps(np.array([[0, 0, lamp_mm]]), np.array([[0, 0, -1.0]]), np.full((1, 3), lamp_mm**2), np.ones(1))
+    lamp = Lamps(np.array([[0, 0, lamp_mm]]), np.array([[0, 0, -1.0]]), np.full((1, 3), lamp_mm**2), *np.ones((2, 1)))
     return radiance_along(scene, *_rays(scene, plane, height_mm), lamp).reshape(*plane.shape[:2], 3)
 
 

@@ -189,10 +189,10 @@ class DepthEstimator:
         ]
 
     def _by_texture(self, group: Group, images: Mapping[str, UInt8[np.ndarray, "h w *c"]]) -> list[Measured]:
-        gray = {view.name: _gray(images[view.name]) for view in group.views}
+        grays = {view.name: gray(images[view.name]) for view in group.views}
         depth_range = self.handpiece.depth_range_mm
-        initial = [initial_points(pair, gray, self.matcher, depth_range) for pair in group.pairs]
-        stack, sizes = stack_images([view.resample(gray[view.name]) for view in group.views])
+        initial = [initial_points(pair, grays, self.matcher, depth_range) for pair in group.pairs]
+        stack, sizes = stack_images([view.resample(grays[view.name]) for view in group.views])
         return [self._measure_reference(group, index, initial, stack, sizes) for index in range(len(group.views))]
 
     def _by_shading(self, group: Group, images: Mapping[str, UInt8[np.ndarray, "h w *c"]]) -> list[Measured]:
@@ -255,7 +255,8 @@ class DepthEstimator:
         )
 
 
-def _gray(image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w"]:
+def gray(image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w"]:
+    """Grey levels of an RGB or grey image."""
     if image.ndim == 2:
         return image
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)

@@ -16,7 +16,7 @@ from cuspid.pairing import camera_groups
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import DepthMap, Reconstruction, SurfacePoints
 from cuspid.stereo.holes import Sightings, Views, covering
-from cuspid.stereo.matching import DepthEstimator, StereoOptions
+from cuspid.stereo.matching import DepthEstimator, Signal, StereoOptions
 from cuspid.stereo.temporal import TemporalOptions, measure_temporal, moving_pair
 from cuspid.storage.captures import hash_frame
 from cuspid.storage.files import digest_of
@@ -66,10 +66,15 @@ class StoredDepthMaps:
 
 
 def measure_depth(
-    capture: Capture, folder: Path, options: StereoOptions, *, progress: Progress = silent
+    capture: Capture,
+    folder: Path,
+    options: StereoOptions,
+    signal: Signal = "texture",
+    *,
+    progress: Progress = silent,
 ) -> StoredDepthMaps:
     """Depth maps of every frame, each from that frame alone, kept in ``folder``."""
-    estimator = DepthEstimator(capture.handpiece, options)
+    estimator = DepthEstimator(capture.handpiece, options, signal=signal)
 
     def measure(frame: Frame) -> tuple[DepthMap, ...]:
         return estimator.measure(capture.images(frame), frame.name)
@@ -77,7 +82,8 @@ def measure_depth(
     def inputs(frame: Frame) -> dict[str, str]:
         return {"frame": hash_frame(capture, frame)}
 
-    return _measure_all(capture, capture.frames, measure, inputs, Stage("depth", folder, options, _CODE), progress)
+    stage = Stage("depth", folder, [options, signal], _CODE)
+    return _measure_all(capture, capture.frames, measure, inputs, stage, progress)
 
 
 def measure_enough_depth(

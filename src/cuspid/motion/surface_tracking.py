@@ -1,0 +1,435 @@
+"""Where the handpiece was, from the surfaces that it measured: for teeth without texture, which give no tracks.
+
+The depth maps of each frame are metric, so that frames are placed by laying their surfaces onto each other: first each
+onto an earlier one, by iterative closest points with point-to-plane distances (Y. Chen, G. Medioni, Image and Vision
+Computing 10, 1992) and a motion model; then all at once, over all pairs of frames that show the same surface, whether
+consecutive or not. A pair counts for as much as its surfaces overlap and as little as they scatter about each other, so
+that drift is spread where it is least certain, and a path that comes back is closed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import groupby, islice
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from cuspid.capture import Capture, Dropped
+from cuspid.errors import ReconstructionError
+from cuspid.geometry import Rigid3, unit
+from cuspid.options import SEED, SHARE, Options, Range
+from cuspid.progress import Progress, silent
+from cuspid.reconstruction import DepthMap, Reconstruction, SurfacePoints
+from cuspid.workers import map_in_threads
+
+_JUMP = 0.06
+"""Neighbours in a depth map that lie farther apart, as a share of the working distance, are not on one surface."""
+_LEAST_COSINE = 0.3
+"""Of the angle between surface and line of sight: what is seen more obliquely is too noisy to lay anything on."""
+_LEAST_MEMBERS = 3
+"""Depths that make a point."""
+_ALIKE = 0.7
+"""Cosine of the largest angle between the normals of the same place in two frames."""
+_REACHES = (0.2, 0.2, 0.14, 0.14, 0.1, 0.1, 0.06, 0.06, 0.04, 0.04, 0.03, 0.03)
+"""Largest distance between the same place in two frames, step by step, as a share of the working distance."""
+_FIRST_STEPS = (0.0, -0.2, 0.2, -0.4, 0.4)
+"""How far the handpiece may have moved at first, along each axis across its view, as shares of the working distance."""
+_TUKEY = 5.0
+"""Robust standard deviations beyond which a distance has no weight."""
+_LEAST_SIGMA = 0.0006
+"""Standard deviation of distances, as a share of the working distance, below which none is assumed."""
+_LEAST_MATCHES = 100
+_BRIEFLY, _BLOCKS = 3, 0.1
+"""Frames back that are tried first, and side of the blocks by which overlap is told, as share of the working distance
+(mm for 10 mm)."""
+_CONVERGED = 2e-6
+"""Step of the joint adjustment, as a share of the working distance, that ends it."""
+_HELD = (
+    "motion: the frames were located by their surfaces, which do not refine the calibration: it is taken as exact, and "
+    "an error of it is in the result"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceTrackingOptions(Options):
+    """How the trajectory of the handpiece is found from surfaces."""
+
+    thinning: Annotated[float, Range(0.0001, 1)] = 0.02
+    """Each frame is thinned to one point per cube of this side, as a share of the working distance (0.1 mm at 5 mm)."""
+    minimum_overlap: Annotated[float, SHARE] = 0.3
+    """Share (0 to 1) of a frame's surface that must lie on an earlier one for the frame to be placed."""
+    largest_scatter: Annotated[float, Range(0.0001, 1)] = 0.008
+    """Standard deviation of the distances between the surfaces of two frames, as a share of the working distance (0.04
+    mm at 5 mm), above which they do not fit each other."""
+    least_relief: Annotated[float, SHARE] = 0.003
+    """How much a surface must turn to hold another in place: least mean squared cosine between its normals and any
+    direction; 0 is a plane, 1/3 a ball."""
+    minimum_located: Annotated[float, SHARE] = 0.5
+    """Minimum share (0 to 1) of the frames that must be placed."""
+    joint_overlap: Annotated[float, SHARE] = 0.15
+    """Frames that share at least this part of the smaller surface are adjusted to each other."""
+    samples: Annotated[int, Range(100, 1_000_000)] = 2000
+    """Points of each frame that are laid onto others in the joint adjustment."""
+    rounds: Annotated[int, Range(1, 1000)] = 20
+    """Maximum number of rounds of the joint adjustment."""
+    seed: Annotated[int, SEED] = 0
+    """Seed of the choice of these points."""
+
+
+class Surface:
+    """What a frame shows, in its rig frame, ready to be asked for the nearest point."""
+
+    def __init__(self, shown: SurfacePoints) -> None:
+        self.points, self.normals = shown.points, shown.normals
+        self._tree = cKDTree(self.points)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def nearest(
+        self, points: Float[np.ndarray, "n 3"], reach_mm: float
+    ) -> tuple[Bool[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+        """Whether a point lies within reach, and which."""
+        distance, index = self._tree.query(points, distance_upper_bound=reach_mm)
+        near = np.isfinite(distance)
+        return near, np.where(near, index, 0)
+
+    def some(self, count: int, rng: np.random.Generator) -> SurfacePoints:
+        """A random choice of the points."""
+        chosen = rng.permutation(len(self))[:count]
+        return SurfacePoints(self.points[chosen], self.normals[chosen])
+
+
+class _Laid(NamedTuple):
+    """How one surface lies on another."""
+
+    points: np.ndarray
+    """Of the first, in the frame of the second."""
+    normals: np.ndarray
+    """Mean of both."""
+    distances: np.ndarray
+    """Along them."""
+    sigma: float
+    """Robust standard deviation of the distances."""
+    share: float
+    """Of the first surface that lies on the second."""
+
+    @property
+    def weights(self) -> Float[np.ndarray, "n"]:
+        """Tukey's, over the variance."""
+        off = np.minimum((self.distances / (_TUKEY * self.sigma)) ** 2, 1.0)
+        return np.asarray((1 - off) ** 2 / self.sigma**2)
+
+    @property
+    def relief(self) -> float:
+        """See :attr:`SurfaceTrackingOptions.least_relief`."""
+        return float(np.linalg.eigvalsh(self.normals.T @ self.normals / len(self.normals))[0])
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """A frame laid onto another one."""
+
+    this_from_other: Rigid3
+    laid: _Laid | None
+
+    @property
+    def rank(self) -> float:
+        """The more overlap and the less scatter, the better."""
+        return 0.0 if self.laid is None else self.laid.share / self.laid.sigma
+
+
+# --- surfaces of frames ------------------------------------------------------------------------------------------
+
+
+def _shown(depth_map: DepthMap, jump_mm: float) -> SurfacePoints:
+    """The points of a depth map that have neighbours on all sides, in the rig frame."""
+    camera = depth_map.camera
+    rays = camera.rays(camera.pixel_centres().reshape(-1, 2)).reshape(camera.height, camera.width, 3)
+    points = rays * np.where(depth_map.known, depth_map.depth_mm, np.nan)[..., None]
+    right, down = np.full((2, *points.shape), np.nan)
+    right[:, 1:-1], down[1:-1] = points[:, 2:] - points[:, :-2], points[2:] - points[:-2]
+    normals = unit(np.cross(down, right))
+    facing = -(normals * points).sum(axis=-1) / np.linalg.norm(points, axis=-1)
+    normals, facing = normals * np.sign(facing)[..., None], np.abs(facing)
+    with np.errstate(invalid="ignore"):
+        smooth = np.maximum(np.linalg.norm(right, axis=-1), np.linalg.norm(down, axis=-1)) < jump_mm
+        good = smooth & (facing > _LEAST_COSINE)
+    rig_from_cam = depth_map.cam_from_rig.inverse()
+    return SurfacePoints(rig_from_cam.apply(points[good]), rig_from_cam.rotate(normals[good]))
+
+
+def surface_of(depth_maps: Iterable[DepthMap], working_distance_mm: float, options: SurfaceTrackingOptions) -> Surface:
+    """What the depth maps of a frame show, thinned out: the mean of what lies in one cube and faces one way."""
+    parts = [_shown(each, _JUMP * working_distance_mm) for each in depth_maps]
+    points = np.concatenate([np.zeros((0, 3)), *(part.points for part in parts)])
+    normals = np.concatenate([np.zeros((0, 3)), *(part.normals for part in parts)])
+    cubes = np.floor(points / (options.thinning * working_distance_mm)).astype(np.int64)
+    sides = np.abs(normals).argmax(axis=1, keepdims=True) if len(normals) else np.zeros((0, 1), int)
+    facing = sides + 3 * (np.take_along_axis(normals, sides, axis=1) > 0)
+    _, cell, members = np.unique(
+        np.concatenate([cubes, facing], axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    cell, enough = cell.reshape(-1), members >= _LEAST_MEMBERS
+
+    def mean(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+        sums = [np.bincount(cell, values[:, axis], len(members)) for axis in range(3)]
+        return (np.stack(sums, axis=1) / members[:, None])[enough]
+
+    return Surface(SurfacePoints(mean(points), unit(mean(normals))))
+
+
+# --- one frame onto another --------------------------------------------------------------------------------------
+
+
+def _lay(
+    one: Surface | SurfacePoints, other: Surface, other_from_one: Rigid3, reach_mm: float, least_mm: float
+) -> _Laid | None:
+    """None where hardly anything is near."""
+    points, normals = other_from_one.apply(one.points), other_from_one.rotate(one.normals)
+    near, index = other.nearest(points, reach_mm)
+    near &= (normals * other.normals[index]).sum(axis=1) > _ALIKE
+    if near.sum() < _LEAST_MATCHES:
+        return None
+    points, index = points[near], index[near]
+    normals = unit(normals[near] + other.normals[index])
+    distances = ((points - other.points[index]) * normals).sum(axis=1)
+    sigma = max(1.4826 * float(np.median(np.abs(distances))), least_mm)
+    return _Laid(points, normals, distances, sigma, float(near.mean()))
+
+
+def _equations(laid: _Laid) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]:
+    """Normal equations of a small motion (rotation vector, translation) of the points."""
+    rows = np.concatenate([np.cross(laid.points, laid.normals), laid.normals], axis=1)
+    weighted = rows * laid.weights[:, None]
+    return weighted.T @ rows, weighted.T @ laid.distances
+
+
+def _moved(motion: Float[np.ndarray, "6"]) -> Rigid3:
+    return Rigid3.from_rotation_vector(motion[:3], motion[3:])
+
+
+def _solved(matrix: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """With a damping that only matters where nothing is known."""
+    return np.asarray(np.linalg.solve(matrix + 1e-9 * np.trace(matrix) * np.eye(len(matrix)), right))
+
+
+def _onto(one: Surface, other: Surface, start: Rigid3, distance_mm: float) -> _Step:
+    """Lay a surface onto another one, from a pose nearby."""
+    pose, least_mm = start, _LEAST_SIGMA * distance_mm
+    for reach in _REACHES:
+        laid = _lay(one, other, pose, reach * distance_mm, least_mm)
+        if laid is None:
+            return _Step(pose, None)
+        pose = _moved(-_solved(*_equations(laid))) @ pose
+    return _Step(pose, _lay(one, other, pose, _REACHES[-1] * distance_mm, least_mm))
+
+
+def _doubt(step: _Step, options: SurfaceTrackingOptions, distance_mm: float) -> str | None:
+    """Why a frame must not be placed so; None if it may be."""
+    laid = step.laid
+    if laid is None or laid.share < options.minimum_overlap:
+        share = 0.0 if laid is None else laid.share
+        return f"only {share:.0%} of its surface lies on that of an earlier frame"
+    if laid.sigma > options.largest_scatter * distance_mm:
+        return f"its surface scatters about that of earlier frames by {1000 * laid.sigma:.0f} um"
+    if laid.relief < options.least_relief:
+        return "its surface is too flat to be held in place by its shape"
+    return None
+
+
+# --- the whole path ----------------------------------------------------------------------------------------------
+
+
+def _starts(motion: Rigid3 | None, distance_mm: float) -> Iterator[Rigid3]:
+    """Where to look for the next frame: moved on as before, or as far as a hand may move at first."""
+    if motion is not None:
+        yield motion
+        yield Rigid3.identity()
+        return
+    for along in _FIRST_STEPS:
+        for across in _FIRST_STEPS:
+            yield Rigid3(np.eye(3), distance_mm * np.array([along, across, 0.0]))
+
+
+def _place(
+    surfaces: Sequence[Surface],
+    placed: Mapping[int, Rigid3],
+    frame: int,
+    motion: Rigid3 | None,
+    options: SurfaceTrackingOptions,
+    distance_mm: float,
+) -> tuple[Rigid3 | None, str]:
+    """``rig_from_world`` of a frame, from those placed before; else why there is none.
+
+    First the latest few, then, where tracking is lost, all of them: the hand may have gone back.
+    """
+    reason = "no earlier frame shows any surface"
+    for number, earlier in enumerate(list(placed)[::-1]):
+        starts = _starts(motion, distance_mm) if number < _BRIEFLY else (Rigid3.identity(),)
+        steps = [_onto(surfaces[earlier], surfaces[frame], start, distance_mm) for start in starts]
+        best = max(steps, key=lambda step: step.rank)
+        doubt = _doubt(best, options, distance_mm)
+        if doubt is None:
+            return best.this_from_other @ placed[earlier], ""
+        reason = doubt if number == 0 else reason
+    return None, reason
+
+
+def _chained(
+    surfaces: Sequence[Surface],
+    names: Sequence[str],
+    options: SurfaceTrackingOptions,
+    distance_mm: float,
+    progress: Progress,
+) -> tuple[dict[int, Rigid3], list[Dropped]]:
+    """``rig_from_world`` of the frames, one after the other."""
+    placed, dropped, motion = dict[int, Rigid3](), list[Dropped](), None
+    for frame, surface in enumerate(surfaces):
+        progress("odometry", frame + 1, len(surfaces))
+        if len(surface) < _LEAST_MATCHES:
+            dropped.append(Dropped(what=f"frame {names[frame]}", reason=f"only {len(surface)} points of its surface"))
+            continue
+        if not placed:
+            placed[frame] = Rigid3.identity()
+            continue
+        pose, reason = _place(surfaces, placed, frame, motion, options, distance_mm)
+        if pose is None:
+            dropped.append(Dropped(what=f"frame {names[frame]}", reason=reason))
+            continue
+        motion = pose @ placed[frame - 1].inverse() if frame - 1 in placed else None
+        placed[frame] = pose
+    return placed, dropped
+
+
+def _neighbours(
+    surfaces: Sequence[Surface], poses: Sequence[Rigid3], options: SurfaceTrackingOptions, distance_mm: float
+) -> list[tuple[int, int]]:
+    """Pairs of frames that show the same surface, told by the blocks of space that it fills."""
+    blocks = [
+        {tuple(each) for each in np.floor(pose.inverse().apply(surface.points) / (_BLOCKS * distance_mm)).astype(int)}
+        for surface, pose in zip(surfaces, poses, strict=True)
+    ]
+    return [
+        (i, j)
+        for i, one in enumerate(blocks)
+        for j, other in enumerate(blocks)
+        if i != j and len(one & other) > options.joint_overlap * min(len(one), len(other))
+    ]
+
+
+def _together(
+    surfaces: Sequence[Surface],
+    poses: Sequence[Rigid3],
+    options: SurfaceTrackingOptions,
+    distance_mm: float,
+    progress: Progress,
+) -> tuple[list[Rigid3], float]:
+    """The poses with which all surfaces that overlap lie on each other best, and their mean scatter, mm."""
+    rng, found = np.random.default_rng(options.seed), list(poses)
+    some = [surface.some(options.samples, rng) for surface in surfaces]
+    pairs = _neighbours(surfaces, poses, options, distance_mm)
+    reach_mm, least_mm, scatter = _REACHES[-3] * distance_mm, _LEAST_SIGMA * distance_mm, 0.0
+    for number in range(options.rounds):
+        laid = map_in_threads(partial(_compared, some, surfaces, found, reach_mm, least_mm), pairs)
+        scatter = float(np.mean([each.sigma for each in laid if each is not None] or [0.0]))
+        step = _joint_step(pairs, laid, [pose.inverse() for pose in found])
+        found = [pose @ _moved(motion).inverse() for pose, motion in zip(found, step, strict=True)]
+        progress("adjustment", number + 1, options.rounds)
+        if np.abs(step[:, 3:]).max() < _CONVERGED * distance_mm:
+            break
+    progress("adjustment", options.rounds, options.rounds)
+    return found, scatter
+
+
+def _compared(
+    some: Sequence[SurfacePoints],
+    surfaces: Sequence[Surface],
+    poses: Sequence[Rigid3],
+    reach_mm: float,
+    least_mm: float,
+    pair: tuple[int, int],
+) -> _Laid | None:
+    """Some points of one frame on the surface of another."""
+    one, other = pair
+    return _lay(some[one], surfaces[other], poses[other] @ poses[one].inverse(), reach_mm, least_mm)
+
+
+def _joint_step(
+    pairs: Sequence[tuple[int, int]], laid: Sequence[_Laid | None], world_from_rig: Sequence[Rigid3]
+) -> Float[np.ndarray, "f 6"]:
+    """Small motions of all frames, in the world, that bring surfaces together; the first frame stays."""
+    count = len(world_from_rig)
+    matrix, right = np.zeros((count, 6, count, 6)), np.zeros((count, 6))
+    for (one, other), each in zip(pairs, laid, strict=True):
+        if each is not None:
+            world = world_from_rig[other]
+            block, side = _equations(each._replace(points=world.apply(each.points), normals=world.rotate(each.normals)))
+            matrix[one, :, one] += block
+            matrix[other, :, other] += block
+            matrix[one, :, other] -= block
+            matrix[other, :, one] -= block
+            right[one] -= side
+            right[other] += side
+    free = 6 * (count - 1)
+    step = np.zeros((count, 6))
+    if free:
+        step[1:] = _solved(matrix[1:, :, 1:].reshape(free, free), right[1:].ravel()).reshape(-1, 6)
+    return step
+
+
+def track_surfaces(
+    capture: Capture,
+    depths: Iterable[DepthMap],
+    options: SurfaceTrackingOptions = SurfaceTrackingOptions(),
+    *,
+    progress: Progress = silent,
+) -> Reconstruction:
+    """Metric poses of the frames of a capture, from their depth maps, which come frame by frame in the order of
+    capture. The calibration is held.
+
+    Raises ReconstructionError where too few frames can be placed.
+    """
+    distance_mm = capture.handpiece.working_distance_mm
+    names, surfaces = [], []
+    for name, maps in groupby(depths, key=lambda depth_map: depth_map.frame):
+        names.append(name)
+        surfaces.append(surface_of(maps, distance_mm, options))
+        progress("surfaces", len(names), max(len(capture.frames), len(names)))
+    placed, dropped = _chained(surfaces, names, options, distance_mm, progress)
+    _require_enough(len(placed), len(names), dropped, options)
+    kept = [surfaces[frame] for frame in placed]
+    poses, scatter_mm = _together(kept, list(placed.values()), options, distance_mm, progress)
+    return Reconstruction(
+        rig=capture.handpiece.rig,
+        rig_from_world={names[frame]: pose for frame, pose in zip(placed, poses, strict=True)},
+        dropped=(*capture.left_out, *dropped),
+        log={"surface_scatter_um": 1000 * scatter_mm},
+        notes=(_HELD, *_lost(names, placed)),
+    )
+
+
+def _lost(names: Sequence[str], placed: Mapping[int, Rigid3]) -> tuple[str, ...]:
+    """Where tracking was lost."""
+    gaps = [frame for frame in range(len(names)) if frame not in placed]
+    if not gaps:
+        return ()
+    shown = ", ".join(names[frame] for frame in islice(gaps, 5))
+    more = ", ..." if len(gaps) > 5 else ""
+    return (f"motion: tracking was lost at {len(gaps)} of {len(names)} frames ({shown}{more}); scan there again",)
+
+
+def _require_enough(placed: int, total: int, dropped: Sequence[Dropped], options: SurfaceTrackingOptions) -> None:
+    """Raise ReconstructionError where too few frames are placed."""
+    if placed >= options.minimum_located * total and (placed > 1 or total == 1):
+        return
+    shown = "; ".join(f"{each.what}: {each.reason}" for each in dropped[:3])
+    raise ReconstructionError(
+        f"motion: only {placed} of {total} frames could be placed by their surfaces ({shown}); take frames closer "
+        "together, see that the lights are on and nothing else shines, or give the surface texture (powder)"
+    )

@@ -1,0 +1,40 @@
+"""What the images of a capture hold that can be matched: texture, or only the light and shade of a plain surface."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from cuspid.capture import Capture
+from cuspid.stereo.matching import Signal, gray
+
+_LOOKED_AT = 24
+"""Images that are looked at, spread over the capture."""
+_FINE_PX, _COARSE_PX, _WINDOW_PX = 1.5, 3.0, 15
+"""Detail is what a Gaussian filter keeps and a wider one removes: noise of one pixel hardly has any."""
+_USUAL_DN, _LEAST_LIT = (30, 250), 1000
+"""Grey levels of lit surface, and how many such pixels tell something."""
+_TEXTURE_DN = 0.8
+"""RMS detail above which there is texture. Artificial texture has 8-10, powder 1.5-2, plain enamel 0.15-0.6, of which
+noise of 1.5 DN makes 0.15."""
+
+
+def signal_of(capture: Capture) -> Signal:
+    """What depth is best measured from, by the detail in half of the images' lit surface or more."""
+    images = [(frame, camera) for frame in capture.frames for camera in frame.cameras]
+    chosen = {images[k] for k in np.linspace(0, len(images) - 1, _LOOKED_AT).astype(int)} if images else set()
+    details = [detail_dn(gray(capture.image(*each))) for each in sorted(chosen, key=images.index)]
+    known = [each for each in details if each is not None]
+    return "texture" if not known or np.median(known) >= _TEXTURE_DN else "shading"
+
+
+def detail_dn(image: UInt8[np.ndarray, "h w"]) -> float | None:
+    """RMS detail in windows of lit surface, their median; None where there is hardly any such surface."""
+    lit = (image > _USUAL_DN[0]) & (image < _USUAL_DN[1])
+    if lit.sum() < _LEAST_LIT:
+        return None
+    level = image.astype(np.float32)
+    band = cv2.GaussianBlur(level, (0, 0), _FINE_PX) - cv2.GaussianBlur(level, (0, 0), _COARSE_PX)
+    power = cv2.boxFilter(band * band, -1, (_WINDOW_PX, _WINDOW_PX))
+    return float(np.sqrt(np.median(power[lit])))
