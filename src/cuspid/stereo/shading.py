@@ -32,8 +32,9 @@ from cuspid.stereo.confidence import ConfidenceOptions
 from cuspid.stereo.rectification import IdealView
 from cuspid.stereo.refinement import FAST, GroupGeometry, solve
 
-_BURNT_DN, _UNUSABLE = 252, np.float32(-1)
-"""A channel from this level on is burnt out, and has this value among those that are compared."""
+_BURNT_DN, _DARK_DN, _UNUSABLE = 252, 16, np.float32(-1)
+"""A channel from the first level on is burnt out, a pixel whose channels all lie below the second shows nothing: darkness
+looks alike everywhere. Both have the last value among those that are compared."""
 _LEAST_SHARE = 0.5
 """Share of a window that another camera must see for it to be compared."""
 _STRIDE = 2
@@ -123,14 +124,15 @@ def brightness(
     images: Sequence[UInt8[np.ndarray, "_ _ 3"]],
     corrections: Sequence[Float32[np.ndarray, "_ _ 1"]],
 ) -> Float32[np.ndarray, "c h w 3"]:
-    """What the cameras of a group are compared by, in digital numbers; `_UNUSABLE` where a channel burnt out, where the
-    real camera saw nothing, and beyond the smaller images."""
+    """What the cameras of a group are compared by, in digital numbers; `_UNUSABLE` where a channel burnt out, where it
+    is dark, where the real camera saw nothing, and beyond the smaller images."""
     sizes = np.array([image.shape[:2] for image in images])
     stack = np.full((len(images), *sizes.max(axis=0), 3), _UNUSABLE)
     for slot, view, image, factor in zip(stack, views, images, corrections, strict=True):
-        burnt = cv2.dilate((image >= _BURNT_DN).astype(np.float32), np.ones((3, 3), np.uint8))
+        useless = (image >= _BURNT_DN) | (cv2.blur(image, (3, 3)).max(axis=-1) < _DARK_DN)[..., None]
+        useless = cv2.dilate(useless.astype(np.float32), np.ones((3, 3), np.uint8))
         seen = view.resample_values(image.astype(np.float32) * factor, 0.0)
-        usable = view.resample_values(burnt, 1.0) <= 0
+        usable = view.resample_values(useless, 1.0) <= 0
         slot[: image.shape[0], : image.shape[1]] = np.where(usable, seen, _UNUSABLE)
     return stack
 
