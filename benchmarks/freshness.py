@@ -54,6 +54,7 @@ MAKERS: Mapping[str, Maker] = {
     "any_rig": Maker("any_rig"),
     "stereo_pairs": Maker("stereo_pairs"),
     "jaws_*": Maker("jaws"),
+    "enamel": Maker("enamel"),
     "manufacturing*": Maker("manufacturing"),
     "expectations": Maker("expectations"),
     "targets": Maker("targets"),

@@ -144,12 +144,12 @@ def judge(*, file: str, part: str, smooth: bool, pixels: int, passes: str, plan_
     if plan_only:
         return planned
     with tempfile.TemporaryDirectory(prefix="cuspid-jaw-") as folder:
-        return planned | scanned(jaw, handpiece, Path(folder), path_options)
+        return planned | scanned(jaw, handpiece, Path(folder), SimulationOptions(path=path_options))
 
 
-def scanned(jaw: Jaw, handpiece: Handpiece, folder: Path, path: ScanPathOptions) -> dict[str, Value]:
+def scanned(jaw: Jaw, handpiece: Handpiece, folder: Path, options: SimulationOptions) -> dict[str, Value]:
     """The figures of a scan."""
-    capture, _ = pipeline.simulate(jaw, handpiece, folder, SimulationOptions(path=path))
+    capture, _ = pipeline.simulate(jaw, handpiece, folder, options)
     begin, begin_cpu = time.perf_counter(), time.process_time()
     reconstruction, mesh = pipeline.reconstruct(capture, folder, ReconstructionOptions())
     took, took_cpu = time.perf_counter() - begin, time.process_time() - begin_cpu

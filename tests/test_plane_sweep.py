@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
 from cuspid.camera import Camera
 from cuspid.errors import InputError
@@ -20,7 +19,7 @@ from cuspid.reconstruction import Tracks
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.height_map import HeightMap, HeightMapOptions, height_map, uncovered
 from cuspid.stitching.mosaic import MosaicOptions, compose
-from cuspid.stitching.plane_sweep import Compared, PlaneSweepOptions, frames_beside, partners, plane_sweep, semi_global
+from cuspid.stitching.plane_sweep import Compared, PlaneSweepOptions, frames_beside, partners, plane_sweep
 
 HALF_MM, DEEP_MM, CAMERA_MM = 3.0, 4.0, 14.0
 """A bar of this half width along Y stands so high over a floor; the camera goes along it so high over its top."""
@@ -264,26 +263,3 @@ def test_a_plane_occludes_nothing(x: float, y: float) -> None:
     plane = flat_with(0.0, lambda x: np.zeros(x.shape[:-1], bool))
     places = np.concatenate([grid((-8, 8), (-8, 8)), np.zeros((160, 160, 1))], axis=-1)
     assert not plane.occludes(places, np.array([x, y, 10.0])).any()
-
-
-@given(arrays(np.float32, (7, 4, 5), elements=st.floats(0, 1, width=16)))
-def test_without_penalties_each_cell_has_its_own_best_plane(cost: np.ndarray) -> None:
-    found = semi_global(cost, 0.0, 0.0)
-    nearest = np.clip(np.rint(found), 0, 6).astype(int)[None]
-    beside = [np.take_along_axis(cost, np.clip(nearest + step, 0, 6), axis=0) for step in (-1, 0, 1)]
-    assert np.all(np.min(beside, axis=0) <= cost[1:-1].min(axis=0) + 1e-6)
-
-
-@given(st.integers(1, 5), st.integers(1, 5), st.floats(0.05, 1.0))
-def test_a_lone_cell_follows_its_neighbours_if_penalties_outweigh_it(plane: int, own: int, gain: float) -> None:
-    cost = np.ones((7, 9, 9), np.float32)
-    cost[plane] = 0
-    cost[:, 4, 4], cost[own, 4, 4] = gain, 0
-    assert semi_global(cost, 1.1, 1.1)[4, 4] == pytest.approx(plane, abs=0.5)
-    assert semi_global(cost, 0.0, 0.0)[4, 4] == pytest.approx(own, abs=0.5)
-
-
-def test_fractions_of_planes_are_those_of_a_parabola() -> None:
-    true = np.linspace(2.0, 6.0, 12).reshape(3, 4)
-    cost = ((np.arange(9)[:, None, None] - true) ** 2).astype(np.float32)
-    assert semi_global(cost, 0.0, 0.0) == pytest.approx(true, abs=1e-4)

@@ -25,6 +25,7 @@ from cuspid.geometry import Rigid3, unit
 from cuspid.options import SEED, SHARE, Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import DepthMap, Reconstruction, SurfacePoints
+from cuspid.rig import Handpiece
 from cuspid.workers import map_in_threads
 
 _JUMP = 0.06
@@ -39,6 +40,8 @@ _REACHES = (0.2, 0.2, 0.14, 0.14, 0.1, 0.1, 0.06, 0.06, 0.04, 0.04, 0.03, 0.03)
 """Largest distance between the same place in two frames, step by step, as a share of the working distance."""
 _FIRST_STEPS = (0.0, -0.2, 0.2, -0.4, 0.4)
 """How far the handpiece may have moved at first, along each axis across its view, as shares of the working distance."""
+_LAST_STEPS = 4
+"""Steps with all points, once a few have found the place."""
 _TUKEY = 5.0
 """Robust standard deviations beyond which a distance has no weight."""
 _LEAST_SIGMA = 0.0006
@@ -47,6 +50,8 @@ _LEAST_MATCHES = 100
 _BRIEFLY, _BLOCKS = 3, 0.1
 """Frames back that are tried first, and side of the blocks by which overlap is told, as share of the working distance
 (mm for 10 mm)."""
+_LITTLE_GLARE = 0.1
+"""Share of mirror reflections that does little harm."""
 _CONVERGED = 2e-6
 """Step of the joint adjustment, as a share of the working distance, that ends it."""
 _HELD = (
@@ -74,7 +79,7 @@ class SurfaceTrackingOptions(Options):
     joint_overlap: Annotated[float, SHARE] = 0.15
     """Frames that share at least this part of the smaller surface are adjusted to each other."""
     samples: Annotated[int, Range(100, 1_000_000)] = 2000
-    """Points of each frame that are laid onto others in the joint adjustment."""
+    """Points of each frame that are laid onto others in searches and in the joint adjustment."""
     rounds: Annotated[int, Range(1, 1000)] = 20
     """Maximum number of rounds of the joint adjustment."""
     seed: Annotated[int, SEED] = 0
@@ -219,15 +224,21 @@ def _solved(matrix: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n"]) -> 
     return np.asarray(np.linalg.solve(matrix + 1e-9 * np.trace(matrix) * np.eye(len(matrix)), right))
 
 
-def _onto(one: Surface, other: Surface, start: Rigid3, distance_mm: float) -> _Step:
+def _onto(
+    one: Surface | SurfacePoints,
+    other: Surface,
+    start: Rigid3,
+    distance_mm: float,
+    reaches: Sequence[float] = _REACHES,
+) -> _Step:
     """Lay a surface onto another one, from a pose nearby."""
     pose, least_mm = start, _LEAST_SIGMA * distance_mm
-    for reach in _REACHES:
+    for reach in reaches:
         laid = _lay(one, other, pose, reach * distance_mm, least_mm)
         if laid is None:
             return _Step(pose, None)
         pose = _moved(-_solved(*_equations(laid))) @ pose
-    return _Step(pose, _lay(one, other, pose, _REACHES[-1] * distance_mm, least_mm))
+    return _Step(pose, _lay(one, other, pose, reaches[-1] * distance_mm, least_mm))
 
 
 def _doubt(step: _Step, options: SurfaceTrackingOptions, distance_mm: float) -> str | None:
@@ -272,8 +283,10 @@ def _place(
     reason = "no earlier frame shows any surface"
     for number, earlier in enumerate(list(placed)[::-1]):
         starts = _starts(motion, distance_mm) if number < _BRIEFLY else (Rigid3.identity(),)
-        steps = [_onto(surfaces[earlier], surfaces[frame], start, distance_mm) for start in starts]
-        best = max(steps, key=lambda step: step.rank)
+        one, other = surfaces[earlier], surfaces[frame]
+        some = one.some(options.samples, np.random.default_rng([options.seed, frame]))
+        tried = max((_onto(some, other, start, distance_mm) for start in starts), key=lambda step: step.rank)
+        best = _onto(one, other, tried.this_from_other, distance_mm, _REACHES[-_LAST_STEPS:])
         doubt = _doubt(best, options, distance_mm)
         if doubt is None:
             return best.this_from_other @ placed[earlier], ""
@@ -410,7 +423,17 @@ def track_surfaces(
         rig_from_world={names[frame]: pose for frame, pose in zip(placed, poses, strict=True)},
         dropped=(*capture.left_out, *dropped),
         log={"surface_scatter_um": 1000 * scatter_mm},
-        notes=(_HELD, *_lost(names, placed)),
+        notes=(_HELD, *_glare(capture.handpiece), *_lost(names, placed)),
+    )
+
+
+def _glare(handpiece: Handpiece) -> tuple[str, ...]:
+    """Whether mirror reflections may have deceived the cameras."""
+    if handpiece.lights and all(light.glare <= _LITTLE_GLARE for light in handpiece.lights.values()):
+        return ()
+    return (
+        "depth: as far as the handpiece file tells (glare of each light), there are no crossed polarisers: mirror "
+        "reflections of wet teeth put the surface 0.1 mm off (mean) and more in simulation; use polarisers or powder",
     )
 
 

@@ -33,8 +33,8 @@ from cuspid.stereo.rectification import IdealView
 from cuspid.stereo.refinement import FAST, GroupGeometry, solve
 
 _BURNT_DN, _DARK_DN, _UNUSABLE = 252, 16, np.float32(-1)
-"""A channel from the first level on is burnt out, a pixel whose channels all lie below the second shows nothing: darkness
-looks alike everywhere. Both have the last value among those that are compared."""
+"""A channel from the first level on is burnt out, a pixel whose channels all lie below the second shows nothing:
+darkness looks alike everywhere. Both have the last value among those that are compared."""
 _LEAST_SHARE = 0.5
 """Share of a window that another camera must see for it to be compared."""
 _STRIDE = 2

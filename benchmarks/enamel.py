@@ -1,0 +1,105 @@
+"""Scan teeth of plain wet enamel, without texture, under lights of three colours or what a handpiece has instead.
+
+    python benchmarks/enamel.py FOLDER [--work build/enamel] [--only phantom] [--add]
+
+FOLDER holds labelled meshes of real jaws. Each case is one tooth with what is seen around it, 10 frames or more of
+twelve cameras; the variants take away one ingredient at a time. Finished scans are kept in the work folder and not run
+again; ``--add`` keeps those of the result file, too, each with the commit that it is of.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from jaws import is_asked, scanned
+from run import conditions
+
+from cuspid.anatomy.jaw_files import load_jaw
+from cuspid.anatomy.phantom.build import build_phantom
+from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.handpiece.designs import DesignOptions, twelve_cameras
+from cuspid.jaw import Jaw
+from cuspid.rig import Handpiece
+from cuspid.simulation.path.scan import ScanPathOptions
+from cuspid.simulation.stage import SimulationOptions
+from cuspid.storage import read_json, write_json
+from cuspid.studies.grid import Case, Value, run_grid
+from cuspid.studies.scan_cases import commit
+
+HERE = Path(__file__).parent
+PHANTOMS = {0: 46, 1: 36, 2: 46}
+"""Tooth by seed of a lower jaw."""
+REAL = {"005_upper": 11, "010_upper": 16, "023_lower": 36, "034_upper": 21, "048_lower": 43}
+VARIANTS = ("glossy", "white-crossed", "white")
+"""Colour-coded without polarisers; white with them; white without: of the phantom of seed 0."""
+
+
+def cases(folder: Path) -> Iterator[Case]:
+    """All that is scanned."""
+    for seed, tooth in PHANTOMS.items():
+        yield Case(name=f"phantom-{seed}", parameters={"jaw": str(seed), "tooth": tooth, "light": "coded"})
+    for light in VARIANTS:
+        yield Case(name=f"phantom-0-{light}", parameters={"jaw": "0", "tooth": PHANTOMS[0], "light": light})
+    for name, tooth in REAL.items():
+        file = next(iter(folder.rglob(f"{name}.ply")), None)
+        if file is not None:
+            yield Case(name=name, parameters={"jaw": str(file), "tooth": tooth, "light": "coded"})
+
+
+def lit(light: str) -> Handpiece:
+    """The twelve cameras under one kind of light."""
+    coded = light in ("coded", "glossy")
+    made = twelve_cameras(DesignOptions(lights="colour-coded" if coded else "white"))
+    glare = {"glossy": 1.0, "white-crossed": 0.03}.get(light)
+    if glare is None:
+        return made
+    return replace(made, lights={name: replace(each, glare=glare) for name, each in made.lights.items()})
+
+
+def jaw_of(name: str) -> Jaw:
+    """A phantom by its seed, or a file."""
+    if name.isdigit():
+        return build_phantom(PhantomOptions(arch="lower", seed=int(name)))
+    return load_jaw(Path(name), arch="upper" if "upper" in name else "lower")[0]
+
+
+def judge(*, jaw: str, tooth: int, light: str) -> dict[str, Value]:
+    """The figures of one scan."""
+    begin = time.perf_counter()
+    with tempfile.TemporaryDirectory(prefix="cuspid-enamel-") as folder:
+        options = SimulationOptions(texture="enamel", path=ScanPathOptions(tooth=tooth))
+        found = scanned(jaw_of(jaw), lit(light), Path(folder), options)
+    return {"commit": commit(), **found, "wall_s": time.perf_counter() - begin}
+
+
+def main() -> None:
+    """Scan what is asked for and write the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--work", type=Path, default=Path("build/enamel"))
+    parser.add_argument("--out", type=Path, default=HERE / "results" / "enamel.json")
+    parser.add_argument("--only", nargs="*", help="names of cases or parts of them; default: all")
+    parser.add_argument("--add", action="store_true", help="to what the result file holds of other scans")
+    arguments = parser.parse_args()
+    known = list(cases(arguments.folder))
+    chosen = [each for each in known if arguments.only is None or is_asked(each.name, arguments.only, known)]
+    outcomes = run_grid(
+        chosen,
+        judge,
+        arguments.work,
+        workers=1,
+        progress=lambda stage, done, total: print(f"{stage}: {done} of {total}", flush=True),
+    )
+    before = read_json(arguments.out)["scans"] if arguments.add and arguments.out.exists() else {}
+    scans = before | {each.case.name: {**each.figures, "failure": each.failure} for each in outcomes}
+    ordered = {each.name: scans[each.name] for each in known if each.name in scans}
+    write_json(arguments.out, {"scans": ordered, **conditions()})
+
+
+if __name__ == "__main__":
+    main()

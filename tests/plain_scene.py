@@ -1,0 +1,68 @@
+"""A plain surface under a handpiece with a red, a green and a blue light, rendered without any texture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from cuspid.capture import Capture, Frame
+from cuspid.geometry import Rigid3
+from cuspid.jaw import Jaw
+from cuspid.mesh import Mesh
+from cuspid.rig import Handpiece, Light, Lighting, Sensor
+from cuspid.simulation.appearance import APPEARANCES
+from cuspid.simulation.raycast import Scene, auto_gain, render_image
+from synthetic_scene import diamond, height_field
+from test_any_rig import InMemory
+
+SIZE_PX = 160
+HILLS = height_field(lambda x, y: 5 + 0.4 * np.sin(1.8 * x) * np.cos(1.5 * y), half_width_mm=7.0)
+WAY = {
+    f"{k:05d}": Rigid3.from_rotation_vector(np.array([0.01, -0.015, 0.02]) * k, np.array([-0.6, 0.1, 0.03]) * k)
+    for k in range(4)
+}
+
+
+def lit(*, glare: float = 0.0, sensors: Mapping[str, Sensor] | None = None) -> Handpiece:
+    """Four cameras within a ring of three lights."""
+    turns = np.deg2rad([90, 210, 330])
+    lights = {
+        name: Light(
+            position_mm=3 * np.array([np.cos(turn), np.sin(turn), 0.0]),
+            direction=np.array([0, 0, 1.0]),
+            colour=colour,
+            glare=glare,
+        )
+        for name, turn, colour in zip("rgb", turns, np.eye(3), strict=True)
+    }
+    all_of_them = (Lighting(name="all", lights=tuple(lights)),)
+    return replace(diamond(SIZE_PX), lights=lights, lightings=all_of_them, sensors=sensors or {})
+
+
+def photographs(
+    handpiece: Handpiece, way: Mapping[str, Rigid3], mesh: Mesh = HILLS
+) -> dict[tuple[str, str], np.ndarray]:
+    """By frame and camera."""
+    scene = Scene(jaw=Jaw(mesh=mesh), handpiece=handpiece, appearance=APPEARANCES["enamel"], supersampling=1)
+    gain = auto_gain(scene, [next(iter(way.values()))])
+    return {
+        (frame, camera): render_image(scene, Frame(name=frame, cameras=handpiece.rig.names), camera, pose, gain)
+        for frame, pose in way.items()
+        for camera in handpiece.rig.names
+    }
+
+
+def capture_of(handpiece: Handpiece, images: Mapping[tuple[str, str], np.ndarray]) -> Capture:
+    names = dict.fromkeys(frame for frame, _ in images)
+    frames = tuple(Frame(name=name, cameras=handpiece.rig.names) for name in names)
+    return Capture(handpiece=handpiece, frames=frames, source=InMemory(images))
+
+
+@cache
+def plain_scan() -> Capture:
+    """Four frames over plain hills."""
+    handpiece = lit()
+    return capture_of(handpiece, photographs(handpiece, WAY))

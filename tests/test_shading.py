@@ -1,0 +1,128 @@
+"""Depth from light and shade: right on plain surfaces, and silent where there is nothing to compare."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cuspid.geometry import Rigid3
+from cuspid.reconstruction import DepthMap
+from cuspid.rig import Handpiece, Sensor
+from cuspid.stereo.matching import DepthEstimator, StereoOptions
+from cuspid.stereo.signal import detail_dn, signal_of
+from plain_scene import HILLS, WAY, capture_of, lit, photographs, plain_scan
+from synthetic_scene import cast_depth
+from test_any_rig import times
+
+FRAME = {"00000": Rigid3.identity()}
+OPTIONS = StereoOptions(spacing_px=4)
+
+
+def measured(handpiece: Handpiece, images: Mapping[str, np.ndarray]) -> tuple[DepthMap, ...]:
+    return DepthEstimator(handpiece, OPTIONS, signal="shading").measure(images, "00000")
+
+
+def of_one_frame(images: Mapping[tuple[str, str], np.ndarray]) -> dict[str, np.ndarray]:
+    return {camera: image for (frame, camera), image in images.items() if frame == "00000"}
+
+
+def errors_um(maps: Sequence[DepthMap]) -> np.ndarray:
+    """All errors of known depths; the world is the rig frame."""
+    off = [1000 * (each.depth_mm - cast_depth(HILLS, each.camera, each.cam_from_rig))[each.known] for each in maps]
+    return np.concatenate(off)
+
+
+def known_share(maps: Sequence[DepthMap]) -> float:
+    return float(np.mean([each.known.mean() for each in maps]))
+
+
+@pytest.fixture(scope="module")
+def images() -> dict[str, np.ndarray]:
+    return of_one_frame({key: plain_scan().source.read(*key) for key in [("00000", n) for n in lit().rig.names]})
+
+
+def test_plain_hills_are_measured(images: dict[str, np.ndarray]) -> None:
+    maps = measured(lit(), images)
+    errors = errors_um(maps)
+    assert known_share(maps) > 0.6
+    assert 2 < np.median(np.abs(errors)) < 40
+    assert abs(np.median(errors)) < 15
+    assert np.mean(np.abs(errors) > 200) < 0.02
+
+
+def test_texture_cannot_measure_them(images: dict[str, np.ndarray]) -> None:
+    assert known_share(DepthEstimator(lit(), OPTIONS).measure(images, "00000")) < 0.05
+
+
+@pytest.mark.parametrize("factor", [0.1, 1000.0])
+def test_all_lengths_scale_with_the_rig(images: dict[str, np.ndarray], factor: float) -> None:
+    one, other = measured(lit(), images), measured(times(lit(), factor), images)
+    for here, there in zip(one, other, strict=True):
+        assert np.mean(here.known != there.known) < 0.01
+        both = here.known & there.known
+        assert there.depth_mm[both] == pytest.approx(factor * here.depth_mm[both], rel=1e-3)
+
+
+def test_nothing_is_found_in_the_dark(images: dict[str, np.ndarray]) -> None:
+    rng = np.random.default_rng(0)
+    dark = {name: rng.integers(0, 8, image.shape).astype(np.uint8) for name, image in images.items()}
+    assert known_share(measured(lit(), dark)) == 0
+
+
+def test_a_channel_that_burnt_out_is_not_compared(images: dict[str, np.ndarray]) -> None:
+    burnt = {name: image.copy() for name, image in images.items()}
+    for image in burnt.values():
+        image[..., 0] = 255
+    maps = measured(lit(), burnt)
+    assert known_share(maps) > 0.4
+    assert np.median(np.abs(errors_um(maps))) < 60
+
+
+def test_gains_are_corrected_where_they_are_known() -> None:
+    gains = dict(zip(lit().rig.names, (0.8, 1.0, 1.1, 0.9), strict=True))
+    uneven = {name: Sensor(gain=gain, falloff=(-0.2, -0.1)) for name, gain in gains.items()}
+    images = of_one_frame(photographs(lit(sensors=uneven), FRAME))
+    known, unknown = measured(lit(sensors=uneven), images), measured(lit(), images)
+    assert known_share(known) > 0.6
+    assert np.median(np.abs(errors_um(known))) < 40
+    assert known_share(unknown) < 0.5 * known_share(known)
+
+
+def test_mirror_reflections_make_it_worse(images: dict[str, np.ndarray]) -> None:
+    glossy = measured(lit(glare=1.0), of_one_frame(photographs(lit(glare=1.0), FRAME)))
+    plain = np.abs(errors_um(measured(lit(), images)))
+    assert np.mean(np.abs(errors_um(glossy))) > 1.3 * np.mean(plain)
+
+
+def test_the_order_of_the_cameras_decides_nothing(images: dict[str, np.ndarray]) -> None:
+    handpiece = lit()
+    rig = replace(handpiece.rig, cameras=dict(reversed(list(handpiece.rig.cameras.items()))))
+    one = {each.camera_name: each for each in measured(handpiece, images)}
+    other = {each.camera_name: each for each in measured(replace(handpiece, rig=rig), images)}
+    assert one.keys() == other.keys()
+    for name, depth_map in one.items():
+        assert np.array_equal(depth_map.depth_mm, other[name].depth_mm, equal_nan=True)
+
+
+def test_plain_images_are_told_from_textured_ones() -> None:
+    rng = np.random.default_rng(1)
+    capture = plain_scan()
+    assert signal_of(capture) == "shading"
+    speckled = {}
+    for frame in WAY:
+        for name in capture.handpiece.rig.names:
+            image = capture.source.read(frame, name).astype(float)
+            speckle = np.kron(rng.normal(0, 12, (40, 40, 1)), np.ones((4, 4, 1)))
+            speckled[frame, name] = np.clip(image + speckle, 0, 255).astype(np.uint8)
+    assert signal_of(capture_of(capture.handpiece, speckled)) == "texture"
+
+
+def test_noise_is_no_texture() -> None:
+    noise = np.random.default_rng(2).normal(120, 4.0, (200, 200))
+    found = detail_dn(np.clip(noise, 0, 255).astype(np.uint8))
+    assert found is not None
+    assert 0.1 < found < 0.7
+    assert detail_dn(np.zeros((200, 200), np.uint8)) is None

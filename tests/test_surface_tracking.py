@@ -1,0 +1,147 @@
+"""Frames located by their surfaces: where they were, or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cuspid.capture import Capture, Frame
+from cuspid.errors import ReconstructionError
+from cuspid.geometry import Rigid3
+from cuspid.mesh import Mesh
+from cuspid.motion.surface_tracking import SurfaceTrackingOptions, track_surfaces
+from cuspid.reconstruction import DepthMap, Reconstruction
+from cuspid.rig import Handpiece
+from cuspid.stereo.matching import coarser
+from plain_scene import SIZE_PX
+from synthetic_scene import cast_depth, diamond, height_field
+from test_any_rig import InMemory, times
+
+HILLS = height_field(
+    lambda x, y: 5 + 0.5 * np.sin(1.8 * x) * np.cos(1.5 * y + 0.3 * x) + 0.3 * np.sin(0.7 * x + 0.13 * x * x - y),
+    half_width_mm=14.0,
+)
+STEP = np.array([0.008, -0.01, 0.012]), np.array([-0.6, 0.1, 0.03])
+OUT = {f"{k:05d}": Rigid3.from_rotation_vector(STEP[0] * k, STEP[1] * k) for k in range(6)}
+NOISE_MM = 0.015
+
+
+def capture_of(handpiece: Handpiece, names: Sequence[str]) -> Capture:
+    frames = tuple(Frame(name=name, cameras=handpiece.rig.names) for name in names)
+    return Capture(handpiece=handpiece, frames=frames, source=InMemory({}))
+
+
+def depth_maps(way: Mapping[str, Rigid3], mesh: Mesh = HILLS, noise_mm: float = NOISE_MM) -> list[DepthMap]:
+    rng, made = np.random.default_rng(0), []
+    for frame, pose in way.items():
+        for name, mounted in diamond(SIZE_PX).rig.cameras.items():
+            grid = coarser(mounted.camera, 2)
+            depth = cast_depth(mesh, grid, mounted.cam_from_rig @ pose) + rng.normal(0, noise_mm, (80, 80))
+            known = np.isfinite(depth).astype(np.float32)
+            made.append(
+                DepthMap(
+                    frame=frame,
+                    camera_name=name,
+                    camera=grid,
+                    cam_from_rig=mounted.cam_from_rig,
+                    depth_mm=depth.astype(np.float32),
+                    confidence=known,
+                )
+            )
+    return made
+
+
+def tracked(maps: Sequence[DepthMap], options: SurfaceTrackingOptions = SurfaceTrackingOptions()) -> Reconstruction:
+    names = list(dict.fromkeys(each.frame for each in maps))
+    return track_surfaces(capture_of(diamond(SIZE_PX), names), maps, options)
+
+
+def errors_um(found: Reconstruction, way: Mapping[str, Rigid3]) -> np.ndarray:
+    """Of the centres, relative to the first frame."""
+    first = way[found.frames[0]]
+    true = {name: (way[name] @ first.inverse()).inverse().translation for name in found.frames}
+    off = [found.rig_from_world[name].inverse().translation - true[name] for name in found.frames]
+    return 1000 * np.linalg.norm(off, axis=1)
+
+
+def test_a_path_is_found_from_surfaces() -> None:
+    found = tracked(depth_maps(OUT))
+    assert found.frames == tuple(OUT)
+    assert found.rig_from_world["00000"].matrix == pytest.approx(np.eye(4), abs=1e-12)
+    worst = errors_um(found, OUT).max()
+    assert 0.1 < worst < 15
+    assert 10 < found.log["surface_scatter_um"] < 25
+
+
+def test_exact_surfaces_give_an_exact_path() -> None:
+    assert errors_um(tracked(depth_maps(OUT, noise_mm=0.0)), OUT).max() < 2
+
+
+def test_a_path_that_comes_back_is_closed() -> None:
+    back = OUT | {f"{5 + k:05d}": OUT[f"{5 - k:05d}"] for k in range(1, 6)}
+    assert errors_um(tracked(depth_maps(back)), back)[-1] < 8
+
+
+@pytest.mark.parametrize("factor", [0.1, 100.0])
+def test_all_lengths_scale(factor: float) -> None:
+    maps = depth_maps(OUT)
+    one = tracked(maps)
+    larger = times(diamond(SIZE_PX), factor)
+    scaled = [
+        replace(
+            each,
+            depth_mm=(factor * each.depth_mm).astype(np.float32),
+            cam_from_rig=larger.rig[each.camera_name].cam_from_rig,
+        )
+        for each in maps
+    ]
+    other = track_surfaces(capture_of(larger, list(OUT)), scaled)
+    for name in OUT:
+        there = other.rig_from_world[name].translation / factor
+        assert there == pytest.approx(one.rig_from_world[name].translation, abs=2e-3)
+
+
+def test_frames_that_show_nothing_or_something_else_are_left_out() -> None:
+    maps = depth_maps(OUT)
+    nothing = [
+        replace(each, confidence=np.zeros_like(each.confidence)) if each.frame == "00002" else each for each in maps
+    ]
+    rng = np.random.default_rng(4)
+    strange = [
+        replace(each, depth_mm=rng.uniform(4, 6, each.depth_mm.shape).astype(np.float32))
+        if each.frame == "00004"
+        else each
+        for each in nothing
+    ]
+    found = tracked(strange)
+    assert set(OUT) - set(found.frames) == {"00002", "00004"}
+    assert {each.what for each in found.dropped} == {"frame 00002", "frame 00004"}
+    assert any("tracking was lost at 2 of 6 frames (00002, 00004)" in note for note in found.notes)
+    assert errors_um(found, OUT).max() < 15
+
+
+def test_tracking_goes_on_where_the_surface_is_seen_again() -> None:
+    away = Rigid3(np.eye(3), np.array([0.0, 30.0, 0.0]))  # beside the surface
+    way = {**OUT, "00003": away, "00004": away}
+    found = tracked(depth_maps(way))
+    assert found.frames == ("00000", "00001", "00002", "00005")
+    assert errors_um(found, way).max() < 15
+
+
+def test_a_plane_holds_nothing_in_place() -> None:
+    plane = height_field(lambda x, y: 5 + 0 * x, half_width_mm=14.0)
+    with pytest.raises(ReconstructionError, match=r"only 1 of 6 frames could be placed .* too flat"):
+        tracked(depth_maps(OUT, plane))
+
+
+def test_a_lone_frame_is_where_it_is() -> None:
+    found = tracked(depth_maps({"00000": Rigid3.identity()}))
+    assert found.frames == ("00000",)
+    assert found.notes  # the calibration is held
+
+
+def test_lights_without_polarisers_are_doubted() -> None:
+    assert any("polaris" in note for note in tracked(depth_maps({"00000": Rigid3.identity()})).notes)
