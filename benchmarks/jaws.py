@@ -175,7 +175,7 @@ def scanned(jaw: Jaw, handpiece: Handpiece, folder: Path, options: SimulationOpt
         "reconstruction_s": took,
         "reconstruction_cpu_s": took_cpu,
         "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
-        "path_crowns_seen": float(read_json(folder / "truth" / "path.json")["crowns_seen"]["all"]),
+        "path_crowns_seen": read_json(folder / "truth" / "path.json")["crowns_seen"].get("all"),
     }
 
 

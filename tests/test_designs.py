@@ -161,6 +161,21 @@ def test_six_are_the_four_and_one_more_on_either_side(options: DesignOptions) ->
 
 
 @pytest.mark.parametrize("name", DESIGNS)
+def test_colour_coded_lights_ring_each_group_of_the_same_cameras(name: str) -> None:
+    white, coded = (DESIGNS[name](DesignOptions(lights=lights)) for lights in ("white", "colour-coded"))
+    assert coded.rig.names == white.rig.names
+    for light_name, light in coded.lights.items():
+        group = white.rig[f"{light_name[0]}1"], white.rig[f"{light_name[0]}2"]
+        middle = np.mean([each.centre_in_rig for each in group], axis=0)
+        assert np.linalg.norm(light.position_mm - middle) == pytest.approx(DesignOptions().ring_mm)
+        np.testing.assert_allclose(light.direction, group[0].axis_in_rig, atol=1e-12)
+        assert "rgb"[int(np.argmax(light.colour))] == light_name[1]
+        assert 0 < light.glare < 0.1
+    assert len(coded.lights) == 3 * len({each[0] for each in coded.rig.names})
+    assert set(coded.lightings[0].lights) == set(coded.lights)
+
+
+@pytest.mark.parametrize("name", DESIGNS)
 def test_designs_are_symmetric(name: str) -> None:
     handpiece = DESIGNS[name](DesignOptions(outer_tilt_deg=20.0))
     mirrored = np.array([1, -1, 1])

@@ -213,6 +213,28 @@ def test_gloss_depends_on_the_direction_of_view_and_matte_does_not() -> None:
     assert 0.9 < at(glossy_image, CAMERA, beside) / at(matte_image, CAMERA, beside) < 1.0
 
 
+@pytest.mark.parametrize("share", [0.0, 0.03, 0.5])
+def test_crossed_polarisers_let_a_share_of_the_mirror_reflection_through(share: float) -> None:
+    jaw = jaw_of(quad((0, 0, 5.0), 50.0))
+    glossy = Appearance(enamel=replace(WHITE, reflectance=0.05, roughness=0.1), gum=BLACK)
+    none, some, whole = (light_seen(jaw, probe(led(x=2.0, glare=glare)), glossy) for glare in (0.0, share, 1.0))
+    mirror = (1.0, 0.0, 5.0)
+    gloss = at(whole, CAMERA, mirror) - at(none, CAMERA, mirror)
+    assert gloss > 0.3 * at(none, CAMERA, mirror)
+    assert at(some, CAMERA, mirror) - at(none, CAMERA, mirror) == pytest.approx(share * gloss, abs=1e-6)
+
+
+def test_exposure_is_metered_by_the_brightest_channel_under_coloured_lights() -> None:
+    jaw, poses = jaw_of(quad((0, 0, 5.0), 50.0)), [Rigid3.identity()]
+
+    def gain(*lights: Light) -> float:
+        return auto_gain(Scene(jaw=jaw, handpiece=probe(*lights), appearance=PLAIN), poses, "all")
+
+    red, green = (replace(led(), colour=colour) for colour in (np.array([1.0, 0, 0]), np.array([0, 0.5, 0])))
+    assert gain(red) == pytest.approx(gain(led()))
+    assert gain(red, green) == pytest.approx(gain(red), rel=1e-3)
+
+
 # --- texture ------------------------------------------------------------------------------------------------------
 
 

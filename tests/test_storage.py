@@ -112,6 +112,20 @@ def test_a_missing_file_is_named(tmp_path):
         storage.read_mesh(tmp_path / "jaw.stl")
 
 
+def test_polarised_lights_return_and_plain_ones_are_written_as_before(tmp_path):
+    plain = handpiece("x")
+    polarised = dataclasses.replace(plain.lights["led"], glare=0.03)
+    file = tmp_path / "handpiece.json"
+    storage.write_handpiece(file, dataclasses.replace(plain, lights={"led": polarised}))
+    assert storage.read_handpiece(file).lights["led"].glare == 0.03
+    file.write_text(file.read_text().replace("0.03", "1.5"))
+    with pytest.raises(InputError, match=r"light 'led': glare is 1\.5"):
+        storage.read_handpiece(file)
+    storage.write_handpiece(file, plain)
+    assert "glare" not in file.read_text()
+    assert storage.read_handpiece(file).lights["led"].glare == 1
+
+
 @given(camera=cameras(), transform=rigid3s(), other=rigid3s())
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25, deadline=None)
 def test_handpiece_and_rig_config_return(tmp_path, camera, transform, other):
