@@ -122,6 +122,7 @@ def reconstruct(
 ) -> tuple[Reconstruction, Mesh]:
     """Reconstruct poses and a mesh from images and calibration. With a COLMAP model, its poses are taken instead of
     found."""
+    options = replace(options, signal=matched(capture, options))
     found = find_poses(capture, folder, options, colmap_model=colmap_model, progress=progress)
     return found, surface(capture, found, folder, options, progress=progress)[0]
 

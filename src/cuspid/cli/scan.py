@@ -133,8 +133,8 @@ def _reconstruct(capture: Capture, out: Path, options: ReconstructionOptions, mo
     settings = {"reconstruction": options, "from_poses": model}
     inputs = storage.hash_capture(capture) | ({} if model is None else {"poses": hash_model(model)})
     with storage.claimed_folder(out, "reconstruct", settings, inputs):
-        signal = pipeline.matched(capture, options)
-        if signal == "shading":
+        options = replace(options, signal=pipeline.matched(capture, options))
+        if options.signal == "shading":
             console.print(
                 "the images show no texture: their light and shade are matched, and the frames are located by their "
                 "surfaces (--signal texture for the other way)"
