@@ -12,7 +12,7 @@ from cuspid.capture import Capture, Frame
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
-from cuspid.motion.surface_tracking import SurfaceTrackingOptions, track_surfaces
+from cuspid.motion.surface_tracking import SurfaceTrackingOptions, _onto, surface_of, track_surfaces
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece
 from cuspid.stereo.matching import coarser
@@ -141,6 +141,15 @@ def test_a_lone_frame_is_where_it_is() -> None:
     found = tracked(depth_maps({"00000": Rigid3.identity()}))
     assert found.frames == ("00000",)
     assert found.notes  # the calibration is held
+
+
+def test_rounding_does_not_add_up_along_a_path() -> None:
+    options = SurfaceTrackingOptions()
+    maps = depth_maps(dict(list(OUT.items())[:2]))
+    one, other = (surface_of([m for m in maps if m.frame == name], 5.0, options) for name in ("00000", "00001"))
+    off = Rigid3(OUT["00001"].rotation @ (np.eye(3) + 4e-7 * np.eye(3)[::-1]), OUT["00001"].translation)
+    found = _onto(one, other, off, 5.0).this_from_other.rotation
+    np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-12)
 
 
 def test_lights_without_polarisers_are_doubted() -> None:

@@ -238,6 +238,8 @@ def _onto(
         if laid is None:
             return _Step(pose, None)
         pose = _moved(-_solved(*_equations(laid))) @ pose
+    # A start that was made of other poses is a rotation only up to rounding, which would double from frame to frame.
+    pose = Rigid3.from_rotation_vector(pose.rotation_vector, pose.translation)
     return _Step(pose, _lay(one, other, pose, reaches[-1] * distance_mm, least_mm))
 
 

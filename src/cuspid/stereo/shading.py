@@ -74,9 +74,7 @@ class ShadingOptions(Options):
     """A camera whose brightness differs by more (RMS over the window, digital numbers) sees something else."""
     camera_lag_dn: Annotated[float, Range(0, 255)] = 2.0
     """A camera whose difference exceeds the best one's by more sees something else."""
-    confidence: ConfidenceOptions = field(
-        default_factory=lambda: ConfidenceOptions(agreement=4.0, largest_sigma=3.0, best_sigma=0.5)
-    )
+    confidence: ConfidenceOptions = field(default_factory=lambda: ConfidenceOptions(agreement=4.0, largest_sigma=1.5))
     """Checks and weights. Shade is broad: the limits are wider than those for texture."""
 
     @property
