@@ -12,7 +12,7 @@ from cuspid.capture import Capture, Frame
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
-from cuspid.motion.surface_tracking import SurfaceTrackingOptions, _onto, surface_of, track_surfaces
+from cuspid.motion.surface_tracking import SurfaceTrackingOptions, _drift, _onto, surface_of, track_surfaces
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece
 from cuspid.stereo.matching import coarser
@@ -140,7 +140,16 @@ def test_a_plane_holds_nothing_in_place() -> None:
 def test_a_lone_frame_is_where_it_is() -> None:
     found = tracked(depth_maps({"00000": Rigid3.identity()}))
     assert found.frames == ("00000",)
-    assert found.notes  # the calibration is held
+    assert any("calibration" in note for note in found.notes)
+
+
+def test_a_long_path_is_said_to_drift() -> None:
+    def drifts(step_mm: float) -> bool:
+        poses = [Rigid3(np.eye(3), np.array([step_mm * k, 0, 0])) for k in range(20)]
+        return bool(_drift(poses, 5.0))
+
+    assert drifts(2.0)
+    assert not drifts(0.5)
 
 
 def test_rounding_does_not_add_up_along_a_path() -> None:

@@ -55,9 +55,11 @@ _LITTLE_GLARE = 0.1
 _CONVERGED = 2e-6
 """Step of the joint adjustment, as a share of the working distance, that ends it."""
 _HELD = (
-    "motion: the frames were located by their surfaces, which do not refine the calibration: it is taken as exact, and "
-    "an error of it is in the result"
+    "motion: the frames were located by their surfaces, which do not refine the calibration: it is taken as exact; an "
+    "error of it, or of the path, is in the result, but not in the sigmas of its vertices"
 )
+_LONG = 5.0
+"""Length of a path, in working distances, from which on its drift is seen."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -425,7 +427,19 @@ def track_surfaces(
         rig_from_world={names[frame]: pose for frame, pose in zip(placed, poses, strict=True)},
         dropped=(*capture.left_out, *dropped),
         log={"surface_scatter_um": 1000 * scatter_mm},
-        notes=(_HELD, *_glare(capture.handpiece), *_lost(names, placed)),
+        notes=(_HELD, *_drift(poses, distance_mm), *_glare(capture.handpiece), *_lost(names, placed)),
+    )
+
+
+def _drift(poses: Sequence[Rigid3], distance_mm: float) -> tuple[str, ...]:
+    """Whether the path is so long that small errors from frame to frame matter."""
+    centres = np.array([pose.inverse().translation for pose in poses])
+    extent_mm = float(np.linalg.norm(np.ptp(centres, axis=0)))
+    if extent_mm < _LONG * distance_mm:
+        return ()
+    return (
+        f"motion: over {extent_mm:.0f} mm, small errors from surface to surface add up: in simulation a whole arch comes "
+        "out bent by 0.1 mm at its ends; go over it again, across its middle, and do not rely on distances across it",
     )
 
 
