@@ -438,8 +438,8 @@ def _drift(poses: Sequence[Rigid3], distance_mm: float) -> tuple[str, ...]:
     if extent_mm < _LONG * distance_mm:
         return ()
     return (
-        f"motion: over {extent_mm:.0f} mm, small errors from surface to surface add up: in simulation a whole arch comes "
-        "out bent by 0.1 mm at its ends; go over it again, across its middle, and do not rely on distances across it",
+        f"motion: over {extent_mm:.0f} mm, small errors from surface to surface add up: in simulation a whole arch "
+        "comes out 0.13 mm too wide at the molars; do not rely on distances across it",
     )
 
 
