@@ -12,6 +12,7 @@ from cuspid.geometry import Rigid3
 from cuspid.reconstruction import DepthMap
 from cuspid.rig import Handpiece, Sensor
 from cuspid.stereo.matching import DepthEstimator, StereoOptions
+from cuspid.stereo.shading import ShadingOptions
 from cuspid.stereo.signal import detail_dn, signal_of
 from plain_scene import HILLS, WAY, capture_of, lit, photographs, plain_scan
 from synthetic_scene import cast_depth
@@ -95,6 +96,18 @@ def test_mirror_reflections_make_it_worse(images: dict[str, np.ndarray]) -> None
     glossy = measured(lit(glare=1.0), of_one_frame(photographs(lit(glare=1.0), FRAME)))
     plain = np.abs(errors_um(measured(lit(), images)))
     assert np.mean(np.abs(errors_um(glossy))) > 1.3 * np.mean(plain)
+
+
+@pytest.mark.parametrize(
+    "shading", [{"sweep_spacing": 100}, {"sweep_step_px": 100.0}, {"radius_px": 1}, {"radius_px": 7}]
+)
+def test_extreme_options_give_fewer_depths_not_an_error(
+    images: dict[str, np.ndarray], shading: dict[str, float]
+) -> None:
+    options = replace(OPTIONS, shading=ShadingOptions(**shading))
+    maps = DepthEstimator(lit(), options, signal="shading").measure(images, "00000")
+    assert len(maps) == 4
+    assert np.sum(np.abs(errors_um(maps)) > 200) <= 0.05 * len(errors_um(maps))
 
 
 def test_the_order_of_the_cameras_decides_nothing(images: dict[str, np.ndarray]) -> None:

@@ -37,6 +37,8 @@ _BURNT_DN, _DARK_DN, _UNUSABLE = 252, 16, np.float32(-1)
 darkness looks alike everywhere. Both have the last value among those that are compared."""
 _LEAST_SHARE = 0.5
 """Share of a window that another camera must see for it to be compared."""
+_LEAST_PLANES = 3
+"""So many planes have a middle one, with fractions."""
 _STRIDE = 2
 """Distance between the compared pixels of a window."""
 _SMOOTH_PX = 4.0
@@ -49,7 +51,7 @@ _SLANT_DAMPING = 3.0
 class ShadingOptions(Options):
     """Depth of plain surfaces, from their light and shade."""
 
-    sweep_step_px: Annotated[float, Range(0.1, 100)] = 2.0
+    sweep_step_px: Annotated[float, Range(0.5, 100)] = 2.0
     """Distance between the planes that are swept, in px of disparity of the widest pair."""
     sweep_spacing: Annotated[int, Range(1, 100)] = 2
     """The planes are swept at every n-th pixel of the depth map, in each direction."""
@@ -80,7 +82,8 @@ class ShadingOptions(Options):
     @property
     def window(self) -> Float32[np.ndarray, "k k"]:
         """Weights of the window of the refinement, at every second pixel: the images are smooth."""
-        offsets = np.arange(-self.radius_px, self.radius_px + 1, _STRIDE)
+        steps = self.radius_px // _STRIDE
+        offsets = _STRIDE * np.arange(-steps, steps + 1)
         return np.exp(-0.5 * (offsets[:, None] ** 2 + offsets**2) / self.window_sigma_px**2).astype(np.float32)
 
 
@@ -391,8 +394,9 @@ def shaded_depth(
     view = _View(blurred, reference, geometry.infinite, geometry.parallax, geometry.others)
     rows, columns = (_every(count, spacing_px) for count in size)
     lowest, highest = (geometry.scale / depth for depth in reversed(depth_range_mm))
-    planes = np.arange(lowest, highest + options.sweep_step_px, options.sweep_step_px)
-    every = options.sweep_spacing
+    count = max(int(np.ceil((highest - lowest) / options.sweep_step_px)) + 1, _LEAST_PLANES)
+    planes = lowest + options.sweep_step_px * np.arange(count)
+    every = min(options.sweep_spacing, len(rows), len(columns))
     coarse = _sweep(view, rows[every // 2 :: every], columns[every // 2 :: every], planes, options)
     starts = _carried(coarse, every, rows, columns, spacing_px)
     found = _refine_all(view, _fit(options, lowest, highest), rows, columns, starts)
