@@ -42,6 +42,8 @@ _FIRST_STEPS = (0.0, -0.2, 0.2, -0.4, 0.4)
 """How far the handpiece may have moved at first, along each axis across its view, as shares of the working distance."""
 _LAST_STEPS = 4
 """Steps with all points, once a few have found the place."""
+_FOUND_AGAIN = 0.5
+"""Least overlap with a frame from long ago: smooth parts of two teeth are alike."""
 _TUKEY = 5.0
 """Robust standard deviations beyond which a distance has no weight."""
 _LEAST_SIGMA = 0.0006
@@ -245,10 +247,10 @@ def _onto(
     return _Step(pose, _lay(one, other, pose, reaches[-1] * distance_mm, least_mm))
 
 
-def _doubt(step: _Step, options: SurfaceTrackingOptions, distance_mm: float) -> str | None:
+def _doubt(step: _Step, overlap: float, options: SurfaceTrackingOptions, distance_mm: float) -> str | None:
     """Why a frame must not be placed so; None if it may be."""
     laid = step.laid
-    if laid is None or laid.share < options.minimum_overlap:
+    if laid is None or laid.share < overlap:
         share = 0.0 if laid is None else laid.share
         return f"only {share:.0%} of its surface lies on that of an earlier frame"
     if laid.sigma > options.largest_scatter * distance_mm:
@@ -291,7 +293,8 @@ def _place(
         some = one.some(options.samples, np.random.default_rng([options.seed, frame]))
         tried = max((_onto(some, other, start, distance_mm) for start in starts), key=lambda step: step.rank)
         best = _onto(one, other, tried.this_from_other, distance_mm, _REACHES[-_LAST_STEPS:])
-        doubt = _doubt(best, options, distance_mm)
+        least = options.minimum_overlap if number < _BRIEFLY else max(options.minimum_overlap, _FOUND_AGAIN)
+        doubt = _doubt(best, least, options, distance_mm)
         if doubt is None:
             return best.this_from_other @ placed[earlier], ""
         reason = doubt if number == 0 else reason
