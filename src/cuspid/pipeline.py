@@ -159,12 +159,11 @@ def surface(
     """The mesh, given the poses of the frames (second part of :func:`reconstruct`), and how well each of its vertices
     is known: standard deviation along the normal, um."""
     options = _settled(options)
-    sized = capture.halved() if options.quality == "draft" else capture
+    sized = _sized(replace(capture, handpiece=replace(capture.handpiece, rig=found.rig)), options)
     lengths_mm = detail_mm(sized.handpiece), capture.handpiece.working_distance_mm
     if matched(capture, options) == "shading":
         depths = _shaded_depth(capture, folder, options, progress)
     else:
-        sized = replace(sized, handpiece=replace(sized.handpiece, rig=found.rig))
         depths = _textured_depth(sized, found, lengths_mm[0], folder, options, progress)
     how = options.fusion, options.cleaning
     return fuse(
@@ -179,12 +178,16 @@ def matched(capture: Capture, options: ReconstructionOptions) -> Signal:
     return signal_of(capture) if options.signal == "auto" else options.signal
 
 
+def _sized(capture: Capture, options: ReconstructionOptions) -> Capture:
+    """With images of the size that depth is measured from."""
+    return capture.halved() if options.quality == "draft" else capture
+
+
 def _shaded_depth(
     capture: Capture, folder: Path, options: ReconstructionOptions, progress: Progress
 ) -> StoredDepthMaps:
     """Depth within frames, before anything is known of their poses."""
-    sized = capture.halved() if options.quality == "draft" else capture
-    return measure_depth(sized, folder / "depth", options.stereo, "shading", progress=progress)
+    return measure_depth(_sized(capture, options), folder / "depth", options.stereo, "shading", progress=progress)
 
 
 def _textured_depth(
