@@ -38,6 +38,8 @@ class Material:
     """Fresnel reflectance of the coat at normal incidence; 0 is matte, water 0.02, enamel 0.05."""
     roughness: float = 0.3
     """GGX roughness (alpha) of the coat; small values give a sharp highlight."""
+    exit_index: float = 1.0
+    """Refractive index by which less of the scattered light leaves at grazing angles; 1 is matte."""
     scattering_mm: Colour = (0.0, 0.0, 0.0)
     """How far red, green and blue light travels below the surface; only Blender renders it."""
     applied: bool = False
@@ -87,6 +89,7 @@ APPEARANCES: Mapping[str, Appearance] = MappingProxyType(
                 wavelengths_mm=(2.5, 5.0),
                 reflectance=0.05,
                 roughness=0.09,
+                exit_index=1.5,
                 scattering_mm=(0.5, 0.4, 0.3),
             ),
             gum=Material(
@@ -95,6 +98,7 @@ APPEARANCES: Mapping[str, Appearance] = MappingProxyType(
                 wavelengths_mm=(0.7, 1.4, 2.8),
                 reflectance=0.035,
                 roughness=0.12,
+                exit_index=1.38,
                 scattering_mm=(0.8, 0.25, 0.15),
             ),
         ),
@@ -112,6 +116,9 @@ class Palette(NamedTuple):
     hardness: np.ndarray
     reflectance: np.ndarray
     roughness: np.ndarray
+    saliva: float
+    """Share of the coat that is a film of saliva."""
+    exit_index: np.ndarray
     octaves: np.ndarray
     """Number of octaves of each material."""
     noise_from_jaw: np.ndarray
@@ -129,8 +136,8 @@ def face_materials(jaw: Jaw) -> UInt8[np.ndarray, "f"]:
     return (jaw.face_labels == GUM).astype(np.uint8)
 
 
-def palette(appearance: Appearance, seed: int) -> Palette:
-    """The arrays that the shading needs. ``seed`` selects the texture."""
+def palette(appearance: Appearance, seed: int, saliva: float = 0.0) -> Palette:
+    """The arrays that the shading needs. ``seed`` selects the texture, ``saliva`` is that of :class:`Palette`."""
     materials = (appearance.enamel, appearance.gum)
     rng = np.random.default_rng(seed)
     most = max(len(material.wavelengths_mm) for material in materials)
@@ -145,6 +152,8 @@ def palette(appearance: Appearance, seed: int) -> Palette:
         hardness=np.array([material.hardness for material in materials]),
         reflectance=np.array([material.reflectance for material in materials]),
         roughness=np.array([material.roughness for material in materials]),
+        saliva=saliva,
+        exit_index=np.array([material.exit_index for material in materials]),
         octaves=np.array([len(material.wavelengths_mm) for material in materials]),
         noise_from_jaw=noise_from_jaw,
     )

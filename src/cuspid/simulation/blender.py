@@ -24,6 +24,7 @@ from cuspid.errors import InputError, MissingDependencyError
 from cuspid.geometry import Rigid3, axes_about
 from cuspid.rig import Light, MountedCamera
 from cuspid.simulation.appearance import face_materials
+from cuspid.simulation.optics import IDEAL
 from cuspid.simulation.raycast import Scene, Sink, image_rng, metered_gains
 from cuspid.simulation.sensor import record
 
@@ -56,6 +57,8 @@ def render_with_blender(
     light has a lobe other than Lambert's, which Blender does not offer.
     """
     python = blender_python()
+    if scene.optics != IDEAL:
+        raise InputError("optics: Blender renders ideal ones only; use the renderer embree")
     tasks = [(frame, camera) for frame in frames for camera in frame.cameras if not skip(frame.name, camera)]
     if not tasks:
         return

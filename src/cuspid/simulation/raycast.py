@@ -24,11 +24,13 @@ from cuspid.camera import Camera
 from cuspid.capture import Frame
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.gloss import coat, leaving
 from cuspid.jaw import Jaw
 from cuspid.kernels import kernel
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
 from cuspid.simulation.appearance import NO_MATERIAL, Appearance, Palette, albedo, face_materials, palette
+from cuspid.simulation.optics import IDEAL, Optics, mixed, recorded, through_lens
 from cuspid.simulation.sensor import record
 
 AMBIENT = 0.08
@@ -41,6 +43,9 @@ traced."""
 SAME_SURFACE = 0.03
 """Rays through a pixel whose lengths differ by less than this share hit the same surface (12 um at 5 mm, up to 85
 deg)."""
+
+_FILM_REFLECTANCE, _FILM_ROUGHNESS = 0.02, 0.03
+"""Of a film of saliva (water): Fresnel reflectance at normal incidence, GGX roughness."""
 
 BRIGHT_PERCENTILE, BRIGHT_LEVEL = 98.0, 0.75
 """The exposure puts this percentile of the metered pixels at this share of full scale (linear)."""
@@ -69,6 +74,8 @@ class Scene:
     """Rays per pixel along each side."""
     seed: int = 0
     """Seed of the texture and the sensor noise."""
+    optics: Optics = IDEAL
+    """What lenses, sensors, hands and the mouth do to the images."""
 
     @cached_property
     def surface(self) -> ShadedMesh:
@@ -85,7 +92,7 @@ class Scene:
     @cached_property
     def palette(self) -> Palette:
         """The materials as arrays for the compiled shading."""
-        return palette(self.appearance, self.seed)
+        return palette(self.appearance, self.seed, self.optics.saliva)
 
 
 class ShadedMesh(NamedTuple):
@@ -138,12 +145,41 @@ def render_depth(mesh: Mesh, camera: Camera, cam_from_world: Rigid3) -> Float[np
     return depth.reshape(camera.height, camera.width)
 
 
-def radiance(scene: Scene, camera: Camera, cam_from_world: Rigid3, lights: Lamps) -> Float[np.ndarray, "h w 3"]:
-    """Linear light at each pixel, averaged over the pixel's area; 0 where nothing is hit."""
-    world_from_cam = cam_from_world.inverse()
-    directions = _turned(scene.rays(camera), world_from_cam.rotation)
-    origins = np.broadcast_to(world_from_cam.translation, directions.shape)
+def radiance(
+    scene: Scene, camera: Camera, cam_from_world: Rigid3, lights: Lamps, smear: Float[np.ndarray, "6"] | None = None
+) -> Float[np.ndarray, "h w 3"]:
+    """Linear light at each pixel, averaged over the pixel's area and, with a smear (rotation vector and shift of the
+    jaw in its own frame during the exposure), over time; 0 where nothing is hit."""
+    rays = scene.rays(camera)
+    origins, directions = np.empty_like(rays), np.empty_like(rays)
+    moments = (0.0,) if smear is None else _moments(scene.supersampling**2)
+    for index, moment in enumerate(moments):
+        motion = np.zeros(6) if smear is None else moment * smear
+        world_from_cam = (cam_from_world @ Rigid3.from_rotation_vector(motion[:3], motion[3:])).inverse()
+        directions[index :: len(moments)] = _turned(rays[index :: len(moments)], world_from_cam.rotation)
+        origins[index :: len(moments)] = world_from_cam.translation
     return radiance_along(scene, origins, directions, lights).reshape(camera.height, camera.width, 3)
+
+
+def _moments(count: int) -> Float[np.ndarray, "n"]:
+    """When the rays of a pixel are cast, from -1/2 to 1/2 of the exposure, in another order than that of their
+    places."""
+    in_order = (np.arange(count) + 0.5) / count - 0.5
+    return in_order[np.random.default_rng(count).permutation(count)]
+
+
+def smears(frames: Sequence[Frame], poses: Mapping[str, Rigid3], smear_mm: float) -> dict[str, Float[np.ndarray, "6"]]:
+    """How the jaw moves in its own frame during the exposure of each frame, if the handpiece goes on from the frame
+    before to the next one, and by ``smear_mm``; empty if that is 0."""
+    names = [frame.name for frame in frames]
+    found = {}
+    for index, name in enumerate(names if smear_mm > 0 else []):
+        before, after = poses[names[max(index - 1, 0)]], poses[names[min(index + 1, len(names) - 1)]]
+        motion = before.inverse() @ after
+        way = float(np.linalg.norm(after.inverse().translation - before.inverse().translation))
+        whole = np.concatenate([motion.rotation_vector, motion.translation])
+        found[name] = whole * (smear_mm / way if way > 0 else 0.0)
+    return found
 
 
 def radiance_along(
@@ -336,19 +372,7 @@ def _light_matters(rays, chosen, surface, lights, points, matters, ambient):
 
 @kernel(fastmath=True)
 @no_type_check
-def _coat(nl, nv, nh, vh, reflectance, roughness):
-    """pi times the GGX reflectance times the cosine towards the light, and the Fresnel share."""
-    alpha2 = roughness * roughness
-    bell = nh * nh * (alpha2 - 1) + 1
-    masking = nl * np.sqrt(nv * nv * (1 - alpha2) + alpha2) + nv * np.sqrt(nl * nl * (1 - alpha2) + alpha2)
-    grazing = 1 - vh
-    fresnel = reflectance + (1 - reflectance) * grazing * grazing * grazing * grazing * grazing
-    return fresnel * alpha2 / (bell * bell) * 0.5 * nl / masking, fresnel
-
-
-@kernel(fastmath=True)
-@no_type_check
-def _reflected(normal, view, towards, reflectance, roughness):
+def _reflected(normal, view, towards, reflectance, roughness, saliva):
     """Diffuse (to be multiplied by the albedo) and glossy answer to a light of strength 1; ``view`` points away."""
     nl = _dot(normal, towards)
     if nl <= 0:
@@ -358,7 +382,10 @@ def _reflected(normal, view, towards, reflectance, roughness):
     half = (towards[0] - view[0], towards[1] - view[1], towards[2] - view[2])
     inverse = 1 / np.sqrt(_dot(half, half))
     nv = max(1e-3, -_dot(normal, view))
-    glossy, fresnel = _coat(nl, nv, _dot(normal, half) * inverse, _dot(towards, half) * inverse, reflectance, roughness)
+    nh, vh = _dot(normal, half) * inverse, _dot(towards, half) * inverse
+    glossy, fresnel = coat(nl, nv, nh, vh, reflectance, roughness)
+    if saliva > 0:
+        glossy += saliva * (coat(nl, nv, nh, vh, _FILM_REFLECTANCE, _FILM_ROUGHNESS)[0] - glossy)
     return nl * (1 - fresnel), glossy
 
 
@@ -384,19 +411,24 @@ def _shade(rays, albedos, surface, palette, lights, lit, ambient, row, out):
         pixel = i // samples
         m = surface.materials[rays.faces[i]]
         point, normal = _point(rays, i), _normal(rays, i, surface)
-        albedo = albedos[i]
+        albedo = (albedos[i, 0], albedos[i, 1], albedos[i, 2])
         direction = rays.directions[i]
         inverse = 1 / np.sqrt(_dot(direction, direction))
         view = (direction[0] * inverse, direction[1] * inverse, direction[2] * inverse)
+        scattered = albedo
+        if palette.exit_index[m] > 1:
+            share = leaving(-_dot(normal, view), palette.exit_index[m])
+            scattered = (albedo[0] * share, albedo[1] * share, albedo[2] * share)
         for c in range(3):
-            out[pixel, c] += albedo[c] * ambient[row[i], c] / samples
+            out[pixel, c] += scattered[c] * ambient[row[i], c] / samples
         for k in range(len(lights.positions)):
             if lit[row[i], k]:
                 towards, falloff = _incoming(point, k, lights)
-                diffuse, glossy = _reflected(normal, view, towards, palette.reflectance[m], palette.roughness[m])
+                surface_coat = palette.reflectance[m], palette.roughness[m], palette.saliva
+                diffuse, glossy = _reflected(normal, view, towards, *surface_coat)
                 glossy *= lights.glare[k]
                 for c in range(3):
-                    out[pixel, c] += falloff * lights.intensities[k, c] * (albedo[c] * diffuse + glossy) / samples
+                    out[pixel, c] += falloff * lights.intensities[k, c] * (scattered[c] * diffuse + glossy) / samples
 
 
 def auto_gain(scene: Scene, poses: Iterable[Rigid3], lighting: str | None = None, stride: int = 10) -> float:
@@ -457,13 +489,23 @@ def lit_frames(
 
 
 def render_image(
-    scene: Scene, frame: Frame, camera_name: str, rig_from_world: Rigid3, gain: float
+    scene: Scene,
+    frame: Frame,
+    camera_name: str,
+    rig_from_world: Rigid3,
+    gain: float,
+    smear: Float[np.ndarray, "6"] | None = None,
 ) -> UInt8[np.ndarray, "h w 3"]:
     """One image. Depends on its arguments alone, so that a resumed capture equals an uninterrupted one."""
-    mounted = scene.handpiece.rig[camera_name]
+    mounted, optics = scene.handpiece.rig[camera_name], scene.optics
+    cam_from_world = mounted.cam_from_rig @ rig_from_world
     lights = lamps(scene.handpiece, frame.lighting, rig_from_world)
-    light = radiance(scene, mounted.camera, mounted.cam_from_rig @ rig_from_world, lights)
-    return record(light, gain, scene.handpiece, camera_name, image_rng(scene, frame.name, camera_name))
+    light = radiance(scene, mounted.camera, cam_from_world, lights, smear)
+    if optics.aperture_mm > 0:
+        depth_mm = np.nan_to_num(render_depth(scene.jaw.mesh, mounted.camera, cam_from_world), nan=np.inf)
+        light = through_lens(light, depth_mm, mounted.camera, scene.handpiece.working_distance_mm, optics)
+    rng = image_rng(scene, frame.name, camera_name)
+    return recorded(record(mixed(light, optics), gain, scene.handpiece, camera_name, rng), optics)
 
 
 def image_rng(scene: Scene, frame: str, camera_name: str) -> np.random.Generator:
@@ -476,12 +518,13 @@ class _Worker:
     scene: Scene
     poses: Mapping[str, Rigid3]
     gains: Mapping[str | None, float]
+    smears: Mapping[str, Float[np.ndarray, "6"]]
     sink: Sink
 
     def __call__(self, task: tuple[Frame, str]) -> tuple[str, str]:
         frame, camera = task
-        gain = self.gains[frame.lighting]
-        self.sink(frame.name, camera, render_image(self.scene, frame, camera, self.poses[frame.name], gain))
+        how = self.poses[frame.name], self.gains[frame.lighting], self.smears.get(frame.name)
+        self.sink(frame.name, camera, render_image(self.scene, frame, camera, *how))
         return frame.name, camera
 
 
@@ -516,7 +559,13 @@ def render_capture(
     tasks.sort(key=lambda task: task[1])  # one camera after the other, for whose rays a process remembers
     if not tasks:
         return
-    worker = _Worker(scene=scene, poses=poses, gains=metered_gains(scene, frames, poses), sink=sink)
+    worker = _Worker(
+        scene=scene,
+        poses=poses,
+        gains=metered_gains(scene, frames, poses),
+        smears=smears(frames, poses, scene.optics.smear_mm),
+        sink=sink,
+    )
     if processes == 1:
         yield from map(worker, tasks)
         return

@@ -19,6 +19,7 @@ from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.blender import render_with_blender
 from cuspid.simulation.lights import lit
 from cuspid.simulation.manufacturing import ManufacturingOptions, built, told
+from cuspid.simulation.optics import OpticsOptions
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 from cuspid.simulation.raycast import Scene, lit_frames, render_capture
 from cuspid.storage.captures import write_capture, write_image
@@ -43,6 +44,8 @@ class RenderOptions(Options):
     """Rays per pixel along each side."""
     seed: Annotated[int, SEED] = 0
     """Seed of texture, hand jitter and sensor noise."""
+    optics: OpticsOptions = field(default_factory=OpticsOptions)
+    """What lenses, sensors, hands and the mouth do to the images."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,4 +146,5 @@ def scene_of(truth: GroundTruth, options: RenderOptions) -> Scene:
         appearance=APPEARANCES[options.texture].seen_by(truth.handpiece.footprint_mm),
         supersampling=options.supersampling,
         seed=options.seed,
+        optics=options.optics.settled,
     )

@@ -31,7 +31,7 @@ from cuspid.stereo.confidence import (
 from cuspid.stereo.initial_depth import PairMatcher, initial_pairs, initial_points, semi_global
 from cuspid.stereo.rectification import IdealView, RectifiedPair, rectify
 from cuspid.stereo.refinement import SCORE, VARIANCE, GroupGeometry, Q, RefinementOptions, image_noise, refine
-from cuspid.stereo.shading import ShadingOptions, brightness, correction, shaded_depth
+from cuspid.stereo.shading import ShadedView, ShadingOptions, brightness, correction, shaded_depths
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,20 +170,24 @@ class DepthEstimator:
             corrections=tuple(correction(rig[name].camera, self.handpiece.sensor_of(name)) for name in names),
         )
 
-    def measure(self, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], frame: str) -> tuple[DepthMap, ...]:
-        """Depth maps of a frame, one for each camera with a stereo partner, from RGB or grey images by camera name.
+    def measure(
+        self, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], frame: str, lighting: str | None = None
+    ) -> tuple[DepthMap, ...]:
+        """Depth maps of a frame, one for each camera with a stereo partner, from RGB or grey images by camera name,
+        taken under a lighting pattern of the handpiece.
 
         A camera of the handpiece that is not among them, or whose image is blank, saw nothing of the frame.
         """
         names = self.handpiece.rig.names
         groups = self._groups(tuple(name for name in names if name in images and not _is_blank(images[name])))
-        found = [depth_map for group in groups for depth_map in self._measure_group(group, images, frame)]
+        found = [depth_map for group in groups for depth_map in self._measure_group(group, images, frame, lighting)]
         return tuple(sorted(found, key=lambda depth_map: names.index(depth_map.camera_name)))
 
     def _measure_group(
-        self, group: Group, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], frame: str
+        self, group: Group, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], frame: str, lighting: str | None
     ) -> list[DepthMap]:
-        measured = self._by_shading(group, images) if self.signal == "shading" else self._by_texture(group, images)
+        by_shading = self.signal == "shading"
+        measured = self._by_shading(group, images, lighting) if by_shading else self._by_texture(group, images)
         return [
             self._depth_map(measured, index, view, images[view.name], frame) for index, view in enumerate(group.views)
         ]
@@ -195,14 +199,26 @@ class DepthEstimator:
         stack, sizes = stack_images([view.resample(grays[view.name]) for view in group.views])
         return [self._measure_reference(group, index, initial, stack, sizes) for index in range(len(group.views))]
 
-    def _by_shading(self, group: Group, images: Mapping[str, UInt8[np.ndarray, "h w *c"]]) -> list[Measured]:
+    def _by_shading(
+        self, group: Group, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], lighting: str | None
+    ) -> list[Measured]:
         stack = brightness(group.views, [_rgb(images[view.name]) for view in group.views], group.corrections)
-        how = self.handpiece.depth_range_mm, self.options.spacing_px, self.options.shading
-        measured = []
-        for index, (view, grid, geometry) in enumerate(zip(group.views, group.grids, group.geometry, strict=True)):
-            size = view.camera.height, view.camera.width
-            measured.append(Measured(grid, view.cam_from_rig, *shaded_depth(stack, index, geometry, size, *how)))
-        return measured
+        views = [
+            ShadedView(
+                grid=grid,
+                size=(view.camera.height, view.camera.width),
+                geometry=geometry,
+                lights=[light.in_frame(view.cam_from_rig) for light in self.handpiece.lights_on(lighting)],
+                gamma=self.handpiece.sensor_of(view.name).gamma,
+            )
+            for view, grid, geometry in zip(group.views, group.grids, group.geometry, strict=True)
+        ]
+        options = self.options
+        depths = shaded_depths(stack, views, self.handpiece.depth_range_mm, options.spacing_px, options.shading)
+        return [
+            Measured(grid, view.cam_from_rig, *found)
+            for view, grid, found in zip(group.views, group.grids, depths, strict=True)
+        ]
 
     def _measure_reference(
         self,

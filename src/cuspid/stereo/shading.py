@@ -26,9 +26,10 @@ from jaxtyping import Float, Float32, Int, UInt8
 from cuspid.camera import Camera
 from cuspid.kernels import kernel
 from cuspid.options import Options, Range
-from cuspid.rig import Sensor
+from cuspid.rig import Light, Sensor
 from cuspid.semi_global import semi_global
 from cuspid.stereo.confidence import ConfidenceOptions
+from cuspid.stereo.glare import seen
 from cuspid.stereo.rectification import IdealView
 from cuspid.stereo.refinement import FAST, GroupGeometry, solve
 
@@ -43,6 +44,7 @@ _STRIDE = 2
 """Distance between the compared pixels of a window."""
 _SMOOTH_PX = 4.0
 """Neighbours on the swept grid whose disparities differ by more are not on one surface."""
+_LENIENT = 2
 _SLANT_DAMPING = 3.0
 """Added to the normal equations of the slants, for each camera: what DN^2 of slope would add."""
 
@@ -76,6 +78,11 @@ class ShadingOptions(Options):
     """A camera whose brightness differs by more (RMS over the window, digital numbers) sees something else."""
     camera_lag_dn: Annotated[float, Range(0, 255)] = 2.0
     """A camera whose difference exceeds the best one's by more sees something else."""
+    glare_dn: Annotated[float, Range(0.001, 1000)] = 0.05
+    """Where mirror reflections of the lights may add this much (digital numbers), as a first depth shows,
+    brightness counts half."""
+    exit_index: Annotated[float, Range(1, 3)] = 1.4
+    """Refractive index of the surface, by which less of its light leaves it at grazing angles; 1 for what is matte."""
     confidence: ConfidenceOptions = field(default_factory=lambda: ConfidenceOptions(agreement=4.0, largest_sigma=1.5))
     """Checks and weights. Shade is broad: the limits are wider than those for texture."""
 
@@ -92,6 +99,8 @@ class _View(NamedTuple):
 
     images: np.ndarray
     """(camera, row, column, channel), brightness in digital numbers, `_UNUSABLE` where that is not known."""
+    trust: np.ndarray
+    """Weight of each of them, 0 to 1."""
     reference: int
     infinite: np.ndarray
     parallax: np.ndarray
@@ -108,6 +117,8 @@ class _Fit(NamedTuple):
     lag: float
     lowest: float
     highest: float
+    lenient: int
+    """Iterations that let cameras in which do not agree well yet: the start may be some pixels off."""
     correlation: float
     """Of weighted samples, by which their normal equations understate a variance."""
 
@@ -263,13 +274,14 @@ def _carried(coarse, spacing, rows, columns, fine):
 def _add_sample(view, j, u, v, du, dv, plane, weight, system):
     """Add a pixel of the window to the normal equations of another camera; returns the number of channels used.
 
-    ``system``: H (upper triangle, row by row), the gradient, the squared differences.
+    ``system``: H (upper triangle, row by row), the gradient, the squared differences, the weights.
     """
     x, y, z = _place(view, j, u + du, v + dv, plane[0] + plane[1] * du + plane[2] * dv)
     if not _is_in(view, x, y, z):
         return 0
     column, row = int(x), int(y)
     fx, fy, used = x - column, y - row, 0
+    near_column, near_row, camera = int(x + 0.5), int(y + 0.5), view.others[j]
     along_x = (view.parallax[j, 0] - x * view.parallax[j, 2]) / z
     along_y = (view.parallax[j, 1] - y * view.parallax[j, 2]) / z
     for channel in range(view.images.shape[3]):
@@ -280,7 +292,12 @@ def _add_sample(view, j, u, v, du, dv, plane, weight, system):
         top, bottom = a + fx * (b - a), c + fx * (d - c)
         difference = top + fy * (bottom - top) - here
         slope = ((b - a) + fy * ((d - c) - (b - a))) * along_x + (bottom - top) * along_y
-        ws, wd = weight * slope * slope, weight * slope * difference
+        trusted = (
+            view.trust[view.reference, v + dv, u + du, channel],
+            view.trust[camera, near_row, near_column, channel],
+        )
+        w = weight * min(trusted)
+        ws, wd = w * slope * slope, w * slope * difference
         system[0] += ws
         system[1] += ws * du
         system[2] += ws * dv
@@ -290,7 +307,8 @@ def _add_sample(view, j, u, v, du, dv, plane, weight, system):
         system[6] += wd
         system[7] += wd * du
         system[8] += wd * dv
-        system[9] += weight * difference * difference
+        system[9] += w * difference * difference
+        system[10] += w
         used += 1
     return used
 
@@ -312,7 +330,7 @@ def _compare(view, fit, u, v, plane, systems):
                 seen += weight * used
                 whole += weight * channels
         enough = seen > _LEAST_SHARE * whole / channels
-        systems[j, 9] = np.sqrt(systems[j, 9] / seen) if enough else np.inf
+        systems[j, 9] = np.sqrt(systems[j, 9] / systems[j, 10]) if enough else np.inf
 
 
 @kernel(**FAST)
@@ -341,8 +359,7 @@ def _refine_plane(view, fit, u, v, plane, systems, total, step):
     variance, used = 0.0, 0
     for iteration in range(fit.iterations):
         _compare(view, fit, u, v, plane, systems)
-        # The start may be some pixels off: let cameras in that do not agree well yet.
-        rms = fit.camera_rms if iteration >= 2 else 3 * fit.camera_rms
+        rms = fit.camera_rms if iteration >= fit.lenient else 3 * fit.camera_rms
         used, square = _combine(systems, rms, fit.lag, total)
         factor = solve(total, step) if used > 0 else -1.0
         if factor < 0:
@@ -352,7 +369,7 @@ def _refine_plane(view, fit, u, v, plane, systems, total, step):
         shrink = 1.0 if length <= 1 else 1 / length
         for k in range(3):
             plane[k] += shrink * step[k]
-        if length < fit.converged and iteration >= 2:
+        if length < fit.converged and iteration >= fit.lenient:
             break
     return variance, used
 
@@ -360,48 +377,112 @@ def _refine_plane(view, fit, u, v, plane, systems, total, step):
 @kernel(**FAST)
 @no_type_check
 def _refine_all(view, fit, rows, columns, planes):
-    """For each pixel of the grid q, its variance, and the number of cameras; 0 where nothing is found."""
+    """For each pixel of the grid q, its variance, and the number of cameras, 0 where nothing is found. The planes, from
+    which it starts, become those found."""
     height, width = view.images.shape[1:3]
     radius = _STRIDE * (fit.window.shape[0] // 2)
     out = np.zeros((rows.size, columns.size, 3))
-    systems, total, step = np.zeros((view.others.size, 10)), np.zeros(9), np.zeros(3)
+    systems, total, step = np.zeros((view.others.size, 11)), np.zeros(9), np.zeros(3)
+    plane = np.zeros(3)
     for r in range(rows.size):
         for c in range(columns.size):
             u, v = columns[c], rows[r]
             if radius <= u < width - radius and radius <= v < height - radius:
-                plane = planes[r, c]
+                plane[:] = planes[r, c]
                 variance, used = _refine_plane(view, fit, u, v, plane, systems, total, step)
                 if used > 0 and fit.lowest <= plane[0] <= fit.highest:
                     out[r, c, 0], out[r, c, 1], out[r, c, 2] = plane[0], variance, used
+                    planes[r, c] = plane
     return out
 
 
-def shaded_depth(
+class ShadedView(NamedTuple):
+    """A camera of a group."""
+
+    grid: Camera
+    """Pinhole camera of its depth map, of every ``spacing_px``-th pixel."""
+    size: tuple[int, int]
+    """Height and width of its images."""
+    geometry: GroupGeometry
+    """With this camera as the reference."""
+    lights: Sequence[Light]
+    """Those that are on, in the frame of the camera."""
+    gamma: float
+    """Encoding exponent."""
+
+
+def shaded_depths(
     images: Float32[np.ndarray, "c h w 3"],
-    reference: int,
-    geometry: GroupGeometry,
-    size: tuple[int, int],
+    views: Sequence[ShadedView],
     depth_range_mm: tuple[float, float],
     spacing_px: int,
     options: ShadingOptions,
-) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
-    """Depth (mm) and its standard deviation on a grid of every ``spacing_px``-th pixel of the reference camera, NaN
-    where nothing is found.
+) -> list[tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]]:
+    """For each camera of a group depth (mm) and its standard deviation on the grid of its depth map, NaN where nothing
+    is found.
 
-    ``images`` are those of :func:`brightness`; ``size`` is the height and width of the reference's.
+    ``images`` are those of :func:`brightness`.
     """
     blurred = np.stack([_blurred(image, options.blur_px) for image in images])
-    view = _View(blurred, reference, geometry.infinite, geometry.parallax, geometry.others)
-    rows, columns = (_every(count, spacing_px) for count in size)
-    lowest, highest = (geometry.scale / depth for depth in reversed(depth_range_mm))
-    count = max(int(np.ceil((highest - lowest) / options.sweep_step_px)) + 1, _LEAST_PLANES)
-    planes = lowest + options.sweep_step_px * np.arange(count)
-    every = min(options.sweep_spacing, len(rows), len(columns))
-    coarse = _sweep(view, rows[every // 2 :: every], columns[every // 2 :: every], planes, options)
-    starts = _carried(coarse, every, rows, columns, spacing_px)
-    found = _refine_all(view, _fit(options, lowest, highest), rows, columns, starts)
-    depth = geometry.scale / np.where(found[..., 2] > 0, found[..., 0], np.nan)
-    return depth, np.sqrt(found[..., 1]) * depth**2 / geometry.scale
+    how = depth_range_mm, spacing_px, options
+    refinements = [_Refinement(blurred, index, view, *how) for index, view in enumerate(views)]
+    found = [each.refined(blurred, np.ones_like(blurred), _LENIENT) for each in refinements]
+    matte, trust = blurred.copy(), np.ones_like(blurred)
+    for view, image, weight, (depth, _) in zip(views, matte, trust, found, strict=True):
+        part = np.s_[: view.size[0], : view.size[1]]
+        what = seen(view.grid, depth, spacing_px, view.lights, options.exit_index)
+        mirrored = _spread(what.mirrored, view.size, spacing_px)
+        too_bright = np.maximum(image[part], 0) * (1 - (1 + mirrored) ** np.float32(-1 / view.gamma))
+        weight[part] = 1 / (1 + (too_bright / options.glare_dn) ** 2)
+        lost = _spread(what.leaving, view.size, spacing_px)[..., None] ** np.float32(-1 / view.gamma)
+        image[part] = np.where(image[part] >= 0, image[part] * lost, _UNUSABLE)
+    return [each.refined(matte, trust, 0) for each in refinements]
+
+
+def _spread(
+    values: Float32[np.ndarray, "h w *c"], size: tuple[int, int], spacing_px: int
+) -> Float32[np.ndarray, "_ _ *c"]:
+    """From every n-th pixel to all."""
+    rows, columns = ((np.arange(count, dtype=np.float32) - spacing_px // 2) / spacing_px for count in size)
+    where = np.meshgrid(columns, rows)
+    return np.asarray(cv2.remap(values, *where, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+
+class _Refinement:
+    """Depth of one camera, refined as often as is asked for."""
+
+    def __init__(
+        self,
+        images: Float32[np.ndarray, "c h w 3"],
+        reference: int,
+        view: ShadedView,
+        depth_range_mm: tuple[float, float],
+        spacing_px: int,
+        options: ShadingOptions,
+    ) -> None:
+        geometry = self._geometry = view.geometry
+        self._view = _View(images, images, reference, geometry.infinite, geometry.parallax, geometry.others)
+        self._rows, self._columns = (_every(count, spacing_px) for count in view.size)
+        lowest, highest = (view.geometry.scale / depth for depth in reversed(depth_range_mm))
+        self._fit = _fit(options, lowest, highest)
+        count = max(int(np.ceil((highest - lowest) / options.sweep_step_px)) + 1, _LEAST_PLANES)
+        planes = lowest + options.sweep_step_px * np.arange(count)
+        every = min(options.sweep_spacing, len(self._rows), len(self._columns))
+        coarse = _sweep(
+            self._view, self._rows[every // 2 :: every], self._columns[every // 2 :: every], planes, options
+        )
+        self._planes = _carried(coarse, every, self._rows, self._columns, spacing_px)
+
+    def refined(
+        self, images: Float32[np.ndarray, "c h w 3"], trust: Float32[np.ndarray, "c h w 3"], lenient: int
+    ) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
+        """Depth and standard deviation, from what was found before."""
+        view = self._view._replace(images=images, trust=trust)
+        fit = self._fit._replace(lenient=lenient)
+        found = _refine_all(view, fit, self._rows, self._columns, self._planes)
+        scale = self._geometry.scale
+        depth = scale / np.where(found[..., 2] > 0, found[..., 0], np.nan)
+        return depth, np.sqrt(found[..., 1]) * depth**2 / scale
 
 
 def _fit(options: ShadingOptions, lowest: float, highest: float) -> _Fit:
@@ -414,5 +495,6 @@ def _fit(options: ShadingOptions, lowest: float, highest: float) -> _Fit:
         lag=options.camera_lag_dn,
         lowest=lowest,
         highest=highest,
+        lenient=0,
         correlation=float((window**2).sum() / window.sum()),
     )

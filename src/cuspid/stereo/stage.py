@@ -77,7 +77,7 @@ def measure_depth(
     estimator = DepthEstimator(capture.handpiece, options, signal=signal)
 
     def measure(frame: Frame) -> tuple[DepthMap, ...]:
-        return estimator.measure(capture.images(frame), frame.name)
+        return estimator.measure(capture.images(frame), frame.name, frame.lighting)
 
     def inputs(frame: Frame) -> dict[str, str]:
         return {"frame": hash_frame(capture, frame)}
