@@ -1,0 +1,109 @@
+"""What a first depth tells of mirror reflections and of light that does not leave a surface."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cuspid.camera import Camera
+from cuspid.geometry import Rigid3, unit
+from cuspid.gloss import leaving
+from cuspid.rig import Light
+from cuspid.stereo.glare import mirrored, seen
+from cuspid.stereo.matching import DepthEstimator, StereoOptions
+from cuspid.stereo.shading import ShadingOptions
+from plain_scene import lit, photographs
+from synthetic_scene import cast_depth, height_field
+from test_shading import OPTIONS, errors_um, of_one_frame
+
+GRID = Camera.from_field_of_view(60, 60, 60.0)
+BALL = height_field(lambda x, y: 7 - np.sqrt(np.maximum(9 - x**2 - y**2, 0.01)), half_width_mm=2.5)
+FRAME = {"00000": Rigid3.identity()}
+
+
+def led(x_mm: float, *, glare: float = 0.03, colour: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Light:
+    return Light(
+        position_mm=np.array([x_mm, 0.0, 0.0]),
+        direction=np.array([0, 0, 1.0]),
+        glare=glare,
+        colour=np.array(colour, dtype=float),
+    )
+
+
+def brightest(values: np.ndarray) -> np.ndarray:
+    """Row and column."""
+    return np.array(np.unravel_index(values.argmax(), values.shape))
+
+
+@pytest.mark.parametrize("x_mm", [-3.0, 0.0, 2.0])
+def test_a_spot_lies_where_the_surface_mirrors_the_light(x_mm: float) -> None:
+    depth = cast_depth(BALL, GRID, Rigid3.identity())
+    spot = brightest(seen(GRID, depth, 3, [led(x_mm)], 1.4).mirrored[..., 0])
+    # Where the normal of the ball (centre at 7 mm) halves the angle between camera and light.
+    rays = GRID.rays(GRID.pixel_centres().reshape(-1, 2)).reshape(60, 60, 3)
+    points = rays * depth[..., None]
+    halfway = unit(unit(np.array([x_mm, 0.0, 0.0]) - points) - unit(points))
+    aligned = (halfway * unit(points - np.array([0, 0, 7.0]))).sum(axis=-1)
+    assert np.abs(spot - brightest(np.where(np.isfinite(aligned), aligned, -1))).max() <= 2
+
+
+def test_spots_have_the_colour_of_their_lights_and_no_other_has_any() -> None:
+    depth = cast_depth(BALL, GRID, Rigid3.identity())
+    lights = [led(-3.0, colour=(1, 0, 0)), led(3.0, colour=(0, 1, 0))]
+    found = seen(GRID, depth, 3, lights, 1.4).mirrored
+    assert brightest(found[..., 0])[1] < 30 < brightest(found[..., 1])[1]
+    assert not found[..., 2].any()
+    assert not seen(GRID, depth, 3, [], 1.4).mirrored.any()
+
+
+def test_reflections_go_with_the_share_that_passes_and_not_with_power_or_scale() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-2, -2, 4], [2, 2, 6], (50, 3))
+    normals = unit(rng.normal([0, 0, -2], 0.5, (50, 3)))
+    one = mirrored(points, normals, [led(1.0)])
+    assert one.max() > 0
+    assert mirrored(points, normals, [led(1.0, glare=0.06)]) == pytest.approx(2 * one)
+    assert mirrored(points, normals, [replace(led(1.0), power=7.0)]) == pytest.approx(one)
+    far = replace(led(1.0), position_mm=np.array([1000.0, 0, 0]))
+    assert mirrored(1000 * points, normals, [far]) == pytest.approx(one, rel=1e-6)
+
+
+def test_less_light_leaves_at_grazing_angles() -> None:
+    angles = np.deg2rad([0, 30, 60, 80, 90])
+    shares = np.array([leaving(np.cos(angle), 1.4) for angle in angles])
+    # Fresnel's equations: 6.7 % of the light is reflected at 60 degrees, 2.8 % at 0, 38.8 % at 80, all at 90.
+    assert shares == pytest.approx([1, 0.9990, 0.955, 0.651, 0], abs=0.004)
+    assert leaving(0.3, 1.0) == pytest.approx(1)
+
+
+def test_a_pit_that_a_reflection_made_is_looked_past() -> None:
+    """The first depth is wrong where a light is mirrored: its slope there must not hide the spot."""
+    depth = np.full((60, 60), 5.0)
+    clean = seen(GRID, depth, 3, [led(0.0)], 1.4).mirrored[..., 0]
+    rows, columns = np.mgrid[:60, :60]
+    pit = depth + 0.1 * np.exp(-((rows - 30) ** 2 + (columns - 30) ** 2) / 18)
+    assert seen(GRID, pit, 3, [led(0.0)], 1.4).mirrored[..., 0][28:33, 28:33].min() > 0.3 * clean.max()
+    hole = np.where((rows - 30) ** 2 + (columns - 30) ** 2 < 16, np.nan, depth)
+    assert seen(GRID, hole, 3, [led(0.0)], 1.4).mirrored[30, 30, 0] > 0.8 * clean.max()
+
+
+def test_polarisers_that_leak_do_little_harm() -> None:
+    images = of_one_frame(photographs(lit(glare=0.03), FRAME))
+    with_lights = DepthEstimator(lit(glare=0.03), OPTIONS, signal="shading").measure(images, "00000")
+    unknown = DepthEstimator(replace(lit(), lights={}, lightings=()), OPTIONS, signal="shading").measure(
+        images, "00000"
+    )
+    known_error, unknown_error = (np.sqrt(np.mean(errors_um(each) ** 2)) for each in (with_lights, unknown))
+    assert known_error < 0.9 * unknown_error
+
+
+def test_a_surface_that_is_not_as_clear_as_thought_is_measured_worse() -> None:
+    images = of_one_frame(photographs(lit(), FRAME))
+    errors = []
+    for index in (1.0, 1.4):
+        options = StereoOptions(spacing_px=4, shading=ShadingOptions(exit_index=index))
+        maps = DepthEstimator(lit(), options, signal="shading").measure(images, "00000")
+        errors.append(np.mean(np.abs(errors_um(maps))))
+    assert errors[1] < 0.8 * errors[0]
