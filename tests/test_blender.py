@@ -20,6 +20,7 @@ from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor
 from cuspid.simulation import blender, raycast
 from cuspid.simulation.appearance import Appearance, Material
+from cuspid.simulation.optics import CLINICAL
 from cuspid.simulation.raycast import Scene, Sink, render_capture
 
 needs_blender = pytest.mark.skipif(
@@ -127,6 +128,8 @@ def test_what_blender_cannot_do_is_refused(monkeypatch: pytest.MonkeyPatch) -> N
     distorted = OFF_CENTRE.with_parameters(np.array([*OFF_CENTRE.parameters[:4], 0.1, 0, 0, 0]))
     with pytest.raises(InputError, match="camera a: Blender cannot render this lens distortion"):
         render(scene_of([(box((1, 1, 1), (0, 0, 5)), 11)], distorted))
+    with pytest.raises(InputError, match="optics: Blender renders ideal ones only"):
+        render(replace(scene_of([(box((1, 1, 1), (0, 0, 5)), 11)]), optics=CLINICAL))
 
 
 def test_a_blender_that_fails_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -16,10 +16,11 @@ from cuspid.stereo.matching import DepthEstimator, StereoOptions
 from cuspid.stereo.shading import ShadingOptions
 from plain_scene import lit, photographs
 from synthetic_scene import cast_depth, height_field
-from test_shading import OPTIONS, errors_um, of_one_frame
+from test_shading import OPTIONS, errors_um, of_one_frame, white
 
 GRID = Camera.from_field_of_view(60, 60, 60.0)
 BALL = height_field(lambda x, y: 7 - np.sqrt(np.maximum(9 - x**2 - y**2, 0.01)), half_width_mm=2.5)
+LEAK = 0.1
 FRAME = {"00000": Rigid3.identity()}
 
 
@@ -90,8 +91,8 @@ def test_a_pit_that_a_reflection_made_is_looked_past() -> None:
 
 
 def test_polarisers_that_leak_do_little_harm() -> None:
-    images = of_one_frame(photographs(lit(glare=0.03), FRAME))
-    with_lights = DepthEstimator(lit(glare=0.03), OPTIONS, signal="shading").measure(images, "00000")
+    images = of_one_frame(photographs(lit(glare=LEAK), FRAME))
+    with_lights = DepthEstimator(lit(glare=LEAK), OPTIONS, signal="shading").measure(images, "00000")
     unknown = DepthEstimator(replace(lit(), lights={}, lightings=()), OPTIONS, signal="shading").measure(
         images, "00000"
     )
@@ -99,11 +100,16 @@ def test_polarisers_that_leak_do_little_harm() -> None:
     assert known_error < 0.9 * unknown_error
 
 
-def test_a_surface_that_is_not_as_clear_as_thought_is_measured_worse() -> None:
-    images = of_one_frame(photographs(lit(), FRAME))
+@pytest.mark.parametrize("coloured", [False, True])
+def test_light_that_is_lost_matters_where_the_lights_have_one_colour(coloured: bool) -> None:
+    handpiece = lit() if coloured else white(lit())
+    images = of_one_frame(photographs(handpiece, FRAME))
     errors = []
     for index in (1.0, 1.4):
         options = StereoOptions(spacing_px=4, shading=ShadingOptions(exit_index=index))
-        maps = DepthEstimator(lit(), options, signal="shading").measure(images, "00000")
+        maps = DepthEstimator(handpiece, options, signal="shading").measure(images, "00000")
         errors.append(np.mean(np.abs(errors_um(maps))))
-    assert errors[1] < 0.8 * errors[0]
+    if coloured:
+        assert errors[1] == pytest.approx(errors[0], rel=0.01)
+    else:
+        assert errors[1] < 0.9 * errors[0]

@@ -12,6 +12,7 @@ from cuspid.camera import Camera
 from cuspid.capture import Frame
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.gloss import coat, leaving
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
@@ -31,7 +32,6 @@ from cuspid.simulation.appearance import (
 from cuspid.simulation.raycast import (
     AMBIENT,
     Scene,
-    _coat,
     auto_gain,
     lamps,
     lit_frames,
@@ -197,7 +197,7 @@ def test_the_coat_reflects_its_fresnel_share_and_no_more() -> None:
             sine = np.sqrt(1 - cosine**2)
             half = view + [sine * np.cos(azimuth), sine * np.sin(azimuth), cosine]
             half /= np.linalg.norm(half)
-            total += _coat(cosine, view[2], half[2], half @ view, 0.05, 0.1)[0] / np.pi
+            total += coat(cosine, view[2], half[2], half @ view, 0.05, 0.1)[0] / np.pi
     total *= (1 / steps) * (np.pi / steps)
     assert total == pytest.approx(0.05, rel=0.05)
 
@@ -211,6 +211,18 @@ def test_gloss_depends_on_the_direction_of_view_and_matte_does_not() -> None:
     assert at(glossy_image, CAMERA, mirror) > 1.5 * at(matte_image, CAMERA, mirror)
     beside = (-2.0, 0.0, 5.0)
     assert 0.9 < at(glossy_image, CAMERA, beside) / at(matte_image, CAMERA, beside) < 1.0
+
+
+def test_less_light_leaves_a_clear_surface_at_grazing_angles() -> None:
+    jaw = jaw_of(quad((0, 0, 5.0), 50.0))
+    clear = Appearance(enamel=replace(WHITE, exit_index=1.5), gum=BLACK)
+    wide = Camera.from_field_of_view(CAMERA.width, CAMERA.height, 130.0)
+    matte_image, clear_image = (light_seen(jaw, probe(led(x=2.0), camera=wide), look) for look in (PLAIN, clear))
+    rays = wide.rays(wide.pixel_centres().reshape(-1, 2))
+    cosines = (1 / np.linalg.norm(rays, axis=-1)).reshape(matte_image.shape)
+    expected = np.vectorize(leaving)(cosines, 1.5)
+    assert expected.min() < 0.95
+    np.testing.assert_allclose(clear_image / matte_image, expected, rtol=1e-4)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.03, 0.5])

@@ -1,11 +1,13 @@
 """Depth of plain surfaces from their light and shade: no texture is needed, but lights that all cameras share.
 
 The cameras of a rig expose at once under the same lights, so that the shade of a matte surface looks the same from all
-of them. Brightness itself is compared here, channel by channel; normalising it, as for texture, would remove what is
-matched. Three lights at different places, one for each channel, give three shades of one exposure (R. Woodham, Optical
-Engineering 19, 1980, has the idea for one camera). Mirror reflections move with the camera and have no place in this:
-crossed polarisers take them away, what burns out is not compared, and a camera that differs from the others is left
-out.
+of them. Normalising brightness over a window, as for texture, would remove what is matched. Three lights at different
+places, one for each channel, give three shades of one exposure (R. Woodham, Optical Engineering 19, 1980, has the idea
+for one camera). Then the ratios of the channels are compared: the gain of a camera, the falloff of its lens, the colour
+of the tooth and the light that does not leave a clear surface at grazing angles are the same in all channels, and
+cancel. Under lights of one colour brightness itself must be compared, and a first depth tells how much of it was lost.
+Mirror reflections move with the camera: crossed polarisers take most of them away, a first depth tells where the rest
+is (:mod:`cuspid.stereo.glare`), what burns out is not compared, and a camera that differs from the others is left out.
 
 First planes of constant inverse depth are swept (R. Collins, CVPR 1996) over a coarse grid, by clipped absolute
 differences of the better half of the cameras, and the plane of each cell is chosen by semi-global optimisation. Then a
@@ -24,6 +26,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from cuspid.camera import Camera
+from cuspid.geometry import unit
 from cuspid.kernels import kernel
 from cuspid.options import Options, Range
 from cuspid.rig import Light, Sensor
@@ -45,6 +48,10 @@ _STRIDE = 2
 _SMOOTH_PX = 4.0
 """Neighbours on the swept grid whose disparities differ by more are not on one surface."""
 _LENIENT = 2
+_COLOURED = 0.2
+"""Difference of the colours (unit vectors) of two lights from which on they are told apart."""
+_COMMON_DN, _LEAST_DN, _ABOVE_ZERO = 100.0, 4.0, 600.0
+"""Brightness for which ratios are scaled, below which they are not taken, and what keeps them positive."""
 _SLANT_DAMPING = 3.0
 """Added to the normal equations of the slants, for each camera: what DN^2 of slope would add."""
 
@@ -82,7 +89,8 @@ class ShadingOptions(Options):
     """Where mirror reflections of the lights may add this much (digital numbers), as a first depth shows,
     brightness counts half."""
     exit_index: Annotated[float, Range(1, 3)] = 1.4
-    """Refractive index of the surface, by which less of its light leaves it at grazing angles; 1 for what is matte."""
+    """Refractive index of the surface, by which less of its light leaves it at grazing angles; 1 for what is matte.
+    Only lights of one colour need it."""
     confidence: ConfidenceOptions = field(default_factory=lambda: ConfidenceOptions(agreement=4.0, largest_sigma=1.5))
     """Checks and weights. Shade is broad: the limits are wider than those for texture."""
 
@@ -100,7 +108,7 @@ class _View(NamedTuple):
     images: np.ndarray
     """(camera, row, column, channel), brightness in digital numbers, `_UNUSABLE` where that is not known."""
     trust: np.ndarray
-    """Weight of each of them, 0 to 1."""
+    """Weight of each of them."""
     reference: int
     infinite: np.ndarray
     parallax: np.ndarray
@@ -424,9 +432,11 @@ def shaded_depths(
     ``images`` are those of :func:`brightness`.
     """
     blurred = np.stack([_blurred(image, options.blur_px) for image in images])
+    compared_of = _ratios if _are_coloured(views[0].lights) else _as_they_are
+    compared, trust = compared_of(blurred, np.ones_like(blurred))
     how = depth_range_mm, spacing_px, options
-    refinements = [_Refinement(blurred, index, view, *how) for index, view in enumerate(views)]
-    found = [each.refined(blurred, np.ones_like(blurred), _LENIENT) for each in refinements]
+    refinements = [_Refinement(compared, index, view, *how) for index, view in enumerate(views)]
+    found = [each.refined(compared, trust, _LENIENT) for each in refinements]
     matte, trust = blurred.copy(), np.ones_like(blurred)
     for view, image, weight, (depth, _) in zip(views, matte, trust, found, strict=True):
         part = np.s_[: view.size[0], : view.size[1]]
@@ -436,7 +446,33 @@ def shaded_depths(
         weight[part] = 1 / (1 + (too_bright / options.glare_dn) ** 2)
         lost = _spread(what.leaving, view.size, spacing_px)[..., None] ** np.float32(-1 / view.gamma)
         image[part] = np.where(image[part] >= 0, image[part] * lost, _UNUSABLE)
-    return [each.refined(matte, trust, 0) for each in refinements]
+    compared, trust = compared_of(matte, trust)
+    return [each.refined(compared, trust, 0) for each in refinements]
+
+
+def _are_coloured(lights: Sequence[Light]) -> bool:
+    """Whether the channels see different shades."""
+    return any(np.abs(unit(one.colour) - unit(lights[0].colour)).max() > _COLOURED for one in lights)
+
+
+_Compared = tuple[Float32[np.ndarray, "c h w 3"], Float32[np.ndarray, "c h w 3"]]
+
+
+def _as_they_are(images: Float32[np.ndarray, "c h w 3"], trust: Float32[np.ndarray, "c h w 3"]) -> _Compared:
+    return images, trust
+
+
+def _ratios(images: Float32[np.ndarray, "c h w 3"], trust: Float32[np.ndarray, "c h w 3"]) -> _Compared:
+    """Ratios of each channel to the next one, and how far both are to be trusted, where they are darker also because of
+    their noise. Ratios are logarithms, times what makes a change of a channel at common brightness one of as many
+    digital numbers, and never negative."""
+    there = images >= _LEAST_DN
+    share = np.maximum(images, _LEAST_DN) / np.float32(_COMMON_DN)
+    level = _COMMON_DN * np.log(share)
+    variance = share**-2 + np.roll(share, -1, axis=-1) ** -2
+    both = there & np.roll(there, -1, axis=-1)
+    ratios = np.where(both, level - np.roll(level, -1, axis=-1) + _ABOVE_ZERO, _UNUSABLE)
+    return ratios.astype(np.float32), 2 / variance * np.minimum(trust, np.roll(trust, -1, axis=-1))
 
 
 def _spread(
