@@ -3,8 +3,8 @@
     python benchmarks/enamel.py FOLDER [--work build/enamel] [--only phantom] [--add]
 
 FOLDER holds labelled meshes of real jaws. Each case is one tooth with what is seen around it, 10 frames or more of
-twelve cameras; the variants take away one ingredient at a time. Finished scans are kept in the work folder and not run
-again; ``--add`` keeps those of the result file, too, each with the commit that it is of.
+twelve cameras; the variants take away one ingredient at a time, or have clinical optics. Finished scans are kept in the
+work folder and not run again; ``--add`` keeps those of the result file, too, each with the commit that it is of.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
 from cuspid.jaw import Jaw
 from cuspid.rig import Handpiece
+from cuspid.simulation.optics import OpticsOptions
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.simulation.stage import SimulationOptions
 from cuspid.storage import read_json, write_json
@@ -41,14 +42,19 @@ VARIANTS = ("glossy", "white-crossed", "white")
 
 def cases(folder: Path) -> Iterator[Case]:
     """All that is scanned."""
-    for seed, tooth in PHANTOMS.items():
-        yield Case(name=f"phantom-{seed}", parameters={"jaw": str(seed), "tooth": tooth, "light": "coded"})
+    plain = {"light": "coded", "optics": "ideal", "texture": "enamel"}
+    phantoms = {f"phantom-{seed}": {"jaw": str(seed), "tooth": tooth} for seed, tooth in PHANTOMS.items()}
+    for name, jaw in phantoms.items():
+        yield Case(name=name, parameters={**jaw, **plain})
+        yield Case(name=f"{name}-clinical", parameters={**jaw, **plain, "optics": "clinical"})
+        textured = {"light": "white", "optics": "clinical", "texture": "artificial"}
+        yield Case(name=f"{name}-artificial-clinical", parameters={**jaw, **textured})
     for light in VARIANTS:
-        yield Case(name=f"phantom-0-{light}", parameters={"jaw": "0", "tooth": PHANTOMS[0], "light": light})
+        yield Case(name=f"phantom-0-{light}", parameters={**phantoms["phantom-0"], **plain, "light": light})
     for name, tooth in REAL.items():
         file = next(iter(folder.rglob(f"{name}.ply")), None)
         if file is not None:
-            yield Case(name=name, parameters={"jaw": str(file), "tooth": tooth, "light": "coded"})
+            yield Case(name=name, parameters={"jaw": str(file), "tooth": tooth, **plain})
 
 
 def lit(light: str) -> Handpiece:
@@ -68,11 +74,12 @@ def jaw_of(name: str) -> Jaw:
     return load_jaw(Path(name), arch="upper" if "upper" in name else "lower")[0]
 
 
-def judge(*, jaw: str, tooth: int, light: str) -> dict[str, Value]:
+def judge(*, jaw: str, tooth: int, light: str, optics: str, texture: str) -> dict[str, Value]:
     """The figures of one scan."""
     begin = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="cuspid-enamel-") as folder:
-        options = SimulationOptions(texture="enamel", path=ScanPathOptions(tooth=tooth))
+        how = {"texture": texture, "optics": OpticsOptions(optics=optics)}
+        options = SimulationOptions(**how, path=ScanPathOptions(tooth=tooth))
         found = scanned(jaw_of(jaw), lit(light), Path(folder), options)
     return {"commit": commit(), **found, "wall_s": time.perf_counter() - begin}
 
