@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 from jaws import is_asked, scanned
 from run import conditions
@@ -25,6 +26,7 @@ from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
 from cuspid.jaw import Jaw
 from cuspid.rig import Handpiece
+from cuspid.simulation.appearance import Preset
 from cuspid.simulation.optics import OpticsOptions
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.simulation.stage import SimulationOptions
@@ -42,12 +44,14 @@ VARIANTS = ("glossy", "white-crossed", "white")
 
 def cases(folder: Path) -> Iterator[Case]:
     """All that is scanned."""
-    plain = {"light": "coded", "optics": "ideal", "texture": "enamel"}
-    phantoms = {f"phantom-{seed}": {"jaw": str(seed), "tooth": tooth} for seed, tooth in PHANTOMS.items()}
+    plain: dict[str, Value] = {"light": "coded", "optics": "ideal", "texture": "enamel"}
+    phantoms: dict[str, dict[str, Value]] = {
+        f"phantom-{seed}": {"jaw": str(seed), "tooth": tooth} for seed, tooth in PHANTOMS.items()
+    }
     for name, jaw in phantoms.items():
         yield Case(name=name, parameters={**jaw, **plain})
         yield Case(name=f"{name}-clinical", parameters={**jaw, **plain, "optics": "clinical"})
-        textured = {"light": "white", "optics": "clinical", "texture": "artificial"}
+        textured: dict[str, Value] = {"light": "white", "optics": "clinical", "texture": "artificial"}
         yield Case(name=f"{name}-artificial-clinical", parameters={**jaw, **textured})
     for light in VARIANTS:
         yield Case(name=f"phantom-0-{light}", parameters={**phantoms["phantom-0"], **plain, "light": light})
@@ -74,12 +78,14 @@ def jaw_of(name: str) -> Jaw:
     return load_jaw(Path(name), arch="upper" if "upper" in name else "lower")[0]
 
 
-def judge(*, jaw: str, tooth: int, light: str, optics: str, texture: str) -> dict[str, Value]:
+def judge(
+    *, jaw: str, tooth: int, light: str, optics: Literal["ideal", "clinical"], texture: Preset
+) -> dict[str, Value]:
     """The figures of one scan."""
     begin = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="cuspid-enamel-") as folder:
-        how = {"texture": texture, "optics": OpticsOptions(optics=optics)}
-        options = SimulationOptions(**how, path=ScanPathOptions(tooth=tooth))
+        path, seen_by = ScanPathOptions(tooth=tooth), OpticsOptions(optics=optics)
+        options = SimulationOptions(texture=texture, optics=seen_by, path=path)
         found = scanned(jaw_of(jaw), lit(light), Path(folder), options)
     return {"commit": commit(), **found, "wall_s": time.perf_counter() - begin}
 

@@ -91,7 +91,7 @@ class ShadingOptions(Options):
     exit_index: Annotated[float, Range(1, 3)] = 1.4
     """Refractive index of the surface, by which less of its light leaves it at grazing angles; 1 for what is matte.
     Only lights of one colour need it."""
-    confidence: ConfidenceOptions = field(default_factory=lambda: ConfidenceOptions(agreement=4.0, largest_sigma=1.5))
+    confidence: ConfidenceOptions = field(default_factory=lambda: ConfidenceOptions(agreement=4.0, largest_sigma=2.5))
     """Checks and weights. Shade is broad: the limits are wider than those for texture."""
 
     @property
