@@ -1,120 +1,110 @@
-"""What lenses, sensors, hands and mouths do to images."""
-
-from __future__ import annotations
-
-from dataclasses import replace
+"""Laws of the thin lens, and the published figures of the presets."""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from cuspid.camera import Camera
-from cuspid.capture import Frame
 from cuspid.errors import InputError
-from cuspid.geometry import Rigid3
-from cuspid.simulation.appearance import APPEARANCES
-from cuspid.simulation.optics import CLINICAL, IDEAL, Optics, OpticsOptions, mixed, recorded, through_lens
-from cuspid.simulation.raycast import Scene, render_image, smears
-from test_raycast import CAMERA, jaw_of, led, probe, quad
+from cuspid.handpiece.optics import Optics, horizontal_from_diagonal_deg
+from cuspid.handpiece.presets import PRESETS
 
-SMALL = Camera.from_field_of_view(61, 61, 60.0)
-WORKING_MM = 5.0
-FOCUS_MM = 0.78 * WORKING_MM
+THESIS = Optics(name="thesis", width_px=500, height_px=500, pixel_um=1.6, field_of_view_deg=62.0, f_number=7.0)
 
 
-def spot(depth_mm: float, optics: Optics) -> np.ndarray:
-    """Image of a point at a depth, green."""
-    light, depth = np.zeros((61, 61, 3)), np.full((61, 61), depth_mm)
-    light[30, 30] = 1.0
-    return through_lens(light, depth, SMALL, WORKING_MM, optics)[..., 1]
+def test_the_thesis_camera_at_5_mm():
+    """416 px of focal length, 12 um a pixel, 6 mm of footprint, and the overlap 1 - b / (2 Z tan 31 deg)."""
+    assert pytest.approx(416.07, abs=0.01) == THESIS.focal_px
+    assert THESIS.um_per_px(5.0) == pytest.approx(12.02, abs=0.01)
+    assert THESIS.footprint_mm(5.0)[0] == pytest.approx(6.009, abs=0.001)
+    assert THESIS.parallel_overlap(2.5, 5.0) == pytest.approx(1 - 2.5 / (2 * 5 * np.tan(np.deg2rad(31))), abs=1e-12)
+    assert THESIS.parallel_overlap(7.0, 5.0) == 0
 
 
-def width_px(image: np.ndarray) -> float:
-    """Standard deviation along the rows."""
-    share = image.sum(axis=0) / image.sum()
-    return float(np.sqrt((share * (np.arange(61) - 30.0) ** 2).sum()))
-
-
-def test_each_option_overrides_the_preset() -> None:
-    assert OpticsOptions().settled == IDEAL
-    assert OpticsOptions(optics="clinical").settled == CLINICAL
-    assert OpticsOptions(optics="clinical", bayer=False, smear_mm=0.0).settled == replace(
-        CLINICAL, bayer=False, smear_mm=0.0
+@given(blur=st.floats(0.2, 20), focus=st.floats(2.0, 12.0))
+def test_the_ends_of_the_depth_of_field_have_the_asked_blur(blur, focus):
+    lens = Optics(
+        name="lens",
+        width_px=500,
+        height_px=500,
+        pixel_um=1.6,
+        field_of_view_deg=62.0,
+        f_number=7.0,
+        focus_mm=focus,
     )
-    assert OpticsOptions(aperture_mm=0.1).settled == replace(IDEAL, aperture_mm=0.1)
-    with pytest.raises(InputError, match=r"optics: --crosstalk is 0\.5"):
-        OpticsOptions(crosstalk=0.5)
+    near, far = lens.depth_of_field_mm(blur)
+    assert near < focus < far
+    assert lens.blur_px(near) == pytest.approx(blur, rel=1e-9)
+    if np.isfinite(far):
+        assert lens.blur_px(far) == pytest.approx(blur, rel=1e-9)
+    else:
+        assert lens.blur_px(1e9) <= blur * (1 + 1e-6)
 
 
-@pytest.mark.parametrize("depth_mm", [2.5, 3.0, 9.0])
-def test_the_disc_of_defocus_is_as_wide_as_the_thin_lens_makes_it(depth_mm: float) -> None:
-    optics = Optics(aperture_mm=0.6)
-    blurred, sharp = (width_px(spot(depth, optics)) for depth in (depth_mm, FOCUS_MM))
-    radius_px = SMALL.focal_px[0] * 0.3 * abs(1 / depth_mm - 1 / FOCUS_MM)
-    # A disc has a standard deviation of half its radius along any axis.
-    assert np.sqrt(blurred**2 - sharp**2) == pytest.approx(radius_px / 2, rel=0.25)
+def test_blur_follows_the_image_distances_of_the_lens_equation():
+    f, n = THESIS.focal_mm, THESIS.f_number
+    image_of = lambda z: 1 / (1 / f - 1 / z)  # noqa: E731
+    at_focus, at_3 = image_of(THESIS.focus_mm), image_of(3.0)
+    disc_mm = (f / n) * abs(at_focus - at_3) / at_3
+    assert THESIS.blur_px(3.0) == pytest.approx(1000 * disc_mm / THESIS.pixel_um, rel=1e-9)
 
 
-def test_smaller_lenses_diffract_more() -> None:
-    widths = [width_px(spot(FOCUS_MM, Optics(aperture_mm=aperture))) for aperture in (0.02, 0.04)]
-    assert widths[0] == pytest.approx(0.42 * 0.00055 / 0.02 * SMALL.focal_px[0], rel=0.15)
-    assert widths[0] > 1.3 * widths[1]
+def test_diffraction_grows_with_the_f_number_and_near_objects():
+    assert THESIS.diffraction_px(1e9) == pytest.approx(2.44 * 0.55 * 7.0 / 1.6, rel=1e-6)
+    assert THESIS.diffraction_px(2.0) > THESIS.diffraction_px(5.0) > THESIS.diffraction_px(50.0)
 
 
-def test_a_lens_keeps_even_light_and_does_not_spread_what_is_hidden() -> None:
-    even = through_lens(np.full((61, 61, 3), 0.4), np.full((61, 61), 2.6), SMALL, WORKING_MM, Optics(aperture_mm=0.5))
-    assert even == pytest.approx(0.4, abs=1e-5)
-    # A sharp black edge before a bright blurred background stays black.
-    light, depth = np.zeros((61, 61, 3)), np.full((61, 61), FOCUS_MM)
-    light[:, 31:], depth[:, 31:] = 1.0, np.inf
-    seen = through_lens(light, depth, SMALL, WORKING_MM, Optics(aperture_mm=0.6))
-    assert seen[30, 25, 1] < 0.01
-    assert seen[30, 40, 1] > 0.9
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"pixel_um": 0.0}, "must be positive"),
+        ({"field_of_view_deg": 180.0}, "angle of view"),
+        ({"focus_mm": 0.3}, "within its focal length"),
+    ],
+)
+def test_impossible_optics_are_refused(change, message):
+    good = {"width_px": 500, "height_px": 500, "pixel_um": 1.6, "field_of_view_deg": 62.0, "f_number": 7.0}
+    with pytest.raises(InputError, match=message):
+        Optics(name="bad", **{**good, **change})
 
 
-def test_crosstalk_mixes_colours_and_keeps_grey() -> None:
-    some = Optics(crosstalk=0.1)
-    assert mixed(np.array([[[1.0, 0.0, 0.0]]]), some)[0, 0] == pytest.approx([0.8, 0.1, 0.1])
-    assert mixed(np.full((1, 1, 3), 0.3), some) == pytest.approx(0.3)
+@given(diagonal=st.floats(5, 170), width=st.integers(50, 2000), height=st.integers(50, 2000))
+def test_a_diagonal_angle_of_view_reaches_the_corners(diagonal, width, height):
+    horizontal = horizontal_from_diagonal_deg(diagonal, width, height)
+    lens = Optics(
+        name="lens", width_px=width, height_px=height, pixel_um=1.0, field_of_view_deg=horizontal, f_number=4.0,
+        focus_mm=1e6,
+    )  # fmt: skip
+    left_up, right_down = lens.camera.rays(np.array([[0.0, 0.0], [width, height]]))
+    cosine = left_up @ right_down / np.linalg.norm(left_up) / np.linalg.norm(right_down)
+    assert np.rad2deg(np.arccos(cosine)) == pytest.approx(diagonal, abs=1e-5)
+    even = horizontal_from_diagonal_deg(diagonal, width, height, "equidistant")
+    assert even == pytest.approx(diagonal * width / np.hypot(width, height))
+    assert even < horizontal < diagonal
 
 
-def test_colour_filters_and_compression_keep_what_is_smooth() -> None:
-    rows, columns = np.mgrid[:64, :64]
-    smooth = np.dstack([80 + rows, 200 - columns, 60 + (rows + columns) // 2]).astype(np.uint8)
-    for optics in (Optics(bayer=True), Optics(jpeg_quality=95), CLINICAL):
-        off = recorded(smooth, optics)[4:-4, 4:-4].astype(float) - smooth[4:-4, 4:-4]
-        assert np.abs(off).max() <= 4
-        assert np.abs(off.mean(axis=(0, 1))).max() < 1
-    fine = np.where((rows + columns)[..., None] % 2 == 0, [200, 40, 40], [40, 40, 200]).astype(np.uint8)
-    assert np.abs(recorded(fine, Optics(bayer=True)).astype(float) - fine).mean() > 20
+def test_a_diagonal_angle_that_no_lens_has_is_refused():
+    with pytest.raises(InputError, match="not 180 deg"):
+        horizontal_from_diagonal_deg(180.0, 100, 100)
 
 
-def test_the_handpiece_smears_along_its_way_by_what_it_moves() -> None:
-    poses = {name: Rigid3(np.eye(3), np.array([-0.5 * k, 0.1 * k, 0.0])) for k, name in enumerate("abc")}
-    frames = [Frame(name=name, cameras=("a",)) for name in poses]
-    found = smears(frames, poses, 0.02)
-    for motion in found.values():
-        assert np.linalg.norm(motion[3:]) == pytest.approx(0.02)
-        assert motion[3:5] / np.linalg.norm(motion[3:5]) == pytest.approx(np.array([-5, 1]) / np.sqrt(26))
-    assert not smears(frames, poses, 0.0)
-    still = dict.fromkeys(poses, Rigid3.identity())
-    assert not any(motion.any() for motion in smears(frames, still, 0.02).values())
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_says_what_is_published_and_what_is_inferred(name):
+    lens = PRESETS[name]
+    assert "Published" in lens.source
+    assert "Inferred" in lens.source
+    assert 0.1 < lens.focal_mm < 1.0
+    assert 0.03 < lens.aperture_mm < 0.2
+    assert lens.sensor_width_mm < 1.0
+    near, far = lens.depth_of_field_mm(5.0)
+    assert near < 5.0 < far
 
 
-def test_motion_blurs_across_it_and_not_along() -> None:
-    """An edge across the motion becomes a ramp as wide as the motion, about the same place."""
-    jaw = jaw_of(quad((2.0, 0.0, 5.0), 2.0), labels=[11])
-    scene = Scene(jaw=jaw, handpiece=probe(led()), appearance=APPEARANCES["powder"], supersampling=4)
-    frame = Frame(name="a", cameras=("a",), lighting="all")
-
-    def edge(shift_mm: tuple[float, float, float]) -> np.ndarray:
-        image = render_image(scene, frame, "a", Rigid3.identity(), 20.0, np.array([0.0, 0, 0, *shift_mm]))
-        middle = CAMERA.height // 2
-        return image[middle - 5 : middle + 5].astype(float).mean(axis=(0, 2))
-
-    far = 10 * 5.0 / CAMERA.focal_px[0]  # 10 px
-    still, across, along = edge((0, 0, 0)), edge((far, 0, 0)), edge((0, far, 0))
-    ramp = [np.count_nonzero((each > 0.15 * each.max()) & (each < 0.6 * each.max())) for each in (still, across, along)]
-    assert ramp[0] <= 2
-    assert 3 <= ramp[1] <= 9
-    assert ramp[2] <= 2
-    assert across.sum() == pytest.approx(still.sum(), rel=0.1)
+def test_the_presets_have_the_published_figures():
+    thesis, omni, nan = PRESETS["thesis"], PRESETS["ovm6948"], PRESETS["naneye-c"]
+    assert (thesis.width_px, thesis.height_px, thesis.field_of_view_deg) == (500, 500, 62.0)
+    assert np.hypot(1, 1) * thesis.sensor_width_mm == pytest.approx(16 / 14, rel=0.01)
+    assert (omni.width_px, omni.pixel_um) == (200, 1.75)
+    assert omni.blur_px(3.0) == pytest.approx(omni.blur_px(30.0), rel=0.01)
+    assert (nan.width_px, nan.pixel_um, nan.f_number) == (320, 2.4, 4.0)
+    assert 2 * np.rad2deg(np.arctan(np.hypot(160, 160) / nan.focal_px)) == pytest.approx(120.0, abs=0.01)
