@@ -35,6 +35,7 @@ from cuspid.stereo.confidence import ConfidenceOptions
 from cuspid.stereo.glare import seen
 from cuspid.stereo.rectification import IdealView
 from cuspid.stereo.refinement import FAST, GroupGeometry, solve
+from cuspid.stereo.smoothing import smoothed
 
 _BURNT_DN, _DARK_DN, _UNUSABLE = 252, 16, np.float32(-1)
 """A channel from the first level on is burnt out, a pixel whose channels all lie below the second shows nothing:
@@ -52,6 +53,9 @@ _COLOURED = 0.2
 """Difference of the colours (unit vectors) of two lights from which on they are told apart."""
 _COMMON_DN, _LEAST_DN, _ABOVE_ZERO = 100.0, 4.0, 600.0
 """Brightness for which ratios are scaled, below which they are not taken, and what keeps them positive."""
+_SIGMA_PX, _LEAST_VARIANCE = 1.7, 1e-9
+"""Standard deviation of a depth whose fit says 1 px, and the least variance that is believed. Errors are as the square root of what fits give: samples that overlap understate
+them, and the start, which is smooth, keeps them small where the images tell nothing."""
 _SLANT_DAMPING = 3.0
 """Added to the normal equations of the slants, for each camera: what DN^2 of slope would add."""
 
@@ -73,9 +77,9 @@ class ShadingOptions(Options):
     """Penalty for a plane that is the next one to its neighbour's; costs lie between 0 and 1 (unlike)."""
     large_jump: Annotated[float, Range(0, 1000)] = 0.5
     """Penalty for a plane that is farther from its neighbour's."""
-    radius_px: Annotated[int, Range(1, 50)] = 4
-    """Half the side of the window of the refinement (4: 9 x 9 px)."""
-    window_sigma_px: Annotated[float, Range(0.1, 100)] = 3.0
+    radius_px: Annotated[int, Range(1, 50)] = 2
+    """Half the side of the window of the refinement (2: 5 x 5 px)."""
+    window_sigma_px: Annotated[float, Range(0.1, 100)] = 2.5
     """Standard deviation of the Gaussian weight over the window."""
     iterations: Annotated[int, Range(1, 1000)] = 10
     """Maximum number of Gauss-Newton steps."""
@@ -85,13 +89,18 @@ class ShadingOptions(Options):
     """A camera whose brightness differs by more (RMS over the window, digital numbers) sees something else."""
     camera_lag_dn: Annotated[float, Range(0, 255)] = 2.0
     """A camera whose difference exceeds the best one's by more sees something else."""
+    bend_px: Annotated[float, Range(0.001, 1000)] = 0.22
+    """How much a surface bends from one pixel of the depth map to the next: change of its slope, px of disparity.
+    Smaller values make surfaces smoother where the images tell little about them."""
     glare_dn: Annotated[float, Range(0.001, 1000)] = 0.05
     """Where mirror reflections of the lights may add this much (digital numbers), as a first depth shows,
     brightness counts half."""
     exit_index: Annotated[float, Range(1, 3)] = 1.4
     """Refractive index of the surface, by which less of its light leaves it at grazing angles; 1 for what is matte.
     Only lights of one colour need it."""
-    confidence: ConfidenceOptions = field(default_factory=lambda: ConfidenceOptions(agreement=4.0, largest_sigma=2.5))
+    confidence: ConfidenceOptions = field(
+        default_factory=lambda: ConfidenceOptions(agreement=4.0, largest_sigma=4.5, best_sigma=1.0)
+    )
     """Checks and weights. Shade is broad: the limits are wider than those for texture."""
 
     @property
@@ -497,6 +506,7 @@ class _Refinement:
         options: ShadingOptions,
     ) -> None:
         geometry = self._geometry = view.geometry
+        self._spacing_px, self._bend_px = spacing_px, options.bend_px
         self._view = _View(images, images, reference, geometry.infinite, geometry.parallax, geometry.others)
         self._rows, self._columns = (_every(count, spacing_px) for count in view.size)
         lowest, highest = (view.geometry.scale / depth for depth in reversed(depth_range_mm))
@@ -516,9 +526,26 @@ class _Refinement:
         view = self._view._replace(images=images, trust=trust)
         fit = self._fit._replace(lenient=lenient)
         found = _refine_all(view, fit, self._rows, self._columns, self._planes)
+        sigma = _SIGMA_PX * np.maximum(found[..., 1], _LEAST_VARIANCE) ** 0.25
+        q = smoothed(np.where(found[..., 2] > 0, found[..., 0], np.nan), sigma, self._bend_px)
+        self._restart(q)
         scale = self._geometry.scale
-        depth = scale / np.where(found[..., 2] > 0, found[..., 0], np.nan)
-        return depth, np.sqrt(found[..., 1]) * depth**2 / scale
+        return scale / q, sigma * scale / q**2
+
+    def _restart(self, q: Float[np.ndarray, "rows columns"]) -> None:
+        """From a smooth surface, next time, where it is known."""
+        along = [_slope(q, axis) / self._spacing_px for axis in (1, 0)]
+        for channel, values in enumerate((q, *along)):
+            self._planes[..., channel] = np.where(np.isfinite(values), values, self._planes[..., channel])
+
+
+def _slope(values: Float[np.ndarray, "h w"], axis: int) -> Float[np.ndarray, "h w"]:
+    """Mean difference to the pixels on both sides, or to the one that is known; NaN without any."""
+    step = np.diff(values, axis=axis)
+    empty = np.full_like(values.take([0], axis=axis), np.nan)
+    sides = np.stack([np.concatenate([empty, step], axis=axis), np.concatenate([step, empty], axis=axis)])
+    known = np.isfinite(sides)
+    return np.where(known, sides, 0).sum(axis=0) / np.where(known.any(axis=0), known.sum(axis=0), np.nan)
 
 
 def _fit(options: ShadingOptions, lowest: float, highest: float) -> _Fit:
