@@ -12,7 +12,8 @@ is (:mod:`cuspid.stereo.glare`), what burns out is not compared, and a camera th
 First planes of constant inverse depth are swept (R. Collins, CVPR 1996) over a coarse grid, by clipped absolute
 differences of the better half of the cameras, and the plane of each cell is chosen by semi-global optimisation. Then a
 slanted plane is fitted around each pixel by Gauss-Newton, as in :mod:`cuspid.stereo.refinement`, whose notation is used
-here, with the plain differences of brightness as residuals.
+here, with the plain differences of brightness as residuals. Last a smooth surface is laid through all of them
+(:mod:`cuspid.stereo.smoothing`): windows are small, and where the shade does not change none of them tells much.
 """
 
 from __future__ import annotations
@@ -54,8 +55,9 @@ _COLOURED = 0.2
 _COMMON_DN, _LEAST_DN, _ABOVE_ZERO = 100.0, 4.0, 600.0
 """Brightness for which ratios are scaled, below which they are not taken, and what keeps them positive."""
 _SIGMA_PX, _LEAST_VARIANCE = 1.7, 1e-9
-"""Standard deviation of a depth whose fit says 1 px, and the least variance that is believed. Errors are as the square root of what fits give: samples that overlap understate
-them, and the start, which is smooth, keeps them small where the images tell nothing."""
+"""Standard deviation (px) of a depth whose fit gives 1 px, and the least variance of a fit. Errors are as the square
+root of what fits give: samples that overlap understate them, a smooth start keeps them small where images tell little.
+"""
 _SLANT_DAMPING = 3.0
 """Added to the normal equations of the slants, for each camera: what DN^2 of slope would add."""
 
@@ -89,7 +91,7 @@ class ShadingOptions(Options):
     """A camera whose brightness differs by more (RMS over the window, digital numbers) sees something else."""
     camera_lag_dn: Annotated[float, Range(0, 255)] = 2.0
     """A camera whose difference exceeds the best one's by more sees something else."""
-    bend_px: Annotated[float, Range(0.001, 1000)] = 0.22
+    bend_px: Annotated[float, Range(0.001, 1000)] = 0.16
     """How much a surface bends from one pixel of the depth map to the next: change of its slope, px of disparity.
     Smaller values make surfaces smoother where the images tell little about them."""
     glare_dn: Annotated[float, Range(0.001, 1000)] = 0.05
