@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
-_ROUNDS = 3
+_ROUNDS = 2
 """Least-squares problems, each with the weights that follow from the one before."""
 _STEPS, _TOLERANCE = 200, 1e-3
 """Limits of the conjugate gradients."""
@@ -40,16 +40,16 @@ def smoothed(
     measured = np.where(known, values, 0.0).ravel()
     precision = np.where(known, sigma, 1.0).ravel() ** -2
     second = _second_differences(known)
-    surface, trust = measured, np.ones_like(measured)
+    change, trust = np.zeros_like(measured), np.ones_like(measured)
     for _ in range(_ROUNDS):
-        bends = np.abs(second @ surface) / bend
+        bends = np.abs(second @ (measured + change)) / bend
         stiffness = np.where(bends < _CUT, _huber(bends, _SHARP), 0) / bend**2
-        system = (sparse.diags_array(precision * trust) + second.T @ sparse.diags_array(stiffness) @ second).tocsr()
+        stiff = second.T @ sparse.diags_array(stiffness) @ second
+        system = (sparse.diags_array(precision * trust) + stiff).tocsr()
         scaled = sparse.diags_array(1 / system.diagonal())
-        right = precision * trust * measured
-        surface, _ = cg(system, right, x0=surface, rtol=_TOLERANCE, maxiter=_STEPS, M=scaled)
-        trust = _huber(np.abs(surface - measured) * np.sqrt(precision), _OUTLYING)
-    return np.where(known, surface.reshape(values.shape), np.nan)
+        change, _ = cg(system, -(stiff @ measured), x0=change, rtol=_TOLERANCE, maxiter=_STEPS, M=scaled)
+        trust = _huber(np.abs(change) * np.sqrt(precision), _OUTLYING)
+    return np.where(known, values + change.reshape(values.shape), np.nan)
 
 
 def _huber(multiples: Float[np.ndarray, "n"], limit: float) -> Float[np.ndarray, "n"]:
