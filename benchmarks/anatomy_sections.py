@@ -271,12 +271,13 @@ def enamel(result: Result) -> str:
             "One tooth each, twelve cameras of 500 x 500 px, texture `enamel` (plain, glossy and wet), noise 1.5 DN. "
             "Three colour-coded LEDs about each group, behind crossed polarisers (3 % of mirror reflections pass), "
             "except: *glossy* colour-coded without polarisers, *white-crossed* four white LEDs a group behind "
-            "polarisers, *white* without. *clinical* has `--optics clinical` (defocus and diffraction, motion during "
-            "the exposure, saliva, crosstalk, Bayer, JPEG); *artificial-clinical* has them, white light, and the "
-            "texture `artificial`. Bars: under colour-coded, polarised light a mean of 6 um (clinical 10 um) with 94 % "
-            "within 50 um; artificial-clinical 4 um. Developed on phantom-0, phantom-1 and front teeth of 005_upper; "
-            "the other jaws were looked at only "
-            "at the end. `python benchmarks/enamel.py`.",
+            "polarisers, *white* without; *as-texture* the images of phantom-0, located by keypoints and matched by "
+            "correlation, as textured teeth are, *colmap* the same with the motion of COLMAP's mapper. *clinical* has "
+            "`--optics clinical` (defocus and diffraction, motion during the exposure, saliva, crosstalk, Bayer, "
+            "JPEG); *artificial-clinical* has them, white light, and the texture `artificial`. Bars: under "
+            "colour-coded, polarised light a mean of 6 um (clinical 10 um) with 94 % within 50 um; artificial-clinical "
+            "4 um. Developed on phantom-0; the other jaws were looked at only at the end. "
+            "`python benchmarks/enamel.py`.",
             "",
             _scans_table(told),
         ]

@@ -3,7 +3,8 @@
     python benchmarks/enamel.py FOLDER [--work build/enamel] [--only phantom] [--add]
 
 FOLDER holds labelled meshes of real jaws. Each case is one tooth with what is seen around it, 10 frames or more of
-twelve cameras; the variants take away one ingredient at a time, or have clinical optics. Finished scans are kept in the
+twelve cameras; the variants take away one ingredient at a time, have clinical optics,
+or are reconstructed as if there were texture. Finished scans are kept in the
 work folder and not run again; ``--add`` keeps those of the result file, too, each with the commit that it is of.
 """
 
@@ -25,6 +26,7 @@ from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
 from cuspid.jaw import Jaw
+from cuspid.pipeline import ReconstructionOptions
 from cuspid.rig import Handpiece
 from cuspid.simulation.appearance import Preset
 from cuspid.simulation.optics import OpticsOptions
@@ -40,6 +42,12 @@ PHANTOMS = {0: 46, 1: 36, 2: 46}
 REAL = {"005_upper": 11, "010_upper": 16, "023_lower": 36, "034_upper": 21, "048_lower": 43}
 VARIANTS = ("glossy", "white-crossed", "white")
 """Colour-coded without polarisers; white with them; white without: of the phantom of seed 0."""
+METHODS = {
+    "as-texture": ReconstructionOptions(signal="texture"),
+    "colmap": ReconstructionOptions(signal="texture", motion="colmap"),
+}
+"""How else the images of the phantom of seed 0 are reconstructed: by keypoints and correlation, with cuspid's motion or
+COLMAP's."""
 
 
 def cases(folder: Path) -> Iterator[Case]:
@@ -55,6 +63,8 @@ def cases(folder: Path) -> Iterator[Case]:
         yield Case(name=f"{name}-artificial-clinical", parameters={**jaw, **textured})
     for light in VARIANTS:
         yield Case(name=f"phantom-0-{light}", parameters={**phantoms["phantom-0"], **plain, "light": light})
+    for method in METHODS:
+        yield Case(name=f"phantom-0-{method}", parameters={**phantoms["phantom-0"], **plain, "method": method})
     for name, tooth in REAL.items():
         file = next(iter(folder.rglob(f"{name}.ply")), None)
         if file is not None:
@@ -79,14 +89,15 @@ def jaw_of(name: str) -> Jaw:
 
 
 def judge(
-    *, jaw: str, tooth: int, light: str, optics: Literal["ideal", "clinical"], texture: Preset
+    *, jaw: str, tooth: int, light: str, optics: Literal["ideal", "clinical"], texture: Preset, method: str = ""
 ) -> dict[str, Value]:
     """The figures of one scan."""
     begin = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="cuspid-enamel-") as folder:
         path, seen_by = ScanPathOptions(tooth=tooth), OpticsOptions(optics=optics)
         options = SimulationOptions(texture=texture, optics=seen_by, path=path)
-        found = scanned(jaw_of(jaw), lit(light), Path(folder), options)
+        how = METHODS.get(method, ReconstructionOptions())
+        found = scanned(jaw_of(jaw), lit(light), Path(folder), options, how)
     return {"commit": commit(), **found, "wall_s": time.perf_counter() - begin}
 
 

@@ -147,11 +147,17 @@ def judge(*, file: str, part: str, smooth: bool, pixels: int, passes: str, plan_
         return planned | scanned(jaw, handpiece, Path(folder), SimulationOptions(path=path_options))
 
 
-def scanned(jaw: Jaw, handpiece: Handpiece, folder: Path, options: SimulationOptions) -> dict[str, Value]:
+def scanned(
+    jaw: Jaw,
+    handpiece: Handpiece,
+    folder: Path,
+    options: SimulationOptions,
+    how: ReconstructionOptions = ReconstructionOptions(),
+) -> dict[str, Value]:
     """The figures of a scan."""
     capture, _ = pipeline.simulate(jaw, handpiece, folder, options)
     begin, begin_cpu = time.perf_counter(), time.process_time()
-    reconstruction, mesh = pipeline.reconstruct(capture, folder, ReconstructionOptions())
+    reconstruction, mesh = pipeline.reconstruct(capture, folder, how)
     took, took_cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
     reference = pipeline.load_reference(folder / "truth")
     found = pipeline.evaluate(
