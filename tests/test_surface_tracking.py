@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
@@ -130,19 +129,6 @@ def test_tracking_goes_on_where_the_surface_is_seen_again() -> None:
     found = tracked(depth_maps(way))
     assert found.frames == ("00000", "00001", "00002", "00005")
     assert errors_um(found, way).max() < 15
-
-
-def test_depths_count_by_their_confidence() -> None:
-    rng, uncertain = np.random.default_rng(1), np.arange(80) % 20 < 12
-
-    def blurred(each: DepthMap, told: bool) -> DepthMap:
-        noise = np.where(uncertain, cv2.GaussianBlur(rng.normal(0, 1.0, (80, 80)), (0, 0), 3.0), 0)
-        confidence = np.where(uncertain & told, 0.02, 1.0) * each.confidence
-        return replace(each, depth_mm=(each.depth_mm + noise).astype(np.float32), confidence=confidence)
-
-    maps = depth_maps(OUT)
-    told, untold = (errors_um(tracked([blurred(each, honest) for each in maps]), OUT) for honest in (True, False))
-    assert 0.5 < told.mean() < 0.7 * untold.mean()
 
 
 def test_a_plane_holds_nothing_in_place() -> None:

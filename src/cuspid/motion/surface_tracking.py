@@ -4,8 +4,7 @@ The depth maps of each frame are metric, so that frames are placed by laying the
 onto an earlier one, by iterative closest points with point-to-plane distances (Y. Chen, G. Medioni, Image and Vision
 Computing 10, 1992) and a motion model; then all at once, over all pairs of frames that show the same surface, whether
 consecutive or not. A pair counts for as much as its surfaces overlap and as little as they scatter about each other, so
-that drift is spread where it is least certain, and a path that comes back is closed. There, points count by how well
-their depth is known.
+that drift is spread where it is least certain, and a path that comes back is closed.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3, unit
 from cuspid.options import SEED, SHARE, Options, Range
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import DepthMap, Reconstruction
+from cuspid.reconstruction import DepthMap, Reconstruction, SurfacePoints
 from cuspid.rig import Handpiece
 from cuspid.workers import map_in_threads
 
@@ -49,8 +48,6 @@ _TUKEY = 5.0
 """Robust standard deviations beyond which a distance has no weight."""
 _LEAST_SIGMA = 0.0006
 """Standard deviation of distances, as a share of the working distance, below which none is assumed."""
-_SHARED_VARIANCE = 0.1
-"""Of all points, for the surface between them is not flat: relative to the variance of the surest depth."""
 _LEAST_MATCHES = 100
 _BRIEFLY, _BLOCKS = 3, 0.1
 """Frames back that are tried first, and side of the blocks by which overlap is told, as share of the working distance
@@ -93,28 +90,11 @@ class SurfaceTrackingOptions(Options):
     """Seed of the choice of these points."""
 
 
-class Shown(NamedTuple):
-    """Points of the surface that a frame shows, in its rig frame."""
-
-    points: np.ndarray
-    """mm."""
-    normals: np.ndarray
-    """Outward."""
-    information: np.ndarray
-    """Inverse variance along the normal, relative to that of the surest depth."""
-
-    @property
-    def variance(self) -> Float[np.ndarray, "n"]:
-        """Along the normal, relative to that of the surest depth."""
-        return np.asarray(_SHARED_VARIANCE + 1 / self.information)
-
-
 class Surface:
-    """What a frame shows, ready to be asked for the nearest point."""
+    """What a frame shows, in its rig frame, ready to be asked for the nearest point."""
 
-    def __init__(self, shown: Shown) -> None:
-        self.points, self.normals, self.information = shown
-        self.variance = shown.variance
+    def __init__(self, shown: SurfacePoints) -> None:
+        self.points, self.normals = shown.points, shown.normals
         self._tree = cKDTree(self.points)
 
     def __len__(self) -> int:
@@ -128,10 +108,10 @@ class Surface:
         near = np.isfinite(distance)
         return near, np.where(near, index, 0)
 
-    def some(self, count: int, rng: np.random.Generator) -> Shown:
+    def some(self, count: int, rng: np.random.Generator) -> SurfacePoints:
         """A random choice of the points."""
         chosen = rng.permutation(len(self))[:count]
-        return Shown(self.points[chosen], self.normals[chosen], self.information[chosen])
+        return SurfacePoints(self.points[chosen], self.normals[chosen])
 
 
 class _Laid(NamedTuple):
@@ -143,19 +123,16 @@ class _Laid(NamedTuple):
     """Mean of both."""
     distances: np.ndarray
     """Along them."""
-    variances: np.ndarray
-    """Of them, relative to their median."""
     sigma: float
-    """Robust standard deviation of the distances, where the variance is the median one."""
+    """Robust standard deviation of the distances."""
     share: float
     """Of the first surface that lies on the second."""
 
     @property
     def weights(self) -> Float[np.ndarray, "n"]:
         """Tukey's, over the variance."""
-        variance = self.sigma**2 * self.variances
-        off = np.minimum(self.distances**2 / (_TUKEY**2 * variance), 1.0)
-        return np.asarray((1 - off) ** 2 / variance)
+        off = np.minimum((self.distances / (_TUKEY * self.sigma)) ** 2, 1.0)
+        return np.asarray((1 - off) ** 2 / self.sigma**2)
 
     @property
     def relief(self) -> float:
@@ -179,7 +156,7 @@ class _Step:
 # --- surfaces of frames ------------------------------------------------------------------------------------------
 
 
-def _shown(depth_map: DepthMap, jump_mm: float) -> Shown:
+def _shown(depth_map: DepthMap, jump_mm: float) -> SurfacePoints:
     """The points of a depth map that have neighbours on all sides, in the rig frame."""
     camera = depth_map.camera
     rays = camera.rays(camera.pixel_centres().reshape(-1, 2)).reshape(camera.height, camera.width, 3)
@@ -193,16 +170,14 @@ def _shown(depth_map: DepthMap, jump_mm: float) -> Shown:
         smooth = np.maximum(np.linalg.norm(right, axis=-1), np.linalg.norm(down, axis=-1)) < jump_mm
         good = smooth & (facing > _LEAST_COSINE)
     rig_from_cam = depth_map.cam_from_rig.inverse()
-    return Shown(rig_from_cam.apply(points[good]), rig_from_cam.rotate(normals[good]), depth_map.confidence[good])
+    return SurfacePoints(rig_from_cam.apply(points[good]), rig_from_cam.rotate(normals[good]))
 
 
 def surface_of(depth_maps: Iterable[DepthMap], working_distance_mm: float, options: SurfaceTrackingOptions) -> Surface:
-    """What the depth maps of a frame show, thinned out: the weighted mean of what lies in one cube and faces one
-    way."""
+    """What the depth maps of a frame show, thinned out: the mean of what lies in one cube and faces one way."""
     parts = [_shown(each, _JUMP * working_distance_mm) for each in depth_maps]
     points = np.concatenate([np.zeros((0, 3)), *(part.points for part in parts)])
     normals = np.concatenate([np.zeros((0, 3)), *(part.normals for part in parts)])
-    information = np.concatenate([np.zeros(0), *(part.information for part in parts)])
     cubes = np.floor(points / (options.thinning * working_distance_mm)).astype(np.int64)
     sides = np.abs(normals).argmax(axis=1, keepdims=True) if len(normals) else np.zeros((0, 1), int)
     facing = sides + 3 * (np.take_along_axis(normals, sides, axis=1) > 0)
@@ -210,28 +185,21 @@ def surface_of(depth_maps: Iterable[DepthMap], working_distance_mm: float, optio
         np.concatenate([cubes, facing], axis=1), axis=0, return_inverse=True, return_counts=True
     )
     cell, enough = cell.reshape(-1), members >= _LEAST_MEMBERS
-    total = np.bincount(cell, information, len(members))[enough]
 
     def mean(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-        sums = [np.bincount(cell, information * values[:, axis], len(members))[enough] for axis in range(3)]
-        return np.stack(sums, axis=1) / total[:, None]
+        sums = [np.bincount(cell, values[:, axis], len(members)) for axis in range(3)]
+        return (np.stack(sums, axis=1) / members[:, None])[enough]
 
-    return Surface(Shown(mean(points), unit(mean(normals)), total))
+    return Surface(SurfacePoints(mean(points), unit(mean(normals))))
 
 
 # --- one frame onto another --------------------------------------------------------------------------------------
 
 
 def _lay(
-    one: Surface | Shown,
-    other: Surface,
-    other_from_one: Rigid3,
-    reach_mm: float,
-    least_mm: float,
-    weighted: bool = False,
+    one: Surface | SurfacePoints, other: Surface, other_from_one: Rigid3, reach_mm: float, least_mm: float
 ) -> _Laid | None:
-    """None where hardly anything is near. Not ``weighted``: all points count alike, which few sure ones cannot deceive
-    while the place is not known yet."""
+    """None where hardly anything is near."""
     points, normals = other_from_one.apply(one.points), other_from_one.rotate(one.normals)
     near, index = other.nearest(points, reach_mm)
     near &= (normals * other.normals[index]).sum(axis=1) > _ALIKE
@@ -240,10 +208,8 @@ def _lay(
     points, index = points[near], index[near]
     normals = unit(normals[near] + other.normals[index])
     distances = ((points - other.points[index]) * normals).sum(axis=1)
-    variances = one.variance[near] + other.variance[index] if weighted else np.ones(len(index))
-    variances /= np.median(variances)
-    sigma = max(1.4826 * float(np.median(np.abs(distances) / np.sqrt(variances))), least_mm)
-    return _Laid(points, normals, distances, variances, sigma, float(near.mean()))
+    sigma = max(1.4826 * float(np.median(np.abs(distances))), least_mm)
+    return _Laid(points, normals, distances, sigma, float(near.mean()))
 
 
 def _equations(laid: _Laid) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]:
@@ -263,7 +229,7 @@ def _solved(matrix: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n"]) -> 
 
 
 def _onto(
-    one: Surface | Shown,
+    one: Surface | SurfacePoints,
     other: Surface,
     start: Rigid3,
     distance_mm: float,
@@ -402,7 +368,7 @@ def _together(
 
 
 def _compared(
-    some: Sequence[Shown],
+    some: Sequence[SurfacePoints],
     surfaces: Sequence[Surface],
     poses: Sequence[Rigid3],
     reach_mm: float,
@@ -411,7 +377,7 @@ def _compared(
 ) -> _Laid | None:
     """Some points of one frame on the surface of another."""
     one, other = pair
-    return _lay(some[one], surfaces[other], poses[other] @ poses[one].inverse(), reach_mm, least_mm, weighted=True)
+    return _lay(some[one], surfaces[other], poses[other] @ poses[one].inverse(), reach_mm, least_mm)
 
 
 def _joint_step(
