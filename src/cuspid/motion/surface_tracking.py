@@ -441,8 +441,8 @@ def _drift(poses: Sequence[Rigid3], distance_mm: float) -> tuple[str, ...]:
     if extent_mm < _LONG * distance_mm:
         return ()
     return (
-        f"motion: over {extent_mm:.0f} mm, small errors from surface to surface add up: in simulation a whole arch "
-        "comes out 0.13 mm too wide at the molars; do not rely on distances across it",
+        f"motion: over {extent_mm:.0f} mm, small errors from surface to surface add up: in simulation the ends of a "
+        "whole arch come out 0.05 mm off; do not rely on distances across it",
     )
 
 

@@ -34,7 +34,9 @@ class ConfidenceOptions(Options):
     contradict them."""
     agreement: Annotated[float, Range(0.01, 1000)] = 2.5
     """Largest difference, in resolutions (0.03 mm at 12 um), between the depths of two cameras that agree, where three
-    or more look; or three standard deviations if that is more."""
+    or more look; or some standard deviations if that is more."""
+    agreement_sigmas: Annotated[float, Range(0, 100)] = 3.0
+    """How many standard deviations."""
     largest_sigma: Annotated[float, Range(0.001, 1000)] = 5 / 6
     """A depth with a larger standard deviation, in resolutions (0.01 mm at 12 um), is dropped."""
     best_sigma: Annotated[float, Range(0.0001, 100)] = 1 / 6
@@ -125,7 +127,7 @@ def _tolerance_mm(
     """How far from each other the depths of two of so many cameras may be."""
     if cameras == 2:
         return options.pair_agreement * resolution.at(one.depth_mm)
-    return np.maximum(options.agreement * resolution.at(one.depth_mm), 3 * one.sigma_mm)
+    return np.maximum(options.agreement * resolution.at(one.depth_mm), options.agreement_sigmas * one.sigma_mm)
 
 
 def at_near_borders(
