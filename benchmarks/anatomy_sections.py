@@ -276,7 +276,8 @@ def enamel(result: Result) -> str:
             "`--optics clinical` (defocus and diffraction, motion during the exposure, saliva, crosstalk, Bayer, "
             "JPEG); *artificial-clinical* has them, white light, and the texture `artificial`. Bars: under "
             "colour-coded, polarised light a mean of 6 um (clinical 10 um) with 94 % within 50 um; artificial-clinical "
-            "4 um. Developed on phantom-0; the other jaws were looked at only at the end. "
+            "4 um. Developed on phantom-0, phantom-1 and front teeth of 005_upper; limits were made stricter after "
+            "048_lower had been seen; the other jaws were looked at only at the end. "
             "`python benchmarks/enamel.py`.",
             "",
             _scans_table(told),
