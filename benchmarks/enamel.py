@@ -3,9 +3,9 @@
     python benchmarks/enamel.py FOLDER [--work build/enamel] [--only phantom] [--add]
 
 FOLDER holds labelled meshes of real jaws. Each case is one tooth with what is seen around it, 10 frames or more of
-twelve cameras; the variants take away one ingredient at a time, have clinical optics,
-or are reconstructed as if there were texture. Finished scans are kept in the
-work folder and not run again; ``--add`` keeps those of the result file, too, each with the commit that it is of.
+twelve cameras; the variants take away one ingredient at a time, have clinical optics, or are reconstructed as if there
+were texture. Finished scans are kept in the work folder and not run again; ``--add`` keeps those of the result file,
+too, each with the commit that it is of.
 """
 
 from __future__ import annotations

@@ -310,6 +310,10 @@ def flat(centre: tuple[float, float], depth: float) -> Measured:
     return Measured(camera, Rigid3(np.eye(3), -np.array([*centre, 0.0])), full, np.full((20, 20), 0.001))
 
 
+PLACES = ((0, 0), 0.0), ((0.5, 0), 0.06), ((0, 0.5), -0.5)
+"""Where cameras are, and how far behind the plane of the first they see it; mm."""
+
+
 def test_cameras_that_agree_vote_for_a_depth_and_others_against() -> None:
     measured = [flat((0, 0), 5.0), flat((0.5, 0), 5.01), flat((0, 0.5), 5.5), flat((0.5, 0.5), 4.5)]
     votes = agreement(measured, 0, RESOLUTION, ConfidenceOptions())[10, 10]
@@ -317,6 +321,13 @@ def test_cameras_that_agree_vote_for_a_depth_and_others_against() -> None:
     assert votes == 0
     assert agreement(measured[:2], 0, RESOLUTION, ConfidenceOptions())[10, 10] == 1
     assert agreement(measured[::3], 0, RESOLUTION, ConfidenceOptions())[10, 10] == 0
+
+
+@pytest.mark.parametrize(("sigmas", "votes"), [(3.0, 1), (1.0, 0)])
+def test_uncertain_depths_may_differ_by_some_of_their_sigmas(sigmas: float, votes: int) -> None:
+    measured = [replace(flat(at, 5 + off), sigma_mm=np.full((20, 20), 0.04)) for at, off in PLACES]
+    options = ConfidenceOptions(agreement_sigmas=sigmas)
+    assert agreement(measured, 0, RESOLUTION, options)[10, 10] == votes
 
 
 def test_two_cameras_alone_must_agree_better() -> None:

@@ -34,7 +34,8 @@ def smoothed(
 ) -> Float[np.ndarray, "h w"]:
     """The smooth surface through measured values, where there are any; NaN elsewhere.
 
-    ``sigma``: their standard deviations. ``bend``: usual second difference of the surface from pixel to pixel.
+    ``sigma``: their standard deviations. ``bend``: usual second difference of the surface from pixel to pixel. All are
+    of one unit.
     """
     known = np.isfinite(values)
     measured = np.where(known, values, 0.0).ravel()
