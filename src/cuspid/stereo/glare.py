@@ -4,9 +4,9 @@ and light that does not leave it at grazing angles.
 The mirror image of a light lies behind the surface, at another place for each camera, so that it pulls the depth of
 what is compared. Crossed polarisers leave a few percent of it, spread over a spot that is as wide as the surface is
 rough: some digital numbers, as much as the shade changes over many pixels. Where the spots lie follows from the places
-of the lights and a first depth; how bright they are at most, from a common model of gloss with the values of a wet
-surface. That is too rough to
-subtract them: a spot's strength cannot be told from the depth that it pulled. It tells where not to compare.
+of the lights and a first depth; how bright they are, from a common model of gloss with the values of a wet surface.
+They are taken off, and what is left of a spot (its strength may be another, and the first depth is wrong where it was
+pulled) tells how far to trust the comparison.
 
 Light that is scattered below a clear surface leaves it the less the more oblique it is (Fresnel): of wet enamel 5 %
 less at 60 degrees, 25 % at 77. That is known well enough to be made up for.
@@ -30,9 +30,11 @@ from cuspid.rig import Light
 _REFLECTANCE, _ROUGHNESS, _ALBEDO = 0.05, 0.12, 0.5
 """Of a wet tooth: Fresnel reflectance at normal incidence (refractive index 1.6), GGX roughness, share of the light
 that it scatters back."""
-_WINDOWS_PX = (15, 45)
-"""Sides, in px of the image, of the windows over which the slope of a surface is averaged. Small ones follow its shape,
-large ones look past the pit that a reflection made in it; what either of them shows is a reflection."""
+_MIDDLE_PX, _WIDE_PX = 27, 75
+"""Sides, in px of the image, of the windows over which the slope of a surface is averaged. The first follows its shape;
+the second looks past the pit that a reflection made in it."""
+_STRENGTH, _PLACE = 0.15, 0.5
+"""What a spot is uncertain by: a share of it, and a share of what it is brighter by seen past a pit."""
 _LEAST_SHARE = 0.2
 """Share of a window whose depth must be known."""
 _GRAZING, _OBLIQUE = 0.05, 0.2
@@ -45,6 +47,8 @@ class Seen(NamedTuple):
 
     mirrored: Float32[np.ndarray, "h w 3"]
     """Mirror reflections as a share of the shade, channel by channel; 0 where the surface is not known."""
+    uncertain: Float32[np.ndarray, "h w 3"]
+    """What they are uncertain by."""
     leaving: Float32[np.ndarray, "h w"]
     """Share of the scattered light that leaves the surface towards the camera, relative to that along the normal; 1
     where that is not known."""
@@ -60,17 +64,18 @@ def seen(
     """What a first depth tells of every ``spacing_px``-th pixel of an image, with lights in the frame of its camera and
     the refractive index of the surface."""
     rays = grid.rays(grid.pixel_centres().reshape(-1, 2)).reshape(grid.height, grid.width, 3)
-    most, share = np.zeros(rays.shape, np.float32), np.ones(depth_mm.shape, np.float32)
-    for window_px in reversed(_WINDOWS_PX):
+    spots, share = np.zeros((2, *rays.shape), np.float32), np.ones(depth_mm.shape, np.float32)
+    for spot, window_px in zip(spots, (_WIDE_PX, _MIDDLE_PX), strict=True):
         inverse, slopes = _smoothed(1 / depth_mm, max(3, window_px // spacing_px))
         # The plane 1 / Z = a x + b y + c, with x = X / Z and y = Y / Z, has the normal (a, b, c).
         across = slopes * grid.focal_px
         normals = -unit(np.dstack([across, inverse - (across * rays[..., :2]).sum(axis=-1)]))
         known = np.isfinite(normals).all(axis=-1)
         points = rays[known] / inverse[known, None]
-        most[known] = np.maximum(most[known], mirrored(points, normals[known], lights))
+        spot[known] = mirrored(points, normals[known], lights)
         share[known] = _leaving(-(normals[known] * unit(points)).sum(axis=-1), exit_index)
-    return Seen(most, share)
+    past_pits, spot = spots
+    return Seen(spot, _STRENGTH * spot + _PLACE * np.maximum(past_pits - spot, 0), share)
 
 
 def _smoothed(

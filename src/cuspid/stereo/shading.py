@@ -6,8 +6,9 @@ places, one for each channel, give three shades of one exposure (R. Woodham, Opt
 for one camera). Then the ratios of the channels are compared: the gain of a camera, the falloff of its lens, the colour
 of the tooth and the light that does not leave a clear surface at grazing angles are the same in all channels, and
 cancel. Under lights of one colour brightness itself must be compared, and a first depth tells how much of it was lost.
-Mirror reflections move with the camera: crossed polarisers take most of them away, a first depth tells where the rest
-is (:mod:`cuspid.stereo.glare`), what burns out is not compared, and a camera that differs from the others is left out.
+Mirror reflections move with the camera: crossed polarisers take most of them away, a first depth tells what is left
+(:mod:`cuspid.stereo.glare`), which is taken off; what burns out is not compared, and a camera that differs from the
+others is left out.
 
 First planes of constant inverse depth are swept (R. Collins, CVPR 1996) over a coarse grid, by clipped absolute
 differences of the better half of the cameras, and the plane of each cell is chosen by semi-global optimisation. Then a
@@ -50,6 +51,8 @@ _STRIDE = 2
 _SMOOTH_PX = 4.0
 """Neighbours on the swept grid whose disparities differ by more are not on one surface."""
 _LENIENT = 2
+_ROUNDS = 2
+"""How often the depth is refined once it is known where lights are mirrored."""
 _COLOURED = 0.2
 """Difference of the colours (unit vectors) of two lights from which on they are told apart."""
 _COMMON_DN, _LEAST_DN, _ABOVE_ZERO = 100.0, 4.0, 600.0
@@ -95,8 +98,7 @@ class ShadingOptions(Options):
     """How much a surface bends from one pixel of the depth map to the next: change of its slope, px of disparity.
     Smaller values make surfaces smoother where the images tell little about them."""
     glare_dn: Annotated[float, Range(0.001, 1000)] = 0.05
-    """Where mirror reflections of the lights may add this much (digital numbers), as a first depth shows,
-    brightness counts half."""
+    """Where mirror reflections of the lights are uncertain by this much (digital numbers), brightness counts half."""
     exit_index: Annotated[float, Range(1, 3)] = 1.4
     """Refractive index of the surface, by which less of its light leaves it at grazing angles; 1 for what is matte.
     Only lights of one colour need it."""
@@ -449,25 +451,39 @@ def shaded_depths(
     how = depth_range_mm, spacing_px, options
     refinements = [_Refinement(compared, index, view, *how) for index, view in enumerate(views)]
     found = [each.refined(compared, trust, _LENIENT) for each in refinements]
-    matte, trust = blurred.copy(), np.ones_like(blurred)
-    for view, image, weight, (depth, _) in zip(views, matte, trust, found, strict=True):
-        part = np.s_[: view.size[0], : view.size[1]]
+    for _ in range(_ROUNDS):
+        depths = [depth for depth, _ in found]
+        compared, trust = compared_of(*_matte(blurred, views, depths, spacing_px, options))
+        found = [each.refined(compared, trust, 0) for each in refinements]
+    return found
+
+
+_Compared = tuple[Float32[np.ndarray, "c h w 3"], Float32[np.ndarray, "c h w 3"]]
+
+
+def _matte(
+    images: Float32[np.ndarray, "c h w 3"],
+    views: Sequence[ShadedView],
+    depths: Sequence[Float[np.ndarray, "rows columns"]],
+    spacing_px: int,
+    options: ShadingOptions,
+) -> _Compared:
+    """The images as they would be without mirror reflections and without what does not leave the surface, as a first
+    depth tells, and how far to trust that."""
+    matte, trust = images.copy(), np.ones_like(images)
+    for view, image, weight, depth in zip(views, matte, trust, depths, strict=True):
+        part, encoded = np.s_[: view.size[0], : view.size[1]], np.float32(-1 / view.gamma)
         what = seen(view.grid, depth, spacing_px, view.lights, options.exit_index)
-        mirrored = _spread(what.mirrored, view.size, spacing_px)
-        too_bright = np.maximum(image[part], 0) * (1 - (1 + mirrored) ** np.float32(-1 / view.gamma))
-        weight[part] = 1 / (1 + (too_bright / options.glare_dn) ** 2)
-        lost = _spread(what.leaving, view.size, spacing_px)[..., None] ** np.float32(-1 / view.gamma)
-        image[part] = np.where(image[part] >= 0, image[part] * lost, _UNUSABLE)
-    compared, trust = compared_of(matte, trust)
-    return [each.refined(compared, trust, 0) for each in refinements]
+        spot, uncertain, share = (_spread(each, view.size, spacing_px) for each in what)
+        left = np.maximum(image[part], 0) * (1 - (1 + uncertain) ** encoded)
+        weight[part] = 1 / (1 + (left / options.glare_dn) ** 2)
+        image[part] = np.where(image[part] >= 0, image[part] * ((1 + spot) * share[..., None]) ** encoded, _UNUSABLE)
+    return matte, trust
 
 
 def _are_coloured(lights: Sequence[Light]) -> bool:
     """Whether the channels see different shades."""
     return any(np.abs(unit(one.colour) - unit(lights[0].colour)).max() > _COLOURED for one in lights)
-
-
-_Compared = tuple[Float32[np.ndarray, "c h w 3"], Float32[np.ndarray, "c h w 3"]]
 
 
 def _as_they_are(images: Float32[np.ndarray, "c h w 3"], trust: Float32[np.ndarray, "c h w 3"]) -> _Compared:
