@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from builders import box_mesh, handpiece, image_path, make_capture, shifted, sphere
 from cuspid import __version__, cli, storage
 from cuspid.cli.scan import _evaluate_trajectory
+from cuspid.cli.shared import Probe, load_probe, suited
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from report_folders import known_trueness
@@ -51,6 +53,18 @@ def test_a_tooth_that_is_not_there(tmp_path, capsys, coarse_phantom):
     message = refused(capsys, "simulate", tmp_path / "jaw.ply", "--tooth", 16, "--out", tmp_path / "scan")
     assert "no tooth 16" in message
     assert not (tmp_path / "scan").exists()
+
+
+def test_plain_enamel_has_crossed_polarisers_unless_others_are_asked_for(capsys):
+    def glare(probe, texture):
+        return {light.glare for light in load_probe(suited(probe, texture)).lights.values()}
+
+    assert max(glare(Probe(), "enamel")) < 0.1
+    assert "--lights white" in " ".join(capsys.readouterr().err.split())
+    assert glare(Probe(), "artificial") == glare(Probe(lights="white"), "enamel") == {1.0}
+    assert max(glare(Probe(lights="colour-coded"), "artificial")) < 0.1
+    assert suited(Probe(handpiece=Path("mine.json")), "enamel") == Probe(handpiece=Path("mine.json"))
+    assert not capsys.readouterr().err
 
 
 def test_broken_captures(tmp_path, capsys):

@@ -14,7 +14,7 @@ from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.motion.surface_tracking import SurfaceTrackingOptions, _drift, _onto, surface_of, track_surfaces
 from cuspid.reconstruction import DepthMap, Reconstruction
-from cuspid.rig import Handpiece
+from cuspid.rig import Handpiece, Light
 from cuspid.stereo.matching import coarser
 from plain_scene import SIZE_PX
 from synthetic_scene import cast_depth, diamond, height_field
@@ -129,6 +129,39 @@ def test_tracking_goes_on_where_the_surface_is_seen_again() -> None:
     found = tracked(depth_maps(way))
     assert found.frames == ("00000", "00001", "00002", "00005")
     assert errors_um(found, way).max() < 15
+
+
+def test_a_first_frame_that_shows_something_else_does_not_lose_all_others() -> None:
+    rng = np.random.default_rng(4)
+    maps = [
+        replace(each, depth_mm=rng.uniform(4, 6, each.depth_mm.shape).astype(np.float32))
+        if each.frame == "00000"
+        else each
+        for each in depth_maps(OUT)
+    ]
+    found = tracked(maps)
+    assert found.frames == tuple(OUT)[1:]
+    assert [each.what for each in found.dropped] == ["frame 00000"]
+    assert errors_um(found, OUT).max() < 15
+
+
+def test_two_pieces_are_joined_where_a_later_frame_shows_both() -> None:
+    """Two frames, then from the other end back to them: what was elsewhere lay on nothing before."""
+    order = (0, 1, *range(10, 1, -1))
+    way = {f"{k:05d}": Rigid3.from_rotation_vector(STEP[0] * at, STEP[1] * at) for k, at in enumerate(order)}
+    found = tracked(depth_maps(way))
+    assert found.frames == tuple(way)
+    assert errors_um(found, way).max() < 25
+
+
+def test_polarisers_are_asked_for_where_there_are_none() -> None:
+    plane = height_field(lambda x, y: 5 + 0 * x, half_width_mm=14.0)
+    crossed = {"led": Light(position_mm=np.zeros(3), direction=np.array([0.0, 0, 1]), glare=0.03)}
+    for lights, said in (({}, True), (crossed, False)):
+        lit = replace(diamond(SIZE_PX), lights=lights, lightings=())
+        with pytest.raises(ReconstructionError) as caught:
+            track_surfaces(capture_of(lit, list(OUT)), depth_maps(OUT, plane))
+        assert ("cross polarisers" in str(caught.value)) == said
 
 
 def test_a_plane_holds_nothing_in_place() -> None:

@@ -12,7 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from cuspid import storage
 from cuspid.cli.report import report
-from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress
+from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress, suited
 from cuspid.errors import InputError
 from cuspid.options import WORKERS
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
@@ -47,6 +47,7 @@ def repeat(
         retry_failed: Repeat scans that failed before.
     """
     check_workers(workers, "repeat")
+    probe = suited(probe, simulation.texture)
     trial = TrialOptions(simulation=simulation, reconstruction=reconstruction)
     kept = {
         "new_texture": options.new_texture,

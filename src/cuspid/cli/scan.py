@@ -16,7 +16,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from cuspid import pipeline, storage
 from cuspid.capture import Capture
 from cuspid.cli.report import report
-from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress
+from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress, suited
 from cuspid.errors import InputError
 from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.evaluation.margin import MarginError, margin_errors
@@ -25,6 +25,7 @@ from cuspid.evaluation.trajectory import trajectory_error
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.motion.colmap import hash_model
+from cuspid.motion.surface_tracking import glare_notes
 from cuspid.options import Range
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.reconstruction import Expectation, Reconstruction
@@ -115,6 +116,7 @@ def evaluate(
 
 
 def _simulate(mesh: Path | None, out: Path, source: Source, probe: Probe, options: SimulationOptions) -> None:
+    probe = suited(probe, options.texture)
     settings = {"source": source, "probe": probe, "simulation": options}
     given = {"jaw": mesh, "handpiece": probe.handpiece}
     hashes = {name: storage.hash_file(path) for name, path in given.items() if path is not None}
@@ -139,6 +141,8 @@ def _reconstruct(capture: Capture, out: Path, options: ReconstructionOptions, mo
                 "the images show no texture: their light and shade are matched, and the frames are located by their "
                 "surfaces (--signal texture for the other way)"
             )
+            for note in glare_notes(capture.handpiece):
+                console.print(f"note: {note}")
         elif options.calibration == "refined" and is_nominal(capture.handpiece):
             _print_nominal(capture.handpiece, options.nominal)
         with show_progress() as progress:
@@ -287,7 +291,8 @@ def _print_located(reconstruction: Reconstruction, capture: Capture) -> None:
     if reconstruction.refinement is not None:
         console.print(f"calibration: {reconstruction.refinement.summary}")
     for note in reconstruction.notes:
-        console.print(f"note: {note}")
+        if note not in glare_notes(capture.handpiece):  # which were printed before the depth was measured
+            console.print(f"note: {note}")
 
 
 _COLUMNS = ("region", "mean |d|", "signed mean", "SD", "RMS", "P95", "max", "within 50 µm, %", "of open crown, %")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -22,6 +22,7 @@ from cuspid.jaw import Arch, Jaw
 from cuspid.options import SEED, Options, Range
 from cuspid.progress import Progress
 from cuspid.rig import Handpiece
+from cuspid.simulation.appearance import Preset
 from cuspid.values import printable
 
 
@@ -57,9 +58,9 @@ class Probe(Options):
 
     design: Literal["two", "four", "six", "twelve"] = "twelve"
     """Built-in design: a stereo pair, the essential four cameras, six cameras (use with --turns 3), or all twelve."""
-    lights: Literal["white", "colour-coded"] = "white"
-    """LEDs of a built-in design: white ones, or red, green and blue ones behind crossed polarisers, for plain enamel
-    (--texture enamel)."""
+    lights: Literal["white", "colour-coded"] | None = None
+    """LEDs of a built-in design: white ones, or red, green and blue ones behind crossed polarisers, which plain enamel
+    needs (default: white, but colour-coded with --texture enamel)."""
     handpiece: Path | None = None
     """Your own handpiece.json, or COLMAP's rig_config.json, instead of a built-in design."""
     working_distance_mm: Annotated[float | None, Range(0.1, 100_000)] = None
@@ -97,4 +98,14 @@ def load_probe(probe: Probe) -> Handpiece:
     if probe.handpiece is not None:
         return storage.read_handpiece(probe.handpiece, probe.working_distance_mm)
     distance_mm = probe.working_distance_mm or DesignOptions.working_distance_mm
-    return DESIGNS[probe.design](DesignOptions(working_distance_mm=distance_mm, lights=probe.lights))
+    return DESIGNS[probe.design](DesignOptions(working_distance_mm=distance_mm, lights=probe.lights or "white"))
+
+
+def suited(probe: Probe, texture: Preset) -> Probe:
+    """With the lights that suit the teeth, for a built-in design for which none are asked for."""
+    if probe.handpiece is not None or probe.lights is not None:
+        return probe
+    plain = texture == "enamel"
+    if plain:
+        console.print("note: plain enamel takes coloured lights and crossed polarisers (--lights white for others)")
+    return replace(probe, lights="colour-coded" if plain else "white")

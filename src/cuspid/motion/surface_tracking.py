@@ -308,23 +308,54 @@ def _chained(
     distance_mm: float,
     progress: Progress,
 ) -> tuple[dict[int, Rigid3], list[Dropped]]:
-    """``rig_from_world`` of the frames, one after the other."""
-    placed, dropped, motion = dict[int, Rigid3](), list[Dropped](), None
+    """``rig_from_world`` of the frames, one after the other.
+
+    A frame that lies on none of those before begins a piece of its own, for it is not known which of them is wrong. The
+    largest piece is kept, with those that are found on it in the end.
+    """
+    pieces, reasons, motion = list[dict[int, Rigid3]](), dict[int, str](), None
     for frame, surface in enumerate(surfaces):
         progress("odometry", frame + 1, len(surfaces))
         if len(surface) < _LEAST_MATCHES:
-            dropped.append(Dropped(what=f"frame {names[frame]}", reason=f"only {len(surface)} points of its surface"))
+            reasons[frame] = f"only {len(surface)} points of its surface"
             continue
-        if not placed:
-            placed[frame] = Rigid3.identity()
-            continue
-        pose, reason = _place(surfaces, placed, frame, motion, options, distance_mm)
-        if pose is None:
-            dropped.append(Dropped(what=f"frame {names[frame]}", reason=reason))
-            continue
-        motion = pose @ placed[frame - 1].inverse() if frame - 1 in placed else None
-        placed[frame] = pose
-    return placed, dropped
+        for piece in reversed(pieces):
+            pose, reason = _place(surfaces, piece, frame, motion if frame - 1 in piece else None, options, distance_mm)
+            if pose is not None:
+                break
+            reasons.setdefault(frame, reason)
+        else:
+            piece, pose = {}, Rigid3.identity()
+            pieces.append(piece)
+        motion = pose @ piece[frame - 1].inverse() if frame - 1 in piece else None
+        piece[frame] = pose
+        pieces.sort(key=lambda each: next(reversed(each)))
+    pieces.sort(key=len)
+    placed = pieces.pop() if pieces else {}
+    for piece in reversed(pieces):
+        placed |= _found_on(surfaces, placed, piece, options, distance_mm)
+    dropped = [
+        Dropped(what=f"frame {name}", reason=reasons.get(frame, "it lies only on frames that lie on no others"))
+        for frame, name in enumerate(names)
+        if frame not in placed
+    ]
+    world_from_first = placed[min(placed)].inverse() if placed else Rigid3.identity()
+    return {frame: placed[frame] @ world_from_first for frame in sorted(placed)}, dropped
+
+
+def _found_on(
+    surfaces: Sequence[Surface],
+    placed: Mapping[int, Rigid3],
+    piece: Mapping[int, Rigid3],
+    options: SurfaceTrackingOptions,
+    distance_mm: float,
+) -> dict[int, Rigid3]:
+    """The frames of a piece among those placed, if one of them is found there."""
+    for frame, pose in piece.items():
+        found, _ = _place(surfaces, placed, frame, None, options, distance_mm)
+        if found is not None:
+            return {each: there @ pose.inverse() @ found for each, there in piece.items()}
+    return {}
 
 
 def _neighbours(
@@ -422,7 +453,7 @@ def track_surfaces(
         surfaces.append(surface_of(maps, distance_mm, options))
         progress("surfaces", len(names), max(len(capture.frames), len(names)))
     placed, dropped = _chained(surfaces, names, options, distance_mm, progress)
-    _require_enough(len(placed), len(names), dropped, options)
+    _require_enough(len(placed), len(names), dropped, capture.handpiece, options)
     kept = [surfaces[frame] for frame in placed]
     poses, scatter_mm = _together(kept, list(placed.values()), options, distance_mm, progress)
     return Reconstruction(
@@ -430,7 +461,7 @@ def track_surfaces(
         rig_from_world={names[frame]: pose for frame, pose in zip(placed, poses, strict=True)},
         dropped=(*capture.left_out, *dropped),
         log={"surface_scatter_um": 1000 * scatter_mm},
-        notes=(_HELD, *_drift(poses, distance_mm), *_glare(capture.handpiece), *_lost(names, placed)),
+        notes=(_HELD, *_drift(poses, distance_mm), *glare_notes(capture.handpiece), *_lost(names, placed)),
     )
 
 
@@ -446,8 +477,8 @@ def _drift(poses: Sequence[Rigid3], distance_mm: float) -> tuple[str, ...]:
     )
 
 
-def _glare(handpiece: Handpiece) -> tuple[str, ...]:
-    """Whether mirror reflections may have deceived the cameras."""
+def glare_notes(handpiece: Handpiece) -> tuple[str, ...]:
+    """Whether mirror reflections may deceive the cameras."""
     if handpiece.lights and all(light.glare <= _LITTLE_GLARE for light in handpiece.lights.values()):
         return ()
     return (
@@ -466,12 +497,15 @@ def _lost(names: Sequence[str], placed: Mapping[int, Rigid3]) -> tuple[str, ...]
     return (f"motion: tracking was lost at {len(gaps)} of {len(names)} frames ({shown}{more}); scan there again",)
 
 
-def _require_enough(placed: int, total: int, dropped: Sequence[Dropped], options: SurfaceTrackingOptions) -> None:
+def _require_enough(
+    placed: int, total: int, dropped: Sequence[Dropped], handpiece: Handpiece, options: SurfaceTrackingOptions
+) -> None:
     """Raise ReconstructionError where too few frames are placed."""
     if placed >= options.minimum_located * total and (placed > 1 or total == 1):
         return
     shown = "; ".join(f"{each.what}: {each.reason}" for each in dropped[:3])
+    polarisers = "cross polarisers (the handpiece file tells of none), " if glare_notes(handpiece) else ""
     raise ReconstructionError(
-        f"motion: only {placed} of {total} frames could be placed by their surfaces ({shown}); take frames closer "
-        "together, see that the lights are on and nothing else shines, or give the surface texture (powder)"
+        f"motion: only {placed} of {total} frames could be placed by their surfaces ({shown}); {polarisers}take frames "
+        "closer together, see that the lights are on and nothing else shines, or give the surface texture (powder)"
     )
