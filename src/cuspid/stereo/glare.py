@@ -30,9 +30,10 @@ from cuspid.rig import Light
 _REFLECTANCE, _ROUGHNESS, _ALBEDO = 0.05, 0.12, 0.5
 """Of a wet tooth: Fresnel reflectance at normal incidence (refractive index 1.6), GGX roughness, share of the light
 that it scatters back."""
-_MIDDLE_PX, _WIDE_PX = 27, 75
-"""Sides, in px of the image, of the windows over which the slope of a surface is averaged. The first follows its shape;
-the second looks past the pit that a reflection made in it."""
+_MIDDLE, _WIDE, _LEAST_PX = 0.065, 0.18, 3
+"""Sides, in focal lengths (0.3 and 0.9 mm at 5 mm), of the windows over which the slope of a surface is averaged, and
+the least one in px of the depth map. The first follows its shape; the second looks past the pit that a reflection made
+in it."""
 _STRENGTH, _PLACE = 0.15, 0.5
 """What a spot is uncertain by: a share of it, and a share of what it is brighter by seen past a pit."""
 _LEAST_SHARE = 0.2
@@ -57,16 +58,15 @@ class Seen(NamedTuple):
 def seen(
     grid: Camera,
     depth_mm: Float[np.ndarray, "h w"],
-    spacing_px: int,
     lights: Sequence[Light],
     exit_index: float,
 ) -> Seen:
-    """What a first depth tells of every ``spacing_px``-th pixel of an image, with lights in the frame of its camera and
-    the refractive index of the surface."""
+    """What a first depth tells of each pixel of its grid, with lights in the frame of its camera and the refractive
+    index of the surface."""
     rays = grid.rays(grid.pixel_centres().reshape(-1, 2)).reshape(grid.height, grid.width, 3)
     spots, share = np.zeros((2, *rays.shape), np.float32), np.ones(depth_mm.shape, np.float32)
-    for spot, window_px in zip(spots, (_WIDE_PX, _MIDDLE_PX), strict=True):
-        inverse, slopes = _smoothed(1 / depth_mm, max(3, window_px // spacing_px))
+    for spot, window in zip(spots, (_WIDE, _MIDDLE), strict=True):
+        inverse, slopes = _smoothed(1 / depth_mm, max(_LEAST_PX, round(window * float(grid.focal_px.mean()))))
         # The plane 1 / Z = a x + b y + c, with x = X / Z and y = Y / Z, has the normal (a, b, c).
         across = slopes * grid.focal_px
         normals = -unit(np.dstack([across, inverse - (across * rays[..., :2]).sum(axis=-1)]))

@@ -473,7 +473,7 @@ def _matte(
     matte, trust = images.copy(), np.ones_like(images)
     for view, image, weight, depth in zip(views, matte, trust, depths, strict=True):
         part, encoded = np.s_[: view.size[0], : view.size[1]], np.float32(-1 / view.gamma)
-        what = seen(view.grid, depth, spacing_px, view.lights, options.exit_index)
+        what = seen(view.grid, depth, view.lights, options.exit_index)
         spot, uncertain, share = (_spread(each, view.size, spacing_px) for each in what)
         left = np.maximum(image[part], 0) * (1 - (1 + uncertain) ** encoded)
         weight[part] = 1 / (1 + (left / options.glare_dn) ** 2)
