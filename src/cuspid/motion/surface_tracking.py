@@ -310,8 +310,8 @@ def _chained(
 ) -> tuple[dict[int, Rigid3], list[Dropped]]:
     """``rig_from_world`` of the frames, one after the other.
 
-    A frame that lies on none of those before begins a piece of its own, for it is not known which of them is wrong. The
-    largest piece is kept, with those that are found on it in the end.
+    A frame that lies neither on the latest piece nor on the largest begins a piece of its own, for it is not known
+    which of them is wrong. The largest is kept, with those that are found on it in the end.
     """
     pieces, reasons, motion = list[dict[int, Rigid3]](), dict[int, str](), None
     for frame, surface in enumerate(surfaces):
@@ -319,23 +319,23 @@ def _chained(
         if len(surface) < _LEAST_MATCHES:
             reasons[frame] = f"only {len(surface)} points of its surface"
             continue
-        for piece in reversed(pieces):
-            pose, reason = _place(surfaces, piece, frame, motion if frame - 1 in piece else None, options, distance_mm)
+        largest, pose = sorted(pieces, key=len)[-1:], None
+        for piece in largest + [latest for latest in pieces[-1:] if latest is not largest[0]]:
+            moved_on = motion if frame - 1 in piece else None
+            pose, reasons[frame] = _place(surfaces, piece, frame, moved_on, options, distance_mm)
             if pose is not None:
                 break
-            reasons.setdefault(frame, reason)
-        else:
+        if pose is None:
             piece, pose = {}, Rigid3.identity()
             pieces.append(piece)
         motion = pose @ piece[frame - 1].inverse() if frame - 1 in piece else None
         piece[frame] = pose
-        pieces.sort(key=lambda each: next(reversed(each)))
     pieces.sort(key=len)
     placed = pieces.pop() if pieces else {}
     for piece in reversed(pieces):
         placed |= _found_on(surfaces, placed, piece, options, distance_mm)
     dropped = [
-        Dropped(what=f"frame {name}", reason=reasons.get(frame, "it lies only on frames that lie on no others"))
+        Dropped(what=f"frame {name}", reason=reasons.get(frame) or "it lies only on frames that lie on no others")
         for frame, name in enumerate(names)
         if frame not in placed
     ]
@@ -352,7 +352,8 @@ def _found_on(
 ) -> dict[int, Rigid3]:
     """The frames of a piece among those placed, if one of them is found there."""
     for frame, pose in piece.items():
-        found, _ = _place(surfaces, placed, frame, None, options, distance_mm)
+        nearest_last = dict(sorted(placed.items(), key=lambda item: -abs(item[0] - frame)))
+        found, _ = _place(surfaces, nearest_last, frame, None, options, distance_mm)
         if found is not None:
             return {each: there @ pose.inverse() @ found for each, there in piece.items()}
     return {}
