@@ -131,15 +131,9 @@ def test_tracking_goes_on_where_the_surface_is_seen_again() -> None:
     assert errors_um(found, way).max() < 15
 
 
-def test_a_first_frame_that_shows_something_else_does_not_lose_all_others() -> None:
-    rng = np.random.default_rng(4)
-    maps = [
-        replace(each, depth_mm=rng.uniform(4, 6, each.depth_mm.shape).astype(np.float32))
-        if each.frame == "00000"
-        else each
-        for each in depth_maps(OUT)
-    ]
-    found = tracked(maps)
+def test_a_first_frame_from_elsewhere_does_not_lose_all_others() -> None:
+    elsewhere = Rigid3(np.eye(3), np.array([8.0, 8.0, 0.0]))
+    found = tracked(depth_maps(OUT | {"00000": elsewhere}))
     assert found.frames == tuple(OUT)[1:]
     assert [each.what for each in found.dropped] == ["frame 00000"]
     assert errors_um(found, OUT).max() < 15
