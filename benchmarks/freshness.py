@@ -2,7 +2,7 @@
 
 What makes a result is its script, the modules that the script imports, in turn, and those of the verbs that it runs.
 Comments, docstrings and the number of the version have no part in it, nor has what only makes pages and pictures of a
-finished folder, unless all verbs are tried.
+finished folder, unless all verbs are tried, nor what only plain surfaces need, where none are scanned.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ HERE = Path(__file__).parent
 ROOT = HERE.parent
 SHOWN_BY = ("cuspid.reporting", "cuspid.storage.results")
 """Modules that only show what was made."""
+PLAIN = ("cuspid.stereo.shading", "cuspid.motion.surface_tracking")
+"""Modules that a scan of a textured surface takes nothing from but options."""
 UNTOLD = "no commit, or one of uncommitted changes"
 
 Result = Mapping[str, Any]
@@ -35,6 +37,13 @@ class Maker:
     """In this folder, without its ending."""
     verbs: tuple[str, ...] = ()
     """Modules of ``cuspid.cli`` that it runs; ``*`` for all of them."""
+    plain: bool = False
+    """Whether surfaces without texture take part."""
+
+    @property
+    def leaves_out(self) -> tuple[str, ...]:
+        """Modules without a part in it."""
+        return (*(() if "*" in self.verbs else SHOWN_BY), *(() if self.plain else PLAIN))
 
 
 _SCAN = ("scan", "jaws")
@@ -54,14 +63,14 @@ MAKERS: Mapping[str, Maker] = {
     "any_rig": Maker("any_rig"),
     "stereo_pairs": Maker("stereo_pairs"),
     "jaws_*": Maker("jaws"),
-    "enamel": Maker("enamel"),
+    "enamel": Maker("enamel", plain=True),
     "manufacturing*": Maker("manufacturing"),
     "expectations": Maker("expectations"),
     "targets": Maker("targets"),
     "grid": Maker("grid"),
-    "fuzz": Maker("fuzz", ("*",)),
-    "kill": Maker("kill", ("*",)),
-    "large": Maker("large", ("*",)),
+    "fuzz": Maker("fuzz", ("*",), plain=True),
+    "kill": Maker("kill", ("*",), plain=True),
+    "large": Maker("large", ("*",), plain=True),
     "panorama/*": Maker("panorama", ("film", "panorama", "panorama_evaluation")),
 }
 """By the name of the result."""
@@ -129,9 +138,9 @@ def _made_by(maker: Maker) -> set[str]:
     """Files that take part."""
     scripts = _scripts(maker.script)
     roots = {name for script in scripts for name in _imported(script) if name.split(".")[0] == "cuspid"}
-    all_of_them = "*" in maker.verbs
-    verbs = [path.stem for path in (ROOT / "src/cuspid/cli").glob("*.py")] if all_of_them else maker.verbs
-    modules = _upstream(roots | {f"cuspid.cli.{verb}" for verb in verbs if verb != "__init__"}, shown=all_of_them)
+    every = [path.stem for path in (ROOT / "src/cuspid/cli").glob("*.py")]
+    verbs = every if "*" in maker.verbs else maker.verbs
+    modules = _upstream(roots | {f"cuspid.cli.{verb}" for verb in verbs if verb != "__init__"}, maker.leaves_out)
     return {str(path.relative_to(ROOT)) for path in [*scripts, *map(_file_of, modules)]}
 
 
@@ -159,16 +168,16 @@ def _imported(script: Path) -> frozenset[str]:
 
 
 @cache
-def _graph(shown: bool) -> grimp.ImportGraph:
+def _graph(without: tuple[str, ...]) -> grimp.ImportGraph:
     graph = grimp.build_graph("cuspid", cache_dir=None)
-    for name in () if shown else SHOWN_BY:
+    for name in without:
         for module in {name} | graph.find_descendants(name):
             graph.remove_module(module)
     return graph
 
 
-def _upstream(roots: Iterable[str], *, shown: bool) -> set[str]:
-    graph = _graph(shown)
+def _upstream(roots: Iterable[str], without: tuple[str, ...]) -> set[str]:
+    graph = _graph(without)
     known: Sequence[str] = [root for root in roots if root in graph.modules]
     return set(known).union(*(graph.find_upstream_modules(root) for root in known)) - {"cuspid"}
 

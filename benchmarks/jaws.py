@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import resource
+import shutil
 import tempfile
 import time
 from collections.abc import Iterator
@@ -125,8 +126,10 @@ def cut_out(jaw: Jaw, teeth: tuple[int, ...], *, gaps: bool) -> Mesh:
     return part.transformed(Rigid3(Rotation.random(rng=rng).as_matrix(), rng.normal(0, 50, 3)))
 
 
-def judge(*, file: str, part: str, smooth: bool, pixels: int, passes: str, plan_only: bool) -> dict[str, Value]:
-    """The figures of one jaw."""
+def judge(
+    *, file: str, part: str, smooth: bool, pixels: int, passes: str, plan_only: bool, scans: Path
+) -> dict[str, Value]:
+    """The figures of one jaw. A scan that was cut short goes on where it stopped; a finished one is not kept."""
     jaw = jaw_of(file, part, smooth)
     handpiece = twelve_cameras(DesignOptions(width_px=pixels, height_px=pixels))
     path_options = ScanPathOptions(passes="auto" if passes == "auto" else "turns")
@@ -143,8 +146,10 @@ def judge(*, file: str, part: str, smooth: bool, pixels: int, passes: str, plan_
     }
     if plan_only:
         return planned
-    with tempfile.TemporaryDirectory(prefix="cuspid-jaw-") as folder:
-        return planned | scanned(jaw, handpiece, Path(folder), SimulationOptions(path=path_options))
+    folder = scans / "-".join([Path(file).stem, part or "whole", "smooth" if smooth else "as-it-is"])
+    figures = planned | scanned(jaw, handpiece, folder, SimulationOptions(path=path_options))
+    shutil.rmtree(folder)
+    return figures
 
 
 def scanned(
@@ -154,8 +159,9 @@ def scanned(
     options: SimulationOptions,
     how: ReconstructionOptions = ReconstructionOptions(),
 ) -> dict[str, Value]:
-    """The figures of a scan."""
+    """The figures of a scan; without times if parts of it are from an earlier run."""
     capture, _ = pipeline.simulate(jaw, handpiece, folder, options)
+    whole = not any((folder / each).exists() for each in ("motion", "depth"))
     begin, begin_cpu = time.perf_counter(), time.process_time()
     reconstruction, mesh = pipeline.reconstruct(capture, folder, how)
     took, took_cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
@@ -178,8 +184,8 @@ def scanned(
         "seen_complete_50_um_pct": found.completeness_pct["50"],
         "crown_complete_50_um_pct": None if crown is None else crown.completeness_pct["50"],
         "scale_ppm": found.scale_error_ppm,
-        "reconstruction_s": took,
-        "reconstruction_cpu_s": took_cpu,
+        "reconstruction_s": took if whole else None,
+        "reconstruction_cpu_s": took_cpu if whole else None,
         "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
         "path_crowns_seen": read_json(folder / "truth" / "path.json")["crowns_seen"].get("all"),
     }
@@ -216,7 +222,9 @@ def main() -> None:
     chosen = [each for each in known if arguments.only is None or is_asked(each.name, arguments.only, known)]
     outcomes = run_grid(
         chosen,
-        partial(judge, pixels=pixels, passes=arguments.passes, plan_only=arguments.plan),
+        partial(
+            judge, pixels=pixels, passes=arguments.passes, plan_only=arguments.plan, scans=arguments.work / "unfinished"
+        ),
         arguments.work / kind,
         workers=1,
         progress=lambda stage, done, total: print(f"{stage}: {done} of {total}", flush=True),

@@ -30,6 +30,7 @@ from builders import image_path, write_frames
 from cuspid import cli, pipeline, storage
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.arch_curve import arch_curve
 from cuspid.board import Board
 from cuspid.capture import read_image
 from cuspid.errors import CuspidError
@@ -40,7 +41,6 @@ from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
 from cuspid.jaw import Jaw, Landmark
 from cuspid.motion.colmap import read_model
 from cuspid.pipeline import RenderOptions, take_images
-from cuspid.simulation.path.arch import arch_curve
 from report_folders import TOOTH, write_comparison, write_evaluation, write_scan, write_score, write_shape
 from test_cli_stitch import picture, write_calibration
 from test_colmap import make_capture, make_found, without_rig, write

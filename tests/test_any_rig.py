@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
+from importlib import import_module
+from inspect import isfunction
 from pathlib import Path
 
 import numpy as np
@@ -132,6 +135,23 @@ def measured(factor: float = 1.0) -> tuple[DepthMap, ...]:
 def reconstructed(factor: float, folder: Path) -> tuple[Reconstruction, Mesh]:
     capture = replace(scan(), handpiece=times(scan().handpiece, factor))
     return pipeline.reconstruct(capture, folder / f"{factor:g}", FIXED)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def what_only_plain_surfaces_need_is_not_called() -> Iterator[None]:
+    """benchmarks/freshness.py counts on it."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a scan of texture called what only plain surfaces need")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).parent.parent / "benchmarks"))
+        plain = import_module("freshness").PLAIN
+        for module in [each for name, each in list(sys.modules.items()) if name.startswith("cuspid")]:
+            for name, value in list(vars(module).items()):
+                if isfunction(value) and value.__module__ in plain:
+                    patch.setattr(module, name, refuse)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -63,6 +63,14 @@ def test_a_change_ends_what_it_made_and_nothing_else(freshness, repository):
         assert freshness.changes(name, result) == ()
 
 
+def test_what_only_plain_surfaces_need_ends_only_their_results(freshness, repository):
+    add(repository, "src/cuspid/stereo/glare.py", "\nNEW = 1\n")
+    result = {"commit": commit_of(repository)}
+    assert freshness.changes("enamel", result) == freshness.changes("fuzz", result) == ("src/cuspid/stereo/glare.py",)
+    for name in ("jaws_half", "molar-seed0", "stereo_pairs"):
+        assert freshness.changes(name, result) == ()
+
+
 def test_pictures_and_pages_are_no_part_of_figures(freshness, repository):
     add(repository, "src/cuspid/reporting/figures/drawing.py", "\nNEW = 1\n")
     add(repository, "benchmarks/page.py", "\nNEW = 1\n")

@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cuspid import storage
+from cuspid.arch_curve import arch_curve
 from cuspid.cli import main
 from cuspid.errors import InputError
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
 from cuspid.jaw import Jaw
 from cuspid.room import Room
-from cuspid.simulation.path.arch import arch_curve
 from cuspid.simulation.path.free import REACH, FreePathOptions, hand_noise, plan_free_path
 from verbs import refused
 

@@ -8,11 +8,11 @@ from itertools import pairwise, product
 import numpy as np
 import pytest
 
+from cuspid.arch_curve import ArchCurve, arch_curve
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import twelve_cameras
 from cuspid.jaw import GUM, Jaw
 from cuspid.room import Room
-from cuspid.simulation.path.arch import ArchCurve, arch_curve
 from cuspid.simulation.path.coverage import CrownPoints, crown_points
 from cuspid.simulation.path.detour import _APART, _UNITS, _shortest, plan_detour
 from cuspid.simulation.path.further import _largest_sum, _woven, further_legs, seen_from

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from cuspid import storage
+from cuspid.arch_curve import arch_curve
 from cuspid.capture import Capture
 from cuspid.geometry import Rigid3, best_similarity
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
@@ -16,7 +17,6 @@ from cuspid.jaw import Jaw
 from cuspid.motion.rig_film import of_camera
 from cuspid.pipeline import RenderOptions, take_images
 from cuspid.reconstruction import Reconstruction, Tracks
-from cuspid.simulation.path.arch import arch_curve
 from cuspid.stitching.plane_sweep import camera_gains, cameras_beside
 from cuspid.trueness import GroundTruth
 from test_stitching import seen_points

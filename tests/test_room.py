@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from builders import any_pose, plate, sphere
+from cuspid.arch_curve import arch_curve
 from cuspid.body import Body, Box, module
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
@@ -21,7 +22,6 @@ from cuspid.handpiece.presets import PRESETS
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.room import Room, check_clearance, room_about, surface_points
-from cuspid.simulation.path.arch import arch_curve
 from cuspid.simulation.path.detour import up
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 

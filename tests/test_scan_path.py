@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
+from cuspid.arch_curve import ArchCurve, arch_curve
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import essential_four, six_cameras, twelve_cameras
@@ -16,7 +17,6 @@ from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece, Rig
 from cuspid.room import Room
-from cuspid.simulation.path.arch import ArchCurve, arch_curve
 from cuspid.simulation.path.hand import HandMotion, hand_motion
 from cuspid.simulation.path.legs import steady_path, there_and_back
 from cuspid.simulation.path.overlap import image_overlap

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from cuspid import storage
+from cuspid.arch_curve import arch_curve
 from cuspid.errors import OutputError
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
 from cuspid.jaw import Jaw
 from cuspid.pipeline import RenderOptions, take_images
-from cuspid.simulation.path.arch import arch_curve
 from cuspid.storage.captures import hash_capture
 from cuspid.storage.stages import RECORD, Stage, code_version
 

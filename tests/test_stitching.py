@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from cuspid import storage
+from cuspid.arch_curve import arch_curve
 from cuspid.camera import Camera
 from cuspid.capture import Capture
 from cuspid.cli import main
@@ -23,7 +24,6 @@ from cuspid.panorama import Panorama
 from cuspid.panorama_pipeline import StitchOptions, stitch
 from cuspid.pipeline import RenderOptions, take_images
 from cuspid.reconstruction import Tracks
-from cuspid.simulation.path.arch import arch_curve
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.gain_compensation import GainOptions, Samples, balance
 from cuspid.stitching.height_map import HeightMapOptions, ScaleOptions, height_map, in_occlusal_frame

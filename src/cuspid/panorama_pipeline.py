@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from cuspid.anatomy.orientation import find_occlusal_frame
+from cuspid.arch_curve import arch_curve
 from cuspid.capture import Capture
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
@@ -30,7 +31,6 @@ from cuspid.panorama import FrameUse
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
 from cuspid.simulation.film import FilmOptions, film
-from cuspid.simulation.path.arch import arch_curve
 from cuspid.stitching.height_map import ScaleOptions
 from cuspid.stitching.mesh_views import MeshViewOptions, MeshViews, draw_mesh
 from cuspid.stitching.ortho import OrthoOptions, Stitched, orthophoto

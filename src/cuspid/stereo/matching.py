@@ -69,7 +69,8 @@ class Group:
     grids: tuple[Camera, ...]
     """The pinhole camera of the depth map of each camera."""
     corrections: tuple[Float32[np.ndarray, "_ _ 1"], ...]
-    """What makes the brightness of each camera comparable (:func:`cuspid.stereo.shading.correction`)."""
+    """What makes the brightness of each camera comparable (:func:`cuspid.stereo.shading.correction`); none where
+    texture is matched."""
 
 
 def coarser(camera: Camera, spacing_px: int) -> Camera:
@@ -162,12 +163,13 @@ class DepthEstimator:
         views = tuple(IdealView.of(name, rig[name]) for name in names)
         possible = stereo_pairs(rig, self.handpiece.working_distance_mm, self.options.pairing)
         pairs = initial_pairs(rig, names, possible)
+        lit = names if self.signal == "shading" else ()
         return Group(
             views=views,
             pairs=tuple(rectify(pair, rig[pair[0]], rig[pair[1]], self.options.initial_scale) for pair in pairs),
             geometry=tuple(group_geometry(views, index) for index in range(len(views))),
             grids=tuple(coarser(view.camera, self.options.spacing_px) for view in views),
-            corrections=tuple(correction(rig[name].camera, self.handpiece.sensor_of(name)) for name in names),
+            corrections=tuple(correction(rig[name].camera, self.handpiece.sensor_of(name)) for name in lit),
         )
 
     def measure(

@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
+from cuspid.arch_curve import ArchCurve
 from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw
 from cuspid.kernels import kernel
 from cuspid.rig import Handpiece
-from cuspid.simulation.path.arch import ArchCurve
 from cuspid.visibility import slope_bounds
 
 _AREA_MM2 = 0.7

@@ -18,12 +18,12 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation
 
+from cuspid.arch_curve import ArchCurve
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
 from cuspid.room import Room
-from cuspid.simulation.path.arch import ArchCurve
 from cuspid.simulation.path.detour import lifts_needed, up
 from cuspid.simulation.path.overlap import image_overlap
 

@@ -1,6 +1,6 @@
 """The trajectory of a camera that a shaky hand moves over the teeth, unrestricted (thesis chapter 4, Fig. 4.2).
 
-The steady trajectory is the arch curve of :mod:`cuspid.simulation.path.arch`, from the first crown to the last. The
+The steady trajectory is the arch curve of :mod:`cuspid.arch_curve`, from the first crown to the last. The
 hand adds a random shift, tilt and rotation to it, and moves at a random speed. Each of these is smooth noise over the
 frames: a slow drift and a quick tremor, both Gaussian and together of the given standard deviation, and never beyond
 `REACH` of it, because whoever holds the camera watches the picture. The camera is shifted and rotated about the place
@@ -18,13 +18,13 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
+from cuspid.arch_curve import arch_curve
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
 from cuspid.options import SHARE, Options, Range
 from cuspid.rig import Handpiece
 from cuspid.room import room_about
-from cuspid.simulation.path.arch import arch_curve
 from cuspid.simulation.path.detour import lifts_needed, up
 
 _LOG = logging.getLogger("cuspid")

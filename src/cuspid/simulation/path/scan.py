@@ -20,6 +20,7 @@ from typing import Annotated, Literal
 import numpy as np
 from jaxtyping import Float
 
+from cuspid.arch_curve import ArchCurve, arch_curve
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw
@@ -27,7 +28,6 @@ from cuspid.mesh import Mesh
 from cuspid.options import TOOTH, Options, Range
 from cuspid.rig import Handpiece
 from cuspid.room import Room, check_clearance, room_about
-from cuspid.simulation.path.arch import ArchCurve, arch_curve
 from cuspid.simulation.path.coverage import CrownPoints, crown_points
 from cuspid.simulation.path.cross import plan_crossing
 from cuspid.simulation.path.detour import Detour, PoseAt, lifted, plan_detour
