@@ -285,6 +285,31 @@ def enamel(result: Result) -> str:
     )
 
 
+def real_gloss(result: Result) -> str:
+    """Photographs of a ball whose lights and normals are known."""
+    ways = {
+        "as if it were matte": "matte_deg",
+        "without the brightest and the darkest fifth of the lights": "trimmed_deg",
+        "where the model trusts the brightness": "weighted_deg",
+        "there, with the modelled reflections taken off": "taken_off_deg",
+    }
+    return "\n".join(
+        [
+            "The model of mirror reflections, with the values of wet enamel, on 96 photographs of a ball (DiLiGenT, "
+            "not part of the project), each under one known light: normals by least squares against the true ones. "
+            f"The model distrusts {result['distrusted_pct']:.0f} % of the lit pixels, and "
+            f"{result['distrusted_of_shiny_pct']:.0f} % of the {result['shiny_pct']:.1f} % that are brighter than 1.2 "
+            "times what is matte. "
+            "`python benchmarks/real_gloss.py`.",
+            "",
+            markdown_table(
+                ("brightness used", "mean error of normals, deg"),
+                [(way, f"{result[key]:.2f}") for way, key in ways.items()],
+            ),
+        ]
+    )
+
+
 def _jaw_figure(scan: Result, key: str) -> str:
     value = scan.get(key)
     if value is None:

@@ -171,6 +171,8 @@ def test_colour_coded_lights_ring_each_group_of_the_same_cameras(name: str) -> N
         np.testing.assert_allclose(light.direction, group[0].axis_in_rig, atol=1e-12)
         assert "rgb"[int(np.argmax(light.colour))] == light_name[1]
         assert 0 < light.glare < 0.1
+        if light_name[0] in "bl":  # two stand at the height of the cusps, one nearer to the gum
+            assert (light.position_mm[2] > middle[2]) == (light_name[1] != "g")
     assert len(coded.lights) == 3 * len({each[0] for each in coded.rig.names})
     assert set(coded.lightings[0].lights) == set(coded.lights)
 

@@ -115,6 +115,16 @@ def test_a_holder_does_not_depend_on_the_frame(name):
     assert thinnest(turned, PrintOptions())[0].thickness_mm == pytest.approx(0.8, abs=0.01)
 
 
+@pytest.mark.parametrize("name", DESIGNS)
+def test_colour_coded_lights_have_a_holder_that_no_light_shines_into(name):
+    check_printable(printable(DESIGNS[name](DesignOptions(lights="colour-coded"))), PrintOptions())
+
+
+def test_a_ring_of_lights_that_another_head_blocks_is_told():
+    with pytest.raises(InputError, match="blocks light"):
+        check_printable(printable(DESIGNS["twelve"](DesignOptions(lights="colour-coded", ring_mm=5.0))), PrintOptions())
+
+
 def test_cameras_that_lean_within_a_head_see_past_it():
     check_printable(printable(six_cameras(DesignOptions(outer_tilt_deg=15.0))), PrintOptions())
 

@@ -60,8 +60,9 @@ class DesignOptions(Options):
     lights: Literal["white", "colour-coded"] = "white"
     """white: four LEDs among the cameras of each group. colour-coded: a red, a green and a blue one about each group,
     with crossed polarisers before them and the lenses, which scan plain enamel."""
-    ring_mm: Annotated[float, Range(0.01, 1000)] = 3.0
-    """Distance of colour-coded LEDs from the middle of their group."""
+    ring_mm: Annotated[float, Range(0.01, 1000)] = 4.5
+    """Distance of colour-coded LEDs from the middle of their group. The farther apart they are, the more their shades
+    differ; much farther, and an LED shines into what carries another group."""
     holder: HolderOptions = field(default_factory=HolderOptions)
     """What carries cameras and LEDs."""
 
@@ -195,9 +196,9 @@ def _group_lights(prefix: str, group_from_rig: Rigid3, options: DesignOptions) -
     }
 
 
-_CODED = {"r": ((1.0, 0.0, 0.0), 1.0, 90.0), "g": ((0.0, 1.0, 0.0), 1.0, 210.0), "b": ((0.0, 0.0, 1.0), 1.4, 330.0)}
+_CODED = {"r": ((1.0, 0.0, 0.0), 1.0, 150.0), "g": ((0.0, 1.0, 0.0), 1.0, 270.0), "b": ((0.0, 0.0, 1.0), 1.4, 30.0)}
 """Colour of each LED, its power (enamel is yellowish), and where it stands about its group, deg from the right of the
-image anticlockwise."""
+image anticlockwise: of a group beside the teeth two at the height of the cusps, one nearer to the gum."""
 _CROSSED = 0.03
 """Share of a mirror reflection that passes crossed polarising films."""
 

@@ -34,7 +34,7 @@ _MIDDLE, _WIDE, _LEAST_PX = 0.065, 0.18, 3
 """Sides, in focal lengths (0.3 and 0.9 mm at 5 mm), of the windows over which the slope of a surface is averaged, and
 the least one in px of the depth map. The first follows its shape; the second looks past the pit that a reflection made
 in it."""
-_STRENGTH, _PLACE = 0.15, 0.5
+STRENGTH, _PLACE = 0.15, 0.5
 """What a spot is uncertain by: a share of it, and a share of what it is brighter by seen past a pit."""
 _LEAST_SHARE = 0.2
 """Share of a window whose depth must be known."""
@@ -75,7 +75,7 @@ def seen(
         spot[known] = mirrored(points, normals[known], lights)
         share[known] = _leaving(-(normals[known] * unit(points)).sum(axis=-1), exit_index)
     past_pits, spot = spots
-    return Seen(spot, _STRENGTH * spot + _PLACE * np.maximum(past_pits - spot, 0), share)
+    return Seen(spot, STRENGTH * spot + _PLACE * np.maximum(past_pits - spot, 0), share)
 
 
 def _smoothed(

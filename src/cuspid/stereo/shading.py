@@ -475,10 +475,18 @@ def _matte(
         part, encoded = np.s_[: view.size[0], : view.size[1]], np.float32(-1 / view.gamma)
         what = seen(view.grid, depth, view.lights, options.exit_index)
         spot, uncertain, share = (_spread(each, view.size, spacing_px) for each in what)
-        left = np.maximum(image[part], 0) * (1 - (1 + uncertain) ** encoded)
-        weight[part] = 1 / (1 + (left / options.glare_dn) ** 2)
+        weight[part] = trusted(image[part], uncertain, view.gamma, options.glare_dn)
         image[part] = np.where(image[part] >= 0, image[part] * ((1 + spot) * share[..., None]) ** encoded, _UNUSABLE)
     return matte, trust
+
+
+def trusted(
+    image: Float32[np.ndarray, "*n"], uncertain: Float32[np.ndarray, "*n"], gamma: float, glare_dn: float
+) -> Float32[np.ndarray, "*n"]:
+    """Weight of brightness (digital numbers) whose mirror reflections are uncertain by a share of the shade: half where
+    that is ``glare_dn``."""
+    left = np.maximum(image, 0) * (1 - (1 + uncertain) ** np.float32(-1 / gamma))
+    return 1 / (1 + (left / np.float32(glare_dn)) ** 2)
 
 
 def _are_coloured(lights: Sequence[Light]) -> bool:
