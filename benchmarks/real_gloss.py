@@ -4,9 +4,9 @@
 
 FOLDER is ``ballPNG`` of DiLiGenT (B. Shi et al., IEEE Trans. PAMI 41, 2019): 96 photographs under one far light each,
 for research only and no part of the project. Normals are found by least squares from the brightness under all lights
-(R. Woodham, Optical Engineering 19, 1980): first as if the ball were matte, then as cuspid treats teeth, which takes
-the reflections off that the normals before tell of, as often, and trusts brightness less where these are uncertain.
-The values of the model are those of wet enamel; nothing is fitted to the ball.
+(R. Woodham, Optical Engineering 19, 1980): first as if the ball were matte, then twice as cuspid treats teeth: the
+reflections that the normals before tell of are taken off, and brightness is trusted less where these are uncertain. The
+values of the model are those of wet enamel; nothing is fitted to the ball.
 """
 
 from __future__ import annotations
