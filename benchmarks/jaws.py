@@ -220,12 +220,11 @@ def main() -> None:
     files = {path.stem: path for path in sorted(arguments.folder.rglob("*.ply"))}
     known = list(cases(files))
     chosen = [each for each in known if arguments.only is None or is_asked(each.name, arguments.only, known)]
+    work = arguments.work / kind
     outcomes = run_grid(
         chosen,
-        partial(
-            judge, pixels=pixels, passes=arguments.passes, plan_only=arguments.plan, scans=arguments.work / "unfinished"
-        ),
-        arguments.work / kind,
+        partial(judge, pixels=pixels, passes=arguments.passes, plan_only=arguments.plan, scans=work / "unfinished"),
+        work,
         workers=1,
         progress=lambda stage, done, total: print(f"{stage}: {done} of {total}", flush=True),
     )
