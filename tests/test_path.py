@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from cuspid.arch_curve import ArchCurve, arch_curve
+from cuspid.evaluation.crown import open_parts
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import twelve_cameras
 from cuspid.jaw import GUM, Jaw
@@ -19,7 +20,7 @@ from cuspid.simulation.path.further import _largest_sum, _woven, further_legs, s
 from cuspid.simulation.path.legs import Leg, steady_path
 from cuspid.simulation.path.overlap import frame_overlap
 from cuspid.simulation.path.scan import ScanPathOptions, _goes_on, plan_scan_path
-from cuspid.visibility import VisibilityOptions, visible_counts
+from cuspid.visibility import VisibilityOptions, scannable_faces, visible_counts
 
 HANDPIECE = twelve_cameras()
 
@@ -102,6 +103,18 @@ def test_parts_of_an_arch_are_scanned(coarse_phantom: Jaw, teeth: tuple[int, ...
         top = part.tooth_faces(tooth) & up
         areas = part.mesh.face_areas
         assert areas[top & (counts >= 2)].sum() / areas[top].sum() > 0.8, tooth
+
+
+def test_the_curve_runs_over_any_four_teeth_in_a_row(coarse_phantom: Jaw) -> None:
+    """They are nearly as wide as long, so that a circle through them may have its centre among them."""
+    row = (*range(37, 30, -1), *range(41, 48))
+    for first in range(len(row) - 3):
+        part = part_of(coarse_phantom, row[first : first + 4])
+        curve = arch_curve(part)
+        spans = [curve.span_of(part.mesh.face_centres[part.tooth_faces(tooth)]) for tooth in row[first : first + 4]]
+        middles = [(low + high) / 2 for low, high in spans]
+        assert all(high - low > 3 for low, high in spans), spans
+        assert all(after - before > 3 for before, after in pairwise(middles)), spans
 
 
 def test_the_cheek_is_on_the_outside_of_a_quadrant(coarse_phantom: Jaw) -> None:
@@ -188,6 +201,19 @@ def test_a_part_is_not(coarse_phantom: Jaw) -> None:
     part = arch_curve(part_of(coarse_phantom, (44, 45, 46, 47)))
     assert not _goes_on(ScanPathOptions(), part)
     assert _goes_on(ScanPathOptions(passes="auto"), part)
+
+
+def test_the_plan_tells_the_share_of_the_open_crowns_that_a_comparison_counts(coarse_phantom: Jaw) -> None:
+    """Crowns without gum show undercuts that are seen only flat from above; passes from the side see them, too."""
+    teeth = (44, 45, 46, 47)
+    kept = np.isin(coarse_phantom.face_labels, teeth)
+    jaw = Jaw(mesh=coarse_phantom.mesh.submesh(kept), face_labels=coarse_phantom.face_labels[kept], arch="lower")
+    path = plan_scan_path(jaw, HANDPIECE, ScanPathOptions(passes="auto"), np.random.default_rng(0))
+    areas = np.where(open_parts(jaw.mesh, jaw.face_labels) != GUM, jaw.mesh.face_areas, 0.0)
+    scannable = scannable_faces(jaw.mesh, HANDPIECE, path.rig_from_world.values(), VisibilityOptions())
+    share = areas[scannable].sum() / areas.sum()
+    assert path.seen[GUM] == pytest.approx(share, abs=0.015)
+    assert share > 0.97
 
 
 def test_a_path_with_further_passes_overlaps_and_fits(coarse_phantom: Jaw) -> None:

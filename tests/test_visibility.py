@@ -23,6 +23,7 @@ from cuspid.rig import Handpiece, MountedCamera, Rig
 from cuspid.visibility import (
     VisibilityOptions,
     camera_rows,
+    openness,
     scannable_faces,
     surface_rows,
     survey_visibility,
@@ -233,6 +234,28 @@ def test_options_that_see_nothing_or_backs_are_refused(change: dict[str, float],
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
+
+
+def open_shares(mesh: Mesh, reach_mm: float = np.inf) -> np.ndarray:
+    return openness(mesh, mesh.face_centres, mesh.face_normals, reach_mm)
+
+
+def test_openness_is_that_of_the_sky() -> None:
+    flat = np.array([[-50.0, -50, 0], [50, -50, 0], [0, 80, 0]])
+    lid = Mesh(np.concatenate([flat, flat + [0, 0, 1.0]]), np.array([[0, 1, 2], [3, 4, 5]]))
+    below, above = open_shares(lid)
+    assert above == 1
+    assert below < 0.1
+    wall = Mesh(np.array([[0.0, -5, -5], [0, 5, -5], [0, 0, 5]]), np.array([[0, 1, 2]]))
+    assert open_shares(wall)[0] == pytest.approx(0.5, abs=0.05)
+
+
+def test_only_what_stands_within_reach_closes_the_sky() -> None:
+    """A lid at a height h over a plane leaves the directions free that meet it beyond the reach r: a share h/r."""
+    flat = 1e3 * np.array([[-1.0, -1, 0], [1, -1, 0], [0, 1.6, 0]])
+    lid = Mesh(np.concatenate([flat, flat + [0, 0, 2.0]]), np.array([[0, 1, 2], [3, 4, 5]]))
+    for reach_mm in (3.0, 4.0, 8.0):
+        assert open_shares(lid, reach_mm)[0] == pytest.approx(2.0 / reach_mm, abs=0.02)
 
 
 def test_the_tables_weigh_by_area() -> None:

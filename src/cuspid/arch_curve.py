@@ -76,27 +76,41 @@ class ArchCurve:
 def arch_curve(jaw: Jaw) -> ArchCurve:
     """The arch of a jaw in its occlusal frame, from the mesh; labels, if there are any, exclude the gum."""
     crowns = _crown_tops(jaw)
-    points = _rough_curve(crowns)
+    curves = [_centred(rough, crowns) for rough in _rough_curves(crowns)]
+    return ArchCurve(points=min(curves, key=lambda points: max(_farthest_mm(points, crowns), NEAR_MM)))
+
+
+def _centred(points: Float[np.ndarray, "m 3"], crowns: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
     for _ in range(3):
         points = _centred_curve(points, crowns)
-    return ArchCurve(points=points)
+    return points
 
 
-def _rough_curve(crowns: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """The arch as seen from the centre of the circle through it; a part that bends too little is taken for straight."""
+def _farthest_mm(points: Float[np.ndarray, "m 3"], crowns: Float[np.ndarray, "n 3"]) -> float:
+    """How far crowns lie beside a curve, but for 2 % of them."""
+    return float(np.percentile(KDTree(points[:, :2]).query(crowns[:, :2])[0], 98))
+
+
+def _rough_curves(crowns: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "m 3"], ...]:
+    """The arch as seen from the centre of the circle through it, and a line along it, as for a part that hardly bends.
+
+    Four or five teeth in a row are wide enough for a circle to go through them anywhere: what fits is seen afterwards.
+    """
     centre = _circle_centre(crowns[:, :2])
     offset = crowns[:, :2] - centre
     middle = np.arctan2(*offset.mean(axis=0)[::-1])
     # Angles grow clockwise and are zero at the middle of the arch, so that the cut lies behind the mouth.
     angle = -np.angle(np.exp(1j * (np.arctan2(offset[:, 1], offset[:, 0]) - middle)))
+    straight = _straight_curve(crowns, centre)
     if np.ptp(np.percentile(angle, [1, 99])) < np.deg2rad(_ARC_DEG) or _is_short(crowns):
-        return _straight_curve(crowns, centre)
+        return (straight,)
     radius = np.linalg.norm(offset, axis=1)
     along = angle * np.median(radius)
     at, middles = _middles(along, radius, crowns[:, 2])
     fine, smooth = _smooth(at, middles)
     turn = middle - fine / np.median(radius)
-    return np.column_stack([centre + smooth[:, :1] * np.stack([np.cos(turn), np.sin(turn)], axis=1), smooth[:, 1]])
+    bent = np.column_stack([centre + smooth[:, :1] * np.stack([np.cos(turn), np.sin(turn)], axis=1), smooth[:, 1]])
+    return bent, straight
 
 
 def _is_short(crowns: Float[np.ndarray, "n 3"]) -> bool:

@@ -22,6 +22,10 @@ from cuspid.mesh import Mesh
 from cuspid.options import Options, Range
 from cuspid.rig import Handpiece
 
+LEAST_OPENNESS = 0.05
+"""Share of the directions above the occlusal plane that must be free for a place on a crown to count as open."""
+_OPENNESS_RAYS = 64
+_OFF_SURFACE_MM = 2e-3
 _AT_ONCE = (1, 2, 3)
 """Numbers of cameras that the tables list."""
 
@@ -117,6 +121,23 @@ def visible_faces(
     """Indices of the faces that one camera sees; only those in ``among`` are tested, but all can occlude."""
     view = _view(camera, Rigid3.identity(), depth_range_mm)
     return _visible_among(mesh, view, cam_from_world, options, np.arange(len(mesh.faces)) if among is None else among)
+
+
+def openness(
+    mesh: Mesh, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], reach_mm: float = np.inf
+) -> Float[np.ndarray, "n"]:
+    """Share of the directions above the occlusal plane (XY) from which points of the surface can be seen at all,
+    however flat, where only what stands within the reach occludes them."""
+    steps = np.arange(_OPENNESS_RAYS) + 0.5
+    z, azimuth = steps / _OPENNESS_RAYS, steps * np.pi * (3 - np.sqrt(5))
+    directions = np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], axis=1)
+    origins = points + _OFF_SURFACE_MM * normals
+    free = np.zeros(len(points))
+    for direction in directions:
+        facing = np.flatnonzero(normals @ direction > 0)
+        hits = mesh.cast(origins[facing], np.broadcast_to(direction, (len(facing), 3)))
+        free[facing[hits.distances >= reach_mm]] += 1
+    return free / _OPENNESS_RAYS
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------

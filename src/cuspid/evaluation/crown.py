@@ -19,12 +19,10 @@ from cuspid.geometry import read_only
 from cuspid.jaw import GUM
 from cuspid.mesh import Mesh
 from cuspid.trueness import CrownCompleteness
+from cuspid.visibility import LEAST_OPENNESS, openness
 
-LEAST_OPENNESS = 0.05
-"""Share of the directions above the occlusal plane that must be free for a face of a crown to count as open."""
 WITHIN_UM = (50, 100, 200)
 """Distances at which completeness is evaluated."""
-_OPENNESS_RAYS = 64
 _NEIGHBOURHOOD_MM = 15.0
 """What lies farther than this from a tooth does not occlude it."""
 _IN_REACH_MM = 0.2
@@ -74,25 +72,10 @@ def open_faces(mesh: Mesh, tooth: Bool[np.ndarray, "f"], least_openness: float) 
     near = np.linalg.norm(mesh.face_centres - middle, axis=1) < _NEIGHBOURHOOD_MM
     wanted = near & tooth
     is_open = np.zeros(len(near), dtype=bool)
-    is_open[wanted] = openness(mesh.submesh(near), np.flatnonzero(tooth[near])) >= least_openness
+    is_open[wanted] = (
+        openness(mesh.submesh(near), mesh.face_centres[wanted], mesh.face_normals[wanted]) >= least_openness
+    )
     return is_open
-
-
-def openness(mesh: Mesh, faces: Int[np.ndarray, "n"] | None = None) -> Float[np.ndarray, "n"]:
-    """Share of the directions above the occlusal plane (XY) from which the centres of some faces (None: all) can be
-    seen."""
-    steps = np.arange(_OPENNESS_RAYS) + 0.5
-    z, azimuth = steps / _OPENNESS_RAYS, steps * np.pi * (3 - np.sqrt(5))
-    directions = np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], axis=1)
-    asked = np.arange(len(mesh.faces)) if faces is None else faces
-    normals = mesh.face_normals[asked]
-    origins = mesh.face_centres[asked] + 2e-3 * normals
-    free = np.zeros(len(asked))
-    for direction in directions:
-        facing = np.flatnonzero(normals @ direction > 0)
-        hits = mesh.cast(origins[facing], np.broadcast_to(direction, (len(facing), 3)))
-        free[facing[hits.faces < 0]] += 1
-    return free / _OPENNESS_RAYS
 
 
 def within_pct(distances_mm: Float[np.ndarray, "n"]) -> dict[str, float]:

@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cuspid.errors import InputError
-from cuspid.evaluation.crown import OpenCrown, crown_completeness, openness, within_pct
+from cuspid.evaluation.crown import OpenCrown, crown_completeness, within_pct
 from cuspid.evaluation.distance import ClosestPoints, SignedDistance
 from cuspid.evaluation.registration import Alignment, RegistrationOptions, best_scale, register
 from cuspid.evaluation.teeth import CANINES, LEAST_SAMPLES, MOLARS, distance_error_um, drift_um, find_teeth
@@ -37,6 +37,7 @@ from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
 from cuspid.options import SHARE, Options, Range
 from cuspid.trueness import DeviationStatistics, Trueness
+from cuspid.visibility import openness
 
 _LEAST_TOOTH_PCT = 30.0
 """Share of a tooth's surface that must lie within 200 um of the scan for its position to be evaluated."""
@@ -200,7 +201,7 @@ def _rules(reference: Mesh, scannable: Bool[np.ndarray, "f"] | None, options: Ev
     if scannable is not None:
         faces, note = scannable, "the faces that at least two cameras could see"
     elif options.min_openness > 0:
-        faces = openness(reference) >= options.min_openness
+        faces = openness(reference, reference.face_centres, reference.face_normals) >= options.min_openness
         note = f"the faces seen from {options.min_openness:.0%} of the directions above the occlusal plane"
     else:
         faces = np.ones(len(reference.faces), dtype=bool)

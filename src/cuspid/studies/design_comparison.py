@@ -39,7 +39,7 @@ from cuspid.anatomy.shape.mean import mean_shape
 from cuspid.anatomy.surfaces import named_surfaces
 from cuspid.camera import Camera
 from cuspid.errors import CuspidError, InputError
-from cuspid.evaluation.crown import LEAST_OPENNESS, open_faces
+from cuspid.evaluation.crown import open_faces
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.handpiece.optimise import handpiece_outline
@@ -51,6 +51,7 @@ from cuspid.rig import Handpiece, Rig
 from cuspid.simulation.path.scan import ScanPathOptions, steady_poses
 from cuspid.studies.grid import Case, Outcome, Value, run_grid
 from cuspid.studies.trial import TrialOptions, run_trial
+from cuspid.visibility import LEAST_OPENNESS
 
 Row = Mapping[str, Value]
 Outlines = tuple[Float[np.ndarray, "n 2"], ...]

@@ -20,15 +20,13 @@ from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw
 from cuspid.kernels import kernel
 from cuspid.rig import Handpiece
-from cuspid.visibility import slope_bounds
+from cuspid.visibility import LEAST_OPENNESS, openness, slope_bounds
 
 _AREA_MM2 = 0.7
 """Area of the surface that each point represents."""
 _DIRECTIONS = 256
 _LEAST_COSINE = float(np.cos(np.deg2rad(75.0)))
 """Minimum cosine of the incidence at which a point is seen; as in :mod:`cuspid.visibility`."""
-_LEAST_OPEN = 0.05
-"""A point with a smaller share of the directions above the occlusal plane open is considered hidden."""
 _ASIDE_MM, _BELOW_MM = 7.0, 8.0
 """Without labels, crowns are what lies this near to the arch, seen from above, and this far below its line."""
 
@@ -92,17 +90,17 @@ def crown_points(jaw: Jaw, curve: ArchCurve, reach_mm: float) -> CrownPoints:
     labels = np.full(len(wanted), GUM) if jaw.face_labels is None else jaw.face_labels
     count = max(int(crowns.face_areas.sum() / _AREA_MM2), 1)
     points, faces = crowns.sample(count, np.random.default_rng(0))
+    is_open = openness(jaw.mesh, points, crowns.face_normals[faces], reach_mm) >= LEAST_OPENNESS
+    points, faces = points[is_open], faces[is_open]
     normals, directions = crowns.face_normals[faces], _evenly(_DIRECTIONS)
     open_ = normals @ directions.T > _LEAST_COSINE
     row, column = np.nonzero(open_)
     open_[row, column] = ~jaw.mesh.occluded(points[row], points[row] + reach_mm * directions[column])
-    up = directions[:, 2] > 0
-    kept = open_[:, up].mean(axis=1) >= _LEAST_OPEN
     return CrownPoints(
-        points=points[kept],
-        normals=normals[kept],
-        teeth=labels[wanted][faces[kept]],
-        open=open_[kept],
+        points=points,
+        normals=normals,
+        teeth=labels[wanted][faces],
+        open=open_,
         directions=directions,
         nearest=_nearest_table(directions),
     )
