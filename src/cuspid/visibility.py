@@ -24,6 +24,8 @@ from cuspid.rig import Handpiece
 
 LEAST_OPENNESS = 0.05
 """Share of the directions above the occlusal plane that must be free for a place on a crown to count as open."""
+OPENNESS_REACH_MM = 15.0
+"""What lies farther than this from a crown does not occlude it."""
 _OPENNESS_RAYS = 64
 _OFF_SURFACE_MM = 2e-3
 _AT_ONCE = (1, 2, 3)

@@ -19,12 +19,10 @@ from cuspid.geometry import read_only
 from cuspid.jaw import GUM
 from cuspid.mesh import Mesh
 from cuspid.trueness import CrownCompleteness
-from cuspid.visibility import LEAST_OPENNESS, openness
+from cuspid.visibility import LEAST_OPENNESS, OPENNESS_REACH_MM, openness
 
 WITHIN_UM = (50, 100, 200)
 """Distances at which completeness is evaluated."""
-_NEIGHBOURHOOD_MM = 15.0
-"""What lies farther than this from a tooth does not occlude it."""
 _IN_REACH_MM = 0.2
 _PIECE_MM = 10.0
 """Side of the squares of the occlusal plane that stand in for teeth if these have no labels."""
@@ -69,7 +67,7 @@ def pieces(mesh: Mesh, crown: Bool[np.ndarray, "f"]) -> Int[np.ndarray, "f"]:
 def open_faces(mesh: Mesh, tooth: Bool[np.ndarray, "f"], least_openness: float) -> Bool[np.ndarray, "f"]:
     """The open faces of a tooth, for a mesh with +Z out of the gum."""
     middle = mesh.face_centres[tooth].mean(axis=0)
-    near = np.linalg.norm(mesh.face_centres - middle, axis=1) < _NEIGHBOURHOOD_MM
+    near = np.linalg.norm(mesh.face_centres - middle, axis=1) < OPENNESS_REACH_MM
     wanted = near & tooth
     is_open = np.zeros(len(near), dtype=bool)
     is_open[wanted] = (

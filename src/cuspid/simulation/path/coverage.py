@@ -20,7 +20,7 @@ from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw
 from cuspid.kernels import kernel
 from cuspid.rig import Handpiece
-from cuspid.visibility import LEAST_OPENNESS, openness, slope_bounds
+from cuspid.visibility import LEAST_OPENNESS, OPENNESS_REACH_MM, openness, slope_bounds
 
 _AREA_MM2 = 0.7
 """Area of the surface that each point represents."""
@@ -90,7 +90,7 @@ def crown_points(jaw: Jaw, curve: ArchCurve, reach_mm: float) -> CrownPoints:
     labels = np.full(len(wanted), GUM) if jaw.face_labels is None else jaw.face_labels
     count = max(int(crowns.face_areas.sum() / _AREA_MM2), 1)
     points, faces = crowns.sample(count, np.random.default_rng(0))
-    is_open = openness(jaw.mesh, points, crowns.face_normals[faces], reach_mm) >= LEAST_OPENNESS
+    is_open = openness(jaw.mesh, points, crowns.face_normals[faces], OPENNESS_REACH_MM) >= LEAST_OPENNESS
     points, faces = points[is_open], faces[is_open]
     normals, directions = crowns.face_normals[faces], _evenly(_DIRECTIONS)
     open_ = normals @ directions.T > _LEAST_COSINE
