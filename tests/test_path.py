@@ -8,6 +8,7 @@ from itertools import pairwise, product
 import numpy as np
 import pytest
 
+from builders import sphere
 from cuspid.arch_curve import ArchCurve, arch_curve
 from cuspid.evaluation.crown import open_parts
 from cuspid.geometry import Rigid3
@@ -140,6 +141,15 @@ def test_the_quick_look_agrees_with_rays(coarse_phantom: Jaw, curve: ArchCurve, 
     assert (quick == exact).mean() > 0.95
 
 
+def test_undercuts_are_open_as_comparisons_count_them(curve: ArchCurve) -> None:
+    """A ball is seen from a share (90 - b) / 180 of the directions above it where it faces down by b: 5 % at 81 deg."""
+    ball = sphere(8.0)
+    points = crown_points(Jaw(mesh=ball, face_labels=np.full(len(ball.faces), 46), arch="lower"), curve, 9.0)
+    lowest = np.sin(np.deg2rad(-81.0))
+    assert points.normals[:, 2].min() == pytest.approx(lowest, abs=0.02)
+    assert len(points.points) / (ball.face_areas.sum() / 0.7) == pytest.approx((1 - lowest) / 2, abs=0.015)
+
+
 def test_the_largest_sum_is_that_of_all_stretches() -> None:
     for seed in range(20):
         values = np.random.default_rng(seed).normal(-0.2, 1, 12)
@@ -204,7 +214,6 @@ def test_a_part_is_not(coarse_phantom: Jaw) -> None:
 
 
 def test_the_plan_tells_the_share_of_the_open_crowns_that_a_comparison_counts(coarse_phantom: Jaw) -> None:
-    """Crowns without gum show undercuts that are seen only flat from above; passes from the side see them, too."""
     teeth = (44, 45, 46, 47)
     kept = np.isin(coarse_phantom.face_labels, teeth)
     jaw = Jaw(mesh=coarse_phantom.mesh.submesh(kept), face_labels=coarse_phantom.face_labels[kept], arch="lower")
