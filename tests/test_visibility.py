@@ -233,7 +233,7 @@ def test_options_that_see_nothing_or_backs_are_refused(change: dict[str, float],
         VisibilityOptions(**change)
 
 
-# --- tables -----------------------------------------------------------------------------------------------------------
+# --- the sky ----------------------------------------------------------------------------------------------------------
 
 
 def open_shares(mesh: Mesh, reach_mm: float = np.inf) -> np.ndarray:
@@ -256,6 +256,9 @@ def test_only_what_stands_within_reach_closes_the_sky() -> None:
     lid = Mesh(np.concatenate([flat, flat + [0, 0, 2.0]]), np.array([[0, 1, 2], [3, 4, 5]]))
     for reach_mm in (3.0, 4.0, 8.0):
         assert open_shares(lid, reach_mm)[0] == pytest.approx(2.0 / reach_mm, abs=0.02)
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
 
 
 def test_the_tables_weigh_by_area() -> None:
