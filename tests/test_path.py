@@ -17,7 +17,7 @@ from cuspid.jaw import GUM, Jaw
 from cuspid.room import Room
 from cuspid.simulation.path.coverage import CrownPoints, crown_points
 from cuspid.simulation.path.detour import _APART, _UNITS, _shortest, plan_detour
-from cuspid.simulation.path.further import _largest_sum, _woven, further_legs, seen_from
+from cuspid.simulation.path.further import _largest_sum, _Trial, _woven, further_legs, seen_from
 from cuspid.simulation.path.legs import Leg, steady_path
 from cuspid.simulation.path.overlap import frame_overlap
 from cuspid.simulation.path.scan import ScanPathOptions, _goes_on, plan_scan_path
@@ -156,6 +156,21 @@ def test_the_largest_sum_is_that_of_all_stretches() -> None:
         sums = {(i, j): values[i : j + 1].sum() for i in range(12) for j in range(i, 12)}
         first, last = _largest_sum(values)
         assert values[first : last + 1].sum() == pytest.approx(max(sums.values()))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_steep_pass_goes_only_where_one_between_ties_it(sign: int) -> None:
+    rng = np.random.default_rng(7)
+    seen, unseen = rng.random((81, 300)) < 0.1, np.ones(300, bool)
+    lengths = np.linspace(0.0, 80.0, 81)
+    steep, lower = _Trial(sign * 90.0, lengths, seen), _Trial(sign * 60.0, lengths, seen)
+    beside, aside, again = (Leg(roll_deg=sign * roll, start_mm=50.0, end_mm=22.0) for roll in (45.0, -45.0, 90.0))
+    for legs in ([], [aside], [again]):
+        assert steep.best_stretch(unseen, legs)[2] < 0
+        assert lower.best_stretch(unseen, legs) == lower.best_stretch(unseen, [])
+    start, end, net = steep.best_stretch(unseen, [aside, beside])
+    assert 22 <= start < end <= 50
+    assert 0 < net < lower.best_stretch(unseen, [])[2]
 
 
 def test_further_passes_are_gone_through_on_the_way_without_jumps() -> None:

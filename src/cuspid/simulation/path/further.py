@@ -1,7 +1,9 @@
 """Further passes over the parts of the crowns that the first ones leave unseen.
 
 For each roll, a pass along the whole path is tried, and the stretch is kept on which it adds most in excess of the cost
-of its frames (the maximum-sum subarray). The best of all is added, and so on until none is worthwhile.
+of its frames (the maximum-sum subarray). The best of all is added, and so on until none is worthwhile. A steep pass
+shares too little surface with the upright one to be located against it, so it goes only where another further pass,
+rolled less to the same side, lies between them.
 """
 
 from __future__ import annotations
@@ -20,9 +22,9 @@ from cuspid.simulation.path.coverage import CrownPoints
 from cuspid.simulation.path.detour import up
 from cuspid.simulation.path.legs import Leg, SteadyPath, steady_path
 
-_ROLLS_DEG = (-60.0, -45.0, -30.0, 30.0, 45.0, 60.0)
-"""Steeper ones show more of crowns without gum, but the scan that was tried so came out displaced
-(docs/scan-path.md)."""
+_ROLLS_DEG = (-90.0, -60.0, -45.0, -30.0, 30.0, 45.0, 60.0, 90.0)
+_STEEP_DEG = 60.0
+"""A pass that is rolled farther is steep."""
 _STATION_MM = 1.5
 _WORTH = 2e-4
 """Share of the crown surface that a millimetre of path must add."""
@@ -42,16 +44,27 @@ class _Trial:
     lengths_mm: Float[np.ndarray, "s"]
     seen: Bool[np.ndarray, "s n"]
 
-    def best_stretch(self, unseen: Bool[np.ndarray, "n"]) -> tuple[float, float, float]:
-        """First and last place of the stretch that pays most, and what it adds beyond its cost, as a share of all."""
+    def best_stretch(self, unseen: Bool[np.ndarray, "n"], legs: Sequence[Leg]) -> tuple[float, float, float]:
+        """First and last place of the stretch that pays most, and what it adds beyond its cost, as a share of all.
+
+        ``legs`` are the further passes so far.
+        """
         new = self.seen & unseen
         added = np.flatnonzero(new.any(axis=0))
         # A point counts at the middle of the places that see it.
         at = np.array([np.median(np.flatnonzero(new[:, point])) for point in added], dtype=int)
         gain = np.bincount(at, minlength=len(self.lengths_mm)) / len(unseen) - _WORTH * _STATION_MM
+        gain[~self._tied(legs)] = -1.0  # no stretch gains as much as that
         first, last = _largest_sum(gain)
         net = float(gain[first : last + 1].sum()) - _WORTH * _ARM_MM * abs(np.deg2rad(self.roll_deg))
         return float(self.lengths_mm[first]), float(self.lengths_mm[last]), net
+
+    def _tied(self, legs: Sequence[Leg]) -> Bool[np.ndarray, "s"]:
+        """Places where the pass shares enough surface with others."""
+        if abs(self.roll_deg) <= _STEEP_DEG:
+            return np.ones(len(self.lengths_mm), bool)
+        between = [_ends(leg) for leg in legs if 0 < leg.roll_deg / self.roll_deg < 1]
+        return np.array([any(low <= at <= high for low, high in between) for at in self.lengths_mm])
 
 
 def _largest_sum(values: Float[np.ndarray, "n"]) -> tuple[int, int]:
@@ -68,7 +81,7 @@ def further_legs(mesh: Mesh, room: Room, crowns: CrownPoints, handpiece: Handpie
     trials = [_trial(mesh, room, crowns, handpiece, steady, roll) for roll in _ROLLS_DEG]
     legs = list[Leg]()
     while len(legs) < _MOST:
-        stretches = [trial.best_stretch(unseen) for trial in trials]
+        stretches = [trial.best_stretch(unseen, legs) for trial in trials]
         best = int(np.argmax([net for *_, net in stretches]))
         start, end, net = stretches[best]
         if net <= 0:
