@@ -15,9 +15,10 @@ from cuspid.arch_curve import ArchCurve, arch_curve
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import essential_four
+from cuspid.handpiece.intra_oral import intra_oral_camera
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
-from cuspid.room import Room
+from cuspid.room import Room, room_about
 from cuspid.simulation.path.cross import Crossing, plan_crossing
 from cuspid.simulation.path.overlap import image_overlap
 from cuspid.simulation.path.scan import ScanPath, ScanPathOptions, plan_scan_path
@@ -100,6 +101,12 @@ def test_it_goes_as_far_back_as_there_is_surface(upper: Jaw) -> None:
     whole = crossing_of(upper)
     assert short.start_mm > whole.start_mm + 5
     assert short.at(short.length_mm / 2).inverse().translation[1] > -6
+
+
+def test_a_single_camera_goes_across_too(upper: Jaw) -> None:
+    camera = intra_oral_camera()
+    crossing = plan_crossing(upper.mesh, room_about(upper.mesh, camera, 2.0), camera, arch_curve(upper), 0.0)
+    assert crossing.length_mm > 0.8 * crossing_of(upper).length_mm
 
 
 def test_where_nothing_lies_between_the_sides_there_is_none() -> None:

@@ -5,7 +5,8 @@ measures it directly. It begins over the crowns of one side like a pass, follows
 with its slope, and ends over the crowns of the other side like a pass there. On the way the handpiece rotates by half a
 turn, as along the arch: what it sees at the ends then looks the same as in the passes, and is recognised.
 
-It goes as far back as there is surface all the way that two cameras see in focus where the handpiece fits.
+It goes as far back as there is surface all the way that two cameras, or the only one, see in focus where the handpiece
+fits.
 """
 
 from __future__ import annotations
@@ -147,6 +148,6 @@ def _following(start: Rigid3, end: Rigid3, heights_mm: Float[np.ndarray, "n"], l
 
 
 def _is_seen(mesh: Mesh, handpiece: Handpiece, crossing: Crossing) -> bool:
-    """Whether two cameras see surface in focus everywhere on the way, and again in the next place."""
+    """Whether two cameras, or the only one, see surface in focus everywhere on the way, and again in the next place."""
     overlap = image_overlap(mesh, handpiece, crossing.rig_from_world, _GRID)
-    return bool(np.all(np.sum(np.nan_to_num(overlap) > 0, axis=1) >= 2))
+    return bool(np.all(np.sum(np.nan_to_num(overlap) > 0, axis=1) >= min(2, len(handpiece.rig.cameras))))
