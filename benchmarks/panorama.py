@@ -1,13 +1,13 @@
 """Measure panoramas of ten subjects filmed by a shaky hand, by cuspid's methods and by OpenCV's Stitcher.
 
     python benchmarks/panorama.py --out benchmarks/results/panorama [--jaws FILE_OR_FOLDER ...] [--work FOLDER]
-        [--subject lower-14-0 ...] [--method ortho pair thesis thesis-unexamined opencv-panorama opencv-scans]
-        [--films-only]
+        [--subject lower-14-0 ...] [--films-only]
+        [--method ortho return s-shape pair thesis thesis-unexamined opencv-panorama opencv-scans]
 
 Subjects are phantoms of the population, and jaws of your own, whose coarse faces are subdivided (Loop) first; the
 subdivided mesh is then the reference. All are filmed in 120 frames with full shake and the texture ``enamel``, for the
-method ``pair`` by two cameras. One JSON a subject and method goes to the results folder; what is there already is not
-made again.
+method ``pair`` by two cameras, for ``return`` and ``s-shape`` on another way over the arch. One JSON a subject and
+method goes to the results folder; what is there already is not made again.
 """
 
 from __future__ import annotations
@@ -92,13 +92,19 @@ def film(name: str, source: PhantomOptions | Path, folder: Path, seed: int, made
         print(f"{name}: {made} in {timed['wall_s']} s", flush=True)
 
 
-FILMS: Mapping[str, tuple[str, ...]] = {"film": (), "film-pair": ("--camera.cameras", "2")}
+FILMS: Mapping[str, tuple[str, ...]] = {
+    "film": (),
+    "film-pair": ("--camera.cameras", "2"),
+    "film-return": ("--path", "return"),
+    "film-s-shape": ("--path", "s-shape"),
+}
 """Films of a subject, and by which options."""
 
 
 def film_of(method: str) -> str:
     """The film that a method takes."""
-    return "film-pair" if method == "pair" else "film"
+    own = f"film-{method}"
+    return own if own in FILMS else "film"
 
 
 def film_command(jaw: Path, out: Path, seed: int, *options: str) -> list[str]:
@@ -168,7 +174,7 @@ def opencv(mode: str) -> Callable[[Path, Path, int], list[str]]:
 CUSPID = (sys.executable, "-m", "cuspid")
 METHODS: Mapping[str, Callable[[Path, Path, int], list[str]]] = {
     "ortho": stitched("ortho"),
-    "pair": stitched("ortho"),
+    **dict.fromkeys(("pair", "return", "s-shape"), stitched("ortho")),
     "thesis": stitched("thesis"),
     "thesis-unexamined": stitched("thesis", "--no-examination"),
     "opencv-panorama": opencv("panorama"),

@@ -10,7 +10,7 @@ from anatomy_sections import mark, markdown_table
 
 Result = Mapping[str, Any]
 
-METHODS = ("ortho", "pair", "thesis", "thesis-unexamined", "opencv-panorama", "opencv-scans")
+METHODS = ("ortho", "return", "s-shape", "pair", "thesis", "thesis-unexamined", "opencv-panorama", "opencv-scans")
 MEDIAN_MM, P95_MM, SSIM_TEETH, SSIM_CANVAS, WALL_S = 0.15, 0.5, 0.80, 0.93, 90.0
 """Bars: greatest errors, least likeness, longest time."""
 PAIR_MEDIAN_MM, PAIR_MOLARS_MM, PAIR_WALL_S = 0.05, 0.15, 45.0
@@ -27,9 +27,9 @@ def panoramas(results: Sequence[Result]) -> str:
         [
             "Phantoms of the population and real jaws (`benchmarks/panorama.py`), each filmed in 120 frames of "
             "640 x 480 px with full hand shake, texture `enamel`; `pair` is the default method on the film of two "
-            "cameras 5 mm apart. docs/panorama-evaluation.md explains the figures. *No arch* counts the "
-            "panoramas that failed: too few frames, collapsed, or nowhere near the jaw. Medians are over "
-            "those that did not fail.",
+            "cameras 5 mm apart, `return` and `s-shape` on a film of that path. docs/panorama-evaluation.md explains "
+            "the figures. *No arch* counts the panoramas that failed: too few frames, collapsed, or nowhere near the "
+            "jaw. Medians are over those that did not fail.",
             "",
             markdown_table(
                 (

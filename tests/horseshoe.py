@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from cuspid.jaw import Jaw
+from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
 
 GUM_TOP_MM, BOTTOM_MM = 0.0, -6.0
@@ -54,3 +56,17 @@ def horseshoe(along: int = 300, around: int = 80) -> Jaw:
 def without_base(mesh: Mesh) -> Mesh:
     """Only what lies above the underside: an open surface, as a scanner sees it."""
     return mesh.submesh(mesh.face_centres[:, 2] > BOTTOM_MM + 2)
+
+
+def with_palate(jaw: Jaw, depth_mm: float, back_mm: float = -30.0) -> Jaw:
+    """The jaw with a vault between its sides, so deep in the middle, from behind the front teeth to ``back_mm``."""
+    x, y = np.meshgrid(np.linspace(-24, 24, 49), np.linspace(back_mm, 16, 47))
+    z = 1.0 - depth_mm * np.clip(1 - (x / 20) ** 2, 0, None)
+    index = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    vertices = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
+    mesh = Mesh(
+        np.concatenate([jaw.mesh.vertices, vertices]), np.concatenate([jaw.mesh.faces, faces + len(jaw.mesh.vertices)])
+    )
+    return replace(jaw, mesh=mesh, face_labels=np.concatenate([jaw.face_labels, np.full(len(faces), GUM)]))

@@ -16,31 +16,16 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import essential_four
 from cuspid.handpiece.intra_oral import intra_oral_camera
-from cuspid.jaw import GUM, Jaw
-from cuspid.mesh import Mesh
+from cuspid.jaw import Jaw
 from cuspid.room import Room, room_about
 from cuspid.simulation.path.cross import Crossing, plan_crossing
 from cuspid.simulation.path.overlap import image_overlap
 from cuspid.simulation.path.scan import ScanPath, ScanPathOptions, plan_scan_path
 from cuspid.storage import write_path
-from horseshoe import horseshoe
+from horseshoe import horseshoe, with_palate
 
 HANDPIECE = essential_four()
 SWEEP = ScanPathOptions(passes="turns", cross_sweep=True)
-
-
-def with_palate(jaw: Jaw, depth_mm: float, back_mm: float = -30.0) -> Jaw:
-    """The jaw with a vault between its sides, so deep in the middle, from behind the front teeth to ``back_mm``."""
-    x, y = np.meshgrid(np.linspace(-24, 24, 49), np.linspace(back_mm, 16, 47))
-    z = 1.0 - depth_mm * np.clip(1 - (x / 20) ** 2, 0, None)
-    index = np.arange(x.size).reshape(x.shape)
-    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
-    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
-    vertices = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
-    mesh = Mesh(
-        np.concatenate([jaw.mesh.vertices, vertices]), np.concatenate([jaw.mesh.faces, faces + len(jaw.mesh.vertices)])
-    )
-    return replace(jaw, mesh=mesh, face_labels=np.concatenate([jaw.face_labels, np.full(len(faces), GUM)]))
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from cuspid import storage
 from cuspid.arch_curve import arch_curve
@@ -15,12 +16,13 @@ from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
 from cuspid.jaw import Jaw
 from cuspid.room import Room
 from cuspid.simulation.path.free import REACH, FreePathOptions, hand_noise, plan_free_path
+from horseshoe import horseshoe, with_palate
 from verbs import refused
 
 CAMERA = intra_oral_camera()
 
 
-def poses_of(jaw: Jaw, seed: int = 0, **options: float) -> list[np.ndarray]:
+def poses_of(jaw: Jaw, seed: int = 0, **options: float | str) -> list[np.ndarray]:
     path = plan_free_path(jaw, CAMERA, FreePathOptions(**options), np.random.default_rng(seed))
     return [pose.matrix for pose in path.values()]
 
@@ -110,6 +112,40 @@ def test_the_hand_goes_at_a_changing_speed_but_never_back(coarse_phantom: Jaw) -
         assert np.sum(steps[1:] * steps[:-1], axis=1).min() > 0
         spreads.append(np.log(np.linalg.norm(steps, axis=1)).std())
     assert 0.2 < np.mean(spreads) < 0.45
+
+
+def test_a_return_ends_where_it_began_and_passes_each_place_twice(coarse_phantom: Jaw) -> None:
+    poses = np.array(poses_of(coarse_phantom, shake=0.0, frames=41, path="return"))
+    np.testing.assert_allclose(poses, poses[::-1], atol=1e-9)
+    np.testing.assert_allclose(poses[:21], poses_of(coarse_phantom, shake=0.0, frames=21), atol=1e-9)
+
+
+def test_an_s_shape_swings_about_the_same_places(coarse_phantom: Jaw) -> None:
+    straight, swung = (
+        np.array(poses_of(coarse_phantom, shake=0.0, frames=200, path=path)) for path in ("arch", "s-shape")
+    )
+    rolls = Rotation.from_matrix((swung @ np.linalg.inv(straight))[:, :3, :3]).as_rotvec()
+    np.testing.assert_allclose(rolls[:, 1:], 0, atol=1e-9)
+    assert np.rad2deg(np.min(rolls)) == pytest.approx(-20, abs=0.3)
+    assert np.rad2deg(np.max(rolls)) == pytest.approx(20, abs=0.3)
+    places = [np.linalg.inv(poses)[:, :3, 3] for poses in (straight, swung)]
+    np.testing.assert_allclose(places[0], places[1], atol=1e-9)
+
+
+def test_a_way_across_ends_on_the_other_side_without_jumps() -> None:
+    upper = with_palate(horseshoe(), 6.0)
+    poses = poses_of(upper, shake=0.0, frames=200, path="cross")
+    places, curve = np.linalg.inv(poses)[:, :3, 3], arch_curve(upper)
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    assert steps.max() < 1.6 * np.median(steps), "down into the vault and up again"
+    end = np.argmin(np.linalg.norm(curve.points - places[-1], axis=1))
+    assert curve.lengths_mm[end] < 0.2 * curve.lengths_mm[-1]
+    np.testing.assert_allclose(places[0], curve.points[0], atol=1e-9)
+
+
+def test_where_nothing_lies_between_the_sides_there_is_no_way_across() -> None:
+    with pytest.raises(InputError, match="no surface between the sides"):
+        poses_of(horseshoe(), path="cross")
 
 
 def test_a_camera_that_would_touch_the_teeth_is_lifted(coarse_phantom: Jaw) -> None:

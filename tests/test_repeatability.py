@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 
 from cuspid import storage
 from cuspid.errors import InputError
+from cuspid.evaluation.deviation import EvaluationOptions
+from cuspid.evaluation.registration import RegistrationOptions
 from cuspid.evaluation.repeatability import PairOptions, compare_pair, spread
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
@@ -139,7 +141,8 @@ def test_the_spread_of_figures():
 
 def small_trial(**path: float) -> TrialOptions:
     simulation = SimulationOptions(supersampling=1, path=ScanPathOptions(tooth=46, length_mm=2.0, frames=3, **path))
-    return TrialOptions(simulation=simulation)
+    few = EvaluationOptions(samples=20_000, registration=RegistrationOptions(samples=10_000))
+    return TrialOptions(simulation=simulation, evaluation=few)
 
 
 @pytest.mark.parametrize("new_texture", [False, True])

@@ -24,6 +24,7 @@ from cuspid.panorama import Panorama
 from cuspid.panorama_pipeline import StitchOptions, stitch
 from cuspid.pipeline import RenderOptions, take_images
 from cuspid.reconstruction import Tracks
+from cuspid.simulation.path.free import FreePathOptions, plan_free_path
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.gain_compensation import GainOptions, Samples, balance
 from cuspid.stitching.height_map import HeightMapOptions, ScaleOptions, height_map, in_occlusal_frame
@@ -187,6 +188,21 @@ def images_in(folder: Path, images: list[np.ndarray]) -> ImageSequence:
     for index, image in enumerate(images):
         storage.write_image(folder / f"{index:03d}.png", image)
     return storage.read_sequence(folder, folder / "decoded")
+
+
+def test_a_way_back_is_tied_to_the_way_there(coarse_phantom: Jaw, tmp_path: Path) -> None:
+    camera = intra_oral_camera(IntraOralOptions(width_px=320, height_px=240))
+    path = FreePathOptions(path="return", frames=60, shake=0.3)
+    poses = plan_free_path(coarse_phantom, camera, path, np.random.default_rng(0))
+    near = dict(list(poses.items())[20:40])
+    take_images(coarse_phantom, camera, near, tmp_path, RenderOptions(texture="artificial", supersampling=1))
+    again = storage.read_sequence(tmp_path / "capture", tmp_path / "decoded")
+    (found,) = locate_single(again, SingleOptions(revisit_frames=5)).parts
+    assert len(found.frames) == len(near)
+    first, last = (np.full(len(found.tracks.points), pick, dtype=np.int64) for pick in (99, -1))
+    np.minimum.at(first, found.tracks.point_index, found.tracks.frame_index)
+    np.maximum.at(last, found.tracks.point_index, found.tracks.frame_index)
+    assert np.sum((first <= 1) & (last >= len(near) - 2)) > 50, "none by steps and patches alone"
 
 
 def test_a_black_or_blurred_frame_and_a_repeated_one_are_left_out_with_a_reason(

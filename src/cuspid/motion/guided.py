@@ -67,22 +67,29 @@ def refine(
     features: Sequence[Features],
     options: GuidedOptions,
     *,
+    again: Sequence[tuple[int, int]] = (),
     progress: Progress = silent,
 ) -> SparseModel:
     """The model of one camera with refined poses and new tracks; ``features`` are those of its frames, in their order.
 
-    The scale is free and changes. Raises ReconstructionError where too little is consistent.
+    ``again`` are pairs of frames (indices) that show the same place, beside those of ``options.steps``. The scale is
+    free and changes. Raises ReconstructionError where too little is consistent.
     """
     model = _rescaled(model)
+    pairs = list(dict.fromkeys([*_successive(len(features), options.steps), *again]))
     for number, (tolerance_px, share) in enumerate(zip(options.tolerances_px, options.depth_shares, strict=True)):
         views = [index_features(each, model.camera) for each in features]
         matching = replace(options.matching, tolerance_px=tolerance_px)
-        track, image_of = _tracks(model, views, matching, share, options.steps)
+        track, image_of = _tracks(model, views, matching, share, pairs)
         limit_px = options.start_px / (1 if number == 0 else 2)
         found = _triangulated(model, features, views, track, image_of, limit_px, options)
         model = _rescaled(adjust_model(found, replace(options.adjustment, start_px=limit_px)))
         progress("refining", number + 1, len(options.tolerances_px))
     return model
+
+
+def _successive(count: int, steps: Sequence[int]) -> list[tuple[int, int]]:
+    return [(i, i + step) for step in steps for i in range(count - step)]
 
 
 def _rescaled(model: SparseModel) -> SparseModel:
@@ -105,14 +112,17 @@ def _bounds(
 
 
 def _tracks(
-    model: SparseModel, views: Sequence[IndexedFeatures], matching: MatchingOptions, share: float, steps: Sequence[int]
+    model: SparseModel,
+    views: Sequence[IndexedFeatures],
+    matching: MatchingOptions,
+    share: float,
+    pairs: Sequence[tuple[int, int]],
 ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
     """Track and frame of every keypoint of all frames, one after the other."""
     poses = list(model.cam_from_world.values())
     sizes = np.array([len(view.features) for view in views])
     starts = np.concatenate([[0], np.cumsum(sizes)])
     bounds = [_bounds(model, index, view.features, share) for index, view in enumerate(views)]
-    pairs = [(i, i + step) for step in steps for i in range(len(views) - step)]
 
     def match(pair: tuple[int, int]) -> Int[np.ndarray, "k 2"]:
         one, other = pair

@@ -28,6 +28,7 @@ from cuspid.motion.features import FeatureOptions, Features, detect
 from cuspid.motion.guided import GuidedOptions, refine
 from cuspid.motion.pairs import MatchingOptions, match_unguided
 from cuspid.motion.patches import PatchOptions, lengthen
+from cuspid.motion.revisits import look_alike
 from cuspid.options import SEED, SHARE, Options, Range
 from cuspid.panorama import FrameUse
 from cuspid.progress import Progress, silent
@@ -78,6 +79,10 @@ class SingleOptions(Options):
     frames later."""
     bridge_ratio: Annotated[float, Range(0.01, 1)] = 0.95
     """Ratio test of the matching where the model broke."""
+    revisit_frames: Annotated[int, Range(2, 100_000)] = 20
+    """Each frame is also matched with the one that looks most like it, of those at least so many frames away."""
+    revisit_matches: Annotated[int, Range(4, 100_000)] = 40
+    """Minimum number of consistent matches that show such a pair to be of the same place."""
     error_px: Annotated[float, Range(0.01, 1000)] = 2.0
     """Largest distance of a match from its epipolar line, px."""
     minimum_matches: Annotated[int, Range(4, 100_000)] = 15
@@ -232,6 +237,20 @@ def _verified_pairs(
 
     found = map_in_threads(verified, pairs, stage="matching", progress=progress)
     return {pair: geometry for pair, geometry in zip(pairs, found, strict=True) if geometry is not None}
+
+
+def _revisits(
+    features: Mapping[int, Features],
+    kept: Sequence[int],
+    camera: pycolmap.Camera,
+    options: SingleOptions,
+    progress: Progress,
+) -> dict[tuple[int, int], pycolmap.TwoViewGeometry]:
+    """Verified matches of frames that show a place again."""
+    alike = look_alike([features[index] for index in kept], options.revisit_frames, options.seed)
+    pairs = [(kept[one], kept[other]) for one, other in alike]
+    found = _verified_pairs(features, pairs, camera, options.matching, options, progress)
+    return {pair: each for pair, each in found.items() if len(each.inlier_matches) >= options.revisit_matches}
 
 
 def _pairs_at(kept: Sequence[int], steps: Sequence[int]) -> list[tuple[int, int]]:
@@ -427,9 +446,9 @@ def locate_single(
 ) -> SingleMotion:
     """The trajectory of the one camera that took a sequence.
 
-    Frames that are black, blurred or repeated are skipped; where the model breaks, the frames are matched again at more
-    distances and with a looser ratio, and models that share frames are joined. Raises ReconstructionError, naming
-    the frames, where nothing can be placed.
+    Frames that are black, blurred or repeated are skipped; frames that show a place again are matched with those that
+    showed it first; where the model breaks, the frames are matched again at more distances and with a looser ratio, and
+    models that share frames are joined. Raises ReconstructionError, naming the frames, where nothing can be placed.
     """
     options = options or SingleOptions()
     names = sequence.names
@@ -440,19 +459,21 @@ def locate_single(
     features = {index: looks[index].features for index in kept}
     camera = _colmap_camera(sequence.camera, sequence.size, options)
     verified = _verified_pairs(features, _pairs_at(kept, options.steps), camera, options.matching, options, progress)
+    again = _revisits(features, kept, camera, options, progress)
+    verified |= again
     calibrated = sequence.camera is not None
     models = _map(camera, features, verified, calibrated, options, progress) if verified else []
     if not models or models[0].num_reg_images() < len(kept):
         looser = replace(options.matching, ratio=options.bridge_ratio)
-        again = _verified_pairs(features, _pairs_at(kept, options.bridge_steps), camera, looser, options, progress)
-        verified = {**again, **verified}
+        bridges = _verified_pairs(features, _pairs_at(kept, options.bridge_steps), camera, looser, options, progress)
+        verified = {**bridges, **verified}
         wider = _map(camera, features, verified, calibrated, options, progress) if verified else []
         models = max(models, wider, key=lambda each: each[0].num_reg_images() if each else 0)
     if not models:
         raise ReconstructionError(_why_nothing(sequence, kept, features, verified))
     parts = _join_all([_model_of(model) for model in models], options.minimum_matches)
     first = _camera_of(models[0].cameras[1], sequence.camera, options)
-    refined = [_refined(part, first, sequence, features, options, progress) for part in parts]
+    refined = [_refined(part, first, sequence, features, list(again), options, progress) for part in parts]
     return SingleMotion(
         parts=tuple(refined),
         frames=_uses(names, refused, refined, verified),
@@ -465,13 +486,16 @@ def _refined(
     camera: Camera,
     sequence: ImageSequence,
     features: Mapping[int, Features],
+    again: Sequence[tuple[int, int]],
     options: SingleOptions,
     progress: Progress,
 ) -> SparseModel:
-    """A part with its poses made precise: by keypoints, then by patches too."""
-    own = [features[index] for index in sorted(part.poses)]
+    """A part with its poses made precise: by keypoints, then by patches too; ``again``: frames of the same place."""
+    place = {frame: index for index, frame in enumerate(sorted(part.poses))}
+    own = [features[index] for index in place]
     start = _as_noun(part, camera, sequence.names, features)
-    by_keypoints = refine(start, own, options.guided, progress=progress)
+    within = [(place[one], place[other]) for one, other in again if one in place and other in place]
+    by_keypoints = refine(start, own, options.guided, again=within, progress=progress)
     number = {name: index for index, name in enumerate(sequence.names)}
 
     def read(name: str) -> UInt8[np.ndarray, "h w"]:
