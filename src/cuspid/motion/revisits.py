@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
-from scipy.cluster.vq import kmeans2, vq
+from scipy.cluster import vq
 
 from cuspid.motion.features import DESCRIPTOR_NORM, Features
 
@@ -42,7 +42,7 @@ def _vlad(features: Sequence[Features], seed: int) -> Float[np.ndarray, "f d"]:
     rng = np.random.default_rng(seed)
     every = np.concatenate([each.descriptors for each in features])
     sample = every[rng.choice(len(every), min(_SAMPLE, len(every)), replace=False)]
-    words, _ = kmeans2(_scaled(sample), _WORDS, iter=_ROUNDS, minit="points", rng=rng, missing="warn")
+    words, _ = vq.kmeans2(_scaled(sample), _WORDS, iter=_ROUNDS, minit="points", rng=rng, missing="warn")
     codes = np.stack([_sums(_scaled(each.descriptors), words) for each in features])
     return codes / np.maximum(np.linalg.norm(codes, axis=1, keepdims=True), 1e-12)
 
@@ -56,7 +56,7 @@ def _sums(descriptors: Float[np.ndarray, "n 128"], words: Float[np.ndarray, "k 1
     2013)."""
     sums = np.zeros_like(words)
     if len(descriptors):
-        nearest, _ = vq(descriptors, words)
+        nearest, _ = vq.vq(descriptors, words)
         np.add.at(sums, nearest, descriptors - words[nearest])
     sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
     return sums.ravel()
