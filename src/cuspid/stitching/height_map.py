@@ -22,6 +22,7 @@ from cuspid.geometry import Rigid3
 from cuspid.kernels import kernel
 from cuspid.options import Options, Range
 from cuspid.sparse_model import SparseModel
+from cuspid.stitching.way import frames_there
 
 NOMINAL_MM = 14.0
 """Distance from an intra-oral camera to the teeth, where nothing else is known."""
@@ -159,7 +160,8 @@ def in_occlusal_frame(model: SparseModel, scale: ScaleOptions | None) -> SparseM
     points, (centres, axes) = near.tracks.points, _centres_and_axes(near)
     world_from_model = _upright(points, centres, axes)
     world_from_model = _levelled(world_from_model.apply(points)) @ world_from_model
-    front = _facing_front(world_from_model.apply(centres), world_from_model.apply(points))
+    above = world_from_model.apply(centres)
+    front = _facing_front(above[: frames_there(above[:, :2])], world_from_model.apply(points))
     found = transformed(near, front @ world_from_model)
     if scale is None:
         return found.scaled(1 / nearer)

@@ -13,14 +13,14 @@ from typing import Annotated
 import cv2
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import gaussian_filter1d
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET
-from cuspid.geometry import lengths_along, unit
+from cuspid.geometry import unit
 from cuspid.options import Options, Range
 from cuspid.panorama import ZONES, Panorama, Strip
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.height_map import HeightMap
+from cuspid.stitching.way import STEP_MM, even, forward, frames_there, smooth
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,65 +35,33 @@ class StripOptions(Options):
     """The occlusal zone ends where the surface lies this far below the ridge of the cross-section."""
 
 
-_STEP_MM = 0.25
 _LEAST_MM = 5.0
 """A shorter trajectory is not unrolled."""
-_TREMOR_FRAMES = 3.0
-"""Standard deviation of the Gaussian filter over the camera's path, in frames."""
 
 
 def arch_curve(motion: SparseModel, surface: HeightMap, options: StripOptions) -> Float[np.ndarray, "n 2"] | None:
-    """World (x, y) of the middle of the crowns, every `_STEP_MM`, in the order in which the camera went; None where it
-    hardly moved."""
+    """World (x, y) of the middle of the crowns, every `STEP_MM`, in the order in which the camera went, until it turned
+    back; None where it hardly moved."""
     centres = np.array([pose.inverse().translation[:2] for pose in motion.cam_from_world.values()])
-    curve = _even(_smooth(_even(_forward(centres)), options.smoothing_mm))
-    if _STEP_MM * len(curve) < _LEAST_MM:
+    curve = even(smooth(even(forward(centres[: frames_there(centres)])), options.smoothing_mm))
+    if STEP_MM * len(curve) < _LEAST_MM:
         return None
-    across = np.arange(-options.half_width_mm, options.half_width_mm + _STEP_MM, _STEP_MM)
+    across = np.arange(-options.half_width_mm, options.half_width_mm + STEP_MM, STEP_MM)
     for _ in range(2):
         normals = sides_of(curve)
         places = curve[:, None] + across[:, None] * normals[:, None]
         heights = surface.at(places)
         weight = np.clip(heights - (heights.max(axis=1, keepdims=True) - options.occlusal_mm), 0, None)
         middle = (weight * across).sum(axis=1) / weight.sum(axis=1)
-        curve = _even(_smooth(curve + middle[:, None] * normals, options.smoothing_mm))
+        curve = even(smooth(curve + middle[:, None] * normals, options.smoothing_mm))
     return _longer(curve, options.half_width_mm)
 
 
 def _longer(curve: Float[np.ndarray, "n 2"], by_mm: float) -> Float[np.ndarray, "m 2"]:
     """The curve, straight on beyond its ends: the camera sees farther than it goes."""
-    steps = _STEP_MM * np.arange(1, round(by_mm / _STEP_MM) + 1)[:, None]
+    steps = STEP_MM * np.arange(1, round(by_mm / STEP_MM) + 1)[:, None]
     head, tail = (unit(curve[a] - curve[b]) for a, b in ((0, min(8, len(curve) - 1)), (-1, max(-9, -len(curve)))))
     return np.concatenate([curve[0] + steps[::-1] * head, curve, curve[-1] + steps * tail])
-
-
-def _forward(path: Float[np.ndarray, "f 2"]) -> Float[np.ndarray, "n 2"]:
-    """A shaky path without its steps back: the mean of frames, in blocks that each go on by a millimetre."""
-    smooth = _smooth(path, _TREMOR_FRAMES * _STEP_MM)
-    kept = [smooth[0]]
-    for place in smooth[1:]:
-        if np.linalg.norm(place - kept[-1]) >= 1.0:
-            kept.append(place)
-    if len(kept) == 1:
-        kept.append(smooth[-1] + [_STEP_MM, 0])
-    return np.array(kept)
-
-
-def _even(curve: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
-    """The same curve, sampled every `_STEP_MM`."""
-    lengths = lengths_along(curve)
-    at = np.arange(0, lengths[-1] + _STEP_MM / 2, _STEP_MM)
-    return np.stack([np.interp(at, lengths, curve[:, axis]) for axis in range(2)], axis=1)
-
-
-def _smooth(curve: Float[np.ndarray, "n 2"], sigma_mm: float) -> Float[np.ndarray, "n 2"]:
-    """Without short bends; the ends go on straight instead of shrinking."""
-    pad = min(len(curve) - 1, int(4 * sigma_mm / _STEP_MM))
-    if pad < 2:
-        return curve
-    head, tail = 2 * curve[0] - curve[pad:0:-1], 2 * curve[-1] - curve[-2 : -pad - 2 : -1]
-    longer = np.concatenate([head, curve, tail])
-    return np.asarray(gaussian_filter1d(longer, sigma_mm / _STEP_MM, axis=0)[pad : pad + len(curve)])
 
 
 def sides_of(curve: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
@@ -115,7 +83,7 @@ def unroll(
     curve = arch_curve(motion, surface, options)
     if curve is None:
         return None
-    columns = int(_STEP_MM * (len(curve) - 1) / mm_per_px)
+    columns = int(STEP_MM * (len(curve) - 1) / mm_per_px)
     at = np.linspace(0, len(curve) - 1, columns)
     line = np.stack([np.interp(at, np.arange(len(curve)), curve[:, axis]) for axis in range(2)], axis=1)
     normals = np.stack([np.interp(at, np.arange(len(curve)), sides_of(curve)[:, axis]) for axis in range(2)], axis=1)
