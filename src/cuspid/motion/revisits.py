@@ -6,10 +6,11 @@ Each frame is described by VLAD (Jégou et al., Aggregating local descriptors in
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from scipy.cluster import vq
 
 from cuspid.motion.features import DESCRIPTOR_NORM, Features
@@ -42,12 +43,14 @@ def _vlad(features: Sequence[Features], seed: int) -> Float[np.ndarray, "f d"]:
     rng = np.random.default_rng(seed)
     every = np.concatenate([each.descriptors for each in features])
     sample = every[rng.choice(len(every), min(_SAMPLE, len(every)), replace=False)]
-    words, _ = vq.kmeans2(_scaled(sample), _WORDS, iter=_ROUNDS, minit="points", rng=rng, missing="warn")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a word that is nearest to nothing stays where it is
+        words, _ = vq.kmeans2(_scaled(sample), _WORDS, iter=_ROUNDS, minit="points", rng=rng)
     codes = np.stack([_sums(_scaled(each.descriptors), words) for each in features])
     return codes / np.maximum(np.linalg.norm(codes, axis=1, keepdims=True), 1e-12)
 
 
-def _scaled(descriptors: np.ndarray) -> Float[np.ndarray, "n 128"]:
+def _scaled(descriptors: UInt8[np.ndarray, "n 128"]) -> Float[np.ndarray, "n 128"]:
     return descriptors.astype(np.float64) / DESCRIPTOR_NORM
 
 

@@ -22,7 +22,7 @@ from cuspid.geometry import Rigid3
 from cuspid.kernels import kernel
 from cuspid.options import Options, Range
 from cuspid.sparse_model import SparseModel
-from cuspid.stitching.way import frames_there
+from cuspid.stitching.trajectory import frames_there
 
 NOMINAL_MM = 14.0
 """Distance from an intra-oral camera to the teeth, where nothing else is known."""

@@ -20,7 +20,7 @@ from cuspid.options import Options, Range
 from cuspid.panorama import ZONES, Panorama, Strip
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.height_map import HeightMap
-from cuspid.stitching.way import STEP_MM, even, forward, frames_there, smooth
+from cuspid.stitching.trajectory import STEP_MM, even, forward, frames_there, smooth
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -34,10 +34,10 @@ _LOG = logging.getLogger("cuspid")
 REACH = 2.5
 """Maximum distance of the hand from where it should be, in standard deviations."""
 _SWING_DEG, _SWING_MM = 20.0, 20.0
-"""Greatest roll of an S-shaped way to either side, and the length of the arch on which it goes there and back: that of
+"""Greatest roll of an S-shaped path to either side, and the length of the arch on which it goes there and back: that of
 two molars."""
 
-Way = Literal["arch", "return", "s-shape", "cross"]
+PathShape = Literal["arch", "return", "s-shape", "cross"]
 Steady = Callable[[float], Rigid3]
 """``rig_from_world`` of a steady hand after a travel in mm."""
 
@@ -46,7 +46,7 @@ Steady = Callable[[float], Rigid3]
 class FreePathOptions(Options):
     """How a hand moves a camera over the arch; the defaults are a full shake."""
 
-    path: Way = "arch"
+    path: PathShape = "arch"
     """From the first crown to the last (arch); then back again (return), or straight across to the other side (cross);
     or to the last crown, swung towards cheek and tongue in turn (s-shape)."""
     frames: Annotated[int, Range(2, 100_000)] = 120
@@ -108,8 +108,8 @@ def plan_free_path(
     }
 
 
-def _steady(jaw: Jaw, room: Room, handpiece: Handpiece, way: Way) -> tuple[float, Steady]:
-    """The length of a way in mm and its poses."""
+def _steady(jaw: Jaw, room: Room, handpiece: Handpiece, shape: PathShape) -> tuple[float, Steady]:
+    """The length of a path in mm and its poses."""
     curve = arch_curve(jaw)
     length = float(curve.lengths_mm[-1])
 
@@ -120,7 +120,7 @@ def _steady(jaw: Jaw, room: Room, handpiece: Handpiece, way: Way) -> tuple[float
         roll = np.deg2rad(_SWING_DEG) * np.sin(2 * np.pi * travel_mm / _SWING_MM)
         return Rigid3.from_rotation_vector(np.array([roll, 0.0, 0.0]), np.zeros(3)) @ curve.rig_from_world(travel_mm)
 
-    match way:
+    match shape:
         case "arch":
             return length, curve.rig_from_world
         case "return":

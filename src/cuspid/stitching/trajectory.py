@@ -1,4 +1,7 @@
-"""The way of a camera over an arch, seen from above: without its tremor, and how far it goes before it turns back."""
+"""The trajectory of a camera over an arch, seen from above: without tremor, and how far it goes before it turns back.
+
+Places are (x, y) in the occlusal plane, mm.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +18,8 @@ _TREMOR_FRAMES = 3.0
 _SHORT_MM = 3.0
 """Bends that are shorter than this (standard deviation of a Gaussian) do not count where it turns back."""
 _ARM_MM, _FOLDED = 8.0, 0.35
-"""It turns back where places so far before and behind are nearer to each other than this share of the way between them.
-Over the front teeth of an arch they are farther apart than 0.8 of it."""
+"""It turns back where places so far before and behind are nearer to each other than this share of the path between
+them. Over the front teeth of an arch they are farther apart than 0.8 of it."""
 
 
 def frames_there(centres: Float[np.ndarray, "f 2"]) -> int:
