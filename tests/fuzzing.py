@@ -7,6 +7,7 @@ line what is wrong: no traceback, no hang, no gigabytes, no noise of libraries, 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import re
@@ -53,6 +54,7 @@ LONGEST_WAIT_S = 60.0
 MOST_BYTES = 2 << 30
 _NOISE = re.compile(r"Traceback|Warning:|corrupt|libpng|\[ ?WARN|\[ERROR|OpenCV|Exception|glog|\*\*\*", re.IGNORECASE)
 _OUT = "out"
+RESULTS = Path(__file__).parent.parent / "benchmarks" / "results"
 
 
 @dataclass(frozen=True)
@@ -209,6 +211,10 @@ def _studies(folder: Path) -> None:
     write_score(folder / "score")
 
 
+def _results(folder: Path) -> None:
+    shutil.copytree(RESULTS, folder / "results", ignore=shutil.ignore_patterns("*opencv*", "0*", "*film*"))
+
+
 def _arrays(folder: Path) -> None:
     storage.files.write_arrays(folder / "a.npz", {"one": np.arange(300), "other": np.eye(9)}, compressed=True)
 
@@ -221,6 +227,8 @@ def _probe(folder: Path) -> None:
 
 HOLDER = ("--out", f"@{_OUT}", "--body", f"@{_OUT}/holder.stl")
 PROBE = ("--handpiece", "@handpiece.json", "--tooth", str(TOOTH))
+BOARD = ("--columns", "6", "--rows", "5", "--square-mm", "1", "--instants", "1", "--supersampling", "1")
+FILM = ("--handpiece", "@handpiece.json", "--frames", "3", "--supersampling", "1")
 SCAN = ("--frames", "2", "--length-mm", "0.8", "--supersampling", "1")
 
 
@@ -232,12 +240,61 @@ def _textured_capture(folder: Path) -> None:
         shutil.move(Path(made) / "scan" / "capture", folder)
 
 
+@cache
+def _finished() -> tuple[bytes, str]:
+    """The mesh of a scan that nothing disturbed, and the digest of its capture."""
+    with tempfile.TemporaryDirectory() as made:
+        _cut_short(Path(made))
+        return _resumed(Path(made)), _digest(Path(made) / "capture")
+
+
+def _cut_short(folder: Path) -> None:
+    """A scan that was killed before it had a mesh."""
+    _textured_capture(folder)
+    verb("reconstruct", "@capture", "--out", f"@{_OUT}")(folder)
+    (folder / _OUT / "mesh.ply").unlink()
+
+
+def _resumed(folder: Path) -> bytes:
+    verb("reconstruct", "@capture", "--out", f"@{_OUT}")(folder)
+    return (folder / _OUT / "mesh.ply").read_bytes()
+
+
+def _resume(folder: Path) -> None:
+    """The same mesh comes out, whatever became of files in between, unless the images are others."""
+    mesh, capture = _finished()
+    if _resumed(folder) != mesh and _digest(folder / "capture") == capture:
+        raise AssertionError("another mesh")
+
+
+def _digest(folder: Path) -> str:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return hashlib.sha256(
+        b"".join(str(path.relative_to(folder)).encode() + path.read_bytes() for path in files)
+    ).hexdigest()
+
+
 def _four_cameras(folder: Path) -> None:
     storage.write_handpiece(folder / "handpiece.json", DESIGNS["four"]())
 
 
 def _arch(folder: Path) -> None:
     storage.write_jaw(folder / "jaw.ply", build_phantom(PhantomOptions(edge_mm=1.2)))
+
+
+def _population(folder: Path) -> None:
+    (folder / "jaws").mkdir()
+    for seed in range(2):
+        jaw = build_phantom(PhantomOptions(seed=seed, edge_mm=1.6))
+        storage.write_jaw(folder / "jaws" / f"{seed}.ply", jaw)
+        storage.write_landmarks(folder / "jaws" / f"{seed}.json", jaw.landmarks, f"{seed}.ply")
+
+
+def _filmed(folder: Path) -> None:
+    """An arch, and a camera with small images to film it with."""
+    _arch(folder)
+    camera = intra_oral_camera(IntraOralOptions(width_px=96, height_px=72))
+    storage.write_handpiece(folder / "handpiece.json", camera)
 
 
 def _film(folder: Path) -> None:
@@ -307,6 +364,13 @@ SCENARIOS: Mapping[str, Scenario] = {
     "report of a study": Scenario(_studies, verb("report", "@comparison")),
     "report of a score": Scenario(_studies, verb("report", "@score")),
     "report of a shape": Scenario(_shape, verb("report", "@shape")),
+    "prepare": Scenario(_arch, verb("prepare", "@jaw.ply", "--tooth", str(TOOTH), "--out", f"@{_OUT}.ply", "crack")),
+    "box": Scenario(_arch, verb("box", "@jaw.ply", "--out", f"@{_OUT}.ply")),
+    "mean shape": Scenario(_population, verb("shape", "@jaws", "--most-rounds", "1", "--out", f"@{_OUT}")),
+    "visibility": Scenario(_probe, verb("visibility", "@jaw.ply", *PROBE, *SCAN[:4], "--out", f"@{_OUT}")),
+    "photograph": Scenario(_four_cameras, verb("photograph", "@handpiece.json", *BOARD, "--out", f"@{_OUT}")),
+    "film": Scenario(_filmed, verb("film", "@jaw.ply", *FILM, "--out", f"@{_OUT}")),
+    "reproduce": Scenario(_results, verb("reproduce", "--results", "@results", "--no-run", "--out", f"@{_OUT}")),
     "evaluate": Scenario(_meshes, _evaluate),
     "measure": Scenario(_arch, verb("measure", "@jaw.ply", "--out", f"@{_OUT}")),
     "simulate": Scenario(_probe, verb("simulate", "@jaw.ply", *PROBE, *SCAN, "--out", f"@{_OUT}")),
@@ -314,6 +378,7 @@ SCENARIOS: Mapping[str, Scenario] = {
     "mouth": Scenario(_four_cameras, verb("mouth", "--handpiece", "@handpiece.json", "--out", f"@{_OUT}")),
     "holder": Scenario(_four_cameras, verb("handpiece", "--handpiece", "@handpiece.json", *HOLDER)),
     "reconstruct": Scenario(_textured_capture, verb("reconstruct", "@capture", "--out", f"@{_OUT}")),
+    "resume": Scenario(_cut_short, _resume),
     "calibrate": Scenario(
         _photographs,
         verb("calibrate", "@photos", "--columns", "6", "--rows", "5", "--square-mm", "3", "--out", f"@{_OUT}"),

@@ -486,6 +486,11 @@ def test_bad_footage_is_one_clear_line_and_nothing_is_written(tmp_path, probe, c
         (tmp_path / "text").mkdir(exist_ok=True)
         (tmp_path / "text" / "left.mp4").write_bytes(said)
         assert "no frame can be decoded" in line(tmp_path / "text")
+    coded = write_films(tmp_path / "coded", {"left": short["left"]}) / "left.mkv"
+    whole = coded.read_bytes()
+    assert whole.count(b"V_FFV1") == 1
+    coded.write_bytes(whole.replace(b"V_FFV1", b"V_NONE"))
+    assert "unknown codec" in line(tmp_path / "coded")
     footage = write_films(tmp_path / "footage", short)
     (footage / "times.csv").write_text("camera,frame\nleft,0\n")
     assert "needs one column 'time'" in line(footage)

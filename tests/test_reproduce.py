@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import signal
@@ -24,6 +25,7 @@ from cuspid.thesis.catalogue import BY_ID, ITEMS, TABLE_3_2
 from cuspid.thesis.checks import cameras, mouth
 from cuspid.thesis.judging import judge
 from cuspid.thesis.page import GENERATED, conditions, figure_text, make_page
+from cuspid.thesis.results import PANORAMA
 from cuspid.thesis.rules import (
     FAVOUR,
     AtLeast,
@@ -219,6 +221,17 @@ def test_a_result_that_lacks_a_field_is_named():
 # --- What is computed -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("content", [[], {}, "x", 1, {"0": "x"}])
+def test_fields_of_another_kind_are_one_line(content):
+    """Whatever stands for any field of a result: it is judged or refused, here and on the page."""
+    found = read_results(ROOT / "benchmarks" / "results")
+    for name in [*(name for name in found if PANORAMA not in name), f"{PANORAMA}lower-14-0-ortho"]:
+        for field in found[name]:
+            results = {name: {**found[name], field: content}}
+            with contextlib.suppress(InputError):
+                make_page(judge(results), results)
+
+
 def test_closed_forms_agree_with_another_way_and_could_disagree():
     assert 0 < mouth.sagittal_model()["residual_mm"] < 1e-9
     assert 0 < cameras.closed_form()["relative_residual"] < 1e-9
@@ -313,7 +326,10 @@ def test_the_page_of_the_documentation_is_that_of_the_results():
 
 
 def test_conditions_name_the_command_and_the_commit():
-    assert conditions({"commands": ["cuspid x"], "commit": "abc", "cores": 2}) == "`cuspid x`; commit abc; 2 cores"
+    assert (
+        conditions("mouth", {"commands": ["cuspid x"], "commit": "abc", "cores": 2})
+        == "`cuspid x`; commit abc; 2 cores"
+    )
 
 
 # --- Runs -------------------------------------------------------------------------------------------------------------

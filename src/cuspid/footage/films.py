@@ -84,7 +84,10 @@ def open_film(camera: str, source: Path) -> Film:
     if images and max(stems.values()) > 1:
         raise InputError(f"{source}: two images are named {stems.most_common(1)[0][0]}; each needs its own name")
     if not images and next(read_video(source), None) is None:
-        raise InputError(f"{source}: no frame can be decoded; it is not a video, or is truncated: copy it again")
+        raise InputError(
+            f"{source}: no frame can be decoded; it is not a video, is truncated, or has an unknown codec: "
+            "copy it again, or convert it"
+        )
     length = VideoLength(frames=len(images), is_counted=True, seconds=0.0) if images else video_length(source)
     return Film(camera=camera, source=source, images=images, length=length, digest=hash_source(source))
 

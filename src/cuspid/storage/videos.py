@@ -99,7 +99,10 @@ def video_length(path: Path) -> VideoLength:
 
 
 def read_video(path: Path) -> Iterator[VideoFrame]:
-    """The frames of a video that can be decoded, none where it is no video. Raises InputError where it is no file."""
+    """The frames of a video that can be decoded, none where it is no video or of an unknown codec.
+
+    Raises InputError where it is no file.
+    """
     with _opened(path) as container:
         if container is None:
             return
@@ -145,7 +148,9 @@ def _opened(path: Path) -> Iterator[av.container.InputContainer | None]:
         yield None
         return
     with container:
-        yield container if container.streams.video else None
+        film = next(iter(container.streams.video), None)
+        # A codec that is unknown has no context to decode with.
+        yield None if film is None or film.codec_context is None else container
 
 
 def write_video(path: Path, capture: Capture, camera: str | None = None) -> None:

@@ -17,9 +17,8 @@ from cuspid.errors import InputError
 from cuspid.reporting.pages.reproduction import Table
 from cuspid.thesis.catalogue import ITEMS, Item, Note, Row
 from cuspid.thesis.computed import FIGURES, ROWS, TABLES
-from cuspid.thesis.results import Result, Results, at, in_words
+from cuspid.thesis.results import Result, Results, at, in_words, looking
 from cuspid.thesis.rules import Comparison, Verdict, least_favourable
-from cuspid.values import shown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,9 +54,10 @@ def judge(results: Results, items: Sequence[Item] = ITEMS) -> tuple[Finding, ...
 
 
 def _finding(item: Item, results: Results) -> Finding:
-    comparisons = tuple(_compared(row, item, results) for row in _rows(item, results))
-    table = _function(TABLES, item.table, {}, item)(results) if item.table else None
-    notes = (*(_note_text(note, results) for note in item.notes), item.table_note if table else "")
+    with looking(f"for {item.id}"):
+        comparisons = tuple(_compared(row, item, results) for row in _rows(item, results))
+        table = _function(TABLES, item.table, {}, item)(results) if item.table else None
+        notes = (*(_note_text(note, results) for note in item.notes), item.table_note if table else "")
     return Finding(item=item, comparisons=comparisons, notes=tuple(filter(None, notes)), table=table)
 
 
@@ -83,22 +83,19 @@ def _compared(row: Row, item: Item, results: Results) -> Comparison:
     look = _function(FIGURES, row.computed, row.arguments, item) if row.computed else partial(_figure, row.ours)
     source = next((name for name in row.source if name in results), row.source[-1])
     result = results if "*" in source else results.get(source)
-    try:
+    with looking(f"{source}.json"):
         found = (None if result is None else look(result)) or {}
-        words = in_words(row.shown, result or {}, found) if found else ""
-    except (KeyError, TypeError, IndexError, AttributeError, StopIteration) as error:
-        raise InputError(f"results {source}.json: unexpected content ({shown(error)}); run it again") from error
-    return Comparison(
-        quantity=row.quantity,
-        unit=row.unit,
-        printed=row.thesis,
-        ours=found.get("ours"),
-        rule=row.rule,
-        because=found.get("because", row.because),
-        shown=words,
-        source=source,
-        quick=any(results[name].get("quick") for name in matching(results, source)),
-    )
+        return Comparison(
+            quantity=row.quantity,
+            unit=row.unit,
+            printed=row.thesis,
+            ours=found.get("ours"),
+            rule=row.rule,
+            because=found.get("because", row.because),
+            shown=in_words(row.shown, result or {}, found) if found else "",
+            source=source,
+            quick=any(results[name].get("quick") for name in matching(results, source)),
+        )
 
 
 def _figure(paths: Sequence[str], result: Result) -> Mapping[str, Any] | None:

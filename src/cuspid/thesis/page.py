@@ -7,7 +7,7 @@ from collections.abc import Container, Sequence
 
 from cuspid.reporting.pages.reproduction import Entry, FigureRow, Page
 from cuspid.thesis.judging import Finding
-from cuspid.thesis.results import PANORAMA, Result, Results
+from cuspid.thesis.results import PANORAMA, Result, Results, looking
 from cuspid.thesis.rules import FAVOUR, Comparison, Figure, Verdict
 
 TITLE = "The thesis, reproduced"
@@ -59,7 +59,7 @@ def make_page(
         intro=(*INTRO, origin),
         counts=tuple((WORDS[each], counts[each], MEANINGS[each]) for each in WORDS if counts[each]),
         entries=tuple(_entry(finding, sources(finding, results), pictures) for finding in findings),
-        conditions=tuple((name, conditions(results[name])) for name in used),
+        conditions=tuple((name, conditions(name, results[name])) for name in used),
     )
 
 
@@ -152,15 +152,16 @@ def figure_text(figure: Figure) -> str:
     return f"{figure:,.0f}" if size >= 100 or figure == round(figure) else f"{figure:.3g}"
 
 
-def conditions(result: Result) -> str:
-    """How a result came about, in a line."""
-    commands = result.get("commands") or ([result["command"]] if result.get("command") else [])
-    made = [
-        "quick" if result.get("quick") else "",
-        *(f"`{command}`" for command in commands),
-        f"commit {result['commit']}" if result.get("commit") else "",
-        f"cuspid {result['versions']['cuspid']}" if "versions" in result else "",
-        f"Python {result['python']}" if "python" in result else "",
-        f"{result['cores']} cores" if "cores" in result else "",
-    ]
+def conditions(name: str, result: Result) -> str:
+    """How a result of that name came about, in a line. Raises InputError where it is not as a run writes it."""
+    with looking(f"{name}.json"):
+        commands = result.get("commands") or ([result["command"]] if result.get("command") else [])
+        made = [
+            "quick" if result.get("quick") else "",
+            *(f"`{command}`" for command in commands),
+            f"commit {result['commit']}" if result.get("commit") else "",
+            f"cuspid {result['versions']['cuspid']}" if "versions" in result else "",
+            f"Python {result['python']}" if "python" in result else "",
+            f"{result['cores']} cores" if "cores" in result else "",
+        ]
     return "; ".join(filter(None, made))

@@ -9,7 +9,7 @@ from cuspid.reporting.figures.mouth import save_sagittal_picture
 from cuspid.reporting.figures.reproduction import save_ssim_picture, save_trueness_picture
 from cuspid.thesis.catalogue import TABLE_3_2
 from cuspid.thesis.computed.panoramas import canvas_ssim, panoramas
-from cuspid.thesis.results import Result, Results, at
+from cuspid.thesis.results import Result, Results, at, looking
 
 TRUENESS, LIKENESS, SAGITTAL = "reproduction-table-3.2.png", "reproduction-fig-4.4.png", "mouth-sagittal.png"
 METHODS = {"ortho": "cuspid, default", "thesis": "the thesis' method"}
@@ -27,33 +27,39 @@ def draw_trueness(path: Path, results: Results) -> None:
     """Mean deviations of Table 3.2."""
     if not any(row.result in results for row in TABLE_3_2):
         return
+    with looking("of Table 3.2"):
+        ours = [
+            float(at(results[row.result], row.path)["mean_abs_um"]) if row.result in results else None
+            for row in TABLE_3_2
+        ]
     save_trueness_picture(
         path,
         [f"{row.part}: {row.what}" + (f" ({row.tooth})" if row.tooth else "") for row in TABLE_3_2],
         [row.mean_um for row in TABLE_3_2],
-        [
-            float(at(results[row.result], row.path)["mean_abs_um"]) if row.result in results else None
-            for row in TABLE_3_2
-        ],
+        ours,
         title="Table 3.2: the thesis and cuspid",
     )
 
 
 def draw_likeness(path: Path, results: Results) -> None:
     """SSIM of Fig 4.4."""
-    found = {name: panoramas(results, method) for method, name in METHODS.items()}
+    with looking("of panoramas"):
+        found = {name: panoramas(results, method) for method, name in METHODS.items()}
     subjects = sorted({subject for each in found.values() for subject in each})
     if not subjects:
         return
-    save_ssim_picture(
-        path,
-        subjects,
-        [
+    with looking("of panoramas"):
+        likeness = [
             (name, [canvas_ssim(each[subject]) if subject in each else None for subject in subjects])
             for name, each in found.items()
             if each
-        ],
-        [_grey(next(each[subject] for each in found.values() if subject in each)) for subject in subjects],
+        ]
+        grey = [_grey(next(each[subject] for each in found.values() if subject in each)) for subject in subjects]
+    save_ssim_picture(
+        path,
+        subjects,
+        likeness,
+        grey,
         title="Fig 4.4: likeness to the reference render",
     )
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from string import Formatter
 from typing import Any
+
+from cuspid.errors import InputError
+from cuspid.values import shown
 
 Result = Mapping[str, Any]
 Results = Mapping[str, Result]
@@ -29,6 +33,15 @@ def at(result: Result, path: str) -> Any:
 def in_words(text: str, result: Result, found: Mapping[str, Any] = {}) -> str:
     """A text whose fields are names of what was found, or paths: ``{ours:.1f} of {gap.least_mm:.0f}``."""
     return _Paths().vformat(text, (), {"result": result, "found": found})
+
+
+@contextmanager
+def looking(where: str) -> Iterator[None]:
+    """While figures are taken from results. Raises InputError where these are not as a run writes them."""
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, StopIteration, TypeError, ValueError) as error:
+        raise InputError(f"results {where}: unexpected content ({shown(error)}); run it again") from error
 
 
 class _Paths(Formatter):

@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import Literal
 
 from cuspid.errors import InputError
+from cuspid.values import shown
 
 Verdict = Literal["better", "reproduced", "differs", "falls short", "not run", "not known"]
 """``not run``: we have no figure yet. ``not known``: what the thesis shows is lost in our copy."""
@@ -182,6 +183,10 @@ class Comparison:
     """Name of the results that it comes from."""
     quick: bool = False
     """From a reduced run."""
+
+    def __post_init__(self) -> None:
+        if self.ours is not None and not all(isinstance(part, (int, float)) for part in _parts(self.ours)):
+            raise TypeError(f"{shown(self.ours)} is no figure")
 
     @property
     def verdict(self) -> Verdict:
