@@ -287,7 +287,7 @@ def _population(folder: Path) -> None:
     for seed in range(2):
         jaw = build_phantom(PhantomOptions(seed=seed, edge_mm=1.6))
         storage.write_jaw(folder / "jaws" / f"{seed}.ply", jaw)
-        storage.write_landmarks(folder / "jaws" / f"{seed}.json", jaw.landmarks, f"{seed}.ply")
+        storage.write_landmarks(folder / "jaws" / f"{seed}.json", jaw.landmarks, "mesh")
 
 
 def _filmed(folder: Path) -> None:
