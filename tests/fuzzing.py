@@ -7,7 +7,6 @@ line what is wrong: no traceback, no hang, no gigabytes, no noise of libraries, 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
 import re
@@ -71,9 +70,15 @@ class Scenario:
 
 
 @cache
+def arch(edge_mm: float) -> Jaw:
+    """A whole one."""
+    return build_phantom(PhantomOptions(edge_mm=edge_mm))
+
+
+@cache
 def small_jaw() -> Jaw:
     """A molar with its neighbours, in big faces."""
-    jaw = build_phantom(PhantomOptions(edge_mm=1.0))
+    jaw = arch(1.0)
     near = (
         np.linalg.norm(jaw.mesh.face_centres - jaw.mesh.face_centres[jaw.tooth_faces(TOOTH)].mean(axis=0), axis=1) < 12
     )
@@ -240,38 +245,33 @@ def _textured_capture(folder: Path) -> None:
         shutil.move(Path(made) / "scan" / "capture", folder)
 
 
+_MESH = f"{_OUT}/mesh.ply"
+
+
 @cache
-def _finished() -> tuple[bytes, str]:
-    """The mesh of a scan that nothing disturbed, and the digest of its capture."""
+def _scanned() -> Mapping[str, bytes]:
+    """The files of a scan that nothing disturbed."""
     with tempfile.TemporaryDirectory() as made:
-        _cut_short(Path(made))
-        return _resumed(Path(made)), _digest(Path(made) / "capture")
+        folder = Path(made)
+        _textured_capture(folder)
+        verb("reconstruct", "@capture", "--out", f"@{_OUT}")(folder)
+        return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def _cut_short(folder: Path) -> None:
     """A scan that was killed before it had a mesh."""
-    _textured_capture(folder)
-    verb("reconstruct", "@capture", "--out", f"@{_OUT}")(folder)
-    (folder / _OUT / "mesh.ply").unlink()
-
-
-def _resumed(folder: Path) -> bytes:
-    verb("reconstruct", "@capture", "--out", f"@{_OUT}")(folder)
-    return (folder / _OUT / "mesh.ply").read_bytes()
+    for name, content in _scanned().items():
+        if name != _MESH:
+            storage.write_bytes(folder / name, content)
 
 
 def _resume(folder: Path) -> None:
     """The same mesh comes out, whatever became of files in between, unless the images are others."""
-    mesh, capture = _finished()
-    if _resumed(folder) != mesh and _digest(folder / "capture") == capture:
+    verb("reconstruct", "@capture", "--out", f"@{_OUT}")(folder)
+    whole = _scanned()
+    capture = [name for name in whole if name.startswith("capture/")]
+    if (folder / _MESH).read_bytes() != whole[_MESH] and all((folder / k).read_bytes() == whole[k] for k in capture):
         raise AssertionError("another mesh")
-
-
-def _digest(folder: Path) -> str:
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return hashlib.sha256(
-        b"".join(str(path.relative_to(folder)).encode() + path.read_bytes() for path in files)
-    ).hexdigest()
 
 
 def _four_cameras(folder: Path) -> None:
@@ -279,7 +279,7 @@ def _four_cameras(folder: Path) -> None:
 
 
 def _arch(folder: Path) -> None:
-    storage.write_jaw(folder / "jaw.ply", build_phantom(PhantomOptions(edge_mm=1.2)))
+    storage.write_jaw(folder / "jaw.ply", arch(1.0))
 
 
 def _population(folder: Path) -> None:
@@ -299,7 +299,7 @@ def _filmed(folder: Path) -> None:
 
 def _film(folder: Path) -> None:
     """Some small frames along the teeth."""
-    jaw = build_phantom(PhantomOptions(edge_mm=0.8))
+    jaw = arch(0.8)
     camera, curve = intra_oral_camera(IntraOralOptions(width_px=160, height_px=120)), arch_curve(jaw)
     poses = {f"{k:03d}": curve.rig_from_world(16.0 + 0.8 * k) for k in range(5)}
     take_images(jaw, camera, poses, folder / "film", RenderOptions(texture="artificial", supersampling=1))

@@ -157,7 +157,7 @@ RULES: Mapping[str, tuple[type[Rule], str]] = MappingProxyType(
 """By the keys of the catalogue; and the field that the value of the key is for."""
 
 
-def _parts(figure: Figure) -> tuple[float, ...]:
+def _parts(figure: Figure) -> tuple[float | bool, ...]:
     return figure if isinstance(figure, tuple) else (figure,)
 
 
