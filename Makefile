@@ -5,6 +5,9 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 BPY    := build/blender
 
+# Containers often ask Python to keep no bytecode. Each of the many processes of the tests would compile all modules.
+export PYTHONDONTWRITEBYTECODE :=
+
 .PHONY: demo test lint format docs wheel benchmarks blender clean
 
 demo: $(STAMP)
