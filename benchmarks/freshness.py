@@ -2,7 +2,7 @@
 
 What makes a result is its script, the modules that the script imports, in turn, and those of the verbs that it runs.
 Comments, docstrings and the number of the version have no part in it, nor has what only makes pages and pictures of a
-finished folder, unless all verbs are tried, nor what only plain surfaces need, where none are scanned.
+finished folder or reads footage, unless all verbs are tried, nor what only plain surfaces need, where none are scanned.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ SHOWN_BY = ("cuspid.reporting", "cuspid.storage.results")
 """Modules that only show what was made."""
 PLAIN = ("cuspid.stereo.shading", "cuspid.motion.surface_tracking")
 """Modules that a scan of a textured surface takes nothing from but options."""
+FOOTAGE = ("cuspid.storage.videos",)
+"""Modules that only real footage is read by."""
 UNTOLD = "no commit, or one of uncommitted changes"
 
 Result = Mapping[str, Any]
@@ -43,7 +45,7 @@ class Maker:
     @property
     def leaves_out(self) -> tuple[str, ...]:
         """Modules without a part in it."""
-        return (*(() if "*" in self.verbs else SHOWN_BY), *(() if self.plain else PLAIN))
+        return (*(() if "*" in self.verbs else SHOWN_BY + FOOTAGE), *(() if self.plain else PLAIN))
 
 
 _SCAN = ("scan", "jaws")
