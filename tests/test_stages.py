@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 
 from cuspid import storage
 from cuspid.arch_curve import arch_curve
-from cuspid.errors import OutputError
+from cuspid.errors import InputError, OutputError
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
 from cuspid.jaw import Jaw
 from cuspid.pipeline import RenderOptions, take_images
@@ -96,10 +97,25 @@ def test_a_record_that_was_cut_short_costs_its_last_line_alone(tmp_path: Path) -
     assert [made_again(each, again) for each in makers] == [False, False, True]
 
 
-def test_a_record_that_cannot_be_written_is_told(tmp_path: Path) -> None:
-    (tmp_path / RECORD).mkdir()
-    with pytest.raises(OutputError, match=RECORD):
-        Stage("cut", tmp_path, Options()).record("key", [])
+def test_a_record_that_is_no_file_is_told_and_nothing_waits_for_it_or_goes_elsewhere(tmp_path: Path) -> None:
+    for number, replace in enumerate((Path.mkdir, os.mkfifo)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        begun = Stage("cut", folder, Options())
+        replace(folder / RECORD)
+        with pytest.raises(InputError, match=RECORD):
+            Stage("cut", folder, Options())
+        with pytest.raises(OutputError, match=f"{RECORD}: is a link, a folder, a pipe"):
+            begun.record("key", [])
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.touch()
+    for folder in (tmp_path / "link", tmp_path / "lost"):
+        folder.mkdir()
+        (folder / RECORD).symlink_to(elsewhere if folder.name == "link" else tmp_path / "nowhere")
+        with pytest.raises(OutputError, match=f"{RECORD}: is a link"):
+            Stage("cut", folder, Options()).record("key", [])
+    assert elsewhere.read_bytes() == b""
+    assert not (tmp_path / "nowhere").exists()
 
 
 def test_the_version_of_the_code_tells_its_parts_apart() -> None:

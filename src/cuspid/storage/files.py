@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import UnionType
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, BinaryIO, TypeVar, Union, get_args, get_origin, get_type_hints
 from zipfile import ZipFile
 
 import numpy as np
@@ -67,6 +67,14 @@ def whole_files(folder: Path) -> Iterator[Path]:
             yield Path(temporary)
             for file in sorted(Path(temporary).iterdir()):
                 file.replace(folder / file.name)
+
+
+def open_to_append(path: Path) -> BinaryIO:
+    """A file to add to. Raises OutputError where it cannot be written, or what is added would go elsewhere."""
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        raise OutputError(f"{path}: is a link, a folder, a pipe or a device, and no file; delete it")
+    with _writing(path):
+        return path.open("ab")
 
 
 @contextmanager

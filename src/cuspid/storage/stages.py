@@ -20,7 +20,8 @@ from threading import Lock
 
 import cuspid
 from cuspid.errors import InputError, OutputError
-from cuspid.storage.files import digest_of, hash_file
+from cuspid.inputs import read_bytes
+from cuspid.storage.files import digest_of, hash_file, open_to_append
 
 RECORD = "made.jsonl"
 """Name of the file that tells what a folder's results were made from."""
@@ -58,6 +59,7 @@ class Stage:
     _lock: Lock = field(init=False, repr=False, default_factory=Lock)
 
     def __post_init__(self) -> None:
+        """Raises InputError where ``made.jsonl`` is there and no file."""
         object.__setattr__(self, "_made", _read_record(self.folder / RECORD))
 
     def key(self, inputs: Mapping[str, str]) -> str:
@@ -87,8 +89,8 @@ class Stage:
         entries = {self._name(file): (key, _digest(file)) for file in files}
         lines = "".join(json.dumps([name, *entry]) + "\n" for name, entry in entries.items())
         try:
-            with self._lock, (self.folder / RECORD).open("a") as stream:
-                stream.write(lines)
+            with self._lock, open_to_append(self.folder / RECORD) as stream:
+                stream.write(lines.encode())
         except OSError as error:
             raise OutputError(f"{self.folder / RECORD}: cannot be written ({error.strerror})") from error
         self._made.update(entries)
@@ -114,9 +116,9 @@ def _digest(file: Path) -> str:
 def _read_record(path: Path) -> dict[str, tuple[str, str]]:
     """Key and contents by file; what a killed run left unfinished does not count, later lines go before earlier."""
     made: dict[str, tuple[str, str]] = {}
-    if not path.is_file():
+    if not path.exists():
         return made
-    for line in path.read_text(errors="replace").splitlines():
+    for line in read_bytes(path, "text").decode(errors="replace").splitlines():
         try:
             name, key, contents = json.loads(line)
         except (ValueError, TypeError):

@@ -22,6 +22,7 @@ from typing import IO
 
 import cuspid
 from cuspid.errors import CuspidError
+from cuspid.storage.files import open_to_append
 from cuspid.workers import usable_cores
 
 PACKAGES = ("cuspid", "numpy", "numba", "opencv-contrib-python-headless", "pycolmap", "embreex", "libigl")
@@ -66,7 +67,7 @@ def run_timed(*arguments: str, log: Path | None = None) -> dict[str, float]:
         status, figures = timed(*command)
     else:
         log.parent.mkdir(parents=True, exist_ok=True)
-        with log.open("ab") as stream:
+        with open_to_append(log) as stream:
             status, figures = timed(*command, log=stream)
     if status:
         raise CuspidError(f"cuspid {arguments[0]} failed with status {status}{'' if log is None else _last_words(log)}")
