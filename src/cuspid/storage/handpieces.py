@@ -138,6 +138,8 @@ _FIELDS = {
     "name", "working_distance_mm", "depth_range_mm", "cameras", "lights", "lightings", "sensor", "sensors", "body",
 }  # fmt: skip
 """Of ``handpiece.json``."""
+_SHORTEST_DIRECTION = 1e-6
+"""Far above where the square of a number is taken for zero."""
 _LIGHT_FIELDS = ("position_mm", "direction", "power", "colour", "lobe_exponent", "glare")
 _SENSOR_RANGES = {"noise_dn": (0.0, 255.0), "shot_noise_share": (0.0, 1.0), "gamma": (0.1, 10.0), "gain": (1e-3, 1e3)}
 _STEEPEST_FALLOFF = 10.0
@@ -154,8 +156,8 @@ def _light_from_json(value: Mapping[str, Any], what: str) -> Light:
     if strange:
         raise InputError(f"{what}: unknown field {shown(strange[0])}; see docs/formats.md")
     direction = numbers(f"{what}: direction", value["direction"], (3,), -LONGEST_MM, LONGEST_MM)
-    if not direction.any():
-        raise InputError(f"{what}: direction is {shown(value['direction'])}; it must not be all zeros")
+    if not np.linalg.norm(direction) > _SHORTEST_DIRECTION:
+        raise InputError(f"{what}: direction is {shown(value['direction'])}; its length must exceed 1e-6")
     matrix = value.get(_LIGHT_COVARIANCE)
     return Light(
         position_mm=numbers(f"{what}: position_mm", value["position_mm"], (3,), -LONGEST_MM, LONGEST_MM),
