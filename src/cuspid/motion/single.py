@@ -477,7 +477,11 @@ def locate_single(
     return SingleMotion(
         parts=tuple(refined),
         frames=_uses(names, refused, refined, verified),
-        notes=(*_strangers(looks, names), *_notes(refined[0].camera, calibrated, refined)),
+        notes=(
+            *_strangers(looks, names),
+            *_seen_again(list(again), names),
+            *_notes(refined[0].camera, calibrated, refined),
+        ),
     )
 
 
@@ -512,6 +516,15 @@ def _strangers(looks: Sequence[_Look], names: Sequence[str]) -> tuple[str, ...]:
         return ()
     which = f"{len(strange)} of {len(names)} frames ({strange[0]} to {strange[-1]})"
     return (f"{which} have few pixels in the colours of teeth or gums: is this a film of teeth?",)
+
+
+def _seen_again(pairs: Sequence[tuple[int, int]], names: Sequence[str]) -> tuple[str, ...]:
+    """A note where the camera came back."""
+    if not pairs:
+        return ()
+    one, other = max(pairs, key=lambda pair: pair[1] - pair[0])
+    which = f"frame {names[other]} shows a place that frame {names[one]} showed"
+    return (f"the camera came back: {which}, and {len(pairs)} such pairs of frames hold the trajectory together",)
 
 
 def _notes(camera: Camera, calibrated: bool, parts: Sequence[SparseModel]) -> tuple[str, ...]:
