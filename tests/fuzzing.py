@@ -142,6 +142,12 @@ def _brief(folder: Path) -> None:
     )
 
 
+def _demand(folder: Path) -> None:
+    """A brief, and the jaw that it is for."""
+    _brief(folder)
+    storage.write_jaw(folder / "jaw.ply", small_jaw())
+
+
 def _scan(folder: Path) -> None:
     write_scan(folder / "scan", small_jaw())
 
@@ -234,6 +240,7 @@ HOLDER = ("--out", f"@{_OUT}", "--body", f"@{_OUT}/holder.stl")
 PROBE = ("--handpiece", "@handpiece.json", "--tooth", str(TOOTH))
 BOARD = ("--columns", "6", "--rows", "5", "--square-mm", "1", "--instants", "1", "--supersampling", "1")
 FILM = ("--handpiece", "@handpiece.json", "--frames", "3", "--supersampling", "1")
+SEARCH = ("--jaw", "@jaw.ply", "--teeth", str(TOOTH), "--points", "10", "--samples", "1", "--finalists", "1")
 SCAN = ("--frames", "2", "--length-mm", "0.8", "--supersampling", "1")
 
 
@@ -370,6 +377,7 @@ SCENARIOS: Mapping[str, Scenario] = {
     "visibility": Scenario(_probe, verb("visibility", "@jaw.ply", *PROBE, *SCAN[:4], "--out", f"@{_OUT}")),
     "photograph": Scenario(_four_cameras, verb("photograph", "@handpiece.json", *BOARD, "--out", f"@{_OUT}")),
     "film": Scenario(_filmed, verb("film", "@jaw.ply", *FILM, "--out", f"@{_OUT}")),
+    "design": Scenario(_demand, verb("design", "@brief.toml", *SEARCH, "--out", f"@{_OUT}")),
     "reproduce": Scenario(_results, verb("reproduce", "--results", "@results", "--no-run", "--out", f"@{_OUT}")),
     "evaluate": Scenario(_meshes, _evaluate),
     "measure": Scenario(_arch, verb("measure", "@jaw.ply", "--out", f"@{_OUT}")),

@@ -4,6 +4,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from matplotlib.text import Text
 
 from builders import joined, moved, sphere
 from cuspid.errors import InputError, OutputError
@@ -18,8 +19,10 @@ from cuspid.reporting.figures.drawing import (
     FigureOptions,
     deviation_colors,
     look,
+    new_figure,
     render,
     save_deviation_picture,
+    save_figure,
     save_picture,
 )
 from horseshoe import horseshoe
@@ -49,6 +52,29 @@ def test_colours_are_green_within_tolerance_red_outside_blue_inside_grey_unknown
     np.testing.assert_array_equal(colors[9], NOT_COUNTED)
     wide = FigureOptions(range_um=500.0, tolerance_um=90.0)
     np.testing.assert_array_equal(deviation_colors(np.array([80.0]), wide), deviation_colors(np.array([0.0])))
+
+
+def test_names_are_drawn_as_they_are_and_begin_no_formula(tmp_path: Path):
+    """In titles, ticks, legends and notes, laid out before or while they are drawn; powers of ten stay ones."""
+    name = "$x_{$"
+    for layout in (None, "constrained"):
+        figure = new_figure(6.0, 4.0, dpi=50, layout=layout)
+        axes, other = figure.subplots(1, 2)
+        axes.plot([1, 100], [0, 1], label=name)
+        axes.legend()
+        axes.set_xscale("log")
+        axes.set_title(name)
+        axes.set_ylabel(name)
+        axes.annotate(name, (1, 0))
+        other.set_xticks([0, 1], [name, "b"])
+        figure.suptitle(name)
+        if layout is None:
+            figure.tight_layout()
+        save_figure(figure, tmp_path / "figure.png")
+        labels = {label for label in axes.xaxis.get_ticklabels() if "10^" in label.get_text()}
+        assert labels
+        assert {text for text in figure.findobj(Text) if text.get_parse_math()} >= labels
+        assert not any(text.get_parse_math() for text in figure.findobj(Text) if name in text.get_text())
 
 
 @pytest.mark.parametrize("tolerance_um", [0.0, 100.0])

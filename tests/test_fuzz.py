@@ -13,7 +13,7 @@ CASES = 19
 """Of each scenario."""
 FEWER = {
     **{name: 8 for name in SCENARIOS if name.startswith("report") or name == "reconstruct"},
-    **dict.fromkeys(("evaluate", "measure", "simulate", "precision", "box", "film"), 4),
+    **dict.fromkeys(("evaluate", "measure", "simulate", "precision", "box", "film", "design"), 4),
     **dict.fromkeys(("stitch", "stitch of a mesh", "stitch-eval", "visibility", "mean shape", "resume"), 3),
 }
 """Of those that take longest."""

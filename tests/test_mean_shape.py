@@ -284,6 +284,8 @@ def test_what_cannot_be_averaged_is_refused(base: Jaw) -> None:
         mean_shape(_pair(base, arch="upper"))
     with pytest.raises(InputError, match="at least two"):
         mean_shape({"one": base})
+    with pytest.raises(InputError, match="one, two are all the same jaw"):
+        mean_shape(_pair(base))
     with pytest.raises(InputError, match="first sample 'three'"):
         mean_shape(_pair(base), MeanShapeOptions(first="three"))
     with pytest.raises(InputError, match="no jaw has any"):

@@ -122,6 +122,7 @@ def test_a_sensor_may_be_changed_or_given_by_its_own_figures() -> None:
         ('"thesis"', "{width_px = 400}", r"sensor: .*pixel_um.* missing"),
         ("thickness_mm = 7", "", r"thickness_mm missing"),
         ("thickness_mm = 7", 'thickness_mm = "7"', r"thickness_mm must be a number"),
+        ("thickness_mm = 7", 'thickness_mm = 7\nname = "' + "x" * 101 + '"', r"name is .*at most 100 characters"),
         ("thickness_mm = 7", "thickness_mm = -7", r"thickness_mm is -7"),
         ("thickness_mm = 7", "thickness_mm = 7\ncolour = 3", r"unknown key colour; choose from .*blur_px"),
         ("[4.0, 6.0]", "[6.0, 4.0]", r"working_distance_mm is 6-4"),

@@ -146,6 +146,9 @@ NONSENSE = [
     (("sensor", "gamma"), 0),
     (("sensor", "noise_dn"), NAN),
     (("working_distance_mm",), INF),
+    (("name",), "x" * 101),
+    (("name",), "a\nb"),
+    (("name",), None),
     (("depth_range_mm",), [2.5, NAN]),
     (("cameras", "../../x"), {}),
 ]

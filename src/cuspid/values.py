@@ -42,6 +42,15 @@ def _can_be_a_file(part: str) -> bool:
     return part.isprintable() and not any(each in _NOT_IN_FILES for each in part)
 
 
+def title(what: str, value: object) -> str:
+    """Text that fits in one line of a page or a picture. Raises InputError otherwise."""
+    if not (isinstance(value, str) and value.isprintable() and len(value) <= _LONGEST_NAME):
+        raise InputError(
+            f"{what} is {shown(value)}; it must be text of one line, of at most {_LONGEST_NAME} characters"
+        )
+    return value
+
+
 def number(what: str, value: object, low: float, high: float) -> float:
     """A finite number between two bounds (inclusive). Raises InputError otherwise."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):

@@ -45,7 +45,7 @@ from cuspid.handpiece.holder import HolderOptions
 from cuspid.handpiece.optics import Optics
 from cuspid.handpiece.presets import PRESETS
 from cuspid.inputs import read_text
-from cuspid.values import one_line, shown
+from cuspid.values import one_line, shown, title
 
 _LARGEST = 1e6
 """No figure is larger; NaN is none."""
@@ -244,7 +244,7 @@ def _typed(values: Mapping[str, Any], kind: type, where: str) -> dict[str, Any]:
         if each.name in values and each.type == "int":
             _check(_is_whole(values[each.name]), f"{where}{each.name} must be a whole number")
         if each.name in values and each.type == "str":
-            _check(isinstance(values[each.name], str), f"{where}{each.name} must be text")
+            title(f"brief: {where}{each.name}", values[each.name])
     return typed
 
 

@@ -16,7 +16,7 @@ from cuspid.geometry import Rigid3
 from cuspid.pairing import guess_working_distance_mm
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor, depth_of_field_mm
 from cuspid.storage.files import digest_of, read_json, reading, write_json
-from cuspid.values import LONGEST_MM, MOST_PX, checked_name, covariance, number, numbers, shown, whole
+from cuspid.values import LONGEST_MM, MOST_PX, checked_name, covariance, number, numbers, shown, title, whole
 
 _MOST_DISTORTION = 1e3
 _BRIGHTEST, _NARROWEST_LOBE = 1e6, 1e4
@@ -232,7 +232,7 @@ def read_handpiece(path: Path, working_distance_mm: float | None = None) -> Hand
             working_distance_mm=distance_mm,
             depth_range_mm=(near, far),
             body=None if value.get("body") is None else _body_from_json(path, value["body"]),
-            name=str(value.get("name", path.stem)),
+            name=title(f"{path}: name", value["name"]) if "name" in value else path.stem,
         )
 
 

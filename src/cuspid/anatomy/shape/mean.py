@@ -85,8 +85,8 @@ def mean_shape(
 ) -> ShapeModel:
     """The mean jaw and the principal modes of at least two jaws of one arch that have landmarks.
 
-    Raises InputError where there are fewer than two jaws, lower and upper ones are mixed, fewer than three landmarks
-    are common or they lie in a line, or the first sample is not among the jaws.
+    Raises InputError where there are fewer than two jaws or all are the same, lower and upper ones are mixed, fewer
+    than three landmarks are common or they lie in a line, or the first sample is not among the jaws.
     """
     samples = _superposed(jaws, options.scale)
     first = options.first or next(iter(sorted(jaws)))
@@ -209,6 +209,8 @@ def _model(
     template = samples.jaws[first]
     weights = vertex_areas(mean) / mean.face_areas.sum()
     scores, modes, deviations, shares = principal_modes(offsets, weights, options.modes)
+    if len(modes) == 0:
+        raise InputError(f"mean shape: {_some(set(samples.jaws))} are all the same jaw; give jaws that differ")
     at_landmarks = np.einsum("nk,nld->kld", scores, samples.pose.aligned - samples.pose.mean) / (len(scores) - 1)
     landmarks = {label: Landmark(point) for label, point in zip(samples.labels, samples.pose.mean, strict=True)}
     return ShapeModel(

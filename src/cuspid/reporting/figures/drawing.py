@@ -7,15 +7,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
+from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.ticker import LogFormatter
 
 from cuspid.errors import InputError
 from cuspid.geometry import unit
@@ -213,9 +216,30 @@ def save_expected_picture(path: Path, mesh: Mesh, sigma_um: Float[np.ndarray, "v
     save_figure(figure, path)
 
 
+class _Page(Figure):
+    """A figure with all texts as they are: a dollar in a name begins no formula, but powers along an axis are ones."""
+
+    def draw(self, renderer: RendererBase) -> None:
+        self._take_texts_as_they_are()
+        super().draw(renderer)
+
+    def tight_layout(self, **options: Any) -> None:
+        self._take_texts_as_they_are()
+        super().tight_layout(**options)
+
+    def _take_texts_as_they_are(self) -> None:
+        along = (axis for axes in self.axes for axis in (axes.xaxis, axes.yaxis))
+        powers = [
+            axis.get_ticklabels(which="both") for axis in along if isinstance(axis.get_major_formatter(), LogFormatter)
+        ]
+        formulas = {label for labels in powers for label in labels}
+        for text in self.findobj(Text):
+            text.set_parse_math(text in formulas)
+
+
 def new_figure(width_in: float, height_in: float, *, dpi: int, layout: Literal["constrained"] | None = None) -> Figure:
     """A white page of a size in inches, without a screen."""
-    figure = Figure(figsize=(width_in, height_in), dpi=dpi, facecolor="white", layout=layout)
+    figure = _Page(figsize=(width_in, height_in), dpi=dpi, facecolor="white", layout=layout)
     FigureCanvasAgg(figure)
     return figure
 
