@@ -87,8 +87,8 @@ def test_a_covariance_is_one_at_any_scale(seed, scale):
     np.testing.assert_array_equal(covariance("covariance", np.zeros((4, 4)).tolist(), 4), 0)
     crooked, negative = matrix.copy(), matrix - 0.1 * np.trace(matrix) * np.eye(4)
     crooked[0, 1] += 0.1 * scale * (1 + abs(matrix).max() / scale)
-    for wrong in (crooked, negative, np.full((4, 4), np.nan), np.eye(3)):
-        with pytest.raises(InputError, match=r"^covariance"):
+    for wrong in (crooked, negative, np.full((4, 4), np.nan), np.full((4, 4), -1e308), np.eye(3)):
+        with pytest.raises(InputError, match=r"^covariance"), np.errstate(over="raise"):
             covariance("covariance", wrong.tolist(), 4)
 
 

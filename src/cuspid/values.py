@@ -20,6 +20,8 @@ MOST_PX = 65_535
 _LONGEST_NAME = 100
 _NOT_IN_FILES = '/\\:*?"<>|'
 _SHOWN = 40
+_LARGEST_VARIANCE = 1e30
+"""In whatever unit; sums of larger ones could overflow."""
 _ROUNDING = 1e-6
 """Smallest eigenvalue of a covariance, as a share of the largest, that counts as zero."""
 
@@ -92,8 +94,8 @@ def _has_truth(value: Any) -> bool:
 def covariance(what: str, value: Any, size: int) -> Float[np.ndarray, "n n"]:
     """A covariance matrix: symmetric, without a negative eigenvalue. Raises InputError otherwise."""
     found = numbers(what, value, (size, size), -math.inf, math.inf)
-    if not np.isfinite(found).all():
-        raise InputError(f"{what} is not finite; leave it out if it is unknown")
+    if not np.abs(found).max() <= _LARGEST_VARIANCE:
+        raise InputError(f"{what} is not finite, or beyond {_LARGEST_VARIANCE:g}; leave it out if it is unknown")
     eigenvalues = np.linalg.eigvalsh((found + found.T) / 2)
     if not np.allclose(found, found.T, rtol=0, atol=_ROUNDING * np.abs(found).max()) or eigenvalues[
         0
