@@ -53,6 +53,8 @@ LONGEST_WAIT_S = 60.0
 MOST_BYTES = 2 << 30
 _NOISE = re.compile(r"Traceback|Warning:|corrupt|libpng|\[ ?WARN|\[ERROR|OpenCV|Exception|glog|\*\*\*", re.IGNORECASE)
 _OUT = "out"
+_SOURCES = Path(cli.__file__).parent.parent.parent
+"""Results name no folder of this machine."""
 RESULTS = Path(__file__).parent.parent / "benchmarks" / "results"
 
 
@@ -576,7 +578,7 @@ def wrong_with(use: Callable[[], object], said: Path) -> str | None:
         return f"more than {LONGEST_S:g} s"
     except BaseException as error:
         return f"{type(error).__name__}: {error}"[:300]
-    printed = said.read_text(errors="replace")
+    printed = said.read_text(errors="replace").replace(f"{_SOURCES}/", "")
     lines = [line for line in printed.splitlines() if line.startswith("cuspid: ")]
     if noise := _NOISE.search(printed):
         return f"noise: {printed[max(0, noise.start() - 80) : noise.end() + 80]!r}"
