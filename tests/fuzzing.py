@@ -242,7 +242,8 @@ HOLDER = ("--out", f"@{_OUT}", "--body", f"@{_OUT}/holder.stl")
 PROBE = ("--handpiece", "@handpiece.json", "--tooth", str(TOOTH))
 BOARD = ("--columns", "6", "--rows", "5", "--square-mm", "1", "--instants", "1", "--supersampling", "1")
 FILM = ("--handpiece", "@handpiece.json", "--frames", "3", "--supersampling", "1")
-SEARCH = ("--jaw", "@jaw.ply", "--teeth", str(TOOTH), "--points", "10", "--samples", "1", "--finalists", "1")
+SHORT = ("--points", "10", "--samples", "1", "--finalists", "1", "--evaluations", "4")
+SEARCH = ("--jaw", "@jaw.ply", "--teeth", str(TOOTH), *SHORT)
 SCAN = ("--frames", "2", "--length-mm", "0.8", "--supersampling", "1")
 
 
