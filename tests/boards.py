@@ -59,6 +59,22 @@ def scene(seed: int, board: Board = BOARD, cameras: int = 3, instants: int = 16,
     )
 
 
+def moving(seed: int, instants: int = 40) -> BoardScene:
+    """Cameras over a board that is moved by hand, filmed."""
+    still = scene(seed, instants=1)
+    poses = {f"{i:05d}": moving_pose(i) for i in range(instants)}
+    return replace(still, rig_from_board=poses)
+
+
+def moving_pose(time: float) -> Rigid3:
+    """Pose of the board of :func:`moving` so many frames after the first."""
+    phase = 2 * np.pi * time / np.array([41.0, 53.0, 67.0])
+    tilt = Rotation.from_euler("xyz", [35, 35, 25] * np.sin(phase), degrees=True).as_matrix()
+    middle = np.array([4.0, 0, 24.0]) + [2, 2, 3] * np.cos(phase[::-1])
+    in_world = Rigid3(tilt, middle - tilt @ np.array([*BOARD.size_mm, 0]) / 2)
+    return looking_at(np.array([4.0, 0, 24.0]), np.zeros(3), 0.0) @ in_world
+
+
 def scaled(pose: Rigid3, scale: float) -> Rigid3:
     return Rigid3(pose.rotation, scale * pose.translation)
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from boards import BOARD, SIZE, options, photographs, scene, undistorted, views_of
+from boards import BOARD, SIZE, moving, moving_pose, options, photographs, scene, undistorted, views_of
 from cuspid import storage
 from cuspid.board import Board
 from cuspid.calibration import bundle, calibrate
@@ -14,6 +14,7 @@ from cuspid.calibration.bundle import BoardScene, adjust_board
 from cuspid.calibration.calibrate import RigCalibration, calibrate_rig
 from cuspid.calibration.corners import BoardView, find_corners
 from cuspid.calibration.start import board_pose, first_camera
+from cuspid.calibration.timing import numbered, untied
 from cuspid.camera import Camera
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
@@ -113,17 +114,22 @@ def test_a_page_is_as_large_as_it_says(tmp_path, square_mm):
 # --- closed loops ------------------------------------------------------------------------------------------------
 
 
-def test_jacobian_agrees_with_finite_differences():
-    truth = scene(0, cameras=2, instants=3)
+@pytest.mark.parametrize("together", [True, False])
+def test_jacobian_agrees_with_finite_differences(together):
+    truth = scene(0, cameras=2, instants=4) if together else moving(0, instants=6)
     views = views_of(truth, BOARD, 1.0, np.random.default_rng(0))
-    seen = bundle._Observations.of(views, BOARD, list(truth.cameras), list(truth.rig_from_board))
+    if not together:
+        truth = untied(truth, numbered(truth.rig_from_board), views)
+        rng = np.random.default_rng(1)
+        truth = replace(truth, timing=truth.timing.later(rng.normal(0, 0.2, 3), rng.normal(0, 0.2, len(views))))
+    seen = bundle._Observations.of(views, BOARD, truth)
     free = bundle._Free.of(truth, BOARD, only_boards=False)
-    in_rig, in_cam, _ = bundle._project(truth, seen)
-    jacobian = bundle._jacobian(truth, seen, in_rig, in_cam)[:, free.columns].toarray()
+    in_cam, _ = bundle._project(truth, seen)
+    jacobian = bundle._jacobian(truth, seen, in_cam)[:, free.columns].toarray()
     for column in range(len(free.columns)):
         step = np.zeros(len(free.columns))
         step[column] = 1e-6
-        ahead, back = (bundle._project(bundle._stepped(truth, free, sign * step), seen)[2] for sign in (1, -1))
+        ahead, back = (bundle._project(bundle._stepped(truth, free, sign * step), seen)[1] for sign in (1, -1))
         numeric = -(ahead - back).ravel() / 2e-6
         assert np.allclose(jacobian[:, column], numeric, atol=1e-4 * max(1, np.abs(numeric).max())), column
 
@@ -271,6 +277,62 @@ def test_cameras_that_moved_against_each_other_are_told_of():
     found = calibrated(truth, views)
     assert any(note.startswith("camera cam1") and "px alone; they may not have seen" in note for note in found.notes)
     assert found.cameras["cam1"].alone_px < 0.1 < 3 * found.cameras["cam1"].alone_px < found.cameras["cam1"].rms_px
+
+
+def freely_running(
+    truth: BoardScene, seed: int, delays: dict[str, float], jitter: float, noise_px: float
+) -> dict[tuple[str, str], BoardView]:
+    """What cameras see of a moving board that expose so many frames late, each time with an error."""
+    rng, views = np.random.default_rng(seed), {}
+    for name, delay in delays.items():
+        times = {instant: int(instant) + delay + rng.normal(0, jitter) for instant in truth.rig_from_board}
+        late = replace(
+            truth,
+            cameras={name: truth.cameras[name]},
+            rig_from_board={instant: moving_pose(time) for instant, time in times.items()},
+        )
+        views |= views_of(late, BOARD, noise_px, rng)
+    return views
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_cameras_that_run_freely_are_calibrated_along_the_path_of_the_board(seed):
+    """One is 0.7 frames late, and none keeps time: as if they were together, errors are many times what is stated."""
+    truth, delays = moving(seed), {"cam0": 0.0, "cam1": 0.7, "cam2": 0.2}
+    views = freely_running(truth, seed, delays, 0.1, 0.05)
+    found = calibrated(truth, views)
+    for name, check in found.cameras.items():
+        assert lens_error(found, truth, name) < 2.5
+        assert np.linalg.norm(between(found, truth, name).translation) < 0.15
+        assert check.held_out_px < 0.15
+        assert check.delay_frames == pytest.approx(delays[name] - 0.3, abs=0.1)
+        assert 0.05 < check.delay_spread_frames < 0.2
+        assert f"{name} {check.delay_frames:+.2f} ± {check.delay_spread_frames:.2f}" in found.notes[0]
+    assert found.notes[0].startswith("the cameras did not expose together")
+    renamed = {(camera, f"a{instant}"): view for (camera, instant), view in views.items()}  # no order of time
+    together = calibrated(truth, renamed)
+    assert all(check.delay_frames is None for check in together.cameras.values())
+    assert max(check.rms_px for check in together.cameras.values()) > 5 * max(c.rms_px for c in found.cameras.values())
+    assert any("may not have seen the board at the same moment" in note for note in together.notes)
+
+
+def test_cameras_that_expose_together_have_no_delays():
+    truth = moving(0)
+    found = calibrated(truth, freely_running(truth, 0, dict.fromkeys(truth.cameras, 0.0), 0.0, 0.1))
+    assert found.notes == ()
+    assert all(check.delay_frames is None and check.alone_apart < 1.5 for check in found.cameras.values())
+
+
+def test_a_parabola_goes_through_what_it_is_of():
+    frames = np.array([[4.0, 2.0, 5.0], [7.0, 8.0, np.nan], [3.0, np.nan, np.nan]])
+    times, paths = np.array([4.6, 7.4, 3.9]), ([0.5, -2.0, 1.0], [3.0, 1.0], [2.0])
+    weights, slopes = bundle.parabola(frames, times)
+    assert np.allclose(weights.sum(axis=1), 1)
+    assert np.allclose(slopes.sum(axis=1), 0)
+    for path, weight, frame, time in zip(paths, weights, frames, times, strict=True):
+        assert weight @ np.polyval(path, np.nan_to_num(frame)) == pytest.approx(np.polyval(path, time))
+    ahead, back = (bundle.parabola(frames, times + step)[0] for step in (1e-6, -1e-6))
+    assert np.allclose(slopes, (ahead - back) / 2e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize(("facing", "told"), [(True, {"cam0", "cam1", "cam2"}), (False, set())])

@@ -76,12 +76,13 @@ class Rehearsal:
 def shaken(case: Rehearsal, seed: int) -> RigCalibration:
     """Its boards placed with errors of 3 um and 0.03 degrees, as a calibration does."""
     sigma, rng = np.repeat([np.deg2rad(0.03), 0.003], 3), np.random.default_rng(seed)
-    pushes = {name: sigma * rng.standard_normal(6) for name in case.found.rig_from_board}
+    instants = dict.fromkeys(instant for _, instant in case.found.rig_from_view)
+    pushes = {instant: sigma * rng.standard_normal(6) for instant in instants}
     boards = {
-        name: pose @ Rigid3.from_rotation_vector(pushes[name][:3], pushes[name][3:])
-        for name, pose in case.found.rig_from_board.items()
+        (camera, instant): pose @ Rigid3.from_rotation_vector(pushes[instant][:3], pushes[instant][3:])
+        for (camera, instant), pose in case.found.rig_from_view.items()
     }
-    return replace(case.found, rig_from_board=boards)
+    return replace(case.found, rig_from_view=boards)
 
 
 def located(true: Handpiece, poses: Mapping[str, Rigid3]) -> RigCalibration:
@@ -100,7 +101,7 @@ def located(true: Handpiece, poses: Mapping[str, Rigid3]) -> RigCalibration:
         pixels={},
         residuals={},
         views=views,
-        rig_from_board=poses,
+        rig_from_view={key: poses[key[1]] for key in views},
         distance_mm=5.0,
         notes=(),
     )

@@ -7,17 +7,22 @@ instant, by one on the left of ``rig_from_board``; and three parameters of a boa
 plane by b1 u^2 + b2 u v + b3 v^2 mm at the distances u and v, in units of half its diagonal, from its middle. A board
 with terraces is a solid body and not bent: there b1 is how much higher than given each step is, and b2 and b3 are 0.
 
+Cameras that do not expose together see a board that moves where it was at other moments. A corner in a view is then at
+``sum_k w_k(t) rig_from_board[k] @ X``: the parabola (Lagrange) through its places at three successive instants k about
+the time t at which the view was taken, in frames: the number of its frame, and a delay of the camera and one of the
+view, both unknown. :mod:`cuspid.calibration.timing` chooses the instants.
+
 The rig frame is that of the first camera; for the covariance it is defined by all cameras together (inner constraints,
 Triggs et al. 2000, section 9.2), so that no camera counts as exact.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
@@ -30,6 +35,8 @@ from cuspid.geometry import Rigid3
 from cuspid.rig import MountedCamera
 
 _INTRINSICS, _PLACE, _BENDING = 8, 6, 3
+_LENSES, _CAMERAS, _BOARDS, _BENDINGS, _CAMERA_DELAYS, _VIEW_DELAYS = range(6)
+"""Kinds of unknowns, in order."""
 _DISTORTION_SIGMA = np.array([0.5, 0.5, 0.01, 0.01])
 """Standard deviation of (k1, k2, p1, p2) about 0, for lenses as they are made: it matters only where the images do not
 decide."""
@@ -37,6 +44,11 @@ _CENTRE_SHARE = 0.05
 """Standard deviation of the principal point about the image centre, as a share of the image width."""
 _BENDING_SHARE = 0.01
 """Standard deviation of the bending, as a share of half the diagonal of the board."""
+_CAMERA_DELAY_SIGMA = 3.0
+"""Standard deviation of the delay of a camera, in frames."""
+_VIEW_DELAY_SIGMA = 1 / np.sqrt(12)
+"""Standard deviation of the delay of a view from that of its camera, in frames: a camera that runs freely may expose at
+any moment of a frame."""
 _KNEE = 2.5
 """Residuals beyond this, in standard deviations, have less weight (Huber)."""
 _STEPS, _SETTLED = 100, 0.01
@@ -44,6 +56,36 @@ _STEPS, _SETTLED = 100, 0.01
 _MOST_DAMPING = 1e8
 """Largest damping of a step, as a share of the diagonal of the normal equations."""
 _LEAST_SIGMA_PX = 1e-6
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Timing:
+    """When each view was taken, of cameras that do not expose together."""
+
+    frame: Mapping[str, int]
+    """Number of the frame of each instant: frames follow each other at equal times."""
+    near: Mapping[tuple[str, str], tuple[str, ...]]
+    """By camera and instant of a view, the instant nearest to when it was taken, and up to two beside that."""
+    by_camera: Mapping[str, float]
+    """How many frames after an instant each camera exposes."""
+    by_view: Mapping[tuple[str, str], float]
+    """How many frames later still it did so in each view."""
+
+    def delay(self, camera: str, instant: str) -> float:
+        """How many frames after an instant a camera exposed."""
+        return self.by_camera[camera] + self.by_view[camera, instant]
+
+    def time(self, camera: str, instant: str) -> float:
+        """When a view was taken, in frames."""
+        return self.frame[instant] + self.delay(camera, instant)
+
+    def later(self, cameras: Float[np.ndarray, "c"], views: Float[np.ndarray, "v"]) -> Timing:
+        """With delays that are longer by so many frames."""
+        return replace(
+            self,
+            by_camera=dict(zip(self.by_camera, np.add([*self.by_camera.values()], cameras).tolist(), strict=True)),
+            by_view=dict(zip(self.by_view, np.add([*self.by_view.values()], views).tolist(), strict=True)),
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -59,6 +101,19 @@ class BoardScene:
     bending_mm: Float[np.ndarray, "3"]
     """Deviation from the plane, of u^2, u v and v^2; with terraces, how much higher than given each step is, and
     zeros."""
+    timing: Timing | None = None
+    """When each view was taken; None if all cameras expose together."""
+
+    def rig_from_view(self, camera: str, instant: str) -> Rigid3:
+        """The pose of the board when a view was taken."""
+        if self.timing is None:
+            return self.rig_from_board[instant]
+        near = self.timing.near[camera, instant]
+        frames = np.array([[self.timing.frame[each] for each in near]], dtype=np.float64)
+        weights, _ = parabola(frames, np.array([self.timing.time(camera, instant)]))
+        blend = np.einsum("k,kij->ij", weights[0], np.stack([self.rig_from_board[each].matrix for each in near]))
+        u, _, vt = np.linalg.svd(blend[:3, :3])
+        return Rigid3(u @ vt, blend[:3, 3])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -82,31 +137,60 @@ class _Observations:
     """All corners that were seen, as arrays."""
 
     camera: Int[np.ndarray, "n"]
-    instant: Int[np.ndarray, "n"]
+    view: Int[np.ndarray, "n"]
+    near: Int[np.ndarray, "v k"]
+    """By view, the instants about its time; the last one several times where there are fewer than elsewhere."""
+    frames: Float[np.ndarray, "v k"]
+    """The numbers of their frames; NaN for repeated ones."""
     points: Float[np.ndarray, "n 3"]
     """On the board as it is given, mm."""
     basis: Float[np.ndarray, "n 3"]
     """What each number of the bending lifts them by."""
     pixels: Float[np.ndarray, "n 2"]
     keys: tuple[tuple[str, str], ...]
-    starts: Int[np.ndarray, "k"]
+    starts: Int[np.ndarray, "s"]
 
     @staticmethod
-    def of(views: Views, board: Board, cameras: Sequence[str], instants: Sequence[str]) -> _Observations:
+    def of(views: Views, board: Board, scene: BoardScene) -> _Observations:
         """In the order of the views."""
-        keys = tuple(views)
+        keys, cameras, instants = tuple(views), list(scene.cameras), list(scene.rig_from_board)
         counts = [len(views[key].corner) for key in keys]
-        corner = np.concatenate([views[key].corner for key in keys])
-        points = board.corners[corner]
+        points = board.corners[np.concatenate([views[key].corner for key in keys])]
+        near = [(instant,) if scene.timing is None else scene.timing.near[camera, instant] for camera, instant in keys]
+        most = max(len(each) for each in near)
+        frame = dict.fromkeys(instants, 0) if scene.timing is None else scene.timing.frame
         return _Observations(
-            np.repeat([cameras.index(camera) for camera, _ in keys], counts),
-            np.repeat([instants.index(instant) for _, instant in keys], counts),
-            points,
-            _basis(board, points),
-            np.concatenate([views[key].pixels for key in keys]),
-            keys,
-            np.cumsum([0, *counts]),
+            camera=np.repeat([cameras.index(camera) for camera, _ in keys], counts),
+            view=np.repeat(np.arange(len(keys)), counts),
+            near=np.array([[instants.index(each[min(k, len(each) - 1)]) for k in range(most)] for each in near]),
+            frames=np.array([[*(float(frame[k]) for k in each), *[np.nan] * (most - len(each))] for each in near]),
+            points=points,
+            basis=_basis(board, points),
+            pixels=np.concatenate([views[key].pixels for key in keys]),
+            keys=keys,
+            starts=np.cumsum([0, *counts]),
         )
+
+    def weights(self, scene: BoardScene) -> tuple[Float[np.ndarray, "v k"], Float[np.ndarray, "v k"]]:
+        """Of the instants about each view, and their derivatives by its time."""
+        times = self.frames[:, 0] if scene.timing is None else np.array([scene.timing.time(*key) for key in self.keys])
+        return parabola(self.frames, times)
+
+
+def parabola(
+    frames: Float[np.ndarray, "v k"], times: Float[np.ndarray, "v"]
+) -> tuple[Float[np.ndarray, "v k"], Float[np.ndarray, "v k"]]:
+    """Weights of values at some frames for the polynomial through them, and their derivatives by the time (Lagrange);
+    frames that are NaN have none."""
+    weights, slopes = np.ones_like(frames), np.zeros_like(frames)
+    for other in range(frames.shape[1]):
+        gap = frames - frames[:, other, None]
+        factor = np.isfinite(gap) & (gap != 0)
+        ahead = (times - frames[:, other])[:, None] / np.where(factor, gap, 1.0)
+        slopes = np.where(factor, slopes * ahead + weights / np.where(factor, gap, 1.0), slopes)
+        weights = np.where(factor, weights * ahead, weights)
+    used = np.isfinite(frames)
+    return np.where(used, weights, 0.0), np.where(used, slopes, 0.0)
 
 
 def _basis(board: Board, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -139,19 +223,28 @@ def of_instants(scene: BoardScene, instants: set[str]) -> BoardScene:
 # --- one step ----------------------------------------------------------------------------------------------------
 
 
-def _project(
-    scene: BoardScene, seen: _Observations
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 2"]]:
-    """The corners in the rig and in the camera, and their residuals; NaN behind a camera."""
-    points = seen.points + (seen.basis @ scene.bending_mm)[:, None] * [0.0, 0.0, 1.0]
-    boards, places = list(scene.rig_from_board.values()), list(scene.cam_from_rig.values())
-    in_rig = _moved(boards, seen.instant, points)
-    in_cam = _moved(places, seen.camera, in_rig)
+def _project(scene: BoardScene, seen: _Observations) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 2"]]:
+    """The corners in the camera, and their residuals; NaN behind a camera."""
+    points = _bent(scene, seen)
+    in_rig = np.einsum("nk,nkj->nj", seen.weights(scene)[0][seen.view], _at_instants(scene, seen, points))
+    in_cam = _moved(list(scene.cam_from_rig.values()), seen.camera, in_rig)
     parameters = np.stack([camera.parameters for camera in scene.cameras.values()])[seen.camera]
     with np.errstate(divide="ignore", invalid="ignore"):
         ideal = np.where(in_cam[:, 2:] > 0, in_cam[:, :2] / in_cam[:, 2:], np.nan)
     image = distort(ideal, parameters[:, 4:].T) * parameters[:, :2] + parameters[:, 2:4]
-    return in_rig, in_cam, seen.pixels - image
+    return in_cam, seen.pixels - image
+
+
+def _bent(scene: BoardScene, seen: _Observations) -> Float[np.ndarray, "n 3"]:
+    return np.asarray(seen.points + (seen.basis @ scene.bending_mm)[:, None] * [0.0, 0.0, 1.0])
+
+
+def _at_instants(
+    scene: BoardScene, seen: _Observations, points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n k 3"]:
+    """Points of the board in the rig, at the instants about their views."""
+    boards = list(scene.rig_from_board.values())
+    return np.stack([_moved(boards, which[seen.view], points) for which in seen.near.T], axis=1)
 
 
 def _moved(
@@ -162,35 +255,46 @@ def _moved(
     return np.asarray(np.einsum("nij,nj->ni", rotations, points) + translations)
 
 
-def _jacobian(
-    scene: BoardScene, seen: _Observations, in_rig: Float[np.ndarray, "n 3"], in_cam: Float[np.ndarray, "n 3"]
-) -> csr_array:
-    """Derivative of the projections by all unknowns: cameras, their motions, those of the board, the bending."""
+def _jacobian(scene: BoardScene, seen: _Observations, in_cam: Float[np.ndarray, "n 3"]) -> csr_array:
+    """Derivative of the projections by all unknowns, in the order of :func:`_sizes`."""
     parameters = np.stack([camera.parameters for camera in scene.cameras.values()])[seen.camera]
     ideal = in_cam[:, :2] / in_cam[:, 2:]
     by_point = _by_point(ideal, in_cam[:, 2], parameters)
     turn = np.stack([place.rotation for place in scene.cam_from_rig.values()])[seen.camera]
     by_rig = by_point @ turn
-    out_of_plane = np.stack([pose.rotation[:, 2] for pose in scene.rig_from_board.values()])[seen.instant]
-    blocks = [
-        _by_parameters(ideal, parameters),
-        _by_motion(by_point, in_cam),
-        _by_motion(by_rig, in_rig),
-        np.einsum("nij,nj->ni", by_rig, out_of_plane)[:, :, None] * seen.basis[:, None],
-    ]
-    count, boards = len(scene.cameras), _INTRINSICS + _PLACE
+    weights, slopes = (each[seen.view] for each in seen.weights(scene))
+    places = _at_instants(scene, seen, _bent(scene, seen))
+    normals = np.stack([pose.rotation[:, 2] for pose in scene.rig_from_board.values()])[seen.near[seen.view]]
+    by_bending = np.einsum("nij,nk,nkj->ni", by_rig, weights, normals)[:, :, None] * seen.basis[:, None]
+    blocks = [_by_parameters(ideal, parameters), _by_motion(by_point, in_cam), by_bending]
+    which = [(_LENSES, seen.camera), (_CAMERAS, seen.camera), (_BENDINGS, 0 * seen.camera)]
+    for k, instant in enumerate(seen.near[seen.view].T):
+        blocks.append(weights[:, k, None, None] * _by_motion(by_rig, places[:, k]))
+        which.append((_BOARDS, instant))
+    if scene.timing is not None:
+        by_delay = np.einsum("nij,nk,nkj->ni", by_rig, slopes, places)[:, :, None]
+        blocks += [by_delay, by_delay]
+        which += [(_CAMERA_DELAYS, seen.camera), (_VIEW_DELAYS, seen.view)]
+    first = np.cumsum([0, *_sizes(scene)])
     columns = [
-        _INTRINSICS * seen.camera[:, None] + np.arange(_INTRINSICS),
-        _INTRINSICS * count + _PLACE * seen.camera[:, None] + np.arange(_PLACE),
-        boards * count + _PLACE * seen.instant[:, None] + np.arange(_PLACE),
-        boards * count + _PLACE * len(scene.rig_from_board) + np.zeros((len(ideal), 1), int) + np.arange(_BENDING),
+        first[group] + block.shape[2] * index[:, None] + np.arange(block.shape[2])
+        for block, (group, index) in zip(blocks, which, strict=True)
     ]
     values, column = np.concatenate(blocks, axis=2), np.concatenate(columns, axis=1)
     width = values.shape[2]
-    return csr_array(
+    jacobian = csr_array(
         (values.ravel(), np.repeat(column, 2, axis=0).ravel(), width * np.arange(2 * len(ideal) + 1)),
-        shape=(2 * len(ideal), boards * count + _PLACE * len(scene.rig_from_board) + _BENDING),
+        shape=(2 * len(ideal), first[-1]),
     )
+    jacobian.sum_duplicates()
+    return jacobian
+
+
+def _sizes(scene: BoardScene) -> tuple[int, ...]:
+    """How many numbers there are of each kind of unknowns."""
+    cameras, instants = len(scene.cameras), len(scene.rig_from_board)
+    delays = (0, 0) if scene.timing is None else (cameras, len(scene.timing.by_view))
+    return _INTRINSICS * cameras, _PLACE * cameras, _PLACE * instants, _BENDING, *delays
 
 
 def _by_point(
@@ -246,23 +350,34 @@ class _Free:
     @staticmethod
     def of(scene: BoardScene, board: Board, *, only_boards: bool) -> _Free:
         """All but the place of the first camera, which is the rig, and what a board with terraces has no use of; or
-        the places of the board alone."""
-        cameras, instants = len(scene.cameras), len(scene.rig_from_board)
-        first = (_INTRINSICS + _PLACE) * cameras
-        if only_boards:
-            return _Free(first + np.arange(_PLACE * instants), np.zeros(_PLACE * instants))
+        the places of the board alone, and the delays of the views."""
+        lenses, places, boards, bending, cameras, views = _sizes(scene)
         precision = np.concatenate(
             [
                 *(_lens_precision(camera) for camera in scene.cameras.values()),
-                np.zeros(_PLACE * (cameras + instants)),
-                np.full(_BENDING, _bending_sigma_mm(board) ** -2.0),
+                np.zeros(places + boards),
+                np.full(bending, _bending_sigma_mm(board) ** -2.0),
+                np.full(cameras, _CAMERA_DELAY_SIGMA**-2.0),
+                np.full(views, _VIEW_DELAY_SIGMA**-2.0),
             ]
         )
-        place = _INTRINSICS * cameras
-        held = np.arange(place, place + _PLACE)
-        unused = np.arange(len(precision) - (_BENDING - 1 if board.terraces > 1 else 0), len(precision))
-        columns = np.delete(np.arange(len(precision)), [*held, *unused])
+        free = np.ones(len(precision), dtype=bool)
+        if only_boards:
+            free[: lenses + places] = False
+            free[lenses + places + boards : len(free) - views] = False
+        free[lenses : lenses + _PLACE] = False
+        if board.terraces > 1:
+            free[lenses + places + boards + 1 : lenses + places + boards + bending] = False
+        if scene.timing is not None:
+            free[len(free) - views :] = ~_first_of_instants(scene.timing.by_view)
+        columns = np.flatnonzero(free)
         return _Free(columns, precision[columns])
+
+
+def _first_of_instants(views: Iterable[tuple[str, str]]) -> Bool[np.ndarray, "v"]:
+    """Which views are the first ones of their instants: these set the times of their poses of the board."""
+    instants = [instant for _, instant in views]
+    return np.array([instant not in instants[:k] for k, instant in enumerate(instants)])
 
 
 def _bending_sigma_mm(board: Board) -> float:
@@ -278,12 +393,12 @@ def adjust_board(start: BoardScene, views: Views, board: Board, *, only_boards: 
 
     Raises ReconstructionError where the images leave something undetermined, or a corner lies behind a camera.
     """
-    seen = _Observations.of(views, board, list(start.cameras), list(start.rig_from_board))
+    seen = _Observations.of(views, board, start)
     free = _Free.of(start, board, only_boards=only_boards)
     scene, settled = _minimised(start, seen, free)
-    in_rig, in_cam, residuals = _project(scene, seen)
+    in_cam, residuals = _project(scene, seen)
     sigma_px = _scale(residuals)
-    matrix, _ = _normal(scene, seen, in_rig, in_cam, residuals, sigma_px, free)
+    matrix, _ = _normal(scene, seen, in_cam, residuals, sigma_px, free)
     pieces = np.split(residuals, seen.starts[1:-1])
     return Adjusted(
         scene=scene,
@@ -296,14 +411,14 @@ def adjust_board(start: BoardScene, views: Views, board: Board, *, only_boards: 
 
 def in_front(scene: BoardScene, views: Views, board: Board) -> dict[tuple[str, str], BoardView]:
     """The views of which every corner lies in front of the camera."""
-    seen = _Observations.of(views, board, list(scene.cameras), list(scene.rig_from_board))
-    residuals = np.split(_project(scene, seen)[2], seen.starts[1:-1])
+    seen = _Observations.of(views, board, scene)
+    residuals = np.split(_project(scene, seen)[1], seen.starts[1:-1])
     return {key: views[key] for key, each in zip(seen.keys, residuals, strict=True) if np.isfinite(each).all()}
 
 
 def _minimised(scene: BoardScene, seen: _Observations, free: _Free) -> tuple[BoardScene, bool]:
     """The best scene, and whether another step would not have been worth it."""
-    in_rig, in_cam, residuals = _project(scene, seen)
+    in_cam, residuals = _project(scene, seen)
     if not np.isfinite(residuals).all():
         raise ReconstructionError("calibration: a corner of the board lies behind a camera that saw it")
     damping, settled, steps = 1e-4, False, 0
@@ -311,21 +426,21 @@ def _minimised(scene: BoardScene, seen: _Observations, free: _Free) -> tuple[Boa
         steps += 1
         sigma_px = _scale(residuals)
         cost = _cost(scene, residuals, sigma_px, free)
-        matrix, gradient = _normal(scene, seen, in_rig, in_cam, residuals, sigma_px, free)
+        matrix, gradient = _normal(scene, seen, in_cam, residuals, sigma_px, free)
         step = _solved(matrix + damping * np.diag(np.diag(matrix)), gradient)
         candidate = _stepped(scene, free, step)
         there = None if candidate is None else _project(candidate, seen)
-        if candidate is None or there is None or not _cost(candidate, there[2], sigma_px, free) <= cost:
+        if candidate is None or there is None or not _cost(candidate, there[1], sigma_px, free) <= cost:
             damping *= 10
             continue
         settled = float(step @ gradient) < _SETTLED
-        scene, (in_rig, in_cam, residuals), damping = candidate, there, max(damping / 10, 1e-12)
+        scene, (in_cam, residuals), damping = candidate, there, max(damping / 10, 1e-12)
     return scene, settled
 
 
 def _scale(residuals: Float[np.ndarray, "n 2"]) -> float:
     """Standard deviation of a coordinate, from the median of the lengths (Rayleigh)."""
-    return max(float(np.median(np.linalg.norm(residuals, axis=1))) / np.sqrt(2 * np.log(2)), _LEAST_SIGMA_PX)
+    return max(float(np.median(np.linalg.norm(residuals, axis=1)) / np.sqrt(2 * np.log(2))), _LEAST_SIGMA_PX)
 
 
 def _cost(scene: BoardScene, residuals: Float[np.ndarray, "n 2"], sigma_px: float, free: _Free) -> float:
@@ -350,13 +465,14 @@ def _held(scene: BoardScene) -> Float[np.ndarray, "k"]:
         for camera in scene.cameras.values()
     ]
     places = np.zeros(_PLACE * (len(scene.cameras) + len(scene.rig_from_board)))
-    return np.concatenate([*lenses, places, scene.bending_mm])
+    timing = scene.timing
+    delays = [] if timing is None else [*timing.by_camera.values(), *timing.by_view.values()]
+    return np.concatenate([*lenses, places, scene.bending_mm, delays])
 
 
 def _normal(
     scene: BoardScene,
     seen: _Observations,
-    in_rig: Float[np.ndarray, "n 3"],
     in_cam: Float[np.ndarray, "n 3"],
     residuals: Float[np.ndarray, "n 2"],
     sigma_px: float,
@@ -365,7 +481,7 @@ def _normal(
     """Of the free unknowns: the matrix of the normal equations, and the gradient."""
     lengths = np.linalg.norm(residuals, axis=1) / sigma_px
     weights = np.repeat(np.minimum(1, _KNEE / np.maximum(lengths, 1e-12)) / sigma_px**2, 2)
-    jacobian = _jacobian(scene, seen, in_rig, in_cam)[:, free.columns]
+    jacobian = _jacobian(scene, seen, in_cam)[:, free.columns]
     weighted = (jacobian * weights[:, None]).T
     matrix = (weighted @ jacobian).toarray() + np.diag(free.precision)
     return matrix, weighted @ residuals.ravel() - free.precision * _held(scene)[free.columns]
@@ -386,12 +502,10 @@ def _solved(matrix: Float[np.ndarray, "k k"], right: Float[np.ndarray, "k *m"]) 
 
 def _stepped(scene: BoardScene, free: _Free, step: Float[np.ndarray, "k"]) -> BoardScene | None:
     """None where a camera would be turned inside out."""
-    cameras, instants = len(scene.cameras), len(scene.rig_from_board)
-    whole = np.zeros((_INTRINSICS + _PLACE) * cameras + _PLACE * instants + _BENDING)
+    sizes = _sizes(scene)
+    whole = np.zeros(sum(sizes))
     whole[free.columns] = step
-    lenses, places, boards, bending = np.split(
-        whole, np.cumsum([_INTRINSICS * cameras, _PLACE * cameras, _PLACE * instants])
-    )
+    lenses, places, boards, bending, cameras, views = np.split(whole, np.cumsum(sizes)[:-1])
     parameters = [
         camera.parameters + shift
         for camera, shift in zip(scene.cameras.values(), lenses.reshape(-1, _INTRINSICS), strict=True)
@@ -406,6 +520,7 @@ def _stepped(scene: BoardScene, free: _Free, step: Float[np.ndarray, "k"]) -> Bo
         cam_from_rig=_all_moved(scene.cam_from_rig, places),
         rig_from_board=_all_moved(scene.rig_from_board, boards),
         bending_mm=scene.bending_mm + bending,
+        timing=scene.timing and scene.timing.later(cameras, views),
     )
 
 

@@ -16,7 +16,6 @@ from cuspid.board import Board
 from cuspid.calibration.bundle import (
     Adjusted,
     BoardScene,
-    adjust_board,
     common_free,
     in_front,
     mounted_cameras,
@@ -24,6 +23,8 @@ from cuspid.calibration.bundle import (
 )
 from cuspid.calibration.corners import Views
 from cuspid.calibration.start import LEAST_VIEWS, calibrated_alone, groups, joined, require_one_group
+from cuspid.calibration.timing import adjust_scene, numbered, untied
+from cuspid.camera import Camera
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.options import Options, Range
@@ -33,6 +34,11 @@ _DOUBTFUL = 2.0
 """Difference between two halves, in standard deviations, that chance hardly explains."""
 _MUCH_MORE = 3.0
 """Ratio of the residuals together with other cameras to those alone, beyond which a note is given."""
+_LESS = 0.9
+"""Residuals in views that a calibration was not made from, as a share of those if all cameras exposed together, below
+which they did not."""
+_BLOCK = 6
+"""Number of successive instants that stay in the same half, where cameras do not expose together."""
 _OPEN_SHARE = 0.01
 """Standard deviation of a focal length, as a share of it, beyond which a note is given."""
 
@@ -67,6 +73,13 @@ class CameraCheck:
     about 1 if these are right."""
     place_apart: float | None
     """The same for the pose in the rig."""
+    alone_apart: float
+    """Difference between the parameters and those from its own views alone, in the standard deviations that the latter
+    state; below 1 if these are right."""
+    delay_frames: float | None
+    """How many frames after the others it saw the board, in the mean; None if all cameras exposed together."""
+    delay_spread_frames: float | None
+    """Standard deviation of that over its views."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -87,8 +100,8 @@ class RigCalibration:
     """Observed minus projected, px."""
     views: Views
     """The views that were used."""
-    rig_from_board: Mapping[str, Rigid3]
-    """Pose of the board at each instant."""
+    rig_from_view: Mapping[tuple[str, str], Rigid3]
+    """Pose of the board when each view of it was taken, by camera and instant."""
     distance_mm: float
     """Median distance of the board from the cameras."""
     notes: tuple[str, ...]
@@ -113,8 +126,28 @@ def calibrate_rig(
     cameras = {name: each.scene.cameras[""] for name, each in alone.items()}
     start, chosen = joined(views, board, cameras, sorted({instant for _, instant in views}))
     found, notes = _without_outliers(start, chosen, board, options)
-    kept = {key: chosen[key] for key in found.residuals}
-    return _described(found, kept, board, {name: each.sigma_px for name, each in alone.items()}, notes)
+    together = _described(found, chosen, board, alone, notes)
+    frame = numbered(start.rig_from_board)
+    if frame is None or not any(_is_doubtful_together(check) for check in together.cameras.values()):
+        return together
+    found, notes = _without_outliers(untied(start, frame, chosen), chosen, board, options)
+    apart = _described(found, chosen, board, alone, notes)
+    return apart if _held_out_px(apart) < _LESS * _held_out_px(together) else together
+
+
+def _is_worse_together(check: CameraCheck) -> bool:
+    """Whether the views of a camera fit much worse together with those of the others than alone."""
+    return check.rms_px > _MUCH_MORE * check.alone_px
+
+
+def _is_doubtful_together(check: CameraCheck) -> bool:
+    return _is_worse_together(check) or check.alone_apart > _DOUBTFUL
+
+
+def _held_out_px(found: RigCalibration) -> float:
+    """Residuals in views that a calibration was not made from, RMS over the cameras; infinite if there are none."""
+    checks = found.cameras.values()
+    return _rms(np.array([np.inf if check.held_out_px is None else check.held_out_px for check in checks]))
 
 
 def _alone(name: str, views: Views, board: Board, size: tuple[int, int]) -> Adjusted:
@@ -140,7 +173,7 @@ def _without_outliers(
     views, scene = sound, of_instants(scene, {instant for _, instant in sound})
     _require_views(views, scene)
     for _ in range(options.rounds):
-        found = adjust_board(scene, views, board)
+        found = adjust_scene(scene, views, board)
         bad = _odd_ones(found, options)
         if not bad:
             return found, tuple(notes)
@@ -152,7 +185,7 @@ def _without_outliers(
         views = {key: view for key, view in views.items() if key not in bad}
         _require_views(views, scene)
         scene = of_instants(found.scene, {instant for _, instant in views})
-    return adjust_board(scene, views, board), tuple(notes)
+    return adjust_scene(scene, views, board), tuple(notes)
 
 
 def _odd_ones(found: Adjusted, options: CalibrationOptions) -> dict[tuple[str, str], tuple[float, float]]:
@@ -200,34 +233,36 @@ def in_frame_of(found: RigCalibration, drawn: Rig) -> RigCalibration:
         np.mean([rig[name].centre_in_rig for name in found.rig.names], axis=0) for rig in (found.rig, drawn)
     )
     drawn_from_rig = Rigid3(turn, theirs - turn @ ours)
-    boards = {name: drawn_from_rig @ pose for name, pose in found.rig_from_board.items()}
-    return replace(found, rig=found.rig.in_frame(drawn_from_rig), rig_from_board=boards)
+    seen = {key: drawn_from_rig @ pose for key, pose in found.rig_from_view.items()}
+    return replace(found, rig=found.rig.in_frame(drawn_from_rig), rig_from_view=seen)
 
 
 # --- what it is worth --------------------------------------------------------------------------------------------
 
 
 def _described(
-    found: Adjusted, views: Views, board: Board, alone_px: Mapping[str, float], notes: tuple[str, ...]
+    found: Adjusted, chosen: Views, board: Board, alone: Mapping[str, Adjusted], notes: tuple[str, ...]
 ) -> RigCalibration:
-    names = list(found.scene.cameras)
+    names, views = list(found.scene.cameras), {key: chosen[key] for key in found.residuals}
     of = {name: [key for key in views if key[0] == name] for name in names}
     pixels = {name: np.concatenate([views[key].pixels for key in of[name]]) for name in names}
     residuals = {name: np.concatenate([found.residuals[key] for key in of[name]]) for name in names}
     held_out, apart = _cross_validated(found, views, board)
-    distances = [
-        np.linalg.norm((found.scene.cam_from_rig[camera] @ found.scene.rig_from_board[instant]).translation)
-        for camera, instant in views
-    ]
+    seen = {key: found.scene.rig_from_view(*key) for key in views}
+    distances = [np.linalg.norm((found.scene.cam_from_rig[key[0]] @ pose).translation) for key, pose in seen.items()]
+    delays = _delays(found.scene, views)
     checks = {
         name: CameraCheck(
             views=len(of[name]),
             corners=len(pixels[name]),
             rms_px=_rms(residuals[name]),
-            alone_px=alone_px[name],
+            alone_px=alone[name].sigma_px,
             held_out_px=held_out.get(name),
             parameters_apart=apart[name][0] if name in apart else None,
             place_apart=apart[name][1] if name in apart else None,
+            alone_apart=_lens_apart(found.scene.cameras[name], alone[name]),
+            delay_frames=delays[name][0],
+            delay_spread_frames=delays[name][1],
         )
         for name in names
     }
@@ -240,15 +275,36 @@ def _described(
         pixels=pixels,
         residuals=residuals,
         views=views,
-        rig_from_board=found.scene.rig_from_board,
+        rig_from_view=seen,
         distance_mm=float(np.median(distances)),
         notes=(*notes, *_doubts(found.settled, checks, rig)),
     )
 
 
+def _delays(scene: BoardScene, views: Views) -> dict[str, tuple[float, float] | tuple[None, None]]:
+    """Of each camera, how many frames after the mean of all it exposed, and the standard deviation of that."""
+    if scene.timing is None:
+        return dict.fromkeys(scene.cameras, (None, None))
+    seen = {instant: [camera for camera, at in views if at == instant] for _, instant in views}
+    late: dict[str, list[float]] = {name: [] for name in scene.cameras}
+    for instant, cameras in seen.items():
+        delays = [scene.timing.delay(camera, instant) for camera in cameras]
+        for camera, delay in zip(cameras, delays, strict=True):
+            late[camera].append(delay - float(np.mean(delays)))
+    return {name: (float(np.mean(each)), float(np.std(each))) for name, each in late.items()}
+
+
+def _lens_apart(camera: Camera, alone: Adjusted) -> float:
+    """Difference of the parameters from those of the camera alone, in the standard deviations of these."""
+    other = mounted_cameras(alone)[""].camera
+    return _in_sigmas(camera.parameters - other.parameters, known(other.covariance))
+
+
 def _widened(mounted: MountedCamera, check: CameraCheck) -> MountedCamera:
-    """With covariances that account for how far two halves of the images are apart."""
-    lens, place = (max(1.0, apart or 0.0) ** 2 for apart in (check.parameters_apart, check.place_apart))
+    """With covariances that account for how far two halves of the images are apart, and the lens from that of its own
+    views alone."""
+    lens = max(1.0, check.parameters_apart or 0.0, check.alone_apart) ** 2
+    place = max(1.0, check.place_apart or 0.0) ** 2
     camera = replace(mounted.camera, covariance=lens * known(mounted.camera.covariance))
     return replace(mounted, camera=camera, covariance=place * known(mounted.covariance))
 
@@ -258,6 +314,16 @@ def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Itera
     triggered together; where the views leave the focal length open."""
     if not settled:
         yield "the adjustment did not converge; its results may be wrong"
+    delays = [
+        f"{name} {check.delay_frames:+.2f} ± {check.delay_spread_frames:.2f}"
+        for name, check in checks.items()
+        if check.delay_frames is not None
+    ]
+    if delays:
+        yield (
+            "the cameras did not expose together; by the motion of the board, in frames from their mean: "
+            f"{', '.join(delays)}; this is taken into account, but a board that is held still gives more"
+        )
     for name, check in checks.items():
         worst = max(check.parameters_apart or 0.0, check.place_apart or 0.0)
         if worst > _DOUBTFUL:
@@ -265,7 +331,13 @@ def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Itera
                 f"camera {name}: calibrations from two halves of the images differ by {worst:.1f} of their standard "
                 "deviations; its covariance is widened accordingly; look for a pattern in residuals.png"
             )
-        if check.rms_px > _MUCH_MORE * check.alone_px:
+        if check.alone_apart > _DOUBTFUL:
+            yield (
+                f"camera {name}: its own views alone give a lens {check.alone_apart:.1f} of their standard deviations "
+                "away; its covariance is widened accordingly; the board may be bent, or the cameras not triggered "
+                "together"
+            )
+        if check.delay_frames is None and _is_worse_together(check):
             yield (
                 f"camera {name}: {check.rms_px:.2f} px RMS together with the others, {check.alone_px:.2f} px alone; "
                 "they may not have seen the board at the same moment, or have moved against each other"
@@ -281,19 +353,21 @@ def _cross_validated(
 ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
     """Of two halves of the instants, each calibrated for itself: the residuals in the other one, and how far they are
     from each other. Nothing where a half is too small, or its cameras fall into groups."""
-    instants = list(found.scene.rig_from_board)
-    halves = [{key: view for key, view in views.items() if key[1] in set(instants[k::2])} for k in range(2)]
+    instants = sorted({instant for _, instant in views})
+    block = 1 if found.scene.timing is None else _BLOCK
+    half = {instant: index // block % 2 for index, instant in enumerate(instants)}
+    halves = [{key: view for key, view in views.items() if half[key[1]] == k} for k in range(2)]
     counts = [Counter(camera for camera, _ in half) for half in halves]
     cameras = list(found.scene.cameras)
     if any(count[name] < LEAST_VIEWS for count in counts for name in cameras):
         return {}, {}
     if any(len(groups(half, cameras)) > 1 for half in halves):
         return {}, {}
-    parts = [adjust_board(of_instants(found.scene, {key[1] for key in half}), half, board) for half in halves]
+    parts = [adjust_scene(of_instants(found.scene, {key[1] for key in half}), half, board) for half in halves]
     squares: dict[str, list[Float[np.ndarray, "n 2"]]] = {name: [] for name in found.scene.cameras}
     for part, other, other_views in zip(parts, parts[::-1], halves[::-1], strict=True):
         start = replace(part.scene, rig_from_board=other.scene.rig_from_board)
-        for (camera, _), residuals in adjust_board(start, other_views, board, only_boards=True).residuals.items():
+        for (camera, _), residuals in adjust_scene(start, other_views, board, only_boards=True).residuals.items():
             squares[camera].append(residuals)
     return {name: _rms(np.concatenate(each)) for name, each in squares.items()}, _apart(*parts)
 

@@ -155,7 +155,7 @@ def look_at_patches(
 
     def look(key: tuple[str, str]) -> Patches:
         mounted = found.rig[key[0]]
-        cam_from_board = mounted.cam_from_rig @ found.rig_from_board[key[1]]
+        cam_from_board = mounted.cam_from_rig @ found.rig_from_view[key]
         corner = found.views[key].corner
         return patches_of(image(*key), mounted.camera, cam_from_board, board, found.bending_mm, corner, places, options)
 
@@ -285,11 +285,11 @@ class _Case:
     def samples(self, instants: Sequence[str]) -> Samples:
         """The patches of some instants as arrays."""
         keys = [(name, instant) for instant in instants for name in self.names if (name, instant) in self.patches]
-        every = joined_patches([self.patches[key] for key in keys])
-        counts = [len(self.patches[key].level_dn) for key in keys]
+        parts = [self.patches[key] for key in keys]
+        every, counts = joined_patches(parts), [len(each.level_dn) for each in parts]
         at = np.repeat([instants.index(instant) for _, instant in keys], counts)
         camera = np.repeat([self.names.index(name) for name, _ in keys], counts)
-        poses = [self.found.rig_from_board[instant] for instant in instants]
+        poses = [self.found.rig_from_view[key] for key in keys]
         degree = KNOWN_DEGREE if self.lamps else UNKNOWN_DEGREE
         return Samples(
             camera=camera,
@@ -301,8 +301,10 @@ class _Case:
                 [falloff_terms(self.found.rig[key[0]].camera, self.patches[key].pixels) for key in keys]
             ),
             basis=polynomials(bending_coordinates(self.board, every.points), degree),
-            points=np.concatenate([self.found.rig_from_board[key[1]].apply(self.patches[key].points) for key in keys]),
-            normals=np.stack([-pose.rotation[:, 2] for pose in poses])[at],
+            points=np.concatenate(
+                [pose.apply(self.patches[key].points) for key, pose in zip(keys, poses, strict=True)]
+            ),
+            normals=np.repeat([-pose.rotation[:, 2] for pose in poses], counts, axis=0),
             lit=tuple(self.lit(instant) for instant in instants),
         )
 
