@@ -33,6 +33,8 @@ from cuspid.evaluation.trajectory import trajectory_error
 from cuspid.geometry import Rigid3, best_similarity
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
+from cuspid.reconstruction import Reconstruction
+from cuspid.rig import Rig
 from cuspid.simulation.manufacturing import ManufacturingOptions, built, told
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.storage import write_json
@@ -60,14 +62,16 @@ def judge(*, tolerances: str, seed: int, scan: Path, held: bool) -> dict[str, Va
     with tempfile.TemporaryDirectory(prefix="cuspid-built-") as folder:
         for how, calibration in CALIBRATIONS.items():
             if how == ("held" if exact else "refined") or (held and not exact):
-                figures |= scanned(how, replace(capture, handpiece=off), scan, Path(folder), calibration)
+                rigs = replace(capture, handpiece=off), capture.handpiece.rig
+                figures |= scanned(how, *rigs, scan, Path(folder), calibration)
     return figures | {"peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6}
 
 
 def scanned(
-    how: str, capture: Capture, scan: Path, folder: Path, calibration: Literal["fixed", "refined"]
+    how: str, capture: Capture, drawn: Rig, scan: Path, folder: Path, calibration: Literal["fixed", "refined"]
 ) -> dict[str, Value]:
-    """The figures of a scan, each with ``how`` before its name. Keypoints are found once for all handpieces."""
+    """The figures of a scan, each with ``how`` before its name; ``drawn`` took the images. Keypoints are found once for
+    all handpieces."""
     (scan / "features").mkdir(exist_ok=True)
     (folder / how / "motion").mkdir(parents=True)
     (folder / how / "motion" / "cache").symlink_to((scan / "features").resolve())
@@ -98,7 +102,7 @@ def scanned(
         "inter_molar_um": found.inter_molar_error_um,
         "trajectory_um": trajectory.ape_um.rmse,
         "similar_mean_um": similar.accuracy.mean_abs_um,
-        "similar_trajectory_um": shape_error_um(reconstruction.rig_from_world, true),
+        "similar_trajectory_um": shape_error_um(reconstruction, true, drawn),
         "adjustment_s": sum(reconstruction.log.get(each, 0.0) for each in ("adjustment_s", "least_squares_s")),
         "located": len(reconstruction.frames),
         "notes": "; ".join(reconstruction.notes),
@@ -112,9 +116,15 @@ def scanned(
     return {f"{how}_{name}": value for name, value in figures.items()}
 
 
-def shape_error_um(found: Mapping[str, Rigid3], true: Mapping[str, Rigid3]) -> float:
-    """Of the places of the handpiece, RMS, after the best similarity."""
-    places = [np.array([poses[name].inverse().translation for name in found]) for poses in (found, true)]
+def shape_error_um(found: Reconstruction, true: Mapping[str, Rigid3], drawn: Rig) -> float:
+    """Of the places of all cameras at all frames, RMS, after the best similarity: those of the handpiece itself would
+    depend on where its file has the origin, which no image tells."""
+    places = [
+        np.array(
+            [(mounted.cam_from_rig @ poses[name]).inverse().translation for name in found.frames for mounted in rig]
+        )
+        for poses, rig in ((found.rig_from_world, found.rig.cameras.values()), (true, drawn.cameras.values()))
+    ]
     scale, rotation, shift = best_similarity(*places)
     return float(1000 * np.sqrt(np.mean(np.sum((scale * places[0] @ rotation.T + shift - places[1]) ** 2, axis=1))))
 
