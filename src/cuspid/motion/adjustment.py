@@ -30,7 +30,7 @@ from scipy.special import chdtri
 from cuspid.epipolar import skew
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
-from cuspid.motion.gauge import PLACE, best_gauge, moved_places, moved_world
+from cuspid.motion.gauge import PLACE, best_gauge, gauge_basis, moved_places, moved_world
 from cuspid.motion.misfit import CHANCE, held_misfit
 from cuspid.motion.normal_equations import (
     CALIBRATION,
@@ -418,13 +418,10 @@ def _posterior(state: State, observations: Observations, weighting: Weighting) -
     poses = np.zeros((len(state.frame_rotation), POSE, POSE))
     start = POSE * (len(poses) - 1)
     _, slope = influence(state, observations, weighting)
-    hessian = slope * normal_equations(state, observations, weighting._replace(huber_sigmas=np.inf)).matrix
+    hessian = normal_equations(state, observations, weighting._replace(huber_sigmas=np.inf)).matrix
+    prior = np.diag(np.arange(len(hessian)) >= start).astype(np.float64)
     scatter = scatter_of_tracks(state, observations, weighting)
-    prior = np.arange(start, len(hessian))
-    hessian[prior, prior] += 1 - slope
-    scatter[prior, prior] += 1
-    factor = cho_factor(hessian, lower=True)
-    inverse = cho_solve(factor, cho_solve(factor, scatter).T)
+    inverse = _inverse(state, slope * (hessian - prior), scatter, prior)
     for frame in range(1, len(poses)):
         at = slice(POSE * (frame - 1), POSE * frame)
         poses[frame] = inverse[at, at]
@@ -435,6 +432,25 @@ def _posterior(state: State, observations: Observations, weighting: Weighting) -
     whitened = np.stack([inverse[at : at + CALIBRATION, at : at + CALIBRATION] for at in starts])
     calibration = state.basis @ whitened @ np.swapaxes(state.basis, 1, 2)
     return _Posterior(poses, calibration, expectation)
+
+
+def _inverse(
+    state: State,
+    by_images: Float[np.ndarray, "k k"],
+    scatter: Float[np.ndarray, "k k"],
+    prior: Float[np.ndarray, "k k"],
+) -> Float[np.ndarray, "k k"]:
+    """``(by_images + prior)^-1 (scatter + prior) (by_images + prior)^-1``. What images tell is up to 1e15 times what
+    the prior does, but of a similarity they tell nothing: there it is set to 0, instead of to what rounding leaves."""
+    basis, blind = gauge_basis(state) if prior.any() else (np.eye(len(prior)), 0)
+    told, scattered = (basis.T @ matrix @ basis for matrix in (by_images, scatter))
+    for matrix in (told, scattered):
+        matrix[len(matrix) - blind :] = 0
+        matrix[:, len(matrix) - blind :] = 0
+    held = basis.T @ prior @ basis
+    factor = cho_factor(told + held, lower=True)
+    inverse = cho_solve(factor, cho_solve(factor, scattered + held).T)
+    return np.asarray(basis @ inverse @ basis.T)
 
 
 def _expectation(

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import null_space
+from scipy.linalg import null_space, qr
 from scipy.spatial.transform import Rotation
 
 from cuspid.epipolar import skew
@@ -25,6 +25,9 @@ PLACE = 6
 _HELD = 1e-6
 """A direction of a camera's pose is held fixed if its standard deviation is less than this share of those of its
 parts."""
+
+_SMALL = 1e-5
+"""Step of a difference."""
 
 
 class Gauge(NamedTuple):
@@ -43,6 +46,29 @@ class Gauge(NamedTuple):
 def best_gauge(state: State) -> Gauge:
     """The similarity that most reduces the prior cost of the cameras' poses, to first order; it moves no pose in a
     direction in which it is held fixed."""
+    free, whitened = _allowed(state)
+    along = np.linalg.lstsq(whitened.reshape(-1, 7) @ free, -state.whitened[:, :PLACE].ravel(), rcond=None)[0]
+    return Gauge.of(free @ along)
+
+
+def gauge_basis(state: State) -> tuple[Float[np.ndarray, "k k"], int]:
+    """A basis of the steps of the reduced unknowns (poses and z), and how many of its last vectors are the similarities
+    that the prior allows, to first order. The others are single unknowns, of which those are left out that a similarity
+    can best replace."""
+    free, whitened = _allowed(state)
+    calibration = np.zeros((*state.whitened.shape, 7))
+    calibration[:, :PLACE] = whitened
+    poses = np.stack([_pose_steps(state, unit) for unit in np.eye(7)], axis=-1)
+    along = np.concatenate([poses.reshape(-1, 7), calibration.reshape(-1, 7)]) @ free
+    start, count = poses[..., 0].size, free.shape[1]
+    replaced = start + qr(along[start:].T, mode="r", pivoting=True)[1][:count]
+    single = np.delete(np.eye(len(along)), replaced, axis=1)
+    return np.concatenate([single, along / np.linalg.norm(along[start:], axis=0)], axis=1), count
+
+
+def _allowed(state: State) -> tuple[Float[np.ndarray, "7 m"], Float[np.ndarray, "c 6 7"]]:
+    """The similarities that move no camera in a direction in which it is held fixed; and how all seven kinds move the
+    z of the cameras' poses."""
     motions = np.stack(
         [
             _motion_by_gauge(turn, place)
@@ -52,9 +78,16 @@ def best_gauge(state: State) -> Gauge:
     inverses, held = zip(*(_split(basis[:PLACE, :PLACE]) for basis in state.basis), strict=True)
     held_rows = np.concatenate([rows @ motion for rows, motion in zip(held, motions, strict=True)])
     free = null_space(held_rows, rcond=1e-9) if len(held_rows) else np.eye(7)
-    whitened = np.concatenate([inverse @ motion for inverse, motion in zip(inverses, motions, strict=True)])
-    along = np.linalg.lstsq(whitened @ free, -state.whitened[:, :PLACE].ravel(), rcond=None)[0]
-    return Gauge.of(free @ along)
+    return free, np.stack(inverses) @ motions
+
+
+def _pose_steps(state: State, direction: Float[np.ndarray, "7"]) -> Float[np.ndarray, "f 6"]:
+    """Small motions on the left of all poses but the first, per unit of a similarity."""
+    ahead, back = (moved_world(state, Gauge.of(sign * _SMALL * direction)) for sign in (1, -1))
+    turn = ahead.frame_rotation @ np.swapaxes(back.frame_rotation, 1, 2)
+    shift = ahead.frame_translation - np.einsum("fij,fj->fi", turn, back.frame_translation)
+    steps = np.concatenate([Rotation.from_matrix(turn).as_rotvec(), shift], axis=1) / (2 * _SMALL)
+    return np.asarray(steps[1:])
 
 
 def _motion_by_gauge(turn: Float[np.ndarray, "3 3"], place: Float[np.ndarray, "3"]) -> Float[np.ndarray, "6 7"]:
