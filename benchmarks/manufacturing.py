@@ -1,11 +1,13 @@
 """Scan with handpieces that are not what their files say: held as drawn, and refined within their tolerances.
 
-    python benchmarks/manufacturing.py [--jaw JAW --tooth T] [--seeds 0 1 2] [--only fine usual] [--size half] [--held]
+    python benchmarks/manufacturing.py [--jaw JAW | --arch] [--tooth T] [--cross-sweep] [--seeds 0 1 2]
+                                       [--only fine usual] [--size half] [--held]
                                        [--work FOLDER] [--out benchmarks/results/manufacturing.json]
 
-Twelve cameras, artificial texture, the molar 46 of the phantom, or a jaw of your own (all of it in one pass unless a
-tooth is given). The images are made once, with the drawn handpiece; the file of each case is that of another one that
-was built to the tolerances. Finished scans are kept in the work folder and not run again.
+Twelve cameras, artificial texture, the molar 46 of the phantom, its whole arch, or a jaw of your own (all of it in one
+pass unless a tooth is given, with a sweep across if asked for). The images are made once, with the drawn handpiece; the
+file of each case is that of another one that was built to the tolerances. Finished scans are kept in the work folder
+and not run again.
 """
 
 from __future__ import annotations
@@ -135,6 +137,8 @@ def asked() -> argparse.Namespace:
     parser.add_argument("--work", type=Path, default=Path("build/manufacturing"))
     parser.add_argument("--out", type=Path, default=HERE / "results" / "manufacturing.json")
     parser.add_argument("--jaw", type=Path, default=None)
+    parser.add_argument("--arch", action="store_true", help="all of the phantom")
+    parser.add_argument("--cross-sweep", action="store_true")
     parser.add_argument("--tooth", type=int, default=None)
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2])
     parser.add_argument("--only", nargs="*", choices=list(TOLERANCES), default=list(TOLERANCES))
@@ -148,8 +152,10 @@ def main() -> None:
     arguments = asked()
     own = arguments.jaw is not None
     jaw = load_jaw(arguments.jaw)[0] if own else build_phantom(PhantomOptions())
-    path = ScanPathOptions(tooth=arguments.tooth if own else 46, passes="turns")
-    what = f"{arguments.jaw.stem if own else 'phantom'}-{path.tooth or 'arch'}-{arguments.size}"
+    tooth = arguments.tooth if own or arguments.arch else 46
+    path = ScanPathOptions(tooth=tooth, passes="turns", cross_sweep=arguments.cross_sweep)
+    swept = "-swept" * path.cross_sweep
+    what = f"{arguments.jaw.stem if own else 'phantom'}-{path.tooth or 'arch'}{swept}-{arguments.size}"
     px = 500 if arguments.size == "full" else 250
     scan, drawn = arguments.work / what, twelve_cameras(DesignOptions(width_px=px, height_px=px))
     pipeline.simulate(jaw, drawn, scan, SimulationOptions(path=path))

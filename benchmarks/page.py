@@ -174,6 +174,11 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
     "targets": ("Boards and terraces", handpiece_sections.targets),
     "manufacturing": ("Handpieces not built exactly as drawn", handpiece_sections.manufacturing),
     "manufacturing_arch": ("Handpieces not built exactly as drawn: a real arch", handpiece_sections.manufacturing),
+    "manufacturing_swept": (
+        "Handpieces not built exactly as drawn: a real arch, with a sweep across",
+        handpiece_sections.manufacturing,
+    ),
+    "manufacturing_phantom": ("Handpieces not built exactly as drawn: an arch", handpiece_sections.manufacturing),
     "expectations": ("What to expect of a scan", trust_sections.expectations),
     "grid": ("Running many cases", handpiece_sections.grid),
     "qualities": ("Draft and standard", trust_sections.qualities),
