@@ -268,15 +268,30 @@ def test_a_shift_of_all_times_and_the_order_of_the_cameras_change_nothing(shift,
     assert sum("b" not in numbers for numbers in plain) == 3
 
 
-@pytest.mark.parametrize("wrong", ["none", "two", "weak"])
+@pytest.mark.parametrize("wrong", ["none", "flicker", "weak"])
 def test_a_flash_that_is_not_clear_is_refused(wrong):
-    level = 100 + np.random.default_rng(0).normal(0, 1.0, 80)
-    if wrong == "two":
-        level[[20, 50]] += 80
+    level = 100 + np.random.default_rng(0).normal(0, 1.0, 120)
+    if wrong == "flicker":
+        level[10:115:10] += 80
     if wrong == "weak":
         level[20] += 6
-    with pytest.raises(InputError, match="no single clear flash" if wrong == "two" else "no flash"):
+    with pytest.raises(InputError, match="no clear flash" if wrong == "flicker" else "no flash"):
         flash_starts({"a": level}, OPTIONS)
+
+
+def flashed(*frames: int) -> np.ndarray:
+    level = 100 + np.random.default_rng(0).normal(0, 1.0, 200)
+    level[list(frames)] += 80
+    return level
+
+
+def test_a_flash_before_and_one_after_tell_of_lost_frames():
+    """A last one that comes a frame early may be rounding; two frames are not."""
+    assert flash_starts({"a": flashed(20, 150), "b": flashed(17, 146)}, OPTIONS) == {"a": 0, "b": 3}
+    with pytest.raises(InputError, match=r"b: two flashes are 128 frames apart, but 130 in a: the frame rates differ"):
+        flash_starts({"a": flashed(20, 150), "b": flashed(20, 148)}, OPTIONS)
+    with pytest.raises(InputError, match=r"b: one flash, at frame 20, but in a 2 flashes, at frames 20, 150; cut"):
+        flash_starts({"a": flashed(20, 150), "b": flashed(20)}, OPTIONS)
 
 
 def test_a_flash_is_found_where_it_is_not_whole_or_the_light_stays_on_and_no_dark_frame_is_one():

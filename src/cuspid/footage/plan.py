@@ -23,8 +23,8 @@ from cuspid.footage.synchronise import (
     by_names,
     by_starts,
     by_times,
-    flash_of,
     flash_starts,
+    flashes_of,
     jumps_in,
     motion_starts,
     offset_between,
@@ -334,11 +334,11 @@ def _doubts_by_motion(instants: Sequence[Instant], looks: Mapping[str, Looks], o
 
 
 def _doubts_by_flash(instants: Sequence[Instant], looks: Mapping[str, Looks], options: SyncOptions) -> Iterator[str]:
-    """Cameras that saw a clear flash at other instants."""
+    """Cameras that saw a single flash at other instants."""
     seen: dict[str, int] = {}
     for camera, each in sorted(looks.items()):
-        with suppress(InputError, StopIteration):
-            flash = flash_of(camera, each.level_dn, options)
+        with suppress(InputError, ValueError, StopIteration):
+            (flash,) = flashes_of(camera, each.level_dn, options)
             seen[camera] = next(k for k, instant in enumerate(instants) if instant.numbers.get(camera) == flash)
     if seen and max(seen.values()) - min(seen.values()) > 1:
         places = ", ".join(f"{camera} {instants[k].name}" for camera, k in seen.items())

@@ -26,6 +26,8 @@ Signals = Mapping[str, Float[np.ndarray, "_"]]
 
 _SLOW = 31
 """Number of frames; slower changes do not mark a moment."""
+_MOST_FLASHES = 9
+"""More rises of the brightness are a flicker."""
 _RISE = 0.25
 """Share of the largest jump; a preceding frame with a larger jump than this already contains part of the flash."""
 _LEAST_DN = 4.0
@@ -38,7 +40,7 @@ class SyncOptions(Options):
 
     sync: Sync = "names"
     """Which images belong together: those with the same name, and video frames with the same number (names); with
-    nearly the same time (times); at the same number of frames from a flash that all cameras saw (flash), or by the
+    nearly the same time (times); at the same number of frames from the flashes that all cameras saw (flash), or by the
     motion in the images (motion); or none (none)."""
     apart_share: Annotated[float, Range(0.01, 0.5)] = 0.25
     """Images that are farther apart than this share of the time between frames were not taken at the same instant
@@ -48,7 +50,8 @@ class SyncOptions(Options):
     motion_sigmas: Annotated[float, Range(3, 1000)] = 6.0
     """Number of standard deviations of all other offsets by which the best one must stand out."""
     second_share: Annotated[float, SHARE] = 0.6
-    """A flash, or an offset, is unambiguous if the second best reaches at most this share of it."""
+    """An offset is unambiguous if the second best reaches at most this share of it; a rise of brightness of more than
+    this share of the largest one is a flash, too."""
     overlap_share: Annotated[float, Range(0.1, 1)] = 0.5
     """Minimum share of the shorter film that two films must have in common at an offset (motion)."""
 
@@ -213,30 +216,56 @@ def one_clock(instants: Sequence[Instant], times_s: Signals, *, is_set: bool) ->
 
 
 def flash_starts(brightness: Signals, options: SyncOptions) -> dict[str, int]:
-    """When each camera started, from a flash that all of them saw. Raises InputError where one saw none, or several."""
-    return _from_zero({camera: -flash_of(camera, each, options) for camera, each in brightness.items()})
+    """When each camera started, from the flashes that all of them saw. Raises InputError where one saw none, or others
+    than the rest."""
+    flashes = {camera: flashes_of(camera, each, options) for camera, each in sorted(brightness.items())}
+    model = max(flashes, key=lambda camera: len(flashes[camera]))
+    for camera, its in flashes.items():
+        if len(its) != len(flashes[model]):
+            raise InputError(
+                f"{camera}: {_at_frames(its)}, but in {model} {_at_frames(flashes[model])}; cut the films so that all "
+                "show the same ones, or use another --sync"
+            )
+        gaps, others = (np.diff(each) for each in (its, flashes[model]))
+        if (np.abs(gaps - others) > 1).any():
+            at = int(np.abs(gaps - others).argmax())
+            raise InputError(
+                f"{camera}: two flashes are {gaps[at]} frames apart, but {others[at]} in {model}: the frame rates "
+                "differ, or frames were dropped; use --sync times, or film again"
+            )
+    return _from_zero({camera: -its[0] for camera, its in flashes.items()})
 
 
-def flash_of(camera: str, brightness: Float[np.ndarray, "_"], options: SyncOptions) -> int:
-    """The first frame that contains a flash. Raises InputError where there is none, or no unambiguous one."""
+def _at_frames(flashes: Sequence[int]) -> str:
+    """How many flashes there are, and where."""
+    places = ", ".join(map(str, flashes))
+    return f"one flash, at frame {places}" if len(flashes) == 1 else f"{len(flashes)} flashes, at frames {places}"
+
+
+def flashes_of(camera: str, brightness: Float[np.ndarray, "_"], options: SyncOptions) -> list[int]:
+    """The first frame of each flash, in order. Raises InputError where there is none, or brightness always rises."""
     if len(brightness) < 6:
         raise InputError(f"{camera}: {len(brightness)} frames are too few to find a flash")
     rises = _rises(_filled(brightness))
     top = int(rises.argmax())
     usual = _spread(np.diff(_filled(brightness)))
-    if rises[top] < max(_LEAST_DN, options.flash_sigmas * usual):
+    least = max(_LEAST_DN, options.flash_sigmas * usual)
+    if rises[top] < least:
         raise InputError(
             f"{camera}: no flash; its brightness rises by {rises[top]:.1f} of 255 at most (frame {top}), and usually "
             f"changes by {usual:.1f}; film one flash that all cameras see, or use another --sync"
         )
-    rest = rises.copy()
-    rest[max(0, top - 2) : top + 3] = -np.inf
-    if rest.max() > options.second_share * rises[top]:
+    found, left = [], rises.copy()
+    while left.max() > max(least, options.second_share * rises[top]):
+        here = int(left.argmax())
+        found.append(here - 1 if rises[here - 1] > _RISE * rises[here] else here)
+        left[max(0, here - 2) : here + 3] = -np.inf
+    if len(found) > _MOST_FLASHES:
         raise InputError(
-            f"{camera}: no single clear flash; its brightness rises at frame {top} and about as much at frame "
-            f"{int(rest.argmax())}; cut the film, or use another --sync"
+            f"{camera}: no clear flash; its brightness rises about as much at {len(found)} frames; cut the film, or "
+            "use another --sync"
         )
-    return top - 1 if rises[top - 1] > _RISE * rises[top] else top
+    return sorted(found)
 
 
 def _rises(brightness: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
