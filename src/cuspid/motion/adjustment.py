@@ -228,7 +228,8 @@ def _cost(state: State, observations: Observations, weighting: Weighting) -> flo
     if not np.all(np.isfinite(lengths)):
         return np.inf
     knee = weighting.huber_sigmas
-    loss = np.where(lengths <= knee, lengths**2, 2 * knee * lengths - knee**2)
+    inside = np.minimum(lengths, knee)
+    loss = inside * (2 * lengths - inside)
     return float(np.sum(loss) + np.sum(state.whitened**2))
 
 
