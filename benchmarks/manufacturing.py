@@ -105,7 +105,7 @@ def scanned(
         "trajectory_um": trajectory.ape_um.rmse,
         "similar_mean_um": similar.accuracy.mean_abs_um,
         "similar_trajectory_um": shape_error_um(reconstruction, true, drawn),
-        "adjustment_s": sum(reconstruction.log.get(each, 0.0) for each in ("adjustment_s", "least_squares_s")),
+        "adjustments_s": reconstruction.log["adjustment_s"],
         "located": len(reconstruction.frames),
         "notes": "; ".join(reconstruction.notes),
         "scale_sigma_ppm": None if expected is None else expected.scale_sigma_ppm,

@@ -86,7 +86,7 @@ def _timed(log: dict[str, float], stage: str) -> Iterator[None]:
     """Add the seconds that a stage takes to the log."""
     start = time.perf_counter()
     yield
-    log[f"{stage}_s"] = time.perf_counter() - start
+    log[f"{stage}_s"] = log.get(f"{stage}_s", 0.0) + time.perf_counter() - start
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,7 +379,7 @@ def _adjusted(
             adjusted = adjust(joined, first, judge=read is None)
     if read is None:
         return adjusted
-    with _timed(log, "least_squares"):
+    with _timed(log, "patches"):
         placed = match_patches(adjusted, read, options.least_squares, progress=progress)
         found = np.bincount(placed.frame_index, minlength=len(adjusted.frames))
         few = np.flatnonzero(found < options.odometry.minimum_matches)
@@ -389,6 +389,7 @@ def _adjusted(
                 "as with glare or blur: keypoints are used as detected, and the path is less accurate"
             )
             start, placed = replace(start, notes=(*start.notes, note)), tracks
+    with _timed(log, "adjustment"):
         exact = replace(start, rig_from_world=adjusted.rig_from_world, tracks=placed)
         return adjust(exact, options.adjustment)
 
