@@ -68,7 +68,7 @@ BENCHMARKS = (
     case("spheres"),
     Benchmark("fuzz", "fuzz.py --out {out}"),
     Benchmark("kill", "kill.py --work {work} --out {out}"),
-    Benchmark("large", "large.py --work {work}"),
+    Benchmark("large", "large.py --work {work} --out {out}"),
     Benchmark("precision", "precision.py --out {out}"),
     Benchmark("visibility", "visibility.py --out {out}"),
     Benchmark("mouth", "mouth.py --out {out}"),
@@ -98,11 +98,11 @@ BENCHMARKS = (
 
 def measured(benchmark: Benchmark, work: Path, given: Mapping[str, Path]) -> bool:
     """Whether the benchmark came to its end; its result is then among the others. ``work`` is that of the commit."""
-    checkout, own = work / "checkout", work / benchmark.name
-    folder = checkout / "benchmarks" / "results"
+    checkout, own, folder = work / "checkout", work / benchmark.name, work / "results"
     out = folder / f"{benchmark.name}.json"
     out.unlink(missing_ok=True)
     own.mkdir(exist_ok=True)
+    folder.mkdir(exist_ok=True)
     script, *options = benchmark.command.format(out=out, folder=folder, work=own, **given).split()
     paths = os.pathsep.join(str(checkout / each) for each in ("src", "benchmarks"))
     with (work / f"{benchmark.name}.log").open("w") as log:

@@ -1,10 +1,10 @@
 """Memory and time of the verbs that read a mesh, on one of 5 million faces.
 
-    python benchmarks/large.py [--work build/large]
+    python benchmarks/large.py [--work build/large] [--out benchmarks/results/large.json]
 
 A phantom whose faces were split twice. ``evaluate`` lays the mesh alone, without labels, on itself, so that both
 surfaces are as large and crowns are told by shape; ``measure`` reads the labelled jaw; from ``view`` a client takes all
-that is shown. Writes benchmarks/results/large.json.
+that is shown.
 """
 
 from __future__ import annotations
@@ -95,21 +95,23 @@ def main() -> None:
     """Run the verbs one after the other."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, default=Path("build/large"))
-    work = parser.parse_args().work.resolve()
+    parser.add_argument("--out", type=Path, default=HERE / "results" / "large.json")
+    arguments = parser.parse_args()
+    work = arguments.work.resolve()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have it passed over in the background
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     faces, scan, scored = make(work), str(work / "scan.ply"), str(work / "scored")
     found = {}
-    for arguments, during in (
+    for verb, during in (
         (("evaluate", scan, scan, "--out", scored), None),
         (("report", scored, "--reference", scan), None),
         (("measure", str(work / "jaw.ply"), "--out", str(work / "measured")), None),
         (("view", scored, "--reference", scan), take_all),
     ):
-        found[arguments[0]] = measured(arguments, during)
-        print(arguments[0], found[arguments[0]], flush=True)
-    write_json(HERE / "results" / "large.json", {"faces": faces, "verbs": found, **conditions()})
+        found[verb[0]] = measured(verb, during)
+        print(verb[0], found[verb[0]], flush=True)
+    write_json(arguments.out, {"faces": faces, "verbs": found, **conditions()})
 
 
 if __name__ == "__main__":
