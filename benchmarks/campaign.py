@@ -8,7 +8,7 @@ benchmarks/results as soon as it is there; a campaign that was stopped goes on w
 (:mod:`freshness`), and finished parts of most benchmarks are kept in the work folder. Nothing is begun after
 ``--hours``. Scans of your own (``--jaws``), rectified photographs of two cameras (``--pairs``) and photographs of a
 glossy ball (``--ball``) are not part of the project: without them, the benchmarks that need them are left out. Then
-make the page (``python benchmarks/page.py``).
+make the page (``python benchmarks/page.py``). Pictures for the documentation stay in the work folder.
 """
 
 from __future__ import annotations
@@ -69,16 +69,16 @@ BENCHMARKS = (
     Benchmark("fuzz", "fuzz.py --out {out}"),
     Benchmark("kill", "kill.py --work {work} --out {out}"),
     Benchmark("large", "large.py --work {work} --out {out}"),
-    Benchmark("precision", "precision.py --out {out}"),
+    Benchmark("precision", "precision.py --pictures {work} --out {out}"),
     Benchmark("visibility", "visibility.py --out {out}"),
     Benchmark("mouth", "mouth.py --out {out}"),
     Benchmark("measure", "measure_jaws.py --jaws {jaws}/iosseg --out {out}"),
     Benchmark("populations", "populations.py --out {out}"),
-    Benchmark("camera_pair", "camera_pair.py --out {out}"),
+    Benchmark("camera_pair", "camera_pair.py --pictures {work} --out {out}"),
     Benchmark("targets", "targets.py --work {work} --out {out}"),
     Benchmark("mean_shape", "mean_shape.py --work {work} --out {out}"),
     Benchmark("grid", "grid.py --out {out}"),
-    Benchmark("stereo_pairs", "stereo_pairs.py {pairs} --out {out}"),
+    Benchmark("stereo_pairs", "stereo_pairs.py {pairs} --pictures {work} --out {out}"),
     Benchmark("real_gloss", "real_gloss.py {ball} --out {out}"),
     Benchmark("any_rig", "any_rig.py --work {work} --out {out}"),
     Benchmark("qualities", "qualities.py {jaws}/fullarch_upper_137k.ply --work {work} --out {out}"),
@@ -91,7 +91,7 @@ BENCHMARKS = (
         "manufacturing.py --jaw {jaws}/fullarch_upper_137k.ply --work {work} --out {out}",
     ),
     Benchmark("manufacturing_phantom", "manufacturing.py --arch --work {work} --out {out}"),
-    Benchmark("design_comparison", "design_comparison.py --work {work} --out {out}"),
+    Benchmark("design_comparison", "design_comparison.py --work {work} --pictures {work} --out {out}"),
 )
 """What matters most comes first."""
 
