@@ -78,7 +78,7 @@ BENCHMARKS = (
     Benchmark("targets", "targets.py --work {work} --out {out}"),
     Benchmark("mean_shape", "mean_shape.py --work {work} --out {out}"),
     Benchmark("grid", "grid.py --out {out}"),
-    Benchmark("stereo_pairs", "stereo_pairs.py {pairs} --pictures {work} --out {out}"),
+    Benchmark("stereo_pairs", "stereo_pairs.py {pairs} --out {out}"),
     Benchmark("real_gloss", "real_gloss.py {ball} --out {out}"),
     Benchmark("any_rig", "any_rig.py --work {work} --out {out}"),
     Benchmark("qualities", "qualities.py {jaws}/fullarch_upper_137k.ply --work {work} --out {out}"),
