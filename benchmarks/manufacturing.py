@@ -119,13 +119,13 @@ def scanned(
 
 
 def shape_error_um(found: Reconstruction, true: Mapping[str, Rigid3], drawn: Rig) -> float:
-    """Of the places of all cameras at all frames, RMS, after the best similarity: those of the handpiece itself would
-    depend on where its file has the origin, which no image tells."""
+    """Of the places of the handpiece, RMS, after the best similarity. Where its file has the origin no image tells: the
+    place is that of the true origin, as the cameras that were found lie about it."""
+    cameras = [np.array([each.centre_in_rig for each in rig.cameras.values()]) for rig in (drawn, found.rig)]
+    _, _, origin = best_similarity(*cameras)
     places = [
-        np.array(
-            [(mounted.cam_from_rig @ poses[name]).inverse().translation for name in found.frames for mounted in rig]
-        )
-        for poses, rig in ((found.rig_from_world, found.rig.cameras.values()), (true, drawn.cameras.values()))
+        np.array([poses[name].inverse().apply(at) for name in found.frames])
+        for poses, at in ((found.rig_from_world, origin), (true, np.zeros(3)))
     ]
     scale, rotation, shift = best_similarity(*places)
     return float(1000 * np.sqrt(np.mean(np.sum((scale * places[0] @ rotation.T + shift - places[1]) ** 2, axis=1))))
