@@ -302,8 +302,9 @@ def manufacturing(result: Result) -> str:
             "these tolerances. The images are those of the drawn handpiece; it is the file that is off. Bars, refined: "
             "mean 3, 5 and 10 um, 2.5 um after a similarity transform, 2 um for the shape of the path (RMS, after a "
             "similarity transform, of the place that the true origin of the handpiece has among the cameras), scale "
-            "within two of its stated standard deviations, 30 s for the adjustments. The shares are those of the surface within one and two of the standard deviations that "
-            "the scan states. `python benchmarks/manufacturing.py`.",
+            "within two of its stated standard deviations, 30 s for the adjustments. The shares are those of the "
+            "surface within one and two of the standard deviations that the scan states. "
+            "`python benchmarks/manufacturing.py`.",
             "",
             markdown_table(_BUILT, rows),
         ]
