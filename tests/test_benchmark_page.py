@@ -1,5 +1,6 @@
 """The page of the benchmarks: which results still hold, and how those are shown that do not."""
 
+import json
 import shutil
 import subprocess
 from fnmatch import fnmatch
@@ -112,3 +113,35 @@ def test_every_result_has_a_maker_and_a_place_on_the_page(freshness):
     assert f"0 of {len(results)} results hold" in shown
     assert "| molar-seed0 (older code) |" in shown
     assert "`src/a.py`, `src/b.py`, `src/c.py` and 1 more" in shown
+
+
+def test_a_campaign_measures_what_no_longer_holds(freshness, repository, monkeypatch, capsys):
+    """At a clean commit, once; what fails, and what has not been given, is told."""
+    campaign = import_module("campaign")
+    describe = '["git", "describe", "--always", "--dirty", "--abbrev=12"]'
+    add(
+        repository,
+        "benchmarks/toy.py",
+        f'"""Tell the commit."""\n\nimport json\nimport subprocess\nimport sys\nfrom pathlib import Path\n\n'
+        f"commit = subprocess.check_output({describe}, text=True).strip()\n"
+        'Path(sys.argv[-1]).write_text(json.dumps({"commit": commit}))\n',
+    )
+    add(repository, "benchmarks/broken.py", "raise SystemExit(3)\n")
+    for command in (("add", "."), ("-c", "user.name=n", "-c", "user.email=e@x.org", "commit", "-qm", "toys")):
+        subprocess.run(["git", "-C", str(repository), *command], check=True)
+    results = repository / "benchmarks" / "results"
+    results.mkdir()
+    toys = [("mouth", "toy.py {out}"), ("precision", "broken.py {out}"), ("measure", "toy.py {jaws} {out}")]
+    monkeypatch.setattr(campaign, "ROOT", repository)
+    monkeypatch.setattr(campaign, "RESULTS", results)
+    monkeypatch.setattr(campaign, "BENCHMARKS", [campaign.Benchmark(*each) for each in toys])
+    monkeypatch.setattr("sys.argv", ["campaign.py", "--work", str(repository / "work")])
+    campaign.main()
+    said = capsys.readouterr().out
+    assert "mouth: 0.0 min\n" in said
+    assert "precision: 0.0 min, failed, see " in said
+    assert "measure: left out, needs --jaws\n" in said
+    assert json.loads((results / "mouth.json").read_text()) == {"commit": commit_of(repository)}
+    assert not (results / "precision.json").exists()
+    campaign.main()
+    assert "mouth: holds\n" in capsys.readouterr().out
