@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+from rich.filesize import decimal
 from tyro.conf import Positional
 
 from cuspid import storage
@@ -35,4 +36,4 @@ def report(
     with storage.reading(folder):
         page = report_page(storage.read_result(folder, reference, unit), options)
     storage.write_bytes(path, page.encode())
-    console.print(f"{path}: {path.stat().st_size / 1e6:.1f} MB", highlight=False)
+    console.print(f"{path}: {decimal(path.stat().st_size)}", highlight=False)
