@@ -41,7 +41,15 @@ from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
 from cuspid.jaw import Jaw, Landmark
 from cuspid.motion.colmap import read_model
 from cuspid.pipeline import RenderOptions, take_images
-from report_folders import TOOTH, write_comparison, write_evaluation, write_scan, write_score, write_shape
+from report_folders import (
+    TOOTH,
+    write_calibrated,
+    write_comparison,
+    write_evaluation,
+    write_scan,
+    write_score,
+    write_shape,
+)
 from test_cli_stitch import picture, write_calibration
 from test_colmap import make_capture, make_found, without_rig, write
 from test_panorama import small_panorama
@@ -224,6 +232,10 @@ def _studies(folder: Path) -> None:
     write_score(folder / "score")
 
 
+def _calibration(folder: Path) -> None:
+    write_calibrated(folder / "calibration")
+
+
 def _results(folder: Path) -> None:
     shutil.copytree(RESULTS, folder / "results", ignore=shutil.ignore_patterns("*opencv*", "0*", "*film*"))
 
@@ -373,6 +385,7 @@ SCENARIOS: Mapping[str, Scenario] = {
     "report of a panorama": Scenario(_panorama, verb("report", "@panorama")),
     "report of a study": Scenario(_studies, verb("report", "@comparison")),
     "report of a score": Scenario(_studies, verb("report", "@score")),
+    "report of a calibration": Scenario(_calibration, verb("report", "@calibration")),
     "report of a shape": Scenario(_shape, verb("report", "@shape")),
     "prepare": Scenario(_arch, verb("prepare", "@jaw.ply", "--tooth", str(TOOTH), "--out", f"@{_OUT}.ply", "crack")),
     "box": Scenario(_arch, verb("box", "@jaw.ply", "--out", f"@{_OUT}.ply")),

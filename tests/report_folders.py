@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -186,3 +187,49 @@ def write_score(folder: Path) -> None:
     rng = np.random.default_rng(1)
     for name in ("made.png", "true.png"):
         storage.write_image(folder / name, rng.integers(0, 255, (90, 120, 3), dtype=np.uint8))
+
+
+def write_calibrated(folder: Path) -> None:
+    """As ``cuspid calibrate`` leaves it; the second camera exposes half a frame after the first."""
+    check = {
+        "views": 12,
+        "corners": 480,
+        "rms_px": 0.07,
+        "alone_px": 0.06,
+        "held_out_px": 0.08,
+        "parameters_apart": 0.9,
+        "place_apart": None,
+        "alone_apart": 0.4,
+    }
+    storage.claim_folder(folder, "calibrate", {"board": {"square_mm": 2.0}}, {"one": "c" * 64})
+    cameras = {
+        name: {**check, "delay_frames": delay, "delay_spread_frames": 0.1}
+        for name, delay in (("one", -0.25), ("<other>", 0.25))
+    }
+    response = {
+        "gain": 1.02,
+        "gain_sigma_pct": 0.3,
+        "corner_loss_pct": 12.0,
+        "corner_loss_sigma_pct": 0.5,
+        "gamma": 2.2,
+        "gamma_sigma_pct": 1.0,
+        "noise_dn": 1.5,
+        "before_pct": 4.0,
+        "held_out_pct": 0.6,
+    }
+    storage.write_json(
+        folder / "calibration.json",
+        {
+            "sigma_px": 0.065,
+            "board_bending_mm": [0.01, 0.0, 0.02],
+            "board_distance_mm": 6.0,
+            "cameras": cameras,
+            "notes": ["the cameras did not expose together"],
+            "photometry": {"cameras": dict.fromkeys(cameras, response), "notes": ["gamma stays"], "lights": {}},
+        },
+    )
+    known = replace(CAMERA, covariance=np.diag([0.04, 0.04, 0.09, 0.09, 1e-6, 1e-6, 1e-8, 1e-8]))
+    place = Rigid3(np.eye(3), np.array([-3.0, 0.0, 0.0]))
+    rig = {name: MountedCamera(known, place, 1e-6 * np.eye(6)) for name in ("one", "other")}
+    storage.write_handpiece(folder / "handpiece.json", Handpiece(rig=Rig(rig), working_distance_mm=6.0))
+    storage.write_image(folder / "residuals.png", np.full((40, 60, 3), 250, dtype=np.uint8))

@@ -46,6 +46,7 @@ from report_folders import (
     looking_down,
     scanned_tooth,
     tooth_alone,
+    write_calibrated,
     write_comparison,
     write_evaluation,
     write_scan,
@@ -400,6 +401,24 @@ def test_the_pages_of_a_panorama_and_its_score(tmp_path):
     assert "seen from a height" not in page, "there is no such picture in this folder"
     (tmp_path / "score" / "made.png").unlink()
     assert "run cuspid stitch-eval again" in report_page(storage.read_result(tmp_path / "score"))
+
+
+def test_the_page_of_a_calibration(tmp_path):
+    write_calibrated(tmp_path)
+    page = report_page(storage.read_result(tmp_path))
+    assert "<other>" not in page
+    for said in ("&lt;other&gt;", "960", "+0.25 ± 0.10", "gamma stays", "3.000", "1.020 ± 0.3 %", "0.08"):
+        assert said in page, said
+    assert page.count("<img") == 1
+    (tmp_path / "handpiece.json").unlink()
+    assert "the cameras: run cuspid calibrate again" in report_page(storage.read_result(tmp_path))
+    assert "nothing to view in 3-D" in refused_view(tmp_path)
+
+
+def refused_view(folder):
+    with pytest.raises(InputError) as raised:
+        live_view.serve(storage.read_result(folder), "127.0.0.1", 18082)
+    return str(raised.value)
 
 
 def test_a_study_that_was_killed_shows_what_is_done(tmp_path):

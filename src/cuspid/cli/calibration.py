@@ -19,11 +19,18 @@ from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, cal
 from cuspid.calibration.corners import BoardView, Views, find_corners
 from cuspid.calibration.photometry import Photometry, PhotometryOptions, calibrate_light, look_at_patches
 from cuspid.calibration.target import PLATE_MM, target_body
+from cuspid.calibration.uncertainty import projection_sigma_px
+from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
 from cuspid.image_sequence import ImageSequence
 from cuspid.options import Range
 from cuspid.progress import Progress
-from cuspid.reporting.figures.calibration import save_board, save_photometry_picture, save_residuals_picture
+from cuspid.reporting.figures.calibration import (
+    save_board,
+    save_photometry_picture,
+    save_residuals_picture,
+    save_uncertainty_picture,
+)
 from cuspid.rig import Handpiece, Light, depth_of_field_mm
 from cuspid.simulation.board_images import PhotographOptions, take_photographs
 from cuspid.simulation.manufacturing import ManufacturingOptions, built
@@ -85,8 +92,8 @@ def calibrate(
     Args:
         images: Folder with a subfolder of images, or a video, for each camera; images taken at the same instant share a
             name.
-        out: Folder for handpiece.json, rig_config.json, calibration.json (the quality of each camera), residuals.png
-            and photometry.png.
+        out: Folder for handpiece.json, rig_config.json, calibration.json (the quality of each camera), residuals.png,
+            uncertainty.png, photometry.png and report.html.
         working_distance_mm: Distance from the cameras to the teeth; default: that of the drawn handpiece, or else the
             median distance of the board.
         drawn: handpiece.json of the handpiece as it was drawn (its design). Its lights, and no others, must have lit
@@ -118,6 +125,7 @@ def calibrate(
     _print(found, out)
     if light is not None:
         _print_light(light)
+    report(out)
 
 
 def _light(
@@ -144,6 +152,8 @@ def _write(found: RigCalibration, light: Photometry | None, handpiece: Handpiece
     storage.write_json(out / "calibration.json", {**_figures(found, board), **_light_figures(light)})
     cameras = {name: mounted.camera for name, mounted in handpiece.rig.cameras.items()}
     save_residuals_picture(out / "residuals.png", cameras, found.pixels, found.residuals, title="residuals")
+    sigma_px = {name: projection_sigma_px(camera) for name, camera in cameras.items()}
+    save_uncertainty_picture(out / "uncertainty.png", cameras, sigma_px)
     if light is not None and light.sensors:
         shown = {name: (each.levels_dn, each.variances_dn2) for name, each in light.noise.items()}
         save_photometry_picture(out / "photometry.png", light.sensors, shown, light.residuals_pct)

@@ -48,6 +48,7 @@ from cuspid.storage.reconstructions import (
 )
 from cuspid.storage.reference_renders import read_reference_render, write_reference_render
 from cuspid.storage.results import (
+    CalibrationResult,
     PanoramaResult,
     Result,
     ScanResult,
@@ -71,6 +72,7 @@ __all__ = [
     "PART",
     "SIGMA",
     "TIMES_FILES",
+    "CalibrationResult",
     "LandmarkFile",
     "LandmarkFrame",
     "MeshFile",

@@ -23,9 +23,11 @@ from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.panorama import Panorama
 from cuspid.reconstruction import Reconstruction
+from cuspid.rig import Rig
 from cuspid.shape_model import ShapeModel
 from cuspid.storage.captures import read_capture
 from cuspid.storage.files import hash_file, read_json, read_manifest, reading
+from cuspid.storage.handpieces import read_handpiece
 from cuspid.storage.jaws import is_jaw, read_jaw, read_labelled_mesh
 from cuspid.storage.meshes import SIGMA, MeshFile, Unit, read_mesh_file
 from cuspid.storage.panoramas import read_panorama
@@ -125,12 +127,22 @@ class ScoreResult(_Result):
     """The reference render of the true jaw."""
 
 
-Result = ScanResult | ShapeResult | StudyResult | PanoramaResult | ScoreResult
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CalibrationResult(_Result):
+    """A folder of ``calibrate``."""
+
+    calibration: Mapping[str, Any]
+    """``calibration.json``."""
+    rig: Rig | None
+    """The calibrated cameras."""
+
+
+Result = ScanResult | ShapeResult | StudyResult | PanoramaResult | ScoreResult | CalibrationResult
 
 
 def read_result(folder: Path, reference: Path | None = None, unit: Unit = "mm") -> Result:
-    """What lies in a folder that ``run``, ``evaluate``, ``shape``, ``sweep``, ``compare``, ``repeat``, ``stitch`` or
-    ``stitch-eval`` wrote.
+    """What lies in a folder that ``run``, ``evaluate``, ``shape``, ``sweep``, ``compare``, ``repeat``, ``stitch``,
+    ``stitch-eval`` or ``calibrate`` wrote.
 
     ``reference``: the mesh (in a unit) with which a scan was compared, or the folder ``truth`` of a simulation, where
     the folder does not hold it. Raises InputError where there is nothing to report, a file is damaged, or the reference
@@ -147,7 +159,7 @@ def read_result(folder: Path, reference: Path | None = None, unit: Unit = "mm") 
     made = f"; it holds only {', '.join(run)}" if run else ""
     raise InputError(
         f"{folder}: nothing to report{made}; give the --out folder of run, reconstruct, evaluate, shape, sweep, "
-        "compare, repeat, stitch or stitch-eval"
+        "compare, repeat, stitch, stitch-eval or calibrate"
     )
 
 
@@ -347,6 +359,23 @@ def _read_score(folder: Path, run: Mapping[str, Any]) -> ScoreResult:
     )
 
 
+def _read_calibration(folder: Path, run: Mapping[str, Any]) -> CalibrationResult:
+    handpiece = _if_there(folder / "handpiece.json")
+    captions = {
+        "residuals.png": "Where each camera saw corners, and their residuals as lines",
+        "uncertainty.png": "How well each lens is known: standard deviation of a projection, px",
+        "photometry.png": "What the cameras make of light: gain and falloff, residuals, noise",
+    }
+    return CalibrationResult(
+        name=folder.resolve().name,
+        run=run,
+        calibration=read_json(folder / "calibration.json"),
+        rig=None if handpiece is None else read_handpiece(handpiece).rig,
+        missing=() if handpiece else ("the cameras: run cuspid calibrate again",),
+        pictures=_pictures(folder, captions),
+    )
+
+
 def _holds(file: str) -> Callable[[Path, Mapping[str, Any]], bool]:
     return lambda folder, run: (folder / file).exists()
 
@@ -354,6 +383,7 @@ def _holds(file: str) -> Callable[[Path, Mapping[str, Any]], bool]:
 _READERS: tuple[tuple[Callable[[Path, Mapping[str, Any]], bool], Callable[[Path, Mapping[str, Any]], Result]], ...] = (
     (_holds("shape.json"), _read_shape),
     (_holds("score.json"), _read_score),
+    (_holds("calibration.json"), _read_calibration),
     (_is_panorama, _read_panorama),
     (_is_study, _read_study),
 )

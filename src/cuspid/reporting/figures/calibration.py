@@ -12,12 +12,13 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from cuspid.board import Board
 from cuspid.camera import Camera
 from cuspid.errors import InputError
-from cuspid.reporting.figures.drawing import new_figure, save_figure
+from cuspid.reporting.figures.drawing import SIGMA_COLORS, new_figure, save_figure
 from cuspid.rig import Sensor
 
 BOARD_SUFFIXES = (".pdf", ".svg", ".png")
@@ -29,6 +30,8 @@ _CUT, _FOOT, _HEAD = (0.0, ()), (0.0, (4.0, 2.0)), (0.0, (1.0, 1.5))
 """Dashes of these lines."""
 _INK = "#333333"
 _BEFORE, _AFTER = "#9a9a9a", "#1f5fd6"
+_SIGMAS_PX = (0.01, 10.0)
+"""Ends of the colours of standard deviations of projections."""
 _BINS = 12
 """Of radii and of levels, over which points are averaged."""
 _FEWEST = 5
@@ -138,6 +141,27 @@ def _draw_residuals(axes: Axes, camera: Camera, at: Float[np.ndarray, "n 2"], dr
     axes.set_ylim(camera.height, 0)
     axes.set_aspect("equal")
     axes.tick_params(labelsize=7, colors=_INK)
+
+
+def save_uncertainty_picture(
+    path: Path, cameras: Mapping[str, Camera], sigma_px: Mapping[str, Float[np.ndarray, "r c"]]
+) -> None:
+    """PNG with an image frame for each camera, coloured by the standard deviation of its projections on a grid over the
+    image; grey where there is none. Colours mean the same in all pictures."""
+    columns = min(4, len(cameras))
+    rows = -(-len(cameras) // columns)
+    figure = new_figure(3.4 * columns, 0.5 + 3.0 * rows, dpi=130)
+    colours = colormaps[SIGMA_COLORS].with_extremes(bad="#cccccc")
+    for index, (name, camera) in enumerate(cameras.items()):
+        axes = figure.add_subplot(rows, columns, index + 1)
+        extent = (0.0, float(camera.width), float(camera.height), 0.0)
+        drawn = axes.imshow(sigma_px[name], cmap=colours, norm=LogNorm(*_SIGMAS_PX), extent=extent)
+        axes.set_title(f"{name}: {np.nanmedian(sigma_px[name]):.2g} px (median)", fontsize=10, color=_INK)
+        axes.tick_params(labelsize=7, colors=_INK)
+        bar = figure.colorbar(drawn, ax=axes, shrink=0.6, extend="both", label="px")
+        bar.ax.tick_params(labelsize=7, colors=_INK)
+    figure.tight_layout()
+    save_figure(figure, path)
 
 
 Residuals = Mapping[str, tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]]

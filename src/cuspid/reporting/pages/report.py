@@ -4,11 +4,20 @@ from __future__ import annotations
 
 from typing import assert_never
 
+from cuspid.reporting.pages.calibration import calibration_page
 from cuspid.reporting.pages.panorama import panorama_page, score_page
 from cuspid.reporting.pages.scan import ReportOptions, scan_page
 from cuspid.reporting.pages.shape import shape_page
 from cuspid.reporting.pages.study import study_page
-from cuspid.storage import PanoramaResult, Result, ScanResult, ScoreResult, ShapeResult, StudyResult
+from cuspid.storage import (
+    CalibrationResult,
+    PanoramaResult,
+    Result,
+    ScanResult,
+    ScoreResult,
+    ShapeResult,
+    StudyResult,
+)
 
 
 def report_page(result: Result, options: ReportOptions = ReportOptions()) -> str:
@@ -24,5 +33,7 @@ def report_page(result: Result, options: ReportOptions = ReportOptions()) -> str
             return panorama_page(result)
         case ScoreResult():
             return score_page(result)
+        case CalibrationResult():
+            return calibration_page(result)
         case _:
             assert_never(result)

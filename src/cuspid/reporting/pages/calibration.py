@@ -1,0 +1,65 @@
+"""The page of a calibration: how good it is, what was found, and the pictures that show where to doubt it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from cuspid.reporting.pages.page import number, picture_uri, provenance, render_page
+from cuspid.rig import MountedCamera
+from cuspid.storage import CalibrationResult
+
+
+def calibration_page(result: CalibrationResult) -> str:
+    """The HTML of a calibration."""
+    found, cameras = result.calibration, result.calibration["cameras"]
+    held_out = [each["held_out_px"] for each in cameras.values() if each["held_out_px"] is not None]
+    light = found.get("photometry")
+    return render_page(
+        "calibration.html.j2",
+        title="Calibration",
+        name=result.name,
+        missing=result.missing,
+        tiles=[
+            ("cameras", str(len(cameras)), ""),
+            ("corners that were used", number(sum(each["corners"] for each in cameras.values()), 0), ""),
+            ("standard deviation of a corner", number(found["sigma_px"], 2), "px"),
+            ("worst camera in held-out images", number(max(held_out), 2) if held_out else "–", "px, RMS"),
+        ],
+        cameras=cameras,
+        timed=any(each.get("delay_frames") is not None for each in cameras.values()),
+        lenses={} if result.rig is None else {name: _lens(each) for name, each in result.rig.cameras.items()},
+        places={} if result.rig is None else {name: _place(each) for name, each in result.rig.cameras.items()},
+        light=light,
+        notes=[*found["notes"], *([] if light is None else light["notes"])],
+        pictures=[(caption, picture_uri(path)) for caption, path in result.pictures.items()],
+        made=provenance(result.run),
+    )
+
+
+_DIGITS = (1, 1, 1, 1, 4, 4, 5, 5)
+"""Of fx, fy, cx, cy, k1, k2, p1, p2."""
+
+
+def _lens(mounted: MountedCamera) -> list[str]:
+    """Each parameter with its standard deviation."""
+    sigma = _sigmas(mounted.camera.covariance, 8)
+    return [
+        f"{number(value, digits)} ± {number(each, digits)}"
+        for value, each, digits in zip(mounted.camera.parameters, sigma, _DIGITS, strict=True)
+    ]
+
+
+def _place(mounted: MountedCamera) -> dict[str, Any]:
+    sigma = _sigmas(mounted.covariance, 6)
+    return {
+        "centre_mm": [number(value, 3) for value in mounted.centre_in_rig],
+        "sigma_um": number(1000 * float(np.linalg.norm(sigma[3:])), 1),
+        "sigma_deg": number(float(np.rad2deg(np.linalg.norm(sigma[:3]))), 3),
+    }
+
+
+def _sigmas(covariance: Float[np.ndarray, "n n"] | None, size: int) -> Float[np.ndarray, "n"]:
+    return np.zeros(size) if covariance is None else np.sqrt(np.diag(covariance))
