@@ -59,7 +59,7 @@ def scene(seed: int, board: Board = BOARD, cameras: int = 3, instants: int = 16,
     )
 
 
-def moving(seed: int, instants: int = 40) -> BoardScene:
+def moving(seed: int, instants: int = 28) -> BoardScene:
     """Cameras over a board that is moved by hand, filmed."""
     still = scene(seed, instants=1)
     poses = {f"{i:05d}": moving_pose(i) for i in range(instants)}
