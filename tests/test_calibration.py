@@ -323,6 +323,37 @@ def test_cameras_that_expose_together_have_no_delays():
     assert all(check.delay_frames is None and check.alone_apart < 1.5 for check in found.cameras.values())
 
 
+@pytest.mark.parametrize("worse", ["undetermined", "no better", "few views", "no halves"])
+def test_delays_that_explain_nothing_are_not_taken(monkeypatch, worse):
+    """Doubtful views are tried with delays; the calibration without stays where these fail, or leave much out."""
+    truth = scene(5)
+    rng = np.random.default_rng(0)
+    views = views_of(truth, BOARD, 0.05, rng)
+    for key, view in views.items():
+        if key[0] == "cam1":
+            views[key] = BoardView(view.corner, view.pixels + rng.normal(0, 0.6, 2))
+    usual, tried = calibrate._described, []
+
+    def described(found, *rest):
+        made = usual(found, *rest)
+        if found.scene.timing is None:
+            unchecked = {name: replace(each, held_out_px=None) for name, each in made.cameras.items()}
+            return replace(made, cameras=unchecked) if worse == "no halves" else made
+        tried.append(worse)
+        if worse == "undetermined":
+            raise ReconstructionError("calibration: the images do not determine all parameters")
+        held_out = 1e-3 if worse in ("few views", "no halves") else 10.0
+        some = dict(list(made.views.items())[:20]) if worse == "few views" else made.views
+        return replace(
+            made, views=some, cameras={n: replace(each, held_out_px=held_out) for n, each in made.cameras.items()}
+        )
+
+    monkeypatch.setattr(calibrate, "_described", described)
+    found = calibrated(truth, views)
+    assert tried == [worse]
+    assert all(check.delay_frames is None for check in found.cameras.values())
+
+
 def test_a_parabola_goes_through_what_it_is_of():
     frames = np.array([[4.0, 2.0, 5.0], [7.0, 8.0, np.nan], [3.0, np.nan, np.nan]])
     times, paths = np.array([4.6, 7.4, 3.9]), ([0.5, -2.0, 1.0], [3.0, 1.0], [2.0])

@@ -39,6 +39,7 @@ from cuspid.reporting.pages.scan import ReportOptions, histogram, worst_places
 from cuspid.reporting.pages.scene import camera_lines
 from cuspid.reporting.pages.shown_mesh import UM_PER_STEP, UNKNOWN, pack_mesh, pack_um, simplified
 from cuspid.reporting.pages.study import heading
+from cuspid.rig import Rig
 from report_folders import (
     BUMP_UM,
     FRAMES,
@@ -410,6 +411,10 @@ def test_the_page_of_a_calibration(tmp_path):
     for said in ("&lt;other&gt;", "960", "+0.25 ± 0.10", "gamma stays", "3.000", "1.020 ± 0.3 %", "0.08"):
         assert said in page, said
     assert page.count("<img") == 1
+    drawn = storage.read_handpiece(tmp_path / "handpiece.json")
+    bare = {name: replace(each, covariance=None) for name, each in drawn.rig.cameras.items()}
+    storage.write_handpiece(tmp_path / "handpiece.json", replace(drawn, rig=Rig(bare)))
+    assert page.count("<td>–</td>") + 4 == report_page(storage.read_result(tmp_path)).count("<td>–</td>")
     (tmp_path / "handpiece.json").unlink()
     assert "the cameras: run cuspid calibrate again" in report_page(storage.read_result(tmp_path))
     assert "nothing to view in 3-D" in refused_view(tmp_path)

@@ -72,3 +72,5 @@ def test_a_lens_without_an_inverse_has_none():
     sigma = projection_sigma_px(folded)
     assert np.isnan(sigma).any()
     assert np.isfinite(sigma[8:16, 12:20]).all()
+    nowhere = replace(folded, principal_point_px=np.array([-2e4, -2e4]))
+    assert np.isnan(projection_sigma_px(nowhere)).all()

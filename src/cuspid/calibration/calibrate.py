@@ -36,7 +36,7 @@ _MUCH_MORE = 3.0
 """Ratio of the residuals together with other cameras to those alone, beyond which a note is given."""
 _LESS = 0.9
 """Residuals in views that a calibration was not made from, as a share of those if all cameras exposed together, below
-which they did not."""
+which they did not; and the share of the views that must then remain."""
 _BLOCK = 6
 """Number of successive instants that stay in the same half, where cameras do not expose together."""
 _OPEN_SHARE = 0.01
@@ -130,9 +130,18 @@ def calibrate_rig(
     frame = numbered(start.rig_from_board)
     if frame is None or not any(_is_doubtful_together(check) for check in together.cameras.values()):
         return together
-    found, notes = _without_outliers(untied(start, frame, chosen), chosen, board, options)
-    apart = _described(found, chosen, board, alone, notes)
-    return apart if _held_out_px(apart) < _LESS * _held_out_px(together) else together
+    try:
+        found, notes = _without_outliers(untied(start, frame, chosen), chosen, board, options)
+        apart = _described(found, chosen, board, alone, notes)
+    except ReconstructionError:  # the images do not tell delays as well
+        return together
+    return apart if _is_better(apart, together) else together
+
+
+def _is_better(apart: RigCalibration, together: RigCalibration) -> bool:
+    """Whether delays explain images that they were not estimated from, and not by leaving out views."""
+    before, after = _held_out_px(together), _held_out_px(apart)
+    return bool(np.isfinite(before) and after < _LESS * before and len(apart.views) > _LESS * len(together.views))
 
 
 def _is_worse_together(check: CameraCheck) -> bool:
@@ -141,6 +150,7 @@ def _is_worse_together(check: CameraCheck) -> bool:
 
 
 def _is_doubtful_together(check: CameraCheck) -> bool:
+    """Whether a camera may have exposed at other moments than the others."""
     return _is_worse_together(check) or check.alone_apart > _DOUBTFUL
 
 

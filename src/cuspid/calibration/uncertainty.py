@@ -53,7 +53,7 @@ def _without_turn(
     sigma = np.ones(len(lens))
     for _ in range(_ROUNDS):
         weighted = (turn / np.maximum(sigma, _LEAST_PX)[:, None, None] ** 2).reshape(-1, 3)
-        away = np.linalg.solve(weighted.T @ turn.reshape(-1, 3), weighted.T @ lens.reshape(-1, 8))
+        away = np.linalg.pinv(weighted.T @ turn.reshape(-1, 3)) @ weighted.T @ lens.reshape(-1, 8)
         left = lens - turn @ away
         spread = np.einsum("nik,kl,njl->nij", left, covariance, left)
         sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(spread)[:, -1], 0))

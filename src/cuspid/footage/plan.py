@@ -337,9 +337,10 @@ def _doubts_by_flash(instants: Sequence[Instant], looks: Mapping[str, Looks], op
     """Cameras that saw a single flash at other instants."""
     seen: dict[str, int] = {}
     for camera, each in sorted(looks.items()):
-        with suppress(InputError, ValueError, StopIteration):
-            (flash,) = flashes_of(camera, each.level_dn, options)
-            seen[camera] = next(k for k, instant in enumerate(instants) if instant.numbers.get(camera) == flash)
+        with suppress(InputError, StopIteration):
+            flashes = flashes_of(camera, each.level_dn, options)
+            if len(flashes) == 1:
+                seen[camera] = next(k for k, at in enumerate(instants) if at.numbers.get(camera) == flashes[0])
     if seen and max(seen.values()) - min(seen.values()) > 1:
         places = ", ".join(f"{camera} {instants[k].name}" for camera, k in seen.items())
         yield f"the cameras saw a flash at different frames ({places}); check them, or give --sync flash"

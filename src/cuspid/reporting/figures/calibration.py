@@ -156,7 +156,9 @@ def save_uncertainty_picture(
         axes = figure.add_subplot(rows, columns, index + 1)
         extent = (0.0, float(camera.width), float(camera.height), 0.0)
         drawn = axes.imshow(sigma_px[name], cmap=colours, norm=LogNorm(*_SIGMAS_PX), extent=extent)
-        axes.set_title(f"{name}: {np.nanmedian(sigma_px[name]):.2g} px (median)", fontsize=10, color=_INK)
+        known = sigma_px[name][np.isfinite(sigma_px[name])]
+        middle = f"{np.median(known):.2g} px (median)" if known.size else "not known"
+        axes.set_title(f"{name}: {middle}", fontsize=10, color=_INK)
         axes.tick_params(labelsize=7, colors=_INK)
         bar = figure.colorbar(drawn, ax=axes, shrink=0.6, extend="both", label="px")
         bar.ax.tick_params(labelsize=7, colors=_INK)

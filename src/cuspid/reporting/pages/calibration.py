@@ -47,7 +47,7 @@ def _lens(mounted: MountedCamera) -> list[str]:
     """Each parameter with its standard deviation."""
     sigma = _sigmas(mounted.camera.covariance, 8)
     return [
-        f"{number(value, digits)} ± {number(each, digits)}"
+        f"{number(value, digits)} ± {number(_known(each), digits)}"
         for value, each, digits in zip(mounted.camera.parameters, sigma, _DIGITS, strict=True)
     ]
 
@@ -56,10 +56,15 @@ def _place(mounted: MountedCamera) -> dict[str, Any]:
     sigma = _sigmas(mounted.covariance, 6)
     return {
         "centre_mm": [number(value, 3) for value in mounted.centre_in_rig],
-        "sigma_um": number(1000 * float(np.linalg.norm(sigma[3:])), 1),
-        "sigma_deg": number(float(np.rad2deg(np.linalg.norm(sigma[:3]))), 3),
+        "sigma_um": number(_known(1000 * np.linalg.norm(sigma[3:])), 1),
+        "sigma_deg": number(_known(np.rad2deg(np.linalg.norm(sigma[:3]))), 3),
     }
 
 
 def _sigmas(covariance: Float[np.ndarray, "n n"] | None, size: int) -> Float[np.ndarray, "n"]:
-    return np.zeros(size) if covariance is None else np.sqrt(np.diag(covariance))
+    """NaN where nothing is stated."""
+    return np.full(size, np.nan) if covariance is None else np.sqrt(np.diag(covariance))
+
+
+def _known(value: np.floating[Any]) -> float | None:
+    return float(value) if np.isfinite(value) else None
