@@ -316,6 +316,17 @@ def test_cameras_that_run_freely_are_calibrated_along_the_path_of_the_board(seed
     assert any("may not have seen the board at the same moment" in note for note in together.notes)
 
 
+def test_instants_follow_each_other_by_their_numbers():
+    """Not by their names, of which 10 would come before 2."""
+    truth = moving(0, instants=24)
+    views = freely_running(truth, 0, {"cam0": 0.0, "cam1": 0.7, "cam2": 0.2}, 0.1, 0.05)
+    short = {(camera, str(int(instant))): view for (camera, instant), view in views.items()}
+    one, other = (calibrated(truth, each) for each in (views, short))
+    for name, check in one.cameras.items():
+        assert check.delay_frames is not None
+        assert other.cameras[name].held_out_px == pytest.approx(check.held_out_px, rel=1e-3)
+
+
 def test_cameras_that_expose_together_have_no_delays():
     truth = moving(0)
     found = calibrated(truth, freely_running(truth, 0, dict.fromkeys(truth.cameras, 0.0), 0.0, 0.1))

@@ -292,12 +292,15 @@ def _described(
 
 
 def _delays(scene: BoardScene, views: Views) -> dict[str, tuple[float, float] | tuple[None, None]]:
-    """Of each camera, how many frames after the mean of all it exposed, and the standard deviation of that."""
+    """Of each camera, how many frames after the mean of those that saw the board with it it exposed, and the standard
+    deviation of that."""
     if scene.timing is None:
         return dict.fromkeys(scene.cameras, (None, None))
     seen = {instant: [camera for camera, at in views if at == instant] for _, instant in views}
     late: dict[str, list[float]] = {name: [] for name in scene.cameras}
     for instant, cameras in seen.items():
+        if len(cameras) == 1:  # nothing to compare with
+            continue
         delays = [scene.timing.delay(camera, instant) for camera in cameras]
         for camera, delay in zip(cameras, delays, strict=True):
             late[camera].append(delay - float(np.mean(delays)))
@@ -363,8 +366,8 @@ def _cross_validated(
 ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
     """Of two halves of the instants, each calibrated for itself: the residuals in the other one, and how far they are
     from each other. Nothing where a half is too small, or its cameras fall into groups."""
-    instants = sorted({instant for _, instant in views})
-    block = 1 if found.scene.timing is None else _BLOCK
+    timing, block = found.scene.timing, 1 if found.scene.timing is None else _BLOCK
+    instants = sorted({instant for _, instant in views}, key=None if timing is None else timing.frame.__getitem__)
     half = {instant: index // block % 2 for index, instant in enumerate(instants)}
     halves = [{key: view for key, view in views.items() if half[key[1]] == k} for k in range(2)]
     counts = [Counter(camera for camera, _ in half) for half in halves]
