@@ -1,4 +1,4 @@
-"""Sections of docs/benchmarks.md on jaws, mouths and metrology objects."""
+"""Sections of the pages of results on jaws, mouths and metrology objects."""
 
 from __future__ import annotations
 

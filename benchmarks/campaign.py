@@ -1,14 +1,16 @@
-"""Measure anew what no longer holds, one benchmark after the other, all at the current commit.
+"""Measure anew what no longer holds, one benchmark after the other, all at one commit: the current one unless told.
 
-    python benchmarks/campaign.py [--list] [--only NAME ...] [--hours H] [--work FOLDER]
+    python benchmarks/campaign.py [--release] [--commit C] [--list] [--only NAME ...] [--hours H] [--work FOLDER]
                                   [--jaws FOLDER] [--pairs FOLDER] [--ball FOLDER]
 
 The commit is checked out into the work folder, so that work can go on meanwhile. Each result goes to
 benchmarks/results as soon as it is there; a campaign that was stopped goes on with what does not hold by then
-(:mod:`freshness`), and finished parts of most benchmarks are kept in the work folder. Nothing is begun after
-``--hours``. Scans of your own (``--jaws``), rectified photographs of two cameras (``--pairs``) and photographs of a
-glossy ball (``--ball``) are not part of the project: without them, the benchmarks that need them are left out. Then
-make the page (``python benchmarks/page.py``). Pictures for the documentation stay in the work folder.
+(:mod:`freshness`), and finished parts of most benchmarks are kept in the work folder. With ``--release`` it measures
+the benchmarks of a release, those that are not of this very commit; to go on with them after other commits, name
+theirs. Nothing is begun after ``--hours``. Scans of your own (``--jaws``), rectified photographs of two cameras
+(``--pairs``) and photographs of a glossy ball (``--ball``) are not part of the project: without them, the benchmarks
+that need them are left out. Then make the page (``python benchmarks/page.py``). Pictures for the documentation stay in
+the work folder.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 
-from freshness import ROOT, changes
+from freshness import ROOT, changes, maker_of
 
 RESULTS = ROOT / "benchmarks" / "results"
 GIVEN = ("jaws", "pairs", "ball")
@@ -48,10 +50,13 @@ class Benchmark:
             f"--{what}" for what in ("jaws", "pairs", "ball") if f"{{{what}}}" in self.command and what not in given
         ]
 
-    def stale(self) -> bool:
-        """Whether there is no result, or one that no longer holds."""
+    def holds(self, release: str | None) -> bool:
+        """Whether there is a result that holds: one of the commit of the release where there is one."""
         file = RESULTS / f"{self.name}.json"
-        return not file.exists() or bool(changes(self.name, json.loads(file.read_text())))
+        if not file.exists():
+            return False
+        result = json.loads(file.read_text())
+        return not changes(self.name, result) if release is None else release.startswith(result["commit"])
 
 
 def case(name: str, options: str = "") -> Benchmark:
@@ -90,6 +95,10 @@ BENCHMARKS = (
         "manufacturing_arch",
         "manufacturing.py --jaw {jaws}/fullarch_upper_137k.ply --work {work} --out {out}",
     ),
+    Benchmark(
+        "manufacturing_swept",
+        "manufacturing.py --jaw {jaws}/fullarch_upper_137k.ply --cross-sweep --work {work} --out {out}",
+    ),
     Benchmark("manufacturing_phantom", "manufacturing.py --arch --work {work} --out {out}"),
     Benchmark("design_comparison", "design_comparison.py --work {work} --pictures {work} --out {out}"),
 )
@@ -120,23 +129,24 @@ def measured(benchmark: Benchmark, work: Path, given: Mapping[str, Path]) -> boo
     return True
 
 
-def checked_out(work: Path) -> Path:
-    """The work folder of the current commit, with a clean copy of it."""
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+def checked_out(work: Path, commit: str) -> Path:
+    """The work folder of a commit, with a clean copy of it."""
     own = work / commit[:12]
     if not (own / "checkout").exists():
         own.mkdir(parents=True, exist_ok=True)
         subprocess.run(["git", "clone", "--quiet", ROOT, own / "checkout"], check=True)
-    subprocess.run(["git", "checkout", "--quiet", "--detach", commit.strip()], cwd=own / "checkout", check=True)
+    subprocess.run(["git", "checkout", "--quiet", "--detach", commit], cwd=own / "checkout", check=True)
     return own
 
 
-def asked_for(only: list[str] | None, given: Mapping[str, Path]) -> Iterator[Benchmark]:
+def asked_for(only: list[str] | None, release: str | None, given: Mapping[str, Path]) -> Iterator[Benchmark]:
     """What does not hold and can be measured; says what is left out."""
     for benchmark in BENCHMARKS:
         if only is not None and not any(fnmatch(benchmark.name, each) for each in only):
             continue
-        if not benchmark.stale():
+        if release is not None and not maker_of(benchmark.name).release:
+            continue
+        if benchmark.holds(release):
             print(f"{benchmark.name}: holds")
         elif missing := benchmark.needs(given):
             print(f"{benchmark.name}: left out, needs {', '.join(missing)}")
@@ -147,6 +157,8 @@ def asked_for(only: list[str] | None, given: Mapping[str, Path]) -> Iterator[Ben
 def main() -> None:
     """Measure, and say how it went."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--release", action="store_true", help="what is measured for each release, all at the commit")
+    parser.add_argument("--commit", default="HEAD")
     parser.add_argument("--list", action="store_true", help="say what would be measured, and end")
     parser.add_argument("--only", nargs="*", help="names of results; * and ? stand for any characters")
     parser.add_argument("--hours", type=float, default=float("inf"))
@@ -155,11 +167,14 @@ def main() -> None:
         parser.add_argument(f"--{what}", type=Path)
     arguments = parser.parse_args()
     given = {each: getattr(arguments, each).resolve() for each in GIVEN if getattr(arguments, each) is not None}
-    begin, wanted = time.monotonic(), list(asked_for(arguments.only, given))
+    named = ["git", "rev-parse", f"{arguments.commit}^{{commit}}"]
+    commit = subprocess.run(named, cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
+    begin = time.monotonic()
+    wanted = list(asked_for(arguments.only, commit if arguments.release else None, given))
     if arguments.list:
         print("\n".join(f"{each.name}: would be measured" for each in wanted))
         return
-    work = checked_out(arguments.work.resolve())
+    work = checked_out(arguments.work.resolve(), commit)
     for benchmark in wanted:
         start = time.monotonic()
         if start - begin > 3600 * arguments.hours:

@@ -41,6 +41,8 @@ class Maker:
     """Modules of ``cuspid.cli`` that it runs; ``*`` for all of them."""
     plain: bool = False
     """Whether surfaces without texture take part."""
+    release: bool = False
+    """Whether it is measured anew for each release, together with the others of these, at one commit."""
 
     @property
     def leaves_out(self) -> tuple[str, ...]:
@@ -50,7 +52,7 @@ class Maker:
 
 _SCAN = ("scan", "jaws")
 MAKERS: Mapping[str, Maker] = {
-    **dict.fromkeys(("molar-*", "arch", "real-arch", "spheres", "prepared-*"), Maker("run", _SCAN)),
+    **dict.fromkeys(("molar-*", "arch", "real-arch", "spheres", "prepared-*"), Maker("run", _SCAN, release=True)),
     "motion-*": Maker("compare_motion", _SCAN),
     "qualities": Maker("qualities", _SCAN),
     "mouth": Maker("mouth"),
@@ -71,17 +73,22 @@ MAKERS: Mapping[str, Maker] = {
     "expectations": Maker("expectations"),
     "targets": Maker("targets"),
     "grid": Maker("grid"),
-    "fuzz": Maker("fuzz", ("*",), plain=True),
-    "kill": Maker("kill", ("*",), plain=True),
-    "large": Maker("large", ("*",), plain=True),
+    "fuzz": Maker("fuzz", ("*",), plain=True, release=True),
+    "kill": Maker("kill", ("*",), plain=True, release=True),
+    "large": Maker("large", ("*",), plain=True, release=True),
     "panorama/*": Maker("panorama", ("film", "panorama", "panorama_evaluation")),
 }
 """By the name of the result."""
 
 
+def maker_of(name: str) -> Maker:
+    """What the result of this name is made by."""
+    return next(maker for pattern, maker in MAKERS.items() if fnmatch(name, pattern))
+
+
 def changes(name: str, result: Result) -> tuple[str, ...]:
     """Files that made a result, as far as they have changed since; empty where it still holds."""
-    maker = next(made_by for pattern, made_by in MAKERS.items() if fnmatch(name, pattern))
+    maker = maker_of(name)
     changed: set[str] = set()
     for commit in _commits(result):
         changed |= {UNTOLD} if commit is None or commit.endswith("-dirty") else _changed_since(commit, maker)

@@ -1,4 +1,4 @@
-"""Sections of docs/benchmarks.md on handpieces."""
+"""Sections of the pages of results on handpieces."""
 
 from __future__ import annotations
 

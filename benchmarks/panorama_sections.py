@@ -1,4 +1,4 @@
-"""Section of docs/benchmarks.md on panoramas."""
+"""Section of the pages of results on panoramas."""
 
 from __future__ import annotations
 

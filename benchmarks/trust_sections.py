@@ -1,4 +1,4 @@
-"""Sections of docs/benchmarks.md on qualities, what scans expect, damaged input, killed runs and large meshes."""
+"""Sections of the pages of results on qualities, what scans expect, damaged input, killed runs and large meshes."""
 
 from __future__ import annotations
 

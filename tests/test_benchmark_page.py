@@ -3,7 +3,6 @@
 import json
 import shutil
 import subprocess
-from fnmatch import fnmatch
 from importlib import import_module
 from pathlib import Path
 
@@ -101,18 +100,31 @@ def test_code_that_nobody_has_is_no_code_of_a_result(freshness, repository, comm
     assert freshness.changes("molar-seed0", {"commit": commit})
 
 
-def test_every_result_has_a_maker_and_a_place_on_the_page(freshness):
+def of_release(freshness, results: dict) -> dict:
+    return {name: result for name, result in results.items() if freshness.maker_of(name).release}
+
+
+def test_every_result_has_a_maker_and_a_place_on_a_page(freshness):
     page = import_module("page")
     results = page.read(ROOT / "benchmarks" / "results")
-    text = page.page(results, {})
-    for name, result in results.items():
-        assert any(fnmatch(name, pattern) for pattern in freshness.MAKERS), name
-        assert str(result["commit"]) in text, name
-    assert "older code" not in text
-    shown = page.page(results, dict.fromkeys(results, ("src/a.py", "src/b.py", "src/c.py", "src/d.py")))
-    assert f"0 of {len(results)} results hold" in shown
-    assert "| molar-seed0 (older code) |" in shown
-    assert "`src/a.py`, `src/b.py`, `src/c.py` and 1 more" in shown
+    release = of_release(freshness, results)
+    others = {name: result for name, result in results.items() if name not in release}
+    for write, chosen in ((page.benchmarks, release), (page.experiments, others)):
+        text = write(chosen, {})
+        for name, result in chosen.items():
+            assert str(result["commit"]) in text, name
+        assert "older code" not in text
+        shown = write(chosen, dict.fromkeys(results, ("src/a.py", "src/b.py", "src/c.py", "src/d.py")))
+        assert f"0 of {len(chosen)} results hold" in shown
+        assert "`src/a.py`, `src/b.py`, `src/c.py` and 1 more" in shown
+        assert ("| molar-seed0 (older code) |" in shown) == (chosen is release)
+
+
+def test_benchmarks_of_several_commits_are_refused(freshness):
+    page = import_module("page")
+    release = of_release(freshness, page.read(ROOT / "benchmarks" / "results"))
+    with pytest.raises(SystemExit, match="of several commits: run "):
+        page.benchmarks(release | {"kill": {**release["kill"], "commit": "0123456789ab"}}, {})
 
 
 def test_a_campaign_measures_what_no_longer_holds(freshness, repository, monkeypatch, capsys):
@@ -145,3 +157,25 @@ def test_a_campaign_measures_what_no_longer_holds(freshness, repository, monkeyp
     assert not (results / "precision.json").exists()
     campaign.main()
     assert "mouth: holds\n" in capsys.readouterr().out
+
+
+def test_a_release_is_measured_at_its_own_commit(freshness, repository, monkeypatch, capsys):
+    """Also what would still hold, and later on where that commit is named."""
+    campaign = import_module("campaign")
+    release = commit_of(repository)
+    commits = {"molar-seed0": release, "kill": release, "fuzz": "0123456789ab", "mouth": "0123456789ab"}
+    results = repository / "benchmarks" / "results"
+    results.mkdir()
+    for name, commit in commits.items():
+        (results / f"{name}.json").write_text(json.dumps({"commit": commit}))
+    add(repository, "CHANGELOG.md", "Something else.\n")
+    for command in (("add", "."), ("-c", "user.name=n", "-c", "user.email=e@x.org", "commit", "-qm", "else")):
+        subprocess.run(["git", "-C", str(repository), *command], check=True)
+    monkeypatch.setattr(campaign, "ROOT", repository)
+    monkeypatch.setattr(campaign, "RESULTS", results)
+    monkeypatch.setattr(campaign, "BENCHMARKS", [campaign.Benchmark(name, "toy.py") for name in commits])
+    for told, measured in ([], ["molar-seed0", "kill", "fuzz"]), (["--commit", release], ["fuzz"]):
+        monkeypatch.setattr("sys.argv", ["campaign.py", "--release", "--list", *told])
+        campaign.main()
+        lines = capsys.readouterr().out.splitlines()
+        assert [line.split(":")[0] for line in lines if line.endswith("would be measured")] == measured
