@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
+from cuspid import storage
 from cuspid.errors import InputError
-from cuspid.evaluation.margin import MarginOptions, margin_error, margin_errors
+from cuspid.evaluation.margin import MarginOptions, cut_margin, cut_margins
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
+from verbs import run
 
 TURNS = 180
 RADIUS_MM = 3.0
@@ -43,7 +48,7 @@ def rim() -> np.ndarray:
 
 
 def test_the_reference_against_itself_is_the_floor() -> None:
-    error = margin_error(stump(), stump(), rim())
+    error = cut_margin(stump(), stump(), rim()).error()
     assert error.floor == error.scan
     assert error.floor.found_pct == 100
     assert error.floor.sections > 150
@@ -55,7 +60,7 @@ def test_the_reference_against_itself_is_the_floor() -> None:
 def test_a_scan_that_is_too_high_or_too_low_is_measured(towards: float, shift_um: float) -> None:
     sign = 1 if towards < np.pi else -1
     moved = stump().transformed(Rigid3(np.eye(3), np.array([0.0, 0.0, sign * shift_um / 1000])))
-    found = margin_error(moved, stump(), rim()).scan
+    found = cut_margin(moved, stump(), rim()).error().scan
     assert found.mean_um == pytest.approx(shift_um, abs=5)
     # The edge is square: its bisector leans by 45 degrees, and lateral points down and outwards.
     assert found.outward_um == pytest.approx(sign * shift_um / np.sqrt(2), abs=5)
@@ -65,14 +70,14 @@ def test_a_scan_that_is_too_high_or_too_low_is_measured(towards: float, shift_um
 def test_a_larger_stump_moves_the_margin_both_outwards_and_aside() -> None:
     reference = stump()
     larger = Mesh(reference.vertices * [1.01, 1.01, 1.0], reference.faces)
-    found = margin_error(larger, reference, rim()).scan
+    found = cut_margin(larger, reference, rim()).error().scan
     assert found.mean_um == pytest.approx(30, abs=5)
     assert found.lateral_um == pytest.approx(30 / np.sqrt(2), abs=4)
 
 
 @pytest.mark.parametrize("fillet_mm", [0.04, 0.08])
 def test_a_rounded_edge_lies_inwards(fillet_mm: float) -> None:
-    found = margin_error(stump(fillet_mm), stump(), rim()).scan
+    found = cut_margin(stump(fillet_mm), stump(), rim()).error().scan
     expected_um = 1000 * fillet_mm * (np.sqrt(2) - 1)
     assert found.outward_um == pytest.approx(-expected_um, abs=4)
     assert found.lateral_um == pytest.approx(0, abs=4)
@@ -82,14 +87,14 @@ def test_a_rounded_edge_lies_inwards(fillet_mm: float) -> None:
 def test_what_the_scan_lacks_is_not_found() -> None:
     reference = stump()
     half = reference.submesh(reference.face_centres[:, 0] > 0)
-    found = margin_error(half, reference, rim()).scan
+    found = cut_margin(half, reference, rim()).error().scan
     assert 40 < found.found_pct < 52
     assert found.mean_um < 5
 
 
 def test_a_scan_elsewhere_has_no_edge() -> None:
     far = stump().transformed(Rigid3(np.eye(3), np.array([50.0, 0.0, 0.0])))
-    found = margin_error(far, stump(), rim()).scan
+    found = cut_margin(far, stump(), rim()).error().scan
     assert found.found_pct == 0
     assert np.isnan(found.mean_um)
 
@@ -97,15 +102,49 @@ def test_a_scan_elsewhere_has_no_edge() -> None:
 def test_margins_are_named_by_tooth_and_the_alignment_is_applied() -> None:
     away = Rigid3.from_rotation_vector(np.array([0.1, -0.2, 0.3]), np.array([1.0, 2.0, 3.0]))
     jaw = Jaw(mesh=stump(), lines={"45.margin": rim(), "46.crack": rim()})
-    errors = margin_errors(stump().transformed(away), jaw, away.inverse())
-    assert list(errors) == [45]
-    assert errors[45].scan.max_um < 5
+    margins = cut_margins(stump().transformed(away), jaw, away.inverse())
+    assert list(margins) == [45]
+    assert margins[45].error().scan.max_um < 5
+
+
+@pytest.mark.parametrize("up_mm", [0.05, -0.05])
+def test_sections_show_where_the_scan_lies(up_mm: float) -> None:
+    """The edge is square, so the scan's is the reference's, moved, in coordinates of its own."""
+    moved = stump().transformed(Rigid3(np.eye(3), np.array([0.0, 0.0, up_mm])))
+    cut = cut_margin(moved, stump(), rim())
+    shift = up_mm * np.array([-1.0, 1.0]) / np.sqrt(2)
+    for section in cut.sections:
+        assert np.hypot(*section.place_mm[:2]) == pytest.approx(RADIUS_MM, abs=0.002)
+        assert section.scan is not None
+        assert section.scan_edge == pytest.approx(section.reference_edge + shift, abs=0.01)
+        lateral, outward = section.reference.T
+        assert outward == pytest.approx(-np.abs(lateral), abs=0.01)
+        assert np.abs(section.scan - shift) @ [-1, 0] == pytest.approx((section.scan - shift)[:, 1], abs=0.01)
+    assert len(cut.sections) == cut.error().scan.sections
 
 
 def test_a_line_that_is_no_edge_is_refused() -> None:
     with pytest.raises(InputError, match="no edge"):
-        margin_error(stump(), stump(), rim() * [0.6, 0.6, 1.0])
+        cut_margin(stump(), stump(), rim() * [0.6, 0.6, 1.0])
     with pytest.raises(InputError, match="too short"):
-        margin_error(stump(), stump(), rim()[:4])
+        cut_margin(stump(), stump(), rim()[:4])
     with pytest.raises(InputError, match="flanks"):
         MarginOptions(flank_from_mm=0.5)
+
+
+def test_margins_are_measured_and_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A tooth whose edge was scanned 50 um too low."""
+    for costly in ("save_deviation_picture", "report"):
+        monkeypatch.setattr(f"cuspid.cli.scan.{costly}", lambda *_, **__: None)
+    tooth, low, out = stump(), Rigid3(np.eye(3), np.array([0.0, 0.0, -0.05])), tmp_path / "out"
+    labels = np.full(len(tooth.faces), 46, dtype=np.int32)
+    storage.write_jaw(tmp_path / "jaw.ply", Jaw(mesh=tooth, face_labels=labels, lines={"46.margin": rim()}))
+    storage.write_mesh(tmp_path / "scan.ply", tooth.transformed(low))
+    run("evaluate", tmp_path / "scan.ply", tmp_path / "jaw.ply", "--out", out, "--no-align", "--samples", 2000)
+    assert storage.read_json(out / "margins.json")["46"]["scan"]["mean_um"] == pytest.approx(50, abs=5)
+    assert "Margins in µm" in capsys.readouterr().out
+    assert out / "margins.png" in storage.read_result(out).pictures.values()
+    pixels = np.asarray(Image.open(out / "margins.png").convert("RGB")).astype(int)
+    assert (np.ptp(pixels, axis=2) > 120).mean() > 0.001, "the scan is drawn in red"

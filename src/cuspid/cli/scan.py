@@ -19,7 +19,7 @@ from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress, suited
 from cuspid.errors import InputError
 from cuspid.evaluation.deviation import EvaluationOptions
-from cuspid.evaluation.margin import MarginError, margin_errors
+from cuspid.evaluation.margin import MarginError, cut_margins
 from cuspid.evaluation.spheres import SphereReport, evaluate_spheres
 from cuspid.evaluation.trajectory import trajectory_error
 from cuspid.jaw import Jaw
@@ -30,6 +30,7 @@ from cuspid.options import Range
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.reconstruction import Expectation, Reconstruction
 from cuspid.reporting.figures.drawing import deviation_colors, save_deviation_picture, save_expected_picture
+from cuspid.reporting.figures.margin import save_margin_picture
 from cuspid.reporting.figures.sphere import save_sphere_picture
 from cuspid.rig import Handpiece
 from cuspid.tolerances import NominalOptions, is_nominal
@@ -185,7 +186,7 @@ def _measure_trueness(mesh: Path, reference: Path, out: Path, source: Source, op
         _evaluate_margins(scan, known, trueness, out)
 
 
-_FURTHER = ("trajectory.json", "spheres.json", "spheres.png", "margins.json")
+_FURTHER = ("trajectory.json", "spheres.json", "spheres.png", "margins.json", "margins.png")
 """What only some scans have."""
 
 
@@ -230,9 +231,11 @@ def _evaluate_spheres(scan: Mesh, reference: Jaw, trueness: Trueness, out: Path)
 def _evaluate_margins(scan: Mesh, reference: Jaw, trueness: Trueness, out: Path) -> None:
     """Margins of preparations, on the teeth that were scanned."""
     lines = {name: line for name, line in reference.lines.items() if int(name.split(".")[0]) in trueness.per_tooth}
-    errors = margin_errors(scan, replace(reference, lines=lines), trueness.reference_from_scan)
+    margins = cut_margins(scan, replace(reference, lines=lines), trueness.reference_from_scan)
+    errors = {fdi: margin.error() for fdi, margin in margins.items()}
     storage.write_json(out / "margins.json", errors)
     if errors:
+        save_margin_picture(out / "margins.png", margins)
         _print_margins(errors)
 
 

@@ -91,6 +91,44 @@ class MarginError:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class MarginSection:
+    """Scan and reference in the plane across the line at one place; coordinates are (lateral, outward), mm."""
+
+    place_mm: Float[np.ndarray, "3"]
+    """The place on the line, in the frame of the reference: the origin of the coordinates."""
+    reference: Float[np.ndarray, "m 2"]
+    """The section of the reference, its outside to the right."""
+    reference_edge: Float[np.ndarray, "2"]
+    """The edge that was found in it."""
+    scan: Float[np.ndarray, "k 2"] | None
+    """The section of the scan; None where it has no surface there."""
+    scan_edge: Float[np.ndarray, "2"] | None
+    """The edge that was found in it, if any."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CutMargin:
+    """A margin, cut at places along its line."""
+
+    line: Float[np.ndarray, "n 3"]
+    """The true line."""
+    stations: int
+    """Number of places along it, those that are not evaluated included."""
+    sections: tuple[MarginSection, ...]
+    """Those that are evaluated, in their order along the line; at least one."""
+
+    def error(self) -> MarginError:
+        """How far the scan's edge lies from the line, and the reference's own edge with the same detector."""
+        nothing = np.full(2, np.nan)
+        found = [nothing if each.scan_edge is None else each.scan_edge for each in self.sections]
+        return MarginError(
+            scan=_statistics(np.array(found)),
+            evaluated_pct=100 * len(self.sections) / self.stations,
+            floor=_statistics(np.array([each.reference_edge for each in self.sections])),
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _Edge:
     """An edge in a section, in the plane's coordinates."""
 
@@ -100,40 +138,56 @@ class _Edge:
     """Unit bisector out of the solid."""
 
 
-def margin_errors(
+def cut_margins(
     scan: Mesh, reference: Jaw, reference_from_scan: Rigid3, options: MarginOptions = MarginOptions()
-) -> Mapping[int, MarginError]:
-    """Errors of the margins ``<FDI>.margin`` of a reference in an aligned scan, by FDI number."""
+) -> Mapping[int, CutMargin]:
+    """The margins ``<FDI>.margin`` of a reference, cut together with an aligned scan, by FDI number."""
     aligned = scan.transformed(reference_from_scan)
     names = [name for name in reference.lines if name.endswith(".margin")]
     return {
-        int(name.split(".")[0]): margin_error(aligned, reference.mesh, reference.lines[name], options) for name in names
+        int(name.split(".")[0]): cut_margin(aligned, reference.mesh, reference.lines[name], options) for name in names
     }
 
 
-def margin_error(
+def cut_margin(
     scan: Mesh, reference: Mesh, line: Float[np.ndarray, "n 3"], options: MarginOptions = MarginOptions()
-) -> MarginError:
-    """Error of one margin, a closed line on the reference (its last point is its first), in an aligned scan.
+) -> CutMargin:
+    """One margin, a closed line on the reference (its last point is its first), cut together with an aligned scan.
 
     Raises InputError where the line is too short or the reference has no edge along it.
     """
     points, tangents, count = _stations(line, options.step_mm)
     slicers = _Slicer(reference, points), _Slicer(scan, points)
-    own, found = [], []
-    for point, tangent in zip(points, tangents, strict=True):
-        axes = _axes(tangent)
-        true = _edge(slicers[0].section(point, tangent, axes, options), options)
-        if true is None or 1000 * np.linalg.norm(true.point) > options.most_floor_um:
-            continue
-        frame = np.stack([true.outward, _lateral(axes, tangent, true.outward)])
-        own.append(frame @ true.point)
-        edge = _edge(slicers[1].section(point, tangent, axes, options), options)
-        found.append(np.full(2, np.nan) if edge is None else frame @ edge.point)
-    if not own:
+    sections = (_section(*slicers, *station, options) for station in zip(points, tangents, strict=True))
+    evaluated = tuple(each for each in sections if each is not None)
+    if not evaluated:
         raise InputError("margin: the reference has no edge along its margin line; check that it belongs to this mesh")
-    evaluated_pct = 100 * len(own) / count
-    return MarginError(scan=_statistics(np.array(found)), evaluated_pct=evaluated_pct, floor=_statistics(np.array(own)))
+    return CutMargin(line=line, stations=count, sections=evaluated)
+
+
+def _section(
+    reference: _Slicer,
+    scan: _Slicer,
+    point: Float[np.ndarray, "3"],
+    tangent: Float[np.ndarray, "3"],
+    options: MarginOptions,
+) -> MarginSection | None:
+    """The section at a point of the line; None where the reference's own edge is not clear."""
+    axes = _axes(tangent)
+    own = reference.section(point, tangent, axes, options)
+    true = _edge(own, options)
+    if own is None or true is None or 1000 * np.linalg.norm(true.point) > options.most_floor_um:
+        return None
+    found = scan.section(point, tangent, axes, options)
+    edge = _edge(found, options)
+    turned = np.stack([_lateral(axes, tangent, true.outward), true.outward], axis=1)
+    return MarginSection(
+        place_mm=point,
+        reference=own @ turned,
+        reference_edge=true.point @ turned,
+        scan=None if found is None else found @ turned,
+        scan_edge=None if edge is None else edge.point @ turned,
+    )
 
 
 def _statistics(offsets_mm: Float[np.ndarray, "n 2"]) -> MarginStatistics:
@@ -152,8 +206,8 @@ def _statistics(offsets_mm: Float[np.ndarray, "n 2"]) -> MarginStatistics:
         std_um=float(distance_um.std()),
         p95_um=float(np.percentile(distance_um, 95)),
         max_um=float(distance_um.max()),
-        outward_um=float(1000 * known[:, 0].mean()),
-        lateral_um=float(1000 * known[:, 1].mean()),
+        outward_um=float(1000 * known[:, 1].mean()),
+        lateral_um=float(1000 * known[:, 0].mean()),
     )
 
 

@@ -215,6 +215,7 @@ def _read_scan(folder: Path, run: Mapping[str, Any], reference: Path | None, uni
 _SCAN_PICTURES = {
     "expected.png": "How well each place is expected to be known (one standard deviation along the normal)",
     "spheres.png": "The spheres, measured without a best fit",
+    "margins.png": "The margins of preparations, in sections across them",
 }
 
 
