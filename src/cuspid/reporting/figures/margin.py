@@ -69,7 +69,7 @@ def _draw_section(axes: Axes, number: int, section: MarginSection) -> None:
     if section.scan_edge is not None:
         axes.plot(*section.scan_edge, "o", color=_FOUND, markersize=5)
     axes.set_title(f"{number}: {_told(section)}", fontsize=11, color=_INK)
-    left, low = -_HALF_MM + 0.03, -_BELOW_MM + 0.03
+    left, low = -0.12, -_BELOW_MM + 0.03
     axes.plot([left, left + _BAR_MM], [low, low], color=_INK, linewidth=2)
     axes.text(left + _BAR_MM + 0.02, low, f"{1000 * _BAR_MM:.0f} µm", fontsize=9, color=_INK, va="center")
     axes.set_xlim(-_HALF_MM, _HALF_MM)
@@ -78,10 +78,10 @@ def _draw_section(axes: Axes, number: int, section: MarginSection) -> None:
 
 
 def _with_inside(section: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "k 2"]:
-    """The polygon between a section and a level far inside."""
-    deep = min(section[:, 1].min(), -_BELOW_MM) - 0.1
-    ends = section[[-1, 0]]
-    return np.concatenate([section, np.column_stack([ends[:, 0], [deep, deep]])])
+    """The polygon of a section and what lies inside of it, beyond the edges of the picture."""
+    rightwards = section if section[0, 0] < section[-1, 0] else section[::-1]
+    far, deep = 2 * _HALF_MM, 2 * _BELOW_MM
+    return np.array([*rightwards, [far, rightwards[-1, 1]], [far, -deep], [-far, -deep], [-far, rightwards[0, 1]]])
 
 
 def _told(section: MarginSection) -> str:
