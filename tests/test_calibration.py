@@ -297,7 +297,7 @@ def freely_running(
 
 @pytest.mark.parametrize("seed", range(2))
 def test_cameras_that_run_freely_are_calibrated_along_the_path_of_the_board(seed):
-    """One is 0.7 frames late, and none keeps time: as if they were together, errors are many times what is stated."""
+    """One is 0.7 frames late, and none keeps time."""
     truth, delays = moving(seed), {"cam0": 0.0, "cam1": 0.7, "cam2": 0.2}
     views = freely_running(truth, seed, delays, 0.1, 0.05)
     found = calibrated(truth, views)
@@ -309,22 +309,27 @@ def test_cameras_that_run_freely_are_calibrated_along_the_path_of_the_board(seed
         assert check.delay_frames == pytest.approx(delays[name] - 0.3, abs=0.1)
         assert 0.05 < check.delay_spread_frames < 0.2
         assert f"{name} {check.delay_frames:+.2f} ± {check.delay_spread_frames:.2f}" in told
-    renamed = {(camera, f"a{instant}"): view for (camera, instant), view in views.items()}  # no order of time
-    together = calibrated(truth, renamed)
-    assert all(check.delay_frames is None for check in together.cameras.values())
-    assert max(check.rms_px for check in together.cameras.values()) > 5 * max(c.rms_px for c in found.cameras.values())
+
+
+def test_without_an_order_of_time_cameras_that_run_freely_are_doubted():
+    """As if they were together, errors are many times what is stated."""
+    truth = moving(0)
+    views = freely_running(truth, 0, {"cam0": 0.0, "cam1": 0.7, "cam2": 0.2}, 0.1, 0.05)
+    together = calibrated(truth, {(camera, f"a{instant}"): view for (camera, instant), view in views.items()})
+    assert all(check.delay_frames is None and check.rms_px > 0.25 for check in together.cameras.values())
     assert any("may not have seen the board at the same moment" in note for note in together.notes)
 
 
-def test_instants_follow_each_other_by_their_numbers():
-    """Not by their names, of which 10 would come before 2."""
-    truth = moving(0, instants=24)
-    views = freely_running(truth, 0, {"cam0": 0.0, "cam1": 0.7, "cam2": 0.2}, 0.1, 0.05)
-    short = {(camera, str(int(instant))): view for (camera, instant), view in views.items()}
-    one, other = (calibrated(truth, each) for each in (views, short))
-    for name, check in one.cameras.items():
-        assert check.delay_frames is not None
-        assert other.cameras[name].held_out_px == pytest.approx(check.held_out_px, rel=1e-3)
+def test_halves_are_runs_of_time_where_cameras_do_not_expose_together():
+    """Instants follow each other by their numbers, not by their names, of which 10 would come before 2."""
+    view = BoardView(np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
+    views = {(name, str(instant)): view for name in ("cam0", "cam1") for instant in range(24)}
+    timing = bundle.Timing(frame={str(k): k for k in range(24)}, near={}, by_camera={}, by_view={})
+    halves = calibrate._halves(views, timing)
+    early = {*range(6), *range(12, 18)}
+    assert [{int(instant) for _, instant in half} for half in halves] == [early, set(range(24)) - early]
+    assert sum(len(half) for half in halves) == len(views)
+    assert {instant for _, instant in calibrate._halves(views, None)[0]} == set(sorted(timing.frame)[::2])
 
 
 def test_cameras_that_expose_together_have_no_delays():

@@ -16,6 +16,7 @@ from cuspid.board import Board
 from cuspid.calibration.bundle import (
     Adjusted,
     BoardScene,
+    Timing,
     common_free,
     in_front,
     mounted_cameras,
@@ -37,7 +38,7 @@ _MUCH_MORE = 3.0
 _LESS = 0.9
 """Residuals in views that a calibration was not made from, as a share of those if all cameras exposed together, below
 which they did not; and the share of the views that must then remain."""
-_BLOCK = 6
+_RUN = 6
 """Number of successive instants that stay in the same half, where cameras do not expose together."""
 _OPEN_SHARE = 0.01
 """Standard deviation of a focal length, as a share of it, beyond which a note is given."""
@@ -366,10 +367,7 @@ def _cross_validated(
 ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
     """Of two halves of the instants, each calibrated for itself: the residuals in the other one, and how far they are
     from each other. Nothing where a half is too small, or its cameras fall into groups."""
-    timing, block = found.scene.timing, 1 if found.scene.timing is None else _BLOCK
-    instants = sorted({instant for _, instant in views}, key=None if timing is None else timing.frame.__getitem__)
-    half = {instant: index // block % 2 for index, instant in enumerate(instants)}
-    halves = [{key: view for key, view in views.items() if half[key[1]] == k} for k in range(2)]
+    halves = _halves(views, found.scene.timing)
     counts = [Counter(camera for camera, _ in half) for half in halves]
     cameras = list(found.scene.cameras)
     if any(count[name] < LEAST_VIEWS for count in counts for name in cameras):
@@ -383,6 +381,15 @@ def _cross_validated(
         for (camera, _), residuals in adjust_scene(start, other_views, board, only_boards=True).residuals.items():
             squares[camera].append(residuals)
     return {name: _rms(np.concatenate(each)) for name, each in squares.items()}, _apart(*parts)
+
+
+def _halves(views: Views, timing: Timing | None) -> list[Views]:
+    """The views of every second instant, or where cameras do not expose together of every second run of instants, and
+    the others."""
+    instants = sorted({instant for _, instant in views}, key=None if timing is None else timing.frame.__getitem__)
+    run = 1 if timing is None else _RUN
+    half = {instant: index // run % 2 for index, instant in enumerate(instants)}
+    return [{key: view for key, view in views.items() if half[key[1]] == k} for k in range(2)]
 
 
 def _apart(one: Adjusted, other: Adjusted) -> dict[str, tuple[float, float]]:
