@@ -4,6 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 BPY    := build/blender
+WHEEL  := build/wheel
 
 # Containers often ask Python to keep no bytecode. Each of the many processes of the tests would compile all modules.
 export PYTHONDONTWRITEBYTECODE :=
@@ -36,13 +37,13 @@ docs: $(STAMP).docs
 
 # As users get it: in an environment of its own, far from the sources.
 wheel: $(STAMP)
-	rm -rf build/wheel
-	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir build/wheel .
-	$(PYTHON) -m venv build/wheel/venv
-	build/wheel/venv/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt build/wheel/*.whl
-	cd build/wheel && venv/bin/cuspid handpiece --design four --width-px 160 --height-px 160 --out probe
-	cd build/wheel && venv/bin/cuspid run --handpiece probe/handpiece.json --tooth 46 --frames 6 --length-mm 3 --out scan
-	test -s build/wheel/scan/report.html
+	rm -rf $(WHEEL)
+	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir $(WHEEL) .
+	$(PYTHON) -m venv $(WHEEL)/venv
+	$(WHEEL)/venv/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt $(WHEEL)/*.whl
+	cd $(WHEEL) && venv/bin/cuspid handpiece --design four --width-px 160 --height-px 160 --out probe
+	cd $(WHEEL) && venv/bin/cuspid run --handpiece probe/handpiece.json --tooth 46 --frames 6 --length-mm 3 --out scan
+	test -s $(WHEEL)/scan/report.html
 
 benchmarks: $(STAMP)
 	$(BIN)/python benchmarks/run.py --out benchmarks/results
