@@ -12,7 +12,7 @@ from PIL import Image
 
 from cuspid import storage
 from cuspid.errors import InputError
-from cuspid.evaluation.margin import MarginOptions, cut_margin, cut_margins
+from cuspid.evaluation.margin import MarginOptions, cut_margin, cut_margins, margin_error
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
@@ -48,7 +48,7 @@ def rim() -> np.ndarray:
 
 
 def test_the_reference_against_itself_is_the_floor() -> None:
-    error = cut_margin(stump(), stump(), rim()).error()
+    error = margin_error(cut_margin(stump(), stump(), rim()))
     assert error.floor == error.scan
     assert error.floor.found_pct == 100
     assert error.floor.sections > 150
@@ -60,7 +60,7 @@ def test_the_reference_against_itself_is_the_floor() -> None:
 def test_a_scan_that_is_too_high_or_too_low_is_measured(towards: float, shift_um: float) -> None:
     sign = 1 if towards < np.pi else -1
     moved = stump().transformed(Rigid3(np.eye(3), np.array([0.0, 0.0, sign * shift_um / 1000])))
-    found = cut_margin(moved, stump(), rim()).error().scan
+    found = margin_error(cut_margin(moved, stump(), rim())).scan
     assert found.mean_um == pytest.approx(shift_um, abs=5)
     # The edge is square: its bisector leans by 45 degrees, and lateral points down and outwards.
     assert found.outward_um == pytest.approx(sign * shift_um / np.sqrt(2), abs=5)
@@ -70,14 +70,14 @@ def test_a_scan_that_is_too_high_or_too_low_is_measured(towards: float, shift_um
 def test_a_larger_stump_moves_the_margin_both_outwards_and_aside() -> None:
     reference = stump()
     larger = Mesh(reference.vertices * [1.01, 1.01, 1.0], reference.faces)
-    found = cut_margin(larger, reference, rim()).error().scan
+    found = margin_error(cut_margin(larger, reference, rim())).scan
     assert found.mean_um == pytest.approx(30, abs=5)
     assert found.lateral_um == pytest.approx(30 / np.sqrt(2), abs=4)
 
 
 @pytest.mark.parametrize("fillet_mm", [0.04, 0.08])
 def test_a_rounded_edge_lies_inwards(fillet_mm: float) -> None:
-    found = cut_margin(stump(fillet_mm), stump(), rim()).error().scan
+    found = margin_error(cut_margin(stump(fillet_mm), stump(), rim())).scan
     expected_um = 1000 * fillet_mm * (np.sqrt(2) - 1)
     assert found.outward_um == pytest.approx(-expected_um, abs=4)
     assert found.lateral_um == pytest.approx(0, abs=4)
@@ -87,14 +87,14 @@ def test_a_rounded_edge_lies_inwards(fillet_mm: float) -> None:
 def test_what_the_scan_lacks_is_not_found() -> None:
     reference = stump()
     half = reference.submesh(reference.face_centres[:, 0] > 0)
-    found = cut_margin(half, reference, rim()).error().scan
+    found = margin_error(cut_margin(half, reference, rim())).scan
     assert 40 < found.found_pct < 52
     assert found.mean_um < 5
 
 
 def test_a_scan_elsewhere_has_no_edge() -> None:
     far = stump().transformed(Rigid3(np.eye(3), np.array([50.0, 0.0, 0.0])))
-    found = cut_margin(far, stump(), rim()).error().scan
+    found = margin_error(cut_margin(far, stump(), rim())).scan
     assert found.found_pct == 0
     assert np.isnan(found.mean_um)
 
@@ -104,7 +104,7 @@ def test_margins_are_named_by_tooth_and_the_alignment_is_applied() -> None:
     jaw = Jaw(mesh=stump(), lines={"45.margin": rim(), "46.crack": rim()})
     margins = cut_margins(stump().transformed(away), jaw, away.inverse())
     assert list(margins) == [45]
-    assert margins[45].error().scan.max_um < 5
+    assert margin_error(margins[45]).scan.max_um < 5
 
 
 @pytest.mark.parametrize("up_mm", [0.05, -0.05])
@@ -120,7 +120,7 @@ def test_sections_show_where_the_scan_lies(up_mm: float) -> None:
         lateral, outward = section.reference.T
         assert outward == pytest.approx(-np.abs(lateral), abs=0.01)
         assert np.abs(section.scan - shift) @ [-1, 0] == pytest.approx((section.scan - shift)[:, 1], abs=0.01)
-    assert len(cut.sections) == cut.error().scan.sections
+    assert len(cut.sections) == margin_error(cut).scan.sections
 
 
 def test_a_line_that_is_no_edge_is_refused() -> None:

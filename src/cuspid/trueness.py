@@ -164,3 +164,31 @@ class Trueness:
     "1" and "2" (68 and 95 if all errors are random and accounted for); None if it predicted none."""
     notes: tuple[str, ...] = field(default=())
     """What a reader should know, for example how the scannable surface was determined."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MarginSection:
+    """Scan and reference in the plane across the line at one place; coordinates are (lateral, outward), mm."""
+
+    place_mm: Float[np.ndarray, "3"]
+    """The place on the line, in the frame of the reference: the origin of the coordinates."""
+    reference: Float[np.ndarray, "m 2"]
+    """The section of the reference, its outside to the right."""
+    reference_edge: Float[np.ndarray, "2"]
+    """The edge that was found in it."""
+    scan: Float[np.ndarray, "k 2"] | None
+    """The section of the scan; None where it has no surface there."""
+    scan_edge: Float[np.ndarray, "2"] | None
+    """The edge that was found in it, if any."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CutMargin:
+    """A margin, cut at places along its line."""
+
+    line: Float[np.ndarray, "n 3"]
+    """The true line."""
+    stations: int
+    """Number of places along it, those that are not evaluated included."""
+    sections: tuple[MarginSection, ...]
+    """Those that are evaluated, in their order along the line; at least one."""

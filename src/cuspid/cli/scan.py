@@ -19,7 +19,7 @@ from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress, suited
 from cuspid.errors import InputError
 from cuspid.evaluation.deviation import EvaluationOptions
-from cuspid.evaluation.margin import MarginError, cut_margins
+from cuspid.evaluation.margin import MarginError, cut_margins, margin_error
 from cuspid.evaluation.spheres import SphereReport, evaluate_spheres
 from cuspid.evaluation.trajectory import trajectory_error
 from cuspid.jaw import Jaw
@@ -232,7 +232,7 @@ def _evaluate_margins(scan: Mesh, reference: Jaw, trueness: Trueness, out: Path)
     """Margins of preparations, on the teeth that were scanned."""
     lines = {name: line for name, line in reference.lines.items() if int(name.split(".")[0]) in trueness.per_tooth}
     margins = cut_margins(scan, replace(reference, lines=lines), trueness.reference_from_scan)
-    errors = {fdi: margin.error() for fdi, margin in margins.items()}
+    errors = {fdi: margin_error(margin) for fdi, margin in margins.items()}
     storage.write_json(out / "margins.json", errors)
     if errors:
         save_margin_picture(out / "margins.png", margins)

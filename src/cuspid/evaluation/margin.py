@@ -24,6 +24,7 @@ from cuspid.geometry import Rigid3, axes_about, lengths_along
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.options import Options, Range
+from cuspid.trueness import CutMargin, MarginSection
 
 _FINE_MM = 0.01
 """Spacing of the points of a section."""
@@ -91,44 +92,6 @@ class MarginError:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MarginSection:
-    """Scan and reference in the plane across the line at one place; coordinates are (lateral, outward), mm."""
-
-    place_mm: Float[np.ndarray, "3"]
-    """The place on the line, in the frame of the reference: the origin of the coordinates."""
-    reference: Float[np.ndarray, "m 2"]
-    """The section of the reference, its outside to the right."""
-    reference_edge: Float[np.ndarray, "2"]
-    """The edge that was found in it."""
-    scan: Float[np.ndarray, "k 2"] | None
-    """The section of the scan; None where it has no surface there."""
-    scan_edge: Float[np.ndarray, "2"] | None
-    """The edge that was found in it, if any."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class CutMargin:
-    """A margin, cut at places along its line."""
-
-    line: Float[np.ndarray, "n 3"]
-    """The true line."""
-    stations: int
-    """Number of places along it, those that are not evaluated included."""
-    sections: tuple[MarginSection, ...]
-    """Those that are evaluated, in their order along the line; at least one."""
-
-    def error(self) -> MarginError:
-        """How far the scan's edge lies from the line, and the reference's own edge with the same detector."""
-        nothing = np.full(2, np.nan)
-        found = [nothing if each.scan_edge is None else each.scan_edge for each in self.sections]
-        return MarginError(
-            scan=_statistics(np.array(found)),
-            evaluated_pct=100 * len(self.sections) / self.stations,
-            floor=_statistics(np.array([each.reference_edge for each in self.sections])),
-        )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
 class _Edge:
     """An edge in a section, in the plane's coordinates."""
 
@@ -163,6 +126,17 @@ def cut_margin(
     if not evaluated:
         raise InputError("margin: the reference has no edge along its margin line; check that it belongs to this mesh")
     return CutMargin(line=line, stations=count, sections=evaluated)
+
+
+def margin_error(margin: CutMargin) -> MarginError:
+    """How far the scan's edge lies from the line, and the reference's own edge with the same detector."""
+    nothing = np.full(2, np.nan)
+    found = [nothing if each.scan_edge is None else each.scan_edge for each in margin.sections]
+    return MarginError(
+        scan=_statistics(np.array(found)),
+        evaluated_pct=100 * len(margin.sections) / margin.stations,
+        floor=_statistics(np.array([each.reference_edge for each in margin.sections])),
+    )
 
 
 def _section(

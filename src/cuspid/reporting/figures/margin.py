@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 
-from cuspid.evaluation.margin import CutMargin, MarginSection
 from cuspid.reporting.figures.drawing import new_figure, save_figure
+from cuspid.trueness import CutMargin, MarginSection
 
 _INK, _SOLID, _TRUE, _FOUND = "#333333", "#e6e1d6", "#6f6a5f", "#c1121f"
 _SECTIONS = 4
