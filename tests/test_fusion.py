@@ -22,7 +22,7 @@ from cuspid.surface.evidence import Evidence, observe, observe_foot
 from cuspid.surface.fusion import FusionOptions, Votes, find_holes
 from cuspid.surface.fusion import fuse as fuse_depth_maps
 from cuspid.surface.stage import find_holes as find_holes_once
-from cuspid.surface.volume import SparseVolume, pack, unpack
+from cuspid.surface.volume import around, find, pack, unpack
 from synthetic_scene import diamond, height_field, true_depth_map
 
 HILLS = height_field(lambda x, y: 5 + 0.3 * np.sin(2 * x) * np.cos(1.7 * y))
@@ -360,14 +360,14 @@ def test_block_keys_are_unique_and_invert(blocks: list[tuple[int, int, int]]) ->
 
 
 def test_neighbours_of_blocks() -> None:
-    volume = SparseVolume(0.05, 0.15)
-    volume._allocate(pack(np.array([[0, 0, 0], [1, 0, 0], [0, -1, 0], [5, 5, 5]])))
-    around = volume.neighbours()
-    assert around[0, 13] == 0
-    assert around[0, 22] == 1
-    assert around[0, 10] == 2
-    assert around[1, 4] == 0
-    assert (around[3] >= 0).sum() == 1
+    keys = pack(np.array([[0, 0, 0], [1, 0, 0], [0, -1, 0], [5, 5, 5]]))
+    near = find(keys, around(keys))
+    assert near[0, 13] == 0
+    assert near[0, 22] == 1
+    assert near[0, 10] == 2
+    assert near[1, 4] == 0
+    assert (near[3] >= 0).sum() == 1
+    assert (find(keys[:0], keys) == -1).all()
 
 
 def test_no_vertex_in_view_is_culled() -> None:

@@ -7,13 +7,19 @@ so that no surface is invented.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import no_type_check
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from cuspid.kernels import kernel
 from cuspid.mesh import Mesh
-from cuspid.surface.volume import BLOCK, SparseVolume, unpack
+from cuspid.surface.volume import BLOCK, SparseVolume, around, find, pack, unpack
+
+PART = 4
+"""Blocks along the side of a part."""
 
 
 @kernel
@@ -126,20 +132,58 @@ def _faces(distance, weight, neighbours, index_of_cell, least_weight, faces):
     return count
 
 
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Some blocks of a volume."""
+
+    keys: Int[np.ndarray, "b"]
+    distance: Float[np.ndarray, "b v"]
+    weight: Float[np.ndarray, "b v"]
+
+    def surface(
+        self, least_weight: float
+    ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Int[np.ndarray, "v"]]:
+        """Vertices (grid units) and faces of the zero level, and which block each vertex is in. The third corner of the
+        first and the second of the second triangle of each pair is in the block that the pair belongs to."""
+        index_of_cell = np.full(self.distance.shape, -1, dtype=np.int32)
+        origins = unpack(self.keys).astype(np.float64) * BLOCK
+        grid = (self.distance, self.weight, find(self.keys, around(self.keys)))
+        vertices = np.zeros((_vertices(*grid, origins, least_weight, index_of_cell, np.zeros((0, 3))), 3))
+        if len(vertices):
+            _vertices(*grid, origins, least_weight, index_of_cell, vertices)
+        faces = np.zeros((_faces(*grid, index_of_cell, least_weight, np.zeros((0, 3), np.int64)), 3), dtype=np.int64)
+        if len(faces):
+            _faces(*grid, index_of_cell, least_weight, faces)
+        return vertices, faces, np.repeat(np.arange(len(self.keys)), (index_of_cell >= 0).sum(axis=1))
+
+
 def extract(volume: SparseVolume, least_weight: float) -> Mesh:
     """The zero level of the volume, where all voxels around it have at least the weight ``least_weight``."""
     keys = volume.keys
-    distance, weight = volume.distance[: len(keys)], volume.weight[: len(keys)]
     if len(keys) == 0:
         return Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
-    neighbours = volume.neighbours()
-    index_of_cell = np.full(distance.shape, -1, dtype=np.int32)
-    origins = unpack(keys).astype(np.float64) * BLOCK
-    grid = (distance, weight, neighbours)
-    vertices = np.zeros((_vertices(*grid, origins, least_weight, index_of_cell, np.zeros((0, 3))), 3))
-    if len(vertices):
-        _vertices(*grid, origins, least_weight, index_of_cell, vertices)
-    faces = np.zeros((_faces(*grid, index_of_cell, least_weight, np.zeros((0, 3), np.int64)), 3), dtype=np.int64)
-    if len(faces):
-        _faces(*grid, index_of_cell, least_weight, faces)
+    grid = _Grid(keys, volume.distance[: len(keys)], volume.weight[: len(keys)])
+    vertices, faces, _ = grid.surface(least_weight)
     return Mesh(vertices * volume.voxel_mm, faces)
+
+
+def extract_parts(volume: SparseVolume, least_weight: float, parts: Iterable[int]) -> dict[int, Mesh]:
+    """The same in some parts of the volume, by their keys (:func:`part_of`), each with vertices of its own: together
+    the parts are the whole."""
+    asked, keys = np.array(sorted(parts), dtype=np.int64), volume.keys
+    empty = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    found = dict.fromkeys(asked.tolist(), empty)
+    owned = keys[np.isin(part_of(keys), asked)]
+    if len(owned) == 0:
+        return found
+    near = np.flatnonzero(np.isin(keys, around(owned)))
+    grid = _Grid(keys[near], volume.distance[near], volume.weight[near])
+    vertices, faces, block = grid.surface(least_weight)
+    part = np.repeat(part_of(grid.keys)[block[faces[::2, 2]]], 2)
+    mesh = Mesh(vertices * volume.voxel_mm, faces)
+    return found | {key: mesh.submesh(part == key) for key in np.intersect1d(part, asked).tolist()}
+
+
+def part_of(keys: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
+    """Key of the part, a cube of some blocks, that each block lies in."""
+    return pack(unpack(keys) // PART)

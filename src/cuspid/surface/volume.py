@@ -21,6 +21,8 @@ from cuspid.workers import beside_work_ahead, map_slices
 BLOCK = 8
 """Voxels along the side of a block."""
 
+_NOTHING = 1e-4
+"""Weight, as a share of that of what was taken out, below which nothing but rounding is left."""
 _OFFSET = 1 << 20
 """Added to block coordinates so that packed keys are positive: room for a million blocks in each direction."""
 
@@ -70,8 +72,10 @@ class SparseVolume:
         """What a depth map with these points (world, mm) will change; independent of what was blended before."""
         return Reached(self._keys_around(points), evidence.nearest(self._reach_px(evidence, cam_from_world, points)))
 
-    def integrate(self, evidence: Evidence, cam_from_world: Rigid3, reached: Reached) -> None:
-        """Blend a depth map into the volume."""
+    def integrate(
+        self, evidence: Evidence, cam_from_world: Rigid3, reached: Reached, *, take_out: bool = False
+    ) -> None:
+        """Blend a depth map into the volume, or take out again one that was blended with the same arguments."""
         slots = self._allocate(reached.keys)
         origins = unpack(reached.keys).astype(np.float64) * BLOCK
         map_slices(
@@ -86,6 +90,7 @@ class SparseVolume:
                 *evidence.arrays,
                 reached.nearest,
                 self.truncation_mm,
+                -1.0 if take_out else 1.0,
             ),
             len(slots),
             parts=beside_work_ahead(),
@@ -118,15 +123,20 @@ class SparseVolume:
             self.weight = _grown(self.weight, room)
         return slots
 
-    def neighbours(self) -> Int[np.ndarray, "b 27"]:
-        """Slot of each neighbouring block at offsets (-1..1)^3, -1 where there is none."""
-        keys = self.keys
-        order = np.argsort(keys)
-        ranked = keys[order]
-        offsets = np.array(list(np.ndindex(3, 3, 3))) - 1
-        wanted = pack(unpack(keys)[:, None] + offsets)
-        place = np.searchsorted(ranked, wanted).clip(0, len(keys) - 1)
-        return np.where(ranked[place] == wanted, order[place], -1)
+
+def around(keys: Int[np.ndarray, "b"]) -> Int[np.ndarray, "b 27"]:
+    """Keys of the blocks at offsets (-1..1)^3 from each block."""
+    return pack(unpack(keys)[:, None] + (np.array(list(np.ndindex(3, 3, 3))) - 1))
+
+
+def find(keys: Int[np.ndarray, "b"], wanted: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
+    """Where each of the wanted keys stands among others, -1 where it does not."""
+    if len(keys) == 0:
+        return np.full(wanted.shape, -1)
+    order = np.argsort(keys)
+    ranked = keys[order]
+    place = np.searchsorted(ranked, wanted).clip(0, len(keys) - 1)
+    return np.where(ranked[place] == wanted, order[place], -1)
 
 
 def _grown(array: Float[np.ndarray, "b v"], room: int) -> Float[np.ndarray, "r v"]:
@@ -138,9 +148,9 @@ def _grown(array: Float[np.ndarray, "b v"], room: int) -> Float[np.ndarray, "r v
 @kernel
 @no_type_check
 def _integrate(
-    distance, weight, slots, origins, voxel, rotation, translation, plane, known, intrinsics, nearest, truncation
+    distance, weight, slots, origins, voxel, rotation, translation, plane, known, intrinsics, nearest, truncation, sign
 ):
-    """Running weighted mean of the signed distance in each voxel of the blocks."""
+    """Running weighted mean of the signed distance in each voxel of the blocks; with a sign of -1, without this one."""
     seen = np.zeros(6)
     for n in range(slots.size):
         values, weights = distance[slots[n]], weight[slots[n]]
@@ -161,8 +171,11 @@ def _integrate(
                     elif not observe_foot(plane, known, intrinsics, nearest, truncation, right, down, depth, seen):
                         continue
                     voxel_index = (i * 8 + j) * 8 + k
-                    new = seen[1]
+                    new = sign * seen[1]
                     total = weights[voxel_index] + new
+                    if total < _NOTHING * seen[1]:
+                        values[voxel_index], weights[voxel_index] = 0, 0
+                        continue
                     step = (min(seen[0], truncation) - values[voxel_index]) * new / total
                     values[voxel_index] += step
                     weights[voxel_index] = total
