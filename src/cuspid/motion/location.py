@@ -75,6 +75,11 @@ class MotionOptions(Options):
     seed: Annotated[int, SEED] = 0
     """Seed of the random samples in pose estimation."""
 
+    @property
+    def sought(self) -> FeatureOptions:
+        """Keypoints; those that no patches will make accurate, in images of full size."""
+        return self.features if self.least_squares.enabled else replace(self.features, halved_from_px=None)
+
     def cell_for(self, rig: Rig) -> float:
         """Size of the cells that each keep their longest track, px."""
         sides = [min(each.camera.width, each.camera.height) for each in rig.cameras.values()]
@@ -236,8 +241,9 @@ def _require_enough(trajectory: Trajectory, clouds: Sequence[Cloud], options: Mo
     )
 
 
-def _loosened(options: MotionOptions, slack_px: float) -> MotionOptions:
+def loosened(options: MotionOptions, handpiece: Handpiece) -> MotionOptions:
     """Options with tolerances that allow for an uncertain calibration."""
+    slack_px = 2 * calibration_sigma_px(handpiece.rig, handpiece.working_distance_mm)
     within, odometry, across = options.within, options.odometry, options.across_frames
     return replace(
         options,
@@ -245,6 +251,12 @@ def _loosened(options: MotionOptions, slack_px: float) -> MotionOptions:
         odometry=replace(odometry, error_px=odometry.error_px + slack_px),
         across_frames=replace(across, tolerance_px=across.tolerance_px + slack_px),
     )
+
+
+def indexed(rig: Rig, features: Mapping[tuple[str, str], Features], frame: str) -> FrameFeatures:
+    """The keypoints of one frame, ready to be matched, by the cameras of the rig that have some."""
+    there = ((camera, features.get((frame, camera)), mounted) for camera, mounted in rig.cameras.items())
+    return {camera: index_features(found, mounted.camera) for camera, found, mounted in there if found is not None}
 
 
 def locate_features(
@@ -264,15 +276,8 @@ def locate_features(
     """
     given, handpiece = handpiece.rig.names, replace(handpiece, rig=handpiece.rig.in_own_order())
     rig, log = handpiece.rig, dict[str, float]()
-    options = _loosened(options, 2 * calibration_sigma_px(rig, handpiece.working_distance_mm))
-    frames = [
-        {
-            c: index_features(features[name, c], mounted.camera)
-            for c, mounted in rig.cameras.items()
-            if (name, c) in features
-        }
-        for name in names
-    ]
+    options = loosened(options, handpiece)
+    frames = [indexed(rig, features, name) for name in names]
     with _timed(log, "triangulation"):
         pairs = stereo_pairs(rig, handpiece.working_distance_mm, options.pairing)
         clouds = map_in_threads(
@@ -407,11 +412,9 @@ def locate(
     """
     options, log = options or MotionOptions(), dict[str, float]()
     require_stereo(capture.handpiece, options.pairing)
-    exact = options.least_squares.enabled
-    sought = options.features if exact else replace(options.features, halved_from_px=None)
-    pictures = Pictures(capture) if exact else Pictures(capture, most_bytes=0)
+    pictures = Pictures(capture) if options.least_squares.enabled else Pictures(capture, most_bytes=0)
     with _timed(log, "features"):
-        features = detect_all(pictures, sought, progress=progress, cache=cache)
+        features = detect_all(pictures, options.sought, progress=progress, cache=cache)
     names = [frame.name for frame in capture.frames]
     frames = {frame.name: frame for frame in capture.frames}
 

@@ -15,7 +15,8 @@ from scipy.cluster import vq
 
 from cuspid.motion.features import DESCRIPTOR_NORM, Features
 
-_WORDS = 32
+WORDS = 32
+"""Number of typical descriptors."""
 _SAMPLE = 20_000
 """Number of descriptors of the film from which the typical ones are found."""
 _ROUNDS = 10
@@ -27,7 +28,7 @@ def look_alike(features: Sequence[Features], apart: int, seed: int) -> list[tupl
     Indices, the earlier one first, without repetition. These are only candidates: every frame that has any frame so far
     away has one.
     """
-    if sum(map(len, features)) < _WORDS:
+    if sum(map(len, features)) < WORDS:
         return []
     codes = _vlad(features, seed)
     likeness = codes @ codes.T
@@ -40,14 +41,27 @@ def look_alike(features: Sequence[Features], apart: int, seed: int) -> list[tupl
 
 def _vlad(features: Sequence[Features], seed: int) -> Float[np.ndarray, "f d"]:
     """Unit vectors."""
+    words = typical([each.descriptors for each in features], seed)
+    return np.stack([look([each.descriptors], words) for each in features])
+
+
+def typical(descriptors: Sequence[UInt8[np.ndarray, "_ 128"]], seed: int) -> Float[np.ndarray, "k 128"]:
+    """A few typical descriptors of images. There must be as many as that."""
     rng = np.random.default_rng(seed)
-    every = np.concatenate([each.descriptors for each in features])
+    every = np.concatenate(list(descriptors))
     sample = every[rng.choice(len(every), min(_SAMPLE, len(every)), replace=False)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a word that is nearest to nothing stays where it is
-        words, _ = vq.kmeans2(_scaled(sample), _WORDS, iter=_ROUNDS, minit="points", rng=rng)
-    codes = np.stack([_sums(_scaled(each.descriptors), words) for each in features])
-    return codes / np.maximum(np.linalg.norm(codes, axis=1, keepdims=True), 1e-12)
+        words, _ = vq.kmeans2(_scaled(sample), WORDS, iter=_ROUNDS, minit="points", rng=rng)
+    return np.asarray(words)
+
+
+def look(
+    descriptors: Sequence[UInt8[np.ndarray, "_ 128"]], words: Float[np.ndarray, "k 128"]
+) -> Float[np.ndarray, "d"]:
+    """Unit vector of how images look together, as measured by typical descriptors."""
+    code = _sums(_scaled(np.concatenate(list(descriptors))), words)
+    return np.asarray(code / max(float(np.linalg.norm(code)), 1e-12))
 
 
 def _scaled(descriptors: UInt8[np.ndarray, "n 128"]) -> Float[np.ndarray, "n 128"]:

@@ -1,0 +1,119 @@
+"""The path of the handpiece while frames come in: each is placed beside those before it, or where it has been before.
+
+Poses are chained and never corrected here, so that they drift; :func:`cuspid.motion.location.locate` adjusts them all.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from cuspid.geometry import Rigid3
+from cuspid.motion.features import Features
+from cuspid.motion.location import MotionOptions, indexed, loosened
+from cuspid.motion.odometry import Cloud, FrameFeatures, relative_pose, triangulate_frame
+from cuspid.motion.revisits import WORDS, look, typical
+from cuspid.pairing import stereo_pairs
+from cuspid.rig import Handpiece
+
+Recall = Callable[[str], Mapping[tuple[str, str], Features]]
+"""The keypoints of an earlier frame, by frame and camera."""
+_CANDIDATES = 4
+"""Frames that a lost one is compared with, those that look most like it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placed:
+    """What became of a frame."""
+
+    rig_from_world: Rigid3 | None
+    """Where the handpiece was; the world is the rig frame of the first frame that could be placed. None if the frame
+    could not be placed."""
+    beside: str | None
+    """Name of the frame that it was placed by."""
+    reason: str | None
+    """Why it could not be placed."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Seen:
+    """A frame that was placed."""
+
+    name: str
+    views: FrameFeatures
+    cloud: Cloud
+
+
+class Tracker:
+    """Places frames one after the other. It remembers where each was and how it looked, and the keypoints of the last
+    few; those of others are recalled where the path was lost."""
+
+    def __init__(self, handpiece: Handpiece, options: MotionOptions, recall: Recall) -> None:
+        self._handpiece, self._options = handpiece, loosened(options, handpiece)
+        self._pairs = stereo_pairs(handpiece.rig, handpiece.working_distance_mm, options.pairing)
+        self._recall = recall
+        self._recent = deque[_Seen](maxlen=options.odometry.reach)
+        self._looks = dict[str, Float[np.ndarray, "d"]]()
+        self._words: Float[np.ndarray, "k 128"] | None = None
+        self.rig_from_world = dict[str, Rigid3]()
+        """Where the frames are that could be placed so far."""
+
+    def push(self, name: str, features: Mapping[tuple[str, str], Features]) -> Placed:
+        """Place the next frame."""
+        frame = self._seen(name, features)
+        least = self._options.odometry.minimum_matches
+        if len(frame.cloud.points) < least:
+            return _lost(f"only {len(frame.cloud.points)} points seen in stereo; {least} are needed")
+        if not self.rig_from_world:
+            return self._kept(frame, Rigid3.identity(), None)
+        most = 0
+        for other in self._others(frame):
+            edge = relative_pose(
+                self._handpiece.rig, other.cloud, other.views, frame.views, self._options.odometry, self._options.seed
+            )
+            if edge.target_from_source is not None:
+                return self._kept(frame, edge.target_from_source @ self.rig_from_world[other.name], other.name)
+            most = max(most, edge.matches)
+        return _lost(f"only {most} matches to the frames before; {least} are needed, or too small a share agreed")
+
+    def correct(self, rig_from_world: Mapping[str, Rigid3]) -> None:
+        """Take better poses of the frames so far; those that are not among them are no longer placed."""
+        self.rig_from_world = dict(rig_from_world)
+        self._looks = {name: code for name, code in self._looks.items() if name in rig_from_world}
+        kept = [seen for seen in self._recent if seen.name in rig_from_world]
+        self._recent = deque(kept, maxlen=self._recent.maxlen)
+
+    def _seen(self, name: str, features: Mapping[tuple[str, str], Features]) -> _Seen:
+        views = indexed(self._handpiece.rig, features, name)
+        return _Seen(
+            name=name, views=views, cloud=triangulate_frame(self._handpiece, self._pairs, views, self._options.within)
+        )
+
+    def _kept(self, frame: _Seen, rig_from_world: Rigid3, beside: str | None) -> Placed:
+        self.rig_from_world[frame.name] = rig_from_world
+        self._recent.append(frame)
+        descriptors = [view.features.descriptors for view in frame.views.values()]
+        if self._words is None and sum(map(len, descriptors)) >= WORDS:
+            self._words = typical(descriptors, self._options.seed)
+        if self._words is not None:
+            self._looks[frame.name] = look(descriptors, self._words)
+        return Placed(rig_from_world=rig_from_world, beside=beside, reason=None)
+
+    def _others(self, frame: _Seen) -> Iterable[_Seen]:
+        """The last frames, the latest first; then those that look most like this one."""
+        yield from reversed(self._recent)
+        if self._words is None:
+            return
+        code = look([view.features.descriptors for view in frame.views.values()], self._words)
+        tried = {seen.name for seen in self._recent}
+        likeness = {name: float(code @ other) for name, other in self._looks.items() if name not in tried}
+        for name in sorted(likeness, key=likeness.__getitem__, reverse=True)[:_CANDIDATES]:
+            yield self._seen(name, self._recall(name))
+
+
+def _lost(reason: str) -> Placed:
+    return Placed(rig_from_world=None, beside=None, reason=reason)
