@@ -6,7 +6,7 @@ Poses are chained and never corrected here, so that they drift; :func:`cuspid.mo
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,7 @@ from jaxtyping import Float
 from cuspid.geometry import Rigid3
 from cuspid.motion.features import Features
 from cuspid.motion.location import MotionOptions, indexed, loosened
-from cuspid.motion.odometry import Cloud, FrameFeatures, relative_pose, triangulate_frame
+from cuspid.motion.odometry import Cloud, Edge, FrameFeatures, relative_pose, triangulate_frame
 from cuspid.motion.revisits import WORDS, look, typical
 from cuspid.pairing import stereo_pairs
 from cuspid.rig import Handpiece
@@ -57,6 +57,7 @@ class Tracker:
         self._pairs = stereo_pairs(handpiece.rig, handpiece.working_distance_mm, options.pairing)
         self._recall = recall
         self._recent = deque[_Seen](maxlen=options.odometry.reach)
+        self._lost = False
         self._looks = dict[str, Float[np.ndarray, "d"]]()
         self._words: Float[np.ndarray, "k 128"] | None = None
         self.rig_from_world = dict[str, Rigid3]()
@@ -67,24 +68,21 @@ class Tracker:
         frame = self._seen(name, features)
         least = self._options.odometry.minimum_matches
         if len(frame.cloud.points) < least:
-            return _lost(f"only {len(frame.cloud.points)} points seen in stereo; {least} are needed")
+            return self._left(f"only {len(frame.cloud.points)} points seen in stereo; {least} are needed")
         if not self.rig_from_world:
             return self._kept(frame, Rigid3.identity(), None)
-        most = 0
-        for other in self._others(frame):
-            edge = relative_pose(
-                self._handpiece.rig, other.cloud, other.views, frame.views, self._options.odometry, self._options.seed
-            )
-            if edge.target_from_source is not None:
-                return self._kept(frame, edge.target_from_source @ self.rig_from_world[other.name], other.name)
-            most = max(most, edge.matches)
-        return _lost(f"only {most} matches to the frames before; {least} are needed, or too small a share agreed")
+        found = self._beside_the_last(frame) or self._where_it_has_been(frame)
+        if found is None:
+            return self._left(f"fewer than {least} matches to the frames before, or too small a share of them agreed")
+        other, target_from_source = found
+        return self._kept(frame, target_from_source @ self.rig_from_world[other.name], other.name)
 
     def correct(self, rig_from_world: Mapping[str, Rigid3]) -> None:
         """Take better poses of the frames so far; those that are not among them are no longer placed."""
         self.rig_from_world = dict(rig_from_world)
         self._looks = {name: code for name, code in self._looks.items() if name in rig_from_world}
         kept = [seen for seen in self._recent if seen.name in rig_from_world]
+        self._lost = len(kept) < len(self._recent)
         self._recent = deque(kept, maxlen=self._recent.maxlen)
 
     def _seen(self, name: str, features: Mapping[tuple[str, str], Features]) -> _Seen:
@@ -94,6 +92,7 @@ class Tracker:
         )
 
     def _kept(self, frame: _Seen, rig_from_world: Rigid3, beside: str | None) -> Placed:
+        self._lost = False
         self.rig_from_world[frame.name] = rig_from_world
         self._recent.append(frame)
         descriptors = [view.features.descriptors for view in frame.views.values()]
@@ -103,17 +102,36 @@ class Tracker:
             self._looks[frame.name] = look(descriptors, self._words)
         return Placed(rig_from_world=rig_from_world, beside=beside, reason=None)
 
-    def _others(self, frame: _Seen) -> Iterable[_Seen]:
-        """The last frames, the latest first; then those that look most like this one."""
-        yield from reversed(self._recent)
+    def _left(self, reason: str) -> Placed:
+        self._lost = True
+        return Placed(rig_from_world=None, beside=None, reason=reason)
+
+    def _beside_the_last(self, frame: _Seen) -> tuple[_Seen, Rigid3] | None:
+        """The frame before, if that could be placed and this one beside it."""
+        if self._lost:
+            return None
+        edge = self._edge(self._recent[-1], frame)
+        return None if edge.target_from_source is None else (self._recent[-1], edge.target_from_source)
+
+    def _where_it_has_been(self, frame: _Seen) -> tuple[_Seen, Rigid3] | None:
+        """Of the last frames and those that look most like this one, the one that it has most in common with."""
+        tried = [*self._recent, *self._look_alikes(frame)]
+        edges = [(other, self._edge(other, frame)) for other in tried]
+        found = [(other, e.target_from_source, e.matches) for other, e in edges if e.target_from_source is not None]
+        return max(found, key=lambda one: one[2])[:2] if found else None
+
+    def _edge(self, source: _Seen, target: _Seen) -> Edge:
+        options = self._options
+        return relative_pose(
+            self._handpiece.rig, source.cloud, source.views, target.views, options.odometry, options.seed
+        )
+
+    def _look_alikes(self, frame: _Seen) -> list[_Seen]:
+        """Frames long before, as recalled."""
         if self._words is None:
-            return
+            return []
         code = look([view.features.descriptors for view in frame.views.values()], self._words)
         tried = {seen.name for seen in self._recent}
         likeness = {name: float(code @ other) for name, other in self._looks.items() if name not in tried}
-        for name in sorted(likeness, key=likeness.__getitem__, reverse=True)[:_CANDIDATES]:
-            yield self._seen(name, self._recall(name))
-
-
-def _lost(reason: str) -> Placed:
-    return Placed(rig_from_world=None, beside=None, reason=reason)
+        best = sorted(likeness, key=likeness.__getitem__, reverse=True)[:_CANDIDATES]
+        return [self._seen(name, self._recall(name)) for name in best]
