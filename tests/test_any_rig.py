@@ -344,12 +344,12 @@ def test_a_draft_is_the_same_scan_at_a_glance(folder: Path) -> None:
 
 def test_what_was_asked_for_goes_before_the_quality() -> None:
     asked = ReconstructionOptions(quality="draft", temporal=TemporalOptions(left_share=0.2))
-    assert pipeline._settled(asked).temporal.left_share == 0.2
-    assert pipeline._settled(asked).tracking.features.count == 500
-    assert pipeline._settled(asked).tracking.features.size_for(640, 480) == (160, 120)
-    assert pipeline._settled(asked).left_share == 1
-    assert pipeline._settled(replace(asked, left_share=0.3)).left_share == 0.3
-    assert pipeline._settled(asked).stereo.refinement.bend_px == 1000
+    assert pipeline.settled(asked).temporal.left_share == 0.2
+    assert pipeline.settled(asked).tracking.features.count == 500
+    assert pipeline.settled(asked).tracking.features.size_for(640, 480) == (160, 120)
+    assert pipeline.settled(asked).left_share == 1
+    assert pipeline.settled(replace(asked, left_share=0.3)).left_share == 0.3
+    assert pipeline.settled(asked).stereo.refinement.bend_px == 1000
     standard = ReconstructionOptions()
-    assert pipeline._settled(standard).tracking.features.size_for(640, 480) == (320, 240)
-    assert pipeline._settled(standard) == replace(standard, left_share=pipeline._LEFT_SHARE)
+    assert pipeline.settled(standard).tracking.features.size_for(640, 480) == (320, 240)
+    assert pipeline.settled(standard) == replace(standard, left_share=pipeline._LEFT_SHARE)

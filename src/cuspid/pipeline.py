@@ -136,7 +136,7 @@ def find_poses(
     progress: Progress = silent,
 ) -> Reconstruction:
     """The poses of the frames, and the calibration adjusted to the images (first part of :func:`reconstruct`)."""
-    options = _settled(options)
+    options = settled(options)
     handpiece = as_known(capture.handpiece, options)
     capture = replace(capture, handpiece=handpiece)
     if colmap_model is not None:
@@ -158,13 +158,13 @@ def surface(
 ) -> tuple[Mesh, Float[np.ndarray, "v"]]:
     """The mesh, given the poses of the frames (second part of :func:`reconstruct`), and how well each of its vertices
     is known: standard deviation along the normal, um."""
-    options = _settled(options)
-    sized = _sized(replace(capture, handpiece=replace(capture.handpiece, rig=found.rig)), options)
-    lengths_mm = detail_mm(sized.handpiece), capture.handpiece.working_distance_mm
+    options = settled(options)
+    of_size = sized(replace(capture, handpiece=replace(capture.handpiece, rig=found.rig)), options)
+    lengths_mm = detail_mm(of_size.handpiece), capture.handpiece.working_distance_mm
     if matched(capture, options) == "shading":
         depths = _shaded_depth(capture, folder, options, progress)
     else:
-        depths = _textured_depth(sized, found, lengths_mm[0], folder, options, progress)
+        depths = _textured_depth(of_size, found, lengths_mm[0], folder, options, progress)
     how = options.fusion, options.cleaning
     return fuse(
         *(depths, depths.digest, _poses(found, depths), *lengths_mm, folder, *how),
@@ -178,7 +178,7 @@ def matched(capture: Capture, options: ReconstructionOptions) -> Signal:
     return signal_of(capture) if options.signal == "auto" else options.signal
 
 
-def _sized(capture: Capture, options: ReconstructionOptions) -> Capture:
+def sized(capture: Capture, options: ReconstructionOptions) -> Capture:
     """With images of the size that depth is measured from."""
     return capture.halved() if options.quality == "draft" else capture
 
@@ -187,7 +187,7 @@ def _shaded_depth(
     capture: Capture, folder: Path, options: ReconstructionOptions, progress: Progress
 ) -> StoredDepthMaps:
     """Depth within frames, before anything is known of their poses."""
-    return measure_depth(_sized(capture, options), folder / "depth", options.stereo, "shading", progress=progress)
+    return measure_depth(sized(capture, options), folder / "depth", options.stereo, "shading", progress=progress)
 
 
 def _textured_depth(
@@ -227,7 +227,7 @@ def _poses(found: Reconstruction, depths: StoredDepthMaps) -> dict[str, Rigid3]:
     return {name: found.rig_from_world[name] for name in depths.frames if name in found.rig_from_world}
 
 
-def _settled(options: ReconstructionOptions) -> ReconstructionOptions:
+def settled(options: ReconstructionOptions) -> ReconstructionOptions:
     """With what the quality decides, where nothing else was asked for."""
     draft, tracking, temporal = options.quality == "draft", options.tracking, options.temporal
     if options.left_share is None:

@@ -71,10 +71,14 @@ def measure_depth(
     options: StereoOptions,
     signal: Signal = "texture",
     *,
+    estimator: DepthEstimator | None = None,
     progress: Progress = silent,
 ) -> StoredDepthMaps:
-    """Depth maps of every frame, each from that frame alone, kept in ``folder``."""
-    estimator = DepthEstimator(capture.handpiece, options, signal=signal)
+    """Depth maps of every frame, each from that frame alone, kept in ``folder``.
+
+    ``estimator``: one for this handpiece, these options and this signal, where there is one already.
+    """
+    estimator = estimator or DepthEstimator(capture.handpiece, options, signal=signal)
 
     def measure(frame: Frame) -> tuple[DepthMap, ...]:
         return estimator.measure(capture.images(frame), frame.name, frame.lighting)
