@@ -95,6 +95,16 @@ class Session:
         return self._capture.frames
 
     @property
+    def capture(self) -> Capture:
+        """What came in, with the handpiece as it was given."""
+        return replace(self._capture, handpiece=self._given)
+
+    @property
+    def handpiece(self) -> Handpiece:
+        """As it was given."""
+        return self._given
+
+    @property
     def rig_from_world(self) -> Mapping[str, Rigid3]:
         """Where those frames were that could be placed."""
         return self._tracker.rig_from_world
@@ -124,7 +134,7 @@ class Session:
 
         Raises ReconstructionError where too few of them can be placed; nothing is changed then.
         """
-        found = pipeline.find_poses(self._whole(), self._folder, self._options, progress=progress)
+        found = pipeline.find_poses(self.capture, self._folder, self._options, progress=progress)
         self._tracker.correct(found.rig_from_world)
         for frame in self.frames:
             self._put(frame, found.rig_from_world.get(frame.name))
@@ -138,7 +148,7 @@ class Session:
         """The reconstruction of everything that came in. Raises ReconstructionError where that is too little."""
         if not self.frames:
             raise ReconstructionError("session: no frame has come in")
-        return pipeline.reconstruct(self._whole(), self._folder, self._options, progress=progress)
+        return pipeline.reconstruct(self.capture, self._folder, self._options, progress=progress)
 
     def _placed(self, frame: Frame, features: Mapping[tuple[str, str], Features]) -> Placed:
         if not self.rig_from_world:
@@ -201,7 +211,3 @@ class Session:
         dropped = Dropped(what=f"frame {frame.name}", reason=reason)
         self._capture = replace(self._capture, left_out=(*self._capture.left_out, dropped))
         return Placed(rig_from_world=None, beside=None, reason=reason)
-
-    def _whole(self) -> Capture:
-        """What came in, with the handpiece as it was given."""
-        return replace(self._capture, handpiece=self._given)

@@ -66,6 +66,7 @@ COMMANDS: Mapping[str, Callable[..., Any]] = _Verbs(
         "film": "film",
         "stitch-eval": "panorama_evaluation",
         "reconstruct": "scan",
+        "live": "live",
         "evaluate": "scan",
         "stitch": "panorama",
         "reproduce": "reproduction",

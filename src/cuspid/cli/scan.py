@@ -55,7 +55,7 @@ def run(
         evaluation: How the trueness is measured.
     """
     _simulate(jaw, out, source, probe, simulation)
-    _reconstruct(storage.read_capture(out / "capture"), out, reconstruction, None)
+    reconstruct_capture(storage.read_capture(out / "capture"), out, reconstruction)
     _evaluate(out / "mesh.ply", out / "truth", out, Source(), evaluation)
 
 
@@ -95,7 +95,7 @@ def reconstruct(
             (guessed unless given).
         from_poses: Folder of a COLMAP model whose poses are used instead of finding them.
     """
-    _reconstruct(storage.read_capture(capture, handpiece, working_distance_mm), out, reconstruction, from_poses)
+    reconstruct_capture(storage.read_capture(capture, handpiece, working_distance_mm), out, reconstruction, from_poses)
 
 
 def evaluate(
@@ -132,7 +132,8 @@ def _simulate(mesh: Path | None, out: Path, source: Source, probe: Probe, option
     )
 
 
-def _reconstruct(capture: Capture, out: Path, options: ReconstructionOptions, model: Path | None) -> None:
+def reconstruct_capture(capture: Capture, out: Path, options: ReconstructionOptions, model: Path | None = None) -> None:
+    """Reconstruct, and tell how it went. ``model``: a COLMAP model, whose poses are taken."""
     settings = {"reconstruction": options, "from_poses": model}
     inputs = storage.hash_capture(capture) | ({} if model is None else {"poses": hash_model(model)})
     with storage.claimed_folder(out, "reconstruct", settings, inputs):

@@ -44,16 +44,23 @@ def serve(result: Result, host: str, port: int) -> Server:
 
     Raises MissingDependencyError without viser, InputError where there is nothing to show in 3-D.
     """
+    show = _what_to_show(result)
+    server = start(host, port)
+    server.scene.set_up_direction("+z")
+    show(server)
+    return server
+
+
+def start(host: str, port: int) -> Server:
+    """An empty scene with light from all sides, for its own pages alone. Raises MissingDependencyError without
+    viser."""
     try:
         import viser
     except ImportError as error:
-        raise MissingDependencyError("view needs viser: pip install 'cuspid[view]'") from error
-    show = _what_to_show(result)
+        raise MissingDependencyError("the view needs viser: pip install 'cuspid[view]'") from error
     with only_own_pages(host):
         server = viser.ViserServer(host=host, port=port, label="cuspid", verbose=False)
-    server.scene.set_up_direction("+z")
     _light(server)
-    show(server)
     return server
 
 
@@ -77,13 +84,13 @@ def _show_scan(server: Server, result: ScanResult, scan: Mesh) -> None:
     def paint(rgb: UInt8[np.ndarray, "v 3"] | None) -> None:
         visible = nodes["scan"].visible if "scan" in nodes else True
         colors = _plain(moved, PLASTER_COLOR) if rgb is None else rgb
-        nodes["scan"] = _add(server, "/scan", moved, colors, visible)
+        nodes["scan"] = add(server, "/scan", moved, colors, visible)
 
     maps = surface_maps(result, deviation_range_um(result))
     paint(next((scale.rgb(values) for scale, values in maps), None))
     if result.reference is not None:
         mesh = result.reference.mesh
-        nodes["reference"] = _add(server, "/reference", mesh, _plain(mesh, REFERENCE_COLOR), False)
+        nodes["reference"] = add(server, "/reference", mesh, _plain(mesh, REFERENCE_COLOR), False)
     if result.reconstruction is not None:
         rig, poses = result.reconstruction.rig, poses_from(result.reconstruction, shown_from_scan)
         path = camera_path(rig, poses)
@@ -148,7 +155,7 @@ def _show_shape(server: Server, model: ShapeModel) -> None:
 
     def bend(_: Any = None) -> None:
         mesh = model.sample([float(slider.value) for slider in sliders]).mesh
-        _add(server, "/jaw", mesh, _plain(mesh, PLASTER_COLOR), True)
+        add(server, "/jaw", mesh, _plain(mesh, PLASTER_COLOR), True)
 
     for slider in sliders:
         slider.on_update(bend)
@@ -186,7 +193,8 @@ def _look_down_on(server: Server, mesh: Mesh) -> None:
     server.initial_camera.position = tuple(map(float, middle + size * np.array([0.0, -0.35, 1.0])))
 
 
-def _add(server: Server, name: str, mesh: Mesh, rgb: UInt8[np.ndarray, "v 3"], visible: bool) -> Node:
+def add(server: Server, name: str, mesh: Mesh, rgb: UInt8[np.ndarray, "v 3"], visible: bool) -> Node:
+    """Show a surface with the colours (sRGB) of its vertices."""
     # The colours of vertices are linear in glTF, in which the mesh is sent.
     linear = np.rint(255 * (rgb / 255) ** _GAMMA).astype(np.uint8)
     shown = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=linear, process=False)

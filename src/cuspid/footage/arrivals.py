@@ -1,0 +1,90 @@
+"""Frames of a capture that is still being written: images appear in ``images/<camera>/<frame>.png``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cuspid.capture import Frame, ImageFolder, image_size
+from cuspid.errors import InputError
+from cuspid.rig import Handpiece
+from cuspid.storage.captures import IMAGE_SUFFIXES, only_lighting
+
+_State = tuple[int, int]
+"""Size and time of modification of a file."""
+
+
+class Arrivals:
+    """Gives each frame once, when its images are whole, in the order of their names.
+
+    An image is whole when it did not change between two looks and its header can be read. A frame of which images are
+    missing is waited for as long as ``late_s`` after a later one is whole, and then given with those that it has.
+    """
+
+    def __init__(self, folder: Path, handpiece: Handpiece, *, late_s: float) -> None:
+        self._images, self._folder, self._handpiece, self._late_s = folder / "images", folder, handpiece, late_s
+        self._states = dict[Path, _State]()
+        self._whole = dict[str, set[str]]()
+        self._since = dict[str, float]()
+        self._given = set[str]()
+        self._suffix: str | None = None
+
+    @property
+    def source(self) -> ImageFolder | None:
+        """Where the images of the frames are; None before there is one."""
+        return None if self._suffix is None else ImageFolder(self._folder, self._suffix)
+
+    def news(self, now_s: float) -> list[Frame]:
+        """The frames that are whole by now and were not given before. Raises InputError where images are of a camera
+        that the handpiece does not have, or of different types."""
+        self._look(now_s)
+        return self._take(now_s, self._late_s)
+
+    def rest(self) -> list[Frame]:
+        """What is left at the end, with the images that there are."""
+        self._look(float("inf"))
+        return self._take(float("inf"), -1.0)
+
+    def _take(self, now_s: float, late_s: float) -> list[Frame]:
+        expected = {camera for cameras in self._whole.values() for camera in cameras}
+        if not self._given and late_s >= 0:
+            expected = set(self._handpiece.rig.names)
+        found = list[Frame]()
+        waiting = sorted(self._whole.keys() - self._given)
+        ready = {name: self._since[name] for name in waiting if self._whole[name] >= expected}
+        for name in waiting:
+            later = [since for other, since in ready.items() if other > name]
+            if name not in ready and not (late_s < 0 or (later and now_s - min(later) > late_s)):
+                break
+            self._given.add(name)
+            cameras = tuple(camera for camera in self._handpiece.rig.names if camera in self._whole[name])
+            found.append(Frame(name=name, cameras=cameras, lighting=only_lighting(self._handpiece)))
+        return found
+
+    def _look(self, now_s: float) -> None:
+        for folder in sorted(path for path in self._images.glob("*") if path.is_dir()):
+            if folder.name not in self._handpiece.rig.names:
+                raise InputError(
+                    f"{folder}: the handpiece has no camera {folder.name}; its cameras are "
+                    f"{', '.join(self._handpiece.rig.names)}"
+                )
+            for path in folder.iterdir():
+                if path.suffix.lower() in IMAGE_SUFFIXES and path.stem not in self._given:
+                    self._look_at(path, now_s)
+
+    def _look_at(self, path: Path, now_s: float) -> None:
+        camera, stem = path.parent.name, path.stem
+        if camera in self._whole.get(stem, ()):
+            return
+        try:
+            state = path.stat()
+            before, self._states[path] = self._states.get(path), (state.st_size, state.st_mtime_ns)
+            if before != self._states[path]:
+                return
+            image_size(path)
+        except (InputError, OSError):  # still being written, or moved to its place meanwhile
+            return
+        if self._suffix not in (None, path.suffix):
+            raise InputError(f"{path}: the images before are {self._suffix} files; write all images in one type")
+        self._suffix = path.suffix
+        self._whole.setdefault(stem, set()).add(camera)
+        self._since[stem] = now_s
