@@ -34,7 +34,7 @@ WAY = {
     f"{k:05d}": Rigid3.from_rotation_vector(np.array([0.01, -0.015, 0.02]) * k, np.array([-0.5, 0.1, 0.03]) * k)
     for k in range(3)
 }
-FACTORS = (0.1, 0.5, 2.0, 10.0, 1000.0)
+FACTORS = (0.1, 2.0, 1000.0)
 Images = Mapping[tuple[str, str], np.ndarray]
 
 

@@ -140,6 +140,5 @@ def test_a_plate_that_slides_but_for_two_posts_finds_its_place():
 
     plate = height_field(posts, count=600)
     points, surface = noisy(plate, 0.0005).sample(20_000, np.random.default_rng(0))[0], SignedDistance(plate)
-    for off_mm in (0.05, 0.3):
-        found = fit(points, surface, Rigid3(np.eye(3), np.array([off_mm, -off_mm / 2, 0])), FAST)
-        assert error_um(found.reference_from_scan, Rigid3.identity(), plate.vertices) < 0.5, off_mm
+    found = fit(points, surface, Rigid3(np.eye(3), np.array([0.3, -0.15, 0])), FAST)
+    assert error_um(found.reference_from_scan, Rigid3.identity(), plate.vertices) < 0.5

@@ -201,9 +201,9 @@ class Session:
         return bool(moved_mm > _MOVED_VOXELS * self._voxel_mm)
 
     def _depths(self, frame: Frame) -> list[DepthMap]:
-        one = replace(self._sized, frames=(frame,))
+        one = replace(self._sized, frames=(frame,))  # measured anew at the end, with the calibration that is found
         stored: StoredDepthMaps = measure_depth(
-            one, self._folder / "depth", self._settled.stereo, estimator=self._estimator
+            one, self._folder / "live", self._settled.stereo, estimator=self._estimator
         )
         return list(stored)
 

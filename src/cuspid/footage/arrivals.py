@@ -17,7 +17,8 @@ class Arrivals:
     """Gives each frame once, when its images are whole, in the order of their names.
 
     An image is whole when it did not change between two looks and its header can be read. A frame of which images are
-    missing is waited for as long as ``late_s`` after a later one is whole, and then given with those that it has.
+    missing is waited for as long as ``late_s`` after the first image of a later one, and then given with those that
+    it has.
     """
 
     def __init__(self, folder: Path, handpiece: Handpiece, *, late_s: float) -> None:
@@ -45,15 +46,12 @@ class Arrivals:
         return self._take(float("inf"), -1.0)
 
     def _take(self, now_s: float, late_s: float) -> list[Frame]:
-        expected = {camera for cameras in self._whole.values() for camera in cameras}
-        if not self._given and late_s >= 0:
-            expected = set(self._handpiece.rig.names)
+        idle = set(self._handpiece.rig.names).difference(*self._whole.values()) if self._given else set[str]()
         found = list[Frame]()
-        waiting = sorted(self._whole.keys() - self._given)
-        ready = {name: self._since[name] for name in waiting if self._whole[name] >= expected}
-        for name in waiting:
-            later = [since for other, since in ready.items() if other > name]
-            if name not in ready and not (late_s < 0 or (later and now_s - min(later) > late_s)):
+        for name in sorted(self._whole.keys() - self._given):
+            complete = self._whole[name] | idle >= set(self._handpiece.rig.names)
+            later = [since for other, since in self._since.items() if other > name]
+            if not complete and late_s >= 0 and not (later and now_s - min(later) > late_s):
                 break
             self._given.add(name)
             cameras = tuple(camera for camera in self._handpiece.rig.names if camera in self._whole[name])
@@ -87,4 +85,4 @@ class Arrivals:
             raise InputError(f"{path}: the images before are {self._suffix} files; write all images in one type")
         self._suffix = path.suffix
         self._whole.setdefault(stem, set()).add(camera)
-        self._since[stem] = now_s
+        self._since.setdefault(stem, now_s)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -24,6 +24,7 @@ _PATH, _HERE, _LOST, _RIM = (181, 23, 158), (28, 93, 153), (205, 30, 30), (235, 
 _UNCOLOURED = 160
 
 
+@runtime_checkable
 class Scan(Protocol):
     """What is shown: :class:`cuspid.session.Session`."""
 

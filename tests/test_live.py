@@ -1,0 +1,115 @@
+"""``cuspid live``: a scan is followed while its images are written, or replayed, and ends as a reconstruction does."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+
+from cuspid import storage
+from cuspid.capture import Frame
+from cuspid.cli.live import _paced
+from cuspid.geometry import Rigid3
+from cuspid.mesh import Mesh
+from cuspid.reporting import live_view
+from cuspid.reporting.growing_view import GrowingView
+from test_session import scan
+from verbs import refused, run
+
+STANDARD = ("--quality", "standard", "--calibration", "fixed")
+
+
+def write(folder: Path, frames: tuple[Frame, ...], pause_s: float = 0.0, black: str | None = None) -> None:
+    """The images of the frames, camera after camera, one frame in black."""
+    for frame in frames:
+        for camera in frame.cameras:
+            image = scan().source.read(frame.name, camera) * np.uint8(frame.name != black)
+            storage.write_image(folder / "images" / camera / f"{frame.name}.png", image)
+            time.sleep(pause_s)
+
+
+def test_a_capture_is_replayed_and_reconstructed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    frames = scan().frames[:3]
+    storage.write_capture(tmp_path / "capture", replace(scan(), frames=frames))
+    write(tmp_path / "capture", frames)
+    run("live", tmp_path / "capture", "--out", tmp_path / "live", *STANDARD)
+    assert "3 of 3 frames placed as they came" in capsys.readouterr().err
+    run("reconstruct", tmp_path / "capture", "--out", tmp_path / "batch", *STANDARD)
+    one, other = ((tmp_path / folder / "mesh.ply").read_bytes() for folder in ("live", "batch"))
+    assert one == other
+    assert {"live", "reconstruct"} <= storage.read_json(tmp_path / "live" / "run.json").keys()
+
+
+def test_a_folder_is_followed_while_images_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The third frame is black: the surface stays, and the scan goes on."""
+    storage.write_handpiece(tmp_path / "capture" / "handpiece.json", scan().handpiece)
+    writer = threading.Thread(target=write, args=(tmp_path / "capture", scan().frames, 0.02, "00002"))
+    writer.start()
+    run("live", tmp_path / "capture", "--watch", "--end-s", 3, "--pause-s", 1, "--out", tmp_path / "scan", *STANDARD)
+    writer.join()
+    said = " ".join(capsys.readouterr().err.split())
+    assert "4 of 5 frames placed as they came" in said
+    assert "frame 00002: not placed" in said
+    assert "go back to where frame 00001 was taken" in said
+    assert "frame 00003: found again" in said
+    assert "located 4 of 5 frames" in said
+    assert len(storage.read_mesh(tmp_path / "scan" / "mesh.ply").faces) > 1000
+
+
+def test_without_frames_nothing_is_left(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "scan"
+    assert "no such folder" in refused(capsys, "live", tmp_path / "none", "--watch", "--out", out)
+    storage.write_handpiece(tmp_path / "capture" / "handpiece.json", scan().handpiece)
+    message = refused(capsys, "live", tmp_path / "capture", "--watch", "--end-s", 0.2, "--out", out)
+    assert "no frame has come" in message
+    assert not out.exists()
+
+
+def test_a_replay_keeps_its_pace() -> None:
+    frames = tuple(replace(frame, time_s=100 + 0.1 * k) for k, frame in enumerate(scan().frames[:3]))
+    for capture, pace, most_s in ((replace(scan(), frames=frames), None, 0.6), (scan(), 25.0, 0.6)):
+        begin = time.monotonic()
+        assert list(_paced(capture, pace)) == list(capture.frames)
+        took = time.monotonic() - begin
+        assert (0.2 if pace is None else 4 / pace) <= took < most_s
+
+
+def triangle() -> Mesh:
+    return Mesh(np.eye(3), np.array([[0, 1, 2]]), np.full((3, 3), 100, np.uint8))
+
+
+def test_the_view_shows_what_changes_and_where_to_go_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown, server = {}, MagicMock()
+
+    def add_mesh(name, mesh, visible):
+        shown[name] = mesh
+        return SimpleNamespace(remove=lambda: shown.pop(name))
+
+    words = SimpleNamespace(content="")
+    server.scene.add_mesh_trimesh, server.gui.add_markdown = add_mesh, lambda content: words
+    monkeypatch.setitem(sys.modules, "viser", SimpleNamespace(ViserServer=lambda **_: server))
+    monkeypatch.setattr(live_view, "only_own_pages", lambda _: nullcontext())
+    view = GrowingView("127.0.0.1", 18090)
+    poses = {"00000": Rigid3.identity(), "00001": Rigid3(np.eye(3), np.array([-1.0, 0, 0]))}
+    session = SimpleNamespace(
+        handpiece=scan().handpiece, rig_from_world=poses, frames=scan().frames, missing=lambda: np.zeros((2, 3))
+    )
+    view.show(session, {7: triangle(), 8: triangle()}, 0)
+    assert shown.keys() == {"/surface/7", "/surface/8"}
+    assert "**2** of 5 frames placed" in words.content
+    assert "Lost" not in words.content
+    nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    view.show(session, {7: nothing, 9: nothing}, 2)
+    assert shown.keys() == {"/surface/8"}
+    assert "Lost for 2 frames" in words.content
+    assert "frame 00001" in words.content
+    assert {call.args[0] for call in server.scene.add_line_segments.call_args_list} == {"/handpiece", "/path"}
+    assert server.scene.add_point_cloud.call_count == 1, "rims of holes are looked for now and then"
