@@ -250,7 +250,7 @@ def _probe(folder: Path) -> None:
     verb("handpiece", "--design", "four", "--width-px", "96", "--height-px", "96", "--out", "@.")(folder)
 
 
-WATCHED = ("--watch", "--end-s", "0.4", "--late-s", "0")
+WATCHED = ("--watch", "--end-s", "0.4", "--late-s", "0", "--quality", "standard")
 HOLDER = ("--out", f"@{_OUT}", "--body", f"@{_OUT}/holder.stl")
 PROBE = ("--handpiece", "@handpiece.json", "--tooth", str(TOOTH))
 BOARD = ("--columns", "6", "--rows", "5", "--square-mm", "1", "--instants", "1", "--supersampling", "1")
@@ -403,22 +403,7 @@ SCENARIOS: Mapping[str, Scenario] = {
     "mouth": Scenario(_four_cameras, verb("mouth", "--handpiece", "@handpiece.json", "--out", f"@{_OUT}")),
     "holder": Scenario(_four_cameras, verb("handpiece", "--handpiece", "@handpiece.json", *HOLDER)),
     "reconstruct": Scenario(_textured_capture, verb("reconstruct", "@capture", "--out", f"@{_OUT}")),
-    "live": Scenario(
-        _textured_capture,
-        verb(
-            "live",
-            "@capture",
-            "--watch",
-            "--end-s",
-            "0.4",
-            "--late-s",
-            "0",
-            "--quality",
-            "standard",
-            "--out",
-            f"@{_OUT}",
-        ),
-    ),
+    "live": Scenario(_textured_capture, verb("live", "@capture", *WATCHED, "--out", f"@{_OUT}")),
     "resume": Scenario(_cut_short, _resume),
     "calibrate": Scenario(
         _photographs,

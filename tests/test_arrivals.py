@@ -55,6 +55,9 @@ def test_a_frame_is_waited_for_but_not_for_ever(tmp_path: Path) -> None:
     found = arrivals.news(2.2)
     assert names(found) == ["00000", "00001"]
     assert found[0].cameras == ("a",)
+    (lost,) = arrivals.lost
+    assert "00000.png" in lost
+    assert "truncated" in lost
     late.unlink()
     write(tmp_path, "b", "00000")
     assert arrivals.news(3.0) == arrivals.news(3.1) == [], "it was given without"
@@ -71,6 +74,7 @@ def test_what_is_whole_in_time_is_given_whole(tmp_path: Path) -> None:
     found = arrivals.news(0.3)
     assert names(found) == ["00000", "00001"]
     assert found[0].cameras == ("a", "b")
+    assert arrivals.lost == []
 
 
 def test_a_camera_that_never_has_an_image_holds_up_the_first_frame_only(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -98,11 +98,15 @@ class _Feed:
     source: Callable[[], ImageSource]
     frames: Iterator[Frame | None]
     """None where none has come for a while."""
+    lost: Callable[[], Sequence[str]]
+    """Images that could not be read, each with the reason."""
 
 
 def _replayed(folder: Path, handpiece: Path | None, distance_mm: float | None, options: FollowOptions) -> _Feed:
     capture = storage.read_capture(folder, handpiece, distance_mm)
-    return _Feed(handpiece=capture.handpiece, source=lambda: capture.source, frames=_paced(capture, options.pace))
+    return _Feed(
+        handpiece=capture.handpiece, source=lambda: capture.source, frames=_paced(capture, options.pace), lost=list
+    )
 
 
 def _paced(capture: Capture, pace: float | None) -> Iterator[Frame]:
@@ -127,7 +131,7 @@ def _watched(folder: Path, handpiece: Path | None, distance_mm: float | None, op
         assert arrivals.source is not None  # a frame has come
         return arrivals.source
 
-    return _Feed(handpiece=known, source=source, frames=_arriving(arrivals, options))
+    return _Feed(handpiece=known, source=source, frames=_arriving(arrivals, options), lost=lambda: arrivals.lost)
 
 
 def _arriving(arrivals: Arrivals, options: FollowOptions) -> Iterator[Frame | None]:
@@ -156,6 +160,8 @@ def _followed(feed: _Feed, out: Path, options: ReconstructionOptions, view: Grow
                 view.show(session, changed, words.lost)
     except KeyboardInterrupt:
         console.print("the scan is ended; what came in is reconstructed")
+    if lost := feed.lost():
+        console.print(f"note: {len(lost)} images could not be read; the first: {lost[0]}", soft_wrap=True)
     if session is None or not session.frames:
         raise InputError("no frame has come that can be used; look whether images appear, and in which folder")
     seconds = time.monotonic() - begin

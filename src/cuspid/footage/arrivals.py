@@ -27,12 +27,18 @@ class Arrivals:
         self._whole = dict[str, set[str]]()
         self._since = dict[str, float]()
         self._given = set[str]()
+        self._refused = dict[Path, str]()
         self._suffix: str | None = None
 
     @property
     def source(self) -> ImageFolder | None:
         """Where the images of the frames are; None before there is one."""
         return None if self._suffix is None else ImageFolder(self._folder, self._suffix)
+
+    @property
+    def lost(self) -> list[str]:
+        """Images that were there but never whole, each with the reason."""
+        return list(self._refused.values())
 
     def news(self, now_s: float) -> list[Frame]:
         """The frames that are whole by now and were not given before. Raises InputError where images are of a camera
@@ -79,8 +85,12 @@ class Arrivals:
             if before != self._states[path]:
                 return
             image_size(path)
-        except (InputError, OSError):  # still being written, or moved to its place meanwhile
+        except OSError:  # moved to its place meanwhile
             return
+        except InputError as error:  # still being written, or damaged
+            self._refused[path] = str(error)
+            return
+        self._refused.pop(path, None)
         if self._suffix not in (None, path.suffix):
             raise InputError(f"{path}: the images before are {self._suffix} files; write all images in one type")
         self._suffix = path.suffix
