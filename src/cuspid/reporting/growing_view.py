@@ -1,6 +1,6 @@
 """A scan that is being taken, in the browser: the surface as it grows, its holes, the path, and where it was lost.
 
-The frame is that of the scan (mm): the cameras of its first frame look along +Z.
+The frame is that of the scan (mm); up is where the handpiece was in the first frame.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.reporting.live_view import add, start
 from cuspid.reporting.pages.scene import camera_lines, camera_path
-from cuspid.rig import Handpiece
+from cuspid.rig import Handpiece, Rig
 
 _RIMS_EVERY_S = 3.0
 """The holes are looked for so often: it takes the whole surface."""
@@ -54,7 +54,6 @@ class GrowingView:
     def __init__(self, host: str, port: int) -> None:
         """It takes the next free port. Raises MissingDependencyError without viser."""
         self._server = start(host, port)
-        self._server.scene.set_up_direction("-z")
         self.address = f"http://{host}:{self._server.get_port()}"
         self._nodes = dict[int, Any]()
         self._words = self._server.gui.add_markdown("Waiting for the first frame.")
@@ -93,16 +92,22 @@ class GrowingView:
         if len(path) > 1:
             segments = np.stack([path[:-1], path[1:]], axis=1)
             shown = self._toggles["Path"].value
-            self._server.scene.add_line_segments("/path", segments, np.array(_PATH), visible=shown)
+            self._server.scene.add_line_segments("/path", segments, np.array(_PATH), line_width=2, visible=shown)
         if not self._looked:
-            self._look_at(path[-1], latest, scan.handpiece.working_distance_mm)
+            self._look_at(path[-1], _towards(rig, latest), scan.handpiece.working_distance_mm)
 
-    def _look_at(self, place: Float[np.ndarray, "3"], pose: Rigid3, distance_mm: float) -> None:
-        """From behind the handpiece, at what it sees first."""
-        towards = pose.inverse().rotation[:, 2]
-        camera = self._server.initial_camera
+    def _look_at(self, place: Float[np.ndarray, "3"], towards: Float[np.ndarray, "3"], distance_mm: float) -> None:
+        """From behind the handpiece, at what it sees first, and with light from there."""
+        scene, camera = self._server.scene, self._server.initial_camera
+        scene.set_up_direction(tuple(map(float, -towards)))
+        aside = np.cross(towards, np.eye(3)[np.argmin(np.abs(towards))])
         camera.look_at = tuple(map(float, place + distance_mm * towards))
-        camera.position = tuple(map(float, place - 6 * distance_mm * towards + 0.01))
+        camera.position = tuple(map(float, place + distance_mm * (1.5 * aside - 3.5 * towards)))
+        # The colours of the images have light and shade of their own, which these lights hardly change.
+        scene.add_light_ambient("/lights/ambient", intensity=3.5)
+        scene.add_light_directional(
+            "/lights/above", intensity=3.0, position=tuple(map(float, 60 * (aside - 2 * towards)))
+        )
         self._looked = True
 
     def _show_rims(self, rims: Float[np.ndarray, "n 3"]) -> None:
@@ -127,3 +132,10 @@ class GrowingView:
                 *lines,
             ]
         return "\n".join(lines)
+
+
+def _towards(rig: Rig, rig_from_world: Rigid3) -> Float[np.ndarray, "3"]:
+    """Unit vector (world) in which the cameras look on the average."""
+    mean = np.mean([mounted.cam_from_rig.rotation[2] for mounted in rig.cameras.values()], axis=0)
+    towards = rig_from_world.inverse().rotate(mean)
+    return np.asarray(towards / np.linalg.norm(towards))

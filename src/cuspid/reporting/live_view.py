@@ -47,20 +47,22 @@ def serve(result: Result, host: str, port: int) -> Server:
     show = _what_to_show(result)
     server = start(host, port)
     server.scene.set_up_direction("+z")
+    _light(server)
     show(server)
     return server
 
 
 def start(host: str, port: int) -> Server:
-    """An empty scene with light from all sides, for its own pages alone. Raises MissingDependencyError without
-    viser."""
+    """An empty scene without lights or surroundings that are mirrored, for its own pages alone. Raises
+    MissingDependencyError without viser."""
     try:
         import viser
     except ImportError as error:
         raise MissingDependencyError("the view needs viser: pip install 'cuspid[view]'") from error
     with only_own_pages(host):
         server = viser.ViserServer(host=host, port=port, label="cuspid", verbose=False)
-    _light(server)
+    server.scene.configure_environment_map(None)
+    server.scene.configure_default_lights(enabled=False)
     return server
 
 
@@ -178,9 +180,7 @@ def _add_toggles(server: Server, nodes: dict[str, Node]) -> None:
 
 
 def _light(server: Server) -> None:
-    """Light from all sides, some more from above: no surroundings that are mirrored, no shadows."""
-    server.scene.configure_environment_map(None)
-    server.scene.configure_default_lights(enabled=False)
+    """Light from all sides, some more from above, and no shadows."""
     server.scene.add_light_ambient("/lights/ambient", intensity=2.4)
     for name, position in (("above", (-20.0, 30.0, 60.0)), ("front", (0.0, 80.0, 20.0)), ("back", (30.0, -80.0, 20.0))):
         server.scene.add_light_directional(f"/lights/{name}", intensity=1.8, position=position)
