@@ -55,6 +55,7 @@ MAKERS: Mapping[str, Maker] = {
     **dict.fromkeys(("molar-*", "arch", "real-arch", "spheres", "prepared-*"), Maker("run", _SCAN, release=True)),
     "motion-*": Maker("compare_motion", _SCAN),
     "qualities": Maker("qualities", _SCAN),
+    "live": Maker("live", _SCAN),
     "mouth": Maker("mouth"),
     "measure": Maker("measure_jaws"),
     "populations": Maker("populations"),

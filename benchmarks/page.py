@@ -187,6 +187,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
     "expectations": ("What to expect of a scan", trust_sections.expectations),
     "grid": ("Running many cases", handpiece_sections.grid),
     "qualities": ("Draft and standard", trust_sections.qualities),
+    "live": ("While scanning", trust_sections.live),
     "fuzz": ("Damaged input", trust_sections.fuzz),
     "kill": ("Killed runs", trust_sections.kill),
     "large": ("A mesh of 5 million faces", trust_sections.large),

@@ -64,6 +64,58 @@ def _rms(values: list[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+_LIVE = (
+    "arch",
+    "frames placed",
+    "first surface s",
+    "frames a second",
+    "behind s: median",
+    "most",
+    "GiB: after a tenth",
+    "at the end",
+    "drift um: median",
+    "most",
+    "adjusted um: median",
+    "most",
+    "with 10 black frames: placed",
+    "wrongly",
+)
+_FIRST_S, _LATE_S = 3.0, 3.0
+
+
+def live(result: Result) -> str:
+    """Whether a session keeps up, and what becomes of a blind stretch."""
+    rows = [_live_row(name, scan) for name, scan in result["scans"].items()]
+    return "\n".join(
+        [
+            f"Arches of twelve cameras replayed to a session, as a draft, at {result['pace']:g} frames a second: what "
+            "is due is pushed as soon as the frame before is done. *Frames a second*: how many it could have taken. "
+            "*Behind*: from when a frame was due until its surface was there. *Drift*: of the chained poses, if the "
+            "first one is right, before and after all were adjusted together. Bars: the first surface within "
+            f"{_FIRST_S:g} s of the first frame, never more than {_LATE_S:g} s behind. `python benchmarks/live.py`.",
+            "",
+            markdown_table(_LIVE, rows),
+        ]
+    )
+
+
+def _live_row(name: str, scan: Result) -> tuple[object, ...]:
+    blind, memory = scan["blind"], scan["memory_gib"]
+    return (
+        name,
+        f"{scan['placed']} of {scan['frames']}",
+        mark(scan["first_surface_s"], _FIRST_S, 1),
+        f"{scan['frames_a_second']:.1f}",
+        f"{scan['median_late_s']:.2f}",
+        mark(scan["most_late_s"], _LATE_S, 1),
+        f"{memory[0]:.2f}",
+        f"{memory[-1]:.2f}",
+        *(f"{scan[part][how]:.0f}" for part in ("drift_um", "corrected_um") for how in ("median", "most")),
+        f"{blind['placed']} of {blind['frames'] - blind['black']}",
+        mark(blind["wrong"], 0, 0),
+    )
+
+
 def fuzz(result: Result) -> str:
     """Damaged input, by what is done with it."""
     wrong = [case["scenario"] for case in result["wrong"]]
