@@ -2,9 +2,9 @@
 
     python benchmarks/page.py [--older]
 
-The benchmarks are what is measured anew for each release, all at one commit: results of several commits are refused
-(``python benchmarks/campaign.py --release`` measures them). An experiment answers a question, and has a commit of its
-own.
+The benchmarks are what is measured anew for each release, all at one commit (``python benchmarks/campaign.py
+--release``). An experiment answers a question, and has a commit of its own. Results of older code, and benchmarks of
+several commits, are refused unless they are asked for.
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ Older = Mapping[str, tuple[str, ...]]
 
 def origin(results: Mapping[str, Result], older: Older) -> str:
     """Of which code some results are."""
-    commits = sorted({str(result["commit"]) for result in results.values()})
+    commits = commits_of(results)
     told = f"Commit{'s' if len(commits) > 1 else ''} {', '.join(commits)}"
     changed = sorted({file for name in results for file in older.get(name, ())})
     if not changed:
@@ -216,20 +216,24 @@ def standing(results: Mapping[str, Result], older: Older) -> str:
     if holding == len(results):
         return f"All {holding} results hold for the current code: nothing that made them has changed since."
     return (
-        f"**{holding} of {len(results)} results hold for the current code**: nothing that made them has changed since. "
+        f"**{holding} of {len(results)} results hold for the current code**: what made them has not changed since. "
         "The others are marked *older code*: later changes may have altered them."
     )
 
 
-def one_commit(results: Mapping[str, Result]) -> str:
-    """That of all results. Raises SystemExit where they are of several."""
-    commits = {str(result["commit"]) for result in results.values()}
-    if len(commits) > 1:
-        told = (f"{name}: {result['commit']}" for name, result in results.items())
-        raise SystemExit(
-            "\n".join([*told, "benchmarks of several commits: run python benchmarks/campaign.py --release"])
-        )
-    return commits.pop()
+def commits_of(results: Mapping[str, Result]) -> list[str]:
+    """All that some results are of."""
+    return sorted({str(result["commit"]) for result in results.values()})
+
+
+def measured_at(commits: list[str]) -> str:
+    """Whether benchmarks are of one commit, for people."""
+    if len(commits) == 1:
+        return f"All of them were measured at commit {commits[0]}."
+    return (
+        f"**They are of {len(commits)} commits**, until `python benchmarks/campaign.py --release` has measured all of "
+        "them anew."
+    )
 
 
 def benchmarks(results: Mapping[str, Result], older: Older) -> str:
@@ -240,7 +244,7 @@ def benchmarks(results: Mapping[str, Result], older: Older) -> str:
         "",
         GENERATED,
         "",
-        f"All of them were measured at commit {one_commit(results)}. {standing(results, older)} "
+        f"{measured_at(commits_of(results))} {standing(results, older)} "
         "What answers a question once is among the [experiments](experiments.md).",
         "",
         "Conditions of the thesis: texture `artificial`, twelve cameras with exact calibration, noise 1.5 DN in each "
@@ -308,12 +312,20 @@ def read(folder: Path) -> dict[str, Result]:
 
 
 def main() -> None:
-    """Read the results, write the pages. Results that no longer hold are refused unless they are asked for."""
+    """Read the results, write the pages, unless results are refused."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--older", action="store_true", help="take results of older code, and say so on the pages")
+    parser.add_argument(
+        "--older", action="store_true", help="take results of older code and of several commits, and say so"
+    )
     arguments = parser.parse_args()
     results = read(HERE / "results")
     older = {name: changed for name, result in results.items() if (changed := changes(name, result))}
+    release = {name: result for name, result in results.items() if maker_of(name).release}
+    if len(commits_of(release)) > 1 and not arguments.older:
+        lines = [f"{name}: {result['commit']}" for name, result in release.items()]
+        raise SystemExit(
+            "\n".join([*lines, "benchmarks of several commits: run python benchmarks/campaign.py --release"])
+        )
     if older and not arguments.older:
         lines = [f"{name}: {', '.join(changed)}" for name, changed in older.items()]
         raise SystemExit(
@@ -321,7 +333,6 @@ def main() -> None:
                 [*lines, f"{len(older)} of {len(results)} results no longer hold: run them anew, or give --older"]
             )
         )
-    release = {name: result for name, result in results.items() if maker_of(name).release}
     others = {name: result for name, result in results.items() if name not in release}
     pages = {"benchmarks": benchmarks(release, older), "experiments": experiments(others, older)}
     for name, text in pages.items():

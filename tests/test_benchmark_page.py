@@ -120,11 +120,27 @@ def test_every_result_has_a_maker_and_a_place_on_a_page(freshness):
         assert ("| molar-seed0 (older code) |" in shown) == (chosen is release)
 
 
-def test_benchmarks_of_several_commits_are_refused(freshness):
+def test_benchmarks_of_several_commits_are_refused_unless_asked_for(freshness, monkeypatch, tmp_path):
     page = import_module("page")
-    release = of_release(freshness, page.read(ROOT / "benchmarks" / "results"))
+    kept = {"molar-seed0": "0123456789ab", "kill": "ba9876543210"}
+    (tmp_path / "benchmarks" / "results").mkdir(parents=True)
+    (tmp_path / "docs").mkdir()
+    for name, commit in kept.items():
+        result = json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text()) | {"commit": commit}
+        (tmp_path / "benchmarks" / "results" / f"{name}.json").write_text(json.dumps(result))
+    monkeypatch.setattr(page, "HERE", tmp_path / "benchmarks")
+    monkeypatch.setattr(page, "changes", lambda *_: ())
+    monkeypatch.setattr("sys.argv", ["page.py"])
     with pytest.raises(SystemExit, match="of several commits: run "):
-        page.benchmarks(release | {"kill": {**release["kill"], "commit": "0123456789ab"}}, {})
+        page.main()
+    assert not list((tmp_path / "docs").iterdir())
+    monkeypatch.setattr("sys.argv", ["page.py", "--older"])
+    page.main()
+    assert "**They are of 2 commits**" in (tmp_path / "docs" / "benchmarks.md").read_text()
+    (tmp_path / "benchmarks" / "results" / "kill.json").unlink()
+    monkeypatch.setattr("sys.argv", ["page.py"])
+    page.main()
+    assert "All of them were measured at commit 0123456789ab." in (tmp_path / "docs" / "benchmarks.md").read_text()
 
 
 def test_a_campaign_measures_what_no_longer_holds(freshness, repository, monkeypatch, capsys):
