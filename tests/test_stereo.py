@@ -215,8 +215,10 @@ def test_a_step_is_not_bridged() -> None:
         assert between.mean() < 0.01
 
 
-def test_the_same_images_give_the_same_depth() -> None:
-    again = DepthEstimator(diamond(), StereoOptions(spacing_px=2)).measure(hills_images(), "00000")
+@pytest.mark.parametrize("alone", [False, True])
+def test_the_same_images_give_the_same_depth(alone: bool) -> None:
+    """Also where the cameras are measured side by side."""
+    again = DepthEstimator(diamond(), StereoOptions(spacing_px=2)).measure(hills_images(), "00000", alone=alone)
     for one, other in zip(measured_hills(), again, strict=True):
         assert np.array_equal(one.depth_mm, other.depth_mm, equal_nan=True)
 

@@ -5,9 +5,9 @@ Frames: ``grid`` is the pinhole of a depth map, a coarser version of the camera'
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Protocol
 
 import cv2
 import numpy as np
@@ -32,6 +32,7 @@ from cuspid.stereo.initial_depth import PairMatcher, initial_pairs, initial_poin
 from cuspid.stereo.rectification import IdealView, RectifiedPair, rectify
 from cuspid.stereo.refinement import SCORE, VARIANCE, GroupGeometry, Q, RefinementOptions, image_noise, refine
 from cuspid.stereo.shading import ShadedView, ShadingOptions, brightness, correction, shaded_depths
+from cuspid.workers import map_in_threads
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,6 +123,18 @@ def stack_images(
     return stack, sizes
 
 
+class _Map(Protocol):
+    """Does some work on each item."""
+
+    def __call__(self, work: Callable[[Any], Any], items: Iterable[Any], /) -> list[Any]:
+        """The results, in order."""
+        ...
+
+
+def _one_by_one(work: Callable[[Any], Any], items: Iterable[Any], /) -> list[Any]:
+    return [work(item) for item in items]
+
+
 class DepthEstimator:
     """Measures depth in the frames of one handpiece. Depends only on the handpiece; safe to share between threads."""
 
@@ -173,33 +186,47 @@ class DepthEstimator:
         )
 
     def measure(
-        self, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], frame: str, lighting: str | None = None
+        self,
+        images: Mapping[str, UInt8[np.ndarray, "h w *c"]],
+        frame: str,
+        lighting: str | None = None,
+        *,
+        alone: bool = False,
     ) -> tuple[DepthMap, ...]:
         """Depth maps of a frame, one for each camera with a stereo partner, from RGB or grey images by camera name,
         taken under a lighting pattern of the handpiece.
 
-        A camera of the handpiece that is not among them, or whose image is blank, saw nothing of the frame.
+        A camera of the handpiece that is not among them, or whose image is blank, saw nothing of the frame. ``alone``:
+        no other frame is measured meanwhile, so that the cameras of a group are measured side by side.
         """
         names = self.handpiece.rig.names
         groups = self._groups(tuple(name for name in names if name in images and not _is_blank(images[name])))
-        found = [depth_map for group in groups for depth_map in self._measure_group(group, images, frame, lighting)]
+        work = map_in_threads if alone else _one_by_one
+        found = [each for group in groups for each in self._measure_group(group, images, frame, lighting, work)]
         return tuple(sorted(found, key=lambda depth_map: names.index(depth_map.camera_name)))
 
     def _measure_group(
-        self, group: Group, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], frame: str, lighting: str | None
+        self,
+        group: Group,
+        images: Mapping[str, UInt8[np.ndarray, "h w *c"]],
+        frame: str,
+        lighting: str | None,
+        work: _Map,
     ) -> list[DepthMap]:
         by_shading = self.signal == "shading"
-        measured = self._by_shading(group, images, lighting) if by_shading else self._by_texture(group, images)
+        measured = self._by_shading(group, images, lighting) if by_shading else self._by_texture(group, images, work)
         return [
             self._depth_map(measured, index, view, images[view.name], frame) for index, view in enumerate(group.views)
         ]
 
-    def _by_texture(self, group: Group, images: Mapping[str, UInt8[np.ndarray, "h w *c"]]) -> list[Measured]:
+    def _by_texture(
+        self, group: Group, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], work: _Map
+    ) -> list[Measured]:
         grays = {view.name: gray(images[view.name]) for view in group.views}
         depth_range = self.handpiece.depth_range_mm
-        initial = [initial_points(pair, grays, self.matcher, depth_range) for pair in group.pairs]
+        initial = work(lambda pair: initial_points(pair, grays, self.matcher, depth_range), group.pairs)
         stack, sizes = stack_images([view.resample(grays[view.name]) for view in group.views])
-        return [self._measure_reference(group, index, initial, stack, sizes) for index in range(len(group.views))]
+        return work(lambda index: self._measure_reference(group, index, initial, stack, sizes), range(len(group.views)))
 
     def _by_shading(
         self, group: Group, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], lighting: str | None

@@ -81,7 +81,7 @@ def measure_depth(
     estimator = estimator or DepthEstimator(capture.handpiece, options, signal=signal)
 
     def measure(frame: Frame) -> tuple[DepthMap, ...]:
-        return estimator.measure(capture.images(frame), frame.name, frame.lighting)
+        return estimator.measure(capture.images(frame), frame.name, frame.lighting, alone=len(capture.frames) == 1)
 
     def inputs(frame: Frame) -> dict[str, str]:
         return {"frame": hash_frame(capture, frame)}
