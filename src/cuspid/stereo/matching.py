@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
@@ -123,15 +123,11 @@ def stack_images(
     return stack, sizes
 
 
-class _Map(Protocol):
-    """Does some work on each item."""
-
-    def __call__(self, work: Callable[[Any], Any], items: Iterable[Any], /) -> list[Any]:
-        """The results, in order."""
-        ...
+_Map = Callable[[Callable[[Any], Any], Iterable[Any]], list[Any]]
+"""Does some work on each item; the results, in order."""
 
 
-def _one_by_one(work: Callable[[Any], Any], items: Iterable[Any], /) -> list[Any]:
+def _one_by_one(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
     return [work(item) for item in items]
 
 
