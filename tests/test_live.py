@@ -42,10 +42,10 @@ def test_a_capture_is_replayed_and_reconstructed(tmp_path: Path, capsys: pytest.
     write(tmp_path / "capture", frames)
     run("live", tmp_path / "capture", "--out", tmp_path / "live", *STANDARD)
     assert "3 of 3 frames placed as they came" in capsys.readouterr().err
-    run("reconstruct", tmp_path / "capture", "--out", tmp_path / "batch", *STANDARD)
-    one, other = ((tmp_path / folder / "mesh.ply").read_bytes() for folder in ("live", "batch"))
-    assert one == other
     assert {"live", "reconstruct"} <= storage.read_json(tmp_path / "live" / "run.json").keys()
+    made = (tmp_path / "live" / "mesh.ply").stat().st_mtime_ns
+    run("reconstruct", tmp_path / "capture", "--out", tmp_path / "live", *STANDARD)
+    assert (tmp_path / "live" / "mesh.ply").stat().st_mtime_ns == made, "it is the same reconstruction"
 
 
 def test_a_folder_is_followed_while_images_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

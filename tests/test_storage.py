@@ -17,7 +17,7 @@ from cuspid.errors import CuspidError, InputError, OutputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw, Landmark, Sphere
 from cuspid.reconstruction import DepthMap, Expectation, Reconstruction, Refinement
-from cuspid.rig import MountedCamera, Rig
+from cuspid.rig import MountedCamera, Rig, Sensor
 from cuspid.shape_model import MeanStep
 from cuspid.storage.files import as_declared, read_arrays, whole_files, write_arrays
 from cuspid.storage.handpieces import hash_handpiece
@@ -245,6 +245,9 @@ def test_broken_captures_are_refused(tmp_path):
     without = storage.read_capture(tmp_path)
     assert without.handpiece.rig.names == ("a",)
     assert [dropped.what for dropped in without.left_out] == ["camera b"]
+    calibrated = dataclasses.replace(handpiece("a", "b"), sensors={"a": Sensor(gamma=1.9), "b": Sensor(gamma=2.0)})
+    storage.write_handpiece(tmp_path / "handpiece.json", calibrated)
+    assert storage.read_capture(tmp_path).handpiece.sensors.keys() == {"a"}
     with pytest.raises(InputError, match="no folder 'images'"):
         storage.read_capture(tmp_path / "images")
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from cuspid.geometry import Rigid3
-from cuspid.rig import Handpiece, Rig
+from cuspid.rig import Handpiece, Rig, Sensor
 from cuspid.stereo.temporal import TemporalOptions, measure_temporal, moving_pair
 from synthetic_scene import cast_depth, diamond, height_field, render
 
@@ -20,8 +21,11 @@ def lone_camera() -> Handpiece:
     return replace(handpiece, rig=Rig({"west": handpiece.rig["west"]}))
 
 
-def test_one_moving_camera_measures_depth() -> None:
+@pytest.mark.parametrize("sensors", [{}, {"west": Sensor(gamma=1.8), "east": Sensor(gamma=2.0)}])
+def test_one_moving_camera_measures_depth(sensors: dict[str, Sensor]) -> None:
+    """Also of a handpiece of which the sensor of every camera is known."""
     handpiece, rng = lone_camera(), np.random.default_rng(0)
+    handpiece = replace(diamond(), sensors=sensors) if sensors else handpiece
     mounted = handpiece.rig["west"]
     images = [{"west": render(HILLS, mounted, pose, rng)} for pose in (Rigid3.identity(), STEP)]
     options = TemporalOptions(confidence_share=0.1)

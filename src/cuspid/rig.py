@@ -322,6 +322,10 @@ class Handpiece:
         focal_px = [mounted.camera.focal_px.mean() for mounted in self.rig.cameras.values()]
         return self.working_distance_mm / float(np.median(focal_px))
 
+    def with_cameras(self, rig: Rig) -> Handpiece:
+        """The same handpiece with other cameras; sensors of those that it no longer has are left out."""
+        return replace(self, rig=rig, sensors={name: own for name, own in self.sensors.items() if name in rig.names})
+
     def sensor_of(self, camera: str) -> Sensor:
         """The sensor of a camera."""
         return self.sensors.get(camera, self.sensor)

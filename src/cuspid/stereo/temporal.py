@@ -87,4 +87,4 @@ def moving_pair(handpiece: Handpiece, name: str, next_from_rig: Rigid3, options:
     rig = Rig({name: mounted, f"{name}+": moved})
     if not stereo_pairs(rig, handpiece.working_distance_mm, options.stereo.pairing):
         return None
-    return replace(handpiece, rig=rig, lights={}, lightings=())
+    return replace(handpiece.with_cameras(rig), lights={}, lightings=())

@@ -60,7 +60,7 @@ def read_capture(folder: Path, handpiece: Path | None = None, working_distance_m
     frames, left_out = _present(_listed(folder, known, stems), stems, folder)
     used = Rig({name: mounted for name, mounted in known.rig.cameras.items() if stems[name]})
     capture = Capture(
-        handpiece=replace(known, rig=used), frames=frames, source=ImageFolder(folder, suffix), left_out=left_out
+        handpiece=known.with_cameras(used), frames=frames, source=ImageFolder(folder, suffix), left_out=left_out
     )
     for frame in frames:
         for name in frame.cameras:
