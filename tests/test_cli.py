@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -175,6 +176,15 @@ def test_the_trajectory_is_that_of_the_mesh_that_it_made(tmp_path, capsys):
     error = storage.read_json(tmp_path / "trajectory.json")
     assert error["frames"] == 3
     assert error["ape_um"]["max"] < 1e-6
+    (tmp_path / "trajectory.json").unlink()
+    other = Rigid3.from_rotation_vector(np.array([0.2, 0.1, 0]), np.array([3.0, 0, -5]))
+    storage.write_handpiece(truth / "handpiece.json", handpiece("a", "b"))
+    calibrated = replace(handpiece("a", "b"), rig=handpiece("a", "b").rig.in_frame(other))
+    storage.write_handpiece(tmp_path / "motion" / "handpiece.json", calibrated)
+    storage.write_poses(tmp_path / "motion" / "poses.json", {name: other @ pose for name, pose in found.items()})
+    _evaluate_trajectory(tmp_path / "mesh.ply", truth, trueness, tmp_path)
+    error = storage.read_json(tmp_path / "trajectory.json")
+    assert error["ape_um"]["max"] < 1e-6, "the same cameras, described in another frame"
     (tmp_path / "trajectory.json").unlink()
     storage.write_poses(tmp_path / "motion" / "poses.json", {"00001": found["00001"]})
     _evaluate_trajectory(tmp_path / "mesh.ply", truth, trueness, tmp_path)

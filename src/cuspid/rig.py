@@ -13,6 +13,7 @@ from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from cuspid.body import CAMERA_MM, LED_MM, Body, module
 from cuspid.camera import Camera
@@ -105,6 +106,15 @@ class Rig:
                 for name, mounted in self.cameras.items()
             }
         )
+
+    def motion_onto(self, other: Rig) -> Rigid3:
+        """``other_from_self``: the rigid motion that lays the cameras which both rigs have, of which there must be one,
+        on those of the other on the whole (mean rotation, mean centre)."""
+        both = [name for name in self.names if name in other.names]
+        turns = [other[name].cam_from_rig.rotation.T @ self[name].cam_from_rig.rotation for name in both]
+        turn = Rotation.from_matrix(np.stack(turns)).mean().as_matrix()
+        ours, theirs = (np.mean([rig[name].centre_in_rig for name in both], axis=0) for rig in (self, other))
+        return Rigid3(turn, theirs - turn @ ours)
 
     def largest_shift_px(self, other: Rig, distance_mm: float) -> float:
         """Largest shift of points at a distance between the images of this calibration and of another one of the same

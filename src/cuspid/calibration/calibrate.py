@@ -10,7 +10,6 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from cuspid.board import Board
 from cuspid.calibration.bundle import (
@@ -236,14 +235,7 @@ def in_frame_of(found: RigCalibration, drawn: Rig) -> RigCalibration:
             f"calibration: the drawn handpiece has the cameras {', '.join(drawn.names)}, but the images are of "
             f"{', '.join(found.rig.names)}; give them the same names"
         )
-    turns = [
-        drawn[name].cam_from_rig.rotation.T @ each.cam_from_rig.rotation for name, each in found.rig.cameras.items()
-    ]
-    turn = Rotation.from_matrix(np.stack(turns)).mean().as_matrix()
-    ours, theirs = (
-        np.mean([rig[name].centre_in_rig for name in found.rig.names], axis=0) for rig in (found.rig, drawn)
-    )
-    drawn_from_rig = Rigid3(turn, theirs - turn @ ours)
+    drawn_from_rig = found.rig.motion_onto(drawn)
     seen = {key: drawn_from_rig @ pose for key, pose in found.rig_from_view.items()}
     return replace(found, rig=found.rig.in_frame(drawn_from_rig), rig_from_view=seen)
 

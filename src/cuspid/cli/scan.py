@@ -22,6 +22,7 @@ from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.evaluation.margin import MarginError, cut_margins, margin_error
 from cuspid.evaluation.spheres import SphereReport, evaluate_spheres
 from cuspid.evaluation.trajectory import trajectory_error
+from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.motion.colmap import hash_model
@@ -196,8 +197,9 @@ def _evaluate_trajectory(mesh: Path, truth: Path, trueness: Trueness, out: Path)
     found, true = mesh.parent / "motion" / "poses.json", truth / "poses.json"
     if mesh.stem != "mesh" or not (found.is_file() and true.is_file()):
         return
+    poses = _as_of(storage.read_poses(found), found.parent, truth)
     try:
-        error = trajectory_error(storage.read_poses(found), storage.read_poses(true), trueness.reference_from_scan)
+        error = trajectory_error(poses, storage.read_poses(true), trueness.reference_from_scan)
     except InputError as reason:
         console.print(f"note: {reason}")
         return
@@ -207,6 +209,18 @@ def _evaluate_trajectory(mesh: Path, truth: Path, trueness: Trueness, out: Path)
         f"{error.ape_deg.rmse:.4f} deg, relative from frame to frame {error.rpe_um.rmse:.1f} µm and "
         f"{error.rpe_deg.rmse:.4f} deg"
     )
+
+
+def _as_of(rig_from_world: Mapping[str, Rigid3], motion: Path, truth: Path) -> dict[str, Rigid3]:
+    """Poses of the frame in which the true handpiece is described: where a calibration has its own, no image tells."""
+    files = [folder / "handpiece.json" for folder in (motion, truth)]
+    if not all(file.is_file() for file in files):
+        return dict(rig_from_world)
+    found, true = (storage.read_handpiece(file).rig for file in files)
+    if set(found.names).isdisjoint(true.names):
+        return dict(rig_from_world)
+    true_from_found = found.motion_onto(true)
+    return {name: true_from_found @ pose for name, pose in rig_from_world.items()}
 
 
 def _evaluate_spheres(scan: Mesh, reference: Jaw, trueness: Trueness, out: Path) -> None:
