@@ -87,7 +87,7 @@ BENCHMARKS = (
     Benchmark("real_gloss", "real_gloss.py {ball} --out {out}"),
     Benchmark("any_rig", "any_rig.py --work {work} --out {out}"),
     Benchmark("qualities", "qualities.py {jaws}/fullarch_upper_137k.ply --work {work} --out {out}"),
-    Benchmark("live", "live.py {jaws}/fullarch_upper_137k.ply --work {work} --out {out}"),
+    Benchmark("live", "live.py phantom {jaws}/fullarch_upper_137k.ply --work {work} --out {out}"),
     Benchmark("expectations", "expectations.py --work {work} --out {out}"),
     Benchmark("enamel", "enamel.py {jaws} --work {work} --out {out}"),
     Benchmark("jaws_plan", "jaws.py {jaws} --plan --work {work} --out {out}"),

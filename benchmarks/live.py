@@ -1,10 +1,11 @@
 """Whether a session keeps up with a handpiece over a whole arch, in steady memory, and with a blind stretch in between.
 
-    python benchmarks/live.py [JAW ...] [--pace 1.5] [--work build/live] [--out benchmarks/results/live.json]
+    python benchmarks/live.py ARCH ... [--pace 1.5] [--work build/live] [--out benchmarks/results/live.json]
 
-Each JAW is a mesh of a whole arch; the built-in phantom comes first. Each is scanned in one pass of 100 frames or more,
-and replayed as a draft at so many frames a second: what is due is pushed as soon as the frame before is done. Then once
-more as fast as it goes, with ten frames in the middle black. Nothing else should run meanwhile.
+Each ARCH is ``phantom`` (the built-in one), a mesh of a whole arch, or the folder of a simulated scan of one. An arch
+is scanned in one pass of 100 frames or more, and replayed as a draft at so many frames a second: what is due is pushed
+as soon as the frame before is done. Then once more as fast as it goes, with ten frames in the middle black. Nothing
+else should run meanwhile.
 """
 
 from __future__ import annotations
@@ -106,10 +107,11 @@ def drift_um(found: Mapping[str, Rigid3], true: Mapping[str, Rigid3]) -> Float[n
     return 1000 * np.linalg.norm(off, axis=1)
 
 
-def scanned(jaw: Path | None, work: Path) -> Path:
+def scanned(arch: str, work: Path) -> Path:
     """The folder of a simulated scan, made where it is not there."""
-    name = "phantom" if jaw is None else jaw.stem
-    given = [] if jaw is None else [str(jaw)]
+    if Path(arch).is_dir():
+        return Path(arch)
+    name, given = Path(arch).stem, [] if arch == "phantom" else [arch]
     run_timed("simulate", *given, *ONE_PASS, "--out", str(work / name), log=work / f"{name}.log")
     return work / name
 
@@ -141,15 +143,15 @@ def measured(scan: Path, pace: float) -> dict[str, Any]:
 def main() -> None:
     """Measure, and write the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("jaws", nargs="*", type=Path)
+    parser.add_argument("arches", nargs="+")
     parser.add_argument("--pace", type=float, default=1.5)
     parser.add_argument("--work", type=Path, default=Path("build/live"))
     parser.add_argument("--out", type=Path, default=HERE / "results" / "live.json")
     arguments = parser.parse_args()
     arguments.work.mkdir(parents=True, exist_ok=True)
     scans = {}
-    for jaw in (None, *arguments.jaws):
-        scan = scanned(jaw, arguments.work)
+    for arch in arguments.arches:
+        scan = scanned(arch, arguments.work)
         scans[scan.name] = measured(scan, arguments.pace)
         print(scan.name, scans[scan.name], flush=True)
     write_json(arguments.out, {"pace": arguments.pace, "scans": scans, **conditions()})
