@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import argparse
 import os
-import shutil
 import tempfile
 import time
 from collections.abc import Mapping
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +38,11 @@ BLIND = 10
 
 @dataclass(frozen=True)
 class Blinded:
-    """Images of another source, some frames of it black. An :class:`cuspid.capture.ImageSource`."""
+    """Images of another source, and black ones of further frames. An :class:`cuspid.capture.ImageSource`."""
 
     whole: ImageSource
-    black: frozenset[str]
+    black: Mapping[str, str]
+    """By the names of the black frames: a frame whose images have the same size."""
 
     @property
     def suffix(self) -> str:
@@ -48,20 +50,30 @@ class Blinded:
         return self.whole.suffix
 
     def read(self, frame: str, camera: str) -> UInt8[np.ndarray, "h w 3"]:
-        """As the other, or nothing."""
-        return self.whole.read(frame, camera) * np.uint8(frame not in self.black)
+        """As the other, or black."""
+        return self.whole.read(self.black.get(frame, frame), camera) * np.uint8(frame not in self.black)
 
     def size(self, frame: str, camera: str) -> tuple[int, int]:
         """As the other."""
-        return self.whole.size(frame, camera)
+        return self.whole.size(self.black.get(frame, frame), camera)
 
     def digest(self, frame: str, camera: str) -> str:
         """As the other, marked where it is black."""
-        return self.whole.digest(frame, camera) + ("-black" if frame in self.black else "")
+        return self.whole.digest(self.black.get(frame, frame), camera) + ("-black" if frame in self.black else "")
 
     def where(self, frame: str, camera: str) -> str:
         """As the other."""
-        return self.whole.where(frame, camera)
+        return self.whole.where(self.black.get(frame, frame), camera)
+
+
+def blinded(capture: Capture) -> tuple[Capture, frozenset[str]]:
+    """With black frames in the middle, and their names: the handpiece waits there until it sees again."""
+    middle = len(capture.frames) // 2
+    here = capture.frames[middle]
+    dark = tuple(replace(here, name=f"black-{k}") for k in range(BLIND))
+    source = Blinded(capture.source, {frame.name: here.name for frame in dark})
+    frames = (*capture.frames[:middle], *dark, *capture.frames[middle:])
+    return replace(capture, frames=frames, source=source), frozenset(source.black)
 
 
 def followed(capture: Capture, folder: Path, pace: float | None) -> tuple[Session, dict[str, Any]]:
@@ -119,18 +131,16 @@ def scanned(arch: str, work: Path) -> Path:
 def measured(scan: Path, pace: float) -> dict[str, Any]:
     """The figures of one arch."""
     capture, true = storage.read_capture(scan / "capture"), storage.read_poses(scan / "truth" / "poses.json")
-    middle = len(capture.frames) // 2
-    black = frozenset(frame.name for frame in capture.frames[middle : middle + BLIND])
+    dark, black = blinded(capture)
     with tempfile.TemporaryDirectory(prefix="cuspid-live-") as folder:
+        followed(replace(capture, frames=capture.frames[:3]), Path(folder) / "first", None)
         session, figures = followed(capture, Path(folder) / "paced", pace)
         off = drift_um(session.rig_from_world, true)
         begin = time.perf_counter()
         session.correct()
         corrected = drift_um(session.rig_from_world, true)
         took = time.perf_counter() - begin
-        blinded = replace(capture, source=Blinded(capture.source, black))
-        again, blind = followed(blinded, Path(folder) / "blind", None)
-        shutil.rmtree(folder, ignore_errors=True)
+        again, blind = followed(dark, Path(folder) / "blind", None)
     return {
         **figures,
         "drift_um": {"median": float(np.median(off)), "most": float(off.max())},
@@ -152,7 +162,8 @@ def main() -> None:
     scans = {}
     for arch in arguments.arches:
         scan = scanned(arch, arguments.work)
-        scans[scan.name] = measured(scan, arguments.pace)
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:  # for its memory
+            scans[scan.name] = alone.submit(measured, scan, arguments.pace).result()
         print(scan.name, scans[scan.name], flush=True)
     write_json(arguments.out, {"pace": arguments.pace, "scans": scans, **conditions()})
 

@@ -77,7 +77,7 @@ _LIVE = (
     "most",
     "adjusted um: median",
     "most",
-    "with 10 black frames: placed",
+    "with 10 black frames in between: placed",
     "wrongly",
 )
 _FIRST_S, _LATE_S = 3.0, 3.0
