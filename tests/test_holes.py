@@ -211,7 +211,9 @@ def measured(
         blank = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
         storage.write_image(image_path(capture, frame, name), blank)
 
-    def measure(_: object, images: Mapping[str, np.ndarray], frame: str, lighting: str | None) -> tuple[DepthMap, ...]:
+    def measure(
+        _: object, images: Mapping[str, np.ndarray], frame: str, lighting: str | None, **how: bool
+    ) -> tuple[DepthMap, ...]:
         asked.append((frame, *sorted(images)))
         return tuple(plane(found, frame, name, 5.0) for name in cameras)
 
