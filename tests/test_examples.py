@@ -7,7 +7,11 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from cuspid import pipeline, storage
+
+pytestmark = pytest.mark.documentation
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
