@@ -266,14 +266,19 @@ def test_cameras_that_were_not_triggered_together_are_refused():
         calibrated(truth, late)
 
 
+def shaken():
+    """A rig, and views in which the second camera saw each board a little aside."""
+    truth, rng = scene(5), np.random.default_rng(0)
+    views = views_of(truth, BOARD, 0.05, rng)
+    return truth, {
+        key: BoardView(view.corner, view.pixels + rng.normal(0, 0.6, 2)) if key[0] == "cam1" else view
+        for key, view in views.items()
+    }
+
+
 def test_cameras_that_moved_against_each_other_are_told_of():
     """The second saw each board a little aside: less than what makes a view odd, more than its own views leave."""
-    truth = scene(5)
-    rng = np.random.default_rng(0)
-    views = views_of(truth, BOARD, 0.05, rng)
-    for key, view in views.items():
-        if key[0] == "cam1":
-            views[key] = BoardView(view.corner, view.pixels + rng.normal(0, 0.6, 2))
+    truth, views = shaken()
     found = calibrated(truth, views)
     assert any(note.startswith("camera cam1") and "px alone; they may not have seen" in note for note in found.notes)
     assert found.cameras["cam1"].alone_px < 0.1 < 3 * found.cameras["cam1"].alone_px < found.cameras["cam1"].rms_px
@@ -342,12 +347,7 @@ def test_cameras_that_expose_together_have_no_delays():
 @pytest.mark.parametrize("worse", ["undetermined", "no better", "few views", "no halves"])
 def test_delays_that_explain_nothing_are_not_taken(monkeypatch, worse):
     """Doubtful views are tried with delays; the calibration without stays where these fail, or leave much out."""
-    truth = scene(5)
-    rng = np.random.default_rng(0)
-    views = views_of(truth, BOARD, 0.05, rng)
-    for key, view in views.items():
-        if key[0] == "cam1":
-            views[key] = BoardView(view.corner, view.pixels + rng.normal(0, 0.6, 2))
+    truth, views = shaken()
     usual, tried = calibrate._described, []
 
     def described(found, *rest):

@@ -39,9 +39,10 @@ def corners(meshes: list[Mesh]) -> np.ndarray:
 
 
 def test_parts_are_together_the_whole_whenever_they_are_asked_for() -> None:
+    """Also where surfaces lie over each other, so that one changes the other beyond its own blocks."""
     surface, parts = GrowingSurface(DETAIL_MM), dict[int, Mesh]()
-    for k in range(3):
-        surface.add(maps_of(k), POSES[k])
+    for k, z_mm in ((0, 0.0), (1, 0.0), (2, 0.3), (0, -0.5), (1, 0.4)):
+        surface.add(maps_of(k), POSES[k] @ Rigid3(np.eye(3), np.array([0.0, 0.0, z_mm])))
         news = surface.changed()
         parts |= news
         assert news

@@ -21,7 +21,7 @@ from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.reporting import live_view
 from cuspid.reporting.growing_view import GrowingView
-from test_session import scan
+from test_session import scan, smooth
 from verbs import refused, run
 
 STANDARD = ("--quality", "standard", "--calibration", "fixed")
@@ -71,6 +71,15 @@ def test_without_frames_nothing_is_left(tmp_path: Path, capsys: pytest.CaptureFi
     message = refused(capsys, "live", tmp_path / "capture", "--watch", "--end-s", 0.2, "--out", out)
     assert "no frame has come" in message
     assert not out.exists()
+
+
+def test_plain_teeth_are_refused_and_nothing_is_left(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    frames = scan().frames[:1]
+    storage.write_capture(tmp_path / "capture", replace(scan(), frames=frames))
+    for camera in frames[0].cameras:
+        storage.write_image(tmp_path / "capture" / "images" / camera / "00000.png", smooth())
+    assert "it shows no texture" in refused(capsys, "live", tmp_path / "capture", "--out", tmp_path / "scan")
+    assert not (tmp_path / "scan").exists()
 
 
 def test_a_replay_keeps_its_pace() -> None:

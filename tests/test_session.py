@@ -60,6 +60,11 @@ def off_um(parts: Mapping[int, Mesh]) -> np.ndarray:
     return 1000 * HILLS.closest(np.concatenate([mesh.vertices for mesh in parts.values()]))[0]
 
 
+def smooth() -> np.ndarray:
+    """An image of a plain surface."""
+    return np.tile(np.linspace(90, 160, 160)[:, None, None], (1, 160, 3)).astype(np.uint8)
+
+
 def with_frame(capture: Capture, name: str, image: np.ndarray) -> Capture:
     """With another image in all cameras of one frame."""
     images = {key: image if key[0] == name else each for key, each in capture.source.images.items()}
@@ -161,8 +166,7 @@ def test_what_a_correction_cannot_place_is_taken_out(monkeypatch: pytest.MonkeyP
 
 
 def test_plain_surfaces_are_refused_with_what_to_do(tmp_path: Path) -> None:
-    shade = np.tile(np.linspace(90, 160, 160)[:, None, None], (1, 160, 3)).astype(np.uint8)
-    capture = with_frame(scan(), "00000", shade)
+    capture = with_frame(scan(), "00000", smooth())
     session = Session(capture.handpiece, capture.source, tmp_path)
     with pytest.raises(InputError, match="run cuspid reconstruct when all images are there"):
         session.push(capture.frames[0])

@@ -39,6 +39,10 @@ from cuspid.stereo.matching import DepthEstimator
 from cuspid.stereo.stage import StoredDepthMaps, measure_depth
 from cuspid.surface.growing import GrowingSurface
 
+_PLAIN = (
+    "it shows no texture, and plain surfaces are not followed while they are scanned; run cuspid reconstruct when all "
+    "images are there"
+)
 _MOVED_VOXELS = 0.5
 """A correction that moves the surface of a frame by less than this is not worth putting it there."""
 
@@ -116,10 +120,13 @@ class Session:
         """
         begin = time.perf_counter()
         try:
-            features = self._features(frame)
+            plain = not self.rig_from_world and self._is_plain(frame)
+            features = {} if plain else self._features(frame)
         except InputError as error:
             placed = self._left_out(frame, str(error))
         else:
+            if plain:
+                raise InputError(f"frame {frame.name}: {_PLAIN}")
             placed = self._placed(frame, features)
         return Step(
             frame=frame.name,
@@ -151,8 +158,6 @@ class Session:
         return pipeline.reconstruct(self.capture, self._folder, self._options, progress=progress)
 
     def _placed(self, frame: Frame, features: Mapping[tuple[str, str], Features]) -> Placed:
-        if not self.rig_from_world:
-            self._require_texture(frame)
         placed = self._tracker.push(frame.name, features)
         self._capture = replace(self._capture, frames=(*self.frames, frame))
         self._ranks[frame.lighting] += 1
@@ -161,12 +166,8 @@ class Session:
         self._put(frame, placed.rig_from_world)
         return placed
 
-    def _require_texture(self, frame: Frame) -> None:
-        if pipeline.matched(replace(self._capture, frames=(frame,)), self._options) == "shading":
-            raise InputError(
-                f"frame {frame.name}: it shows no texture, and plain surfaces are not followed while they are scanned; "
-                "run cuspid reconstruct when all images are there"
-            )
+    def _is_plain(self, frame: Frame) -> bool:
+        return pipeline.matched(replace(self._capture, frames=(frame,)), self._options) == "shading"
 
     def _features(self, frame: Frame) -> Mapping[tuple[str, str], Features]:
         one = replace(self._capture, frames=(frame,))

@@ -36,7 +36,8 @@ class FollowOptions(Options):
     pace: Annotated[float | None, Range(0.001, 1000)] = None
     """Frames a second of a replay; default: at the times that the capture tells, without these as fast as possible."""
     late_s: Annotated[float, Range(0, 3600)] = 2.0
-    """A watched frame whose images are not all there is taken without them this long after a later frame is whole."""
+    """A watched frame whose images are not all there is taken without them this long after the first image of a later
+    one."""
     end_s: Annotated[float, Range(0.1, 86_400)] = 60.0
     """A watched scan ends when no image has come for so long, or with Ctrl-C."""
     pause_s: Annotated[float, Range(0.1, 86_400)] = 5.0
