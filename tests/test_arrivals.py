@@ -55,9 +55,9 @@ def test_a_frame_is_waited_for_but_not_for_ever(tmp_path: Path) -> None:
     found = arrivals.news(2.2)
     assert names(found) == ["00000", "00001"]
     assert found[0].cameras == ("a",)
-    (lost,) = arrivals.lost
-    assert "00000.png" in lost
-    assert "truncated" in lost
+    (left_out,) = arrivals.left_out
+    assert left_out.what == "camera b of frame 00000"
+    assert "truncated" in left_out.reason
     late.unlink()
     write(tmp_path, "b", "00000")
     assert arrivals.news(3.0) == arrivals.news(3.1) == [], "it was given without"
@@ -74,7 +74,7 @@ def test_what_is_whole_in_time_is_given_whole(tmp_path: Path) -> None:
     found = arrivals.news(0.3)
     assert names(found) == ["00000", "00001"]
     assert found[0].cameras == ("a", "b")
-    assert arrivals.lost == []
+    assert arrivals.left_out == ()
 
 
 def test_a_camera_that_never_has_an_image_holds_up_the_first_frame_only(tmp_path: Path) -> None:
@@ -89,6 +89,7 @@ def test_a_camera_that_never_has_an_image_holds_up_the_first_frame_only(tmp_path
         write(tmp_path, camera, "00002")
     assert names(arrivals.news(3.0)) == []
     assert names(arrivals.news(3.1)) == ["00002"]
+    assert [each.what for each in arrivals.left_out] == ["camera c"]
 
 
 def test_at_the_end_the_rest_is_given(tmp_path: Path) -> None:
@@ -97,6 +98,7 @@ def test_at_the_end_the_rest_is_given(tmp_path: Path) -> None:
     assert arrivals.news(0.0) == arrivals.news(0.1) == []
     (last,) = arrivals.rest()
     assert last.cameras == ("a",)
+    assert [(each.what, each.reason) for each in arrivals.left_out] == [("camera b", "it has no images")]
 
 
 def test_what_is_not_of_the_handpiece_is_refused(tmp_path: Path) -> None:

@@ -40,8 +40,11 @@ def test_a_capture_is_replayed_and_reconstructed(tmp_path: Path, capsys: pytest.
     frames = scan().frames[:3]
     storage.write_capture(tmp_path / "capture", replace(scan(), frames=frames))
     write(tmp_path / "capture", frames)
+    (tmp_path / "capture" / "images" / "north" / "00001.png").unlink()
     run("live", tmp_path / "capture", "--out", tmp_path / "live", *STANDARD)
-    assert "3 of 3 frames placed as they came" in capsys.readouterr().err
+    said = " ".join(capsys.readouterr().err.split())
+    assert "3 of 3 frames placed as they came" in said
+    assert "left out camera north of frame 00001: its image is missing" in said
     assert {"live", "reconstruct"} <= storage.read_json(tmp_path / "live" / "run.json").keys()
     made = (tmp_path / "live" / "mesh.ply").stat().st_mtime_ns
     run("reconstruct", tmp_path / "capture", "--out", tmp_path / "live", *STANDARD)

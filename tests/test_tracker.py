@@ -119,3 +119,8 @@ def test_frames_follow_corrected_poses() -> None:
     distance, _ = off(placed.rig_from_world, {names[3]: path[names[3]] @ aside}, names[3])
     assert distance < 0.03
     assert tracker.rig_from_world.keys() == {*names[:2], names[3]}
+    for _ in range(2):
+        tracker.correct({"00000": better["00000"]})
+    tracker.correct({"elsewhere": Rigid3.identity()})
+    tracker.correct({"elsewhere": Rigid3.identity()})
+    assert tracker.push("again", {("again", c): f for (_, c), f in of_frame(seen, names[3]).items()}).beside is None

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional
 
 from cuspid import storage
-from cuspid.capture import Capture, Frame, ImageSource
+from cuspid.capture import Capture, Dropped, Frame, ImageSource
 from cuspid.cli.scan import reconstruct_capture
 from cuspid.cli.shared import Flat, console
 from cuspid.errors import InputError, ReconstructionError
@@ -99,14 +99,17 @@ class _Feed:
     source: Callable[[], ImageSource]
     frames: Iterator[Frame | None]
     """None where none has come for a while."""
-    lost: Callable[[], Sequence[str]]
-    """Images that could not be read, each with the reason."""
+    left_out: Callable[[], tuple[Dropped, ...]]
+    """Images that are missing so far, and why."""
 
 
 def _replayed(folder: Path, handpiece: Path | None, distance_mm: float | None, options: FollowOptions) -> _Feed:
     capture = storage.read_capture(folder, handpiece, distance_mm)
     return _Feed(
-        handpiece=capture.handpiece, source=lambda: capture.source, frames=_paced(capture, options.pace), lost=list
+        handpiece=capture.handpiece,
+        source=lambda: capture.source,
+        frames=_paced(capture, options.pace),
+        left_out=lambda: capture.left_out,
     )
 
 
@@ -132,7 +135,8 @@ def _watched(folder: Path, handpiece: Path | None, distance_mm: float | None, op
         assert arrivals.source is not None  # a frame has come
         return arrivals.source
 
-    return _Feed(handpiece=known, source=source, frames=_arriving(arrivals, options), lost=lambda: arrivals.lost)
+    frames = _arriving(arrivals, options)
+    return _Feed(handpiece=known, source=source, frames=frames, left_out=lambda: arrivals.left_out)
 
 
 def _arriving(arrivals: Arrivals, options: FollowOptions) -> Iterator[Frame | None]:
@@ -161,16 +165,16 @@ def _followed(feed: _Feed, out: Path, options: ReconstructionOptions, view: Grow
                 view.show(session, changed, words.lost)
     except KeyboardInterrupt:
         console.print("the scan is ended; what came in is reconstructed")
-    if lost := feed.lost():
-        console.print(f"note: {len(lost)} images could not be read; the first: {lost[0]}", soft_wrap=True)
+    left_out = feed.left_out()
     if session is None or not session.frames:
-        raise InputError("no frame has come that can be used; look whether images appear, and in which folder")
+        why = next((f" ({each.what}: {each.reason})" for each in left_out), "")
+        raise InputError(f"no frame has come that can be used{why}; look whether images appear, and in which folder")
     seconds = time.monotonic() - begin
     console.print(
         f"{len(session.rig_from_world)} of {len(session.frames)} frames placed as they came, "
         f"{len(session.frames) / seconds:.1f} frames a second"
     )
-    return session.capture
+    return replace(session.capture, left_out=(*left_out, *session.capture.left_out))
 
 
 def _corrected(session: Session) -> Mapping[int, Mesh]:

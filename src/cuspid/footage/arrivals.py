@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cuspid.capture import Frame, ImageFolder, image_size
+from cuspid.capture import Dropped, Frame, ImageFolder, image_size
 from cuspid.errors import InputError
 from cuspid.rig import Handpiece
 from cuspid.storage.captures import IMAGE_SUFFIXES, only_lighting
@@ -36,9 +36,22 @@ class Arrivals:
         return None if self._suffix is None else ImageFolder(self._folder, self._suffix)
 
     @property
-    def lost(self) -> list[str]:
-        """Images that were there but never whole, each with the reason."""
-        return list(self._refused.values())
+    def left_out(self) -> tuple[Dropped, ...]:
+        """The images that the frames so far do not have, and why."""
+        idle, late = self._idle(), "its image came too late"
+        why = {(path.stem, path.parent.name): reason for path, reason in self._refused.items()}
+        missing = [
+            Dropped(what=f"camera {camera} of frame {name}", reason=why.get((name, camera), late))
+            for name in sorted(self._given | {path.stem for path in self._refused})
+            for camera in self._handpiece.rig.names
+            if camera not in idle and camera not in self._whole.get(name, ())
+        ]
+        return (*(Dropped(what=f"camera {camera}", reason="it has no images") for camera in idle), *missing)
+
+    def _idle(self) -> list[str]:
+        """Cameras without a whole image so far."""
+        seen = set[str]().union(*self._whole.values(), {path.parent.name for path in self._refused})
+        return [camera for camera in self._handpiece.rig.names if camera not in seen]
 
     def news(self, now_s: float) -> list[Frame]:
         """The frames that are whole by now and were not given before. Raises InputError where images are of a camera
@@ -52,7 +65,7 @@ class Arrivals:
         return self._take(float("inf"), -1.0)
 
     def _take(self, now_s: float, late_s: float) -> list[Frame]:
-        idle = set(self._handpiece.rig.names).difference(*self._whole.values()) if self._given else set[str]()
+        idle = set(self._idle()) if self._given else set[str]()
         found = list[Frame]()
         for name in sorted(self._whole.keys() - self._given):
             complete = self._whole[name] | idle >= set(self._handpiece.rig.names)

@@ -108,7 +108,7 @@ class Tracker:
 
     def _beside_the_last(self, frame: _Seen) -> tuple[_Seen, Rigid3] | None:
         """The frame before, if that could be placed and this one beside it."""
-        if self._lost:
+        if self._lost or not self._recent:
             return None
         edge = self._edge(self._recent[-1], frame)
         return None if edge.target_from_source is None else (self._recent[-1], edge.target_from_source)
