@@ -1,4 +1,4 @@
-"""Time, memory and trueness of each ``--quality`` over a whole arch, on one core and on two.
+"""Time, memory and trueness of each ``--quality`` over a whole arch, on one core and on two, and time of each stage.
 
     python benchmarks/qualities.py [JAW] [--work build/qualities]
 
@@ -13,12 +13,13 @@ import argparse
 import json
 import os
 import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import get_args
 
-from run import conditions, run_timed
+from run import conditions, run_timed, timed
 
 from cuspid.pipeline import Quality
 from cuspid.studies.scan_cases import ONE_PASS
@@ -38,15 +39,19 @@ def only(cores: list[int]) -> Iterator[None]:
 
 def measured(scan: Path, quality: str, cores: list[int], log: Path) -> dict[str, object]:
     """The figures of one reconstruction, from the images to the mesh."""
-    out = scan.parent / f"{quality}-{len(cores)}"
+    out, walls = scan.parent / f"{quality}-{len(cores)}", scan.parent / "walls.json"
     shutil.rmtree(out, ignore_errors=True)
-    with only(cores):
-        took = run_timed("reconstruct", str(scan / "capture"), "--quality", quality, "--out", str(out), log=log)
+    arguments = ["reconstruct", str(scan / "capture"), "--quality", quality, "--out", str(out)]
+    with only(cores), log.open("ab") as stream:
+        status, took = timed(sys.executable, str(HERE / "staged.py"), str(walls), *arguments, log=stream)
+    if status:
+        raise SystemExit(f"cuspid {' '.join(arguments)}: status {status}, see {log}")
     run_timed("evaluate", str(out / "mesh.ply"), str(scan / "truth"), "--out", str(out), log=log)
     row = {
         "quality": quality,
         "cores": len(cores),
         **took,
+        "stages_s": json.loads(walls.read_text()),
         "motion_s": json.loads((out / "motion" / "reconstruction.json").read_text())["log"],
         "trueness": json.loads((out / "trueness.json").read_text()),
     }

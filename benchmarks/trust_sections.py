@@ -219,8 +219,62 @@ def qualities(result: Result) -> str:
             "*Mapping*: from the images to the poses. `python benchmarks/qualities.py`.",
             "",
             markdown_table(_QUALITIES, rows),
+            *(line for quality in _qualities_on_several_cores(result) for line in ("", *_scaling(result, quality))),
         ]
     )
+
+
+def _qualities_on_several_cores(result: Result) -> list[str]:
+    """Those that were measured on one core as well as on all."""
+    names = [row["quality"] for row in result["rows"]]
+    return [name for name in dict.fromkeys(names) if names.count(name) == 2]
+
+
+def stages_s(row: Result) -> dict[str, float]:
+    """Wall seconds of each stage of a reconstruction, those of the motion one by one."""
+    inner = {part.removesuffix("_s"): seconds for part, seconds in row["motion_s"].items() if part.endswith("_s")}
+    outer = dict(row["stages_s"])
+    motion = outer.pop("motion")
+    return {**inner, "the rest of the motion": motion - sum(inner.values()), **outer}
+
+
+def _scaling(result: Result, quality: str) -> list[str]:
+    """Each stage of a quality on one core and on several, and what this foretells of more."""
+    alone, several = sorted((row for row in result["rows"] if row["quality"] == quality), key=lambda row: row["cores"])
+    cores, one, many = several["cores"], stages_s(alone), stages_s(several)
+    rows = []
+    for stage, seconds in one.items():
+        share = parallel_share(seconds, many[stage], cores)
+        rows.append((stage, seconds, many[stage], share, *(foretold(seconds, share, n) for n in _MORE_CORES)))
+    sums = [sum(column) for column in zip(*(row[1:] for row in rows), strict=True)]
+    whole = ("all", sums[0], sums[1], parallel_share(sums[0], sums[1], cores), *sums[3:])
+    return [
+        f"*{quality}*, stage by stage, in s. *Parallel*: the share p of a stage that more cores make faster, if its "
+        f"time on n of them is t (1 - p + p / n) (Amdahl 1967), from that on one and on {cores}. The columns of "
+        f"{', '.join(str(n) for n in _MORE_CORES)} cores follow from it, and are not measured; that all cores share "
+        "one memory is not in them.",
+        "",
+        markdown_table(
+            ("stage", "1 core", f"{cores} cores", "parallel %", *(f"{n} cores" for n in _MORE_CORES)),
+            [
+                (stage, f"{a:.1f}", f"{b:.1f}", f"{100 * share:.0f}", *(f"{each:.1f}" for each in more))
+                for stage, a, b, share, *more in (*rows, whole)
+            ],
+        ),
+    ]
+
+
+_MORE_CORES = (4, 8, 16)
+
+
+def parallel_share(alone_s: float, several_s: float, cores: int) -> float:
+    """The share of work that several cores make faster, by what they take of its time on one (Amdahl 1967)."""
+    return float(np.clip((1 - several_s / alone_s) / (1 - 1 / cores), 0, 1)) if alone_s > 0 else 0.0
+
+
+def foretold(alone_s: float, share: float, cores: int) -> float:
+    """Seconds on so many cores."""
+    return alone_s * (1 - share + share / cores)
 
 
 def _trueness_cells(trueness: Result) -> tuple[str, ...]:

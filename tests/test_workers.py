@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from cuspid.workers import core_numbers, map_ahead, map_in_threads, map_slices, usable_cores
+from cuspid.workers import core_numbers, in_shares, map_ahead, map_batches, map_in_threads, map_slices, usable_cores
 
 
 def pinned(work):
@@ -73,6 +73,40 @@ def test_the_first_error_of_work_ahead_is_raised_in_its_place():
     assert next(results) == -1
     with pytest.raises(ZeroDivisionError):
         next(results)
+
+
+def test_batches_follow_each_other_and_no_item_is_read_before_its_batch():
+    drawn = []
+
+    def items():
+        for item in range(100):
+            drawn.append(item)
+            yield item
+
+    taken = []
+    for batch in map_batches(lambda item: 10 * item, items()):
+        taken += batch
+        assert len(taken) == len(drawn)
+    assert taken == list(range(0, 1000, 10))
+    assert list(map_batches(lambda item: item, [])) == []
+
+
+def test_a_pinned_thread_takes_smaller_batches_and_one_share():
+    def first() -> int:
+        return len(next(map_batches(lambda item: item, range(1000))))
+
+    assert first() == usable_cores() * pinned(first)
+    assert pinned(shares) == [(0, 1)]
+
+
+def shares():
+    told = []
+    in_shares(lambda share, of: told.append((share, of)))
+    return sorted(told)
+
+
+def test_each_share_is_worked_on_once():
+    assert shares() == [(share, usable_cores()) for share in range(usable_cores())]
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 1000])

@@ -26,8 +26,9 @@ def _ended_by_interrupts() -> Iterator[None]:
 
 def main() -> None:
     """Load what the verb needs and run it; signals are handled by the main thread."""
-    # Our own threads use the cores; more of them for each small system only wait for each other on a busy machine.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Our own threads use the cores; more of them for each small system or image only wait for each other.
+    for each in ("OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+        os.environ.setdefault(each, "1")
     if threading.current_thread() is threading.main_thread():
         with _ended_by_interrupts():
             from cuspid import cli

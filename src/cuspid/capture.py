@@ -48,12 +48,13 @@ def _decoded(
     image_size(path)
     try:
         with Image.open(path) as image:
-            upright = ImageOps.exif_transpose(image)
-            if mode is None and (upright.mode == "L" or upright.mode.startswith("I;16")):
-                return np.asarray(upright).astype(np.uint8 if upright.mode == "L" else np.uint16)
-            if upright.mode.startswith("I;16"):
-                upright = Image.fromarray((np.asarray(upright) >> 8).astype(np.uint8))
-            return np.asarray(upright.convert(mode or "RGB"))
+            ImageOps.exif_transpose(image, in_place=True)
+            if mode is None and (image.mode == "L" or image.mode.startswith("I;16")):
+                return np.asarray(image).astype(np.uint8 if image.mode == "L" else np.uint16)
+            deep = image.mode.startswith("I;16")
+            shown = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8)) if deep else image
+            wanted = mode or "RGB"
+            return np.asarray(shown if shown.mode == wanted else shown.convert(wanted))
     except Exception as error:  # as in image_size
         raise InputError(f"{path}: cannot be decoded ({one_line(error)}); copy the image again") from error
 

@@ -192,7 +192,7 @@ class Mesh:
     @cached_property
     def _scene(self) -> rtcore_scene.EmbreeScene:
         scene = rtcore_scene.EmbreeScene()
-        TriangleMesh(scene, self.vertices.astype(np.float32)[self.faces])
+        TriangleMesh(scene, self.vertices.astype(np.float32), self.faces.astype(np.int32))
         return scene
 
     def cast(self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> RayHits:

@@ -6,7 +6,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -15,6 +15,8 @@ from cuspid.progress import Progress, silent
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
+
+_BATCH_PER_CORE = 8
 
 
 def core_numbers(thread: int = 0) -> list[int]:
@@ -69,10 +71,19 @@ def map_ahead(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> Itera
             pool.shutdown(cancel_futures=True)
 
 
-def beside_work_ahead() -> int:
-    """Number of parts into which to cut what is done with each result of :func:`map_ahead`, whose threads run
-    meanwhile."""
-    return max(usable_cores() // 2, 1)
+def map_batches(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[list[_Result]]:
+    """``work`` on each item, in threads, several items per usable core at a time; the results of each time, in the
+    order of the items, which are read as they are needed. What is done with them may use all cores as well."""
+    remaining = iter(items)
+    while batch := list(islice(remaining, _BATCH_PER_CORE * usable_cores())):
+        yield map_in_threads(work, batch)
+
+
+def in_shares(work: Callable[[int, int], None]) -> None:
+    """``work(share, shares)``, which must release the GIL, for each of as many shares as there are usable cores, in
+    threads."""
+    shares = usable_cores()
+    map_in_threads(lambda share: work(share, shares), range(shares))
 
 
 def map_slices(

@@ -9,7 +9,7 @@ ghosts, back walls, and what is only extrapolated past the borders of all maps.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, no_type_check
 
@@ -27,7 +27,7 @@ from cuspid.surface.cleaning import hole_rims
 from cuspid.surface.evidence import Evidence, colors_of, observe
 from cuspid.surface.meshing import extract
 from cuspid.surface.volume import Reached, SparseVolume
-from cuspid.workers import beside_work_ahead, map_ahead, map_slices
+from cuspid.workers import in_shares, map_batches
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,20 +117,22 @@ def _votes(
     volume = SparseVolume(voxel_mm, options.truncation_voxels * voxel_mm)
     half = len(rig_from_world)
 
-    def reached(one: _Located) -> tuple[_Located, Evidence, Reached]:
+    def reached(one: _Located) -> tuple[int, Reached]:
         evidence = Evidence.of(one.depth_map, jump_mm)
-        return one, evidence, volume.reached(evidence, one.cam_from_world, one.points_in_world())
+        return one.number, volume.reached(evidence, one.cam_from_world, one.points_in_world())
 
-    for one, evidence, where in map_ahead(reached, _located(depth_maps, rig_from_world)):
-        volume.integrate(evidence, one.cam_from_world, where)
-        progress(stage, one.number, 2 * half)
+    for batch in map_batches(reached, _located(depth_maps, rig_from_world)):
+        volume.integrate([where for _, where in batch])
+        progress(stage, batch[-1][0], 2 * half)
     votes = Votes.on(extract(volume, options.least_weight))
     del volume
-    for one, evidence in map_ahead(
-        lambda one: (one, Evidence.of(one.depth_map, jump_mm)), _located(depth_maps, rig_from_world)
-    ):
-        votes.collect(evidence, one.depth_map, one.cam_from_world, agreement_mm, one.number)
-        progress(stage, half + one.number, 2 * half)
+
+    def in_view(one: _Located) -> Voter:
+        return votes.in_view(Evidence.of(one.depth_map, jump_mm), one.depth_map, one.cam_from_world, one.number)
+
+    for voters in map_batches(in_view, _located(depth_maps, rig_from_world)):
+        votes.collect(voters, agreement_mm)
+        progress(stage, half + voters[-1].frame, 2 * half)
     return votes
 
 
@@ -169,6 +171,24 @@ CHUNK = 256
 
 
 @dataclass(frozen=True, eq=False)
+class Voter:
+    """A depth map, and the vertices that it may see."""
+
+    evidence: Evidence
+    """What it says."""
+    cam_from_world: Rigid3
+    """Where its camera was."""
+    chunks: Int[np.ndarray, "k"]
+    """Numbers of the chunks of vertices in its view."""
+    colors: UInt8[np.ndarray, "p 3"]
+    """RGB by flat pixel index."""
+    known: Bool[np.ndarray, "p"]
+    """Whether it has a depth there itself, by flat pixel index."""
+    frame: int
+    """Number of its frame, starting from 1."""
+
+
+@dataclass(frozen=True, eq=False)
 class Votes:
     """What the depth maps say about each vertex of a rough mesh; accumulated map by map."""
 
@@ -200,34 +220,35 @@ class Votes:
         maps, measured = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool)
         return Votes(rough, balls, np.zeros((count, 3)), np.zeros((count, 3)), maps, measured, whole)
 
-    def collect(
-        self, evidence: Evidence, depth_map: DepthMap, cam_from_world: Rigid3, agreement_mm: float, frame: int
-    ) -> None:
-        """Let one depth map vote on the vertices that it sees; ``frame`` is the number of its frame, starting from
-        1."""
+    def in_view(self, evidence: Evidence, depth_map: DepthMap, cam_from_world: Rigid3, frame: int) -> Voter:
+        """A depth map with the vertices that it may see; ``frame`` is the number of its frame, starting from 1."""
         chunks = self._in_view(depth_map.camera, cam_from_world)
-        colors, known = colors_of(depth_map), depth_map.known.ravel()
-        map_slices(
-            lambda part: _vote(
-                chunks[part],
-                self.rough.vertices,
-                self.rough.vertex_normals,
-                cam_from_world.rotation,
-                cam_from_world.translation,
-                *evidence.arrays,
-                colors,
-                known,
-                agreement_mm,
-                self.moment,
-                self.color,
-                self.maps,
-                self.measured,
-                self.frames,
-                frame,
-            ),
-            len(chunks),
-            parts=beside_work_ahead(),
-        )
+        return Voter(evidence, cam_from_world, chunks, colors_of(depth_map), depth_map.known.ravel(), frame)
+
+    def collect(self, voters: Sequence[Voter], agreement_mm: float) -> None:
+        """Let depth maps vote, one after the other, on the vertices that they see."""
+
+        def work(share: int, shares: int) -> None:
+            for voter in voters:
+                _vote(
+                    voter.chunks[voter.chunks % shares == share],
+                    self.rough.vertices,
+                    self.rough.vertex_normals,
+                    voter.cam_from_world.rotation,
+                    voter.cam_from_world.translation,
+                    *voter.evidence.arrays,
+                    voter.colors,
+                    voter.known,
+                    agreement_mm,
+                    self.moment,
+                    self.color,
+                    self.maps,
+                    self.measured,
+                    self.frames,
+                    voter.frame,
+                )
+
+        in_shares(work)
 
     def _in_view(self, camera: Camera, cam_from_world: Rigid3) -> Int[np.ndarray, "k"]:
         """Chunks whose ball meets the pyramid of view (a few more, never less)."""

@@ -66,7 +66,7 @@ class GrowingSurface:
         in_rig, pixel = depth_map.points_in_rig()
         points, cam_from_world = rig_from_world.inverse().apply(in_rig), depth_map.cam_from_rig @ rig_from_world
         reached = self._volume.reached(evidence, cam_from_world, points)
-        self._volume.integrate(evidence, cam_from_world, reached, take_out=take_out)
+        self._volume.integrate([reached], take_out=take_out)
         self._changed.update(reached.keys.tolist())
         self._paint(points, colors_of(depth_map)[pixel], -1.0 if take_out else 1.0)
 

@@ -22,6 +22,7 @@ from cuspid.surface.cleaning import CleaningOptions, clean
 from cuspid.surface.fusion import Fused, FusionOptions
 from cuspid.surface.fusion import find_holes as find_holes_of_depth_maps
 from cuspid.surface.fusion import fuse as fuse_depth_maps
+from cuspid.workers import usable_cores
 
 _CODE = ("surface",)
 
@@ -91,6 +92,6 @@ def fuse(
 
 def _sigma_um(mesh: Mesh, raw: Fused, expected: Expectation | None) -> Float[np.ndarray, "v"]:
     """Of each vertex of a mesh that was cleaned, which moves none."""
-    depth_mm = raw.sigma_mm[cKDTree(raw.mesh.vertices).query(mesh.vertices)[1]]
+    depth_mm = raw.sigma_mm[cKDTree(raw.mesh.vertices).query(mesh.vertices, workers=usable_cores())[1]]
     motion_mm = 0.0 if expected is None else expected.sigma_mm(mesh.vertices, mesh.vertex_normals)
     return np.asarray(1000 * np.hypot(depth_mm, motion_mm))

@@ -7,6 +7,7 @@ key in a sorted array; ``neighbours`` holds the slot of each of the 27 blocks ar
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import no_type_check
 
@@ -16,7 +17,7 @@ from jaxtyping import Float, Int
 from cuspid.geometry import Rigid3
 from cuspid.kernels import kernel
 from cuspid.surface.evidence import Evidence, observe, observe_foot
-from cuspid.workers import beside_work_ahead, map_slices
+from cuspid.workers import in_shares
 
 BLOCK = 8
 """Voxels along the side of a block."""
@@ -41,8 +42,12 @@ def unpack(keys: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n 3"]:
 
 @dataclass(frozen=True, eq=False)
 class Reached:
-    """Where a depth map has information."""
+    """A depth map, and where in the volume it has information."""
 
+    evidence: Evidence
+    """What it says."""
+    cam_from_world: Rigid3
+    """Where its camera was."""
     keys: Int[np.ndarray, "b"]
     """Keys of the blocks around its points, sorted."""
     nearest: Int[np.ndarray, "h w"]
@@ -70,31 +75,31 @@ class SparseVolume:
 
     def reached(self, evidence: Evidence, cam_from_world: Rigid3, points: Float[np.ndarray, "n 3"]) -> Reached:
         """What a depth map with these points (world, mm) will change; independent of what was blended before."""
-        return Reached(self._keys_around(points), evidence.nearest(self._reach_px(evidence, cam_from_world, points)))
+        nearest = evidence.nearest(self._reach_px(evidence, cam_from_world, points))
+        return Reached(evidence, cam_from_world, self._keys_around(points), nearest)
 
-    def integrate(
-        self, evidence: Evidence, cam_from_world: Rigid3, reached: Reached, *, take_out: bool = False
-    ) -> None:
-        """Blend a depth map into the volume, or take out again one that was blended with the same arguments."""
-        slots = self._allocate(reached.keys)
-        origins = unpack(reached.keys).astype(np.float64) * BLOCK
-        map_slices(
-            lambda part: _integrate(
-                self.distance,
-                self.weight,
-                slots[part],
-                origins[part],
-                self.voxel_mm,
-                cam_from_world.rotation,
-                cam_from_world.translation,
-                *evidence.arrays,
-                reached.nearest,
-                self.truncation_mm,
-                -1.0 if take_out else 1.0,
-            ),
-            len(slots),
-            parts=beside_work_ahead(),
-        )
+    def integrate(self, maps: Sequence[Reached], *, take_out: bool = False) -> None:
+        """Blend depth maps into the volume, one after the other, or take out again what was blended so."""
+        slots = [self._allocate(one.keys) for one in maps]
+
+        def work(share: int, shares: int) -> None:
+            for one, blocks in zip(maps, slots, strict=True):
+                own = blocks % shares == share
+                _integrate(
+                    self.distance,
+                    self.weight,
+                    blocks[own],
+                    unpack(one.keys[own]).astype(np.float64) * BLOCK,
+                    self.voxel_mm,
+                    one.cam_from_world.rotation,
+                    one.cam_from_world.translation,
+                    *one.evidence.arrays,
+                    one.nearest,
+                    self.truncation_mm,
+                    -1.0 if take_out else 1.0,
+                )
+
+        in_shares(work)
 
     def _reach_px(self, evidence: Evidence, cam_from_world: Rigid3, points: Float[np.ndarray, "n 3"]) -> int:
         """How many pixels the truncation distance takes at most, seen from the camera."""
