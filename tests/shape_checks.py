@@ -6,15 +6,24 @@ On the small arrays of a geometry that is called a million times, the checks tak
 import functools
 import itertools
 import sys
+from collections import Counter
 
 from beartype import beartype
 
 CALLS = 50
+INNER = 4
+"""A function within a function is made, and would be given new checks, at each call of that: of so many it is."""
 _trusted = []
+_made = Counter()
 
 
 def first_calls(stub):
     """Beartype for jaxtyping, from the first call of a function until it was called often enough."""
+    if "<locals>" in stub.__qualname__:
+        name = stub.__module__, stub.__qualname__
+        _made[name] += 1
+        if _made[name] > 2 * INNER:  # jaxtyping asks for the arguments and for the whole
+            return stub
     checked, calls = functools.cache(lambda: beartype(stub)), itertools.count(1)
 
     @functools.wraps(stub)
@@ -33,5 +42,6 @@ def first_calls(stub):
 
 def check_again():
     """From now on the next calls are checked again."""
+    _made.clear()
     while _trusted:
         vars(_trusted.pop()).pop("__no_type_check__", None)

@@ -23,8 +23,9 @@ from cuspid.pairing import detail_mm, resolved_mm
 from cuspid.pipeline import ReconstructionOptions
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece, MountedCamera, Rig
-from cuspid.stereo import DepthEstimator
+from cuspid.stereo import DepthEstimator, StereoOptions
 from cuspid.stereo.temporal import TemporalOptions
+from cuspid.surface.fusion import FusionOptions
 from cuspid.tolerances import EXACT
 from synthetic_scene import diamond, height_field, render
 
@@ -342,6 +343,16 @@ def test_a_draft_is_the_same_scan_at_a_glance(folder: Path) -> None:
     assert 0.0003 < np.median(distance) < 0.01
 
 
+def test_fine_is_the_same_scan_with_more_faces(folder: Path) -> None:
+    """The same path, for only depth and fusion differ, and a surface that lies where that of the usual quality does."""
+    found, mesh = pipeline.reconstruct(scan(), folder / "fine", replace(FIXED, quality="fine"))
+    expected, reference = reconstructed(1.0, folder)
+    check_poses(found, expected)
+    assert 3 < len(mesh.faces) / len(reference.faces) < 5
+    distance, _, _ = reference.closest(mesh.vertices)
+    assert 0.0001 < np.median(distance) < 0.003
+
+
 def test_what_was_asked_for_goes_before_the_quality() -> None:
     asked = ReconstructionOptions(quality="draft", temporal=TemporalOptions(left_share=0.2))
     assert pipeline.settled(asked).temporal.left_share == 0.2
@@ -350,6 +361,12 @@ def test_what_was_asked_for_goes_before_the_quality() -> None:
     assert pipeline.settled(asked).left_share == 1
     assert pipeline.settled(replace(asked, left_share=0.3)).left_share == 0.3
     assert pipeline.settled(asked).stereo.refinement.bend_px == 1000
+    fine = ReconstructionOptions(quality="fine")
+    assert pipeline.settled(fine).stereo.grid_px < pipeline.settled(ReconstructionOptions()).stereo.grid_px
+    assert pipeline.settled(replace(fine, stereo=StereoOptions(spacing_px=5))).stereo.grid_px == 5
+    assert (pipeline.settled(fine).left_share, pipeline.settled(replace(fine, left_share=0.3)).left_share) == (0, 0.3)
+    assert pipeline._of_quality(fine, 0.012).voxel_mm == ReconstructionOptions().fusion.voxel_for(0.012) / 2
+    assert pipeline._of_quality(replace(fine, fusion=FusionOptions(voxel_mm=0.2)), 0.012).voxel_mm == 0.2
     standard = ReconstructionOptions()
     assert pipeline.settled(standard).tracking.features.size_for(640, 480) == (320, 240)
     assert pipeline.settled(standard) == replace(standard, left_share=pipeline._LEFT_SHARE)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from jaxtyping import TypeCheckError
+from jaxtyping import Float, TypeCheckError, jaxtyped
 
 import shape_checks
 from cuspid.geometry import Rigid3
@@ -19,3 +19,19 @@ def test_a_wrong_shape_is_refused_until_enough_calls_were_right_and_then_again()
         with pytest.raises(ValueError, match="mismatch"):
             pose.apply(wrong)
         shape_checks.check_again()
+
+
+def test_a_function_that_is_made_anew_is_checked_the_first_times():
+    def make():
+        @jaxtyped(typechecker=shape_checks.first_calls)
+        def inner(point: Float[np.ndarray, "3"]) -> float:
+            return float(point.sum())
+
+        return inner
+
+    for _ in range(2):
+        shape_checks.check_again()
+        for _ in range(shape_checks.INNER):
+            with pytest.raises(TypeCheckError):
+                make()(np.ones(4))
+        assert make()(np.ones(4)) == 4

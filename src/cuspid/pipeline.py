@@ -70,10 +70,11 @@ __all__ = [
 ]
 
 
-Quality = Literal["draft", "standard"]
+Quality = Literal["draft", "standard", "fine"]
 _DRAFT_KEYPOINTS, _DRAFT_HALVINGS = 500, 2
 _LEFT_SHARE, _DRAFT_LEFT_SHARE = 0.005, 1.0
 _DRAFT_TEMPORAL_LEFT_SHARE, _DRAFT_BEND_PX = 0.03, 1000.0
+_FINE_SPACING_PX, _FINE_VOXELS = 2, 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,11 +84,12 @@ class ReconstructionOptions(Options):
     quality: Quality = "standard"
     """draft: a quick look at a scan, with keypoints from images of a quarter of the size, depth of every second frame
     from images of half the size, and more small holes. standard: everything that the images give, except for frames
-    that add nothing."""
+    that add nothing. fine: sharper edges, with depth of all frames at every second pixel and voxels of half the size,
+    for several times the time and the memory."""
     left_share: Annotated[float | None, SHARE] = None
     """Depth is measured in every second frame, and then in those frames between them that add to the surface, until the
     sparse points that few depth maps confirm, and that more frames could still improve, are no more than this share (0
-    to 1) of all points. 0: in all frames. Default: 0.005, for a draft 1 (every second frame only)."""
+    to 1) of all points. 0: in all frames. Default: 0.005, for a draft 1 (every second frame only), for fine 0."""
     calibration: Literal["refined", "fixed"] = "refined"
     """refined: adjusted to the images, within its covariance. fixed: treated as exact."""
     nominal: NominalOptions = field(default_factory=NominalOptions)
@@ -165,7 +167,7 @@ def surface(
         depths = _shaded_depth(capture, folder, options, progress)
     else:
         depths = _textured_depth(of_size, found, lengths_mm[0], folder, options, progress)
-    how = options.fusion, options.cleaning
+    how = _of_quality(options, lengths_mm[0]), options.cleaning
     return fuse(
         *(depths, depths.digest, _poses(found, depths), *lengths_mm, folder, *how),
         expected=found.expectation,
@@ -212,7 +214,7 @@ def _textured_depth(
     holes = None
     if found.tracks is not None and options.temporal.small_holes is not False and options.temporal.left_share != 0:
         located = depths, depths.digest, _poses(found, depths)
-        holes = find_holes(*located, detail, folder, options.fusion, progress=progress)
+        holes = find_holes(*located, detail, folder, _of_quality(options, detail), progress=progress)
     return depths | measure_temporal_depth(
         *(capture, found, depths, folder / "depth-temporal", options.temporal),
         agreement_mm=agreement_mm,
@@ -227,13 +229,29 @@ def _poses(found: Reconstruction, depths: StoredDepthMaps) -> dict[str, Rigid3]:
     return {name: found.rig_from_world[name] for name in depths.frames if name in found.rig_from_world}
 
 
+def _of_quality(options: ReconstructionOptions, detail: float) -> FusionOptions:
+    """How depth maps are fused, for a handpiece that shows this detail (mm)."""
+    fusion = options.fusion
+    if options.quality != "fine" or fusion.voxel_mm is not None:
+        return fusion
+    return replace(fusion, voxel_mm=_FINE_VOXELS * fusion.voxel_for(detail))
+
+
 def settled(options: ReconstructionOptions) -> ReconstructionOptions:
     """With what the quality decides, where nothing else was asked for."""
-    draft, tracking, temporal = options.quality == "draft", options.tracking, options.temporal
     if options.left_share is None:
-        options = replace(options, left_share=_DRAFT_LEFT_SHARE if draft else _LEFT_SHARE)
-    if not draft:
-        return options
+        left = {"draft": _DRAFT_LEFT_SHARE, "standard": _LEFT_SHARE, "fine": 0.0}
+        options = replace(options, left_share=left[options.quality])
+    if options.quality == "draft":
+        return _drafted(options)
+    if options.quality == "fine" and options.stereo.spacing_px is None:
+        options = replace(options, stereo=replace(options.stereo, spacing_px=_FINE_SPACING_PX))
+    return options
+
+
+def _drafted(options: ReconstructionOptions) -> ReconstructionOptions:
+    """As for a draft, where nothing else was asked for."""
+    tracking, temporal = options.tracking, options.temporal
     features = tracking.features
     if features.count is None:
         features = replace(features, count=_DRAFT_KEYPOINTS)

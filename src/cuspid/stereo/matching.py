@@ -34,13 +34,15 @@ from cuspid.stereo.refinement import SCORE, VARIANCE, GroupGeometry, Q, Refineme
 from cuspid.stereo.shading import ShadedView, ShadingOptions, brightness, correction, shaded_depths
 from cuspid.workers import map_in_threads
 
+_SPACING_PX = 3
+
 
 @dataclass(frozen=True, kw_only=True)
 class StereoOptions(Options):
     """Depth within one frame."""
 
-    spacing_px: Annotated[int, Range(1, 100)] = 3
-    """Depth is measured at every n-th pixel, in each direction."""
+    spacing_px: Annotated[int | None, Range(1, 100)] = None
+    """Depth is measured at every n-th pixel, in each direction. Default: 3, for fine 2."""
     initial_scale: Annotated[float, Range(0.05, 1)] = 0.5
     """Resolution of the initial matching relative to the images."""
     pairing: PairingOptions = field(default_factory=PairingOptions)
@@ -51,6 +53,11 @@ class StereoOptions(Options):
     """Checks and weights."""
     shading: ShadingOptions = field(default_factory=ShadingOptions)
     """Depth of plain surfaces, where it is their light and shade that is matched."""
+
+    @property
+    def grid_px(self) -> int:
+        """The spacing that is used."""
+        return _SPACING_PX if self.spacing_px is None else self.spacing_px
 
 
 Signal = Literal["texture", "shading"]
@@ -177,7 +184,7 @@ class DepthEstimator:
             views=views,
             pairs=tuple(rectify(pair, rig[pair[0]], rig[pair[1]], self.options.initial_scale) for pair in pairs),
             geometry=tuple(group_geometry(views, index) for index in range(len(views))),
-            grids=tuple(coarser(view.camera, self.options.spacing_px) for view in views),
+            grids=tuple(coarser(view.camera, self.options.grid_px) for view in views),
             corrections=tuple(correction(rig[name].camera, self.handpiece.sensor_of(name)) for name in lit),
         )
 
@@ -239,7 +246,7 @@ class DepthEstimator:
             for view, grid, geometry in zip(group.views, group.grids, group.geometry, strict=True)
         ]
         options = self.options
-        depths = shaded_depths(stack, views, self.handpiece.depth_range_mm, options.spacing_px, options.shading)
+        depths = shaded_depths(stack, views, self.handpiece.depth_range_mm, options.grid_px, options.shading)
         return [
             Measured(grid, view.cam_from_rig, *found)
             for view, grid, found in zip(group.views, group.grids, depths, strict=True)
@@ -262,7 +269,7 @@ class DepthEstimator:
             geometry,
             layers,
             self.handpiece.depth_range_mm,
-            self.options.spacing_px,
+            self.options.grid_px,
             image_noise(stack[index, : sizes[index, 0], : sizes[index, 1]]),
             self.options.refinement,
         )
@@ -282,7 +289,7 @@ class DepthEstimator:
         one, resolution, options = measured[index], self.resolution, self.confidence
         keep = (agreement(measured, index, resolution, options) > 0) & sure_enough(one, resolution, options)
         if len(measured) == 2:
-            radius = -(-options.border_px // self.options.spacing_px)
+            radius = -(-options.border_px // self.options.grid_px)
             keep &= ~at_near_borders(measured, index, radius, resolution, options)
         keep = without_speckle(np.where(keep, one.depth_mm, np.nan), resolution, options)
         return DepthMap(
@@ -292,7 +299,7 @@ class DepthEstimator:
             cam_from_rig=one.cam_from_rig,
             depth_mm=np.where(keep, one.depth_mm, np.nan).astype(np.float32),
             confidence=confidence(one.sigma_mm, keep, resolution, options),
-            color=_color_grid(view.resample(image), self.options.spacing_px),
+            color=_color_grid(view.resample(image), self.options.grid_px),
         )
 
 
