@@ -3,12 +3,13 @@
     python benchmarks/staged.py TIMES.json reconstruct CAPTURE --out OUT
 
 Motion times its own stages; of the others, each is a function of :mod:`cuspid.pipeline`. What is left, the start of the
-program and reading and writing, is told as one.
+program, reading and pictures, is told as one. With each goes the peak of memory until its end.
 """
 
 from __future__ import annotations
 
 import json
+import resource
 import sys
 import time
 from collections.abc import Callable
@@ -28,24 +29,25 @@ FUNCTIONS = {
 
 
 def main() -> None:
-    """Run, and write the wall seconds of each stage."""
+    """Run, and write wall seconds and peak memory (GiB, up to its end) of each stage."""
     times, *arguments = sys.argv[1:]
     from cuspid import pipeline
     from cuspid.__main__ import main as cuspid
 
-    walls: dict[str, float] = {}
+    stages: dict[str, dict[str, float]] = {}
     for name, stage in FUNCTIONS.items():
-        setattr(pipeline, name, clocked(getattr(pipeline, name), stage, walls))
+        setattr(pipeline, name, watched(getattr(pipeline, name), stage, stages))
     sys.argv = ["cuspid", *arguments]
     try:
         cuspid()
     finally:
-        walls["the rest"] = time.perf_counter() - BEGIN - sum(walls.values())
-        Path(times).write_text(json.dumps(walls))
+        rest = time.perf_counter() - BEGIN - sum(each["wall_s"] for each in stages.values())
+        stages["the rest"] = {"wall_s": rest, "peak_gib": peak_gib()}
+        Path(times).write_text(json.dumps(stages))
 
 
-def clocked(work: Callable[..., Any], stage: str, walls: dict[str, float]) -> Callable[..., Any]:
-    """The same function, whose wall seconds are added to ``walls``."""
+def watched(work: Callable[..., Any], stage: str, stages: dict[str, dict[str, float]]) -> Callable[..., Any]:
+    """The same function, which tells ``stages`` what it took."""
 
     @wraps(work)
     def run(*arguments: Any, **named: Any) -> Any:
@@ -53,9 +55,15 @@ def clocked(work: Callable[..., Any], stage: str, walls: dict[str, float]) -> Ca
         try:
             return work(*arguments, **named)
         finally:
-            walls[stage] = walls.get(stage, 0.0) + time.perf_counter() - begin
+            before = stages.get(stage, {"wall_s": 0.0})["wall_s"]
+            stages[stage] = {"wall_s": before + time.perf_counter() - begin, "peak_gib": peak_gib()}
 
     return run
+
+
+def peak_gib() -> float:
+    """Of this process until now."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 
 
 if __name__ == "__main__":

@@ -233,7 +233,7 @@ def _qualities_on_several_cores(result: Result) -> list[str]:
 def stages_s(row: Result) -> dict[str, float]:
     """Wall seconds of each stage of a reconstruction, those of the motion one by one."""
     inner = {part.removesuffix("_s"): seconds for part, seconds in row["motion_s"].items() if part.endswith("_s")}
-    outer = dict(row["stages_s"])
+    outer = {stage: taken["wall_s"] for stage, taken in row["stages"].items()}
     motion = outer.pop("motion")
     return {**inner, "the rest of the motion": motion - sum(inner.values()), **outer}
 
@@ -246,13 +246,14 @@ def _scaling(result: Result, quality: str) -> list[str]:
     for stage, seconds in one.items():
         share = parallel_share(seconds, many[stage], cores)
         rows.append((stage, seconds, many[stage], share, *(foretold(seconds, share, n) for n in _MORE_CORES)))
+    peaks = ", ".join(f"{stage} {taken['peak_gib']:.1f}" for stage, taken in several["stages"].items())
     sums = [sum(column) for column in zip(*(row[1:] for row in rows), strict=True)]
     whole = ("all", sums[0], sums[1], parallel_share(sums[0], sums[1], cores), *sums[3:])
     return [
         f"*{quality}*, stage by stage, in s. *Parallel*: the share p of a stage that more cores make faster, if its "
         f"time on n of them is t (1 - p + p / n) (Amdahl 1967), from that on one and on {cores}. The columns of "
         f"{', '.join(str(n) for n in _MORE_CORES)} cores follow from it, and are not measured; that all cores share "
-        "one memory is not in them.",
+        f"one memory is not in them. Peak memory until the end of each, on {cores} cores, GiB: {peaks}.",
         "",
         markdown_table(
             ("stage", "1 core", f"{cores} cores", "parallel %", *(f"{n} cores" for n in _MORE_CORES)),

@@ -1,14 +1,21 @@
-"""Compiled code on disk is never another's."""
+"""Compiled code on disk is never another's, and kernels are arrays in, arrays out."""
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
+from pkgutil import walk_packages
 
+import numpy as np
 import pytest
+from numba.core.dispatcher import Dispatcher
 
+import cuspid
 from cuspid.kernels import CheckedFile
 
 
@@ -117,3 +124,23 @@ def test_a_kernel_that_cannot_be_compiled_leaves_no_lock(tmp_path: Path) -> None
     for _ in range(2):
         ended = subprocess.run([sys.executable, tmp_path / "wrong.py"], capture_output=True, text=True, timeout=60)
         assert ended.stdout.split() == ["TypingError", "TypingError"]
+
+
+def kernels() -> Iterator[Dispatcher]:
+    names = (found.name for found in walk_packages(cuspid.__path__, "cuspid."))
+    modules = [import_module(name) for name in names if not name.endswith(("__main__", "blender_script"))]
+    return (value for module in modules for value in vars(module).values() if isinstance(value, Dispatcher))
+
+
+def test_kernels_depend_on_nothing_but_numbers_and_other_kernels() -> None:
+    """So that another compiler could take them; and none starts threads, or keeps others waiting."""
+    found = {kernel.py_func: kernel for kernel in kernels()}
+    assert len(found) > 100
+    for function, kernel in found.items():
+        used = {name: function.__globals__[name] for name in function.__code__.co_names if name in function.__globals__}
+        allowed = (bool, int, float, tuple, np.generic, Dispatcher)
+        strange = [name for name, value in used.items() if not (isinstance(value, allowed) or value in (np, math))]
+        assert not strange, (function.__module__, function.__qualname__, strange)
+        assert function.__closure__ is None
+        assert kernel.targetoptions["nogil"]
+        assert not kernel.targetoptions.get("parallel")
