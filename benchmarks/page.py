@@ -186,7 +186,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
     "manufacturing_phantom": ("Handpieces not built exactly as drawn: an arch", handpiece_sections.manufacturing),
     "expectations": ("What to expect of a scan", trust_sections.expectations),
     "grid": ("Running many cases", handpiece_sections.grid),
-    "qualities": ("Draft and standard", trust_sections.qualities),
+    "qualities": ("Draft, standard and fine", trust_sections.qualities),
     "live": ("While scanning", trust_sections.live),
     "fuzz": ("Damaged input", trust_sections.fuzz),
     "kill": ("Killed runs", trust_sections.kill),

@@ -18,7 +18,7 @@ from cuspid.geometry import Rigid3
 from cuspid.reconstruction import Tracks
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.height_map import HeightMap, HeightMapOptions, height_map, uncovered
-from cuspid.stitching.mosaic import MosaicOptions, compose
+from cuspid.stitching.mosaic import Mosaic, MosaicOptions, compose
 from cuspid.stitching.plane_sweep import Compared, PlaneSweepOptions, frames_beside, partners, plane_sweep
 
 HALF_MM, DEEP_MM, CAMERA_MM = 3.0, 4.0, 14.0
@@ -179,9 +179,24 @@ def test_a_camera_that_stands_still_finds_no_surface(scene: Scene) -> None:
     assert Scene(still, scene.images).swept() is None
 
 
-def test_the_mosaic_shows_each_place_once(scene: Scene, surface: HeightMap) -> None:
+@pytest.fixture(scope="module")
+def mosaic(scene: Scene, surface: HeightMap) -> Mosaic:
+    return compose(scene.motion, surface, scene.read, MosaicOptions())
+
+
+@pytest.mark.parametrize("cores", [1, 5])
+def test_the_number_of_cores_does_not_change_the_mosaic(
+    scene: Scene, surface: HeightMap, mosaic: Mosaic, monkeypatch: pytest.MonkeyPatch, cores: int
+) -> None:
+    monkeypatch.setattr("cuspid.workers.usable_cores", lambda: cores)
+    again = compose(scene.motion, surface, scene.read, MosaicOptions())
+    assert np.array_equal(again.image, mosaic.image)
+    assert np.array_equal(again.frame_pixel, mosaic.frame_pixel, equal_nan=True)
+    assert again.overlaps == mosaic.overlaps
+
+
+def test_the_mosaic_shows_each_place_once(scene: Scene, mosaic: Mosaic) -> None:
     """What lies behind the bar is taken from frames that see it there, and not shown where none does."""
-    mosaic = compose(scene.motion, surface, scene.read, MosaicOptions())
     rows, columns = np.nonzero(mosaic.frame >= 0)
     poses = list(scene.motion.cam_from_world.values())
     shown = np.full((len(rows), 3), np.nan)

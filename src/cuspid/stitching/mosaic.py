@@ -28,6 +28,7 @@ from cuspid.sparse_model import SparseModel
 from cuspid.stitching.gain_compensation import Compensation, GainOptions, Samples, balance
 from cuspid.stitching.height_map import HeightMap
 from cuspid.stitching.seams import SeamOptions, choose
+from cuspid.workers import map_ahead
 
 CELL_PX = 6
 """Width in px of the cells on which the frame is chosen."""
@@ -259,32 +260,51 @@ class _Best:
 # --- composing ---------------------------------------------------------------------------------------------------
 
 
-class _Bands:
-    """Sums of the bands of all frames on the canvas, each with its own weights."""
+@dataclass(frozen=True, eq=False)
+class _Layers:
+    """The bands of one frame, from fine to coarse."""
 
-    def __init__(self, canvas: Canvas, sigmas: tuple[float, ...]) -> None:
-        shape = (canvas.height, canvas.width)
-        self.sigmas = sigmas
-        self.sums = [np.zeros((*shape, 3), np.float32) for _ in range(len(sigmas) + 1)]
-        self.weights = [np.zeros(shape, np.float32) for _ in range(len(sigmas) + 1)]
+    window: tuple[slice, slice]
+    """Its rows and columns of the canvas."""
+    bands: list[Float[np.ndarray, "h w 3"]]
+    """Each times its weight."""
+    weights: list[Float[np.ndarray, "h w"]]
+    """Where the frame is chosen, faded over the width of the band."""
 
-    def add(
-        self,
+    @staticmethod
+    def of(
         window: tuple[slice, slice],
         image: Float[np.ndarray, "h w 3"],
         valid: Float[np.ndarray, "h w"],
         chosen: Float[np.ndarray, "h w"],
-    ) -> None:
-        """Add a frame: its bands, weighted by where it is chosen, faded over the width of the band."""
-        finer = image
-        for level, sigma in enumerate([*self.sigmas, self.sigmas[-1]]):
-            last = level == len(self.sigmas)
+        sigmas: tuple[float, ...],
+    ) -> _Layers:
+        """Of a rectified image, with the widths of the bands in px."""
+        layers, finer = _Layers(window, [], []), image
+        for level, sigma in enumerate([*sigmas, sigmas[-1]]):
+            last = level == len(sigmas)
             coarser = np.zeros_like(finer) if last else _blurred(finer, valid, sigma)
             weight = valid * _soft(chosen, sigma)
-            self.sums[level][window] += (finer - coarser) * weight[..., None]
-            self.weights[level][window] += weight
+            layers.bands.append((finer - coarser) * weight[..., None])
+            layers.weights.append(weight)
             if not last:
                 finer = coarser
+        return layers
+
+
+class _Bands:
+    """Sums of the bands of all frames on the canvas, each with its own weights."""
+
+    def __init__(self, canvas: Canvas, count: int) -> None:
+        shape = (canvas.height, canvas.width)
+        self.sums = [np.zeros((*shape, 3), np.float32) for _ in range(count)]
+        self.weights = [np.zeros(shape, np.float32) for _ in range(count)]
+
+    def add(self, layers: _Layers) -> None:
+        """Add the bands of a frame."""
+        for total, weights, band, weight in zip(self.sums, self.weights, layers.bands, layers.weights, strict=True):
+            total[layers.window] += band
+            weights[layers.window] += weight
 
     def image(self) -> Float[np.ndarray, "h w 3"]:
         """The sum of the bands."""
@@ -349,8 +369,13 @@ def _survey(
     samples = Samples.empty()
     overlaps: list[float | None] = []
     before = np.zeros(best.cost.shape[1:], bool)
-    for index, (view, name) in enumerate(zip(views, names, strict=True)):
-        seen, cells = glance(canvas, view, surface, read(name), options), _cells(view)
+
+    def look(one: tuple[PlacedFrame, str]) -> _Glance:
+        view, name = one
+        return glance(canvas, view, surface, read(name), options)
+
+    for index, seen in enumerate(map_ahead(look, zip(views, names, strict=True))):
+        cells = _cells(views[index])
         best.offer(index, cells, seen)
         samples.take(index, cells, best.cost.shape[2], seen.color, seen.light, seen.usable)
         now = np.zeros_like(before)
@@ -380,15 +405,24 @@ def _render(
     progress: Progress,
 ) -> Mosaic:
     shape = (canvas.height, canvas.width)
-    bands = _Bands(canvas, options.bands_px)
+    bands = _Bands(canvas, len(options.bands_px) + 1)
     frame = cv2.resize(choice.astype(np.int16), shape[::-1], interpolation=cv2.INTER_NEAREST)
     frame_pixel = np.full((*shape, 2), np.nan, np.float32)
-    for index, (view, name) in enumerate(zip(views, names, strict=True)):
+
+    def layers(index: int) -> tuple[_Layers, Float[np.ndarray, "h w 2"]] | None:
+        view = views[index]
         chosen = frame[view.window] == index
-        if chosen.any():
-            px = frame_map(canvas, view, surface)
-            _put(bands, canvas, view, surface, px, read(name), chosen, compensation, index, options)
-            frame_pixel[view.window][chosen] = px[chosen]
+        if not chosen.any():
+            return None
+        px = frame_map(canvas, view, surface)
+        return _parted(canvas, view, surface, px, read(names[index]), chosen, compensation, index, options), px
+
+    for index, found in enumerate(map_ahead(layers, range(len(names)))):
+        if found is not None:
+            bands.add(found[0])
+            window = views[index].window
+            chosen = frame[window] == index
+            frame_pixel[window][chosen] = found[1][chosen]
         progress("mosaic", index + 1, len(names))
     image = np.clip(np.rint(bands.image()), 0, 255).astype(np.uint8)
     shown = (frame >= 0) & ~unlit(image)
@@ -408,8 +442,7 @@ def unlit(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
     return np.asarray(cv2.morphologyEx(dark, cv2.MORPH_OPEN, disc) > 0)
 
 
-def _put(
-    bands: _Bands,
+def _parted(
     canvas: Canvas,
     view: PlacedFrame,
     surface: HeightMap,
@@ -419,8 +452,8 @@ def _put(
     compensation: Compensation,
     index: int,
     options: MosaicOptions,
-) -> None:
-    """Rectify one frame, even out its light and add it."""
+) -> _Layers:
+    """Rectify one frame, even out its light and part it into bands."""
     where = px - np.float32(OPENCV_PIXEL_OFFSET)
     rectified = cv2.remap(image, where, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
     inside = _to_border(px, view.camera) >= 1
@@ -437,4 +470,4 @@ def _put(
     factor = cv2.resize(
         np.exp(-compensation.of(index, falloff)), (view.width, view.height), interpolation=cv2.INTER_LINEAR
     )
-    bands.add(view.window, rectified * factor[..., None], valid, chosen.astype(np.float32))
+    return _Layers.of(view.window, rectified * factor[..., None], valid, chosen.astype(np.float32), options.bands_px)
