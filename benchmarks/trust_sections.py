@@ -198,15 +198,15 @@ def qualities(result: Result) -> str:
     """What each quality takes and gives."""
     rows = []
     for row in result["rows"]:
-        alone = next((each for each in result["rows"] if (each["quality"], each["cores"]) == (row["quality"], 1)), row)
-        ideal = 100 * alone["wall_s"] / (row["cores"] * row["wall_s"])
+        alone = [each["wall_s"] for each in result["rows"] if (each["quality"], each["cores"]) == (row["quality"], 1)]
+        ideal = f"{100 * alone[0] / (row['cores'] * row['wall_s']):.0f}" if alone else ""
         rows.append(
             (
                 row["quality"],
                 row["cores"],
                 f"{row['wall_s']:.0f}",
                 f"{row['cpu_s']:.0f}",
-                f"{ideal:.0f}",
+                ideal,
                 f"{row['peak_gib']:.1f}",
                 *_trueness_cells(row["trueness"]),
                 f"{sum(seconds for part, seconds in row['motion_s'].items() if part.endswith('_s')):.0f}",

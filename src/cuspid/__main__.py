@@ -13,6 +13,8 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from cuspid.memory import keep_freed
+
 
 @contextmanager
 def _ended_by_interrupts() -> Iterator[None]:
@@ -29,6 +31,7 @@ def main() -> None:
     # Our own threads use the cores; more of them for each small system or image only wait for each other.
     for each in ("OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
         os.environ.setdefault(each, "1")
+    keep_freed()
     if threading.current_thread() is threading.main_thread():
         with _ended_by_interrupts():
             from cuspid import cli

@@ -28,6 +28,7 @@ from cuspid.evaluation.crown import OpenCrown, open_parts, pieces
 from cuspid.evaluation.deviation import EvaluationOptions, evaluate
 from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Arch, Jaw
+from cuspid.memory import give_back
 from cuspid.mesh import Mesh
 from cuspid.motion.location import MotionOptions
 from cuspid.motion.stage import MotionMethod, locate, locate_by_surfaces, take_poses
@@ -160,6 +161,7 @@ def surface(
 ) -> tuple[Mesh, Float[np.ndarray, "v"]]:
     """The mesh, given the poses of the frames (second part of :func:`reconstruct`), and how well each of its vertices
     is known: standard deviation along the normal, um."""
+    give_back()
     options = settled(options)
     of_size = sized(replace(capture, handpiece=replace(capture.handpiece, rig=found.rig)), options)
     lengths_mm = detail_mm(of_size.handpiece), capture.handpiece.working_distance_mm
@@ -167,6 +169,7 @@ def surface(
         depths = _shaded_depth(capture, folder, options, progress)
     else:
         depths = _textured_depth(of_size, found, lengths_mm[0], folder, options, progress)
+    give_back()
     how = _of_quality(options, lengths_mm[0]), options.cleaning
     return fuse(
         *(depths, depths.digest, _poses(found, depths), *lengths_mm, folder, *how),
