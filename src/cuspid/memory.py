@@ -19,12 +19,12 @@ _KEPT = 1 << 30
 
 def keep_freed() -> None:
     """From now on, keep what is freed for what is made next."""
-    if hasattr(_LIBC, "mallopt"):
+    if _LIBC is not None and hasattr(_LIBC, "mallopt"):
         _LIBC.mallopt(_M_MMAP_THRESHOLD, _MAPPED_FROM)
         _LIBC.mallopt(_M_TRIM_THRESHOLD, _KEPT)
 
 
 def give_back() -> None:
     """Return to the system what is kept, as at the end of a stage."""
-    if hasattr(_LIBC, "malloc_trim"):
+    if _LIBC is not None and hasattr(_LIBC, "malloc_trim"):
         _LIBC.malloc_trim(0)
