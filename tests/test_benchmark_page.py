@@ -195,3 +195,13 @@ def test_a_release_is_measured_at_its_own_commit(freshness, repository, monkeypa
         campaign.main()
         lines = capsys.readouterr().out.splitlines()
         assert [line.split(":")[0] for line in lines if line.endswith("would be measured")] == measured
+
+
+@pytest.mark.parametrize(("alone", "several", "cores"), [(10.0, 5.0, 2), (10.0, 8.0, 2), (12.0, 4.0, 4), (3.0, 3.0, 2)])
+def test_what_is_foretold_is_what_was_measured_where_that_was(freshness, alone, several, cores):
+    sections = import_module("trust_sections")
+    share = sections.parallel_share(alone, several, cores)
+    assert sections.foretold(alone, share, 1) == alone
+    assert sections.foretold(alone, share, cores) == pytest.approx(several)
+    assert sections.foretold(alone, share, 10**9) >= alone - (alone - several) * cores / (cores - 1) - 1e-6
+    assert sections.parallel_share(alone, 1.1 * alone, cores) == 0
