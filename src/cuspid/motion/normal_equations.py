@@ -164,13 +164,14 @@ def linearise(state, point, frame, camera, calibrated, scratch, pixel, jacobian)
 
 @kernel
 @no_type_check
-def pose_equations(lenses, rotations, translations, pose, points, pixels, cameras):
-    """Normal equations of the pose of one frame alone, with Cauchy weights at 1 px; the step is a small motion on its
-    left.
+def pose_equations(lenses, rotations, translations, pose, points, pixels, cameras, limit_px):
+    """Normal equations of the pose of one frame alone, and the number of observations within ``limit_px``; the step is
+    a small motion on its left.
 
-    ``pose`` is (rotation, translation); an observation is a point, a pixel and the camera that saw it.
+    ``pose`` is (rotation, translation); an observation is a point, a pixel and the camera that saw it. Weights are
+    Cauchy's at 1 px, times Tukey's, which fall to zero at the limit: as an observation crosses it, nothing jumps.
     """
-    matrix, gradient = np.zeros((POSE, POSE)), np.zeros(POSE)
+    matrix, gradient, within = np.zeros((POSE, POSE)), np.zeros(POSE), 0
     x_in_rig, x_in_cam, by_cam, by_rig = np.zeros(3), np.zeros(3), np.zeros((2, 3)), np.zeros((2, 3))
     pixel, by_lens, by_pose = np.zeros(2), np.zeros((2, 8)), np.zeros((2, POSE))
     for o in range(len(points)):
@@ -180,15 +181,19 @@ def pose_equations(lenses, rotations, translations, pose, points, pixels, camera
         if not _is_before(x_in_cam):
             continue
         _camera_jacobian(lenses[camera], x_in_cam[0], x_in_cam[1], x_in_cam[2], pixel, by_cam, by_lens)
+        x, y = pixel[0] - pixels[o, 0], pixel[1] - pixels[o, 1]
+        left = 1 - (x * x + y * y) / limit_px**2
+        if not left > 0:
+            continue
+        within += 1
+        weight = left * left / (1 + x * x + y * y)
         _times(by_cam, rotations[camera], by_rig)
         _times_motion(by_rig, x_in_rig, by_pose)
-        x, y = pixel[0] - pixels[o, 0], pixel[1] - pixels[o, 1]
-        weight = 1 / (1 + x * x + y * y)
         for i in range(POSE):
             gradient[i] += weight * (by_pose[0, i] * x + by_pose[1, i] * y)
             for j in range(POSE):
                 matrix[i, j] += weight * (by_pose[0, i] * by_pose[0, j] + by_pose[1, i] * by_pose[1, j])
-    return matrix, gradient
+    return matrix, gradient, within
 
 
 @kernel

@@ -36,7 +36,9 @@ _SEARCHED = 8.0
 jaw beyond it as well; if the true match were out of range, a wrong one would be found, and such points look consistent
 and move too little."""
 _CELL_PX = 40
-_POLISHING_ROUNDS = 12
+_POLISHING_ROUNDS = 100
+"""At most; ten to twenty are usual."""
+_SETTLED = 1e-12
 _DECIMALS = 9
 """Decimals of a polished pose, in rad and in mean distances of the points."""
 
@@ -202,11 +204,13 @@ def polish(
     points: Float[np.ndarray, "k 3"],
     pixels: Float[np.ndarray, "k 2"],
     cameras: Int[np.ndarray, "k"],
-) -> Rigid3:
-    """The best-fitting pose near a given one: Gauss-Newton with Cauchy weights at 1 px, rounded.
+    limit_px: float,
+) -> tuple[Rigid3, int]:
+    """The best-fitting pose near a given one, rounded, and the number of sightings that lie within ``limit_px`` of it:
+    Gauss-Newton over all sightings with weights that fall to zero there.
 
-    COLMAP's estimate differs from call to call, and its refinement, of the same sum, stops some nanometres before the
-    optimum.
+    COLMAP's estimate, and what it takes for outliers, differ from call to call, and its refinement stops some
+    nanometres before the optimum.
     """
     unit_mm = float(np.linalg.norm(points, axis=1).mean())
     scale = np.array([1.0, 1.0, 1.0, unit_mm, unit_mm, unit_mm])
@@ -214,15 +218,17 @@ def polish(
     lenses = np.array([each.camera.parameters for each in mounted])
     rotations = np.array([each.cam_from_rig.rotation for each in mounted])
     translations = np.array([each.cam_from_rig.translation for each in mounted])
-    pose = rig_from_world
+    pose, within = rig_from_world, 0
     for _ in range(_POLISHING_ROUNDS):
-        matrix, gradient = pose_equations(
-            lenses, rotations, translations, (pose.rotation, pose.translation), points, pixels, cameras
+        matrix, gradient, within = pose_equations(
+            lenses, rotations, translations, (pose.rotation, pose.translation), points, pixels, cameras, limit_px
         )
-        step = scale * np.linalg.lstsq(scale[:, None] * matrix * scale, -scale * gradient, rcond=None)[0]
-        pose = Rigid3.from_rotation_vector(step[:3], step[3:]) @ pose
+        step = np.linalg.lstsq(scale[:, None] * matrix * scale, -scale * gradient, rcond=None)[0]
+        pose = Rigid3.from_rotation_vector(step[:3], unit_mm * step[3:]) @ pose
+        if np.abs(step).max() < _SETTLED:
+            break
     rounded_mm = unit_mm * (pose.translation / unit_mm).round(_DECIMALS)
-    return Rigid3.from_rotation_vector(pose.rotation_vector.round(_DECIMALS), rounded_mm)
+    return Rigid3.from_rotation_vector(pose.rotation_vector.round(_DECIMALS), rounded_mm), within
 
 
 def relative_pose(
@@ -243,13 +249,11 @@ def relative_pose(
         [colmap_camera(mounted.camera) for mounted in rig.cameras.values()],
         ransac,
     )
-    agree = np.zeros(len(points), dtype=bool) if found is None else np.asarray(found["inlier_mask"], dtype=bool)
-    inliers = int(agree.sum())
-    if found is None or inliers < max(options.minimum_matches, options.minimum_share * len(points)):
-        return Edge(target_from_source=None, matches=inliers)
-    estimate = rigid_from_colmap(found["rig_from_world"])
-    polished = polish(rig, estimate, points[agree], pixels[agree], cameras[agree])
-    return Edge(target_from_source=polished, matches=inliers)
+    if found is None:
+        return Edge(target_from_source=None, matches=0)
+    pose, inliers = polish(rig, rigid_from_colmap(found["rig_from_world"]), points, pixels, cameras, options.error_px)
+    enough = inliers >= max(options.minimum_matches, options.minimum_share * len(points))
+    return Edge(target_from_source=pose if enough else None, matches=inliers)
 
 
 def _parts(edges: Mapping[tuple[int, int], Edge], count: int) -> Int[np.ndarray, "f"]:
