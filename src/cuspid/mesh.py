@@ -213,7 +213,7 @@ class Mesh:
         """True where the open segment from ``points`` to ``towards`` meets the mesh farther away than the tolerance
         (or, for long rays, than single precision resolves)."""
         # The segment is shot backwards: a hit nearer than the surface point is an occluder.
-        origins, directions, farthest = _backwards(np.asarray(points), np.asarray(towards), tolerance_mm)
+        origins, directions, farthest = _backwards(*map(np.ascontiguousarray, (points, towards)), tolerance_mm)
         hits = self._scene.run(origins, directions, dists=farthest, query="OCCLUDED")
         return np.asarray((hits >= 0) & (farthest > 0))
 

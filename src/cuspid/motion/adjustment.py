@@ -200,7 +200,7 @@ def _initial_state(poses: Sequence[Rigid3], points: Float[np.ndarray, "p 3"], pr
 def _moved(state: State, observations: Observations, weighting: Weighting, prior: _Prior, step: Any) -> State:
     """The state after a step of poses and calibration, with the points where their rays then meet."""
     size = POSE * (len(state.frame_rotation) - 1)
-    points = substitute(state, observations, weighting, step)
+    points = substitute(state, observations, weighting, step[:, None])[0]
     moved = with_poses_moved(state, step[:size])._replace(points=points)
     if weighting.calibrated:
         moved = _with_calibration(moved, prior, state.whitened + step[size:].reshape(state.whitened.shape))
@@ -462,12 +462,10 @@ def _expectation(
     some = np.unique(np.linspace(0, count - 1, min(count, _MOST_DRAWN)).astype(np.int64))
     point = np.repeat(np.arange(count), np.diff(observations.start))
     part, seen, _ = _select(state, observations, np.zeros((count, 3), np.uint8), np.isin(point, some))
-    steps = (
-        np.random.default_rng(0).standard_normal((_DRAWS, len(covariance)))
-        @ covariance_factor(covariance, len(covariance)).T
-    )
-    still = substitute(part, seen, weighting, np.zeros(len(covariance)))
-    moved = np.stack([substitute(part, seen, weighting, step) - still for step in steps])
+    draws = np.random.default_rng(0).standard_normal((_DRAWS, len(covariance)))
+    steps = covariance_factor(covariance, len(covariance)) @ draws.T
+    places = substitute(part, seen, weighting, np.column_stack([np.zeros(len(covariance)), steps]))
+    moved = places[1:] - places[0]
     offsets = part.points - part.points.mean(axis=0)
     scale = np.einsum("dni,ni->d", moved, offsets) / np.sum(offsets**2)
     by_motion = np.concatenate(

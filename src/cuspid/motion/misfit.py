@@ -197,7 +197,7 @@ def _after(raw: State, observations: Observations, weighting: Weighting, step: F
         camera_rotation=turns @ raw.camera_rotation,
         camera_translation=np.einsum("cij,cj->ci", turns, raw.camera_translation) + numbers[:, 3:POSE],
         intrinsics=raw.intrinsics + numbers[:, POSE:],
-        points=substitute(raw, observations, weighting, step),
+        points=substitute(raw, observations, weighting, step[:, None])[0],
     )
     return settle(moved, observations, weighting)
 

@@ -378,11 +378,12 @@ def _scores(state, observations, weighting, first, last, out):
 
 @kernel
 @no_type_check
-def _substitute(state, observations, weighting, step, first, last, moved):
-    """Back-substitution: the points ``first`` to ``last`` after the reduced unknowns have made their step."""
-    frames = state.frame_rotation.shape[0]
+def _substitute(state, observations, weighting, steps, first, last, moved):
+    """Back-substitution: the points ``first`` to ``last`` after the reduced unknowns have made each of some steps."""
+    frames, count = state.frame_rotation.shape[0], steps.shape[1]
     scratch, residual, jacobian = make_scratch(), np.zeros(2), np.zeros((2, _COLUMNS))
-    hessian, gradient, inverse = np.zeros((3, 3)), np.zeros((3, 1)), np.zeros((3, 3))
+    hessian, inverse = np.zeros((3, 3)), np.zeros((3, 3))
+    ahead, gradient = np.zeros((2, count)), np.zeros((3, count))
     for point in range(first, last):
         hessian[:], gradient[:] = 0, 0
         for o in range(observations.start[point], observations.start[point + 1]):
@@ -390,17 +391,28 @@ def _substitute(state, observations, weighting, step, first, last, moved):
                 continue
             pose_at, camera_at = _offsets_of(observations, weighting, o, frames)
             for i in range(2):
+                ahead[i] = residual[i]
                 if pose_at >= 0:
-                    residual[i] += np.dot(jacobian[i, 3 : 3 + POSE], step[pose_at : pose_at + POSE])
+                    _add_products(jacobian[i, 3 : 3 + POSE], steps[pose_at : pose_at + POSE], ahead[i])
                 if camera_at >= 0:
-                    residual[i] += np.dot(jacobian[i, 3 + POSE :], step[camera_at : camera_at + CALIBRATION])
+                    _add_products(jacobian[i, 3 + POSE :], steps[camera_at : camera_at + CALIBRATION], ahead[i])
             _add_block(hessian, 0, 0, jacobian[:, :3], jacobian[:, :3])
-            _add_block(gradient, 0, 0, jacobian[:, :3], residual.reshape(2, 1))
+            _add_block(gradient, 0, 0, jacobian[:, :3], ahead)
         _point_inverse(hessian, inverse)
         for i in range(3):
-            moved[point, i] = state.points[point, i] - (
-                inverse[i, 0] * gradient[0, 0] + inverse[i, 1] * gradient[1, 0] + inverse[i, 2] * gradient[2, 0]
-            )
+            for d in range(count):
+                moved[d, point, i] = state.points[point, i] - (
+                    inverse[i, 0] * gradient[0, d] + inverse[i, 1] * gradient[1, d] + inverse[i, 2] * gradient[2, d]
+                )
+
+
+@kernel
+@no_type_check
+def _add_products(left, right, out):
+    """out += left @ right."""
+    for k in range(len(left)):
+        for d in range(len(out)):
+            out[d] += left[k] * right[k, d]
 
 
 @kernel
@@ -517,15 +529,15 @@ def with_poses_moved(state: State, step: Float[np.ndarray, "n"]) -> State:
 
 
 def substitute(
-    state: State, observations: Observations, weighting: Weighting, step: Float[np.ndarray, "n"]
-) -> Float[np.ndarray, "p 3"]:
-    """The points after the step of the reduced unknowns."""
-    moved = np.empty_like(state.points)
+    state: State, observations: Observations, weighting: Weighting, steps: Float[np.ndarray, "k d"]
+) -> Float[np.ndarray, "d p 3"]:
+    """The points after each of some steps of the reduced unknowns, given as columns."""
+    moved, steps = np.empty((steps.shape[1], *state.points.shape)), np.ascontiguousarray(steps)
 
     def part(points: slice) -> None:
-        _substitute(state, observations, weighting, step, points.start, points.stop, moved)
+        _substitute(state, observations, weighting, steps, points.start, points.stop, moved)
 
-    map_slices(part, len(moved), _PARTS, few=_FEW)
+    map_slices(part, len(state.points), _PARTS, few=_FEW)
     return moved
 
 

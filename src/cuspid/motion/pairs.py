@@ -60,7 +60,7 @@ class IndexedFeatures:
 
 def index_features(features: Features, camera: Camera) -> IndexedFeatures:
     """Undistort the keypoints and sort them into cells."""
-    ideal = camera.rays(features.pixels)[:, :2]
+    ideal = np.ascontiguousarray(camera.rays(features.pixels)[:, :2])
     focal = float(np.mean(camera.focal_px))
     corner = ideal.min(axis=0, initial=0.0) * focal
     cells = np.floor((ideal * focal - corner) / _CELL_PX).astype(np.int64)

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from cuspid.camera import Camera
 from cuspid.capture import Frame
 from cuspid.errors import InputError
-from cuspid.geometry import Rigid3
+from cuspid.geometry import Rigid3, read_only
 from cuspid.gloss import coat, leaving
 from cuspid.jaw import Jaw
 from cuspid.kernels import kernel
@@ -81,7 +81,8 @@ class Scene:
     def surface(self) -> ShadedMesh:
         """The jaw as arrays for the compiled shading."""
         mesh = self.jaw.mesh
-        return ShadedMesh(mesh.faces, mesh.face_normals, mesh.vertex_normals, face_materials(self.jaw))
+        # Arrays that came from another process are writable: for those the shading would be compiled once more.
+        return ShadedMesh(read_only(mesh.faces), mesh.face_normals, mesh.vertex_normals, face_materials(self.jaw))
 
     @cached_property
     def rays(self) -> Callable[[Camera], Float[np.ndarray, "n 3"]]:
@@ -203,6 +204,8 @@ def _add_light(
     out: Float[np.ndarray, "m 3"],
 ) -> None:
     """:func:`radiance_along` for some of the pixels, into ``out``."""
+    # One origin or direction for all, repeated by a stride of none, would be of another kind for the compiler.
+    origins, directions = np.ascontiguousarray(origins), np.ascontiguousarray(directions)
     hits = scene.jaw.mesh.cast(origins, directions)
     rays = _Rays(origins, directions, hits.faces, hits.distances, hits.barycentric)
     chosen, row = _shadow_rows(hits.distances, scene.supersampling**2)

@@ -125,6 +125,7 @@ class HeightMap:
         """Whether the surface stands between places on it and a camera's centre."""
         occluded = np.zeros(places.shape[:2], bool)
         start = round(_RIM_MM / self.cell_mm) + 1
+        places, centre = np.array(places, order="C"), np.array(centre)  # of one kind for the compiler
         _mark_occluded(places, centre, self._occluder, self.corner, self.cell_mm, start, _OVER_MM, occluded)
         return occluded if self.visible is None else occluded & ~self._marked(self.visible, places[..., :2])
 
