@@ -108,6 +108,19 @@ def test_what_is_nearer_hides_what_is_farther():
     assert np.argmax(render(scene, look(-90.0, -90.0), width_px=200).image[tuple(centre)]) == 0
 
 
+@pytest.mark.parametrize("eye", [OCCLUSAL, look(30.0, 20.0), look(-90.0, -90.0)])
+def test_a_surface_shows_its_colours_from_the_front_and_grey_from_behind_in_the_same_light(eye: np.ndarray):
+    """Corners of three colours: in the middle of the triangle their mean."""
+    corners = np.array([[-1.0, -0.6, 0], [1.0, -0.6, 0], [0.0, 1.2, 0]]) @ eye
+    colors = np.diag([240, 150, 90]).astype(np.uint8)
+    front = Mesh(corners, np.array([[0, 1, 2]]), colors=colors)
+    lit = 0.46 + 0.38 * 0.66 / np.linalg.norm([0.45, 0.60, 0.66]) + 0.22
+    for mesh, expected in ((front, np.array([80, 50, 30])), (replace(front, faces=front.faces[:, ::-1]), 0.78 * 255)):
+        image = render(mesh, eye, width_px=100).image
+        row, column = np.argwhere(image.min(axis=2) < 255).mean(axis=0).round().astype(int)
+        np.testing.assert_allclose(image[row, column], expected * lit, atol=3)
+
+
 def test_a_long_title_is_not_cut_off(tmp_path: Path):
     box = [np.array([[-4.0, 5.0], [4.0, 5.0], [4.0, 9.0], [-4.0, 9.0]])]
     curve = Curve(turns=(1, 3), images=(40.0, 120.0), complete_pct=(30.0, 60.0), error_um=(5.0, 4.0))

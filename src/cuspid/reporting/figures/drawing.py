@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple, no_type_check
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
@@ -21,7 +21,8 @@ from matplotlib.text import Text
 from matplotlib.ticker import LogFormatter
 
 from cuspid.errors import InputError
-from cuspid.geometry import unit
+from cuspid.geometry import read_only
+from cuspid.kernels import kernel
 from cuspid.mesh import Mesh, RayHits
 from cuspid.options import Options, Range
 from cuspid.storage import whole_file
@@ -37,6 +38,8 @@ SIGMA_COLORS = "viridis"
 """Colours of standard deviations from 0 up, by their name in matplotlib."""
 _BACK = 0.78
 """Grey of a surface seen from behind."""
+_LIGHT = (-0.45, 0.60, 0.66)
+"""Where the light is, in the axes of the view."""
 _INK = "#333333"
 
 
@@ -135,37 +138,64 @@ def render(
     eye = (across + (y[:, None, None] * axes[1]).astype(np.float32)).reshape(-1, 3)
     hits = mesh.cast(eye, np.broadcast_to(-axes[2].astype(np.float32), eye.shape))
     depth = hits.distances.reshape(rows, columns)
-    canvas = np.ones((rows * columns, 3), dtype=np.float32)
-    canvas[hits.faces >= 0] = _lit(mesh, hits, axes) * (1 - _crevices(depth, step).reshape(-1, 1)[hits.faces >= 0])
-    pixels = cv2.resize(
-        canvas.reshape(rows, columns, 3), (width_px, rows // supersampling), interpolation=cv2.INTER_AREA
-    )
+    canvas = _lit(mesh, hits, _crevices(depth, step).ravel(), axes).reshape(rows, columns, 3)
+    pixels = cv2.resize(canvas, (width_px, rows // supersampling), interpolation=cv2.INTER_AREA)
     return RenderedMesh(
         image=np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8), mm_per_px=float(step * supersampling)
     )
 
 
-def _lit(mesh: Mesh, hits: RayHits, axes: Float[np.ndarray, "3 3"]) -> Float32[np.ndarray, "n 3"]:
-    """Colour of each hit under a soft light from the upper left, mild enough to be read off a colour bar."""
-    faces, weights = hits.faces[hits.faces >= 0], hits.barycentric[hits.faces >= 0].astype(np.float32)
-    corners = mesh.faces[faces]
-    normals = unit(_interpolated(mesh.vertex_normals @ axes.T, corners, weights))
-    back = (mesh.face_cross @ axes[2] < 0)[faces]
-    normals[back] *= -1
-    key = np.clip(normals @ np.array([-0.45, 0.60, 0.66], dtype=np.float32), 0, 1)
-    shade = 0.46 + 0.38 * key + 0.22 * np.clip(normals[:, 2], 0, 1)
-    colors = np.broadcast_to(PLASTER, mesh.vertices.shape) if mesh.colors is None else mesh.colors
-    albedo = _interpolated(colors / 255, corners, weights)
-    albedo[back] = _BACK
-    return albedo * shade[:, None]
-
-
-def _interpolated(
-    values: Float[np.ndarray, "v 3"], corners: Int[np.ndarray, "n 3"], weights: Float32[np.ndarray, "n 3"]
+def _lit(
+    mesh: Mesh, hits: RayHits, crevices: Float[np.ndarray, "n"], axes: Float[np.ndarray, "3 3"]
 ) -> Float32[np.ndarray, "n 3"]:
-    """Values of the vertices at places in their faces."""
-    single = values.astype(np.float32)
-    return np.asarray(sum(weights[:, k, None] * single[corners[:, k]] for k in range(3)))
+    """Colour of each ray under a soft light from the upper left, mild enough to be read off a colour bar; white for a
+    miss."""
+    colors = np.broadcast_to(PLASTER, mesh.vertices.shape) if mesh.colors is None else mesh.colors
+    surface = _Surface(
+        faces=read_only(mesh.faces),
+        back=mesh.face_cross @ axes[2] < 0,
+        normals=(mesh.vertex_normals @ axes.T).astype(np.float32),
+        colors=(colors / 255).astype(np.float32),
+    )
+    canvas = np.ones((len(hits.faces), 3), dtype=np.float32)
+    _shade(surface, hits.faces, hits.barycentric, crevices, canvas)
+    return canvas
+
+
+class _Surface(NamedTuple):
+    """What is drawn, as arrays for the compiled shading."""
+
+    faces: Int[np.ndarray, "f 3"]
+    back: Bool[np.ndarray, "f"]
+    normals: Float32[np.ndarray, "v 3"]
+    """In the axes of the view."""
+    colors: Float32[np.ndarray, "v 3"]
+    """From 0 to 1."""
+
+
+@kernel
+@no_type_check
+def _shade(surface, faces, weights, crevices, canvas):
+    """Paint the rays that meet a face."""
+    normal, color = np.zeros(3), np.zeros(3)
+    for n in range(len(faces)):
+        face = faces[n]
+        if face < 0:
+            continue
+        for i in range(3):
+            normal[i], color[i] = 0, 0
+            for k in range(3):
+                corner = surface.faces[face, k]
+                normal[i] += weights[n, k] * surface.normals[corner, i]
+                color[i] += weights[n, k] * surface.colors[corner, i]
+        scale = 1 / max(np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2), 1e-30)
+        if surface.back[face]:
+            scale = -scale
+            color[:] = _BACK
+        key = scale * (_LIGHT[0] * normal[0] + _LIGHT[1] * normal[1] + _LIGHT[2] * normal[2])
+        shade = 0.46 + 0.38 * min(max(key, 0.0), 1.0) + 0.22 * min(max(scale * normal[2], 0.0), 1.0)
+        for i in range(3):
+            canvas[n, i] = color[i] * shade * (1 - crevices[n])
 
 
 def _crevices(depth_mm: Float[np.ndarray, "h w"], step_mm: float) -> Float[np.ndarray, "h w"]:
