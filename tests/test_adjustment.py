@@ -330,6 +330,22 @@ def seen_change(state, observations, prior, step: np.ndarray) -> float:
     return float(np.abs(change[0] - change[1]).max() / 2e-5)
 
 
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_points_follow_each_of_many_steps_as_that_step_alone_and_in_proportion(calibrated: bool) -> None:
+    state, observations, _ = disturbed_state(5, with_priors(make_rig()))
+    weighting = normal_equations.Weighting(1.0, 2.0, calibrated)
+    size = 6 * (len(state.frame_rotation) - 1) + calibrated * 14 * len(state.camera_rotation)
+    one, other = np.random.default_rng(6).normal(0, 1e-3, (2, size))
+    steps = np.column_stack([np.zeros(size), one, other, one + 2 * other])
+    places = normal_equations.substitute(state, observations, weighting, steps)
+    for step, there in zip(steps.T, places, strict=True):
+        alone = normal_equations.substitute(state, observations, weighting, step[:, None])
+        np.testing.assert_allclose(there, alone[0], rtol=0, atol=1e-12)
+    by_one, by_other, by_both = places[1:] - places[0]
+    np.testing.assert_allclose(by_both, by_one + 2 * by_other, rtol=0, atol=1e-10)
+    assert min(np.abs(each).mean() for each in (by_one, by_other)) > 1e-4
+
+
 @pytest.mark.parametrize("sigma_px", [1e-3, 1e-6])
 def test_sharp_images_do_not_drown_what_the_prior_alone_knows(sigma_px: float) -> None:
     """Of the scale; rounding in what the images tell made it some ten times as uncertain for an arch."""
