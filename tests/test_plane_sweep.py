@@ -15,11 +15,13 @@ from hypothesis import strategies as st
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.gloss import leaving_shares
 from cuspid.reconstruction import Tracks
 from cuspid.sparse_model import SparseModel
+from cuspid.stitching.compared import Compared, frames_beside, partners
 from cuspid.stitching.height_map import HeightMap, HeightMapOptions, height_map, uncovered
 from cuspid.stitching.mosaic import Mosaic, MosaicOptions, compose
-from cuspid.stitching.plane_sweep import Compared, PlaneSweepOptions, frames_beside, partners, plane_sweep
+from cuspid.stitching.plane_sweep import PlaneSweepOptions, plane_sweep
 
 HALF_MM, DEEP_MM, CAMERA_MM = 3.0, 4.0, 14.0
 """A bar of this half width along Y stands so high over a floor; the camera goes along it so high over its top."""
@@ -126,6 +128,7 @@ def test_cameras_of_one_instant_find_the_step_however_bright_they_show_it(scene:
         cam_from_world=tuple(poses),
         pairs=tuple((2 * k, 2 * k + 1) for k in range(len(beside))),
         baseline_share=0.2,
+        gammas=(2.2,) * len(poses),
         same_lights=True,
     )
 
@@ -278,3 +281,91 @@ def test_a_plane_occludes_nothing(x: float, y: float) -> None:
     plane = flat_with(0.0, lambda x: np.zeros(x.shape[:-1], bool))
     places = np.concatenate([grid((-8, 8), (-8, 8)), np.zeros((160, 160, 1))], axis=-1)
     assert not plane.occludes(places, np.array([x, y, 10.0])).any()
+
+
+# --- a smooth hill ---------------------------------------------------------------------------------------------------
+
+RADIUS_MM, RIM_MM = 4.0, 4.5
+"""A hill along Y falls from z = 0 as x^2 / (2 RADIUS_MM), up to so far from its crest: 48 degrees steep there."""
+
+
+def hill(x: np.ndarray) -> np.ndarray:
+    """Its height."""
+    return -(np.minimum(np.abs(x), RIM_MM) ** 2) / (2 * RADIUS_MM)
+
+
+def on_hill(pose: Rigid3, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """What pixels show of it, and the cosine between the line of sight and the normal there."""
+    centre, rays = pose.inverse().translation, pose.inverse().rotate(camera.rays(camera.pixel_centres()))
+    places = centre - rays * (centre[2] / rays[..., 2:])
+    for _ in range(60):
+        places = centre - rays * ((centre[2] - hill(places[..., 0])) / rays[..., 2])[..., None]
+    normals = np.dstack([places[..., 0] / RADIUS_MM, np.zeros(places.shape[:2]), np.ones(places.shape[:2])])
+    cosines = (normals * (centre - places)).sum(axis=-1)
+    return places, cosines / np.linalg.norm(normals, axis=-1) / np.linalg.norm(centre - places, axis=-1)
+
+
+def instants(index: float, paint: Callable[[np.ndarray], np.ndarray]) -> Scene:
+    """Two cameras turned towards each other, at ten places along the hill; what they see of ``paint`` loses as much
+    light as on the way out of a body of that refractive index. Names are ``camera/instant``."""
+    poses, images = {}, {}
+    for instant, y in enumerate(np.linspace(-6.0, 6.0, 10)):
+        for name, x in (("a", -2.5), ("b", 2.5)):
+            place = Rigid3(np.eye(3), -np.array([x, y, CAMERA_MM]))
+            down = Rigid3(np.diag([1.0, -1, -1]), np.zeros(3))
+            turn = Rigid3.from_rotation_vector(np.array([0.0, np.arctan2(x, CAMERA_MM), 0]), np.zeros(3))
+            pose = turn @ down @ place
+            places, cosines = on_hill(pose, CAMERA)
+            light = paint(places) * leaving_shares(np.ascontiguousarray(cosines.ravel()), index).reshape(cosines.shape)
+            gray = np.where(np.abs(places[..., 0]) < RIM_MM, 255 * np.clip(light, 0, 1) ** (1 / 2.2), 0)
+            poses[f"{name}/{instant}"] = pose
+            images[f"{name}/{instant}"] = np.dstack([np.rint(gray).astype(np.uint8)] * 3)
+    rng = np.random.default_rng(1)
+    points = rng.uniform([-RIM_MM, -8, 0], [RIM_MM, 8, 0], (900, 3))
+    points[:, 2] = hill(points[:, 0])
+    tracks = Tracks(
+        points=points,
+        colors=np.zeros((len(points), 3), np.uint8),
+        point_index=np.repeat(np.arange(len(points)), 3),
+        frame_index=np.tile(np.array([8, 9, 10]), len(points)),
+        camera_index=np.zeros(3 * len(points), np.int64),
+        pixels=np.zeros((3 * len(points), 2)),
+    )
+    return Scene(SparseModel(camera=CAMERA, cam_from_world=poses, tracks=tracks), images)
+
+
+def off_hill(scene: Scene, **changes: object) -> np.ndarray:
+    """How much too high the surface that both cameras agree on lies, where it is 20 to 45 degrees steep."""
+    names = tuple(scene.images)
+    compared = Compared(
+        names=names,
+        cameras=(CAMERA,) * len(names),
+        cam_from_world=tuple(scene.motion.cam_from_world.values()),
+        pairs=tuple((k, k + 1) for k in range(0, len(names), 2)),
+        baseline_share=5 / CAMERA_MM,
+        gammas=(2.2,) * len(names),
+        same_lights=True,
+    )
+    sparse = height_map(scene.motion, HeightMapOptions())
+    found = plane_sweep(scene.motion, compared, sparse, scene.read, PlaneSweepOptions(**changes))
+    assert found is not None
+    flanks = np.concatenate([grid((-4.0, -1.5), (-4.0, 4.0)), grid((1.5, 4.0), (-4.0, 4.0))], axis=1)
+    assert found.known_at(flanks).mean() > 0.95
+    return found.at(flanks) - hill(flanks[..., 0])
+
+
+def shaded(places: np.ndarray) -> np.ndarray:
+    """Plain, but for what changes over several millimetres."""
+    x, y = places[..., 0], places[..., 1]
+    return 0.35 + 0.1 * np.cos(x / 1.5) + 0.05 * np.sin(y / 2 + x)
+
+
+@pytest.mark.parametrize("index", [1.0, 1.5])
+def test_plain_flanks_are_found_once_the_light_that_they_lose_is_made_up_for(index: float) -> None:
+    scene = instants(index, shaded)
+    off = off_hill(scene, exit_index=index)
+    wrong = off_hill(scene, exit_index=2.5 - index)
+    assert abs(np.median(off)) < 0.06
+    assert 0.001 < np.median(np.abs(off)) < 0.12
+    too_deep = np.sign(index - 1.25)
+    assert -too_deep * np.median(wrong) > max(0.1, 3 * abs(np.median(off)))

@@ -17,7 +17,7 @@ from cuspid.jaw import Jaw
 from cuspid.motion.rig_film import of_camera
 from cuspid.pipeline import RenderOptions, take_images
 from cuspid.reconstruction import Reconstruction, Tracks
-from cuspid.stitching.plane_sweep import camera_gains, cameras_beside
+from cuspid.stitching.compared import camera_gains, cameras_beside
 from cuspid.trueness import GroundTruth
 from test_stitching import seen_points
 from verbs import refused, run
@@ -103,7 +103,7 @@ def test_a_frame_that_lacks_an_image_is_left_out_where_it_is_missing(film: tuple
         pixels=np.zeros((4, 2)),
     )
     found = Reconstruction(rig=rig, rig_from_world=truth.rig_from_world, tracks=tracks)
-    beside = cameras_beside(found, frames, [("left", "right")], 14.0)
+    beside = cameras_beside(found, frames, [("left", "right")], capture.handpiece)
     assert len(beside.pairs) == FRAMES - 2
     assert not {f"{camera}/{frames[k].name}" for k in (3, 5) for camera in rig.names} & set(beside.names)
     for one, other in beside.pairs:

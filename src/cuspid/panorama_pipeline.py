@@ -31,10 +31,10 @@ from cuspid.panorama import FrameUse
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
 from cuspid.simulation.film import FilmOptions, film
+from cuspid.stitching.compared import cameras_beside
 from cuspid.stitching.height_map import ScaleOptions
 from cuspid.stitching.mesh_views import MeshViewOptions, MeshViews, draw_mesh
 from cuspid.stitching.ortho import OrthoOptions, Stitched, orthophoto
-from cuspid.stitching.plane_sweep import cameras_beside
 from cuspid.stitching.thesis_method import ThesisOptions, stitch_as_thesis
 from cuspid.tolerances import NominalOptions
 
@@ -97,9 +97,8 @@ def stitch_rig(capture: Capture, options: StitchOptions, *, progress: Progress =
     capture = replace(capture, handpiece=handpiece)
     found = locate_rig_film(capture, options.rig, options.motion, progress=progress)
     camera = _facing_down(found)
-    distance_mm = handpiece.working_distance_mm
-    pairs = stereo_pairs(found.rig, distance_mm, options.rig.pairing)
-    beside = cameras_beside(found, capture.frames, pairs, distance_mm)
+    pairs = stereo_pairs(found.rig, handpiece.working_distance_mm, options.rig.pairing)
+    beside = cameras_beside(found, capture.frames, pairs, handpiece)
     shown = of_camera(found, camera, {frame.name for frame in capture.frames if camera in frame.cameras})
 
     def read(name: str) -> UInt8[np.ndarray, "h w 3"]:

@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 from cuspid.panorama import FrameUse, Panorama, Strip
 from cuspid.progress import Progress, silent
 from cuspid.sparse_model import SparseModel
+from cuspid.stitching.compared import Compared, frames_beside
 from cuspid.stitching.height_map import (
     HeightMap,
     HeightMapOptions,
@@ -20,7 +21,7 @@ from cuspid.stitching.height_map import (
     uncovered,
 )
 from cuspid.stitching.mosaic import Mosaic, MosaicOptions, compose
-from cuspid.stitching.plane_sweep import Compared, PlaneSweepOptions, frames_beside, plane_sweep
+from cuspid.stitching.plane_sweep import PlaneSweepOptions, plane_sweep
 from cuspid.stitching.strip import StripOptions, unroll
 
 

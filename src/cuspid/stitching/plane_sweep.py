@@ -1,4 +1,4 @@
-"""A dense surface under the occlusal plane, by sweeping horizontal planes through images.
+"""A dense surface under the occlusal plane, by sweeping surfaces through images.
 
 On each plane z = const all images are laid down as if the surface were there (Collins 1996); where it is, images from
 different places agree. What agrees is the zero-mean normalised cross-correlation (ZNCC) of small windows, averaged over
@@ -8,12 +8,16 @@ that goes along with the camera moves over the surface and pulls what is matched
 instant see the same light and shade: there it is the brightness itself that agrees. The height of each cell then
 follows from semi-global optimisation (Hirschmueller 2008) over the volume of places and heights.
 
-The volume grows with the arch; of the frames only a few are held at a time.
+Windows on a plane are wrong where the surface is steep, and its slope tells what light it loses on the way to each
+camera (see :mod:`cuspid.stereo.glare`). Therefore the same is done again, twice, with finer steps, on copies of the
+surface found before that lie a little higher and lower.
+
+The volume grows with the arch; of the frames only some are held.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, NamedTuple
@@ -24,21 +28,25 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from skimage.morphology import remove_small_holes, remove_small_objects
 from skimage.restoration import inpaint_biharmonic
 
-from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera, undistortion_maps
-from cuspid.capture import Frame
+from cuspid.camera import Camera, undistortion_maps
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.gloss import leaving_shares
 from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import Reconstruction
 from cuspid.semi_global import semi_global
 from cuspid.sparse_model import SparseModel
+from cuspid.stitching.compared import Compared, camera_gains
 from cuspid.stitching.height_map import HOLE_MM2, HeightMap
 from cuspid.stitching.mosaic import BURNT, brightest, footprint
 from cuspid.workers import map_in_threads
 
-_BLOCK, _REACH = 24, 14
-"""Frames that are paired at a time, and how many frames later a partner may be."""
+_BLOCK = 24
+"""Images that are paired at a time."""
+_FINER = ((4, 9), (8, 6))
+"""Copies of a surface: by what the step between planes is divided, and how many lie above it and below."""
+_BYTES = 400_000_000
+"""Memory for images that are used again."""
 _NOISE_DN = 1.0
 """Contrast (standard deviation in grey levels) below which there is nothing to agree on."""
 _DETAIL = 4
@@ -46,13 +54,13 @@ _DETAIL = 4
 _LIT, _UNLIKE_DN, _ALIKE_CELLS = 24, 6.0, 3
 """Cameras of one instant: grey level above which there is light, difference of grey levels beyond which two places are
 not alike, and the width over which that is averaged."""
-_METERED, _USUAL_DN = 40, (40, 230)
-"""Images of each camera whose brightness is compared, and grey levels that are."""
 _DARKEST = 16
 """Grey levels below are raised to this one: noise."""
+_SLOPE_MM = 0.3
+"""Standard deviation of the Gaussian filter over the heights from which slopes are taken."""
 _SPECK_MM2 = 4.0
 """Smaller islands of what is known are taken for nothing."""
-_RIM_CELLS = 2
+_RIM_CELLS = 3
 """So wide is the rim of a hole whose heights are not trusted either."""
 _ABOVE_MM = 1.5
 """The surface is looked for no higher above the smooth one through the points: highlights would have it there."""
@@ -75,8 +83,9 @@ class PlaneSweepOptions(Options):
     cell_mm: Annotated[float, Range(0.01, 10)] = 0.1
     """Spacing of the places at which frames are compared, but at least one pixel; that of the height map is twice as
     large."""
-    step_mm: Annotated[float, Range(0.01, 10)] = 0.2
-    """Distance between the planes, but at least what shifts the compared frames by half a pixel."""
+    step_mm: Annotated[float, Range(0.01, 10)] = 0.4
+    """Distance between the planes; beside the surface that they give, others are tried at a quarter and then at an
+    eighth of it. At least what shifts the compared frames by half a pixel."""
     depth_mm: Annotated[float, Range(0.1, 100)] = 11.0
     """Depth of the lowest plane below the occlusal plane."""
     window: Annotated[int, Range(3, 101)] = 5
@@ -90,8 +99,11 @@ class PlaneSweepOptions(Options):
     agreement) and 1."""
     large_jump: Annotated[float, Range(0, 1000)] = 0.5
     """Penalty for a height that differs by more."""
-    smoothing_mm: Annotated[float, Range(0.001, 100)] = 0.24
+    smoothing_mm: Annotated[float, Range(0.001, 100)] = 0.1
     """Standard deviation of the Gaussian filter over the heights."""
+    exit_index: Annotated[float, Range(1, 3)] = 1.4
+    """Refractive index of the teeth, by which less of their light leaves them at grazing angles; 1 for what is
+    matte."""
     agreement: Annotated[float, Range(-1, 1)] = 0.15
     """Places where the frames agree less than this (0 to 1, by ZNCC) at the height found count as unknown."""
 
@@ -103,97 +115,7 @@ class PlaneSweepOptions(Options):
             raise InputError("plane sweep: a large jump must cost no less than a small one")
 
 
-# --- which frames are compared -----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Compared:
-    """Images, where they were taken from, and which of them are compared."""
-
-    names: tuple[str, ...]
-    """By which the images are read, in order of capture."""
-    cameras: tuple[Camera, ...]
-    cam_from_world: tuple[Rigid3, ...]
-    pairs: tuple[tuple[int, int], ...]
-    """Each a stereo baseline apart; a later image is second."""
-    baseline_share: float
-    """Baseline as a share of the distance to the teeth (approximate)."""
-    same_lights: bool
-    """Whether the two images of a pair were taken at one instant: a place is then as bright in one as in the other."""
-
-    def seen_from(self, world_from_new: Rigid3) -> Compared:
-        """The same in another world."""
-        return replace(self, cam_from_world=tuple(pose @ world_from_new for pose in self.cam_from_world))
-
-
-def frames_beside(motion: SparseModel, share: float) -> Compared:
-    """The frames of one camera, each with a later one a stereo baseline from it."""
-    names = motion.frames
-    poses = tuple(motion.cam_from_world.values())
-    return Compared(
-        names=names,
-        cameras=(motion.camera,) * len(names),
-        cam_from_world=poses,
-        pairs=tuple(partners(motion, share).items()),
-        baseline_share=share,
-        same_lights=False,
-    )
-
-
-def cameras_beside(
-    found: Reconstruction, frames: Iterable[Frame], pairs: Sequence[tuple[str, str]], distance_mm: float
-) -> Compared:
-    """The images that two cameras of a rig took of the teeth at one instant, named ``camera/frame``. The same lights
-    were on for both, so that their light and shade are of the surface."""
-    located = [frame for frame in frames if frame.name in found.rig_from_world]
-    together = [
-        ((frame.name, one), (frame.name, other))
-        for frame in located
-        for one, other in pairs
-        if one in frame.cameras and other in frame.cameras
-    ]
-    images = sorted({image for pair in together for image in pair}, key=_in_order(located, found.rig.names))
-    place = {image: number for number, image in enumerate(images)}
-    apart = [np.linalg.norm(np.diff([found.rig[name].centre_in_rig for name in pair], axis=0)) for pair in pairs]
-    return Compared(
-        names=tuple(f"{name}/{frame}" for frame, name in images),
-        cameras=tuple(found.rig[name].camera for _, name in images),
-        cam_from_world=tuple(found.rig[name].cam_from_rig @ found.rig_from_world[frame] for frame, name in images),
-        pairs=tuple((place[one], place[other]) for one, other in together),
-        baseline_share=float(np.median(apart)) / distance_mm,
-        same_lights=True,
-    )
-
-
-def _in_order(frames: Sequence[Frame], cameras: Sequence[str]) -> Callable[[tuple[str, str]], tuple[int, int]]:
-    """Sorts images, each by the names of its frame and its camera, in order of capture."""
-    frame_of = {frame.name: number for number, frame in enumerate(frames)}
-    return lambda image: (frame_of[image[0]], cameras.index(image[1]))
-
-
-def partners(motion: SparseModel, share: float) -> dict[int, int]:
-    """For each frame that has one a later frame beside it, whose baseline is nearest to ``share`` of the distance to
-    the points (within a factor 1.8), mostly sideways, looking in about the same direction."""
-    poses = [pose.inverse() for pose in motion.cam_from_world.values()]
-    centres = np.array([pose.translation for pose in poses])
-    axes = np.array([pose.rotation[:, 2] for pose in poses])
-    wanted = share * float(np.median(motion.depths))
-    found: dict[int, int] = {}
-    for one in range(len(poses) - 1):
-        others = np.arange(one + 1, min(one + 1 + _REACH, len(poses)))
-        shift, axis = centres[others] - centres[one], axes[others] + axes[one]
-        axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-        along = np.sum(shift * axis, axis=1)
-        sideways = np.linalg.norm(shift - along[:, None] * axis, axis=1)
-        off = np.abs(np.log(np.maximum(sideways, 1e-9) / wanted))
-        alike = (sideways >= 2 * np.abs(along)) & (axes[others] @ axes[one] > np.cos(np.deg2rad(20)))
-        off[~alike] = np.inf
-        if off.min() < np.log(1.8):
-            found[one] = int(others[off.argmin()])
-    return found
-
-
-# --- one plane ---------------------------------------------------------------------------------------------------
+# --- what is swept -----------------------------------------------------------------------------------------------
 
 
 class Grid(NamedTuple):
@@ -211,9 +133,54 @@ class Grid(NamedTuple):
         columns, rows = (_POOL * np.ceil((high - low) / cell_mm / _POOL)).astype(int).tolist()
         return Grid(low, cell_mm, columns, rows)
 
+    @property
+    def pooled(self) -> Grid:
+        """The cells of the height map."""
+        return Grid(self.corner, _POOL * self.cell_mm, self.columns // _POOL, self.rows // _POOL)
+
+    @property
+    def centres(self) -> Float[np.ndarray, "h w 2"]:
+        """Of the cells."""
+        across, down = (self.cell_mm * (np.arange(count) + 0.5) for count in (self.columns, self.rows))
+        return self.corner + np.stack(np.meshgrid(across, down), axis=-1)
+
+
+class _Ground(NamedTuple):
+    """A surface, of which copies are tried that lie higher or lower."""
+
+    grid: Grid
+    places: Float[np.ndarray, "h w 3"]
+    """Of the cells of the grid on the surface."""
+    normals: Float[np.ndarray, "h w 3"]
+
+    @staticmethod
+    def level(grid: Grid, z: float) -> _Ground:
+        """A plane."""
+        centres = grid.centres
+        up = np.broadcast_to([0.0, 0.0, 1.0], (*centres.shape[:2], 3))
+        return _Ground(grid, np.dstack([centres, np.full(centres.shape[:2], z)]), up)
+
+    @staticmethod
+    def of(surface: HeightMap, grid: Grid) -> _Ground:
+        """A surface, with the slopes that it has on average."""
+        smooth = cv2.GaussianBlur(surface.heights, (0, 0), _SLOPE_MM / surface.cell_mm)
+        slopes = np.gradient(smooth, surface.cell_mm)
+        down, across = (replace(surface, heights=slope).at(grid.centres) for slope in slopes)
+        normals = np.dstack([-across, -down, np.ones_like(down)]).astype(np.float64)
+        places = np.dstack([grid.centres, surface.at(grid.centres)])
+        return _Ground(grid, places, normals / np.linalg.norm(normals, axis=-1, keepdims=True))
+
+    def part(self, low: Int[np.ndarray, "2"], high: Int[np.ndarray, "2"]) -> _Ground:
+        """Some of its columns and rows."""
+        here = slice(low[1], high[1]), slice(low[0], high[0])
+        return _Ground(self.grid, self.places[here], self.normals[here])
+
+
+# --- one image on one surface ------------------------------------------------------------------------------------
+
 
 class _Field(NamedTuple):
-    """Values on a plane, and what they are like around each place."""
+    """Values on a surface, and what they are like around each place."""
 
     values: np.ndarray
     mean: np.ndarray
@@ -229,7 +196,7 @@ class _Field(NamedTuple):
 
 
 class _Laid(NamedTuple):
-    """A frame on a plane, within its window of the grid."""
+    """An image on a surface, within its window of the grid."""
 
     low: np.ndarray
     high: np.ndarray
@@ -241,6 +208,52 @@ class _Laid(NamedTuple):
         """Rows and columns of this window."""
         (left, top), (right, bottom) = (low - self.low).tolist(), (high - self.low).tolist()
         return slice(top, bottom), slice(left, right)
+
+
+class _Projected(NamedTuple):
+    """Where an image shows the places of a ground, within its window of the grid, and copies of them."""
+
+    low: np.ndarray
+    high: np.ndarray
+    pixels: Float32[np.ndarray, "h w 3"]
+    """Homogeneous, of the ground itself."""
+    upwards: Float32[np.ndarray, "3"]
+    """What is added to them for each mm that a copy lies higher."""
+    brighter: Float32[np.ndarray, "h w"]
+    """By what grey levels are multiplied to make up for the light that does not leave the surface."""
+
+    @staticmethod
+    def of(
+        ground: _Ground, camera: Camera, pose: Rigid3, gamma: float, exit_index: float, window: int
+    ) -> _Projected | None:
+        """None where the image sees nothing of the grid."""
+        low, high = _window_of(ground.grid, camera, pose, float(np.median(ground.places[..., 2])))
+        if np.any(high - low < window):
+            return None
+        part = ground.part(low, high)
+        in_camera = pose.apply(part.places)
+        facing = -(in_camera * pose.rotate(part.normals)).sum(axis=-1) / np.linalg.norm(in_camera, axis=-1)
+        share = leaving_shares(facing.ravel(), exit_index).reshape(facing.shape)
+        return _Projected(
+            low,
+            high,
+            (in_camera @ camera.opencv_matrix.T).astype(np.float32),
+            (camera.opencv_matrix @ pose.rotation[:, 2]).astype(np.float32),
+            (share ** (-1 / gamma)).astype(np.float32),
+        )
+
+    def lay(self, image: UInt8[np.ndarray, "h w 3"], higher_mm: float, window: int) -> _Laid:
+        """The image on a copy of the ground."""
+        moved = self.pixels + np.float32(higher_mm) * self.upwards
+        laid = cv2.remap(image, moved[..., :2] / moved[..., 2:], None, cv2.INTER_LINEAR).astype(np.float32)
+        gray, detail, weight = cv2.split(laid)
+        weight = cv2.erode(weight, np.ones((window, window), np.uint8), borderValue=0)
+        gray_field, detail_field = (_Field.of(each, window) for each in (gray * self.brighter, detail))
+        return _Laid(self.low, self.high, gray_field, detail_field, weight / 255)
+
+
+_Image = tuple[UInt8[np.ndarray, "h w 3"], _Projected | None]
+"""A picture, and where it shows the ground."""
 
 
 def _mean(values: Float32[np.ndarray, "h w"], window: int) -> Float32[np.ndarray, "h w"]:
@@ -256,24 +269,6 @@ def _window_of(grid: Grid, camera: Camera, pose: Rigid3, z: float) -> tuple[Int[
     high = np.minimum(corners.max(axis=0), centre[:2] + half)
     low, high = (np.clip(np.floor((end - grid.corner) / grid.cell_mm), 0, limits).astype(int) for end in (low, high))
     return low, high
-
-
-def _lay(
-    grid: Grid, camera: Camera, pose: Rigid3, z: float, image: UInt8[np.ndarray, "h w 3"], window: int
-) -> _Laid | None:
-    """A frame on the plane at height z; None where it sees nothing of the grid."""
-    low, high = _window_of(grid, camera, pose, z)
-    if np.any(high - low < window):
-        return None
-    corner = grid.corner + grid.cell_mm * (low + 0.5)
-    place = np.array([[grid.cell_mm, 0, corner[0]], [0, grid.cell_mm, corner[1]], [0, 0, 1]])
-    in_camera = np.column_stack([pose.rotation[:, :2], pose.rotation[:, 2] * z + pose.translation]) @ place
-    to_pixel = camera.matrix @ in_camera - OPENCV_PIXEL_OFFSET * np.outer([1, 1, 0], in_camera[2])
-    size, flags = (high - low).tolist(), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    laid = cv2.warpPerspective(image, to_pixel, size, flags=flags).astype(np.float32)
-    gray, detail, weight = (np.ascontiguousarray(laid[..., channel]) for channel in range(3))
-    weight = cv2.erode(weight, np.ones((window, window), np.uint8), borderValue=0)
-    return _Laid(low, high, _Field.of(gray, window), _Field.of(detail, window), weight / 255)
 
 
 def _zncc(one: _Field, other: _Field, noise: float, window: int) -> Float32[np.ndarray, "h w"]:
@@ -292,7 +287,7 @@ def _alike(one: Float32[np.ndarray, "h w"], other: Float32[np.ndarray, "h w"]) -
 def _agreed(
     one: _Laid, a: tuple[slice, slice], other: _Laid, b: tuple[slice, slice], window: int, same_lights: bool
 ) -> Float32[np.ndarray, "h w"]:
-    """What two images agree on parts of a plane, 0 to 1."""
+    """What two images agree on parts of a surface, 0 to 1."""
     detail = _zncc(one.detail.cut(a), other.detail.cut(b), _DETAIL * _NOISE_DN, window)
     if same_lights:
         return (2 * _alike(one.gray.values[a], other.gray.values[b]) + detail) / 3
@@ -303,7 +298,7 @@ def _agreed(
 def _add_agreement(
     one: _Laid, other: _Laid, window: int, same_lights: bool, agreement: np.ndarray, pairs: np.ndarray
 ) -> None:
-    """Add what two images agree on a plane, and where both see it, to the sums over the grid."""
+    """Add what two images agree on a surface, and where both see it, to the sums over the grid."""
     low, high = np.maximum(one.low, other.low), np.minimum(one.high, other.high)
     if np.any(high <= low):
         return
@@ -314,27 +309,7 @@ def _add_agreement(
     pairs[here] += weight
 
 
-# --- all planes --------------------------------------------------------------------------------------------------
-
-
-def camera_gains(names: Sequence[str], read: Callable[[str], UInt8[np.ndarray, "h w 3"]]) -> dict[str, float]:
-    """How much brighter each camera shows the same surface than the first one, from images ``camera/frame`` in order of
-    capture: cameras of one instant see about the same, under the same lights."""
-    images = dict[str, list[str]]()
-    for name in names:
-        images.setdefault(name.rpartition("/")[0], []).append(name)
-    instants = slice(None, None, max(1, len(names) // len(images) // _METERED))
-    levels = {camera: np.log([_usual_level(read(name)) for name in each[instants]]) for camera, each in images.items()}
-    first = next(iter(levels.values()))
-    ratios = {camera: each - first for camera, each in levels.items()}
-    return {c: float(np.exp(np.nanmedian(each))) if np.isfinite(each).any() else 1.0 for c, each in ratios.items()}
-
-
-def _usual_level(image: UInt8[np.ndarray, "h w 3"]) -> float:
-    """Mean grey level of what is neither dark nor burnt out; NaN where there is nothing."""
-    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[::4, ::4]
-    usual = gray[(gray > _USUAL_DN[0]) & (gray < _USUAL_DN[1])]
-    return float(usual.mean()) if len(usual) else float("nan")
+# --- all of them ------------------------------------------------------------------------------------------------
 
 
 def _compared(
@@ -348,6 +323,26 @@ def _compared(
     weight = np.where(glare > 0, 255 * _GLARE_WEIGHT, 255)
     picture = np.dstack([gray, np.clip(128 + _DETAIL * detail, 0, 255), weight]).astype(np.uint8)
     return picture if maps is None else np.asarray(cv2.remap(picture, *maps, cv2.INTER_LINEAR))
+
+
+class _Pictures:
+    """What is compared of each image, by its number; the first of them, as many as fit in memory, are kept."""
+
+    def __init__(self, compared: Compared, read: Callable[[str], UInt8[np.ndarray, "h w 3"]], detail_px: float) -> None:
+        self._names, self._cameras = compared.names, compared.cameras
+        self._read, self._detail_px = read, detail_px
+        self._maps = {camera: undistortion_maps(camera) for camera in compared.cameras}
+        self._gains = camera_gains(compared.names, read) if compared.same_lights else {}
+        self._kept = dict[int, UInt8[np.ndarray, "h w 3"]]()
+
+    def __call__(self, image: int) -> UInt8[np.ndarray, "h w 3"]:
+        if image in self._kept:
+            return self._kept[image]
+        name, maps = self._names[image], self._maps[self._cameras[image]]
+        made = _compared(self._read(name), maps, self._gains.get(name.rpartition("/")[0], 1.0), self._detail_px)
+        if (len(self._kept) + 1) * made.nbytes <= _BYTES:
+            self._kept[image] = made
+        return made
 
 
 def plane_sweep(
@@ -366,37 +361,58 @@ def plane_sweep(
     """
     if not compared.pairs:
         return None
-    grid, levels = _places(motion, float(sparse.heights.max()) + _ABOVE_MM, compared.baseline_share, options)
-    volume = _agreement(compared, grid, levels, read, options, progress)
-    cell_mm = _POOL * grid.cell_mm
-    corner, (rows, columns) = grid.corner + cell_mm / 2, volume.shape[1:]
-    places = corner + cell_mm * np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
-    volume[levels[:, None, None] > sparse.at(places) + _ABOVE_MM] = 0
-    cost = np.ascontiguousarray(np.moveaxis(1 - volume, 0, -1))
-    plane = semi_global(cost, options.small_jump, options.large_jump)
-    at = np.clip(np.rint(plane), 0, len(levels) - 1).astype(int)
-    certainty = cv2.blur(np.take_along_axis(volume, at[None], axis=0)[0], (5, 5))
-    heights = cv2.medianBlur(np.interp(plane, np.arange(len(levels)), levels).astype(np.float32), 5)
-    sure = remove_small_objects(certainty >= options.agreement, max_size=round(_SPECK_MM2 / cell_mm**2))
-    known = remove_small_holes(sure, max_size=round(HOLE_MM2 / cell_mm**2))
-    heights = _bridged(heights, known & ~sure)
-    return HeightMap(
-        corner=corner,
-        cell_mm=cell_mm,
-        heights=np.asarray(cv2.GaussianBlur(heights, (0, 0), options.smoothing_mm / cell_mm)),
-        known=np.asarray(known),
-    )
-
-
-def _places(
-    motion: SparseModel, top: float, baseline_share: float, options: PlaneSweepOptions
-) -> tuple[Grid, Float[np.ndarray, "d"]]:
-    """Where frames are compared: the cells, and the heights of the planes; not closer than pixels tell apart."""
     camera = motion.camera
     pixel_mm = float(np.median(motion.depths) / np.mean(camera.focal_px))
-    step_mm = max(options.step_mm, 0.5 * pixel_mm / baseline_share)
-    levels = np.arange(-options.depth_mm, top + step_mm, step_mm)
-    return Grid.over(motion, max(options.cell_mm, pixel_mm)), levels
+    finest_mm = 0.5 * pixel_mm / compared.baseline_share
+    grid = Grid.over(motion, max(options.cell_mm, pixel_mm))
+    ceiling = sparse.at(grid.pooled.centres) + _ABOVE_MM
+    step_mm = max(options.step_mm, finest_mm)
+    levels = np.arange(-options.depth_mm, float(sparse.heights.max()) + _ABOVE_MM + step_mm, step_mm)
+    pictures = _Pictures(compared, read, options.detail_px)
+    sweep = partial(_swept, compared, pictures, ceiling, options)
+    middle, rounds = float(levels.mean()), 1 + len(_FINER)
+    plane = _Ground.level(grid, middle)
+    surface, sure = sweep(plane, levels - middle, np.ones(ceiling.shape, bool), _part(progress, 0, rounds))
+    known = surface.known
+    for number, (finer, copies) in enumerate(_FINER, start=1):
+        higher = max(step_mm / finer, finest_mm) * np.arange(-copies, copies + 1)
+        surface, sure = sweep(_Ground.of(surface, grid), higher, sure, _part(progress, number, rounds))
+    return replace(surface, known=known)
+
+
+def _part(progress: Progress, number: int, rounds: int) -> Progress:
+    """Progress of one round as that of all."""
+    return lambda stage, done, total: progress(stage, number * total + done, rounds * total)
+
+
+def _swept(
+    compared: Compared,
+    pictures: _Pictures,
+    ceiling: Float[np.ndarray, "r c"],
+    options: PlaneSweepOptions,
+    ground: _Ground,
+    higher_mm: Float[np.ndarray, "d"],
+    sure: Bool[np.ndarray, "r c"],
+    progress: Progress,
+) -> tuple[HeightMap, Bool[np.ndarray, "r c"]]:
+    """The best of the copies of a ground at each place, not above the ceiling, and where images agree on it of those
+    places that were ``sure`` before."""
+    pooled = ground.grid.pooled
+    volume = _agreement(compared, pictures, ground, higher_mm, options, progress)
+    base = cv2.resize(ground.places[..., 2], (pooled.columns, pooled.rows), interpolation=cv2.INTER_AREA)
+    volume[base + higher_mm[:, None, None] > ceiling] = 0
+    cost = np.ascontiguousarray(np.moveaxis(1 - volume, 0, -1))
+    copy = semi_global(cost, options.small_jump, options.large_jump)
+    at = np.clip(np.rint(copy), 0, len(higher_mm) - 1).astype(int)
+    certainty = cv2.blur(np.take_along_axis(volume, at[None], axis=0)[0], (5, 5))
+    moved = cv2.medianBlur(np.interp(copy, np.arange(len(higher_mm)), higher_mm).astype(np.float32), 5)
+    agreed = sure & (certainty >= options.agreement)
+    sure = np.asarray(remove_small_objects(agreed, max_size=round(_SPECK_MM2 / pooled.cell_mm**2)))
+    known = remove_small_holes(sure, max_size=round(HOLE_MM2 / pooled.cell_mm**2))
+    heights = _bridged((base + moved).astype(np.float32), known & ~sure)
+    smooth = np.asarray(cv2.GaussianBlur(heights, (0, 0), options.smoothing_mm / pooled.cell_mm))
+    corner = pooled.centres[0, 0]
+    return HeightMap(corner=corner, cell_mm=pooled.cell_mm, heights=smooth, known=np.asarray(known)), sure
 
 
 def _bridged(heights: Float32[np.ndarray, "r c"], holes: Bool[np.ndarray, "r c"]) -> Float32[np.ndarray, "r c"]:
@@ -407,41 +423,39 @@ def _bridged(heights: Float32[np.ndarray, "r c"], holes: Bool[np.ndarray, "r c"]
 
 def _agreement(
     compared: Compared,
-    grid: Grid,
-    levels: Float[np.ndarray, "d"],
-    read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
+    pictures: _Pictures,
+    ground: _Ground,
+    higher_mm: Float[np.ndarray, "d"],
     options: PlaneSweepOptions,
     progress: Progress,
 ) -> Float32[np.ndarray, "d r c"]:
-    """Mean agreement (0 to 1) of the pairs of images that see a place, at each height; the less, the fewer they are."""
-    cameras, poses, names = compared.cameras, compared.cam_from_world, compared.names
-    maps, window = {camera: undistortion_maps(camera) for camera in cameras}, options.window
-    gains = camera_gains(names, read) if compared.same_lights else {}
+    """Mean agreement (0 to 1) of the pairs of images that see a place, on each copy of the ground; the less, the fewer
+    they are."""
+    grid, pooled, window, names = ground.grid, ground.grid.pooled, options.window, compared.names
+    sums, counts = np.zeros((2, len(higher_mm), pooled.rows, pooled.columns), np.float32)
 
-    def picture(image: int) -> UInt8[np.ndarray, "h w 3"]:
-        name, camera = names[image], cameras[image]
-        return _compared(read(name), maps[camera], gains.get(name.rpartition("/")[0], 1.0), options.detail_px)
+    def project(image: int) -> _Projected | None:
+        camera, pose = compared.cameras[image], compared.cam_from_world[image]
+        return _Projected.of(ground, camera, pose, compared.gammas[image], options.exit_index, window)
 
-    sums, counts = np.zeros((2, len(levels), grid.rows // _POOL, grid.columns // _POOL), np.float32)
-
-    def look(block: Sequence[tuple[int, int]], images: Mapping[int, UInt8[np.ndarray, "h w 3"]], level: int) -> None:
+    def look(block: Sequence[tuple[int, int]], images: Mapping[int, _Image], copy: int) -> None:
         agreement, seen = np.zeros((2, grid.rows, grid.columns), np.float32)
         laid = {
-            frame: _lay(grid, cameras[frame], poses[frame], float(levels[level]), each, window)
-            for frame, each in images.items()
+            image: None if where is None else where.lay(picture, float(higher_mm[copy]), window)
+            for image, (picture, where) in images.items()
         }
         for one, other in block:
             first, second = laid[one], laid[other]
             if first is not None and second is not None:
                 _add_agreement(first, second, window, compared.same_lights, agreement, seen)
-        size = sums.shape[:0:-1]
-        sums[level] += cv2.resize(agreement, size, interpolation=cv2.INTER_AREA)
-        counts[level] += cv2.resize(seen, size, interpolation=cv2.INTER_AREA)
+        size = pooled.columns, pooled.rows
+        sums[copy] += cv2.resize(agreement, size, interpolation=cv2.INTER_AREA)
+        counts[copy] += cv2.resize(seen, size, interpolation=cv2.INTER_AREA)
 
     for start in range(0, len(names), _BLOCK):
         block = [pair for pair in compared.pairs if start <= pair[0] < start + _BLOCK]
         wanted = sorted({image for pair in block for image in pair})
-        images = {frame: picture(frame) for frame in wanted}
-        map_in_threads(partial(look, block, images), range(len(levels)))
+        found = map_in_threads(lambda image: (pictures(image), project(image)), wanted)
+        map_in_threads(partial(look, block, dict(zip(wanted, found, strict=True))), range(len(higher_mm)))
         progress("surface", min(start + _BLOCK, len(names)), len(names))
     return sums / (counts + np.float32(_PAIRS))
