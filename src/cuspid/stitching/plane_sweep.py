@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, no_type_check
 
 import cv2
 import numpy as np
@@ -32,6 +32,7 @@ from cuspid.camera import Camera, undistortion_maps
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.gloss import leaving_shares
+from cuspid.kernels import kernel
 from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.semi_global import semi_global
@@ -179,30 +180,14 @@ class _Ground(NamedTuple):
 # --- one image on one surface ------------------------------------------------------------------------------------
 
 
-class _Field(NamedTuple):
-    """Values on a surface, and what they are like around each place."""
-
-    values: np.ndarray
-    mean: np.ndarray
-    variance: np.ndarray
-
-    @staticmethod
-    def of(values: Float32[np.ndarray, "h w"], window: int) -> _Field:
-        mean = _mean(values, window)
-        return _Field(values, mean, _mean(values * values, window) - mean * mean)
-
-    def cut(self, part: tuple[slice, slice]) -> _Field:
-        return _Field(*(each[part] for each in self))
-
-
 class _Laid(NamedTuple):
     """An image on a surface, within its window of the grid."""
 
     low: np.ndarray
     high: np.ndarray
-    gray: _Field
-    detail: _Field
-    weight: np.ndarray
+    gray: Float32[np.ndarray, "h w"]
+    detail: Float32[np.ndarray, "h w"]
+    weight: Float32[np.ndarray, "h w"]
 
     def part(self, low: np.ndarray, high: np.ndarray) -> tuple[slice, slice]:
         """Rows and columns of this window."""
@@ -244,20 +229,36 @@ class _Projected(NamedTuple):
 
     def lay(self, image: UInt8[np.ndarray, "h w 3"], higher_mm: float, window: int) -> _Laid:
         """The image on a copy of the ground."""
-        moved = self.pixels + np.float32(higher_mm) * self.upwards
-        laid = cv2.remap(image, moved[..., :2] / moved[..., 2:], None, cv2.INTER_LINEAR).astype(np.float32)
-        gray, detail, weight = cv2.split(laid)
+        gray, detail, weight = np.zeros((3, *self.brighter.shape), np.float32)
+        _sample(image, self.pixels, np.float32(higher_mm) * self.upwards, gray, detail, weight)
         weight = cv2.erode(weight, np.ones((window, window), np.uint8), borderValue=0)
-        gray_field, detail_field = (_Field.of(each, window) for each in (gray * self.brighter, detail))
-        return _Laid(self.low, self.high, gray_field, detail_field, weight / 255)
+        return _Laid(self.low, self.high, gray * self.brighter, detail, weight / 255)
 
 
 _Image = tuple[UInt8[np.ndarray, "h w 3"], _Projected | None]
 """A picture, and where it shows the ground."""
 
 
-def _mean(values: Float32[np.ndarray, "h w"], window: int) -> Float32[np.ndarray, "h w"]:
-    return np.asarray(cv2.blur(values, (window, window)))
+@kernel(fastmath=True)
+@no_type_check
+def _sample(image, pixels, moved, gray, detail, weight):
+    """Fill in the three channels of an image at homogeneous pixels that are moved, bilinearly; 0 outside."""
+    rows, columns = image.shape[:2]
+    for i in range(gray.shape[0]):
+        for j in range(gray.shape[1]):
+            z = pixels[i, j, 2] + moved[2]
+            if z <= 0:
+                continue
+            x, y = (pixels[i, j, 0] + moved[0]) / z, (pixels[i, j, 1] + moved[1]) / z
+            if not (0 <= x < columns - 1 and 0 <= y < rows - 1):
+                continue
+            c, r = int(x), int(y)
+            x, y = x - c, y - r
+            a, b, c2, d = (1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y
+            here, right, below, beyond = image[r, c], image[r, c + 1], image[r + 1, c], image[r + 1, c + 1]
+            gray[i, j] = a * here[0] + b * right[0] + c2 * below[0] + d * beyond[0]
+            detail[i, j] = a * here[1] + b * right[1] + c2 * below[1] + d * beyond[1]
+            weight[i, j] = a * here[2] + b * right[2] + c2 * below[2] + d * beyond[2]
 
 
 def _window_of(grid: Grid, camera: Camera, pose: Rigid3, z: float) -> tuple[Int[np.ndarray, "2"], Int[np.ndarray, "2"]]:
@@ -271,11 +272,18 @@ def _window_of(grid: Grid, camera: Camera, pose: Rigid3, z: float) -> tuple[Int[
     return low, high
 
 
-def _zncc(one: _Field, other: _Field, noise: float, window: int) -> Float32[np.ndarray, "h w"]:
-    """What two fields agree, 0 to 1; little where their contrast is not above the noise."""
-    common = _mean(one.values * other.values, window) - one.mean * other.mean
-    power = (np.maximum(one.variance, 0) + noise**2) * (np.maximum(other.variance, 0) + noise**2)
-    return np.clip(common / np.sqrt(power), 0, 1)
+def _zncc(
+    one: Float32[np.ndarray, "h w"], other: Float32[np.ndarray, "h w"], noise: float, window: int
+) -> Float32[np.ndarray, "h w"]:
+    """What two images agree in windows, 0 to 1; little where their contrast is not above the noise."""
+
+    def mean(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+        return np.asarray(cv2.blur(values, (window, window)))
+
+    first, second = mean(one), mean(other)
+    power = np.maximum(mean(one * one) - first * first, 0) + noise**2
+    power *= np.maximum(mean(other * other) - second * second, 0) + noise**2
+    return np.clip((mean(one * other) - first * second) / np.sqrt(power), 0, 1)
 
 
 def _alike(one: Float32[np.ndarray, "h w"], other: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
@@ -288,10 +296,10 @@ def _agreed(
     one: _Laid, a: tuple[slice, slice], other: _Laid, b: tuple[slice, slice], window: int, same_lights: bool
 ) -> Float32[np.ndarray, "h w"]:
     """What two images agree on parts of a surface, 0 to 1."""
-    detail = _zncc(one.detail.cut(a), other.detail.cut(b), _DETAIL * _NOISE_DN, window)
+    detail = _zncc(one.detail[a], other.detail[b], _DETAIL * _NOISE_DN, window)
     if same_lights:
-        return (2 * _alike(one.gray.values[a], other.gray.values[b]) + detail) / 3
-    gray = _zncc(one.gray.cut(a), other.gray.cut(b), _NOISE_DN, window)
+        return (2 * _alike(one.gray[a], other.gray[b]) + detail) / 3
+    gray = _zncc(one.gray[a], other.gray[b], _NOISE_DN, window)
     return (gray * gray + detail) / 2
 
 
