@@ -22,6 +22,7 @@ from cuspid.evaluation.panorama import (
     grey,
     image_scores,
     inter_molar_error,
+    own_direction,
     seen_by_frames,
     trace_pixels,
     trivial_scores,
@@ -100,6 +101,8 @@ def test_a_perfect_panorama_has_no_error(known: Known) -> None:
     assert found.geometry.median_mm < 1e-3
     assert found.geometry.p95_mm < 0.02
     assert abs(found.geometry.scale_error_pct) < 0.05
+    assert found.geometry.tilt_deg < 0.02
+    assert found.geometry.own_median_mm < 1e-3
     assert abs(found.inter_molar_error_mm) < 0.02
     assert found.complete
     assert found.coverage_pct > 99.5
@@ -107,6 +110,31 @@ def test_a_perfect_panorama_has_no_error(known: Known) -> None:
     assert found.picture.ssim_teeth > 0.98
     assert found.picture.zncc > 0.99
     assert found.picture.ssim_full > 0.99
+
+
+@given(st.floats(0.1, 12.0), st.floats(0.0, 360.0), st.floats(0.5, 2.0), st.floats(-180.0, 180.0))
+def test_a_jaw_seen_from_another_direction_is_told_by_its_angle(
+    tilt_deg: float, azimuth_deg: float, scale: float, turn_deg: float
+) -> None:
+    """Along its own direction such a picture has no error but what is added; along that of the jaw it has."""
+    rng = np.random.default_rng(0)
+    true = rng.uniform([-30, -20, -6], [30, 20, 1], (400, 3))
+    azimuth = np.deg2rad(azimuth_deg)
+    axis = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    turned = Rigid3.from_rotation_vector(np.deg2rad(tilt_deg) * axis, np.zeros(3)).rotate(true)[:, :2]
+    noise = rng.normal(0, 0.01, turned.shape)
+    about = np.deg2rad(turn_deg)
+    spin = np.array([[np.cos(about), -np.sin(about)], [np.sin(about), np.cos(about)]])
+    turn, errors = own_direction(scale * (turned + noise) @ spin.T + [3.0, -4.0], true)
+    assert np.rad2deg(np.arccos(turn.rotation[2, 2])) == pytest.approx(tilt_deg, abs=0.05)
+    assert np.median(errors) == pytest.approx(np.median(np.linalg.norm(noise, axis=1)), rel=0.1)
+
+
+def test_a_flat_jaw_has_no_direction_of_its_own() -> None:
+    flat = np.column_stack([np.random.default_rng(1).uniform(-20, 20, (50, 2)), np.zeros(50)])
+    turn, errors = own_direction(flat[:, :2], flat)
+    assert turn.rotation[2, 2] == pytest.approx(1.0)
+    assert errors.max() < 1e-9
 
 
 @pytest.mark.parametrize(

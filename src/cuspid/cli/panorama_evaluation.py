@@ -139,5 +139,12 @@ def _print_extent(score: PanoramaScore) -> None:
     )
     if score.inter_molar_error_mm is not None:
         console.print(f"inter-molar distance error {score.inter_molar_error_mm:+.2f} mm")
-    if score.geometry is not None and score.geometry.scale_error_pct is not None:
-        console.print(f"scale error {score.geometry.scale_error_pct:+.2f} %")
+    if score.geometry is None:
+        return
+    own = score.geometry
+    console.print(
+        f"it looks at the jaw {own.tilt_deg:.1f} deg from the occlusal frame's direction; along its own, the error is "
+        f"{own.own_median_mm:.3f} mm (median), {own.own_p95_mm:.3f} mm (95 %)"
+    )
+    if own.scale_error_pct is not None:
+        console.print(f"scale error {own.scale_error_pct:+.2f} %")

@@ -3,7 +3,8 @@
 A panorama that knows which frame each of its pixels came from is evaluated by geometry: the pixel's ray, from where the
 frame truly was, meets the true jaw in a point, and the panorama places that point somewhere in the occlusal plane. The
 best similarity (least squares, Umeyama 1991) of all tooth pixels is removed; what remains is the geometric error.
-The same similarity lays the panorama over the reference render of the true jaw
+It is told once more along the direction in which the panorama looks at the jaw, which may be another than that of the
+jaw's occlusal frame. The same similarity lays the panorama over the reference render of the true jaw
 (:class:`cuspid.trueness.ReferenceRender`), where the pictures are compared. A panorama without that knowledge is
 aligned with it by image features, and only the pictures are compared.
 
@@ -43,6 +44,8 @@ _MATCH_MM = 0.5
 """Features are consistent if they lie within this distance of each other after the alignment."""
 _WINDOW_PX = 1.5
 """Standard deviation of the window of SSIM."""
+_TURNS = 20
+"""Steps in which the direction of a panorama is found."""
 _FEATURES = 6000
 """Maximum number of features in each picture."""
 
@@ -81,6 +84,12 @@ class GeometricError:
     """Number of tooth pixels that were evaluated."""
     scale_error_pct: float | None
     """How much the panorama's millimetres are too small (positive) or too large; None if it has none."""
+    tilt_deg: float
+    """Angle between the direction along which it looks at the jaw and that of the occlusal frame."""
+    own_median_mm: float
+    """Median, seen along its own direction."""
+    own_p95_mm: float
+    """95th percentile, seen along its own direction."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,6 +196,25 @@ class Similarity2:
         """The inverse transform."""
         back = np.linalg.inv(self.linear)
         return Similarity2(back, -back @ self.shift)
+
+
+def own_direction(
+    placed: Float[np.ndarray, "n 2"], true_mm: Float[np.ndarray, "n 3"]
+) -> tuple[Rigid3, Float[np.ndarray, "n"]]:
+    """A panorama may look at the jaw along another direction than the reference render, which moves what is high and
+    what is low apart. The rotation of the jaw that brings its direction upright, and the errors that are left then, mm.
+
+    Least squares over rotations, with the best similarity each time.
+    """
+    turn = Rigid3.identity()
+    for _ in range(_TURNS):
+        seen = turn.rotate(true_mm)
+        off = seen[:, :2] - Similarity2.best(placed, seen[:, :2]).apply(placed)
+        height = seen[:, 2] - seen[:, 2].mean()
+        lean = off.T @ height / max(float(height @ height), 1e-12)
+        turn = Rigid3.from_rotation_vector(np.array([lean[1], -lean[0], 0.0]), np.zeros(3)) @ turn
+    seen = turn.rotate(true_mm)[:, :2]
+    return turn, np.linalg.norm(Similarity2.best(placed, seen).apply(placed) - seen, axis=1)
 
 
 # --- Where pixels truly are ------------------------------------------------------------------------------------------
@@ -456,7 +484,7 @@ class _Comparison:
         if self.shot is not None:
             on_plane = self.shot.on_plane(traced.true_mm)
             shot_from_panorama = Similarity2.best(traced.placed, on_plane)
-        geometry = self._geometry(errors, plane_from_panorama.scale)
+        geometry = self._geometry(errors, plane_from_panorama.scale, *own_direction(traced.placed, traced.true_mm))
         molars = inter_molar_error(traced, 1.0 if self.panorama.mm_per_px else plane_from_panorama.scale)
         made = self._scored(plane_from_panorama, shot_from_panorama, geometry=geometry, inter_molar_error_mm=molars)
         return replace(made, points_mm=traced.true_mm[:, :2], errors_mm=errors)
@@ -496,7 +524,9 @@ class _Comparison:
             return f"collapsed: the whole picture lies on {extent:.2g} mm of the jaw"
         return None
 
-    def _geometry(self, errors: Float[np.ndarray, "n"], scale: float) -> GeometricError:
+    def _geometry(
+        self, errors: Float[np.ndarray, "n"], scale: float, turn: Rigid3, own_errors: Float[np.ndarray, "n"]
+    ) -> GeometricError:
         return GeometricError(
             median_mm=float(np.median(errors)),
             rms_mm=float(np.sqrt(np.mean(errors**2))),
@@ -504,6 +534,9 @@ class _Comparison:
             max_mm=float(errors.max()),
             pixels=len(errors),
             scale_error_pct=None if self.panorama.mm_per_px is None else 100 * (scale - 1),
+            tilt_deg=float(np.rad2deg(np.arccos(min(turn.rotation[2, 2], 1.0)))),
+            own_median_mm=float(np.median(own_errors)),
+            own_p95_mm=float(np.percentile(own_errors, 95)),
         )
 
     def _scored(
