@@ -73,8 +73,8 @@ def pairs(results: Sequence[Result]) -> list[str]:
         f"Two cameras, subject by subject; the scale is theirs. Bars: median {PAIR_MEDIAN_MM} mm, inter-molar distance "
         f"{PAIR_MOLARS_MM} mm, {PAIR_WALL_S:.0f} s on 2 cores. *Tilt* is the angle between the directions of the "
         "picture and of the jaw's occlusal frame, beside it the median of the error along the picture's own. SSIM is "
-        "fitted; *seen* is what the frames saw of the jaw, and `grey jaw` its score there. Subjects on which the method was "
-        f"developed: {', '.join(sorted(LOOKED_AT))}; all others were looked at only at the end.",
+        "fitted; *seen* is what the frames saw of the jaw, and `grey jaw` its score there. Subjects on which the "
+        f"method was developed: {', '.join(sorted(LOOKED_AT))}; all others were looked at only at the end.",
         "",
         markdown_table(heads, [pair_row(result) for result in results]),
     ]
