@@ -9,9 +9,6 @@ import numpy as np
 
 from cuspid.kernels import kernel
 
-_OBLIQUE = 0.2
-"""Cosine of the angle to the normal below which light that is lost is not told apart further."""
-
 
 @kernel(fastmath=True)
 @no_type_check
@@ -40,14 +37,3 @@ def leaving(cosine, index):
     along = (index * cosine - inside) / (index * cosine + inside)
     straight = (index - 1) / (index + 1)
     return (1 - 0.5 * (across * across + along * along)) / (1 - straight * straight)
-
-
-@kernel(fastmath=True)
-@no_type_check
-def leaving_shares(cosines, index):
-    """As :func:`leaving`, for the cosines of many directions; not less than at 78 degrees, where no normal that was
-    measured is known well enough."""
-    out = np.empty_like(cosines)
-    for i in range(len(out)):
-        out[i] = leaving(max(cosines[i], _OBLIQUE), index)
-    return out

@@ -23,7 +23,7 @@ from jaxtyping import Float, Float32
 
 from cuspid.camera import Camera
 from cuspid.geometry import unit
-from cuspid.gloss import coat, leaving_shares
+from cuspid.gloss import coat, leaving
 from cuspid.kernels import kernel
 from cuspid.rig import Light
 
@@ -38,9 +38,9 @@ STRENGTH, _PLACE = 0.15, 0.5
 """What a spot is uncertain by: a share of it, and a share of what it is brighter by seen past a pit."""
 _LEAST_SHARE = 0.2
 """Share of a window whose depth must be known."""
-_GRAZING = 0.05
-"""Cosine of the angle to the normal, below which gloss is not told apart further: the normal is not known well
-enough."""
+_GRAZING, _OBLIQUE = 0.05, 0.2
+"""Cosines of the angle to the normal, below which gloss, and light that is lost, are not told apart further: the normal
+is not known well enough."""
 
 
 class Seen(NamedTuple):
@@ -73,7 +73,7 @@ def seen(
         known = np.isfinite(normals).all(axis=-1)
         points = rays[known] / inverse[known, None]
         spot[known] = mirrored(points, normals[known], lights)
-        share[known] = leaving_shares(-(normals[known] * unit(points)).sum(axis=-1), exit_index)
+        share[known] = _leaving(-(normals[known] * unit(points)).sum(axis=-1), exit_index)
     past_pits, spot = spots
     return Seen(spot, STRENGTH * spot + _PLACE * np.maximum(past_pits - spot, 0), share)
 
@@ -121,4 +121,13 @@ def _gloss(falling, facing, halfway, grazing):
     for i in range(len(out)):
         nl = max(falling[i], _GRAZING)
         out[i] = coat(nl, max(facing[i], _GRAZING), halfway[i], grazing[i], _REFLECTANCE, _ROUGHNESS)[0] / nl
+    return out
+
+
+@kernel(fastmath=True)
+@no_type_check
+def _leaving(facing, index):
+    out = np.empty_like(facing)
+    for i in range(len(out)):
+        out[i] = leaving(max(facing[i], _OBLIQUE), index)
     return out

@@ -31,7 +31,7 @@ from skimage.restoration import inpaint_biharmonic
 from cuspid.camera import Camera, undistortion_maps
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.gloss import leaving_shares
+from cuspid.gloss import leaving
 from cuspid.kernels import kernel
 from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
@@ -59,6 +59,9 @@ _DARKEST = 16
 """Grey levels below are raised to this one: noise."""
 _SLOPE_MM = 0.3
 """Standard deviation of the Gaussian filter over the heights from which slopes are taken."""
+_OBLIQUE = 0.2
+"""Cosine of the angle to the normal below which the light that is lost is not told apart further: the normal is not
+known well enough."""
 _SPECK_MM2 = 4.0
 """Smaller islands of what is known are taken for nothing."""
 _RIM_CELLS = 3
@@ -218,13 +221,12 @@ class _Projected(NamedTuple):
         part = ground.part(low, high)
         in_camera = pose.apply(part.places)
         facing = -(in_camera * pose.rotate(part.normals)).sum(axis=-1) / np.linalg.norm(in_camera, axis=-1)
-        share = leaving_shares(facing.ravel(), exit_index).reshape(facing.shape)
         return _Projected(
             low,
             high,
             (in_camera @ camera.opencv_matrix.T).astype(np.float32),
             (camera.opencv_matrix @ pose.rotation[:, 2]).astype(np.float32),
-            (share ** (-1 / gamma)).astype(np.float32),
+            _made_up_for(facing, exit_index, gamma),
         )
 
     def lay(self, image: UInt8[np.ndarray, "h w 3"], higher_mm: float, window: int) -> _Laid:
@@ -237,6 +239,16 @@ class _Projected(NamedTuple):
 
 _Image = tuple[UInt8[np.ndarray, "h w 3"], _Projected | None]
 """A picture, and where it shows the ground."""
+
+
+@kernel(fastmath=True)
+@no_type_check
+def _made_up_for(facing, index, gamma):
+    """By what grey levels are to be multiplied where a body is seen at an angle of this cosine to its normal."""
+    out = np.empty(facing.shape, np.float32)
+    for place in np.ndindex(facing.shape):
+        out[place] = leaving(max(facing[place], _OBLIQUE), index) ** (-1 / gamma)
+    return out
 
 
 @kernel(fastmath=True)
