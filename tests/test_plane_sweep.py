@@ -176,6 +176,22 @@ def test_distortion_is_taken_out(scene: Scene, surface: HeightMap) -> None:
     assert np.median(np.abs(found.at(middle) - surface.at(middle))) < 0.05
 
 
+@pytest.mark.parametrize("most_bytes", [0, 6 * 240 * 180 * 3])
+def test_how_many_images_fit_in_memory_does_not_change_the_surface(
+    scene: Scene, surface: HeightMap, monkeypatch: pytest.MonkeyPatch, most_bytes: int
+) -> None:
+    read = list[str]()
+    monkeypatch.setattr("cuspid.stitching.plane_sweep._BYTES", most_bytes)
+    monkeypatch.setattr(Scene, "read", lambda self, name: read.append(name) or self.images[name])
+    found = scene.swept()
+    assert found is not None
+    assert np.array_equal(found.heights, surface.heights)
+    assert np.array_equal(found.known, surface.known)
+    times = np.unique(read, return_counts=True)[1]
+    assert np.sum(times == 1) == most_bytes // (240 * 180 * 3)
+    assert times.max() == 3, "once a round"
+
+
 def test_a_camera_that_stands_still_finds_no_surface(scene: Scene) -> None:
     pose = scene.motion.cam_from_world["009"]
     still = replace(scene.motion, cam_from_world=dict.fromkeys(scene.motion.cam_from_world, pose))
