@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -206,8 +206,12 @@ def origin(results: Mapping[str, Result], older: Older) -> str:
     changed = sorted({file for name in results for file in older.get(name, ())})
     if not changed:
         return f"{told}."
-    more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
-    return f"{told}; **older code**, changed since: {', '.join(f'`{each}`' for each in changed[:3])}{more}."
+    return f"{told}; **older code**, changed since: {first_few([f'`{each}`' for each in changed])}."
+
+
+def first_few(names: Sequence[str]) -> str:
+    """Three of some names, and how many more there are."""
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def standing(results: Mapping[str, Result], older: Older) -> str:
@@ -327,7 +331,7 @@ def main() -> None:
             "\n".join([*lines, "benchmarks of several commits: run python benchmarks/campaign.py --release"])
         )
     if older and not arguments.older:
-        lines = [f"{name}: {', '.join(changed)}" for name, changed in older.items()]
+        lines = [f"{name}: {first_few(changed)}" for name, changed in older.items()]
         raise SystemExit(
             "\n".join(
                 [*lines, f"{len(older)} of {len(results)} results no longer hold: run them anew, or give --older"]
