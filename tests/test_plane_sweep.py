@@ -62,6 +62,18 @@ def picture(pose: Rigid3, texture: np.ndarray) -> np.ndarray:
     return np.dstack([np.clip(gray, 0, 255).astype(np.uint8)] * 3)
 
 
+def seen_thrice(points: np.ndarray) -> Tracks:
+    """Points that three frames saw."""
+    return Tracks(
+        points=points,
+        colors=np.zeros((len(points), 3), np.uint8),
+        point_index=np.repeat(np.arange(len(points)), 3),
+        frame_index=np.tile(np.array([8, 9, 10]), len(points)),
+        camera_index=np.zeros(3 * len(points), np.int64),
+        pixels=np.zeros((3 * len(points), 2)),
+    )
+
+
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     rng = np.random.default_rng(3)
@@ -78,14 +90,7 @@ def scene() -> Scene:
     motion = SparseModel(
         camera=CAMERA,
         cam_from_world=poses,
-        tracks=Tracks(
-            points=points,
-            colors=np.zeros((len(points), 3), np.uint8),
-            point_index=np.repeat(np.arange(len(points)), 3),
-            frame_index=np.tile(np.array([8, 9, 10]), len(points)),
-            camera_index=np.zeros(3 * len(points), np.int64),
-            pixels=np.zeros((3 * len(points), 2)),
-        ),
+        tracks=seen_thrice(points),
     )
     return Scene(motion, {name: picture(pose, texture) for name, pose in poses.items()})
 
@@ -237,7 +242,8 @@ def test_a_film_of_another_scale_needs_no_more_cells(scene: Scene, surface: Heig
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"cell_mm": 0.0}, {"window": 4}, {"window": 1}, {"large_jump": 0.01}, {"small_jump": -1.0}]
+    "wrong",
+    [{"cell_mm": 0.0}, {"window": 4}, {"window": 1}, {"large_jump": 0.01}, {"small_jump": -1.0}, {"exit_index": 0.9}],
 )
 def test_options_that_make_no_sense_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(InputError, match="plane sweep"):
@@ -339,15 +345,7 @@ def instants(index: float, paint: Callable[[np.ndarray], np.ndarray]) -> Scene:
     rng = np.random.default_rng(1)
     points = rng.uniform([-RIM_MM, -8, 0], [RIM_MM, 8, 0], (900, 3))
     points[:, 2] = hill(points[:, 0])
-    tracks = Tracks(
-        points=points,
-        colors=np.zeros((len(points), 3), np.uint8),
-        point_index=np.repeat(np.arange(len(points)), 3),
-        frame_index=np.tile(np.array([8, 9, 10]), len(points)),
-        camera_index=np.zeros(3 * len(points), np.int64),
-        pixels=np.zeros((3 * len(points), 2)),
-    )
-    return Scene(SparseModel(camera=CAMERA, cam_from_world=poses, tracks=tracks), images)
+    return Scene(SparseModel(camera=CAMERA, cam_from_world=poses, tracks=seen_thrice(points)), images)
 
 
 def off_hill(scene: Scene, **changes: object) -> np.ndarray:
