@@ -109,6 +109,31 @@ for k in (1, 2.0):
         print(type(error).__name__)
 """
 
+FORKED = """
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from cuspid.kernels import kernel
+
+@kernel
+def twice(x):
+    return 2 * x
+
+def use(x):
+    return twice(x)
+
+if __name__ == "__main__":
+    with ProcessPoolExecutor(2, get_context("fork")) as pool:
+        print(sum(pool.map(use, range(8))))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the system does not fork")
+def test_a_forked_process_may_be_the_first_to_use_a_kernel(tmp_path: Path) -> None:
+    """As where a film is rendered with optics whose kernels its parent never calls."""
+    (tmp_path / "forked.py").write_text(FORKED)
+    ended = subprocess.run([sys.executable, tmp_path / "forked.py"], capture_output=True, text=True, timeout=60)
+    assert ended.stdout.split() == ["56"], ended.stderr
+
 
 def test_processes_that_need_kernels_at_once_compile_them_once(tmp_path: Path) -> None:
     (tmp_path / "slow.py").write_text(SLOW)

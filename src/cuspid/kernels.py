@@ -59,8 +59,7 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]
         self._cache_file = CheckedFile(
             cache_path=self._cache_path, filename_base=self._impl.filename_base, source_stamp=self.stamp
         )
-        path = Path(self._cache_path) / f"{self._impl.filename_base}.lock"
-        self._lock = FileLock(path, timeout=_LONGEST_WAIT_S, thread_local=False)
+        self._lock_path = Path(self._cache_path) / f"{self._impl.filename_base}.lock"
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -68,7 +67,8 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]
         with global_compiler_lock, ExitStack() as stack:  # in this order: a thread that compiles may wait for files
             with suppress(OSError):
                 self._impl.locator.ensure_cache_path()
-                stack.enter_context(self._lock)
+                # A lock of its own each time: a forked process must not use one that it inherited.
+                stack.enter_context(FileLock(self._lock_path, timeout=_LONGEST_WAIT_S, thread_local=False))
             yield
 
 
