@@ -166,7 +166,14 @@ def write_score(folder: Path) -> None:
     """As ``cuspid stitch-eval`` leaves it."""
     scores = dict.fromkeys(("zncc", "ssim_teeth", "ssim_full", "ssim_teeth_fitted", "ssim_full_fitted"), 0.5)
     storage.claim_folder(folder, "stitch-eval", {"evaluation": {"samples": 10}}, {"panorama": "d" * 64})
-    geometry = {"median_mm": 0.3, "p95_mm": 0.8, "rms_mm": 0.4, "scale_error_pct": -1.0}
+    geometry = {
+        "median_mm": 0.3,
+        "p95_mm": 0.8,
+        "rms_mm": 0.4,
+        "scale_error_pct": -1.0,
+        "tilt_deg": 2.1,
+        "own_median_mm": 0.2,
+    }
     storage.write_json(
         folder / "score.json",
         {

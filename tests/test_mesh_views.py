@@ -141,7 +141,9 @@ def test_how_a_jaw_lies_in_its_file_makes_no_difference(coarse_phantom: Jaw) -> 
     (plain, upright), (turned, found) = (
         view_mesh(mesh, options) for mesh in (coarse_phantom.mesh, coarse_phantom.mesh.transformed(moved))
     )
-    assert np.abs((found @ moved @ upright.inverse()).matrix - np.eye(4)).max() < 0.1
+    between = found @ moved @ upright.inverse()
+    assert between.angle_deg < 1.5
+    assert np.abs(between.translation).max() < 0.25  # half the spacing of the grid on which the crowns are found
     assert list(turned.strips) == list(plain.strips) == ["occlusal", "buccal", "lingual"]
     for name, strip in plain.strips.items():
         assert turned.strips[name].covered.shape[1] == pytest.approx(strip.covered.shape[1], rel=0.03)

@@ -69,13 +69,11 @@ def test_pixels_show_what_lies_there_in_true_millimetres(pano: Path, film: tuple
     panorama = storage.read_panorama(pano)
     camera = film[1].handpiece.rig["left"].camera
     here, true = seen_points(panorama, film[1], camera, "left")
-    assert (
-        0.001 < np.median(left_over(here, true[:, :2])) < 0.2
-    )  # enamel loses light at grazing angles, which two cameras see differently
     pixels = np.floor(panorama.pixels_from_world(here)).astype(int)
     assert panorama.height_mm is not None
-    deep = panorama.height_mm[pixels[:, 1], pixels[:, 0]] - true[:, 2]
-    assert 0.001 < np.median(np.abs(deep - np.median(deep))) < 0.25
+    found = np.column_stack([here, panorama.height_mm[pixels[:, 1], pixels[:, 0]]])
+    # Which way three teeth look is hardly known; a plane in place of their surface would be off by 0.45 mm.
+    assert 0.001 < np.median(left_over(found, true)) < 0.2
 
 
 def test_the_scale_is_that_of_the_handpiece_and_nothing_else(

@@ -12,24 +12,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
-from scipy.ndimage import maximum_filter
+from jaxtyping import Float, Int, UInt8
 from scipy.spatial import ConvexHull, cKDTree
 
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, axes_about, best_similarity
 from cuspid.jaw import GUM, Arch
 from cuspid.mesh import Mesh
+from cuspid.occlusal_plane import crown_tips, crown_tops, levelled, upright
 from cuspid.storage import MM_PER_UNIT, Unit
 
 _GRID_MM = 0.5
 """Spacing of the height map."""
-_NEAR_MM = 8.0
-"""About the width of a tooth: a tip is the highest point within a square of this side."""
-_CROWN_MM = 3.0
-"""A point belongs to the top of a crown if it lies less than this below the tip near it."""
-_SPEE_MM = 5.0
-"""Tips lie within this below the plane on which the jaw would rest."""
 _ARCH_HALF_WIDTH_MM, _ARCH_DEPTH_MM = 25.0, 42.0
 """Of the mean arch, at the middle of the second molars."""
 _ARCH_MISFIT_MM = 2.0
@@ -42,8 +36,8 @@ _NARROW_MM = 32.0
 """What is narrower across is part of an arch."""
 _ENOUGH_FACES = 500_000
 """More say no more of how a jaw lies."""
-_TILT_MM = 6.0
-"""Tips that spread less than this say little of a tilt."""
+_TILT_SD_DEG = 30.0
+"""Standard deviation of what the outside of a scan, or the plane on which it rests, tells of its tilt."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -65,36 +59,24 @@ class _Relief:
     normals: Float[np.ndarray, "h w 3"]
     """Normal there."""
 
-    @property
-    def heights(self) -> Float[np.ndarray, "h w"]:
-        """Z of the points, minus infinity where unknown."""
-        return np.where(np.isnan(self.points[..., 2]), -np.inf, self.points[..., 2])
+    def crowns(self) -> Float[np.ndarray, "n 3"]:
+        """Points of the tops of the crowns."""
+        return np.asarray(self.points[crown_tops(self.points[..., 2], _GRID_MM)])
 
-    def crowns(self) -> Bool[np.ndarray, "h w"]:
-        """The tops of the crowns."""
-        summits = maximum_filter(self.heights, round(_NEAR_MM / _GRID_MM))
-        return np.asarray((self.heights > summits - _CROWN_MM) & (np.abs(summits - self._plane()) < _SPEE_MM))
-
-    def tips(self) -> Bool[np.ndarray, "h w"]:
-        """The highest points of their surroundings."""
-        return np.asarray(self.crowns() & (self.heights == maximum_filter(self.heights, round(_NEAR_MM / _GRID_MM))))
-
-    def _plane(self) -> float:
-        """About the height of the tips; flaps of gum may rise higher."""
-        known = self.heights[np.isfinite(self.heights)]
-        return float(np.percentile(known, 95))
+    def tips(self) -> Float[np.ndarray, "n 3"]:
+        """Points that are the highest of their surroundings."""
+        return np.asarray(self.points[crown_tips(self.points[..., 2], _GRID_MM)])
 
 
 def find_occlusal_frame(mesh: Mesh) -> OcclusalFrame:
     """The occlusal frame of a jaw in any orientation, in mm; says so where it is unsure."""
     mesh = mesh.thinned(_ENOUGH_FACES)
-    upright, notes_up = _upright(mesh)
-    level = _level(mesh, upright)
+    start, notes_up = _upright(mesh)
+    level = _level(mesh, start)
     relief = _relief(mesh, level)
-    crowns = relief.points[relief.crowns()]
+    crowns = relief.crowns()
     anterior, notes_front = _anterior(crowns[:, :2])
-    tips = relief.points[relief.tips()]
-    centre = np.array([*crowns[:, :2].mean(axis=0), tips[:, 2].mean()])
+    centre = np.array([*crowns[:, :2].mean(axis=0), relief.tips()[:, 2].mean()])
     turn = np.array([[anterior[1], -anterior[0], 0], [anterior[0], anterior[1], 0], [0, 0, 1.0]])
     return OcclusalFrame(occlusal_from_mesh=Rigid3(turn, -turn @ centre) @ level, notes=(*notes_up, *notes_front))
 
@@ -159,22 +141,10 @@ def _roughness(relief: _Relief) -> float:
     return float(np.arccos(np.clip(cosines[known], -1, 1)).mean()) if known.any() else 0.0
 
 
-def _level(mesh: Mesh, upright: Rigid3) -> Rigid3:
-    """Turn a frame so that the tips of the crowns lie in the plane XY on average.
-
-    About an axis along which the tips hardly spread it is turned the less, the less they do.
-    """
-    frame = upright if _is_part(mesh, upright.rotation[2]) else _resting(_relief(mesh, upright), upright)
-    for _ in range(4):
-        relief = _relief(mesh, frame)
-        tips = relief.points[relief.tips()]
-        if len(tips) < 3:
-            return frame
-        centred = tips - tips.mean(axis=0)
-        spread = centred[:, :2].T @ centred[:, :2] + len(tips) * _TILT_MM**2 * np.eye(2)
-        a, b = np.linalg.solve(spread, centred[:, :2].T @ centred[:, 2])
-        frame = _tilted(np.array([-a, -b, 1.0]), frame)
-    return frame
+def _level(mesh: Mesh, start: Rigid3) -> Rigid3:
+    """Turn a frame so that the tips of the crowns lie in the plane XY on average."""
+    frame = start if _is_part(mesh, start.rotation[2]) else _resting(_relief(mesh, start), start)
+    return levelled(lambda turn: _relief(mesh, turn @ frame).points, _GRID_MM, _TILT_SD_DEG) @ frame
 
 
 def _resting(relief: _Relief, frame: Rigid3) -> Rigid3:
@@ -190,17 +160,7 @@ def _resting(relief: _Relief, frame: Rigid3) -> Rigid3:
         return frame
     # The facet over the centre of mass is the one at which the line upwards leaves the hull first.
     exits = -(offsets + normals @ centre) / normals[:, 2]
-    return _tilted(normals[int(np.argmin(exits))], frame)
-
-
-def _tilted(up: Float[np.ndarray, "3"], frame: Rigid3) -> Rigid3:
-    """``frame`` turned the short way so that the direction ``up`` in it becomes +Z."""
-    up = up / np.linalg.norm(up)
-    axis = np.cross(up, [0, 0, 1.0])
-    sine = np.linalg.norm(axis)
-    if sine < 1e-12:
-        return frame
-    return Rigid3.from_rotation_vector(axis / sine * np.arctan2(sine, up[2]), np.zeros(3)) @ frame
+    return upright(normals[int(np.argmin(exits))]) @ frame
 
 
 def _anterior(crowns: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "2"], tuple[str, ...]]:

@@ -29,8 +29,10 @@ NOMINAL_MM = 14.0
 
 _PATCH_MM = 3.0
 """Size of the patches of which each gives one height to the occlusal plane: about half a tooth."""
-_PATCH_SD_MM, _TILT_SD = 1.0, np.deg2rad(4.0)
-"""How far the tops of patches stand off the occlusal plane, and the mean of the optical axes off its normal."""
+_PATCH_SD_MM = 1.0
+"""How far the tops of patches stand off the occlusal plane."""
+AXES_SD_DEG = 4.0
+"""How far the mean of the optical axes stands off the normal of the occlusal plane."""
 _RIDGE_MM, _BELOW_MM = 6.0, 1.2
 """A patch lower by more than the second than the highest patch within the first is no top of a tooth."""
 _TEETH_MM = 4.0
@@ -115,6 +117,13 @@ class HeightMap:
     """Whether there is a surface that was seen."""
     visible: Bool[np.ndarray, "r c"] | None = None
     """Places that nothing occludes, whatever rises beside them."""
+
+    @cached_property
+    def places(self) -> Float[np.ndarray, "r c 3"]:
+        """The surface at each cell."""
+        rows, columns = self.heights.shape
+        x, y = (low + self.cell_mm * np.arange(n) for low, n in zip(self.corner, (columns, rows), strict=True))
+        return np.stack([*np.meshgrid(x, y), self.heights], axis=-1)
 
     @cached_property
     def _occluder(self) -> Float[np.ndarray, "r c"]:
@@ -235,7 +244,7 @@ def _levelled(points: Float[np.ndarray, "p 3"]) -> Rigid3:
     tops = _tops(points)
     if len(tops) < 3:
         return Rigid3(np.eye(3), np.array([0, 0, -float(np.percentile(points[:, 2], 90))]))
-    prior = np.diag([0, 1, 1]) * (_PATCH_SD_MM / _TILT_SD) ** 2
+    prior = np.diag([0, 1, 1]) * (_PATCH_SD_MM / np.deg2rad(AXES_SD_DEG)) ** 2
     for _ in range(4):
         design = np.column_stack([np.ones(len(tops)), tops[:, :2]])
         plane = np.linalg.solve(design.T @ design + prior, design.T @ tops[:, 2])
@@ -296,9 +305,7 @@ def uncovered(dense: HeightMap, sparse: HeightMap, motion: SparseModel) -> Heigh
     Where seen surface lies all around a place of a crown that is occluded in every frame, something rises beside it
     that cannot be: a highlight in a hollow. Gum far below the smooth surface may well be occluded by a crown.
     """
-    camera, cells = motion.camera, dense.known.shape
-    x, y = np.meshgrid(*(low + dense.cell_mm * np.arange(n) for low, n in zip(dense.corner, cells[::-1], strict=True)))
-    places = np.stack([x, y, dense.heights], axis=-1)
+    camera, cells, places = motion.camera, dense.known.shape, dense.places
     seen = np.zeros(cells, bool)
     for pose in motion.cam_from_world.values():
         there = pose.apply(places)

@@ -18,8 +18,10 @@ from cuspid.stitching.height_map import (
     ScaleOptions,
     height_map,
     in_occlusal_frame,
+    transformed,
     uncovered,
 )
+from cuspid.stitching.levelling import level_by_crowns, turned
 from cuspid.stitching.mosaic import Mosaic, MosaicOptions, compose
 from cuspid.stitching.plane_sweep import PlaneSweepOptions, plane_sweep
 from cuspid.stitching.strip import StripOptions, unroll
@@ -73,9 +75,12 @@ def orthophoto(
     if scale.working_distance_mm is None:
         scale = replace(scale, working_distance_mm=working_distance_mm)
     motion = in_occlusal_frame(located, scale if beside is None else None)
-    sparse = height_map(motion, options.height_map)
-    dense = _dense(located, motion, sparse, read, beside, options.plane_sweep, progress)
-    surface = sparse if dense is None else uncovered(dense, sparse, motion)
+    surface = height_map(motion, options.height_map)
+    dense = _dense(located, motion, surface, read, beside, options.plane_sweep, progress)
+    if dense is not None:
+        level = level_by_crowns(dense)
+        motion = transformed(motion, level)
+        surface = uncovered(turned(dense, level), height_map(motion, options.height_map), motion)
     mosaic = compose(motion, surface, read, options.mosaic, progress=progress)
     metric = beside is not None or scale.working_distance_mm is not None or scale.width_mm is not None
     panorama = _panorama(mosaic, motion, frames, metric)

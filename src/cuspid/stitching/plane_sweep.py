@@ -156,13 +156,15 @@ class _Ground(NamedTuple):
     places: Float[np.ndarray, "h w 3"]
     """Of the cells of the grid on the surface."""
     normals: Float[np.ndarray, "h w 3"]
+    height: float
+    """About its Z."""
 
     @staticmethod
     def level(grid: Grid, z: float) -> _Ground:
         """A plane."""
         centres = grid.centres
         up = np.broadcast_to([0.0, 0.0, 1.0], (*centres.shape[:2], 3))
-        return _Ground(grid, np.dstack([centres, np.full(centres.shape[:2], z)]), up)
+        return _Ground(grid, np.dstack([centres, np.full(centres.shape[:2], z)]), up, z)
 
     @staticmethod
     def of(surface: HeightMap, grid: Grid) -> _Ground:
@@ -172,12 +174,13 @@ class _Ground(NamedTuple):
         down, across = (replace(surface, heights=slope).at(grid.centres) for slope in slopes)
         normals = np.dstack([-across, -down, np.ones_like(down)]).astype(np.float64)
         places = np.dstack([grid.centres, surface.at(grid.centres)])
-        return _Ground(grid, places, normals / np.linalg.norm(normals, axis=-1, keepdims=True))
+        height = float(np.median(places[..., 2]))
+        return _Ground(grid, places, normals / np.linalg.norm(normals, axis=-1, keepdims=True), height)
 
     def part(self, low: Int[np.ndarray, "2"], high: Int[np.ndarray, "2"]) -> _Ground:
         """Some of its columns and rows."""
         here = slice(low[1], high[1]), slice(low[0], high[0])
-        return _Ground(self.grid, self.places[here], self.normals[here])
+        return self._replace(places=self.places[here], normals=self.normals[here])
 
 
 # --- one image on one surface ------------------------------------------------------------------------------------
@@ -215,7 +218,7 @@ class _Projected(NamedTuple):
         ground: _Ground, camera: Camera, pose: Rigid3, gamma: float, exit_index: float, window: int
     ) -> _Projected | None:
         """None where the image sees nothing of the grid."""
-        low, high = _window_of(ground.grid, camera, pose, float(np.median(ground.places[..., 2])))
+        low, high = _window_of(ground.grid, camera, pose, ground.height)
         if np.any(high - low < window):
             return None
         part = ground.part(low, high)
@@ -266,11 +269,11 @@ def _sample(image, pixels, moved, gray, detail, weight):
                 continue
             c, r = int(x), int(y)
             x, y = x - c, y - r
-            a, b, c2, d = (1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y
+            w00, w01, w10, w11 = (1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y
             here, right, below, beyond = image[r, c], image[r, c + 1], image[r + 1, c], image[r + 1, c + 1]
-            gray[i, j] = a * here[0] + b * right[0] + c2 * below[0] + d * beyond[0]
-            detail[i, j] = a * here[1] + b * right[1] + c2 * below[1] + d * beyond[1]
-            weight[i, j] = a * here[2] + b * right[2] + c2 * below[2] + d * beyond[2]
+            gray[i, j] = w00 * here[0] + w01 * right[0] + w10 * below[0] + w11 * beyond[0]
+            detail[i, j] = w00 * here[1] + w01 * right[1] + w10 * below[1] + w11 * beyond[1]
+            weight[i, j] = w00 * here[2] + w01 * right[2] + w10 * below[2] + w11 * beyond[2]
 
 
 def _window_of(grid: Grid, camera: Camera, pose: Rigid3, z: float) -> tuple[Int[np.ndarray, "2"], Int[np.ndarray, "2"]]:

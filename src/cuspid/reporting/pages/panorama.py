@@ -112,6 +112,8 @@ def _tiles(score: Mapping[str, Any]) -> list[tuple[str, str, str]]:
             ("geometric error, median", number(found["median_mm"], 2), "mm"),
             ("95 % within", number(found["p95_mm"], 2), "mm"),
             ("scale error", signed(found["scale_error_pct"], 2), "%"),
+            ("tilt of its occlusal plane", number(found["tilt_deg"], 1), "deg"),
+            ("median seen along its own direction", number(found["own_median_mm"], 2), "mm"),
         ]
     if score["inter_molar_error_mm"] is not None:
         tiles.append(("inter-molar error", signed(score["inter_molar_error_mm"], 2), "mm"))
