@@ -8,7 +8,7 @@ import trimesh
 
 from builders import joined, moved, sphere
 from cuspid.mesh import Mesh
-from cuspid.surface.cleaning import CleaningReport, boundaries, face_pieces, non_manifold_faces
+from cuspid.surface.cleaning import CleaningReport, boundaries, non_manifold_faces
 from cuspid.surface.cleaning import clean as clean_mesh
 from synthetic_scene import height_field
 
@@ -85,7 +85,11 @@ def test_surfaces_that_touch_in_a_point_are_parted() -> None:
 
 
 def test_pieces_are_counted_by_shared_edges() -> None:
-    assert face_pieces(joined(SHEET, moved(SHEET, (0, 0, 2)), sphere(1.0, 3))).max() == 2
+    crumbs = [moved(sphere(0.1, 2), (0, 0, -3)), moved(sphere(0.2, 2), (0, 0, -5))]
+    cleaned, report = clean(joined(SHEET, moved(SHEET, (0, 0, 2)), *crumbs))
+    assert report.removed_pieces == 2
+    assert report.removed_piece_faces == sum(len(crumb.faces) for crumb in crumbs)
+    assert len(cleaned.faces) == 2 * len(SHEET.faces)
 
 
 def test_colours_stay_with_their_vertices() -> None:

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 from hypothesis import given
+from hypothesis import strategies as st
 
 from builders import any_pose, sphere
 from cuspid.errors import InputError
@@ -146,3 +147,14 @@ def test_some_normals_are_those_of_all() -> None:
     mesh = sphere(10.0, subdivisions=2)
     some = np.array([3, 100, 3, 7])
     np.testing.assert_array_equal(mesh.normals_of(some), mesh.face_normals[some])
+
+
+@given(farthest=st.floats(0.5, 4.0))
+def test_rays_go_no_farther_than_told(farthest: float) -> None:
+    ball = sphere(1.0, 3)
+    origins = np.column_stack([np.linspace(-0.5, 0.5, 7), np.full(7, 0.1), np.full(7, 3.0)])
+    down = np.broadcast_to([0, 0, -2.0], origins.shape)
+    whole, limited = ball.cast(origins, down), ball.cast(origins, down, farthest)
+    near = whole.distances < farthest
+    np.testing.assert_array_equal(limited.faces, np.where(near, whole.faces, -1))
+    np.testing.assert_array_equal(limited.distances, np.where(near, whole.distances, np.inf))

@@ -195,11 +195,14 @@ class Mesh:
         TriangleMesh(scene, self.vertices.astype(np.float32), self.faces.astype(np.int32))
         return scene
 
-    def cast(self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> RayHits:
-        """First hit of each ray (Embree, single precision)."""
+    def cast(
+        self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"], farthest: float = np.inf
+    ) -> RayHits:
+        """First hit of each ray (Embree, single precision), none farther away than so many lengths of its direction."""
         hits = self._scene.run(
             np.ascontiguousarray(origins, dtype=np.float32),
             np.ascontiguousarray(directions, dtype=np.float32),
+            dists=np.full(len(origins), farthest, dtype=np.float32),
             output=True,
         )
         return RayHits(*_in_double(hits["primID"], hits["tfar"], hits["u"], hits["v"]))

@@ -70,9 +70,11 @@ def clean(
     ghosts = ghost_faces(mesh, options.ghost_depth * working_distance_mm)
     cleaned = mesh.submesh(~ghosts)
     crowded = non_manifold_faces(cleaned)
-    cleaned, split = with_split_fans(cleaned.submesh(~crowded))
+    cleaned = cleaned.submesh(~crowded)
+    sides = _Sides.of(cleaned)
+    cleaned, split = _with_split_fans(cleaned, sides)  # which leaves the sides as they are
     least_mm2 = (options.least_piece_width * working_distance_mm) ** 2
-    floating, pieces = floating_faces(cleaned, least_mm2, options.least_piece_share)
+    floating, pieces = _floating(cleaned.face_areas, sides.face_pieces, least_mm2, options.least_piece_share)
     cleaned = cleaned.submesh(~floating)
     outer, holes = boundaries(cleaned)
     report = CleaningReport(
@@ -92,9 +94,9 @@ def ghost_faces(mesh: Mesh, depth_mm: float) -> Bool[np.ndarray, "f"]:
     if len(mesh.faces) == 0:
         return np.zeros(0, dtype=bool)
     start = mesh.face_centres + depth_mm / 500 * mesh.face_normals
-    hits = mesh.cast(start, mesh.face_normals)
-    same_way = np.einsum("nd,nd->n", mesh.face_normals, mesh.face_normals[hits.faces]) > 0
-    return (hits.faces >= 0) & (hits.distances < depth_mm) & same_way
+    behind = mesh.cast(start, mesh.face_normals, depth_mm).faces
+    same_way = np.einsum("nd,nd->n", mesh.face_normals, mesh.face_normals[behind]) > 0
+    return (behind >= 0) & same_way
 
 
 class _Sides(NamedTuple):
@@ -123,6 +125,12 @@ class _Sides(NamedTuple):
         """Sides of one edge, each with the one before."""
         later = np.flatnonzero(self.before >= 0)
         return self.before[later], later
+
+    @property
+    def face_pieces(self) -> Int[np.ndarray, "f"]:
+        """Number of the connected piece that each face belongs to."""
+        (one, other), faces = self.pairs, len(self.ends) // 3
+        return parts_of(np.stack([one % faces, other % faces], axis=1), faces)
 
 
 @kernel
@@ -162,31 +170,23 @@ def non_manifold_faces(mesh: Mesh) -> Bool[np.ndarray, "f"]:
     return bad[sides.edge].reshape(3, -1).any(axis=0) | (mesh.face_areas == 0)
 
 
-def face_pieces(mesh: Mesh) -> Int[np.ndarray, "f"]:
-    """Number of the connected piece that each face belongs to."""
-    one, other = _Sides.of(mesh).pairs
-    count = max(len(mesh.faces), 1)
-    return parts_of(np.stack([one % count, other % count], axis=1), len(mesh.faces))
-
-
-def floating_faces(mesh: Mesh, least_mm2: float, least_share: float) -> tuple[Bool[np.ndarray, "f"], int]:
+def _floating(
+    areas: Float[np.ndarray, "f"], pieces: Int[np.ndarray, "f"], least_mm2: float, least_share: float
+) -> tuple[Bool[np.ndarray, "f"], int]:
     """Faces of pieces that are smaller than a given area or than a share of the total, and the number of such
     pieces."""
-    if len(mesh.faces) == 0:
-        return np.zeros(0, dtype=bool), 0
-    piece = face_pieces(mesh)
-    area = np.bincount(piece, mesh.face_areas)
+    area = np.bincount(pieces, areas)
     small = area < max(least_mm2, least_share * area.sum())
-    return small[piece], int(small.sum())
+    return small[pieces], int(small.sum())
 
 
-def with_split_fans(mesh: Mesh) -> tuple[Mesh, int]:
+def _with_split_fans(mesh: Mesh, sides: _Sides) -> tuple[Mesh, int]:
     """The mesh with a separate vertex for each fan of faces around a point, and how many vertices were added."""
     corners = mesh.faces.size
     if corners == 0:
         return mesh, 0
     # Corners (face-major) of one fan are joined where two faces share an edge.
-    one, other = _Sides.of(mesh).pairs
+    one, other = sides.pairs
     count = len(mesh.faces)
     start = [side % count * 3 + side // count for side in (one, other)]
     end = [side % count * 3 + (side // count + 1) % 3 for side in (one, other)]
@@ -229,7 +229,7 @@ def _open_loops(mesh: Mesh) -> tuple[Int[np.ndarray, "s 2"], Int[np.ndarray, "s"
     _, loop = np.unique(parts_of(open_sides, len(mesh.vertices))[open_sides[:, 0]], return_inverse=True)
     perimeter, _ = _loop_measures(mesh.vertices[open_sides], loop)
     piece_of_loop = np.zeros(len(perimeter), dtype=np.int64)
-    piece_of_loop[loop] = face_pieces(mesh)[face]
+    piece_of_loop[loop] = sides.face_pieces[face]
     by_length = np.argsort(-perimeter, kind="stable")
     _, outermost = np.unique(piece_of_loop[by_length], return_index=True)
     outer = np.zeros(len(perimeter), dtype=bool)
