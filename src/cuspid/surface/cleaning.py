@@ -15,6 +15,7 @@ from cuspid.graph import parts_of
 from cuspid.kernels import kernel
 from cuspid.mesh import Mesh, used_vertices
 from cuspid.options import Options, Range
+from cuspid.workers import map_slices
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,8 +95,9 @@ def ghost_faces(mesh: Mesh, depth_mm: float) -> Bool[np.ndarray, "f"]:
     if len(mesh.faces) == 0:
         return np.zeros(0, dtype=bool)
     start = mesh.face_centres + depth_mm / 500 * mesh.face_normals
-    behind = mesh.cast(start, mesh.face_normals, depth_mm).faces
-    same_way = np.einsum("nd,nd->n", mesh.face_normals, mesh.face_normals[behind]) > 0
+    normals = mesh.face_normals
+    behind = np.concatenate(map_slices(lambda part: mesh.cast(start[part], normals[part], depth_mm).faces, len(start)))
+    same_way = np.einsum("nd,nd->n", normals, normals[behind]) > 0
     return (behind >= 0) & same_way
 
 

@@ -7,19 +7,23 @@ so that no surface is invented.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 
 from cuspid.kernels import kernel
 from cuspid.mesh import Mesh
 from cuspid.surface.volume import BLOCK, SparseVolume, around, find, pack, unpack
+from cuspid.workers import map_slices
 
 PART = 4
 """Blocks along the side of a part."""
+_FEW = 200
+"""Fewer blocks are not shared by threads."""
 
 
 @kernel
@@ -69,23 +73,23 @@ def _cell_vertex(values, vertex):
 
 @kernel
 @no_type_check
-def _vertices(distance, weight, neighbours, origins, least_weight, index_of_cell, vertices):
-    """A vertex (grid units) for each cell that the surface crosses; returns how many (``vertices`` may be empty)."""
-    count = 0
+def _vertices(distance, weight, neighbours, origins, least_weight, index_of_cell, first, last, row, vertices):
+    """A vertex (grid units) for each cell of some blocks that the surface crosses, from a row on; returns the row after
+    them. Without room for ``vertices`` they are only counted."""
     values, vertex = np.zeros(8), np.zeros(3)
-    for slot in range(origins.shape[0]):
+    for slot in range(first, last):
         for voxel in range(512):
             i, j, k = voxel >> 6, (voxel >> 3) & 7, voxel & 7
             if not _corners(distance, weight, neighbours, slot, i, j, k, least_weight, values):
                 continue
             if vertices.shape[0] > 0:
                 _cell_vertex(values, vertex)
-                index_of_cell[slot, voxel] = count
-                vertices[count, 0] = origins[slot, 0] + i + vertex[0]
-                vertices[count, 1] = origins[slot, 1] + j + vertex[1]
-                vertices[count, 2] = origins[slot, 2] + k + vertex[2]
-            count += 1
-    return count
+                index_of_cell[slot, voxel] = row
+                vertices[row, 0] = origins[slot, 0] + i + vertex[0]
+                vertices[row, 1] = origins[slot, 1] + j + vertex[1]
+                vertices[row, 2] = origins[slot, 2] + k + vertex[2]
+            row += 1
+    return row
 
 
 @kernel
@@ -107,11 +111,10 @@ def _quad_around(index_of_cell, neighbours, slot, i, j, k, axis, quad):
 
 @kernel
 @no_type_check
-def _faces(distance, weight, neighbours, index_of_cell, least_weight, faces):
-    """Two triangles for each grid edge that the surface crosses; returns their number (``faces`` may be empty)."""
-    count = 0
+def _faces(distance, weight, neighbours, index_of_cell, least_weight, first, last, row, faces):
+    """Two triangles for each grid edge of some blocks that the surface crosses, as :func:`_vertices`."""
     quad = np.zeros(4, np.int64)
-    for slot in range(index_of_cell.shape[0]):
+    for slot in range(first, last):
         for voxel in range(512):
             if weight[slot, voxel] < least_weight:
                 continue
@@ -126,10 +129,23 @@ def _faces(distance, weight, neighbours, index_of_cell, least_weight, faces):
                 if faces.shape[0] > 0:
                     a, c = quad[0], quad[2]
                     b, d = (quad[1], quad[3]) if here else (quad[3], quad[1])
-                    faces[count, 0], faces[count, 1], faces[count, 2] = a, b, c
-                    faces[count + 1, 0], faces[count + 1, 1], faces[count + 1, 2] = a, c, d
-                count += 2
-    return count
+                    faces[row, 0], faces[row, 1], faces[row, 2] = a, b, c
+                    faces[row + 1, 0], faces[row + 1, 1], faces[row + 1, 2] = a, c, d
+                row += 2
+    return row
+
+
+def _rows(find: Callable[[int, int, int, np.ndarray], int], blocks: int, dtype: type) -> Shaped[np.ndarray, "n 3"]:
+    """What a kernel finds in blocks, in their order, by all cores; ``find`` gets the first of its blocks and the one
+    after them, its first row, and the array."""
+    none: np.ndarray = np.zeros((0, 3), dtype)
+    parts = map_slices(lambda part: (part, find(part.start, part.stop, 0, none)), blocks, few=_FEW)
+    ends = np.cumsum([0, *(count for _, count in parts)]).tolist()
+    rows = np.zeros((ends[-1], 3), dtype)
+    if len(rows):
+        row = {part.start: first for (part, _), first in zip(parts, ends, strict=False)}
+        map_slices(lambda part: find(part.start, part.stop, row[part.start], rows), blocks, few=_FEW)
+    return rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,12 +164,9 @@ class _Grid:
         index_of_cell = np.full(self.distance.shape, -1, dtype=np.int32)
         origins = unpack(self.keys).astype(np.float64) * BLOCK
         grid = (self.distance, self.weight, find(self.keys, around(self.keys)))
-        vertices = np.zeros((_vertices(*grid, origins, least_weight, index_of_cell, np.zeros((0, 3))), 3))
-        if len(vertices):
-            _vertices(*grid, origins, least_weight, index_of_cell, vertices)
-        faces = np.zeros((_faces(*grid, index_of_cell, least_weight, np.zeros((0, 3), np.int64)), 3), dtype=np.int64)
-        if len(faces):
-            _faces(*grid, index_of_cell, least_weight, faces)
+        blocks = len(self.keys)
+        vertices = _rows(partial(_vertices, *grid, origins, least_weight, index_of_cell), blocks, np.float64)
+        faces = _rows(partial(_faces, *grid, index_of_cell, least_weight), blocks, np.int64)
         return vertices, faces, np.repeat(np.arange(len(self.keys)), (index_of_cell >= 0).sum(axis=1))
 
 
