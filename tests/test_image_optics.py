@@ -13,7 +13,7 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.simulation.appearance import APPEARANCES
 from cuspid.simulation.optics import CLINICAL, IDEAL, Optics, OpticsOptions, mixed, recorded, through_lens
-from cuspid.simulation.raycast import Scene, render_image, smears
+from cuspid.simulation.raycast import Scene, motions, render_image, smeared
 from test_raycast import CAMERA, jaw_of, led, probe, quad
 
 SMALL = Camera.from_field_of_view(61, 61, 60.0)
@@ -88,16 +88,18 @@ def test_colour_filters_and_compression_keep_what_is_smooth() -> None:
     assert np.abs(recorded(fine, Optics(bayer=True)).astype(float) - fine).mean() > 20
 
 
-def test_the_handpiece_smears_along_its_way_by_what_it_moves() -> None:
+def test_the_handpiece_moves_from_frame_to_frame_and_smears_by_a_share_of_it() -> None:
     poses = {name: Rigid3(np.eye(3), np.array([-0.5 * k, 0.1 * k, 0.0])) for k, name in enumerate("abc")}
     frames = [Frame(name=name, cameras=("a",)) for name in poses]
-    found = smears(frames, poses, 0.02)
-    for motion in found.values():
-        assert np.linalg.norm(motion[3:]) == pytest.approx(0.02)
-        assert motion[3:5] / np.linalg.norm(motion[3:5]) == pytest.approx(np.array([-5, 1]) / np.sqrt(26))
-    assert not smears(frames, poses, 0.0)
-    still = dict.fromkeys(poses, Rigid3.identity())
-    assert not any(motion.any() for motion in smears(frames, still, 0.02).values())
+    found = motions(frames, poses)
+    for name, motion in found.items():
+        assert motion == pytest.approx([0, 0, 0, -0.5, 0.1, 0])
+        smear = smeared(motion, poses[name], 0.02)
+        assert np.linalg.norm(smear[3:]) == pytest.approx(0.02)
+        assert smear[3:5] / np.linalg.norm(smear[3:5]) == pytest.approx(np.array([-5, 1]) / np.sqrt(26))
+    still = motions(frames, dict.fromkeys(poses, Rigid3.identity()))
+    assert not any(motion.any() for motion in still.values())
+    assert not smeared(still["a"], Rigid3.identity(), 0.02).any()
 
 
 def test_motion_blurs_across_it_and_not_along() -> None:
@@ -107,7 +109,9 @@ def test_motion_blurs_across_it_and_not_along() -> None:
     frame = Frame(name="a", cameras=("a",), lighting="all")
 
     def edge(shift_mm: tuple[float, float, float]) -> np.ndarray:
-        image = render_image(scene, frame, "a", Rigid3.identity(), 20.0, np.array([0.0, 0, 0, *shift_mm]))
+        motion = 20 * np.array([0.0, 0, 0, *shift_mm])  # from frame to frame, of which the exposure takes a share
+        seen = replace(scene, optics=Optics(smear_mm=float(np.linalg.norm(shift_mm))))
+        image = render_image(seen, frame, "a", Rigid3.identity(), 20.0, motion)
         middle = CAMERA.height // 2
         return image[middle - 5 : middle + 5].astype(float).mean(axis=(0, 2))
 
@@ -118,3 +122,28 @@ def test_motion_blurs_across_it_and_not_along() -> None:
     assert 3 <= ramp[1] <= 9
     assert ramp[2] <= 2
     assert across.sum() == pytest.approx(still.sum(), rel=0.1)
+
+
+@pytest.mark.parametrize("readout", [0.3, 1.0])
+def test_rows_are_exposed_one_after_the_other(readout: float) -> None:
+    """An upright edge that moves aside slants: from the first row to the last by what it moves meanwhile."""
+    jaw = jaw_of(quad((8.0, 0.0, 5.0), 8.0), labels=[11])
+    scene = Scene(jaw=jaw, handpiece=probe(led()), appearance=APPEARANCES["powder"], optics=Optics(readout=readout))
+    frame = Frame(name="a", cameras=("a",), lighting="all")
+    moved_px = 12.0
+    motion = np.array([0.0, 0, 0, moved_px * 5.0 / CAMERA.focal_px[0], 0, 0])
+
+    def image(optics: Optics, motion: np.ndarray) -> np.ndarray:
+        return render_image(replace(scene, optics=optics), frame, "a", Rigid3.identity(), 20.0, motion)
+
+    def edges(seen: np.ndarray) -> np.ndarray:
+        lit = seen.astype(float).mean(axis=2)
+        return np.array([np.argmax(row > 0.25 * row.max()) for row in lit], dtype=float)
+
+    slanted, upright = edges(image(scene.optics, motion)), edges(image(IDEAL, motion))
+    rows = np.arange(CAMERA.height)
+    slope, _ = np.polyfit(rows, slanted - upright, 1)
+    assert slope * CAMERA.height == pytest.approx(readout * moved_px, rel=0.1)
+    # The middle row is where it would be without.
+    assert abs((slanted - upright)[CAMERA.height // 2]) <= 1
+    np.testing.assert_array_equal(image(scene.optics, np.zeros(6)), image(IDEAL, np.zeros(6)))

@@ -31,6 +31,9 @@ class Optics:
     """Diameter of the lens: defocus and diffraction; 0 for a pinhole that does not diffract."""
     smear_mm: float = 0.0
     """How far the handpiece moves during an exposure."""
+    readout: float = 0.0
+    """Rolling shutter: share of the time from one frame to the next in which the rows are exposed one after the other,
+    from the first to the last; 0 for all at once."""
     saliva: float = 0.0
     """Share of the surface under a film of saliva, which mirrors the lights sharply."""
     crosstalk: float = 0.0
@@ -59,6 +62,9 @@ class OpticsOptions(Options):
     """Diameter of the lenses: defocus and diffraction; 0 for pinholes that do not diffract."""
     smear_mm: Annotated[float | None, Range(0, 100)] = None
     """How far the handpiece moves during an exposure."""
+    readout: Annotated[float | None, SHARE] = None
+    """Rolling shutter: share (0 to 1) of the time from one frame to the next in which the rows are exposed one after
+    the other; 0 for all at once. The true pose of a frame is that of its middle."""
     saliva: Annotated[float | None, SHARE] = None
     """Share (0 to 1) of the teeth under a film of saliva, which mirrors the lights sharply."""
     crosstalk: Annotated[float | None, Range(0, 1 / 3)] = None

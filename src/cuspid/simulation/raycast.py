@@ -28,7 +28,7 @@ from cuspid.gloss import coat, leaving
 from cuspid.jaw import Jaw
 from cuspid.kernels import kernel
 from cuspid.mesh import Mesh
-from cuspid.rig import Handpiece
+from cuspid.rig import Handpiece, MountedCamera
 from cuspid.simulation.appearance import NO_MATERIAL, Appearance, Palette, albedo, face_materials, palette
 from cuspid.simulation.optics import IDEAL, Optics, mixed, recorded, through_lens
 from cuspid.simulation.sensor import record
@@ -147,11 +147,18 @@ def render_depth(mesh: Mesh, camera: Camera, cam_from_world: Rigid3) -> Float[np
 
 
 def radiance(
-    scene: Scene, camera: Camera, cam_from_world: Rigid3, lights: Lamps, smear: Float[np.ndarray, "6"] | None = None
+    scene: Scene,
+    camera: Camera,
+    cam_from_world: Rigid3,
+    lights: Lamps,
+    smear: Float[np.ndarray, "6"] | None = None,
+    row: int | None = None,
 ) -> Float[np.ndarray, "h w 3"]:
-    """Linear light at each pixel, averaged over the pixel's area and, with a smear (rotation vector and shift of the
-    jaw in its own frame during the exposure), over time; 0 where nothing is hit."""
+    """Linear light at each pixel, or at those of one row, averaged over the pixel's area and, with a smear (rotation
+    vector and shift of the jaw in its own frame during the exposure), over time; 0 where nothing is hit."""
     rays = scene.rays(camera)
+    if row is not None:
+        rays = rays.reshape(camera.height, -1, 3)[row]
     origins, directions = np.empty_like(rays), np.empty_like(rays)
     moments = (0.0,) if smear is None else _moments(scene.supersampling**2)
     for index, moment in enumerate(moments):
@@ -159,7 +166,26 @@ def radiance(
         world_from_cam = (cam_from_world @ Rigid3.from_rotation_vector(motion[:3], motion[3:])).inverse()
         directions[index :: len(moments)] = _turned(rays[index :: len(moments)], world_from_cam.rotation)
         origins[index :: len(moments)] = world_from_cam.translation
-    return radiance_along(scene, origins, directions, lights).reshape(camera.height, camera.width, 3)
+    return radiance_along(scene, origins, directions, lights).reshape(-1, camera.width, 3)
+
+
+def _row_by_row(
+    scene: Scene,
+    mounted: MountedCamera,
+    lighting: str | None,
+    rig_from_world: Rigid3,
+    motion: Float[np.ndarray, "6"],
+    smear: Float[np.ndarray, "6"] | None,
+) -> Float[np.ndarray, "h w 3"]:
+    """As :func:`radiance`, if the rows are exposed one after the other while the jaw moves in its own frame by
+    ``motion`` (rotation vector and shift) from one frame to the next. The lights go along with the camera."""
+    camera, rows = mounted.camera, []
+    for row in range(camera.height):
+        moved = scene.optics.readout * ((row + 0.5) / camera.height - 0.5) * motion
+        then = rig_from_world @ Rigid3.from_rotation_vector(moved[:3], moved[3:])
+        lights = lamps(scene.handpiece, lighting, then)
+        rows.append(radiance(scene, camera, mounted.cam_from_rig @ then, lights, smear, row))
+    return np.concatenate(rows)
 
 
 def _moments(count: int) -> Float[np.ndarray, "n"]:
@@ -169,18 +195,23 @@ def _moments(count: int) -> Float[np.ndarray, "n"]:
     return in_order[np.random.default_rng(count).permutation(count)]
 
 
-def smears(frames: Sequence[Frame], poses: Mapping[str, Rigid3], smear_mm: float) -> dict[str, Float[np.ndarray, "6"]]:
-    """How the jaw moves in its own frame during the exposure of each frame, if the handpiece goes on from the frame
-    before to the next one, and by ``smear_mm``; empty if that is 0."""
+def motions(frames: Sequence[Frame], poses: Mapping[str, Rigid3]) -> dict[str, Float[np.ndarray, "6"]]:
+    """How the jaw moves in its own frame (rotation vector and shift) from each frame to the next, as it does on average
+    from the frame before."""
     names = [frame.name for frame in frames]
     found = {}
-    for index, name in enumerate(names if smear_mm > 0 else []):
-        before, after = poses[names[max(index - 1, 0)]], poses[names[min(index + 1, len(names) - 1)]]
-        motion = before.inverse() @ after
-        way = float(np.linalg.norm(after.inverse().translation - before.inverse().translation))
-        whole = np.concatenate([motion.rotation_vector, motion.translation])
-        found[name] = whole * (smear_mm / way if way > 0 else 0.0)
+    for index, name in enumerate(names):
+        before, after = max(index - 1, 0), min(index + 1, len(names) - 1)
+        motion = poses[names[before]].inverse() @ poses[names[after]]
+        found[name] = np.concatenate([motion.rotation_vector, motion.translation]) / max(after - before, 1)
     return found
+
+
+def smeared(motion: Float[np.ndarray, "6"], rig_from_world: Rigid3, smear_mm: float) -> Float[np.ndarray, "6"]:
+    """The share of a motion in which the handpiece itself moves by ``smear_mm``; none if it only turns, or rests."""
+    then = rig_from_world @ Rigid3.from_rotation_vector(motion[:3], motion[3:])
+    way = float(np.linalg.norm(then.inverse().translation - rig_from_world.inverse().translation))
+    return motion * (smear_mm / way if way > 0 else 0.0)
 
 
 def radiance_along(
@@ -497,13 +528,19 @@ def render_image(
     camera_name: str,
     rig_from_world: Rigid3,
     gain: float,
-    smear: Float[np.ndarray, "6"] | None = None,
+    motion: Float[np.ndarray, "6"] | None = None,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """One image. Depends on its arguments alone, so that a resumed capture equals an uninterrupted one."""
+    """One image; ``motion`` is the jaw's about it (:func:`motions`), none at rest. Depends on its arguments alone, so
+    that a resumed capture equals an uninterrupted one."""
     mounted, optics = scene.handpiece.rig[camera_name], scene.optics
+    motion = np.zeros(6) if motion is None else motion
     cam_from_world = mounted.cam_from_rig @ rig_from_world
-    lights = lamps(scene.handpiece, frame.lighting, rig_from_world)
-    light = radiance(scene, mounted.camera, cam_from_world, lights, smear)
+    smear = smeared(motion, rig_from_world, optics.smear_mm) if optics.smear_mm > 0 else None
+    if optics.readout > 0:
+        light = _row_by_row(scene, mounted, frame.lighting, rig_from_world, motion, smear)
+    else:
+        lights = lamps(scene.handpiece, frame.lighting, rig_from_world)
+        light = radiance(scene, mounted.camera, cam_from_world, lights, smear)
     if optics.aperture_mm > 0:
         depth_mm = np.nan_to_num(render_depth(scene.jaw.mesh, mounted.camera, cam_from_world), nan=np.inf)
         light = through_lens(light, depth_mm, mounted.camera, scene.handpiece.working_distance_mm, optics)
@@ -521,12 +558,12 @@ class _Worker:
     scene: Scene
     poses: Mapping[str, Rigid3]
     gains: Mapping[str | None, float]
-    smears: Mapping[str, Float[np.ndarray, "6"]]
+    motions: Mapping[str, Float[np.ndarray, "6"]]
     sink: Sink
 
     def __call__(self, task: tuple[Frame, str]) -> tuple[str, str]:
         frame, camera = task
-        how = self.poses[frame.name], self.gains[frame.lighting], self.smears.get(frame.name)
+        how = self.poses[frame.name], self.gains[frame.lighting], self.motions[frame.name]
         self.sink(frame.name, camera, render_image(self.scene, frame, camera, *how))
         return frame.name, camera
 
@@ -566,7 +603,7 @@ def render_capture(
         scene=scene,
         poses=poses,
         gains=metered_gains(scene, frames, poses),
-        smears=smears(frames, poses, scene.optics.smear_mm),
+        motions=motions(frames, poses),
         sink=sink,
     )
     if processes == 1:
