@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -117,5 +119,13 @@ def test_upright_takes_a_direction_to_z_the_short_way(up: np.ndarray):
 def test_few_crowns_hardly_tilt(half_width_mm: float, least: float, most: float):
     tilted = seen_from(tilt(4, 90))
     known = tilted.known & (np.abs(tilted.places[..., 0]) < half_width_mm)
-    part = HeightMap(corner=tilted.corner, cell_mm=CELL_MM, heights=tilted.heights, known=known)
+    part = replace(tilted, known=known)
     assert least <= level_by_crowns(part).angle_deg / 4 <= most
+
+
+@pytest.mark.parametrize("cell_mm", [CELL_MM, 30.0])
+def test_where_nothing_is_known_or_it_is_coarse_nothing_is_turned(cell_mm: float):
+    flat = np.zeros((4, 5), np.float32)
+    nowhere = HeightMap(corner=np.zeros(2), cell_mm=cell_mm, heights=flat, known=flat > 0)
+    assert level_by_crowns(nowhere).angle_deg == 0
+    assert level_by_crowns(replace(nowhere, known=flat == 0)).angle_deg < 1e-6

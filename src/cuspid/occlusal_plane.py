@@ -77,9 +77,10 @@ def _up_from_tips(tips: Float[np.ndarray, "n 3"], tilt_sd_deg: float) -> Float[n
 def _summits(heights: Float[np.ndarray, "h w"], spacing_mm: float, square_mm: float) -> Float[np.ndarray, "h w"]:
     """The highest height in the square around each place; minus infinity where none is known."""
     seen = np.where(np.isfinite(heights), heights, -np.inf)
-    return np.asarray(maximum_filter(seen, round(square_mm / spacing_mm)))
+    return np.asarray(maximum_filter(seen, max(1, round(square_mm / spacing_mm))))
 
 
 def _on_plane(summits: Float[np.ndarray, "h w"], heights: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Whether summits are about as high as the tips are; flaps of gum may rise higher."""
-    return np.asarray(np.abs(summits - np.nanpercentile(heights, 95)) < _SPEE_MM)
+    known = heights[np.isfinite(heights)]
+    return np.asarray(np.abs(summits - (np.percentile(known, 95) if len(known) else np.nan)) < _SPEE_MM)
