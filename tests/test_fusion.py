@@ -328,6 +328,7 @@ def test_fusion_is_deterministic_and_tells_progress() -> None:
 def test_neither_cores_nor_batches_change_the_mesh(monkeypatch: pytest.MonkeyPatch, cores: int, batch: int) -> None:
     monkeypatch.setattr("cuspid.workers.usable_cores", lambda: cores)
     monkeypatch.setattr("cuspid.workers._BATCH_PER_CORE", batch)
+    monkeypatch.setattr("cuspid.surface.meshing._FEW", 0)
     again = fuse(depth_maps(HILLS), POSES)
     assert np.array_equal(again.vertices, fused_hills().vertices)
     assert np.array_equal(again.faces, fused_hills().faces)
