@@ -69,6 +69,30 @@ def test_a_step_stays() -> None:
     assert np.abs(left[:, 24:26].mean(axis=0)).max() < 0.2
 
 
+ROOF = -0.8 * np.abs(COLUMNS - 25)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_crease_stays_sharp_and_does_not_swing(seed: int) -> None:
+    """With a loss that is linear only from twice the usual bend on, 1.5 is lost of the ridge, and 0.3 added beside."""
+    left = (smoothed(ROOF + noise(0.5, seed), alike(2.0), BEND) - ROOF).mean(axis=0)
+    assert 0.1 < -left[25] < 1.2
+    assert np.abs(left[np.r_[12:21, 30:39]]).max() < 0.27
+    assert rms(left) < 0.22
+
+
+def test_a_surface_may_bend_where_its_colour_changes() -> None:
+    """A crease that the measured depth hardly tells is seen in the colour; a colour alone bends nothing."""
+    colours = np.where(COLUMNS < 25, 0.0, 1.0)[..., None]
+    shape = ROOF / 2
+    without = smoothed(shape + noise(0.5), alike(8.0), BEND) - shape
+    helped = smoothed(shape + noise(0.5), alike(8.0), BEND, colours) - shape
+    assert rms(helped[:, 20:31]) < 0.8 * rms(without[:, 20:31])
+    assert rms(smoothed(PLANE + noise(0.5), alike(8.0), BEND, colours) - PLANE) < 0.1
+    same = smoothed(shape + noise(0.5), alike(8.0), BEND, np.ones((*SHAPE, 3))) - shape
+    assert same == pytest.approx(without, abs=1e-6)
+
+
 @given(
     factor=st.floats(1e-3, 1e3),
     slope=st.floats(-2, 2),

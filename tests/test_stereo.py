@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -28,7 +29,14 @@ from cuspid.stereo.confidence import (
 from cuspid.stereo.initial_depth import initial_pairs, semi_global
 from cuspid.stereo.matching import DepthEstimator, StereoOptions, coarser, group_geometry
 from cuspid.stereo.rectification import IdealView, rectify
-from cuspid.stereo.refinement import RefinementOptions, half_window, image_noise, patch_window
+from cuspid.stereo.refinement import (
+    RefinementOptions,
+    detail_px,
+    half_window,
+    image_noise,
+    patch_window,
+    window_size,
+)
 from synthetic_scene import cast_depth, diamond, height_field, render
 
 HILLS = height_field(lambda x, y: 5 + 0.25 * np.sin(1.8 * x) * np.cos(1.5 * y))
@@ -198,9 +206,9 @@ def test_noise_seldom_makes_an_edge() -> None:
 
 @pytest.mark.parametrize("side", [(0, 1), (-1, 0), (1, -1)])
 def test_half_of_a_window_has_the_middle_and_one_side(side: tuple[int, int]) -> None:
-    window = patch_window(RefinementOptions())
+    window = patch_window(3, 2.0)
     half, other = half_window(window, side), half_window(window, (-side[0], -side[1]))
-    assert half.shape[1] + other.shape[1] == window.shape[1] + 2 * RefinementOptions().radius_px + 1
+    assert half.shape[1] + other.shape[1] == window.shape[1] + 2 * 3 + 1
     assert half[2].sum() == pytest.approx(1)
     assert np.all(half[1] * side[0] + half[0] * side[1] >= 0)
     np.testing.assert_allclose(np.sort(half[2]), np.sort(other[2]), rtol=1e-6)
@@ -384,6 +392,51 @@ def test_noise_is_told_where_the_image_is_smooth(noise: float) -> None:
     image = 128 + rng.normal(0, noise, (120, 120))
     image[:60] += rng.normal(0, 30, (60, 120))
     assert 0.7 * noise < image_noise(image.astype(np.float32)) < 1.1 * noise
+
+
+def blurred_noise(sigma_px: float, seed: int = 0) -> np.ndarray:
+    white = np.random.default_rng(seed).normal(0, 1, (200, 240)).astype(np.float32)
+    grain = cv2.GaussianBlur(white, (0, 0), sigma_px)
+    return np.asarray(128 + 20 * grain / grain.std(), dtype=np.float32)
+
+
+@pytest.mark.parametrize("sigma_px", [1.5, 2.0, 3.0])
+@pytest.mark.parametrize("noise", [0.0, 3.0])
+def test_detail_is_told_from_noise(sigma_px: float, noise: float) -> None:
+    """White noise after a Gaussian filter has the correlation exp(-(d / L)^2) with L = 2 sigma."""
+    image = blurred_noise(sigma_px)
+    noisy = image + np.random.default_rng(1).normal(0, noise, image.shape).astype(np.float32)
+    assert detail_px(noisy, noise) == pytest.approx(2 * sigma_px, rel=0.15)
+    dark = np.vstack([noisy, np.full_like(noisy, 3)])
+    assert detail_px(dark, noise) == pytest.approx(detail_px(noisy, noise), rel=0.02)
+
+
+def test_windows_grow_with_blur_within_bounds() -> None:
+    usual = RefinementOptions()
+    sizes = [window_size(usual, blurred_noise(sigma_px), 0.5) for sigma_px in (0.5, 1.9, 2.2, 6.0)]
+    assert sizes[0] == (3, 2.0)
+    assert 2.0 < sizes[1][1] < sizes[2][1] < 3.0
+    assert sizes[3] == (4, 3.0)
+    assert window_size(RefinementOptions(radius_px=5, window_sigma_px=1.0), blurred_noise(6.0), 0.5) == (5, 1.0)
+    assert window_size(usual, np.full((50, 50), 100, np.float32), 0.5) == (4, 3.0)
+    assert window_size(usual, np.zeros((5, 2), np.float32), 0.5) == (4, 3.0)
+
+
+def test_blurred_images_are_measured_better_with_their_larger_windows() -> None:
+    images = {
+        name: np.clip(
+            cv2.GaussianBlur(image.astype(np.float32), (0, 0), 2.0)
+            + np.random.default_rng(5).normal(0, 1.0, image.shape),
+            *(0, 255),
+        ).astype(np.uint8)
+        for name, image in hills_images().items()
+    }
+    usual = DepthEstimator(diamond(), StereoOptions(spacing_px=4)).measure(images, "00000")
+    small = RefinementOptions(window_sigma_px=2.0)
+    before = DepthEstimator(diamond(), StereoOptions(spacing_px=4, refinement=small)).measure(images, "00000")
+    for one, other in zip(usual, before, strict=True):
+        assert errors_um(one).size > 0.97 * errors_um(other).size
+        assert np.median(np.abs(errors_um(one))) < 0.9 * np.median(np.abs(errors_um(other)))
 
 
 def test_speckle_goes_and_surface_stays() -> None:

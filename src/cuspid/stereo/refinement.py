@@ -13,7 +13,7 @@ considered occluded and left out. Pixels are OpenCV's here: the first centre is 
 
 A window across an edge sees two planes, and rounds the edge off. Where the planes around a pixel differ, halves of its
 window are therefore tried as well, each from the plane on its side, and the one that leaves the least unexplained is
-taken.
+taken. What is blurred has larger windows: they need some detail within them.
 """
 
 from __future__ import annotations
@@ -37,6 +37,13 @@ _BEND_PX = 0.75
 _SIDES = ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
 """Rows and columns towards which half windows lie."""
 
+_DARK_DN = 16
+_RATIOS = 1.001, 3.999
+"""Mean squared differences 4 px apart, over those 2 px apart: fine noise has 1, a slope 4."""
+_DETAILS, _SIGMAS_PX, _REACH = 0.65, (2.0, 3.0), 1.5
+"""Standard deviation of a window's weight, in distances within which the image changes, its bounds, and the radius of
+the window in standard deviations."""
+
 FAST = {"fastmath": {"contract", "reassoc", "arcp", "nsz"}}
 
 
@@ -44,10 +51,11 @@ FAST = {"fastmath": {"contract", "reassoc", "arcp", "nsz"}}
 class RefinementOptions(Options):
     """Multi-camera refinement of depth."""
 
-    radius_px: Annotated[int, Range(1, 50)] = 3
-    """Half the side of the window (3: 7 x 7 px)."""
-    window_sigma_px: Annotated[float, Range(0.1, 100)] = 2.0
-    """Standard deviation of the Gaussian weight over the window."""
+    radius_px: Annotated[int | None, Range(1, 50)] = None
+    """Half the side of the window (3: 7 x 7 px). Default: one and a half standard deviations of its weight."""
+    window_sigma_px: Annotated[float | None, Range(0.1, 100)] = None
+    """Standard deviation of the Gaussian weight over the window. Default: 2, and up to 3 for an image in which nothing
+    is as fine as a pixel: blurred by its lens, by a Bayer filter, or of a coarse texture."""
     iterations: Annotated[int, Range(0, 1000)] = 10
     """Maximum number of Gauss-Newton steps."""
     converged_px: Annotated[float, Range(1e-06, 10)] = 0.06
@@ -63,7 +71,8 @@ class RefinementOptions(Options):
     """Lower bound of that limit in weaker texture: noise of standard deviation n reduces the correlation of a texture
     of standard deviation c to the share c^2 / (c^2 + n^2)."""
     least_contrast: Annotated[float, Range(0, 1000)] = 1.2
-    """Standard deviation of a window, in multiples of that of the noise, below which it has no texture."""
+    """Standard deviation of a window, in multiples of that of the noise, below which it has no texture; more in larger
+    windows, as shade without texture changes more over them."""
     propagations: Annotated[int, Range(0, 100)] = 1
     """Number of times that planes are propagated to neighbours without one, in each direction."""
     bend_px: Annotated[float | None, Range(0, 1000)] = None
@@ -143,11 +152,42 @@ def image_noise(image: Float[np.ndarray, "h w"]) -> float:
     return max(float(np.sqrt(np.quantile(power[::5, ::5], 0.1))), _ROUNDING_DN)
 
 
-def patch_window(options: RefinementOptions) -> Float[np.ndarray, "3 k"]:
+def detail_px(image: Float[np.ndarray, "h w"], noise_dn: float) -> float:
+    """Distance L within which an image changes, from mean squared differences of pixels 2 and 4 px apart where it is
+    not dark, less those of its noise: of a texture with the correlation exp(-(d / L)^2) at the distance d, they are as
+    1 - a to 1 - a^4 with a = exp(-4 / L^2). Infinite for an image without texture."""
+    near, far = (_mean_squared_difference(image, distance) - 2 * noise_dn**2 for distance in (2, 4))
+    if not near > 0:
+        return np.inf
+    # (1 - a^4) / (1 - a) = 1 + a + a^2 + a^3 = far / near, which grows with a.
+    roots = np.roots([1, 1, 1, 1 - np.clip(far / near, *_RATIOS)])
+    return float(2 / np.sqrt(-np.log(roots[np.abs(roots.imag).argmin()].real)))
+
+
+def _mean_squared_difference(image: Float[np.ndarray, "h w"], distance: int) -> float:
+    """Of pixels so far apart in their row or column, neither of them dark; 0 if there are none."""
+    total, count = 0.0, 0
+    for each in (image, image.T):
+        here, there = each[distance:], each[:-distance]
+        lit = (here > _DARK_DN) & (there > _DARK_DN)
+        total += float(((here - there)[lit] ** 2).sum(dtype=np.float64))
+        count += int(lit.sum())
+    return total / max(count, 1)
+
+
+def window_size(options: RefinementOptions, image: Float[np.ndarray, "h w"], noise_dn: float) -> tuple[int, float]:
+    """Half the side of the window that suits an image, and the standard deviation of its weight, px."""
+    sigma_px = options.window_sigma_px
+    if sigma_px is None:
+        sigma_px = float(np.clip(_DETAILS * detail_px(image, noise_dn), *_SIGMAS_PX))
+    return options.radius_px or max(int(_REACH * sigma_px), 1), sigma_px
+
+
+def patch_window(radius_px: int, sigma_px: float) -> Float[np.ndarray, "3 k"]:
     """Offsets du and dv over the window, row by row, and Gaussian weights with sum 1."""
-    offsets = np.arange(-options.radius_px, options.radius_px + 1)
+    offsets = np.arange(-radius_px, radius_px + 1)
     du, dv = np.meshgrid(offsets, offsets)
-    weights = np.exp(-0.5 * (du**2 + dv**2) / options.window_sigma_px**2)
+    weights = np.exp(-0.5 * (du**2 + dv**2) / sigma_px**2)
     return np.stack([du.ravel(), dv.ravel(), (weights / weights.sum()).ravel()]).astype(np.float32)
 
 
@@ -182,6 +222,18 @@ def _load_template(view, u, v, template):
         for k in range(count):
             template[k] /= deviation
     return deviation
+
+
+@kernel(**FAST)
+@no_type_check
+def _detail(window, template):
+    """Share of the variance of a whole window's template that no plane explains."""
+    along = across = moment = np.float32(0)
+    for k in range(window.shape[1]):
+        along += window[2, k] * window[0, k] * template[k]
+        across += window[2, k] * window[1, k] * template[k]
+        moment += window[2, k] * window[0, k] * window[0, k]
+    return max(1 - (along * along + across * across) / moment, np.float32(0))
 
 
 @kernel(inline="always", **FAST)
@@ -438,7 +490,7 @@ def _visit(view, limits, buffers, initial, field, row, column, direction):
     if count == 0:
         return
     contrast = _load_template(view, u, v, buffers.template)
-    if contrast < limits.least_contrast:
+    if contrast * np.sqrt(_detail(view.window, buffers.template)) < limits.least_contrast:
         return
     plane = buffers.candidates[_best_start(view, limits, buffers, u, v, count)]
     if not _refine_plane(view, limits, buffers, u, v, plane):
@@ -538,7 +590,9 @@ def refine(
     ``initial_mm`` are layers of initial depths on the grid, NaN where there is none; ``noise_dn`` is the noise of the
     reference image.
     """
-    window = patch_window(options)
+    height, width = sizes[reference]
+    radius, sigma_px = window_size(options, images[reference, :height, :width], noise_dn)
+    window = patch_window(radius, sigma_px)
     near, far = depth_range_mm
     view = _View(
         images=images,
@@ -549,7 +603,7 @@ def refine(
         parallax=geometry.parallax,
         others=geometry.others,
         window=window,
-        radius=options.radius_px,
+        radius=radius,
         spacing=spacing_px,
         q_low=geometry.scale / far,
         q_high=geometry.scale / near,
@@ -570,8 +624,8 @@ def refine(
     field = _refine_field(view, limits, buffers, initial, options.propagations)
     halves = [half_window(window, side) for side in _SIDES]
     views = tuple(view._replace(window=half) for half in halves)
-    reach = -(-options.radius_px // spacing_px)
-    bend = (_BEND_PX if options.bend_px is None else options.bend_px) / options.radius_px
+    reach = -(-radius // spacing_px)
+    bend = (_BEND_PX if options.bend_px is None else options.bend_px) / radius
     limits = limits._replace(effective=_effective(halves[0]))
     buffers = _new_buffers(halves[0].shape[1], len(geometry.others), len(initial_mm))
     return np.asarray(_sharpen(views, limits, buffers, field, reach, bend, options.half_sigmas))

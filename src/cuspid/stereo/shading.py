@@ -14,7 +14,8 @@ First planes of constant inverse depth are swept (R. Collins, CVPR 1996) over a 
 differences of the better half of the cameras, and the plane of each cell is chosen by semi-global optimisation. Then a
 slanted plane is fitted around each pixel by Gauss-Newton, as in :mod:`cuspid.stereo.refinement`, whose notation is used
 here, with the plain differences of brightness as residuals. Last a smooth surface is laid through all of them
-(:mod:`cuspid.stereo.smoothing`): windows are small, and where the shade does not change none of them tells much.
+(:mod:`cuspid.stereo.smoothing`): windows are small, and where the shade does not change none of them tells much. It may
+bend where the colour changes.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ class ShadingOptions(Options):
     """A camera whose brightness differs by more (RMS over the window, digital numbers) sees something else."""
     camera_lag_dn: Annotated[float, Range(0, 255)] = 2.0
     """A camera whose difference exceeds the best one's by more sees something else."""
-    bend_px: Annotated[float, Range(0.001, 1000)] = 0.16
+    bend_px: Annotated[float, Range(0.001, 1000)] = 0.14
     """How much a surface bends from one pixel of the depth map to the next: change of its slope, px of disparity.
     Smaller values make surfaces smoother where the images tell little about them."""
     glare_dn: Annotated[float, Range(0.001, 1000)] = 0.05
@@ -449,7 +450,10 @@ def shaded_depths(
     compared_of = _ratios if _are_coloured(views[0].lights) else _as_they_are
     compared, trust = compared_of(blurred, np.ones_like(blurred))
     how = depth_range_mm, spacing_px, options
-    refinements = [_Refinement(compared, index, view, *how) for index, view in enumerate(views)]
+    refinements = [
+        _Refinement(compared, hue, index, view, *how)
+        for index, (view, hue) in enumerate(zip(views, _hues(blurred), strict=True))
+    ]
     found = [each.refined(compared, trust, _LENIENT) for each in refinements]
     for _ in range(_ROUNDS):
         depths = [depth for depth, _ in found]
@@ -511,6 +515,12 @@ def _ratios(images: Float32[np.ndarray, "c h w 3"], trust: Float32[np.ndarray, "
     return ratios.astype(np.float32), 2 / variance * np.minimum(trust, np.roll(trust, -1, axis=-1))
 
 
+def _hues(images: Float32[np.ndarray, "*n 3"]) -> Float32[np.ndarray, "*n 3"]:
+    """Logarithms of the ratios of each channel to the next one, which brightness does not change."""
+    level = np.log(np.maximum(images, np.float32(_LEAST_DN)))
+    return level - np.roll(level, -1, axis=-1)
+
+
 def _spread(
     values: Float32[np.ndarray, "h w *c"], size: tuple[int, int], spacing_px: int
 ) -> Float32[np.ndarray, "_ _ *c"]:
@@ -526,6 +536,7 @@ class _Refinement:
     def __init__(
         self,
         images: Float32[np.ndarray, "c h w 3"],
+        colours: Float32[np.ndarray, "_ _ 3"],
         reference: int,
         view: ShadedView,
         depth_range_mm: tuple[float, float],
@@ -536,6 +547,7 @@ class _Refinement:
         self._spacing_px, self._bend_px = spacing_px, options.bend_px
         self._view = _View(images, images, reference, geometry.infinite, geometry.parallax, geometry.others)
         self._rows, self._columns = (_every(count, spacing_px) for count in view.size)
+        self._colours = colours[np.ix_(self._rows, self._columns)]
         lowest, highest = (view.geometry.scale / depth for depth in reversed(depth_range_mm))
         self._fit = _fit(options, lowest, highest)
         count = max(int(np.ceil((highest - lowest) / options.sweep_step_px)) + 1, _LEAST_PLANES)
@@ -554,7 +566,7 @@ class _Refinement:
         fit = self._fit._replace(lenient=lenient)
         found = _refine_all(view, fit, self._rows, self._columns, self._planes)
         sigma = _SIGMA_PX * np.maximum(found[..., 1], _LEAST_VARIANCE) ** 0.25
-        q = smoothed(np.where(found[..., 2] > 0, found[..., 0], np.nan), sigma, self._bend_px)
+        q = smoothed(np.where(found[..., 2] > 0, found[..., 0], np.nan), sigma, self._bend_px, self._colours)
         self._restart(q)
         scale = self._geometry.scale
         return scale / q, sigma * scale / q**2

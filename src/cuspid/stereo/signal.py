@@ -17,18 +17,24 @@ _USUAL_DN, _LEAST_LIT = (30, 250), 0.03
 """Grey levels of lit surface, and the share of the pixels that tells something."""
 _SMOOTHEST = 10
 """Percentile of the windows: a plain surface has edges, but most of it is smooth; texture is everywhere."""
-_TEXTURE_DN = 1.0
-"""RMS detail above which there is texture. Artificial texture has 5.5-8, powder 1.3-1.7, plain enamel 0.12-0.8 (most in
-images of 160 px), of which noise of 1.5 DN makes 0.12."""
+_TEXTURE_DN, _SHADE_DN, _SHADE_PX = 0.5, 1.0, 160
+"""RMS detail above which there is texture: the first value, or more in small images, where shade alone makes the second
+one at the third one's size, and less with the square of the size. Artificial texture has 2.5-8, powder 0.6-1.7 (least
+under clinical optics), plain enamel 0.12-0.2, in images of 160 px up to 0.8; noise of 1.5 DN makes 0.12."""
 
 
 def signal_of(capture: Capture) -> Signal:
     """What depth is best measured from, by the detail of the smoothest tenth of what is lit."""
     images = [(frame, camera) for frame in capture.frames for camera in frame.cameras]
     chosen = {images[k] for k in np.linspace(0, len(images) - 1, _LOOKED_AT).astype(int)} if images else set()
-    details = [detail_dn(gray(capture.image(*each))) for each in sorted(chosen, key=images.index)]
-    known = [each for each in details if each is not None]
-    return "texture" if not known or np.median(known) >= _TEXTURE_DN else "shading"
+    grays = [gray(capture.image(*each)) for each in sorted(chosen, key=images.index)]
+    details = [(detail, _least_dn(image)) for image in grays if (detail := detail_dn(image)) is not None]
+    return "texture" if not details or np.median([one / least for one, least in details]) >= 1 else "shading"
+
+
+def _least_dn(image: UInt8[np.ndarray, "h w"]) -> float:
+    """Detail of an image of texture."""
+    return max(_TEXTURE_DN, _SHADE_DN * (_SHADE_PX / min(image.shape)) ** 2)
 
 
 def detail_dn(image: UInt8[np.ndarray, "h w"]) -> float | None:

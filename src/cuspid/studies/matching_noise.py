@@ -44,6 +44,8 @@ from cuspid.studies.camera_pair import (
 _DEPTHS_MM = (1.0, 20.0)
 _MARGIN_PX = 8.0
 """Points nearer to the border of the second image are not asked for."""
+_WINDOW_SIGMA_PX = 2.0
+"""Of the weight over the slanted window."""
 _LED_MM = 1.5
 """Two LEDs stand so far from the middle of the pair, square to the baseline."""
 
@@ -222,7 +224,8 @@ def _slanted(
     seeds[points.known] = geometry.scale / (geometry.scale / true_mm + starts_px)
     stack = np.stack(images).astype(np.float32)
     sizes = np.array([image.shape for image in images])
-    refinement, noise_dn = RefinementOptions(radius_px=options.window_px // 2), image_noise(stack[0])
+    refinement = RefinementOptions(radius_px=options.window_px // 2, window_sigma_px=_WINDOW_SIGMA_PX)
+    noise_dn = image_noise(stack[0])
     planes = refine(stack, sizes, 0, geometry, seeds[None], _DEPTHS_MM, options.spacing_px, noise_dn, refinement)
     planes = planes[points.known]
     found = planes[:, SCORE] >= refinement.accept_zncc
