@@ -71,8 +71,8 @@ class RefinementOptions(Options):
     """Lower bound of that limit in weaker texture: noise of standard deviation n reduces the correlation of a texture
     of standard deviation c to the share c^2 / (c^2 + n^2)."""
     least_contrast: Annotated[float, Range(0, 1000)] = 1.2
-    """Standard deviation of a window, in multiples of that of the noise, below which it has no texture; more in larger
-    windows, as shade without texture changes more over them."""
+    """Standard deviation of what no plane explains of a window's brightness, in multiples of that of the noise, below
+    which it has no texture: what a plane explains is shade."""
     propagations: Annotated[int, Range(0, 100)] = 1
     """Number of times that planes are propagated to neighbours without one, in each direction."""
     bend_px: Annotated[float | None, Range(0, 1000)] = None
