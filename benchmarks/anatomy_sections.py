@@ -276,8 +276,9 @@ def enamel(result: Result) -> str:
             "`--optics clinical` (defocus and diffraction, motion during the exposure, saliva, crosstalk, Bayer, "
             "JPEG); *artificial-clinical* has them, white light, and the texture `artificial`. Bars: under "
             "colour-coded, polarised light a mean of 6 um (clinical 10 um) with 94 % within 50 um; artificial-clinical "
-            "4 um. Developed on phantom-0 and 048_lower, with which the places of the LEDs were chosen, too; a limit "
-            "was chosen with phantom-1 in view; the others were looked at only at the end, but most also with earlier "
+            "4 um. Developed on phantom-0, ideal and clinical, on 048_lower, with which the places of the LEDs were "
+            "chosen, too, and on 023_lower; a limit was chosen with phantom-1 in view; the others were looked at only "
+            "at the end, but most also with earlier "
             "versions. `python benchmarks/enamel.py`.",
             "",
             _scans_table(told),
