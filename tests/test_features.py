@@ -16,7 +16,7 @@ from cuspid.camera import Camera
 from cuspid.capture import Capture
 from cuspid.errors import InputError, OutputError
 from cuspid.geometry import Rigid3
-from cuspid.motion.features import DESCRIPTOR_NORM, FeatureOptions, detect, detect_all, spread
+from cuspid.motion.features import DESCRIPTOR_NORM, FeatureOptions, detect, detect_all, spread, without_doubles
 from cuspid.motion.pairs import match_unguided
 from cuspid.motion.pictures import Pictures
 from cuspid.rig import Handpiece, MountedCamera, Rig
@@ -109,6 +109,18 @@ def test_turned_images_match_with_orientations_only() -> None:
     turning = match_unguided(detect(image, free), detect(turned, free))
     assert len(turning) > 100
     assert len(upright) < 0.1 * len(turning)
+
+
+def test_a_place_with_several_orientations_is_one_keypoint() -> None:
+    """The first that was found there, in the order in which they were found."""
+    gray = cv2.cvtColor(photograph(FIRST), cv2.COLOR_RGB2GRAY)
+    keypoints = cv2.SIFT.create(contrastThreshold=0.01).detect(gray, None)
+    expected = dict[tuple[float, ...], cv2.KeyPoint]()
+    for keypoint in keypoints:
+        expected.setdefault((*np.round(keypoint.pt, 2).tolist(), round(keypoint.size, 2)), keypoint)
+    assert 100 < len(expected) < 0.95 * len(keypoints)
+    assert without_doubles(keypoints) == list(expected.values())
+    assert without_doubles([]) == []
 
 
 @pytest.mark.parametrize("gray", [0, 128, 255])

@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from cuspid.errors import InputError
-from cuspid.geometry import Rigid3, axes_about, best_similarity, lengths_along, unit
+from cuspid.geometry import Rigid3, axes_about, best_similarity, distinct_rows, lengths_along, owned, unit
 from strategies import points, rigid3s, vectors
 
 
@@ -141,3 +142,21 @@ def test_values_are_frozen():
     value = Rigid3.identity()
     with pytest.raises(ValueError, match="read-only"):
         value.rotation[0, 0] = 2
+
+
+few_values = st.sampled_from([-1.0, -0.0, 0.0, 1e-300, 1.0, 2.0])
+
+
+@given(arrays(np.float64, st.tuples(st.integers(0, 30), st.integers(1, 3)), elements=few_values))
+def test_distinct_rows_are_those_that_numpy_finds(rows):
+    first, number = distinct_rows(rows)
+    _, expected, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    np.testing.assert_array_equal(first, expected)
+    np.testing.assert_array_equal(number, inverse.reshape(-1))
+
+
+def test_what_is_owned_is_not_copied_and_cannot_be_changed():
+    array = np.zeros(3)
+    assert owned(array) is array
+    with pytest.raises(ValueError, match="read-only"):
+        array[0] = 1

@@ -19,6 +19,30 @@ def test_areas_and_normals_of_a_sphere():
     assert np.all(np.sum(mesh.face_normals * mesh.face_centres, axis=1) > 9.9)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_crosses_and_vertex_normals_are_those_that_numpy_gives(seed):
+    rng = np.random.default_rng(seed)
+    mesh = Mesh(rng.normal(size=(40, 3)), rng.integers(0, 40, (100, 3)))  # some faces are lines, some vertices unused
+    a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
+    crosses = np.cross(b - a, c - a)
+    np.testing.assert_array_equal(mesh.face_cross, crosses)
+    summed = np.zeros_like(mesh.vertices)
+    np.add.at(summed, mesh.faces, crosses[:, None])
+    lengths = np.linalg.norm(summed, axis=1, keepdims=True)
+    np.testing.assert_allclose(mesh.vertex_normals * lengths, summed, atol=1e-12)
+    assert set(np.linalg.norm(mesh.vertex_normals, axis=1).round(9)) <= {0.0, 1.0}
+
+
+def test_rays_of_all_cores_hit_what_those_of_one_hit(monkeypatch):
+    monkeypatch.setattr("cuspid.workers.usable_cores", lambda: 5)
+    mesh, rng = sphere(10.0), np.random.default_rng(0)
+    origins, directions = rng.normal(0, 12, (2, 503, 3))
+    expected, found = mesh.cast(origins, directions, 3.0), mesh.cast_on_all_cores(origins, directions, 3.0)
+    assert 0.1 < (expected.faces >= 0).mean() < 0.9
+    for name in ("faces", "distances", "barycentric"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
 def test_rays_hit_where_they_should():
     mesh = sphere(10.0)
     rng = np.random.default_rng(0)

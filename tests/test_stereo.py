@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from threading import Barrier
 
 import cv2
 import numpy as np
@@ -27,7 +28,7 @@ from cuspid.stereo.confidence import (
     without_speckle,
 )
 from cuspid.stereo.initial_depth import initial_pairs, semi_global
-from cuspid.stereo.matching import DepthEstimator, StereoOptions, coarser, group_geometry
+from cuspid.stereo.matching import DepthEstimator, Group, StereoOptions, coarser, group_geometry
 from cuspid.stereo.rectification import IdealView, rectify
 from cuspid.stereo.refinement import (
     RefinementOptions,
@@ -37,6 +38,7 @@ from cuspid.stereo.refinement import (
     patch_window,
     window_size,
 )
+from cuspid.workers import map_in_threads
 from synthetic_scene import cast_depth, diamond, height_field, render
 
 HILLS = height_field(lambda x, y: 5 + 0.25 * np.sin(1.8 * x) * np.cos(1.5 * y))
@@ -229,6 +231,26 @@ def test_the_same_images_give_the_same_depth(alone: bool) -> None:
     again = DepthEstimator(diamond(), StereoOptions(spacing_px=2)).measure(hills_images(), "00000", alone=alone)
     for one, other in zip(measured_hills(), again, strict=True):
         assert np.array_equal(one.depth_mm, other.depth_mm, equal_nan=True)
+
+
+def test_what_frames_have_in_common_is_prepared_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even where many threads begin at once."""
+    monkeypatch.setattr("cuspid.workers.usable_cores", lambda: 8)
+    prepared, together, prepare = [], Barrier(8), DepthEstimator._prepare
+
+    def told(self: DepthEstimator, rig: Rig, names: tuple[str, ...]) -> Group:
+        prepared.append(names)
+        return prepare(self, rig, names)
+
+    monkeypatch.setattr(DepthEstimator, "_prepare", told)
+    estimator, images = DepthEstimator(diamond(), StereoOptions(spacing_px=8)), hills_images()
+
+    def measure(frame: int) -> tuple[DepthMap, ...]:
+        together.wait(10)
+        return estimator.measure(images, f"{frame:05}")
+
+    map_in_threads(measure, range(8))
+    assert sorted(prepared) == sorted(set(prepared)) != []
 
 
 def test_cameras_that_share_no_view_are_refused() -> None:

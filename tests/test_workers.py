@@ -6,7 +6,16 @@ import time
 
 import pytest
 
-from cuspid.workers import core_numbers, in_shares, map_ahead, map_batches, map_in_threads, map_slices, usable_cores
+from cuspid.workers import (
+    computed_once,
+    core_numbers,
+    in_shares,
+    map_ahead,
+    map_batches,
+    map_in_threads,
+    map_slices,
+    usable_cores,
+)
 
 
 def pinned(work):
@@ -145,3 +154,27 @@ def test_a_thread_that_is_pinned_to_one_core_starts_one_thread_at_a_time():
 def test_a_system_without_affinity_lends_all_cores(monkeypatch):
     monkeypatch.delattr(os, "sched_getaffinity")
     assert usable_cores() == os.cpu_count()
+
+
+def test_what_many_threads_ask_for_at_once_is_computed_once(monkeypatch):
+    """Since Python 3.12, functools' own cached property is not."""
+    monkeypatch.setattr("cuspid.workers.usable_cores", lambda: 8)
+    computed, together = [], threading.Barrier(8)
+
+    class Answer:
+        @computed_once
+        def value(self):
+            computed.append(self)
+            time.sleep(0.05)
+            return object()
+
+    one, other = Answer(), Answer()
+
+    def ask(_):
+        together.wait(10)
+        return one.value
+
+    assert set(map_in_threads(ask, range(8))) == {one.value}
+    assert computed == [one]
+    assert other.value is not one.value
+    assert isinstance(Answer.value, computed_once)

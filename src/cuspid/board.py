@@ -8,7 +8,6 @@ rise towards the cameras, along +X; seen from straight above, the squares are th
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Annotated, Literal
 
 import cv2
@@ -17,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from cuspid.errors import InputError
 from cuspid.options import Options, Range
+from cuspid.workers import computed_once
 
 Dictionary = Literal[
     "4X4_50", "4X4_100", "4X4_250", "4X4_1000", "5X5_50", "5X5_100", "5X5_250", "5X5_1000",
@@ -101,7 +101,7 @@ class Board(Options):
     def _terrace_of(self, column: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
         return column * self.terraces // self.columns
 
-    @cached_property
+    @computed_once
     def orders(self) -> Int[np.ndarray, "k n"]:
         """The numberings of the corners that an image of the board does not tell apart, the usual one first: rotated by
         half a turn if it has no markers, by quarter turns if it is also square."""
@@ -109,7 +109,7 @@ class Board(Options):
         turns = 1 if self.kind == "charuco" else 4 if self.columns == self.rows else 2
         return np.stack([np.rot90(usual, k * (4 // turns)).ravel() for k in range(turns)])
 
-    @cached_property
+    @computed_once
     def opencv(self) -> cv2.aruco.CharucoBoard:
         """The same board as an OpenCV object. Raises InputError for a chessboard."""
         if self.kind != "charuco":
@@ -120,7 +120,7 @@ class Board(Options):
         board.setLegacyPattern(self.legacy)
         return board
 
-    @cached_property
+    @computed_once
     def dark(self) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
         """The printed squares, seen from straight above: top left corner (mm) and side of each."""
         row, column = np.indices((self.rows, self.columns))
@@ -155,7 +155,7 @@ class Board(Options):
         across, down = np.clip(place, 0, count - 1).T
         return ((place >= 0) & (place < count)).all(axis=1) & ~self._bits[row, column, down, across]
 
-    @cached_property
+    @computed_once
     def _bits(self) -> Bool[np.ndarray, "rows columns b b"]:
         """The light bits of the marker in each square, with its dark border; all light where there is none."""
         dictionary = self.opencv.getDictionary()

@@ -12,7 +12,7 @@ from math import isfinite
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int, Shaped
 from scipy.spatial.transform import Rotation
 
 from cuspid.errors import InputError
@@ -29,6 +29,25 @@ def read_only(array: _Array) -> _Array:
         array = array.copy(order="C")
         array.flags.writeable = False
     return array
+
+
+def owned(array: _Array) -> _Array:
+    """``array`` itself, made read-only: for what nothing else refers to."""
+    array.flags.writeable = False
+    return array
+
+
+def distinct_rows(rows: Shaped[np.ndarray, "n d"]) -> tuple[Int[np.ndarray, "u"], Int[np.ndarray, "n"]]:
+    """Where each of the distinct rows stands first, in the order of their values, and which of them each row is.
+
+    As ``numpy.unique`` along the first axis, which takes twice as long.
+    """
+    order = np.lexsort(rows.T[::-1])  # stable: the first of equal rows stays the first
+    new = np.ones(len(order), dtype=bool)
+    new[1:] = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
+    number = np.empty(len(order), dtype=np.int64)
+    number[order] = np.cumsum(new) - 1
+    return order[new], number
 
 
 def unit(vectors: Float[np.ndarray, "*n d"]) -> Float[np.ndarray, "*n d"]:

@@ -5,8 +5,7 @@ Visibility, rendering and evaluation all use these, so that there is one impleme
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, fields, replace
 from typing import no_type_check
 
 import fast_simplification
@@ -17,8 +16,9 @@ from embreex.mesh_construction import TriangleMesh
 from jaxtyping import Bool, Float, Int, UInt8
 
 from cuspid.errors import InputError
-from cuspid.geometry import Rigid3, read_only
+from cuspid.geometry import Rigid3, owned, read_only
 from cuspid.kernels import kernel
+from cuspid.workers import computed_once, map_slices
 
 _ROUNDING = 5e-7
 """Rounding of a length in single precision, relative: four steps."""
@@ -26,8 +26,6 @@ _ROUNDING = 5e-7
 
 _MOST_COLLAPSED = 500_000
 """Largest number of faces that edge collapse starts from."""
-_BLOCK = 1 << 18
-"""Faces that are processed at once: for millions, corners and edges would take gigabytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +48,32 @@ def edges_of(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
 def used_vertices(faces: Int[np.ndarray, "f 3"], count: int) -> Int[np.ndarray, "u"]:
     """Those of ``count`` vertices that the faces use, in ascending order."""
     return np.flatnonzero(np.bincount(faces.ravel(), minlength=count))
+
+
+@kernel
+@no_type_check
+def _face_cross(vertices, faces):
+    """Cross product of the sides of each face that leave its first vertex."""
+    crosses, a, b = np.empty(faces.shape), np.empty(3), np.empty(3)
+    for i in range(len(faces)):
+        first, second, third = faces[i]
+        for k in range(3):
+            a[k], b[k] = vertices[second, k] - vertices[first, k], vertices[third, k] - vertices[first, k]
+        for k in range(3):
+            crosses[i, k] = a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3]
+    return crosses
+
+
+@kernel
+@no_type_check
+def _summed_at_vertices(faces, vectors, count):
+    """The sum of the vectors of the faces around each vertex."""
+    summed = np.zeros((count, 3))
+    for i in range(len(faces)):
+        for vertex in faces[i]:
+            for k in range(3):
+                summed[vertex, k] += vectors[i, k]
+    return summed
 
 
 @kernel
@@ -105,55 +129,46 @@ class Mesh:
     @property
     def face_cross(self) -> Float[np.ndarray, "f 3"]:
         """Cross product of two edges of each face: along its outward normal, with a length of twice its area (mm^2)."""
-        crosses = np.empty(self.faces.shape)
-        for begin in range(0, len(crosses), _BLOCK):
-            a, b, c = self.vertices[self.faces[begin : begin + _BLOCK]].transpose(1, 0, 2)
-            crosses[begin : begin + _BLOCK] = np.cross(b - a, c - a)
-        return crosses
+        return np.asarray(_face_cross(self.vertices, self.faces))
 
-    @cached_property
+    @computed_once
     def face_normals(self) -> Float[np.ndarray, "f 3"]:
         """Unit outward normals; zero for a degenerate face."""
         normals = self.face_cross
         norms = np.linalg.norm(normals, axis=1, keepdims=True)
         normals /= np.where(norms > 0, norms, 1)
-        normals.flags.writeable = False
-        return normals
+        return owned(normals)
 
     def normals_of(self, faces: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
         """Unit outward normals of some faces."""
         return Mesh(self.vertices, self.faces[faces]).face_normals
 
-    @cached_property
+    @computed_once
     def face_areas(self) -> Float[np.ndarray, "f"]:
         """Areas in mm^2."""
-        return read_only(0.5 * np.linalg.norm(self.face_cross, axis=1))
+        return owned(0.5 * np.linalg.norm(self.face_cross, axis=1))
 
-    @cached_property
+    @computed_once
     def vertex_areas(self) -> Float[np.ndarray, "v"]:
         """A third of the total area of the faces around each vertex, mm^2."""
         shares = np.repeat(self.face_areas / 3, 3)
-        return read_only(np.bincount(self.faces.ravel(), shares, minlength=len(self.vertices)))
+        return owned(np.bincount(self.faces.ravel(), shares, minlength=len(self.vertices)))
 
-    @cached_property
+    @computed_once
     def face_centres(self) -> Float[np.ndarray, "f 3"]:
         """Centroids in mm."""
         centres = self.vertices[self.faces[:, 0]]
         for corner in (1, 2):
             centres += self.vertices[self.faces[:, corner]]
         centres /= 3
-        centres.flags.writeable = False
-        return centres
+        return owned(centres)
 
-    @cached_property
+    @computed_once
     def vertex_normals(self) -> Float[np.ndarray, "v 3"]:
         """Unit normals, the area-weighted mean of the adjoining faces."""
-        summed, crosses = np.zeros_like(self.vertices), self.face_cross
-        for corner in range(3):
-            for axis in range(3):
-                summed[:, axis] += np.bincount(self.faces[:, corner], crosses[:, axis], minlength=len(self.vertices))
+        summed = _summed_at_vertices(self.faces, self.face_cross, len(self.vertices))
         norms = np.linalg.norm(summed, axis=1, keepdims=True)
-        return read_only(summed / np.where(norms > 0, norms, 1))
+        return owned(summed / np.where(norms > 0, norms, 1))
 
     @property
     def bounds(self) -> Float[np.ndarray, "2 3"]:
@@ -174,8 +189,8 @@ class Mesh:
         used = used_vertices(faces, len(self.vertices))
         number = np.zeros(len(self.vertices), dtype=np.int64)
         number[used] = np.arange(len(used))
-        colors = None if self.colors is None else self.colors[used]
-        return Mesh(self.vertices[used], number[faces], colors)
+        colors = None if self.colors is None else owned(self.colors[used])
+        return Mesh(owned(self.vertices[used]), owned(number[faces]), colors)
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
         """Points distributed uniformly by area (stratified over the faces), and the face of each."""
@@ -189,7 +204,7 @@ class Mesh:
         weights = np.stack([1 - u - v, u, v], axis=1)
         return np.einsum("nk,nkd->nd", weights, corners), faces
 
-    @cached_property
+    @computed_once
     def _scene(self) -> rtcore_scene.EmbreeScene:
         scene = rtcore_scene.EmbreeScene()
         TriangleMesh(scene, self.vertices.astype(np.float32), self.faces.astype(np.int32))
@@ -207,6 +222,13 @@ class Mesh:
         )
         return RayHits(*_in_double(hits["primID"], hits["tfar"], hits["u"], hits["v"]))
 
+    def cast_on_all_cores(
+        self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"], farthest: float = np.inf
+    ) -> RayHits:
+        """As :meth:`cast`."""
+        parts = map_slices(lambda part: self.cast(origins[part], directions[part], farthest), len(origins))
+        return RayHits(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(RayHits)))
+
     def occluded(
         self,
         points: Float[np.ndarray, "n 3"],
@@ -220,7 +242,7 @@ class Mesh:
         hits = self._scene.run(origins, directions, dists=farthest, query="OCCLUDED")
         return np.asarray((hits >= 0) & (farthest > 0))
 
-    @cached_property
+    @computed_once
     def _tree(self) -> igl.AABB:
         tree = igl.AABB()
         tree.init(self.vertices, self.faces)

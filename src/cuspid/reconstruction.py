@@ -14,8 +14,10 @@ from cuspid.camera import Camera
 from cuspid.capture import Dropped
 from cuspid.geometry import Rigid3, read_only
 from cuspid.rig import Rig
+from cuspid.workers import map_slices
 
 _NEAREST = 4
+_AT_ONCE = 50_000
 """Number of nearest points from which a vertex is judged."""
 
 
@@ -124,9 +126,14 @@ class Expectation:
 
     def sigma_mm(self, vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v"]:
         """Standard deviation of vertices nearby, along their normals: that of the nearest points (mean variance)."""
-        _, nearest = cKDTree(self.points).query(vertices, k=min(_NEAREST, len(self.points)))
-        covariance = self.covariance[nearest.reshape(len(vertices), -1)].mean(axis=1)
-        return np.asarray(np.sqrt(np.einsum("vi,vij,vj->v", normals, covariance, normals)))
+        tree = cKDTree(self.points)
+
+        def variance(part: slice) -> Float[np.ndarray, "n"]:
+            _, nearest = tree.query(vertices[part], k=min(_NEAREST, len(self.points)))
+            covariance = self.covariance[nearest.reshape(len(nearest), -1)].mean(axis=1)
+            return np.asarray(np.einsum("vi,vij,vj->v", normals[part], covariance, normals[part]))
+
+        return np.sqrt(np.concatenate(map_slices(variance, len(vertices), 1 + len(vertices) // _AT_ONCE)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
@@ -20,6 +19,7 @@ from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, axes_about, read_only, unit
 from cuspid.values import checked_name, one_line
+from cuspid.workers import computed_once
 
 _NO_SIDE = 1e-3
 """Length of the mean of unit vectors below which they have no common direction."""
@@ -311,7 +311,7 @@ class Handpiece:
                 f"handpiece: depth range {near}-{far} mm must enclose the working distance {self.working_distance_mm}"
             )
 
-    @cached_property
+    @computed_once
     def solid(self) -> Body:
         """The body; if it is not known, a box of the size of a miniature module behind each lens and each LED."""
         if self.body is not None:

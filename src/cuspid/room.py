@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from itertools import product
 from typing import no_type_check
 
@@ -25,6 +25,7 @@ from cuspid.geometry import Rigid3
 from cuspid.kernels import kernel
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
+from cuspid.workers import computed_once
 
 _LOG = logging.getLogger("cuspid")
 
@@ -110,12 +111,12 @@ class Room:
     def _points(self) -> Float[np.ndarray, "n 3"]:
         return _points_of(self.mesh)
 
-    @cached_property
+    @computed_once
     def _corners(self) -> Float[np.ndarray, "8 3"]:
         """Of the box around the body, the lower one first and the upper one last."""
         return np.array(list(product(*self.body.bounds.T)))
 
-    @cached_property
+    @computed_once
     def _distances(self) -> _Grid:
         """Signed distance to the body, in the rig frame."""
         reach = self.clearance_mm + 2 * _PITCH_MM
@@ -135,7 +136,7 @@ class Room:
         numbers = map_coordinates(self._winding.values, at, order=1, cval=0.0)
         return np.asarray(numbers.reshape(len(rig_from_world), len(self._middles)) > _INSIDE)
 
-    @cached_property
+    @computed_once
     def _middles(self) -> Float[np.ndarray, "p 3"]:
         return np.array([box.box_from_rig.inverse().translation for box in self.body.parts.values()])
 

@@ -6,8 +6,10 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cached_property
 from itertools import islice, pairwise
-from typing import TypeVar
+from threading import RLock
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -17,6 +19,20 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 _BATCH_PER_CORE = 8
+
+
+class computed_once(cached_property[_Result]):
+    """A cached property that threads do not compute side by side: since Python 3.12, functools' own has no lock."""
+
+    def __init__(self, compute: Callable[[Any], _Result]) -> None:
+        super().__init__(compute)
+        self._lock = RLock()
+
+    if not TYPE_CHECKING:
+
+        def __get__(self, instance: object, owner: type | None = None) -> object:
+            with self._lock:
+                return super().__get__(instance, owner)
 
 
 def core_numbers(thread: int = 0) -> list[int]:

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import cached_property
 from types import MappingProxyType
 from typing import Annotated, Literal
 
@@ -31,6 +30,7 @@ from jaxtyping import Bool, Float
 from cuspid.anatomy.teeth.dentition import ARCH_FORMS, QUADRANTS
 from cuspid.errors import InputError
 from cuspid.options import SEED, Options, Range
+from cuspid.workers import computed_once
 
 Sizes = float | Float[np.ndarray, "*n"]
 """A value for one person, or one for each of many."""
@@ -91,7 +91,7 @@ class Mouth:
         """alpha: angle between the occlusal plane and the line from the hinge axis to the incisal edges."""
         return np.rad2deg(np.arcsin(np.divide(self.depth_mm, self.radius_mm)))
 
-    @cached_property
+    @computed_once
     def turn_rad(self) -> Sizes:
         """theta: how far the lower jaw turns."""
         return opening_turn_rad(self.opening_mm, self.radius_mm, self.depth_mm, self.path_mm, self.slope_deg)
@@ -298,12 +298,12 @@ class People:
     left_out: int
     """Draws that no mouth can have, for example an opening smaller than the slide of the condyles."""
 
-    @cached_property
+    @computed_once
     def gap_mm(self) -> Float[np.ndarray, "n 7"]:
         """L at the distal end of each tooth."""
         return np.stack([np.asarray(self.mouth.gap_mm(ends)) for ends in self.ends_mm.T], axis=1)
 
-    @cached_property
+    @computed_once
     def vertical_gap_mm(self) -> Float[np.ndarray, "n 7"]:
         """V at the distal end of each tooth."""
         return np.stack([np.asarray(self.mouth.vertical_gap_mm(ends)) for ends in self.ends_mm.T], axis=1)

@@ -8,13 +8,13 @@ for points over the surface, not for points past its edge: these are reported se
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from functools import cached_property
 
 import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cuspid.mesh import Mesh
+from cuspid.workers import computed_once
 
 _ON_EDGE = 1e-7
 """Barycentric weight below which a point of a face is considered to lie on the opposite edge."""
@@ -45,7 +45,7 @@ class SignedDistance:
     mesh: Mesh
     """The surface; faces are counter-clockwise seen from outside."""
 
-    @cached_property
+    @computed_once
     def _edges(self) -> tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]]:
         """The key of each edge of each face, in order, and the face."""
         keys = self._edge_keys(
@@ -65,7 +65,7 @@ class SignedDistance:
         begin = np.searchsorted(ordered, keys)
         return begin, np.searchsorted(ordered, keys, side="right") - begin
 
-    @cached_property
+    @computed_once
     def _border_vertices(self) -> Bool[np.ndarray, "v"]:
         keys, counts = np.unique(self._edges[0], return_counts=True)
         flags = np.zeros(len(self.mesh.vertices), dtype=bool)
@@ -73,7 +73,7 @@ class SignedDistance:
             flags[ends] = True
         return flags
 
-    @cached_property
+    @computed_once
     def _corner_normals(self) -> Float[np.ndarray, "v 3"]:
         by_angle = igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE
         return igl.per_vertex_normals(self.mesh.vertices, self.mesh.faces, by_angle, self.mesh.face_normals)

@@ -7,7 +7,7 @@ handpiece keep their roll from one frame to the next, so fixing the orientation 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -18,6 +18,7 @@ from jaxtyping import Float, Int, UInt8
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET
 from cuspid.capture import Frame, halved_size
+from cuspid.geometry import distinct_rows
 from cuspid.motion.pictures import Pictures
 from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
@@ -91,9 +92,16 @@ def spread(
     return np.sort(np.lexsort((-strengths, rank))[:count])
 
 
-def _without_doubles(keypoints: list[cv2.KeyPoint]) -> list[cv2.KeyPoint]:
-    """One keypoint for each place and size; SIFT repeats a place for each of its orientations."""
-    return list({(round(k.pt[0], 2), round(k.pt[1], 2), round(k.size, 2)): k for k in keypoints}.values())
+def _places(keypoints: Sequence[cv2.KeyPoint]) -> Float[np.ndarray, "n 2"]:
+    """Where keypoints are, px, with the first pixel centre at 0."""
+    return np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64).reshape(-1, 2)
+
+
+def without_doubles(keypoints: Sequence[cv2.KeyPoint]) -> list[cv2.KeyPoint]:
+    """One keypoint for each place and size, in their order; SIFT repeats a place for each of its orientations."""
+    kind = np.round(np.column_stack([_places(keypoints), [k.size for k in keypoints]]), 2)
+    first, _ = distinct_rows(kind)
+    return [keypoints[index] for index in np.sort(first).tolist()]
 
 
 def _root_sift(descriptors: Float[np.ndarray, "n 128"]) -> UInt8[np.ndarray, "n 128"]:
@@ -118,12 +126,11 @@ def detect(image: UInt8[np.ndarray, "h w 3"], options: FeatureOptions | None = N
         gray = cv2.resize(gray, searched, interpolation=cv2.INTER_AREA)
     px = np.array([width, height]) / searched
     sift = cv2.SIFT.create(contrastThreshold=options.contrast, edgeThreshold=options.edge, enable_precise_upscale=True)
-    keypoints = list(sift.detect(gray, None))
+    keypoints = sift.detect(gray, None)
     if options.upright:
-        keypoints = _without_doubles(keypoints)
-    places = px * np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
+        keypoints = without_doubles(keypoints)
     most = options.count_for(width, height)
-    chosen = spread(places, np.array([k.response for k in keypoints]), most, options.cell_px)
+    chosen = spread(px * _places(keypoints), np.array([k.response for k in keypoints]), most, options.cell_px)
     keypoints = [keypoints[index] for index in chosen]
     if options.upright:
         for keypoint in keypoints:
@@ -131,7 +138,7 @@ def detect(image: UInt8[np.ndarray, "h w 3"], options: FeatureOptions | None = N
     described, descriptors = sift.compute(gray, keypoints)
     if descriptors is None:
         descriptors = np.zeros((0, 128), np.float32)
-    pixels = px * (np.array([k.pt for k in described], dtype=np.float64).reshape(-1, 2) + OPENCV_PIXEL_OFFSET)
+    pixels = px * (_places(described) + OPENCV_PIXEL_OFFSET)
     return Features(pixels=pixels, descriptors=_root_sift(descriptors), colors=_colors_at(image, pixels))
 
 

@@ -6,7 +6,6 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
@@ -38,7 +37,7 @@ from cuspid.pairing import PairingOptions, require_stereo, resolved_mm, stereo_p
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import Handpiece, Rig
-from cuspid.workers import map_in_threads
+from cuspid.workers import computed_once, map_in_threads
 
 _LOOSE_SCALE_PPM, _LOOSE_SPAN_PPM = 1000.0, 300.0
 """Standard deviations of the scale and, apart from it, of the length of a scan, above which advice is given."""
@@ -128,12 +127,12 @@ class _Scan:
     clouds: Sequence[Cloud]
     poses: Sequence[Rigid3]
 
-    @cached_property
+    @computed_once
     def numbering(self) -> _Numbering:
         """Of all keypoints."""
         return _Numbering.of(self.frames, self.handpiece.rig)
 
-    @cached_property
+    @computed_once
     def resolved_mm(self) -> float:
         """Of the handpiece."""
         return resolved_mm(self.handpiece)

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +39,7 @@ from cuspid.motion.normal_equations import (
     substitute,
     with_poses_moved,
 )
+from cuspid.workers import computed_once
 
 CHANCE = 1e-6
 """A calibration that would occur with less than this probability is rejected as not being that of the handpiece."""
@@ -86,11 +86,11 @@ class _Numbers:
     hessian: Float[np.ndarray, "n n"]
     gradient: Float[np.ndarray, "n"]
 
-    @cached_property
+    @computed_once
     def _rest(self) -> tuple[Float[np.ndarray, "f f"], bool]:
         return cho_factor(self.hessian[np.ix_(~self.held, ~self.held)], lower=True)
 
-    @cached_property
+    @computed_once
     def _onto_held(self) -> Float[np.ndarray, "k n"]:
         """What is left of a gradient for the held numbers once the rest has followed."""
         onto = np.zeros((np.count_nonzero(self.held), len(self.held)))

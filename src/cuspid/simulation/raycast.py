@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache, partial
 from multiprocessing import get_context
 from typing import NamedTuple, no_type_check
 
@@ -32,6 +32,7 @@ from cuspid.rig import Handpiece, MountedCamera
 from cuspid.simulation.appearance import NO_MATERIAL, Appearance, Palette, albedo, face_materials, palette
 from cuspid.simulation.optics import IDEAL, Optics, mixed, recorded, through_lens
 from cuspid.simulation.sensor import record
+from cuspid.workers import computed_once
 
 AMBIENT = 0.08
 """Share of the light reaching a point that arrives from all directions after reflection in the mouth, unshadowed."""
@@ -77,20 +78,20 @@ class Scene:
     optics: Optics = IDEAL
     """What lenses, sensors, hands and the mouth do to the images."""
 
-    @cached_property
+    @computed_once
     def surface(self) -> ShadedMesh:
         """The jaw as arrays for the compiled shading."""
         mesh = self.jaw.mesh
         # Arrays that came from another process are writable: for those the shading would be compiled once more.
         return ShadedMesh(read_only(mesh.faces), mesh.face_normals, mesh.vertex_normals, face_materials(self.jaw))
 
-    @cached_property
+    @computed_once
     def rays(self) -> Callable[[Camera], Float[np.ndarray, "n 3"]]:
         """:func:`pixel_rays` of a camera, cached for the last one: through a lens with distortion they cost more than
         the rest of an image, and those of twelve cameras of 500 x 500 px would take 300 MB in each process."""
         return lru_cache(maxsize=1)(partial(pixel_rays, supersampling=self.supersampling))
 
-    @cached_property
+    @computed_once
     def palette(self) -> Palette:
         """The materials as arrays for the compiled shading."""
         return palette(self.appearance, self.seed, self.optics.saliva)

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.reconstruction import DepthMap, Reconstruction, SurfacePoints, Tracks
+from cuspid.workers import map_ahead, map_in_threads
 
 Image = tuple[str, str]
 """Names of a frame and of one of its cameras."""
@@ -59,11 +60,14 @@ class Sightings:
     ) -> Int[np.ndarray, "p"]:
         """For each point, the number of depth maps of located frames that have it on their surface, whether or not
         their image shows it (keypoints come and go)."""
+
+        def confirmed(depth_map: DepthMap) -> Bool[np.ndarray, "p"]:
+            cam_from_world = depth_map.cam_from_rig @ rig_from_world[depth_map.frame]
+            return _on_surface(depth_map, cam_from_world.apply(self.points), agreement_mm)
+
         count = np.zeros(len(self.points), dtype=np.int64)
-        for depth_map in depth_maps:
-            if depth_map.frame in rig_from_world:
-                cam_from_world = depth_map.cam_from_rig @ rig_from_world[depth_map.frame]
-                count += _on_surface(depth_map, cam_from_world.apply(self.points), agreement_mm)
+        for points in map_ahead(confirmed, (each for each in depth_maps if each.frame in rig_from_world)):
+            count += points
         return count
 
 
@@ -95,18 +99,19 @@ class Views:
     ) -> Views:
         """The views of images of located frames. A place is hidden by a depth that is nearer by more than
         ``agreement_mm``; if an image has no depth map, nothing is hidden."""
-        shown = dict[Image, Bool[np.ndarray, "p"]]()
-        for depth_map in depth_maps:
-            if depth_map.frame in found.rig_from_world:
-                cam_from_world = depth_map.cam_from_rig @ found.rig_from_world[depth_map.frame]
-                facing = _facing(places, depth_map.camera, cam_from_world)
-                facing[facing] = ~_hidden(depth_map, cam_from_world.apply(places.points[facing]), agreement_mm)
-                shown[depth_map.frame, depth_map.camera_name] = facing
-        for frame, name in set(images) - set(shown):
-            mounted = found.rig[name]
-            cam_from_world = mounted.cam_from_rig @ found.rig_from_world[frame]
-            shown[frame, name] = _facing(places, mounted.camera, cam_from_world)
-        return Views(len(places.points), shown)
+
+        def seen(depth_map: DepthMap) -> tuple[Image, Bool[np.ndarray, "p"]]:
+            cam_from_world = depth_map.cam_from_rig @ found.rig_from_world[depth_map.frame]
+            facing = _facing(places, depth_map.camera, cam_from_world)
+            facing[facing] = ~_hidden(depth_map, cam_from_world.apply(places.points[facing]), agreement_mm)
+            return (depth_map.frame, depth_map.camera_name), facing
+
+        def facing(image: Image) -> tuple[Image, Bool[np.ndarray, "p"]]:
+            mounted = found.rig[image[1]]
+            return image, _facing(places, mounted.camera, mounted.cam_from_rig @ found.rig_from_world[image[0]])
+
+        shown = dict(map_ahead(seen, (each for each in depth_maps if each.frame in found.rig_from_world)))
+        return Views(len(places.points), shown | dict(map_in_threads(facing, set(images) - set(shown))))
 
     def both(self, one: Image, other: Image) -> Int[np.ndarray, "_"]:
         """Indices of the places that two images show."""

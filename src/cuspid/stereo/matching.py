@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from threading import Lock
 from typing import Annotated, Any, Literal
 
 import cv2
@@ -160,6 +161,7 @@ class DepthEstimator:
         self.confidence = self.options.confidence if signal == "texture" else self.options.shading.confidence
         self.resolution = Resolution(resolution_mm or resolved_mm(handpiece), handpiece.working_distance_mm)
         self._prepared: dict[tuple[str, ...], Group] = {}
+        self._preparing = Lock()
         require_stereo(handpiece, self.options.pairing)
 
     def _groups(self, cameras: tuple[str, ...]) -> list[Group]:
@@ -171,9 +173,10 @@ class DepthEstimator:
         return [self._group(rig, names) for names in groups if len(names) > 1]
 
     def _group(self, rig: Rig, names: tuple[str, ...]) -> Group:
-        if names not in self._prepared:
-            self._prepared[names] = self._prepare(rig, names)
-        return self._prepared[names]
+        with self._preparing:
+            if names not in self._prepared:
+                self._prepared[names] = self._prepare(rig, names)
+            return self._prepared[names]
 
     def _prepare(self, rig: Rig, names: tuple[str, ...]) -> Group:
         views = tuple(IdealView.of(name, rig[name]) for name in names)

@@ -8,7 +8,6 @@ such that the camera was `NOMINAL_MM` from the teeth, and are not called millime
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Annotated, no_type_check
 
 import cv2
@@ -23,6 +22,7 @@ from cuspid.kernels import kernel
 from cuspid.options import Options, Range
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.trajectory import frames_there
+from cuspid.workers import computed_once
 
 NOMINAL_MM = 14.0
 """Distance from an intra-oral camera to the teeth, where nothing else is known."""
@@ -118,14 +118,14 @@ class HeightMap:
     visible: Bool[np.ndarray, "r c"] | None = None
     """Places that nothing occludes, whatever rises beside them."""
 
-    @cached_property
+    @computed_once
     def places(self) -> Float[np.ndarray, "r c 3"]:
         """The surface at each cell."""
         rows, columns = self.heights.shape
         x, y = (low + self.cell_mm * np.arange(n) for low, n in zip(self.corner, (columns, rows), strict=True))
         return np.stack([*np.meshgrid(x, y), self.heights], axis=-1)
 
-    @cached_property
+    @computed_once
     def _occluder(self) -> Float[np.ndarray, "r c"]:
         """The highest surface within `_RIM_MM`, for the crowns' rims may lie that far out."""
         return np.asarray(cv2.dilate(self.heights, _disc(_RIM_MM, self.cell_mm)))

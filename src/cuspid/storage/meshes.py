@@ -16,6 +16,7 @@ import trimesh
 from jaxtyping import Float, Int, UInt8
 
 from cuspid.errors import InputError
+from cuspid.geometry import distinct_rows, owned
 from cuspid.inputs import read_bytes
 from cuspid.mesh import Mesh
 from cuspid.storage.files import write_bytes
@@ -112,9 +113,10 @@ def _checked(path: Path, loaded: trimesh.Trimesh, declared: int, mm_per_unit: fl
         raise InputError(f"{path}: coordinates beyond {LONGEST_MM / 1000:g} m; repair the mesh, or give its --unit")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"{path}: faces refer to vertices that do not exist; export the mesh again")
-    merged, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    first, number = distinct_rows(vertices)
     colors = _colors(loaded, "vertex")
-    mesh = Mesh(merged * mm_per_unit, inverse.reshape(-1)[faces], None if colors is None else colors[first])
+    merged = owned(vertices[first] * mm_per_unit)
+    mesh = Mesh(merged, owned(number[faces]), None if colors is None else owned(colors[first]))
     if not mesh.face_areas.sum() > _LEAST_AREA * np.ptp(mesh.bounds, axis=0).max() ** 2:
         raise InputError(f"{path}: its triangles have no area; export the surface again")
     values = _ply_values(loaded, "vertex")

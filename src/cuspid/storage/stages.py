@@ -55,16 +55,18 @@ class Stage:
     """How it is made."""
     code: tuple[str, ...] = ()
     """What of cuspid makes it, as :func:`code_version` takes it."""
+    _version: str = field(init=False, repr=False)
     _made: dict[str, tuple[str, str]] = field(init=False, repr=False)
     _lock: Lock = field(init=False, repr=False, default_factory=Lock)
 
     def __post_init__(self) -> None:
         """Raises InputError where ``made.jsonl`` is there and no file."""
+        object.__setattr__(self, "_version", code_version(*self.code))  # here, or every thread would read all modules
         object.__setattr__(self, "_made", _read_record(self.folder / RECORD))
 
     def key(self, inputs: Mapping[str, str]) -> str:
         """What identifies a result that is made from inputs, given by their digests."""
-        return digest_of([self.name, self.options, inputs, code_version(*self.code)])
+        return digest_of([self.name, self.options, inputs, self._version])
 
     def has(self, key: str, files: Sequence[Path]) -> bool:
         """Whether all of the files are there as they were made under a key."""

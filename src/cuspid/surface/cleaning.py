@@ -15,7 +15,6 @@ from cuspid.graph import parts_of
 from cuspid.kernels import kernel
 from cuspid.mesh import Mesh, used_vertices
 from cuspid.options import Options, Range
-from cuspid.workers import map_slices
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +95,7 @@ def ghost_faces(mesh: Mesh, depth_mm: float) -> Bool[np.ndarray, "f"]:
         return np.zeros(0, dtype=bool)
     start = mesh.face_centres + depth_mm / 500 * mesh.face_normals
     normals = mesh.face_normals
-    behind = np.concatenate(map_slices(lambda part: mesh.cast(start[part], normals[part], depth_mm).faces, len(start)))
+    behind = mesh.cast_on_all_cores(start, normals, depth_mm).faces
     same_way = np.einsum("nd,nd->n", normals, normals[behind]) > 0
     return (behind >= 0) & same_way
 

@@ -231,7 +231,9 @@ class Votes:
         def work(share: int, shares: int) -> None:
             for voter in voters:
                 _vote(
-                    voter.chunks[voter.chunks % shares == share],
+                    voter.chunks,
+                    share,
+                    shares,
                     self.rough.vertices,
                     self.rough.vertex_normals,
                     voter.cam_from_world.rotation,
@@ -284,6 +286,8 @@ class Votes:
 @no_type_check
 def _vote(
     chunks,
+    share,
+    shares,
     vertices,
     normals,
     rotation,
@@ -301,9 +305,12 @@ def _vote(
     frames,
     frame,
 ):
-    """Each vertex that a depth map sees from its outer side and near its surface gets the map's vote."""
+    """Each vertex of a share of the chunks that a depth map sees from its outer side and near its surface gets the
+    map's vote."""
     seen, x, normal = np.zeros(6), np.zeros(3), np.zeros(3)
     for chunk in chunks:
+        if chunk % shares != share:
+            continue
         for n in range(chunk * CHUNK, min((chunk + 1) * CHUNK, vertices.shape[0])):
             for k in range(3):
                 x[k], normal[k] = translation[k], 0

@@ -24,6 +24,7 @@ BLOCK = 8
 
 _NOTHING = 1e-4
 """Weight, as a share of that of what was taken out, below which nothing but rounding is left."""
+_MASK = (1 << 21) - 1
 _OFFSET = 1 << 20
 """Added to block coordinates so that packed keys are positive: room for a million blocks in each direction."""
 
@@ -36,8 +37,7 @@ def pack(blocks: Int[np.ndarray, "*n 3"]) -> Int[np.ndarray, "*n"]:
 
 def unpack(keys: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n 3"]:
     """Inverse of :func:`pack`."""
-    mask = (1 << 21) - 1
-    return np.stack([keys >> 42, (keys >> 21) & mask, keys & mask], axis=-1) - _OFFSET
+    return np.stack([keys >> 42, (keys >> 21) & _MASK, keys & _MASK], axis=-1) - _OFFSET
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +84,13 @@ class SparseVolume:
 
         def work(share: int, shares: int) -> None:
             for one, blocks in zip(maps, slots, strict=True):
-                own = blocks % shares == share
                 _integrate(
                     self.distance,
                     self.weight,
-                    blocks[own],
-                    unpack(one.keys[own]).astype(np.float64) * BLOCK,
+                    blocks,
+                    one.keys,
+                    share,
+                    shares,
                     self.voxel_mm,
                     one.cam_from_world.rotation,
                     one.cam_from_world.translation,
@@ -153,18 +154,36 @@ def _grown(array: Float[np.ndarray, "b v"], room: int) -> Float[np.ndarray, "r v
 @kernel
 @no_type_check
 def _integrate(
-    distance, weight, slots, origins, voxel, rotation, translation, plane, known, intrinsics, nearest, truncation, sign
+    distance,
+    weight,
+    slots,
+    keys,
+    share,
+    shares,
+    voxel,
+    rotation,
+    translation,
+    plane,
+    known,
+    intrinsics,
+    nearest,
+    truncation,
+    sign,
 ):
-    """Running weighted mean of the signed distance in each voxel of the blocks; with a sign of -1, without this one."""
+    """Running weighted mean of the signed distance in each voxel of a share of the blocks; with a sign of -1, without
+    this one."""
     seen = np.zeros(6)
     for n in range(slots.size):
+        if slots[n] % shares != share:
+            continue
         values, weights = distance[slots[n]], weight[slots[n]]
+        first, second, third = keys[n] >> 42, (keys[n] >> 21) & _MASK, keys[n] & _MASK  # as unpack
         for i in range(8):
             for j in range(8):
                 for k in range(8):
-                    x = (origins[n, 0] + i) * voxel
-                    y = (origins[n, 1] + j) * voxel
-                    z = (origins[n, 2] + k) * voxel
+                    x = ((first - _OFFSET) * BLOCK + i) * voxel
+                    y = ((second - _OFFSET) * BLOCK + j) * voxel
+                    z = ((third - _OFFSET) * BLOCK + k) * voxel
                     depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
                     if depth <= 0:
                         continue

@@ -1,7 +1,6 @@
 """The gum of a phantom as an implicit surface: an alveolar ridge, and a collar round each tooth."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -11,6 +10,7 @@ from scipy.spatial import cKDTree
 from cuspid.anatomy.phantom.arrangement import PlacedTooth
 from cuspid.anatomy.teeth.crowns import Crown, Points, Values, silhouettes, smooth_max, smooth_min
 from cuspid.geometry import lengths_along
+from cuspid.workers import computed_once
 
 ROOT = 0.7
 """Length of the root that is modelled, as a fraction of the crown height; it ends inside the gum."""
@@ -56,7 +56,7 @@ class Gum:
         """Unevenness of an individual."""
         return np.column_stack([rng.normal(0.0, 0.45, (WAVES, 3)), rng.uniform(0.0, 2 * np.pi, WAVES)])
 
-    @cached_property
+    @computed_once
     def _tree(self) -> cKDTree:
         return cKDTree(self.path)
 

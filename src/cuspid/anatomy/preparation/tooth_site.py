@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -21,6 +20,7 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh, edges_of
+from cuspid.workers import computed_once
 
 TURNS = 240
 """Directions round the axis in which a tooth is described."""
@@ -121,7 +121,7 @@ class ToothSite:
         angles, _ = self.polar(self.gum_margin)
         return round_means(angles, self.gum_margin[:, 2])
 
-    @cached_property
+    @computed_once
     def lean(self) -> Float[np.ndarray, "2"]:
         """Shift in x and y per mm of height of the line from the cervix to the middle of the occlusal surface."""
         vertices = self.surface.vertices
@@ -133,7 +133,7 @@ class ToothSite:
         x, y = (points[:, :2] - points[:, 2:] * self.lean).T
         return np.arctan2(y, x) % (2 * np.pi), np.hypot(x, y)
 
-    @cached_property
+    @computed_once
     def _sides(self) -> Mesh:
         angles, _ = self.polar(self.surface.face_centres)
         normals = self.surface.face_normals
@@ -156,7 +156,7 @@ class ToothSite:
     def _top(self) -> float:
         return float(self.surface.vertices[:, 2].max())
 
-    @cached_property
+    @computed_once
     def table(self) -> Heights:
         """The occlusal surface smoothed over `TABLE_MM` and continued level beyond its rim."""
         low, high = self.surface.vertices[:, :2].min(axis=0) - 1, self.surface.vertices[:, :2].max(axis=0) + 1
@@ -171,7 +171,7 @@ class ToothSite:
             smooth, [(x - low[0]) / GRID_MM, (y - low[1]) / GRID_MM], order=1, mode="nearest"
         )
 
-    @cached_property
+    @computed_once
     def edge(self) -> Heights:
         """The height of the incisal edge over x, smoothed over 0.3 mm, whatever y."""
         vertices = self.surface.vertices

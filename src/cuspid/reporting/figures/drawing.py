@@ -136,7 +136,7 @@ def render(
     y = upper[1] + margin - (np.arange(rows) + 0.5) * step
     across = (x[:, None] * axes[0] + (upper[2] + 1.0) * axes[2]).astype(np.float32)
     eye = (across + (y[:, None, None] * axes[1]).astype(np.float32)).reshape(-1, 3)
-    hits = mesh.cast(eye, np.broadcast_to(-axes[2].astype(np.float32), eye.shape))
+    hits = mesh.cast_on_all_cores(eye, np.broadcast_to(-axes[2].astype(np.float32), eye.shape))
     depth = hits.distances.reshape(rows, columns)
     canvas = _lit(mesh, hits, _crevices(depth, step).ravel(), axes).reshape(rows, columns, 3)
     pixels = cv2.resize(canvas, (width_px, rows // supersampling), interpolation=cv2.INTER_AREA)
