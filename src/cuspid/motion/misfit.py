@@ -87,14 +87,15 @@ class _Numbers:
     gradient: Float[np.ndarray, "n"]
 
     @computed_once
-    def _rest(self) -> tuple[Float[np.ndarray, "f f"], bool]:
-        return cho_factor(self.hessian[np.ix_(~self.held, ~self.held)], lower=True)
+    def _rest(self) -> Float[np.ndarray, "f f"]:
+        """The lower Cholesky factor of the equations of what is free."""
+        return np.asarray(cho_factor(self.hessian[np.ix_(~self.held, ~self.held)], lower=True)[0])
 
     @computed_once
     def _onto_held(self) -> Float[np.ndarray, "k n"]:
         """What is left of a gradient for the held numbers once the rest has followed."""
         onto = np.zeros((np.count_nonzero(self.held), len(self.held)))
-        following = cho_solve(self._rest, self.hessian[np.ix_(~self.held, self.held)])
+        following = cho_solve((self._rest, True), self.hessian[np.ix_(~self.held, self.held)])
         onto[:, self.held], onto[:, ~self.held] = np.eye(len(onto)), -following.T
         return onto
 
@@ -109,7 +110,7 @@ class _Numbers:
         onto, step = self._onto_held, np.zeros(len(self.held))
         generous = np.eye(len(onto)) / _GENEROUS**2
         step[self.held] = -np.linalg.solve(onto @ self.hessian @ onto.T + generous, onto @ self.gradient)
-        step[~self.held] = -cho_solve(self._rest, self.gradient[~self.held])
+        step[~self.held] = -cho_solve((self._rest, True), self.gradient[~self.held])
         step[~self.held] += onto[:, ~self.held].T @ step[self.held]
         return self.raw_from_numbers @ step
 
