@@ -39,6 +39,8 @@ class Maker:
     """In this folder, without its ending."""
     verbs: tuple[str, ...] = ()
     """Modules of ``cuspid.cli`` that it runs; ``*`` for all of them."""
+    runs: tuple[str, ...] = ()
+    """Further scripts in this folder, which it starts instead of importing them."""
     plain: bool = False
     """Whether surfaces without texture take part."""
     release: bool = False
@@ -54,7 +56,7 @@ _SCAN = ("scan", "jaws")
 MAKERS: Mapping[str, Maker] = {
     **dict.fromkeys(("molar-*", "arch", "real-arch", "spheres", "prepared-*"), Maker("run", _SCAN, release=True)),
     "motion-*": Maker("compare_motion", _SCAN),
-    "qualities": Maker("qualities", _SCAN),
+    "qualities": Maker("qualities", _SCAN, runs=("staged",)),
     "live": Maker("live", _SCAN),
     "mouth": Maker("mouth"),
     "measure": Maker("measure_jaws"),
@@ -147,7 +149,7 @@ def _is_text(statement: ast.AST) -> bool:
 
 def _made_by(maker: Maker) -> set[str]:
     """Files that take part."""
-    scripts = _scripts(maker.script)
+    scripts = set[Path]().union(*(_scripts(name) for name in (maker.script, *maker.runs)))
     roots = {name for script in scripts for name in _imported(script) if name.split(".")[0] == "cuspid"}
     every = [path.stem for path in (ROOT / "src/cuspid/cli").glob("*.py")]
     verbs = every if "*" in maker.verbs else maker.verbs

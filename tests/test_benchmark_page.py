@@ -54,6 +54,13 @@ def test_what_is_only_read_changes_no_result(freshness, repository, text):
     assert freshness.changes("jaws_half", {"commit": commit_of(repository)}) == ()
 
 
+def test_a_script_that_a_benchmark_starts_has_a_part_in_its_result(freshness, repository):
+    add(repository, "benchmarks/staged.py", "\nNEW = 1\n")
+    result = {"commit": commit_of(repository)}
+    assert freshness.changes("qualities", result) == ("benchmarks/staged.py",)
+    assert freshness.changes("live", result) == ()
+
+
 def test_a_change_ends_what_it_made_and_nothing_else(freshness, repository):
     add(repository, REFINEMENT, "\nNEW = 1\n")
     result = {"commit": commit_of(repository)}

@@ -17,8 +17,9 @@ from cuspid.rig import Rig
 from cuspid.workers import map_slices
 
 _NEAREST = 4
-_AT_ONCE = 50_000
 """Number of nearest points from which a vertex is judged."""
+_AT_ONCE = 50_000
+"""Vertices that are judged together; the nearest points of millions would take gigabytes."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
