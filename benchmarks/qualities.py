@@ -77,11 +77,13 @@ def main() -> None:
     parser.add_argument("--quality", nargs="+", choices=get_args(Quality), default=get_args(Quality))
     parser.add_argument("--cores", nargs="+", type=int, help="numbers of cores; default: all and one")
     options = parser.parse_args()
+    cores, known = core_numbers(), Known()
+    if options.cores and not all(1 <= count <= len(cores) for count in options.cores):
+        parser.error(f"--cores: this process may use 1 to {len(cores)}")
     scan, log = options.work / "scan", options.work / "log.txt"
     options.work.mkdir(parents=True, exist_ok=True)
     jaw = [] if options.jaw is None else [str(options.jaw)]
     run_timed("simulate", *jaw, *ONE_PASS, "--out", str(scan), log=log)
-    cores, known = core_numbers(), Known()
     measured(scan, "draft", cores, log, known)
     begun = conditions()  # the load before, not that of the runs
     images = len(list((scan / "capture" / "images").rglob("*.png")))

@@ -225,7 +225,7 @@ class Mesh:
     def cast_on_all_cores(
         self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"], farthest: float = np.inf
     ) -> RayHits:
-        """As :meth:`cast`."""
+        """As :meth:`cast`, with the rays distributed over all cores."""
         parts = map_slices(lambda part: self.cast(origins[part], directions[part], farthest), len(origins))
         return RayHits(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(RayHits)))
 

@@ -1,4 +1,4 @@
-"""How many cores this process may use, and the distribution of work over them."""
+"""How many cores this process may use, the distribution of work over them, and properties that threads share."""
 
 from __future__ import annotations
 

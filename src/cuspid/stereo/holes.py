@@ -100,18 +100,18 @@ class Views:
         """The views of images of located frames. A place is hidden by a depth that is nearer by more than
         ``agreement_mm``; if an image has no depth map, nothing is hidden."""
 
-        def seen(depth_map: DepthMap) -> tuple[Image, Bool[np.ndarray, "p"]]:
+        def by_depth(depth_map: DepthMap) -> tuple[Image, Bool[np.ndarray, "p"]]:
             cam_from_world = depth_map.cam_from_rig @ found.rig_from_world[depth_map.frame]
-            facing = _facing(places, depth_map.camera, cam_from_world)
-            facing[facing] = ~_hidden(depth_map, cam_from_world.apply(places.points[facing]), agreement_mm)
-            return (depth_map.frame, depth_map.camera_name), facing
+            shows = _facing(places, depth_map.camera, cam_from_world)
+            shows[shows] = ~_hidden(depth_map, cam_from_world.apply(places.points[shows]), agreement_mm)
+            return (depth_map.frame, depth_map.camera_name), shows
 
-        def facing(image: Image) -> tuple[Image, Bool[np.ndarray, "p"]]:
+        def without_depth(image: Image) -> tuple[Image, Bool[np.ndarray, "p"]]:
             mounted = found.rig[image[1]]
             return image, _facing(places, mounted.camera, mounted.cam_from_rig @ found.rig_from_world[image[0]])
 
-        shown = dict(map_ahead(seen, (each for each in depth_maps if each.frame in found.rig_from_world)))
-        return Views(len(places.points), shown | dict(map_in_threads(facing, set(images) - set(shown))))
+        shown = dict(map_ahead(by_depth, (each for each in depth_maps if each.frame in found.rig_from_world)))
+        return Views(len(places.points), shown | dict(map_in_threads(without_depth, set(images) - set(shown))))
 
     def both(self, one: Image, other: Image) -> Int[np.ndarray, "_"]:
         """Indices of the places that two images show."""

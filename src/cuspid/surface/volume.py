@@ -24,9 +24,10 @@ BLOCK = 8
 
 _NOTHING = 1e-4
 """Weight, as a share of that of what was taken out, below which nothing but rounding is left."""
-_MASK = (1 << 21) - 1
 _OFFSET = 1 << 20
 """Added to block coordinates so that packed keys are positive: room for a million blocks in each direction."""
+_MASK = (1 << 21) - 1
+"""The bits of a coordinate in a packed key."""
 
 
 def pack(blocks: Int[np.ndarray, "*n 3"]) -> Int[np.ndarray, "*n"]:
