@@ -229,6 +229,7 @@ _JAW_COLUMNS = {
     "mean of everything um": "everything_mean_um",
     "of what could be seen, within 50 um %": "seen_complete_50_um_pct",
     "of open crown, within 50 um %": "crown_complete_50_um_pct",
+    "inter-molar um": "inter_molar_um",
     "images to mesh, CPU s": "reconstruction_cpu_s",
     "peak GB": "peak_gb",
 }

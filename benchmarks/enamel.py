@@ -1,20 +1,23 @@
-"""Scan teeth of plain wet enamel, without texture, under lights of three colours or what a handpiece has instead.
+"""Scan teeth and arches of plain wet enamel, without texture, under lights of three colours or what a handpiece has
+instead.
 
     python benchmarks/enamel.py FOLDER [--work build/enamel] [--only phantom] [--add]
 
 FOLDER holds labelled meshes of real jaws. Each case is one tooth with what is seen around it, 10 frames or more of
-twelve cameras; the variants take away one ingredient at a time, have clinical optics, or are reconstructed as if there
-were texture. Finished scans are kept in the work folder and not run again; ``--add`` keeps those of the result file,
+twelve cameras, or a whole arch in one pass of 100 frames or more; the variants take away one ingredient at a time, have
+clinical optics, twice the frames, or are reconstructed as if there were texture. Finished scans are kept in the work
+folder and not run again, one that was cut short goes on where it stopped; ``--add`` keeps those of the result file,
 too, each with the commit that it is of.
 """
 
 from __future__ import annotations
 
 import argparse
-import tempfile
+import shutil
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -40,14 +43,19 @@ HERE = Path(__file__).parent
 PHANTOMS = {0: 46, 1: 36, 2: 46}
 """Tooth by seed of a lower jaw."""
 REAL = {"005_upper": 11, "010_upper": 16, "023_lower": 36, "034_upper": 21, "048_lower": 43}
-VARIANTS = ("glossy", "white-crossed", "white")
-"""Colour-coded without polarisers; white with them; white without: of the phantom of seed 0."""
+DENSE = 20
+"""Frames of a tooth that is scanned with twice as many as usual."""
+ARCHES = {"arch-phantom": "0", "arch-upper": "fullarch_upper_137k"}
+VARIANTS = ("glossy", "white-crossed", "white", "in-turn")
+"""Colour-coded without polarisers; white with them; white without; six LEDs a group in turn without: of the phantom of
+seed 0."""
 METHODS = {
     "as-texture": ReconstructionOptions(signal="texture"),
     "colmap": ReconstructionOptions(signal="texture", motion="colmap"),
 }
 """How else the images of the phantom of seed 0 are reconstructed: by keypoints and correlation, with cuspid's motion or
 COLMAP's."""
+_TEXTURED: dict[str, Value] = {"light": "white", "optics": "clinical", "texture": "artificial"}
 
 
 def cases(folder: Path) -> Iterator[Case]:
@@ -59,20 +67,37 @@ def cases(folder: Path) -> Iterator[Case]:
     for name, jaw in phantoms.items():
         yield Case(name=name, parameters={**jaw, **plain})
         yield Case(name=f"{name}-clinical", parameters={**jaw, **plain, "optics": "clinical"})
-        textured: dict[str, Value] = {"light": "white", "optics": "clinical", "texture": "artificial"}
-        yield Case(name=f"{name}-artificial-clinical", parameters={**jaw, **textured})
+        dense: dict[str, Value] = {"optics": "clinical", "frames": DENSE}
+        yield Case(name=f"{name}-clinical-dense", parameters={**jaw, **plain, **dense})
+        yield Case(name=f"{name}-artificial-clinical", parameters={**jaw, **_TEXTURED})
     for light in VARIANTS:
         yield Case(name=f"phantom-0-{light}", parameters={**phantoms["phantom-0"], **plain, "light": light})
+    in_turn: dict[str, Value] = {"light": "in-turn", "frames": DENSE}
+    for name, jaw in phantoms.items():
+        yield Case(name=f"{name}-in-turn-dense", parameters={**jaw, **plain, **in_turn})
     for method in METHODS:
         yield Case(name=f"phantom-0-{method}", parameters={**phantoms["phantom-0"], **plain, "method": method})
     for name, tooth in REAL.items():
-        file = next(iter(folder.rglob(f"{name}.ply")), None)
+        file = _file_of(name, folder)
         if file is not None:
-            yield Case(name=name, parameters={"jaw": str(file), "tooth": tooth, **plain})
+            yield Case(name=name, parameters={"jaw": file, "tooth": tooth, **plain})
+    for name, jaw_name in ARCHES.items():
+        file = jaw_name if jaw_name.isdigit() else _file_of(jaw_name, folder)
+        if file is not None:
+            whole: dict[str, Value] = {"jaw": file, "tooth": None}
+            yield Case(name=name, parameters={**whole, **plain})
+            yield Case(name=f"{name}-clinical", parameters={**whole, **plain, "optics": "clinical"})
+            yield Case(name=f"{name}-artificial-clinical", parameters={**whole, **_TEXTURED})
+
+
+def _file_of(name: str, folder: Path) -> str | None:
+    return next(map(str, folder.rglob(f"{name}.ply")), None)
 
 
 def lit(light: str) -> Handpiece:
     """The twelve cameras under one kind of light."""
+    if light == "in-turn":
+        return twelve_cameras(DesignOptions(lights="in-turn"))
     coded = light in ("coded", "glossy")
     made = twelve_cameras(DesignOptions(lights="colour-coded" if coded else "white"))
     glare = {"glossy": 1.0, "white-crossed": 0.03}.get(light)
@@ -89,15 +114,25 @@ def jaw_of(name: str) -> Jaw:
 
 
 def judge(
-    *, jaw: str, tooth: int, light: str, optics: Literal["ideal", "clinical"], texture: Preset, method: str = ""
+    *,
+    jaw: str,
+    tooth: int | None,
+    light: str,
+    optics: Literal["ideal", "clinical"],
+    texture: Preset,
+    frames: int | None = None,
+    method: str = "",
+    scans: Path,
 ) -> dict[str, Value]:
-    """The figures of one scan."""
+    """The figures of one scan. One that was cut short goes on where it stopped; a finished one is not kept."""
     begin = time.perf_counter()
-    with tempfile.TemporaryDirectory(prefix="cuspid-enamel-") as folder:
-        path, seen_by = ScanPathOptions(tooth=tooth), OpticsOptions(optics=optics)
-        options = SimulationOptions(texture=texture, optics=seen_by, path=path)
-        how = METHODS.get(method, ReconstructionOptions())
-        found = scanned(jaw_of(jaw), lit(light), Path(folder), options, how)
+    what = "arch" if tooth is None else f"{tooth}-{frames or 'usual'}"
+    folder = scans / "-".join([Path(jaw).stem, what, light, optics, texture, method])
+    path = ScanPathOptions(tooth=tooth, frames=frames, passes="turns" if tooth is None else None)
+    options = SimulationOptions(texture=texture, optics=OpticsOptions(optics=optics), path=path)
+    how = METHODS.get(method, ReconstructionOptions())
+    found = scanned(jaw_of(jaw), lit(light), folder, options, how)
+    shutil.rmtree(folder)
     return {"commit": commit(), **found, "wall_s": time.perf_counter() - begin}
 
 
@@ -114,7 +149,7 @@ def main() -> None:
     chosen = [each for each in known if arguments.only is None or is_asked(each.name, arguments.only, known)]
     outcomes = run_grid(
         chosen,
-        judge,
+        partial(judge, scans=arguments.work / "unfinished"),
         arguments.work,
         workers=1,
         progress=lambda stage, done, total: print(f"{stage}: {done} of {total}", flush=True),

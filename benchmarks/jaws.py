@@ -184,6 +184,7 @@ def scanned(
         "seen_complete_50_um_pct": found.completeness_pct["50"],
         "crown_complete_50_um_pct": None if crown is None else crown.completeness_pct["50"],
         "scale_ppm": found.scale_error_ppm,
+        "inter_molar_um": found.inter_molar_error_um,
         "reconstruction_s": took if whole else None,
         "reconstruction_cpu_s": took_cpu if whole else None,
         "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,

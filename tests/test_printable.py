@@ -116,8 +116,9 @@ def test_a_holder_does_not_depend_on_the_frame(name):
 
 
 @pytest.mark.parametrize("name", DESIGNS)
-def test_colour_coded_lights_have_a_holder_that_no_light_shines_into(name):
-    check_printable(printable(DESIGNS[name](DesignOptions(lights="colour-coded"))), PrintOptions())
+@pytest.mark.parametrize("lights", ["colour-coded", "in-turn"])
+def test_coloured_lights_have_a_holder_that_no_light_shines_into(name, lights):
+    check_printable(printable(DESIGNS[name](DesignOptions(lights=lights))), PrintOptions())
 
 
 def test_a_ring_of_lights_that_another_head_blocks_is_told():

@@ -58,9 +58,10 @@ class Probe(Options):
 
     design: Literal["two", "four", "six", "twelve"] = "twelve"
     """Built-in design: a stereo pair, the essential four cameras, six cameras (use with --turns 3), or all twelve."""
-    lights: Literal["white", "colour-coded"] | None = None
+    lights: Literal["white", "colour-coded", "in-turn"] | None = None
     """LEDs of a built-in design: white ones, or red, green and blue ones behind crossed polarisers, which plain enamel
-    needs (default: white, but colour-coded with --texture enamel)."""
+    needs, or two such triples that take turns, without polarisers (default: white, but colour-coded with --texture
+    enamel)."""
     handpiece: Path | None = None
     """Your own handpiece.json, or COLMAP's rig_config.json, instead of a built-in design."""
     working_distance_mm: Annotated[float | None, Range(0.1, 100_000)] = None

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import product
 from types import MappingProxyType
 from typing import Annotated, Literal
 
@@ -57,11 +58,12 @@ class DesignOptions(Options):
     only)."""
     outer_tilt_deg: Annotated[float, Range(-89, 89)] = 0.0
     """How far the axes of these two tilt towards the middle of the tooth (six cameras only)."""
-    lights: Literal["white", "colour-coded"] = "white"
+    lights: Literal["white", "colour-coded", "in-turn"] = "white"
     """white: four LEDs among the cameras of each group. colour-coded: a red, a green and a blue one about each group,
-    with crossed polarisers before them and the lenses, which scan plain enamel."""
+    with crossed polarisers before them and the lenses, which scan plain enamel. in-turn: without polarisers, but with
+    three more LEDs between these, which are on in every second exposure: mirror reflections then lie elsewhere."""
     ring_mm: Annotated[float, Range(0.01, 1000)] = 4.5
-    """Distance of colour-coded LEDs from the middle of their group. The farther apart they are, the more their shades
+    """Distance of coloured LEDs from the middle of their group. The farther apart they are, the more their shades
     differ; much farther, and an LED shines into what carries another group."""
     holder: HolderOptions = field(default_factory=HolderOptions)
     """What carries cameras and LEDs."""
@@ -93,14 +95,10 @@ def six_cameras(options: DesignOptions = DesignOptions()) -> Handpiece:
     """
     four = _four(options)
     cameras = {f"o{5 + k}": _outer_camera(options, side) for k, side in enumerate((+1, -1))}
-    lights = {} if options.lights == "colour-coded" else _outer_lights(options)
-    six = replace(
-        four,
-        rig=Rig({**four.rig.cameras, **cameras}),
-        lights={**four.lights, **lights},
-        lightings=(Lighting(name="all", lights=(*four.lights, *lights)),),
-        name="six-cameras",
-    )
+    six = replace(four, rig=Rig({**four.rig.cameras, **cameras}), name="six-cameras")
+    if options.lights == "white":
+        lights = {**four.lights, **_outer_lights(options)}
+        six = replace(six, lights=lights, lightings=_together(lights))
     return with_holder(six, options.holder)
 
 
@@ -116,14 +114,13 @@ def _four(options: DesignOptions) -> Handpiece:
 
 def _handpiece(name: str, views: Mapping[str, Rigid3], options: DesignOptions) -> Handpiece:
     cameras: dict[str, MountedCamera] = {}
-    lights: dict[str, Light] = {}
     for prefix, group_from_rig in views.items():
         cameras |= _group_cameras(prefix, group_from_rig, options)
-        lights |= (_group_lights if options.lights == "white" else _coded_lights)(prefix, group_from_rig, options)
+    lights, lightings = _lit(views, options)
     return Handpiece(
         rig=Rig(cameras),
         lights=lights,
-        lightings=(Lighting(name="all", lights=tuple(lights)),),
+        lightings=lightings,
         working_distance_mm=options.working_distance_mm,
         depth_range_mm=depth_of_field_mm(options.working_distance_mm),
         name=name,
@@ -184,6 +181,23 @@ def _group_cameras(prefix: str, group_from_rig: Rigid3, options: DesignOptions) 
     }
 
 
+def _lit(views: Mapping[str, Rigid3], options: DesignOptions) -> tuple[dict[str, Light], tuple[Lighting, ...]]:
+    """The LEDs about all groups, and which of them are on together."""
+    if options.lights == "white":
+        white = {name: light for view in views.items() for name, light in _group_lights(*view, options).items()}
+        return white, _together(white)
+    in_turn = options.lights == "in-turn"
+    first = _coded_lights(views, options, glare=1.0 if in_turn else _CROSSED)
+    if not in_turn:
+        return first, _together(first)
+    second = _coded_lights(views, options, glare=1.0, turned_deg=_BETWEEN_DEG, suffix="2")
+    return first | second, (Lighting(name="first", lights=tuple(first)), Lighting(name="second", lights=tuple(second)))
+
+
+def _together(lights: Mapping[str, Light]) -> tuple[Lighting, ...]:
+    return (Lighting(name="all", lights=tuple(lights)),)
+
+
 def _group_lights(prefix: str, group_from_rig: Rigid3, options: DesignOptions) -> dict[str, Light]:
     """Four LEDs in the plane of the cameras, at the corners between them, shining along the axes."""
     across, along = options.baseline_across_mm / 2, options.baseline_along_mm
@@ -201,21 +215,23 @@ _CODED = {"r": ((1.0, 0.0, 0.0), 1.0, 150.0), "g": ((0.0, 1.0, 0.0), 1.0, 270.0)
 image anticlockwise: of a group beside the teeth two at the height of the cusps, one nearer to the gum."""
 _CROSSED = 0.03
 """Share of a mirror reflection that passes crossed polarising films."""
+_BETWEEN_DEG = 60.0
+"""How far a second triple of LEDs is turned about its group, to stand between those of the first."""
 
 
-def _coded_lights(prefix: str, group_from_rig: Rigid3, options: DesignOptions) -> dict[str, Light]:
-    """Three LEDs in the plane of the cameras, on a ring about them, shining along the axes through polarisers."""
-    rig_from_group = group_from_rig.inverse()
-    axis = rig_from_group.rotate(np.array([0, 0, 1.0]))
+def _coded_lights(
+    views: Mapping[str, Rigid3], options: DesignOptions, *, glare: float, turned_deg: float = 0.0, suffix: str = ""
+) -> dict[str, Light]:
+    """Three LEDs in the plane of the cameras of each group, on a ring about them, shining along the axes."""
     lights = {}
-    for name, (colour, power, turn_deg) in _CODED.items():
-        turn = np.deg2rad(turn_deg)
-        place = options.ring_mm * np.array([np.cos(turn), -np.sin(turn), 0.0])
-        lights[f"{prefix}{name}"] = Light(
+    for (prefix, group_from_rig), (name, (colour, power, place_deg)) in product(views.items(), _CODED.items()):
+        rig_from_group, angle = group_from_rig.inverse(), np.deg2rad(place_deg + turned_deg)
+        place = options.ring_mm * np.array([np.cos(angle), -np.sin(angle), 0.0])
+        lights[f"{prefix}{name}{suffix}"] = Light(
             position_mm=rig_from_group.apply(place),
-            direction=axis,
+            direction=rig_from_group.rotate(np.array([0, 0, 1.0])),
             power=power,
             colour=np.array(colour),
-            glare=_CROSSED,
+            glare=glare,
         )
     return lights

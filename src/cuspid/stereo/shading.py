@@ -26,7 +26,7 @@ from typing import Annotated, NamedTuple, no_type_check
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from cuspid.camera import Camera
 from cuspid.geometry import unit
@@ -62,6 +62,9 @@ _SIGMA_PX, _LEAST_VARIANCE = 1.7, 1e-9
 """Standard deviation (px) of a depth whose fit gives 1 px, and the least variance of a fit. Errors are as the square
 root of what fits give: samples that overlap understate them, a smooth start keeps them small where images tell little.
 """
+_POOLED_PX, _TINY = 2.0, 1e-12
+"""Standard deviation, in pixels of the depth map, of the weight by which neighbours tell how well a smooth surface is
+known."""
 _SLANT_DAMPING = 3.0
 """Added to the normal equations of the slants, for each camera: what DN^2 of slope would add."""
 
@@ -104,7 +107,7 @@ class ShadingOptions(Options):
     """Refractive index of the surface, by which less of its light leaves it at grazing angles; 1 for what is matte.
     Only lights of one colour need it."""
     confidence: ConfidenceOptions = field(
-        default_factory=lambda: ConfidenceOptions(agreement_sigmas=1.0, largest_sigma=3.0, best_sigma=1.0)
+        default_factory=lambda: ConfidenceOptions(agreement_sigmas=1.0, largest_sigma=4.0, best_sigma=1.0)
     )
     """Checks and weights. Shade is broad: the limits are wider than those for texture. Smooth surfaces agree easily
     where two cameras are deceived alike, so that standard deviations excuse less."""
@@ -566,16 +569,23 @@ class _Refinement:
         fit = self._fit._replace(lenient=lenient)
         found = _refine_all(view, fit, self._rows, self._columns, self._planes)
         sigma = _SIGMA_PX * np.maximum(found[..., 1], _LEAST_VARIANCE) ** 0.25
-        q = smoothed(np.where(found[..., 2] > 0, found[..., 0], np.nan), sigma, self._bend_px, self._colours)
+        known = found[..., 2] > 0
+        q = smoothed(np.where(known, found[..., 0], np.nan), sigma, self._bend_px, self._colours)
         self._restart(q)
         scale = self._geometry.scale
-        return scale / q, sigma * scale / q**2
+        return scale / q, _pooled(sigma, known) * scale / q**2
 
     def _restart(self, q: Float[np.ndarray, "rows columns"]) -> None:
         """From a smooth surface, next time, where it is known."""
         along = [_slope(q, axis) / self._spacing_px for axis in (1, 0)]
         for channel, values in enumerate((q, *along)):
             self._planes[..., channel] = np.where(np.isfinite(values), values, self._planes[..., channel])
+
+
+def _pooled(sigma: Float[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Standard deviation of a smooth surface, of which neighbours tell, too; NaN where it is not known."""
+    precision = cv2.GaussianBlur(np.where(known, sigma, np.inf) ** -2, (0, 0), _POOLED_PX)
+    return np.where(known, np.maximum(precision, _TINY) ** -0.5, np.nan)
 
 
 def _slope(values: Float[np.ndarray, "h w"], axis: int) -> Float[np.ndarray, "h w"]:
