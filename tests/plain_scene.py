@@ -26,9 +26,9 @@ WAY = {
 }
 
 
-def lit(*, glare: float = 0.0, sensors: Mapping[str, Sensor] | None = None) -> Handpiece:
+def lit(*, glare: float = 0.0, sensors: Mapping[str, Sensor] | None = None, turned_deg: float = 0.0) -> Handpiece:
     """Four cameras within a ring of three lights."""
-    turns = np.deg2rad([90, 210, 330])
+    turns = np.deg2rad(np.array([90, 210, 330]) + turned_deg)
     lights = {
         name: Light(
             position_mm=3 * np.array([np.cos(turn), np.sin(turn), 0.0]),

@@ -178,6 +178,29 @@ def test_colour_coded_lights_ring_each_group_of_the_same_cameras(name: str) -> N
 
 
 @pytest.mark.parametrize("name", DESIGNS)
+def test_lights_in_turn_are_two_triples_between_each_other_without_polarisers(name: str) -> None:
+    coded, made = (DESIGNS[name](DesignOptions(lights=lights)) for lights in ("colour-coded", "in-turn"))
+    first, second = (each.lights for each in made.lightings)
+    assert set(first) == set(coded.lights)
+    assert set(first) | set(second) == set(made.lights)
+    assert len(first) == len(second) == len(made.lights) / 2
+    ring = DesignOptions().ring_mm
+    for light_name in first:
+        one, other = made.lights[light_name], made.lights[f"{light_name}2"]
+        np.testing.assert_array_equal(one.position_mm, coded.lights[light_name].position_mm)
+        np.testing.assert_array_equal(one.colour, other.colour)
+        assert np.linalg.norm(one.position_mm - other.position_mm) == pytest.approx(ring)  # a sixth of a turn
+        assert one.glare == other.glare == 1.0
+    apart = [
+        np.linalg.norm(made.lights[one].position_mm - made.lights[other].position_mm)
+        for one in first
+        for other in second
+        if one[0] == other[0]
+    ]
+    assert min(apart) == pytest.approx(ring)
+
+
+@pytest.mark.parametrize("name", DESIGNS)
 def test_designs_are_symmetric(name: str) -> None:
     handpiece = DESIGNS[name](DesignOptions(outer_tilt_deg=20.0))
     mirrored = np.array([1, -1, 1])

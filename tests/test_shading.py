@@ -12,6 +12,7 @@ import pytest
 from cuspid.geometry import Rigid3
 from cuspid.reconstruction import DepthMap
 from cuspid.rig import Handpiece, Rig, Sensor
+from cuspid.stereo import shading
 from cuspid.stereo.matching import DepthEstimator, StereoOptions, gray
 from cuspid.stereo.refinement import RefinementOptions
 from cuspid.stereo.shading import ShadingOptions
@@ -114,13 +115,32 @@ def test_mirror_reflections_make_it_worse(images: dict[str, np.ndarray]) -> None
     assert known_share(glossy) < 0.8 * known_share(measured(lit(), images))
 
 
-@pytest.mark.parametrize(
-    "shading", [{"sweep_spacing": 100}, {"sweep_step_px": 100.0}, {"radius_px": 1}, {"radius_px": 7}]
-)
-def test_extreme_options_give_fewer_depths_not_an_error(
-    images: dict[str, np.ndarray], shading: dict[str, float]
-) -> None:
-    options = replace(OPTIONS, shading=ShadingOptions(**shading))
+def test_some_of_what_is_mirrored_is_seen_under_lights_between(images: dict[str, np.ndarray]) -> None:
+    def known(turned_deg: float) -> np.ndarray:
+        glossy = lit(glare=1.0, turned_deg=turned_deg)
+        return np.stack([each.known for each in measured(glossy, of_one_frame(photographs(glossy, FRAME)))])
+
+    first, second = known(0.0), known(60.0)
+    assert 0.2 < first.mean() < 0.8
+    assert 1.05 * max(first.mean(), second.mean()) < (first | second).mean() < known_share(measured(lit(), images))
+
+
+def test_neighbours_tell_how_well_a_smooth_surface_is_known() -> None:
+    sigma, known = np.full((40, 50), 3.0), np.ones((40, 50), dtype=bool)
+    assert shading._pooled(sigma, known) == pytest.approx(3.0)
+    sigma[20, 20] = 30.0
+    assert 3.0 < shading._pooled(sigma, known)[20, 20] < 3.2
+    sigma[20, 20], known[:, 25:] = np.nan, False
+    known[20, 20] = False
+    pooled = shading._pooled(sigma, known)
+    assert np.array_equal(np.isfinite(pooled), known)
+    assert 3.5 < pooled[20, 24] < 3.0 * np.sqrt(2.0)  # little more than half of its neighbours are known
+    assert shading._pooled(7 * sigma, known)[known] == pytest.approx(7 * pooled[known])
+
+
+@pytest.mark.parametrize("how", [{"sweep_spacing": 100}, {"sweep_step_px": 100.0}, {"radius_px": 1}, {"radius_px": 7}])
+def test_extreme_options_give_fewer_depths_not_an_error(images: dict[str, np.ndarray], how: dict[str, float]) -> None:
+    options = replace(OPTIONS, shading=ShadingOptions(**how))
     maps = DepthEstimator(lit(), options, signal="shading").measure(images, "00000")
     assert len(maps) == 4
     assert np.sum(np.abs(errors_um(maps)) > 200) <= 0.05 * len(errors_um(maps))
