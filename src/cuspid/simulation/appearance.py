@@ -41,7 +41,8 @@ class Material:
     exit_index: float = 1.0
     """Refractive index by which less of the scattered light leaves at grazing angles; 1 is matte."""
     scattering_mm: Colour = (0.0, 0.0, 0.0)
-    """How far red, green and blue light travels below the surface; only Blender renders it."""
+    """How far red, green and blue light travels below the surface; Blender renders it always, Embree where the optics
+    ask for it."""
     applied: bool = False
     """Whether the texture is sprayed or painted on, as fine as the cameras need it, rather than the surface's own."""
 
@@ -123,6 +124,11 @@ class Palette(NamedTuple):
     """Number of octaves of each material."""
     noise_from_jaw: np.ndarray
     """(material, octave, 3, 4): rotation, scale and shift of each octave, so that their lattices never coincide."""
+
+
+def scattering_mm(appearance: Appearance, materials: UInt8[np.ndarray, "f"]) -> Float[np.ndarray, "f 3"]:
+    """How far light of each colour travels below each face."""
+    return np.array([appearance.enamel.scattering_mm, appearance.gum.scattering_mm])[materials]
 
 
 NO_MATERIAL = 255

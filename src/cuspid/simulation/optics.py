@@ -34,6 +34,8 @@ class Optics:
     readout: float = 0.0
     """Rolling shutter: share of the time from one frame to the next in which the rows are exposed one after the other,
     from the first to the last; 0 for all at once."""
+    scattering: float = 0.0
+    """How far light travels below the surface, as a multiple of what is known of teeth and gums; 0 for not at all."""
     saliva: float = 0.0
     """Share of the surface under a film of saliva, which mirrors the lights sharply."""
     crosstalk: float = 0.0
@@ -65,6 +67,9 @@ class OpticsOptions(Options):
     readout: Annotated[float | None, SHARE] = None
     """Rolling shutter: share (0 to 1) of the time from one frame to the next in which the rows are exposed one after
     the other; 0 for all at once. The true pose of a frame is that of its middle."""
+    scattering: Annotated[float | None, Range(0, 10)] = None
+    """How far light travels below the surface before it leaves it, as a multiple of what is known of enamel (0.3 to 0.5
+    mm, by colour) and gums; 0 for not at all."""
     saliva: Annotated[float | None, SHARE] = None
     """Share (0 to 1) of the teeth under a film of saliva, which mirrors the lights sharply."""
     crosstalk: Annotated[float | None, Range(0, 1 / 3)] = None

@@ -2,9 +2,10 @@
 
 Each ray through a pixel gives the albedo of the solid texture at the hit, lit by the lights that are on, each a point
 light with a lobe and 1/d^2 falloff, through a GGX coat with Schlick's Fresnel term (Walter et al. 2007). Shadows are
-traced once for each surface in a pixel. Interreflection is a constant share of the light that reaches a point. Radiance
-is linear RGB in units in which a white diffuse surface facing a light of power 1 at 1 mm has radiance 1 plus that
-share. The world is the frame of the jaw.
+traced once for each surface in a pixel. Interreflection is a constant share of the light that reaches a point. Where
+light travels below the surface, what enters is known at the vertices, and spreads among them
+(:mod:`cuspid.simulation.scattering`). Radiance is linear RGB in units in which a white diffuse surface facing a light
+of power 1 at 1 mm has radiance 1 plus that share. The world is the frame of the jaw.
 """
 
 from __future__ import annotations
@@ -29,8 +30,17 @@ from cuspid.jaw import Jaw
 from cuspid.kernels import kernel
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece, MountedCamera
-from cuspid.simulation.appearance import NO_MATERIAL, Appearance, Palette, albedo, face_materials, palette
+from cuspid.simulation.appearance import (
+    NO_MATERIAL,
+    Appearance,
+    Palette,
+    albedo,
+    face_materials,
+    palette,
+    scattering_mm,
+)
 from cuspid.simulation.optics import IDEAL, Optics, mixed, recorded, through_lens
+from cuspid.simulation.scattering import Scattering
 from cuspid.simulation.sensor import record
 from cuspid.workers import computed_once
 
@@ -96,6 +106,24 @@ class Scene:
         """The materials as arrays for the compiled shading."""
         return palette(self.appearance, self.seed, self.optics.saliva)
 
+    @computed_once
+    def scattering(self) -> Scattering | None:
+        """How light spreads below the surface; None if it does not."""
+        lengths = self.optics.scattering * scattering_mm(self.appearance, self.surface.materials)
+        return Scattering(self.jaw.mesh, lengths) if lengths.any() else None
+
+    @computed_once
+    def below(self) -> Callable[[str | None, Rigid3], Float[np.ndarray, "v 3"]]:
+        """The light that leaves each vertex from below under a lighting pattern, by the pose of the handpiece
+        (``rig_from_world``), cached for the last ones; of no vertex where light does not travel below the surface."""
+        return lru_cache(maxsize=1)(self._below)
+
+    def _below(self, lighting: str | None, rig_from_world: Rigid3) -> Float[np.ndarray, "v 3"]:
+        if self.scattering is None:
+            return _NONE
+        lights = lamps(self.handpiece, lighting, rig_from_world)
+        return self.scattering.leaving(_entering_light(self, lights))
+
 
 class ShadedMesh(NamedTuple):
     """A mesh as arrays for the compiled shading."""
@@ -104,6 +132,10 @@ class ShadedMesh(NamedTuple):
     face_normals: np.ndarray
     vertex_normals: np.ndarray
     materials: np.ndarray
+
+
+_NONE: Float[np.ndarray, "0 3"] = np.zeros((0, 3))
+"""Light from below the surface, where there is none."""
 
 
 class Lamps(NamedTuple):
@@ -152,11 +184,13 @@ def radiance(
     camera: Camera,
     cam_from_world: Rigid3,
     lights: Lamps,
+    below: Float[np.ndarray, "v 3"] = _NONE,
     smear: Float[np.ndarray, "6"] | None = None,
     row: int | None = None,
 ) -> Float[np.ndarray, "h w 3"]:
     """Linear light at each pixel, or at those of one row, averaged over the pixel's area and, with a smear (rotation
-    vector and shift of the jaw in its own frame during the exposure), over time; 0 where nothing is hit."""
+    vector and shift of the jaw in its own frame during the exposure), over time; 0 where nothing is hit. ``below``: see
+    :attr:`Scene.below`."""
     rays = scene.rays(camera)
     if row is not None:
         rays = rays.reshape(camera.height, -1, 3)[row]
@@ -167,7 +201,7 @@ def radiance(
         world_from_cam = (cam_from_world @ Rigid3.from_rotation_vector(motion[:3], motion[3:])).inverse()
         directions[index :: len(moments)] = _turned(rays[index :: len(moments)], world_from_cam.rotation)
         origins[index :: len(moments)] = world_from_cam.translation
-    return radiance_along(scene, origins, directions, lights).reshape(-1, camera.width, 3)
+    return radiance_along(scene, origins, directions, lights, below).reshape(-1, camera.width, 3)
 
 
 def _row_by_row(
@@ -179,13 +213,15 @@ def _row_by_row(
     smear: Float[np.ndarray, "6"] | None,
 ) -> Float[np.ndarray, "h w 3"]:
     """As :func:`radiance`, if the rows are exposed one after the other while the jaw moves in its own frame by
-    ``motion`` (rotation vector and shift) from one frame to the next. The lights go along with the camera."""
+    ``motion`` (rotation vector and shift) from one frame to the next. The lights go along with the camera; what is
+    softened below the surface is that of the middle row."""
     camera, rows = mounted.camera, []
+    below = scene.below(lighting, rig_from_world)
     for row in range(camera.height):
         moved = scene.optics.readout * ((row + 0.5) / camera.height - 0.5) * motion
         then = rig_from_world @ Rigid3.from_rotation_vector(moved[:3], moved[3:])
         lights = lamps(scene.handpiece, lighting, then)
-        rows.append(radiance(scene, camera, mounted.cam_from_rig @ then, lights, smear, row))
+        rows.append(radiance(scene, camera, mounted.cam_from_rig @ then, lights, below, smear, row))
     return np.concatenate(rows)
 
 
@@ -216,15 +252,20 @@ def smeared(motion: Float[np.ndarray, "6"], rig_from_world: Rigid3, smear_mm: fl
 
 
 def radiance_along(
-    scene: Scene, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"], lights: Lamps
+    scene: Scene,
+    origins: Float[np.ndarray, "n 3"],
+    directions: Float[np.ndarray, "n 3"],
+    lights: Lamps,
+    below: Float[np.ndarray, "v 3"] = _NONE,
 ) -> Float[np.ndarray, "m 3"]:
-    """Linear light (float32) of pixels, given their rays, ``supersampling**2`` consecutive ones for each pixel."""
+    """Linear light (float32) of pixels, given their rays, ``supersampling**2`` consecutive ones for each pixel.
+    ``below``: see :attr:`Scene.below`."""
     samples = scene.supersampling**2
     out = np.zeros((len(directions) // samples, 3), dtype=np.float32)
     pixels = max(1, _BLOCK // samples)
     for begin in range(0, len(out), pixels):
         some = slice(begin * samples, (begin + pixels) * samples)
-        _add_light(scene, origins[some], directions[some], lights, out[begin : begin + pixels])
+        _add_light(scene, origins[some], directions[some], lights, below, out[begin : begin + pixels])
     return out
 
 
@@ -233,6 +274,7 @@ def _add_light(
     origins: Float[np.ndarray, "n 3"],
     directions: Float[np.ndarray, "n 3"],
     lights: Lamps,
+    below: Float[np.ndarray, "v 3"],
     out: Float[np.ndarray, "m 3"],
 ) -> None:
     """:func:`radiance_along` for some of the pixels, into ``out``."""
@@ -244,7 +286,7 @@ def _add_light(
     lit, ambient = _lighting(scene, rays, chosen, lights)
     points, materials = _places(rays, scene.surface)
     albedos = albedo(points, materials, scene.palette)
-    _shade(rays, albedos, scene.surface, scene.palette, lights, lit, ambient, row, out)
+    _shade(rays, albedos, scene.surface, scene.palette, lights, lit, ambient, row, below, out)
 
 
 @kernel
@@ -438,7 +480,8 @@ def _places(rays, surface):
 
 @kernel(fastmath=True)
 @no_type_check
-def _shade(rays, albedos, surface, palette, lights, lit, ambient, row, out):
+def _shade(rays, albedos, surface, palette, lights, lit, ambient, row, below, out):
+    spread = len(below) > 0
     samples = len(rays.faces) // len(out)
     for i in range(len(rays.faces)):
         if rays.faces[i] < 0:
@@ -456,14 +499,46 @@ def _shade(rays, albedos, surface, palette, lights, lit, ambient, row, out):
             scattered = (albedo[0] * share, albedo[1] * share, albedo[2] * share)
         for c in range(3):
             out[pixel, c] += scattered[c] * ambient[row[i], c] / samples
+        if spread:
+            for corner in range(3):
+                share = rays.barycentric[i, corner] / samples
+                for c in range(3):
+                    out[pixel, c] += scattered[c] * share * below[surface.faces[rays.faces[i], corner], c]
         for k in range(len(lights.positions)):
             if lit[row[i], k]:
                 towards, falloff = _incoming(point, k, lights)
                 surface_coat = palette.reflectance[m], palette.roughness[m], palette.saliva
                 diffuse, glossy = _reflected(normal, view, towards, *surface_coat)
                 glossy *= lights.glare[k]
+                if spread:
+                    diffuse = 0.0
                 for c in range(3):
                     out[pixel, c] += falloff * lights.intensities[k, c] * (scattered[c] * diffuse + glossy) / samples
+
+
+def _entering_light(scene: Scene, lights: Lamps) -> Float[np.ndarray, "v 3"]:
+    """The light that enters the surface at each vertex, in the units of radiance."""
+    mesh, materials = scene.jaw.mesh, scene.surface.materials
+    shares = np.zeros((len(mesh.vertices), len(lights.positions)))
+    reflectance = np.zeros(len(mesh.vertices))
+    reflectance[mesh.faces] = scene.palette.reflectance[materials][:, None]
+    _entering(mesh.vertices, mesh.vertex_normals, reflectance, lights, shares)
+    lit = shares > NOTICEABLE * shares.sum(axis=1, keepdims=True)
+    _darken(lit, mesh.occluded(*_segments(mesh.vertices, lit, lights.positions)))
+    return np.einsum("vl,lc->vc", np.where(lit, shares, 0.0), lights.intensities)
+
+
+@kernel(fastmath=True)
+@no_type_check
+def _entering(points, normals, reflectance, lights, shares):
+    """Fill in the share of each light that enters at each point, if nothing hides it."""
+    for i in range(len(points)):
+        normal = (normals[i, 0], normals[i, 1], normals[i, 2])
+        for k in range(len(lights.positions)):
+            towards, falloff = _incoming(points[i], k, lights)
+            cosine = max(0.0, _dot(normal, towards))
+            mirrored = reflectance[i] + (1 - reflectance[i]) * (1 - cosine) ** 5
+            shares[i, k] = falloff * cosine * (1 - mirrored)
 
 
 def auto_gain(scene: Scene, poses: Iterable[Rigid3], lighting: str | None = None, stride: int = 10) -> float:
@@ -477,7 +552,8 @@ def auto_gain(scene: Scene, poses: Iterable[Rigid3], lighting: str | None = None
     for rig_from_world in poses:
         lights = lamps(scene.handpiece, lighting, rig_from_world)
         for mounted in scene.handpiece.rig.cameras.values():
-            coarse = radiance(scene, _coarser(mounted.camera, stride), mounted.cam_from_rig @ rig_from_world, lights)
+            camera, cam_from_world = _coarser(mounted.camera, stride), mounted.cam_from_rig @ rig_from_world
+            coarse = radiance(scene, camera, cam_from_world, lights, scene.below(lighting, rig_from_world))
             levels.append(level_of(coarse, axis=-1).ravel())
     seen = np.concatenate(levels)
     seen = seen[seen > 0]
@@ -541,7 +617,8 @@ def render_image(
         light = _row_by_row(scene, mounted, frame.lighting, rig_from_world, motion, smear)
     else:
         lights = lamps(scene.handpiece, frame.lighting, rig_from_world)
-        light = radiance(scene, mounted.camera, cam_from_world, lights, smear)
+        below = scene.below(frame.lighting, rig_from_world)
+        light = radiance(scene, mounted.camera, cam_from_world, lights, below, smear)
     if optics.aperture_mm > 0:
         depth_mm = np.nan_to_num(render_depth(scene.jaw.mesh, mounted.camera, cam_from_world), nan=np.inf)
         light = through_lens(light, depth_mm, mounted.camera, scene.handpiece.working_distance_mm, optics)
@@ -597,7 +674,8 @@ def render_capture(
     in the scene that the parent built (a forked child could not build one) and run kernels that the parent compiled.
     """
     tasks = [(frame, camera) for frame in frames for camera in frame.cameras if not skip(frame.name, camera)]
-    tasks.sort(key=lambda task: task[1])  # one camera after the other, for whose rays a process remembers
+    if scene.scattering is None:
+        tasks.sort(key=lambda task: task[1])  # one camera after the other, for whose rays a process remembers
     if not tasks:
         return
     worker = _Worker(
