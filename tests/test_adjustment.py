@@ -14,7 +14,8 @@ from cuspid.camera import Camera
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.motion import adjustment, gauge, normal_equations
-from cuspid.motion.adjustment import AdjustmentOptions, adjust, covariance_factor, left_jacobian
+from cuspid.motion.adjustment import AdjustmentOptions, adjust, left_jacobian
+from cuspid.motion.expectation import covariance_factor
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from cuspid.capture import Capture, Frame
 from cuspid.errors import ReconstructionError
@@ -34,12 +35,16 @@ def capture_of(handpiece: Handpiece, names: Sequence[str]) -> Capture:
     return Capture(handpiece=handpiece, frames=frames, source=InMemory({}))
 
 
-def depth_maps(way: Mapping[str, Rigid3], mesh: Mesh = HILLS, noise_mm: float = NOISE_MM) -> list[DepthMap]:
-    rng, made = np.random.default_rng(0), []
+def depth_maps(
+    way: Mapping[str, Rigid3], mesh: Mesh = HILLS, noise_mm: float = NOISE_MM, seed: int = 0, wide_px: float = 0.0
+) -> list[DepthMap]:
+    """With errors that hang together over ``wide_px`` pixels."""
+    rng, made = np.random.default_rng(seed), []
     for frame, pose in way.items():
         for name, mounted in diamond(SIZE_PX).rig.cameras.items():
             grid = coarser(mounted.camera, 2)
-            depth = cast_depth(mesh, grid, mounted.cam_from_rig @ pose) + rng.normal(0, noise_mm, (80, 80))
+            noise = gaussian_filter(rng.normal(0, 1, (80, 80)), wide_px)
+            depth = cast_depth(mesh, grid, mounted.cam_from_rig @ pose) + noise_mm * noise / noise.std()
             known = np.isfinite(depth).astype(np.float32)
             made.append(
                 DepthMap(
@@ -74,6 +79,30 @@ def test_a_path_is_found_from_surfaces() -> None:
     worst = errors_um(found, OUT).max()
     assert 0.1 < worst < 15
     assert 10 < found.log["surface_scatter_um"] < 25
+
+
+@pytest.mark.parametrize("wide_px", [0.0, 3.0])
+def test_the_error_of_a_path_is_expected(wide_px: float) -> None:
+    """Also where the errors of a surface hang together, so that its points tell less than they are many."""
+    squares, expected = [], []
+    way = dict(list(OUT.items())[:4])
+    for seed in range(4):
+        found = tracked(depth_maps(way, seed=seed, wide_px=wide_px))
+        assert found.expectation is not None
+        points = found.expectation.points
+        frames = np.array_split(np.arange(len(points)), len(found.frames))
+        off = np.zeros_like(points)
+        for name, some in zip(found.frames, frames, strict=True):
+            world_from_true = (way[name] @ way["00000"].inverse()).inverse()
+            off[some] = (world_from_true @ found.rig_from_world[name]).apply(points[some]) - points[some]
+        rows = np.concatenate(
+            [np.cross(points[:, None], np.eye(3)[None]), np.broadcast_to(np.eye(3), (len(off), 3, 3))], 2
+        )
+        rows = rows.reshape(-1, 6)
+        left = off.ravel() - rows @ np.linalg.lstsq(rows, off.ravel(), rcond=None)[0]
+        squares.append((left**2).mean())
+        expected.append(np.trace(found.expectation.covariance.mean(axis=0)) / 3)
+    assert 0.7 < np.sqrt(np.mean(squares) / np.mean(expected)) < 1.5
 
 
 def test_exact_surfaces_give_an_exact_path() -> None:

@@ -30,6 +30,7 @@ from scipy.special import chdtri
 from cuspid.epipolar import skew
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
+from cuspid.motion.expectation import MOST_POINTS, covariance_factor, expectation_of, steps_drawn
 from cuspid.motion.gauge import PLACE, best_gauge, gauge_basis, moved_places, moved_world
 from cuspid.motion.misfit import CHANCE, held_misfit
 from cuspid.motion.normal_equations import (
@@ -57,10 +58,6 @@ _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
 """Damping of a step, as shares of the diagonal of the normal equations. What moves everything at once, such as the
 scale and the bending of an arch, stands out so little from that diagonal that 1e-4 of it would freeze it."""
 _GAUGE_STEPS = 5
-_DRAWS, _MOST_DRAWN = 64, 2000
-"""Number of draws from the covariance of the result, and of points whose motion is followed in them."""
-_END = 0.02
-"""Share of the length of a scan that counts as its end."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,16 +84,6 @@ class AdjustmentOptions(Options):
 
 
 # --- states ------------------------------------------------------------------------------------------------------
-
-
-def covariance_factor(covariance: Float[np.ndarray, "n n"] | None, size: int) -> Float[np.ndarray, "n n"]:
-    """L with L L^T = covariance, which may be singular (parameters without variance are held fixed); zero for None."""
-    if covariance is None:
-        return np.zeros((size, size))
-    scale = np.sqrt(np.diag(covariance))
-    unit = np.where(scale > 0, scale, 1)
-    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
-    return scale[:, None] * vectors * np.sqrt(np.clip(values, 0, None))
 
 
 def left_jacobian(rotation_vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
@@ -459,35 +446,12 @@ def _expectation(
 ) -> Expectation:
     """What draws from the covariance make of the points."""
     count = len(state.points)
-    some = np.unique(np.linspace(0, count - 1, min(count, _MOST_DRAWN)).astype(np.int64))
+    some = np.unique(np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(np.int64))
     point = np.repeat(np.arange(count), np.diff(observations.start))
     part, seen, _ = _select(state, observations, np.zeros((count, 3), np.uint8), np.isin(point, some))
-    draws = np.random.default_rng(0).standard_normal((_DRAWS, len(covariance)))
-    steps = covariance_factor(covariance, len(covariance)) @ draws.T
-    places = substitute(part, seen, weighting, np.column_stack([np.zeros(len(covariance)), steps]))
-    moved = places[1:] - places[0]
-    offsets = part.points - part.points.mean(axis=0)
-    scale = np.einsum("dni,ni->d", moved, offsets) / np.sum(offsets**2)
-    by_motion = np.concatenate(
-        [np.broadcast_to(np.eye(3), (len(some), 3, 3)), -np.stack([*map(skew, offsets)])], axis=2
-    ).reshape(-1, 6)
-    flat = moved.reshape(_DRAWS, -1).T
-    left = (flat - by_motion @ np.linalg.lstsq(by_motion, flat, rcond=None)[0]).T.reshape(moved.shape)
-    along = offsets @ np.linalg.svd(offsets, full_matrices=False)[2][0]
-    ends = [along >= np.quantile(along, 1 - _END), along <= np.quantile(along, _END)]
-    span = part.points[ends[0]].mean(axis=0) - part.points[ends[1]].mean(axis=0)
-    change = (moved[:, ends[0]].mean(axis=1) - moved[:, ends[1]].mean(axis=1)) @ span / np.linalg.norm(span)
-    return Expectation(
-        points=part.points,
-        covariance=np.einsum("dni,dnj->nij", left, left) / _DRAWS,
-        scale_sigma_ppm=1e6 * _rms(scale),
-        span_mm=float(np.linalg.norm(span)),
-        span_sigma_um=1000 * _rms(change),
-    )
-
-
-def _rms(values: Float[np.ndarray, "n"]) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+    steps = np.column_stack([np.zeros(len(covariance)), steps_drawn(covariance)])
+    places = substitute(part, seen, weighting, steps)
+    return expectation_of(part.points, places[1:] - places[0])
 
 
 def _known_posterior(state: State, observations: Observations, weighting: Weighting) -> _Posterior:

@@ -5,6 +5,10 @@ onto an earlier one, by iterative closest points with point-to-plane distances (
 Computing 10, 1992) and a motion model; then all at once, over all pairs of frames that show the same surface, whether
 consecutive or not. A pair counts for as much as its surfaces overlap and as little as they scatter about each other, so
 that drift is spread where it is least certain, and a path that comes back is closed.
+
+How far the poses may be off follows from how the gradients of all pairs scatter from one block of space to the next
+(covariance of an M-estimate with clusters, as for tracks): surfaces are smooth, so that their errors hang together
+within a block, whichever frames show it.
 """
 
 from __future__ import annotations
@@ -17,14 +21,16 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy import sparse
 from scipy.spatial import cKDTree
 
 from cuspid.capture import Capture, Dropped
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3, unit
+from cuspid.motion.expectation import MOST_POINTS, expectation_of, steps_drawn
 from cuspid.options import SEED, SHARE, Options, Range
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import DepthMap, Reconstruction, SurfacePoints
+from cuspid.reconstruction import DepthMap, Expectation, Reconstruction, SurfacePoints
 from cuspid.rig import Handpiece
 from cuspid.workers import map_in_threads
 
@@ -54,11 +60,13 @@ _BRIEFLY, _BLOCKS = 3, 0.1
 (mm for 10 mm)."""
 _LITTLE_GLARE = 0.1
 """Share of mirror reflections that does little harm."""
+_CLUSTER = 0.2
+"""Side of the blocks within which errors of surfaces hang together, as a share of the working distance."""
 _CONVERGED = 2e-6
 """Step of the joint adjustment, as a share of the working distance, that ends it."""
 _HELD = (
     "motion: the frames were located by their surfaces, which do not refine the calibration: it is taken as exact; an "
-    "error of it, or of the path, is in the result, but not in the sigmas of its vertices"
+    "error of it is in the result, but not in the sigmas of its vertices"
 )
 _LONG = 5.0
 """Length of a path, in working distances, from which on its drift is seen."""
@@ -129,10 +137,18 @@ class _Laid(NamedTuple):
     """Of the first surface that lies on the second."""
 
     @property
+    def _off(self) -> Float[np.ndarray, "n"]:
+        return np.asarray(np.minimum((self.distances / (_TUKEY * self.sigma)) ** 2, 1.0))
+
+    @property
     def weights(self) -> Float[np.ndarray, "n"]:
         """Tukey's, over the variance."""
-        off = np.minimum((self.distances / (_TUKEY * self.sigma)) ** 2, 1.0)
-        return np.asarray((1 - off) ** 2 / self.sigma**2)
+        return np.asarray((1 - self._off) ** 2 / self.sigma**2)
+
+    @property
+    def slopes(self) -> Float[np.ndarray, "n"]:
+        """How much weight times distance changes with the distance."""
+        return np.asarray((1 - self._off) * (1 - 5 * self._off) / self.sigma**2)
 
     @property
     def relief(self) -> float:
@@ -212,9 +228,14 @@ def _lay(
     return _Laid(points, normals, distances, sigma, float(near.mean()))
 
 
+def _rows(laid: _Laid) -> Float[np.ndarray, "n 6"]:
+    """What a small motion (rotation vector, translation) of the points does to their distances."""
+    return np.concatenate([np.cross(laid.points, laid.normals), laid.normals], axis=1)
+
+
 def _equations(laid: _Laid) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]:
-    """Normal equations of a small motion (rotation vector, translation) of the points."""
-    rows = np.concatenate([np.cross(laid.points, laid.normals), laid.normals], axis=1)
+    """Normal equations of that motion."""
+    rows = _rows(laid)
     weighted = rows * laid.weights[:, None]
     return weighted.T @ rows, weighted.T @ laid.distances
 
@@ -223,7 +244,7 @@ def _moved(motion: Float[np.ndarray, "6"]) -> Rigid3:
     return Rigid3.from_rotation_vector(motion[:3], motion[3:])
 
 
-def _solved(matrix: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def _solved(matrix: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n *k"]) -> Float[np.ndarray, "n *k"]:
     """With a damping that only matters where nothing is known."""
     return np.asarray(np.linalg.solve(matrix + 1e-9 * np.trace(matrix) * np.eye(len(matrix)), right))
 
@@ -381,22 +402,23 @@ def _together(
     options: SurfaceTrackingOptions,
     distance_mm: float,
     progress: Progress,
-) -> tuple[list[Rigid3], float]:
-    """The poses with which all surfaces that overlap lie on each other best, and their mean scatter, mm."""
+) -> tuple[list[Rigid3], float, Expectation | None]:
+    """The poses with which all surfaces that overlap lie on each other best, their mean scatter, mm, and what follows
+    for the surface."""
     rng, found = np.random.default_rng(options.seed), list(poses)
     some = [surface.some(options.samples, rng) for surface in surfaces]
     pairs = _neighbours(surfaces, poses, options, distance_mm)
-    reach_mm, least_mm, scatter = _REACHES[-3] * distance_mm, _LEAST_SIGMA * distance_mm, 0.0
+    reach_mm, least_mm, laid = _REACHES[-3] * distance_mm, _LEAST_SIGMA * distance_mm, list[_Laid | None]()
     for number in range(options.rounds):
         laid = map_in_threads(partial(_compared, some, surfaces, found, reach_mm, least_mm), pairs)
-        scatter = float(np.mean([each.sigma for each in laid if each is not None] or [0.0]))
-        step = _joint_step(pairs, laid, [pose.inverse() for pose in found])
+        step = _joint_step(_in_world(pairs, laid, found), len(found))
         found = [pose @ _moved(motion).inverse() for pose, motion in zip(found, step, strict=True)]
         progress("adjustment", number + 1, options.rounds)
         if np.abs(step[:, 3:]).max() < _CONVERGED * distance_mm:
             break
     progress("adjustment", options.rounds, options.rounds)
-    return found, scatter
+    scatter = float(np.mean([each.sigma for each in laid if each is not None] or [0.0]))
+    return found, scatter, _expected(some, _in_world(pairs, laid, found), found, distance_mm)
 
 
 def _compared(
@@ -412,27 +434,82 @@ def _compared(
     return _lay(some[one], surfaces[other], poses[other] @ poses[one].inverse(), reach_mm, least_mm)
 
 
-def _joint_step(
-    pairs: Sequence[tuple[int, int]], laid: Sequence[_Laid | None], world_from_rig: Sequence[Rigid3]
-) -> Float[np.ndarray, "f 6"]:
-    """Small motions of all frames, in the world, that bring surfaces together; the first frame stays."""
-    count = len(world_from_rig)
+_Pair = tuple[int, int, _Laid]
+"""Two frames, and how the surface of the first lies on that of the second, in the world."""
+
+
+def _in_world(pairs: Sequence[tuple[int, int]], laid: Sequence[_Laid | None], poses: Sequence[Rigid3]) -> list[_Pair]:
+    """The pairs that lie on each other."""
+    world_from_rig = [pose.inverse() for pose in poses]
+    return [
+        (
+            *(one, other),
+            each._replace(
+                points=world_from_rig[other].apply(each.points), normals=world_from_rig[other].rotate(each.normals)
+            ),
+        )
+        for (one, other), each in zip(pairs, laid, strict=True)
+        if each is not None
+    ]
+
+
+def _joint_equations(pairs: Sequence[_Pair], count: int) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n"]]:
+    """Normal equations of small motions of all frames, in the world; the first frame stays."""
     matrix, right = np.zeros((count, 6, count, 6)), np.zeros((count, 6))
-    for (one, other), each in zip(pairs, laid, strict=True):
-        if each is not None:
-            world = world_from_rig[other]
-            block, side = _equations(each._replace(points=world.apply(each.points), normals=world.rotate(each.normals)))
-            matrix[one, :, one] += block
-            matrix[other, :, other] += block
-            matrix[one, :, other] -= block
-            matrix[other, :, one] -= block
-            right[one] -= side
-            right[other] += side
+    for one, other, each in pairs:
+        block, side = _equations(each)
+        matrix[one, :, one] += block
+        matrix[other, :, other] += block
+        matrix[one, :, other] -= block
+        matrix[other, :, one] -= block
+        right[one] -= side
+        right[other] += side
     free = 6 * (count - 1)
+    return matrix[1:, :, 1:].reshape(free, free), right[1:].ravel()
+
+
+def _joint_step(pairs: Sequence[_Pair], count: int) -> Float[np.ndarray, "f 6"]:
+    """Small motions of all frames that bring surfaces together."""
     step = np.zeros((count, 6))
-    if free:
-        step[1:] = _solved(matrix[1:, :, 1:].reshape(free, free), right[1:].ravel()).reshape(-1, 6)
+    if count > 1:
+        step[1:] = _solved(*_joint_equations(pairs, count)).reshape(-1, 6)
     return step
+
+
+def _covariance(pairs: Sequence[_Pair], count: int, block_mm: float) -> Float[np.ndarray, "n n"]:
+    """Covariance of these motions, from how the gradients of all pairs scatter from block to block of space (Huber, 5th
+    Berkeley Symposium, 1967), with the blocks that the motions have used up taken off their number."""
+    gradients, blocks, frames = [], [], []
+    for one, other, each in pairs:
+        gradient = _rows(each) * (each.weights * each.distances)[:, None]
+        gradients += [-gradient, gradient]
+        blocks += [np.floor(each.points / block_mm).astype(np.int64)] * 2
+        frames += [np.full(len(gradient), one), np.full(len(gradient), other)]
+    block = np.unique(np.concatenate(blocks), axis=0, return_inverse=True)[1].reshape(-1)
+    columns = 6 * np.concatenate(frames)[:, None] + np.arange(6)
+    rows = np.broadcast_to(block[:, None], columns.shape)
+    shape = block.max() + 1, 6 * count
+    by_block = sparse.coo_array((np.concatenate(gradients).ravel(), (rows.ravel(), columns.ravel())), shape).tocsr()
+    scatter = (by_block.T @ by_block).toarray()[6:, 6:]
+    matrix, _ = _joint_equations(pairs, count)
+    slope = sum(each.slopes.sum() for *_, each in pairs) / sum(each.weights.sum() for *_, each in pairs)
+    left = max(1 - len(matrix) / shape[0], 1 / shape[0])
+    return _solved(matrix, _solved(matrix, scatter).T) / (slope**2 * left)
+
+
+def _expected(
+    some: Sequence[SurfacePoints], pairs: Sequence[_Pair], poses: Sequence[Rigid3], distance_mm: float
+) -> Expectation | None:
+    """How far the surface may be off by its poses; None for a single frame, and where none lies on another."""
+    if not pairs:
+        return None
+    each = max(MOST_POINTS // len(poses), 1)
+    parts = [pose.inverse().apply(shown.points[:each]) for shown, pose in zip(some, poses, strict=True)]
+    points = np.concatenate(parts)
+    owner = np.repeat(np.arange(len(poses)), [len(part) for part in parts])
+    steps = steps_drawn(_covariance(pairs, len(poses), _CLUSTER * distance_mm)).T.reshape(-1, len(poses) - 1, 6)
+    of_points = np.pad(steps, ((0, 0), (1, 0), (0, 0)))[:, owner]
+    return expectation_of(points, np.cross(of_points[..., :3], points) + of_points[..., 3:])
 
 
 def track_surfaces(
@@ -456,9 +533,10 @@ def track_surfaces(
     placed, dropped = _chained(surfaces, names, options, distance_mm, progress)
     _require_enough(len(placed), len(names), dropped, capture.handpiece, options)
     kept = [surfaces[frame] for frame in placed]
-    poses, scatter_mm = _together(kept, list(placed.values()), options, distance_mm, progress)
+    poses, scatter_mm, expectation = _together(kept, list(placed.values()), options, distance_mm, progress)
     return Reconstruction(
         rig=capture.handpiece.rig,
+        expectation=expectation,
         rig_from_world={names[frame]: pose for frame, pose in zip(placed, poses, strict=True)},
         dropped=(*capture.left_out, *dropped),
         log={"surface_scatter_um": 1000 * scatter_mm},
