@@ -11,10 +11,19 @@ from scipy.ndimage import gaussian_filter
 
 from cuspid.capture import Capture, Frame
 from cuspid.errors import ReconstructionError
-from cuspid.geometry import Rigid3
+from cuspid.geometry import Rigid3, unit
 from cuspid.mesh import Mesh
-from cuspid.motion.surface_tracking import SurfaceTrackingOptions, _drift, _onto, surface_of, track_surfaces
-from cuspid.reconstruction import DepthMap, Reconstruction
+from cuspid.motion.surface_tracking import (
+    Surface,
+    SurfaceTrackingOptions,
+    _drift,
+    _onto,
+    _together,
+    surface_of,
+    track_surfaces,
+)
+from cuspid.progress import silent
+from cuspid.reconstruction import DepthMap, Reconstruction, SurfacePoints
 from cuspid.rig import Handpiece, Light
 from cuspid.stereo.matching import coarser
 from plain_scene import SIZE_PX
@@ -79,6 +88,31 @@ def test_a_path_is_found_from_surfaces() -> None:
     worst = errors_um(found, OUT).max()
     assert 0.1 < worst < 15
     assert 10 < found.log["surface_scatter_um"] < 25
+
+
+def test_a_long_path_that_was_found_bent_is_straightened() -> None:
+    rng, way, bent, surfaces = np.random.default_rng(0), [], [], []
+    for k in range(50):
+        x, y = rng.uniform(-2.5, 2.5, (2, 1500))
+        u = x + k
+        z = 0.5 * np.sin(1.8 * u) * np.cos(1.5 * y + 0.3 * u) + rng.normal(0, 0.003, len(x))
+        slope_x = 0.9 * np.cos(1.8 * u) * np.cos(1.5 * y + 0.3 * u) - 0.15 * np.sin(1.8 * u) * np.sin(1.5 * y + 0.3 * u)
+        slope_y = -0.75 * np.sin(1.8 * u) * np.sin(1.5 * y + 0.3 * u)
+        surfaces.append(
+            Surface(SurfacePoints(np.stack([x, y, z], axis=1), unit(np.stack([-slope_x, -slope_y, 1 + 0 * x], axis=1))))
+        )
+        way.append(Rigid3(np.eye(3), np.array([-k, 0.0, 0.0])))
+        bent.append(Rigid3.from_rotation_vector(np.array([0, 0, 2e-4 * k]), np.array([-k, 1e-4 * k**2, 0])))
+
+    def off_um(poses: Sequence[Rigid3]) -> float:
+        pairs = zip(poses, way, strict=True)
+        return max(1000 * float(np.linalg.norm((one @ other.inverse()).inverse().translation)) for one, other in pairs)
+
+    straight, _, expected = _together(surfaces, bent, SurfaceTrackingOptions(samples=500), 5.0, silent)
+    assert off_um(bent) > 200
+    assert 1 < off_um(straight) < 50
+    assert expected is not None
+    assert 0.5 < expected.span_sigma_um < 10
 
 
 @pytest.mark.parametrize("wide_px", [0.0, 3.0])

@@ -62,6 +62,11 @@ _LITTLE_GLARE = 0.1
 """Share of mirror reflections that does little harm."""
 _CLUSTER = 0.2
 """Side of the blocks within which errors of surfaces hang together, as a share of the working distance."""
+_OVERLAP_POWER = 4
+"""Of the overlap of a pair, for its weight."""
+_DAMPING, _HELD_BY_NOTHING = 1e-9, 1e-13
+"""Shares of the diagonal that are added to the normal equations of one pair, and of all: what bends a whole path stands
+out so little from it that more would freeze the bend."""
 _CONVERGED = 2e-6
 """Step of the joint adjustment, as a share of the working distance, that ends it."""
 _HELD = (
@@ -149,6 +154,12 @@ class _Laid(NamedTuple):
     def slopes(self) -> Float[np.ndarray, "n"]:
         """How much weight times distance changes with the distance."""
         return np.asarray((1 - self._off) * (1 - 5 * self._off) / self.sigma**2)
+
+    @property
+    def worth(self) -> float:
+        """Weight of a pair: what overlaps less is seen from places farther apart, where errors that both have in common
+        are less alike."""
+        return self.share**_OVERLAP_POWER
 
     @property
     def relief(self) -> float:
@@ -244,9 +255,12 @@ def _moved(motion: Float[np.ndarray, "6"]) -> Rigid3:
     return Rigid3.from_rotation_vector(motion[:3], motion[3:])
 
 
-def _solved(matrix: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n *k"]) -> Float[np.ndarray, "n *k"]:
+def _solved(
+    matrix: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n *k"], damping: float = _DAMPING
+) -> Float[np.ndarray, "n *k"]:
     """With a damping that only matters where nothing is known."""
-    return np.asarray(np.linalg.solve(matrix + 1e-9 * np.trace(matrix) * np.eye(len(matrix)), right))
+    diagonal = np.diag(matrix)
+    return np.asarray(np.linalg.solve(matrix + damping * np.diag(np.maximum(diagonal, diagonal.mean())), right))
 
 
 def _onto(
@@ -457,7 +471,7 @@ def _joint_equations(pairs: Sequence[_Pair], count: int) -> tuple[Float[np.ndarr
     """Normal equations of small motions of all frames, in the world; the first frame stays."""
     matrix, right = np.zeros((count, 6, count, 6)), np.zeros((count, 6))
     for one, other, each in pairs:
-        block, side = _equations(each)
+        block, side = (each.worth * part for part in _equations(each))
         matrix[one, :, one] += block
         matrix[other, :, other] += block
         matrix[one, :, other] -= block
@@ -471,8 +485,8 @@ def _joint_equations(pairs: Sequence[_Pair], count: int) -> tuple[Float[np.ndarr
 def _joint_step(pairs: Sequence[_Pair], count: int) -> Float[np.ndarray, "f 6"]:
     """Small motions of all frames that bring surfaces together."""
     step = np.zeros((count, 6))
-    if count > 1:
-        step[1:] = _solved(*_joint_equations(pairs, count)).reshape(-1, 6)
+    if pairs:
+        step[1:] = _solved(*_joint_equations(pairs, count), _HELD_BY_NOTHING).reshape(-1, 6)
     return step
 
 
@@ -481,7 +495,7 @@ def _covariance(pairs: Sequence[_Pair], count: int, block_mm: float) -> Float[np
     Berkeley Symposium, 1967), with the blocks that the motions have used up taken off their number."""
     gradients, blocks, frames = [], [], []
     for one, other, each in pairs:
-        gradient = _rows(each) * (each.weights * each.distances)[:, None]
+        gradient = _rows(each) * (each.worth * each.weights * each.distances)[:, None]
         gradients += [-gradient, gradient]
         blocks += [np.floor(each.points / block_mm).astype(np.int64)] * 2
         frames += [np.full(len(gradient), one), np.full(len(gradient), other)]
@@ -494,7 +508,8 @@ def _covariance(pairs: Sequence[_Pair], count: int, block_mm: float) -> Float[np
     matrix, _ = _joint_equations(pairs, count)
     slope = sum(each.slopes.sum() for *_, each in pairs) / sum(each.weights.sum() for *_, each in pairs)
     left = max(1 - len(matrix) / shape[0], 1 / shape[0])
-    return _solved(matrix, _solved(matrix, scatter).T) / (slope**2 * left)
+    solved = partial(_solved, matrix, damping=_HELD_BY_NOTHING)
+    return solved(solved(scatter).T) / (slope**2 * left)
 
 
 def _expected(
