@@ -2,9 +2,9 @@
 
 The depth maps of each frame are metric, so that frames are placed by laying their surfaces onto each other: first each
 onto an earlier one, by iterative closest points with point-to-plane distances (Y. Chen, G. Medioni, Image and Vision
-Computing 10, 1992) and a motion model; then all at once, over all pairs of frames that show the same surface, whether
-consecutive or not. A pair counts for as much as its surfaces overlap and as little as they scatter about each other, so
-that drift is spread where it is least certain, and a path that comes back is closed.
+Computing 10, 1992) and a motion model; then all at once, over the pairs of frames that show most of the same surface,
+whether consecutive or not. A pair counts for as much as its surfaces overlap and as little as they scatter about each
+other, so that drift is spread where it is least certain, and a path that comes back is closed.
 
 How far the poses may be off follows from how the gradients of all pairs scatter from one block of space to the next
 (covariance of an M-estimate with clusters, as for tracks): surfaces are smooth, so that their errors hang together
@@ -50,7 +50,7 @@ _LAST_STEPS = 4
 """Steps with all points, once a few have found the place."""
 _FOUND_AGAIN = 0.5
 """Least overlap with a frame from long ago: smooth parts of two teeth are alike."""
-_TUKEY = 5.0
+_TUKEY = 3.0
 """Robust standard deviations beyond which a distance has no weight."""
 _LEAST_SIGMA = 0.0006
 """Standard deviation of distances, as a share of the working distance, below which none is assumed."""
@@ -62,8 +62,6 @@ _LITTLE_GLARE = 0.1
 """Share of mirror reflections that does little harm."""
 _CLUSTER = 0.2
 """Side of the blocks within which errors of surfaces hang together, as a share of the working distance."""
-_OVERLAP_POWER = 4
-"""Of the overlap of a pair, for its weight."""
 _DAMPING, _HELD_BY_NOTHING = 1e-9, 1e-13
 """Shares of the diagonal that are added to the normal equations of one pair, and of all: what bends a whole path stands
 out so little from it that more would freeze the bend."""
@@ -94,7 +92,8 @@ class SurfaceTrackingOptions(Options):
     minimum_located: Annotated[float, SHARE] = 0.5
     """Minimum share (0 to 1) of the frames that must be placed."""
     joint_overlap: Annotated[float, SHARE] = 0.15
-    """Frames that share at least this part of the smaller surface are adjusted to each other."""
+    """Frames that share at least this part of the smaller surface are adjusted to each other, if neither shares more
+    with one that lies between."""
     samples: Annotated[int, Range(100, 1_000_000)] = 2000
     """Points of each frame that are laid onto others in searches and in the joint adjustment."""
     rounds: Annotated[int, Range(1, 1000)] = 20
@@ -154,12 +153,6 @@ class _Laid(NamedTuple):
     def slopes(self) -> Float[np.ndarray, "n"]:
         """How much weight times distance changes with the distance."""
         return np.asarray((1 - self._off) * (1 - 5 * self._off) / self.sigma**2)
-
-    @property
-    def worth(self) -> float:
-        """Weight of a pair: what overlaps less is seen from places farther apart, where errors that both have in common
-        are less alike."""
-        return self.share**_OVERLAP_POWER
 
     @property
     def relief(self) -> float:
@@ -397,17 +390,21 @@ def _found_on(
 def _neighbours(
     surfaces: Sequence[Surface], poses: Sequence[Rigid3], options: SurfaceTrackingOptions, distance_mm: float
 ) -> list[tuple[int, int]]:
-    """Pairs of frames that show the same surface, told by the blocks of space that it fills."""
+    """Pairs of frames that show the same surface, told by the blocks of space that it fills, in both orders.
+
+    Only relative neighbours (G. Toussaint, Pattern Recognition 12, 1980): a pair is left out if both overlap more with
+    a third frame. The farther apart two frames are, the less alike are the errors of their surfaces, and what these do
+    to a pose adds up along a path; pairs of one pass and another stay where these come closest.
+    """
     blocks = [
         {tuple(each) for each in np.floor(pose.inverse().apply(surface.points) / (_BLOCKS * distance_mm)).astype(int)}
         for surface, pose in zip(surfaces, poses, strict=True)
     ]
-    return [
-        (i, j)
-        for i, one in enumerate(blocks)
-        for j, other in enumerate(blocks)
-        if i != j and len(one & other) > options.joint_overlap * min(len(one), len(other))
-    ]
+    shared = np.array([[len(one & other) / max(min(len(one), len(other)), 1) for other in blocks] for one in blocks])
+    np.fill_diagonal(shared, 0.0)
+    through_third = np.array([np.minimum(one, shared).max(axis=1) for one in shared])
+    found = (shared > options.joint_overlap) & (shared >= through_third)
+    return [(int(one), int(other)) for one, other in np.argwhere(found)]
 
 
 def _together(
@@ -471,7 +468,7 @@ def _joint_equations(pairs: Sequence[_Pair], count: int) -> tuple[Float[np.ndarr
     """Normal equations of small motions of all frames, in the world; the first frame stays."""
     matrix, right = np.zeros((count, 6, count, 6)), np.zeros((count, 6))
     for one, other, each in pairs:
-        block, side = (each.worth * part for part in _equations(each))
+        block, side = _equations(each)
         matrix[one, :, one] += block
         matrix[other, :, other] += block
         matrix[one, :, other] -= block
@@ -495,7 +492,7 @@ def _covariance(pairs: Sequence[_Pair], count: int, block_mm: float) -> Float[np
     Berkeley Symposium, 1967), with the blocks that the motions have used up taken off their number."""
     gradients, blocks, frames = [], [], []
     for one, other, each in pairs:
-        gradient = _rows(each) * (each.worth * each.weights * each.distances)[:, None]
+        gradient = _rows(each) * (each.weights * each.distances)[:, None]
         gradients += [-gradient, gradient]
         blocks += [np.floor(each.points / block_mm).astype(np.int64)] * 2
         frames += [np.full(len(gradient), one), np.full(len(gradient), other)]
