@@ -265,22 +265,26 @@ def _scans_table(scans: Mapping[str, Result]) -> str:
 
 
 def enamel(result: Result) -> str:
-    """Teeth without texture, under several kinds of light."""
+    """Teeth and arches without texture, under several kinds of light."""
     told = {name: {**scan, "notes": ""} for name, scan in result["scans"].items()}
+    commits = ", ".join(sorted({str(scan["commit"])[:7] for scan in told.values() if scan.get("commit")}))
     return "\n".join(
         [
-            "One tooth each, twelve cameras of 500 x 500 px, texture `enamel` (plain, glossy and wet), noise 1.5 DN. "
+            "One tooth each or, where the name begins with *arch*, a whole arch in one pass; twelve cameras of "
+            "500 x 500 px, texture `enamel` (plain, glossy and wet), noise 1.5 DN. "
             "Three colour-coded LEDs about each group, behind crossed polarisers (3 % of mirror reflections pass), "
-            "except: *glossy* colour-coded without polarisers, *white-crossed* four white LEDs a group behind "
-            "polarisers, *white* without; *as-texture* the images of phantom-0, located by keypoints and matched by "
-            "correlation, as textured teeth are, *colmap* the same with the motion of COLMAP's mapper. *clinical* has "
-            "`--optics clinical` (defocus and diffraction, motion during the exposure, saliva, crosstalk, Bayer, "
-            "JPEG); *artificial-clinical* has them, white light, and the texture `artificial`. Bars: under "
-            "colour-coded, polarised light a mean of 6 um (clinical 10 um) with 94 % within 50 um; artificial-clinical "
-            "4 um. Developed on phantom-0, ideal and clinical, on 048_lower, with which the places of the LEDs were "
-            "chosen, too, and on 023_lower; a limit was chosen with phantom-1 in view; the others were looked at only "
-            "at the end, but most also with earlier "
-            "versions. `python benchmarks/enamel.py`.",
+            "except: *glossy* colour-coded without polarisers, *in-turn* six of them in turn, without polarisers, "
+            "*white-crossed* four white LEDs a group behind polarisers, *white* without; *as-texture* the images of "
+            "phantom-0, located by keypoints and matched by correlation, as textured teeth are, *colmap* the same with "
+            "the motion of COLMAP's mapper. *clinical* has `--optics clinical` (defocus and diffraction, motion during "
+            "the exposure, saliva, crosstalk, Bayer, JPEG), *dense* 20 frames instead of 10; *artificial-clinical* has "
+            "these optics, white light, and the texture `artificial`. Bars: under colour-coded, polarised light a mean "
+            "of 6 um (clinical 10 um) with 94 % within 50 um, in turn 12 um; artificial-clinical 4 um; of arches 20 um "
+            "(clinical 30 um, artificial-clinical 6 um) and an inter-molar error of 40 um (clinical 60 um). Developed "
+            "on phantom-0, ideal and clinical, on 048_lower, with which the places of the LEDs were chosen, too, on "
+            "023_lower, and on arch-upper, ideal and clinical, for paths; a limit was chosen with phantom-1 in view; "
+            "the others were looked at only at the end, but most also with earlier versions. Scans are of "
+            f"{commits}. `python benchmarks/enamel.py`.",
             "",
             _scans_table(told),
         ]
