@@ -573,8 +573,9 @@ def glare_notes(handpiece: Handpiece) -> tuple[str, ...]:
     if handpiece.lights and all(light.glare <= _LITTLE_GLARE for light in handpiece.lights.values()):
         return ()
     return (
-        "depth: as far as the handpiece file tells (glare of each light), there are no crossed polarisers: mirror "
-        "reflections of wet teeth put the surface 0.1 mm off (mean) and more in simulation; use polarisers or powder",
+        "depth: as far as the handpiece file tells (glare of each light), there are no crossed polarisers: in "
+        "simulation, mirror reflections of wet teeth hide from a sixth (six coloured lights in turn) to half of the "
+        "surface (white lights, and 0.03 mm of error); use polarisers or powder",
     )
 
 
