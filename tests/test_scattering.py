@@ -15,7 +15,7 @@ from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.simulation.appearance import APPEARANCES
 from cuspid.simulation.optics import OpticsOptions
-from cuspid.simulation.raycast import Scene, auto_gain, lit_frames, render_image
+from cuspid.simulation.raycast import Scene, _entering_light, auto_gain, lamps, lit_frames, render_image
 from cuspid.simulation.scattering import Scattering
 from cuspid.stereo.matching import DepthEstimator, StereoOptions
 from plain_scene import HILLS, lit
@@ -87,6 +87,25 @@ def test_softened_shade_still_tells_depth() -> None:
     )
     assert np.mean([each.known.mean() for each in maps]) > 0.4
     assert 2 < np.median(np.abs(errors)) < 60
+
+
+def test_what_lies_in_shadow_takes_no_light() -> None:
+    """A ball between the lights and a plane: only what spreads to its shadow is seen there."""
+    plane = height_field(lambda x, y: 0 * x + 6, half_width_mm=7.0)
+    ball = Mesh(0.3 * SPHERE.vertices + [0.0, 0, 4.5], SPHERE.faces)
+    both = Mesh(
+        np.concatenate([plane.vertices, ball.vertices]), np.concatenate([plane.faces, ball.faces + len(plane.vertices)])
+    )
+
+    def entering(mesh: Mesh) -> np.ndarray:
+        scene = Scene(jaw=Jaw(mesh=mesh), handpiece=lit(), appearance=APPEARANCES["enamel"])
+        return _entering_light(scene, lamps(lit(), "all", Rigid3.identity()))[: len(plane.vertices)]
+
+    open_plane, under = entering(plane), entering(both)
+    assert open_plane.min() > 0
+    hidden = (under < 0.01 * open_plane).any(axis=1)
+    assert 0.002 < hidden.mean() < 0.2
+    assert under[~hidden] == pytest.approx(open_plane[~hidden])
 
 
 def test_what_does_not_scatter_is_rendered_as_without(monkeypatch: pytest.MonkeyPatch) -> None:
