@@ -9,6 +9,7 @@ import numpy as np
 from cuspid import pipeline
 from cuspid.handpiece.designs import DesignOptions, essential_four
 from cuspid.simulation.lights import lit
+from cuspid.simulation.optics import OpticsOptions
 from cuspid.simulation.path.scan import ScanPathOptions, steady_poses
 
 FOUR = essential_four(DesignOptions(width_px=24, height_px=24))
@@ -40,3 +41,19 @@ def test_a_handpiece_without_lights_is_simulated(coarse_phantom, tmp_path):
     assert len(truth.handpiece.lights) == 4
     for image in capture.images(capture.frames[0]).values():
         assert image.std() > 10
+
+
+def test_light_that_cannot_go_below_the_surface_is_told(coarse_phantom, tmp_path, caplog):
+    poses = {"00000": steady_poses(coarse_phantom, ScanPathOptions(tooth=46), per_pass=1)[0]}
+    told = {}
+    for texture, optics in (
+        ("artificial", OpticsOptions(scattering=1.0)),
+        ("artificial", OpticsOptions(optics="clinical")),
+        ("enamel", OpticsOptions(scattering=1.0)),
+    ):
+        options = pipeline.RenderOptions(texture=texture, optics=optics, supersampling=1)
+        with caplog.at_level("INFO", logger="cuspid"):
+            pipeline.take_images(coarse_phantom, FOUR, poses, tmp_path / f"{len(told)}", options)
+        told[texture, optics] = "--scattering changes nothing" in caplog.text
+        caplog.clear()
+    assert list(told.values()) == [True, False, False]

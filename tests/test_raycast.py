@@ -29,6 +29,7 @@ from cuspid.simulation.appearance import (
     gradient_noise,
     palette,
 )
+from cuspid.simulation.optics import Optics
 from cuspid.simulation.raycast import (
     AMBIENT,
     Scene,
@@ -417,6 +418,31 @@ def test_processes_give_the_same_images_as_one(scene: Scene, poses: dict[str, Ri
     assert sorted(done) == sorted(whole)
     for (frame, camera), image in whole.items():
         np.testing.assert_array_equal(np.load(tmp_path / f"{frame}-{camera}.npy"), image)
+
+
+def test_light_below_the_surface_is_found_once_for_each_frame(
+    scene: Scene, poses: dict[str, Rigid3], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many frames are remembered, the images are the same, and while all are, each is found once."""
+    asked = list[int]()
+    entering = raycast._entering_light
+
+    def counted(scene: Scene, lights: Lamps) -> np.ndarray:
+        asked.append(1)
+        return entering(scene, lights)
+
+    monkeypatch.setattr(raycast, "_entering_light", counted)
+    found = []
+    for together in (1, 2, 3):
+        monkeypatch.setattr(raycast, "_TOGETHER", together)
+        wet = replace(scene, appearance=APPEARANCES["enamel"], optics=Optics(scattering=1.0))
+        asked.clear()
+        found.append(rendered(wet, poses))
+        assert len(poses) <= len(asked) <= (1 if together == len(poses) else 2) * len(poses)  # metering asks, too
+    assert sorted(found[0]) == sorted(rendered(scene, poses))
+    for other in found[1:]:
+        for key, image in other.items():
+            np.testing.assert_array_equal(image, found[0][key])
 
 
 def test_each_lighting_pattern_lights_its_own_frames(scene: Scene, poses: dict[str, Rigid3]) -> None:

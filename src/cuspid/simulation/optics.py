@@ -47,7 +47,9 @@ class Optics:
 
 
 IDEAL = Optics()
-CLINICAL = Optics(aperture_mm=0.07, smear_mm=0.02, saliva=0.5, crosstalk=0.05, bayer=True, jpeg_quality=95)
+CLINICAL = Optics(
+    aperture_mm=0.07, smear_mm=0.02, scattering=1.0, saliva=0.5, crosstalk=0.05, bayer=True, jpeg_quality=95
+)
 """A small camera in a mouth: the lens for which defocus at the ends of the depth of field equals diffraction, 20 mm/s
 for 1 ms of light, a Bayer sensor, MJPEG video."""
 
@@ -59,7 +61,7 @@ class OpticsOptions(Options):
 
     optics: Literal["ideal", "clinical"] = "ideal"
     """ideal: pinholes at rest, each pixel sees all colours (default). clinical: a small camera in a mouth (aperture
-    0.07 mm, smear 0.02 mm, saliva 0.5, crosstalk 0.05, Bayer, JPEG 95)."""
+    0.07 mm, smear 0.02 mm, scattering 1, saliva 0.5, crosstalk 0.05, Bayer, JPEG 95)."""
     aperture_mm: Annotated[float | None, Range(0, 100)] = None
     """Diameter of the lenses: defocus and diffraction; 0 for pinholes that do not diffract."""
     smear_mm: Annotated[float | None, Range(0, 100)] = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -30,6 +31,8 @@ from cuspid.storage.truths import write_path, write_truth
 from cuspid.tolerances import EXACT
 from cuspid.trueness import GroundTruth
 from cuspid.workers import usable_cores
+
+_LOG = logging.getLogger("cuspid")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +90,8 @@ def take_images(
 ) -> tuple[Capture, GroundTruth]:
     """As :func:`simulate`, from given poses of the handpiece by frame name. The capture has the handpiece ``known``; by
     default the true one, as exact."""
+    if options.optics.scattering and not any(APPEARANCES[options.texture].enamel.scattering_mm):
+        _LOG.info(f"optics: --scattering changes nothing, for light does not go below the texture {options.texture}")
     handpiece = lit(handpiece)
     frames, poses = lit_frames(handpiece, rig_from_world)
     truth = GroundTruth(jaw=jaw, handpiece=handpiece, rig_from_world=poses)
