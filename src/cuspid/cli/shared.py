@@ -106,7 +106,7 @@ def suited(probe: Probe, texture: Preset) -> Probe:
     """With the lights that suit the teeth, for a built-in design for which none are asked for."""
     if probe.handpiece is not None or probe.lights is not None:
         return probe
-    plain = texture == "enamel"
+    plain = texture in ("enamel", "natural")
     if plain:
         console.print("note: plain enamel takes coloured lights and crossed polarisers (--lights white for others)")
     return replace(probe, lights="colour-coded" if plain else "white")

@@ -19,7 +19,7 @@ from cuspid.jaw import GUM, Jaw
 from cuspid.kernels import kernel
 
 Colour = tuple[float, float, float]
-Preset = Literal["artificial", "powder", "enamel"]
+Preset = Literal["artificial", "powder", "enamel", "natural"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +43,8 @@ class Material:
     scattering_mm: Colour = (0.0, 0.0, 0.0)
     """How far red, green and blue light travels below the surface; Blender renders it always, Embree where the optics
     ask for it."""
+    veins: Colour | None = None
+    """Linear RGB albedo of thin lines through it, as of vessels; None for none."""
     applied: bool = False
     """Whether the texture is sprayed or painted on, as fine as the cameras need it, rather than the surface's own."""
 
@@ -64,10 +66,12 @@ class Appearance:
     """Teeth; everything, if the jaw has no labels."""
     gum: Material
     """Gingiva."""
+    marked: bool = False
+    """Whether teeth bear what real ones do (:func:`cuspid.simulation.marks.natural_marks`)."""
 
     def seen_by(self, footprint_mm: float) -> Appearance:
         """Both materials as :meth:`Material.seen_by`."""
-        return Appearance(enamel=self.enamel.seen_by(footprint_mm), gum=self.gum.seen_by(footprint_mm))
+        return replace(self, enamel=self.enamel.seen_by(footprint_mm), gum=self.gum.seen_by(footprint_mm))
 
 
 _SUITED_MM, _ALIKE_OCTAVES = 0.012, 2.3
@@ -79,34 +83,40 @@ _ARTIFICIAL = Material(
 )
 _POWDER = Material(dark=(0.62, 0.62, 0.60), light=(0.90, 0.90, 0.88), wavelengths_mm=(0.06, 0.12, 0.24), applied=True)
 
+_ENAMEL = Material(
+    dark=(0.60, 0.47, 0.28),
+    light=(0.78, 0.70, 0.54),
+    wavelengths_mm=(2.5, 5.0),
+    reflectance=0.05,
+    roughness=0.09,
+    exit_index=1.5,
+    scattering_mm=(0.5, 0.4, 0.3),
+)
+_GUM = Material(
+    dark=(0.42, 0.10, 0.09),
+    light=(0.66, 0.28, 0.24),
+    wavelengths_mm=(0.7, 1.4, 2.8),
+    reflectance=0.035,
+    roughness=0.12,
+    exit_index=1.38,
+    scattering_mm=(0.8, 0.25, 0.15),
+)
+
 APPEARANCES: Mapping[str, Appearance] = MappingProxyType(
     {
         "artificial": Appearance(enamel=_ARTIFICIAL, gum=_ARTIFICIAL),
         "powder": Appearance(enamel=_POWDER, gum=_POWDER),
-        "enamel": Appearance(
-            enamel=Material(
-                dark=(0.60, 0.47, 0.28),
-                light=(0.78, 0.70, 0.54),
-                wavelengths_mm=(2.5, 5.0),
-                reflectance=0.05,
-                roughness=0.09,
-                exit_index=1.5,
-                scattering_mm=(0.5, 0.4, 0.3),
-            ),
-            gum=Material(
-                dark=(0.42, 0.10, 0.09),
-                light=(0.66, 0.28, 0.24),
-                wavelengths_mm=(0.7, 1.4, 2.8),
-                reflectance=0.035,
-                roughness=0.12,
-                exit_index=1.38,
-                scattering_mm=(0.8, 0.25, 0.15),
-            ),
+        "enamel": Appearance(enamel=_ENAMEL, gum=_GUM),
+        "natural": Appearance(
+            enamel=replace(_ENAMEL, dark=(0.70, 0.60, 0.42), light=(0.80, 0.73, 0.58)),
+            gum=replace(_GUM, veins=(0.36, 0.03, 0.03)),
+            marked=True,
         ),
     }
 )
 """Presets: ``artificial`` is a strong matte texture on everything (the thesis' condition), ``powder`` a weak matte
-speckle like that of scanning spray, ``enamel`` plain, glossy and wet."""
+speckle like that of scanning spray, ``enamel`` plain, glossy and wet, ``natural`` the same with dentine that shines
+through, stained fissures, fillings, and gums with vessels."""
 
 
 class Palette(NamedTuple):
@@ -124,6 +134,10 @@ class Palette(NamedTuple):
     """Number of octaves of each material."""
     noise_from_jaw: np.ndarray
     """(material, octave, 3, 4): rotation, scale and shift of each octave, so that their lattices never coincide."""
+    veins: np.ndarray
+    """Colour of the veins of each material; negative for none."""
+    veins_from_jaw: np.ndarray
+    """(2, 3, 4): as for the octaves, of the noise along whose zeros veins run, and of that by which they fade."""
 
 
 def scattering_mm(appearance: Appearance, materials: UInt8[np.ndarray, "f"]) -> Float[np.ndarray, "f 3"]:
@@ -149,9 +163,7 @@ def palette(appearance: Appearance, seed: int, saliva: float = 0.0) -> Palette:
     most = max(len(material.wavelengths_mm) for material in materials)
     noise_from_jaw = np.zeros((2, most, 3, 4))
     for index, material in enumerate(materials):
-        for octave, wavelength in enumerate(material.wavelengths_mm):
-            noise_from_jaw[index, octave, :, :3] = Rotation.random(rng=rng).as_matrix() / wavelength
-            noise_from_jaw[index, octave, :, 3] = rng.uniform(0, 1000, 3)
+        noise_from_jaw[index, : len(material.wavelengths_mm)] = _lattices(material.wavelengths_mm, rng)
     return Palette(
         dark=np.array([material.dark for material in materials]),
         light=np.array([material.light for material in materials]),
@@ -162,11 +174,28 @@ def palette(appearance: Appearance, seed: int, saliva: float = 0.0) -> Palette:
         exit_index=np.array([material.exit_index for material in materials]),
         octaves=np.array([len(material.wavelengths_mm) for material in materials]),
         noise_from_jaw=noise_from_jaw,
+        veins=np.array([material.veins or (-1.0,) * 3 for material in materials]),
+        veins_from_jaw=_lattices(_VEINS_MM, rng),
     )
+
+
+def _lattices(wavelengths_mm: tuple[float, ...], rng: np.random.Generator) -> Float[np.ndarray, "n 3 4"]:
+    """Rotation, scale and shift of noise of these wavelengths."""
+    parts = [
+        np.column_stack([Rotation.random(rng=rng).as_matrix() / each, rng.uniform(0, 1000, 3)])
+        for each in wavelengths_mm
+    ]
+    return np.array(parts).reshape(-1, 3, 4)
 
 
 GRADIENT_NOISE_SD = 0.27
 """Standard deviation of :func:`gradient_noise` over space."""
+
+
+_VEINS_MM = (1.8, 2.6)
+"""Distance of veins, and over which they fade."""
+_VEIN = 0.04
+"""Half width of a vein, as a share of their distance."""
 
 
 @kernel(fastmath=True, inline="always")
@@ -224,6 +253,17 @@ def _add_octave(points, noise_from_jaw, total):
 
 @kernel(fastmath=True)
 @no_type_check
+def _add_veins(points, veins_from_jaw, share):
+    """How much of a vein each point is: along the zeros of one noise, where another is not too low."""
+    course, strength = np.zeros(len(share)), np.zeros(len(share))
+    _add_octave(points, veins_from_jaw[0], course)
+    _add_octave(points, veins_from_jaw[1], strength)
+    for i in range(len(share)):
+        share[i] = np.exp(-((course[i] / _VEIN) ** 2)) * min(max(strength[i] / (2 * GRADIENT_NOISE_SD), 0.0), 1.0)
+
+
+@kernel(fastmath=True)
+@no_type_check
 def _albedo(points, materials, palette, out):
     for material in range(len(palette.octaves)):
         chosen = np.flatnonzero(materials == material)
@@ -232,11 +272,16 @@ def _albedo(points, materials, palette, out):
         for k in range(octaves):
             _add_octave(coordinates, palette.noise_from_jaw[material, k], total)
         dark, light = palette.dark[material], palette.light[material]
+        veins = np.zeros(len(chosen))
+        if palette.veins[material, 0] >= 0:
+            _add_veins(coordinates, palette.veins_from_jaw, veins)
         for i in range(len(chosen)):
             unit = total[i] / (GRADIENT_NOISE_SD * np.sqrt(octaves))
             share = 1 / (1 + np.exp(-palette.hardness[material] * unit))
             for c in range(3):
                 out[chosen[i], c] = dark[c] + share * (light[c] - dark[c])
+                if veins[i] > 0:
+                    out[chosen[i], c] += veins[i] * (palette.veins[material, c] - out[chosen[i], c])
 
 
 def albedo(

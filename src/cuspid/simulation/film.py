@@ -28,7 +28,8 @@ class FilmOptions(RenderOptions):
     """How a jaw is filmed by hand in simulation."""
 
     texture: Preset = "enamel"
-    """Surface: artificial (strong matte texture, the thesis' condition), powder (weak speckle), enamel (plain, wet)."""
+    """Surface: artificial (strong matte texture, the thesis' condition), powder (weak speckle), enamel (plain, wet),
+    natural (the same, with stained fissures, fillings and vessels)."""
     path: FreePathOptions = field(default_factory=FreePathOptions)
     """How the hand moves the camera."""
 

@@ -40,6 +40,7 @@ from cuspid.simulation.appearance import (
     palette,
     scattering_mm,
 )
+from cuspid.simulation.marks import natural_marks, no_marks
 from cuspid.simulation.optics import IDEAL, Optics, mixed, recorded, through_lens
 from cuspid.simulation.scattering import Scattering
 from cuspid.simulation.sensor import record
@@ -96,8 +97,11 @@ class Scene:
     def surface(self) -> ShadedMesh:
         """The jaw as arrays for the compiled shading."""
         mesh = self.jaw.mesh
-        # Arrays that came from another process are writable: for those the shading would be compiled once more.
-        return ShadedMesh(read_only(mesh.faces), mesh.face_normals, mesh.vertex_normals, face_materials(self.jaw))
+        marks = natural_marks(self.jaw, self.seed) if self.appearance.marked else no_marks(mesh)
+        return ShadedMesh(
+            read_only(mesh.faces),  # arrays from another process are writable: the shading would be compiled once more
+            *(mesh.face_normals, mesh.vertex_normals, face_materials(self.jaw), marks.colours, marks.shares),
+        )
 
     @computed_once
     def rays(self) -> Callable[[Camera], Float[np.ndarray, "n 3"]]:
@@ -136,6 +140,9 @@ class ShadedMesh(NamedTuple):
     face_normals: np.ndarray
     vertex_normals: np.ndarray
     materials: np.ndarray
+    mark_colours: np.ndarray
+    marks: np.ndarray
+    """Share of each mark at each vertex."""
 
 
 _NONE: Float[np.ndarray, "0 3"] = np.zeros((0, 3))
@@ -290,6 +297,7 @@ def _add_light(
     lit, ambient = _lighting(scene, rays, chosen, lights)
     points, materials = _places(rays, scene.surface)
     albedos = albedo(points, materials, scene.palette)
+    _mark(rays, scene.surface, albedos)
     _shade(rays, albedos, scene.surface, scene.palette, lights, lit, ambient, row, below, out)
 
 
@@ -480,6 +488,22 @@ def _places(rays, surface):
             points[i, 0], points[i, 1], points[i, 2] = _point(rays, i)
             materials[i] = surface.materials[rays.faces[i]]
     return points, materials
+
+
+@kernel(fastmath=True)
+@no_type_check
+def _mark(rays, surface, albedos):
+    """Replace what lies below the marks of teeth by them."""
+    for i in range(len(rays.faces)):
+        if rays.faces[i] < 0 or surface.materials[rays.faces[i]] != 0:
+            continue
+        corners = surface.faces[rays.faces[i]]
+        for mark in range(len(surface.mark_colours)):
+            share = 0.0
+            for corner in range(3):
+                share += rays.barycentric[i, corner] * surface.marks[corners[corner], mark]
+            for c in range(3):
+                albedos[i, c] += share * (surface.mark_colours[mark, c] - albedos[i, c])
 
 
 @kernel(fastmath=True)

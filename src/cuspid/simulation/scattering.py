@@ -32,19 +32,31 @@ class Scattering:
 
     def __init__(self, mesh: Mesh, lengths_mm: Float[np.ndarray, "f c"]) -> None:
         """``lengths_mm``: how far light of each colour travels below each face; 0 for not at all."""
-        self._mass = np.maximum(mesh.vertex_areas, np.finfo(np.float32).tiny)  # some may be in no face
-        self._systems = [
-            (sparse.diags_array(self._mass) + _stiffness(mesh, lengths**2)).tocsr() for lengths in lengths_mm.T
-        ]
+        self._spreads = [_Spread(mesh, lengths) for lengths in lengths_mm.T]
 
     def leaving(self, entering: Float[np.ndarray, "v c"]) -> Float[np.ndarray, "v c"]:
         """The light of each colour that leaves each vertex, from what enters there (both per area)."""
-        return np.stack([self._spread(*each) for each in zip(self._systems, entering.T, strict=True)], axis=-1)
+        spread = [each(light) for each, light in zip(self._spreads, entering.T, strict=True)]
+        return np.maximum(np.stack(spread, axis=-1), 0.0)
 
-    def _spread(self, system: sparse.csr_array, entering: Float[np.ndarray, "v"]) -> Float[np.ndarray, "v"]:
-        scaled = sparse.diags_array(1 / system.diagonal())
-        found, _ = cg(system, self._mass * entering, x0=entering, rtol=_TOLERANCE, maxiter=_STEPS, M=scaled)
-        return np.maximum(found, 0.0)
+
+def diffused(mesh: Mesh, length_mm: float, values: Float[np.ndarray, "v k"]) -> Float[np.ndarray, "v k"]:
+    """Values per vertex after they have spread along the surface by a length."""
+    spread = _Spread(mesh, np.full(len(mesh.faces), length_mm))
+    return np.stack([spread(column) for column in values.T], axis=-1)
+
+
+class _Spread:
+    """The screened Poisson equation on a mesh, with a length for each face."""
+
+    def __init__(self, mesh: Mesh, lengths_mm: Float[np.ndarray, "f"]) -> None:
+        self._mass = np.maximum(mesh.vertex_areas, np.finfo(np.float32).tiny)  # some may be in no face
+        self._system = (sparse.diags_array(self._mass) + _stiffness(mesh, lengths_mm**2)).tocsr()
+
+    def __call__(self, values: Float[np.ndarray, "v"]) -> Float[np.ndarray, "v"]:
+        scaled = sparse.diags_array(1 / self._system.diagonal())
+        found, _ = cg(self._system, self._mass * values, x0=values, rtol=_TOLERANCE, maxiter=_STEPS, M=scaled)
+        return np.asarray(found)
 
 
 def _stiffness(mesh: Mesh, squares: Float[np.ndarray, "f"]) -> sparse.csr_array:

@@ -40,7 +40,8 @@ class RenderOptions(Options):
     """What the images of a simulation look like."""
 
     texture: Preset = "artificial"
-    """Surface: artificial (strong matte texture, the thesis' condition), powder (weak speckle), enamel (plain, wet)."""
+    """Surface: artificial (strong matte texture, the thesis' condition), powder (weak speckle), enamel (plain, wet),
+    natural (the same, with stained fissures, fillings and vessels)."""
     renderer: Literal["embree", "blender"] = "embree"
     """embree: ray casting (default). blender: Blender Cycles with subsurface scattering (needs its own environment)."""
     supersampling: Annotated[int, Range(1, 16)] = 2
