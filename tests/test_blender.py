@@ -19,7 +19,7 @@ from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor
 from cuspid.simulation import blender, raycast
-from cuspid.simulation.appearance import Appearance, Material
+from cuspid.simulation.appearance import APPEARANCES, Appearance, Material
 from cuspid.simulation.optics import CLINICAL
 from cuspid.simulation.raycast import Scene, Sink, render_capture
 
@@ -130,6 +130,8 @@ def test_what_blender_cannot_do_is_refused(monkeypatch: pytest.MonkeyPatch) -> N
         render(scene_of([(box((1, 1, 1), (0, 0, 5)), 11)], distorted))
     with pytest.raises(InputError, match="optics: Blender renders ideal ones only"):
         render(replace(scene_of([(box((1, 1, 1), (0, 0, 5)), 11)]), optics=CLINICAL))
+    with pytest.raises(InputError, match="texture: Blender renders no stains"):
+        render(replace(scene_of([(box((1, 1, 1), (0, 0, 5)), 11)]), appearance=APPEARANCES["natural"]))
 
 
 def test_a_blender_that_fails_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -63,7 +63,8 @@ def natural_marks(jaw: Jaw, seed: int) -> Marks:
 
 def hollow_mm(mesh: Mesh, length_mm: float) -> Float[np.ndarray, "v"]:
     """How far the surface, softened over a length, lies above each vertex, along its normal."""
-    above = diffused(mesh, length_mm, mesh.vertices) - mesh.vertices
+    centred = mesh.vertices - mesh.vertices.mean(axis=0)  # what spreads is found as exactly as it is large
+    above = diffused(mesh, length_mm, centred) - centred
     return np.asarray((above * mesh.vertex_normals).sum(axis=1))
 
 
@@ -95,8 +96,8 @@ def _fillings(jaw: Jaw, rng: np.random.Generator) -> list[Float[np.ndarray, "v"]
         vertices = np.unique(jaw.mesh.faces[jaw.tooth_faces(tooth)])
         plan, upwards = jaw.mesh.vertices[vertices, :2], jaw.mesh.vertex_normals[vertices, 2] > _UPWARDS
         off = (plan - np.median(plan, axis=0)) / np.ptp(plan, axis=0).min() - _OFF_CENTRE * (np.array(shift) - 0.5)
-        along = np.array([np.cos(np.pi * turn), np.sin(np.pi * turn)])
-        radius = np.hypot(off @ along / _FILLING[0], np.cross(along, off) / _FILLING[1])
+        cosine, sine = np.cos(np.pi * turn), np.sin(np.pi * turn)
+        radius = np.linalg.norm(off @ np.array([[cosine, -sine], [sine, cosine]]) / _FILLING, axis=1)
         inside = _ramp(-radius, -1 - _FILLING_EDGE, -1 + _FILLING_EDGE)
         shares[int(amalgam < _AMALGAM)][vertices] = np.where(upwards, inside, 0)
     return shares
