@@ -70,6 +70,9 @@ def cases(folder: Path) -> Iterator[Case]:
         dense: dict[str, Value] = {"optics": "clinical", "frames": DENSE}
         yield Case(name=f"{name}-clinical-dense", parameters={**jaw, **plain, **dense})
         yield Case(name=f"{name}-artificial-clinical", parameters={**jaw, **_TEXTURED})
+        natural: dict[str, Value] = {**plain, "texture": "natural"}
+        yield Case(name=f"{name}-natural", parameters={**jaw, **natural})
+        yield Case(name=f"{name}-natural-clinical-dense", parameters={**jaw, **natural, **dense})
     for light in VARIANTS:
         yield Case(name=f"phantom-0-{light}", parameters={**phantoms["phantom-0"], **plain, "light": light})
     in_turn: dict[str, Value] = {"light": "in-turn", "frames": DENSE}
@@ -87,6 +90,9 @@ def cases(folder: Path) -> Iterator[Case]:
             whole: dict[str, Value] = {"jaw": file, "tooth": None}
             yield Case(name=name, parameters={**whole, **plain})
             yield Case(name=f"{name}-clinical", parameters={**whole, **plain, "optics": "clinical"})
+            yield Case(
+                name=f"{name}-clinical-cross", parameters={**whole, **plain, "optics": "clinical", "cross": True}
+            )
             yield Case(name=f"{name}-artificial-clinical", parameters={**whole, **_TEXTURED})
 
 
@@ -121,14 +127,15 @@ def judge(
     optics: Literal["ideal", "clinical"],
     texture: Preset,
     frames: int | None = None,
+    cross: bool = False,
     method: str = "",
     scans: Path,
 ) -> dict[str, Value]:
     """The figures of one scan. One that was cut short goes on where it stopped; a finished one is not kept."""
     begin = time.perf_counter()
-    what = "arch" if tooth is None else f"{tooth}-{frames or 'usual'}"
+    what = ("cross" if cross else "arch") if tooth is None else f"{tooth}-{frames or 'usual'}"
     folder = scans / "-".join([Path(jaw).stem, what, light, optics, texture, method])
-    path = ScanPathOptions(tooth=tooth, frames=frames, passes="turns" if tooth is None else None)
+    path = ScanPathOptions(tooth=tooth, frames=frames, passes="turns" if tooth is None else None, cross_sweep=cross)
     options = SimulationOptions(texture=texture, optics=OpticsOptions(optics=optics), path=path)
     how = METHODS.get(method, ReconstructionOptions())
     found = scanned(jaw_of(jaw), lit(light), folder, options, how)

@@ -2,11 +2,12 @@
 
     python benchmarks/panorama.py --out benchmarks/results/panorama [--jaws FILE_OR_FOLDER ...] [--work FOLDER]
         [--subject lower-14-0 ...] [--films-only]
-        [--method ortho return s-shape pair thesis thesis-unexamined opencv-panorama opencv-scans]
+        [--method ortho return s-shape natural pair thesis thesis-unexamined opencv-panorama opencv-scans]
 
 Subjects are phantoms of the population, and jaws of your own, whose coarse faces are subdivided (Loop) first; the
 subdivided mesh is then the reference. All are filmed in 120 frames with full shake and the texture ``enamel``, for the
-method ``pair`` by two cameras, for ``return`` and ``s-shape`` on another way over the arch. One JSON a subject and
+method ``pair`` by two cameras, for ``return`` and ``s-shape`` on another way over the arch, for ``natural`` with the
+texture of that name. One JSON a subject and
 method goes to the results folder; what is there already is not made again.
 """
 
@@ -97,6 +98,7 @@ FILMS: Mapping[str, tuple[str, ...]] = {
     "film-pair": ("--camera.cameras", "2"),
     "film-return": ("--path", "return"),
     "film-s-shape": ("--path", "s-shape"),
+    "film-natural": ("--texture", "natural"),
 }
 """Films of a subject, and by which options."""
 
@@ -174,7 +176,7 @@ def opencv(mode: str) -> Callable[[Path, Path, int], list[str]]:
 CUSPID = (sys.executable, "-m", "cuspid")
 METHODS: Mapping[str, Callable[[Path, Path, int], list[str]]] = {
     "ortho": stitched("ortho"),
-    **dict.fromkeys(("pair", "return", "s-shape"), stitched("ortho")),
+    **dict.fromkeys(("pair", "return", "s-shape", "natural"), stitched("ortho")),
     "thesis": stitched("thesis"),
     "thesis-unexamined": stitched("thesis", "--no-examination"),
     "opencv-panorama": opencv("panorama"),
