@@ -10,7 +10,10 @@ from anatomy_sections import mark, markdown_table
 
 Result = Mapping[str, Any]
 
-METHODS = ("ortho", "return", "s-shape", "pair", "thesis", "thesis-unexamined", "opencv-panorama", "opencv-scans")
+METHODS = (
+    *("ortho", "return", "s-shape", "natural", "pair"),
+    *("thesis", "thesis-unexamined", "opencv-panorama", "opencv-scans"),
+)
 MEDIAN_MM, P95_MM, SSIM_TEETH, SSIM_CANVAS, WALL_S = 0.15, 0.5, 0.80, 0.93, 90.0
 """Bars: greatest errors, least likeness, longest time."""
 PAIR_MEDIAN_MM, PAIR_MOLARS_MM, PAIR_WALL_S = 0.05, 0.15, 45.0
@@ -30,14 +33,15 @@ def panoramas(results: Sequence[Result]) -> str:
         [
             "Phantoms of the population and real jaws (`benchmarks/panorama.py`), each filmed in 120 frames of "
             "640 x 480 px with full hand shake, texture `enamel`; `pair` is the default method on the film of two "
-            "cameras 5 mm apart, `return` and `s-shape` on a film of that path. docs/panorama-evaluation.md explains "
+            "cameras 5 mm apart, `return` and `s-shape` on a film of that path, `natural` on one of teeth with what "
+            "real ones bear (texture `natural`). docs/panorama-evaluation.md explains "
             "the figures. *No arch* counts the panoramas that failed: too few frames, collapsed, or nowhere near the "
             "jaw. Medians are over those that did not fail.",
             "",
             markdown_table(
                 (
                     *("method", "subjects", "no arch", "complete", "frames placed, %", "error: median mm", "P95 mm"),
-                    *("SSIM teeth, fitted", "SSIM canvas, as it is", "CPU-s"),
+                    *("scale, % off", "inter-molar, mm off", "SSIM teeth, fitted", "SSIM canvas, as it is", "CPU-s"),
                 ),
                 [method_row(name, rows) for name, rows in by_method.items() if rows],
             ),
@@ -104,7 +108,7 @@ def method_row(name: str, results: Sequence[Result]) -> list[str]:
     made = [result for result in results if result["failure"] is None]
 
     def middle(*path: str, digits: int = 2) -> str:
-        found = [value for value in (at(result["score"], path) for result in made) if value is not None]
+        found = [abs(value) for value in (at(result["score"], path) for result in made) if value is not None]
         return f"{median(found):.{digits}f}" if found else "-"
 
     placed = [100 * share for share in map(placed_share, results) if share is not None]
@@ -112,7 +116,8 @@ def method_row(name: str, results: Sequence[Result]) -> list[str]:
         *(f"`{name}`", str(len(results)), str(len(results) - len(made))),
         str(sum(bool(result["score"]["complete"]) for result in made)),
         f"{median(placed):.0f}" if placed else "-",
-        *(middle("geometry", key) for key in ("median_mm", "p95_mm")),
+        *(middle("geometry", key) for key in ("median_mm", "p95_mm", "scale_error_pct")),
+        middle("inter_molar_error_mm"),
         *(middle("picture", key) for key in ("ssim_teeth_fitted", "ssim_full")),
         f"{median(result['frames_to_panorama']['cpu_s'] for result in results):.0f}",
     ]
