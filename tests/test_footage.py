@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -30,7 +31,7 @@ from cuspid.footage.synchronise import (
     offset_between,
 )
 from cuspid.geometry import Rigid3
-from cuspid.rig import Handpiece, MountedCamera, Rig
+from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 from cuspid.storage.videos import read_video
 from verbs import refused, run
 
@@ -194,6 +195,48 @@ def test_cameras_that_are_not_synchronised_have_frames_of_their_own(tmp_path, pr
 def test_motion_that_contradicts_the_names_is_told(tmp_path, probe, capsys):
     imported(write_films(tmp_path / "footage", filmed({"left": 0, "right": 4})), probe)
     assert "right is 4 frames later than left" in " ".join(capsys.readouterr().err.split())
+
+
+def lit(probe: Path) -> Path:
+    """The handpiece with two lights, of which one is on at a time."""
+    known = storage.read_handpiece(probe)
+    ahead = np.array([0.0, 0, 1])
+    lights = {
+        name: Light(position_mm=np.array([x, 0.0, 0]), direction=ahead) for name, x in (("east", 3.0), ("west", -3.0))
+    }
+    patterns = (Lighting(name="a", lights=("east",)), Lighting(name="b", lights=("west",)))
+    storage.write_handpiece(probe, replace(known, lights=lights, lightings=patterns))
+    return probe
+
+
+@pytest.mark.parametrize("in_turn", [("a", "b"), ("b", "a"), ("a", "a", "b")])
+def test_lights_take_turns_whatever_is_left_out_or_lost(in_turn, tmp_path, probe, capsys):
+    films = filmed(dict.fromkeys(STARTS, 0), count=40)
+    kept = [k for k in range(40) if k not in range(20, 25)]
+    (tmp_path / "footage").mkdir()
+    for camera, images in films.items():
+        write_film(tmp_path / "footage" / f"{camera}.mkv", [images[k] for k in kept], [40 * k for k in kept])
+    asked = "--lightings", *in_turn
+    out = imported(tmp_path / "footage", lit(probe), "--sync", "times", "--every", 3, *asked)
+    capture = storage.read_capture(out)
+    assert len(capture.frames) == 12
+    for frame in capture.frames:
+        assert frame.lighting == in_turn[round(frame.time_s / 0.04) % len(in_turn)]
+    assert "lighting pattern" not in capsys.readouterr().err
+
+
+def test_lights_that_are_not_told_or_cannot_be_are_said(tmp_path, probe, capsys):
+    footage = write_folders(tmp_path / "footage", filmed(dict.fromkeys(STARTS, 0), count=6))
+    for more, reason in (
+        (("--lightings", "a", "c"), "no lighting pattern named 'c'; it has a, b"),
+        (("--lightings", "a", "b", "--sync", "none"), "--lightings: lights that take turns are shared"),
+    ):
+        line = refused(capsys, "import", footage, "--handpiece", lit(probe), "--out", tmp_path / "capture", *more)
+        assert reason in line
+        assert not (tmp_path / "capture").exists()
+    capture = storage.read_capture(imported(footage, probe))
+    assert {frame.lighting for frame in capture.frames} == {None}
+    assert "if they take turns, give --lightings a b" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_part_of_a_long_film_is_chosen_by_time(tmp_path, probe):

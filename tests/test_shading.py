@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
+from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.reconstruction import DepthMap
-from cuspid.rig import Handpiece, Rig, Sensor
+from cuspid.rig import Handpiece, Lighting, Rig, Sensor
 from cuspid.stereo import shading
 from cuspid.stereo.matching import DepthEstimator, StereoOptions, gray
 from cuspid.stereo.refinement import RefinementOptions
@@ -123,6 +124,16 @@ def test_some_of_what_is_mirrored_is_seen_under_lights_between(images: dict[str,
     first, second = known(0.0), known(60.0)
     assert 0.2 < first.mean() < 0.8
     assert 1.05 * max(first.mean(), second.mean()) < (first | second).mean() < known_share(measured(lit(), images))
+
+
+def test_lights_that_are_not_told_are_asked_for(images: dict[str, np.ndarray]) -> None:
+    one, *others = lit().lights
+    two = replace(lit(), lightings=(Lighting(name="a", lights=(one,)), Lighting(name="b", lights=tuple(others))))
+    estimator = DepthEstimator(two, OPTIONS, signal="shading")
+    with pytest.raises(InputError, match=r"frame 7: which lights were on is not told.*\(a, b\)"):
+        estimator.measure(images, "7")
+    assert known_share(estimator.measure(images, "7", "b")) > 0.1
+    assert DepthEstimator(two, OPTIONS).measure(images, "7")  # texture does not ask
 
 
 def test_neighbours_tell_how_well_a_smooth_surface_is_known() -> None:

@@ -340,6 +340,11 @@ class Handpiece:
         """The sensor of a camera."""
         return self.sensors.get(camera, self.sensor)
 
+    @property
+    def only_lighting(self) -> str | None:
+        """The lighting pattern of frames of which nothing is told; None where there are several, or none."""
+        return self.lightings[0].name if len(self.lightings) == 1 else None
+
     def lights_on(self, lighting: str | None) -> list[Light]:
         """The lights of a lighting pattern; all of them where the pattern is not known (None).
 

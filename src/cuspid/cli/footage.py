@@ -13,7 +13,7 @@ from tyro.conf import Positional
 from cuspid import storage
 from cuspid.cli.shared import Flat, console, show_progress
 from cuspid.footage.films import DevelopmentOptions
-from cuspid.footage.plan import Films, ImportOptions, Plan, SelectionOptions, kinds_of, plan_import
+from cuspid.footage.plan import Films, ImportOptions, Plan, SelectionOptions, check_lightings, kinds_of, plan_import
 from cuspid.footage.quality import Looks, QualityOptions
 from cuspid.footage.stage import develop, open_films, survey
 from cuspid.footage.synchronise import SyncOptions
@@ -29,6 +29,7 @@ def import_(
     handpiece: Path,
     out: Path,
     times: Path | None = None,
+    lightings: tuple[str, ...] = (),
     working_distance_mm: Annotated[float | None, Range(0.1, 100_000)] = None,
     sync: Annotated[SyncOptions, Flat] = SyncOptions(),
     quality: Annotated[QualityOptions, Flat] = QualityOptions(),
@@ -43,11 +44,14 @@ def import_(
         out: Folder for the capture, the input of cuspid reconstruct.
         times: CSV file with the columns camera, frame and time (s); default: times.csv or timestamps.csv in the footage
             folder, if there is one.
+        lightings: Lighting patterns of the handpiece that take turns, in the order in which the frames of the film have
+            them (default: its only one).
         working_distance_mm: Distance from the cameras to the teeth, for a rig_config.json, which does not contain it
             (guessed unless given).
     """
-    options = ImportOptions(sync=sync, quality=quality, selection=selection)
+    options = ImportOptions(sync=sync, quality=quality, selection=selection, lightings=lightings)
     known = storage.read_handpiece(handpiece, working_distance_mm)
+    check_lightings(options, known)
     films = open_films(storage.rig_sources(footage), known)
     table = times or next((footage / name for name in storage.TIMES_FILES if (footage / name).is_file()), None)
     taken = None if table is None else storage.read_frame_times(table, list(films))

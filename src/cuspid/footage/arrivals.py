@@ -7,7 +7,7 @@ from pathlib import Path
 from cuspid.capture import Dropped, Frame, ImageFolder, image_size
 from cuspid.errors import InputError
 from cuspid.rig import Handpiece
-from cuspid.storage.captures import IMAGE_SUFFIXES, only_lighting
+from cuspid.storage.captures import IMAGE_SUFFIXES
 
 _State = tuple[int, int]
 """Size and time of modification of a file."""
@@ -74,7 +74,7 @@ class Arrivals:
                 break
             self._given.add(name)
             cameras = tuple(camera for camera in self._handpiece.rig.names if camera in self._whole[name])
-            found.append(Frame(name=name, cameras=cameras, lighting=only_lighting(self._handpiece)))
+            found.append(Frame(name=name, cameras=cameras, lighting=self._handpiece.only_lighting))
         return found
 
     def _look(self, now_s: float) -> None:

@@ -64,6 +64,9 @@ class ImportOptions:
     """Which images are left out."""
     selection: SelectionOptions = field(default_factory=SelectionOptions)
     """Which part of the footage is taken."""
+    lightings: tuple[str, ...] = ()
+    """The handpiece's lighting patterns as the frames of the film have them, one after the other and over again; empty
+    where it has only one, or they are not known."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,8 +113,9 @@ class Plan:
 def plan_import(
     films: Films, looks: Mapping[str, Looks], handpiece: Handpiece, options: ImportOptions, times: FrameTimes | None
 ) -> Plan:
-    """Synchronise and select. Raises InputError where the synchronisation cannot be trusted, or nothing usable is
-    left."""
+    """Synchronise and select. Raises InputError where the synchronisation cannot be trusted, nothing usable is left, or
+    cameras that are not synchronised are to share lights."""
+    check_lightings(options, handpiece)
     times_s = {
         camera: each.time_s if times is None else _times_of(films[camera], len(each.time_s), times.get(camera, {}))
         for camera, each in looks.items()
@@ -122,12 +126,15 @@ def plan_import(
         *_film_notes(films, looks, handpiece),
         *_sync_notes(every, looks, times_s, clock, options.sync),
         *_depth_notes(looks),
+        *_lighting_notes(options.lightings, handpiece),
     ]
     is_kept = [options.sync.sync == "none" or len(films) == 1 or len(instant.numbers) > 1 for instant in every]
     notes += _alone([instant for instant, kept in zip(every, is_kept, strict=True) if not kept])
     chosen = _selected(np.flatnonzero(is_kept).tolist(), clock, options.selection)
     wrong = {camera: faults(each, options.quality) for camera, each in looks.items()}
-    frames, bad = _judged([every[k] for k in chosen], [_time(clock, k) for k in chosen], wrong, handpiece)
+    lit = _lightings(every, clock, options.lightings, handpiece)
+    taken = [(every[k], _time(clock, k), lit[k]) for k in chosen]
+    frames, bad = _judged(taken, wrong, handpiece)
     return Plan(
         frames=frames,
         numbers={every[k].name: every[k].numbers for k in chosen},
@@ -227,16 +234,38 @@ def _selected(instants: Sequence[int], clock: Clock | None, options: SelectionOp
 # --- judging ---------------------------------------------------------------------------------------------------------
 
 
+def check_lightings(options: ImportOptions, handpiece: Handpiece) -> None:
+    """Raise InputError for a lighting pattern that the handpiece does not have, and where cameras that are not
+    synchronised would share it."""
+    for name in options.lightings:
+        handpiece.lights_on(name)
+    if options.lightings and options.sync.sync == "none":
+        raise InputError("--lightings: lights that take turns are shared by cameras that expose together; give --sync")
+
+
+def _lightings(
+    instants: Sequence[Instant], clock: Clock | None, in_turn: Sequence[str], handpiece: Handpiece
+) -> list[str | None]:
+    """The lighting pattern of each instant. Where times are known they tell of lost frames, which had one, too."""
+    if not in_turn:
+        return [handpiece.only_lighting] * len(instants)
+    steps = np.ones(max(len(instants) - 1, 0), dtype=int)
+    if clock is not None:
+        apart = np.diff(clock.times_s) / clock.interval_s
+        steps = np.where(np.isfinite(apart), np.maximum(np.rint(apart), 1), 1).astype(int)
+    turns = np.concatenate([[0], np.cumsum(steps)])[: len(instants)] % len(in_turn)
+    return [in_turn[turn] for turn in turns]
+
+
 def _judged(
-    instants: Sequence[Instant],
-    times_s: Sequence[float | None],
+    taken: Sequence[tuple[Instant, float | None, str | None]],
     wrong: Mapping[str, Mapping[int, str]],
     handpiece: Handpiece,
 ) -> tuple[tuple[Frame, ...], tuple[Bad, ...]]:
-    """The frames with their good images, and the bad ones. Raises InputError where nothing good is left."""
-    lighting = handpiece.lightings[0].name if len(handpiece.lightings) == 1 else None
+    """The frames with their good images, and the bad ones, from instants with their times and lighting patterns. Raises
+    InputError where nothing good is left."""
     frames, found = [], []
-    for instant, time_s in zip(instants, times_s, strict=True):
+    for instant, time_s, lighting in taken:
         bad = {camera: wrong[camera][k] for camera, k in instant.numbers.items() if k in wrong[camera]}
         good = tuple(camera for camera in handpiece.rig.names if camera in instant.numbers and camera not in bad)
         found += [Bad(frame=instant.name, camera=camera, reason=bad[camera]) for camera in sorted(bad)]
@@ -245,7 +274,7 @@ def _judged(
     if not frames:
         kinds = ", ".join(f"{count} {kind}" for kind, count in kinds_of(found).items())
         raise InputError(
-            f"no image of {len(instants)} frames is usable: {kinds}; check the images, and --blurred-below, "
+            f"no image of {len(taken)} frames is usable: {kinds}; check the images, and --blurred-below, "
             "--dark-below-dn, --burnt-above, --same-below-dn and --bits"
         )
     return tuple(frames), tuple(found)
@@ -269,6 +298,15 @@ def _film_notes(films: Films, looks: Mapping[str, Looks], handpiece: Handpiece) 
             yield f"{film.source.name}: {missing}"
     if len(set(counts.values())) > 1:
         yield f"the films differ in length: {', '.join(f'{name} {count}' for name, count in counts.items())} frames"
+
+
+def _lighting_notes(in_turn: Sequence[str], handpiece: Handpiece) -> Iterator[str]:
+    if len(handpiece.lightings) > 1 and not in_turn:
+        names = " ".join(each.name for each in handpiece.lightings)
+        yield (
+            "which lighting pattern each frame has is not told, which plain teeth need; if they take turns, give "
+            f"--lightings {names} in their order"
+        )
 
 
 def _alone(instants: Sequence[Instant]) -> Iterator[str]:

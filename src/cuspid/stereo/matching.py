@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from cuspid.camera import Camera
+from cuspid.errors import InputError
 from cuspid.options import Options, Range
 from cuspid.pairing import PairingOptions, camera_groups, require_stereo, resolved_mm, stereo_pairs
 from cuspid.reconstruction import DepthMap
@@ -204,7 +205,15 @@ class DepthEstimator:
 
         A camera of the handpiece that is not among them, or whose image is blank, saw nothing of the frame. ``alone``:
         no other frame is measured meanwhile, so that the cameras of a group are measured side by side.
+
+        Raises InputError where shading is to be matched and it is not told which of several patterns was on.
         """
+        if self.signal == "shading" and lighting is None and len(self.handpiece.lightings) > 1:
+            known = ", ".join(each.name for each in self.handpiece.lightings)
+            raise InputError(
+                f"frame {frame}: which lights were on is not told, and plain surfaces are matched by them; give each "
+                f"frame's lighting in capture.json ({known}), or import the footage with --lightings"
+            )
         names = self.handpiece.rig.names
         groups = self._groups(tuple(name for name in names if name in images and not _is_blank(images[name])))
         work = map_in_threads if alone else _one_by_one

@@ -73,7 +73,7 @@ def _listed(folder: Path, handpiece: Handpiece, stems: Mapping[str, set[str]]) -
     manifest = folder / "capture.json"
     if not manifest.exists():
         every = sorted(set().union(*stems.values()))
-        return [Frame(name=stem, cameras=handpiece.rig.names, lighting=only_lighting(handpiece)) for stem in every]
+        return [Frame(name=stem, cameras=handpiece.rig.names, lighting=handpiece.only_lighting) for stem in every]
     value = read_json(manifest)
     with reading(manifest):
         listed = [as_declared(Frame, **{**frame, "cameras": tuple(frame["cameras"])}) for frame in value["frames"]]
@@ -81,11 +81,6 @@ def _listed(folder: Path, handpiece: Handpiece, stems: Mapping[str, set[str]]) -
             for name in frame.cameras:
                 handpiece.rig[name]
     return listed
-
-
-def only_lighting(handpiece: Handpiece) -> str | None:
-    """The lighting pattern of frames of which nothing is told, where the handpiece has only one."""
-    return handpiece.lightings[0].name if len(handpiece.lightings) == 1 else None
 
 
 def _present(
