@@ -14,6 +14,7 @@ from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3, unit
 from cuspid.mesh import Mesh
 from cuspid.motion.surface_tracking import (
+    Shown,
     Surface,
     SurfaceTrackingOptions,
     _drift,
@@ -23,7 +24,7 @@ from cuspid.motion.surface_tracking import (
     track_surfaces,
 )
 from cuspid.progress import silent
-from cuspid.reconstruction import DepthMap, Reconstruction, SurfacePoints
+from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece, Light
 from cuspid.stereo.matching import coarser
 from plain_scene import SIZE_PX
@@ -99,7 +100,9 @@ def test_a_long_path_that_was_found_bent_is_straightened() -> None:
         slope_x = 0.9 * np.cos(1.8 * u) * np.cos(1.5 * y + 0.3 * u) - 0.15 * np.sin(1.8 * u) * np.sin(1.5 * y + 0.3 * u)
         slope_y = -0.75 * np.sin(1.8 * u) * np.sin(1.5 * y + 0.3 * u)
         surfaces.append(
-            Surface(SurfacePoints(np.stack([x, y, z], axis=1), unit(np.stack([-slope_x, -slope_y, 1 + 0 * x], axis=1))))
+            Surface(
+                Shown(np.stack([x, y, z], axis=1), unit(np.stack([-slope_x, -slope_y, 1 + 0 * x], axis=1)), 1 + 0 * x)
+            )
         )
         way.append(Rigid3(np.eye(3), np.array([-k, 0.0, 0.0])))
         bent.append(Rigid3.from_rotation_vector(np.array([0, 0, 2e-4 * k]), np.array([-k, 1e-4 * k**2, 0])))
@@ -113,6 +116,32 @@ def test_a_long_path_that_was_found_bent_is_straightened() -> None:
     assert 1 < off_um(straight) < 50
     assert expected is not None
     assert 0.5 < expected.span_sigma_um < 10
+
+
+def held_back(trust: float) -> list[DepthMap]:
+    """Depth maps half of whose pixels, in stripes, show the same hollow in each frame, as if it went along with the
+    cameras; those have this confidence."""
+    made = []
+    for each in depth_maps(OUT, noise_mm=0.002):
+        columns = np.arange(each.depth_mm.shape[1])
+        along = (columns // 20) % 2 == 0
+        deeper = each.depth_mm + 0.03 * np.sin(columns / 4) * along
+        confidence = np.where(along, trust * each.confidence, each.confidence).astype(np.float32)
+        made.append(replace(each, depth_mm=deeper.astype(np.float32), confidence=confidence))
+    return made
+
+
+def test_what_is_hardly_known_does_not_hold_a_path_back() -> None:
+    trusted, distrusted = (errors_um(tracked(held_back(trust)), OUT).max() for trust in (1.0, 0.02))
+    assert trusted > 2 * distrusted
+    assert 0.1 < distrusted < 15
+
+
+def test_only_relative_trust_matters() -> None:
+    maps = depth_maps(dict(list(OUT.items())[:3]))
+    some = [replace(each, confidence=np.float32(0.25) * each.confidence) for each in maps]
+    for name, pose in tracked(maps).rig_from_world.items():
+        assert tracked(some).rig_from_world[name].matrix == pytest.approx(pose.matrix, abs=1e-9)
 
 
 @pytest.mark.parametrize("wide_px", [0.0, 3.0])

@@ -4,7 +4,9 @@ The depth maps of each frame are metric, so that frames are placed by laying the
 onto an earlier one, by iterative closest points with point-to-plane distances (Y. Chen, G. Medioni, Image and Vision
 Computing 10, 1992) and a motion model; then all at once, over the pairs of frames that show most of the same surface,
 whether consecutive or not. A pair counts for as much as its surfaces overlap and as little as they scatter about each
-other, so that drift is spread where it is least certain, and a path that comes back is closed.
+other, and a point for as much as its depth is known: what is smooth because the images tell little there goes along
+with the cameras, so that it would hold them back. Thus drift is spread where it is least certain, and a path that comes
+back is closed.
 
 How far the poses may be off follows from how the gradients of all pairs scatter from one block of space to the next
 (covariance of an M-estimate with clusters, as for tracks): surfaces are smooth, so that their errors hang together
@@ -30,7 +32,7 @@ from cuspid.geometry import Rigid3, unit
 from cuspid.motion.expectation import MOST_POINTS, expectation_of, steps_drawn
 from cuspid.options import SEED, SHARE, Options, Range
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import DepthMap, Expectation, Reconstruction, SurfacePoints
+from cuspid.reconstruction import DepthMap, Expectation, Reconstruction
 from cuspid.rig import Handpiece
 from cuspid.workers import map_in_threads
 
@@ -94,7 +96,7 @@ class SurfaceTrackingOptions(Options):
     joint_overlap: Annotated[float, SHARE] = 0.15
     """Frames that share at least this part of the smaller surface are adjusted to each other, if neither shares more
     with one that lies between."""
-    samples: Annotated[int, Range(100, 1_000_000)] = 2000
+    samples: Annotated[int, Range(100, 1_000_000)] = 6000
     """Points of each frame that are laid onto others in searches and in the joint adjustment."""
     rounds: Annotated[int, Range(1, 1000)] = 20
     """Maximum number of rounds of the joint adjustment."""
@@ -102,11 +104,20 @@ class SurfaceTrackingOptions(Options):
     """Seed of the choice of these points."""
 
 
-class Surface:
-    """What a frame shows, in its rig frame, ready to be asked for the nearest point."""
+class Shown(NamedTuple):
+    """Points of a surface that a frame shows, in its rig frame."""
 
-    def __init__(self, shown: SurfacePoints) -> None:
-        self.points, self.normals = shown.points, shown.normals
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    trust: Float[np.ndarray, "n"]
+    """Inverse variance, in any unit."""
+
+
+class Surface:
+    """What a frame shows, ready to be asked for the nearest point."""
+
+    def __init__(self, shown: Shown) -> None:
+        self.points, self.normals, self.trust = shown
         self._tree = cKDTree(self.points)
 
     def __len__(self) -> int:
@@ -120,10 +131,10 @@ class Surface:
         near = np.isfinite(distance)
         return near, np.where(near, index, 0)
 
-    def some(self, count: int, rng: np.random.Generator) -> SurfacePoints:
+    def some(self, count: int, rng: np.random.Generator) -> Shown:
         """A random choice of the points."""
         chosen = rng.permutation(len(self))[:count]
-        return SurfacePoints(self.points[chosen], self.normals[chosen])
+        return Shown(self.points[chosen], self.normals[chosen], self.trust[chosen])
 
 
 class _Laid(NamedTuple):
@@ -135,24 +146,26 @@ class _Laid(NamedTuple):
     """Mean of both."""
     distances: np.ndarray
     """Along them."""
+    sigmas: np.ndarray
+    """Standard deviation of each."""
     sigma: float
-    """Robust standard deviation of the distances."""
+    """That of a typical one."""
     share: float
     """Of the first surface that lies on the second."""
 
     @property
     def _off(self) -> Float[np.ndarray, "n"]:
-        return np.asarray(np.minimum((self.distances / (_TUKEY * self.sigma)) ** 2, 1.0))
+        return np.asarray(np.minimum((self.distances / (_TUKEY * self.sigmas)) ** 2, 1.0))
 
     @property
     def weights(self) -> Float[np.ndarray, "n"]:
         """Tukey's, over the variance."""
-        return np.asarray((1 - self._off) ** 2 / self.sigma**2)
+        return np.asarray((1 - self._off) ** 2 / self.sigmas**2)
 
     @property
     def slopes(self) -> Float[np.ndarray, "n"]:
         """How much weight times distance changes with the distance."""
-        return np.asarray((1 - self._off) * (1 - 5 * self._off) / self.sigma**2)
+        return np.asarray((1 - self._off) * (1 - 5 * self._off) / self.sigmas**2)
 
     @property
     def relief(self) -> float:
@@ -176,7 +189,7 @@ class _Step:
 # --- surfaces of frames ------------------------------------------------------------------------------------------
 
 
-def _shown(depth_map: DepthMap, jump_mm: float) -> SurfacePoints:
+def _shown(depth_map: DepthMap, jump_mm: float) -> Shown:
     """The points of a depth map that have neighbours on all sides, in the rig frame."""
     camera = depth_map.camera
     rays = camera.rays(camera.pixel_centres().reshape(-1, 2)).reshape(camera.height, camera.width, 3)
@@ -190,14 +203,16 @@ def _shown(depth_map: DepthMap, jump_mm: float) -> SurfacePoints:
         smooth = np.maximum(np.linalg.norm(right, axis=-1), np.linalg.norm(down, axis=-1)) < jump_mm
         good = smooth & (facing > _LEAST_COSINE)
     rig_from_cam = depth_map.cam_from_rig.inverse()
-    return SurfacePoints(rig_from_cam.apply(points[good]), rig_from_cam.rotate(normals[good]))
+    return Shown(
+        rig_from_cam.apply(points[good]), rig_from_cam.rotate(normals[good]), depth_map.confidence[good].astype(float)
+    )
 
 
 def surface_of(depth_maps: Iterable[DepthMap], working_distance_mm: float, options: SurfaceTrackingOptions) -> Surface:
     """What the depth maps of a frame show, thinned out: the mean of what lies in one cube and faces one way."""
     parts = [_shown(each, _JUMP * working_distance_mm) for each in depth_maps]
-    points = np.concatenate([np.zeros((0, 3)), *(part.points for part in parts)])
-    normals = np.concatenate([np.zeros((0, 3)), *(part.normals for part in parts)])
+    nothing = Shown(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    points, normals, trust = (np.concatenate(each) for each in zip(nothing, *parts, strict=True))
     cubes = np.floor(points / (options.thinning * working_distance_mm)).astype(np.int64)
     sides = np.abs(normals).argmax(axis=1, keepdims=True) if len(normals) else np.zeros((0, 1), int)
     facing = sides + 3 * (np.take_along_axis(normals, sides, axis=1) > 0)
@@ -205,19 +220,20 @@ def surface_of(depth_maps: Iterable[DepthMap], working_distance_mm: float, optio
         np.concatenate([cubes, facing], axis=1), axis=0, return_inverse=True, return_counts=True
     )
     cell, enough = cell.reshape(-1), members >= _LEAST_MEMBERS
+    total = np.bincount(cell, trust, len(members))
 
     def mean(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-        sums = [np.bincount(cell, values[:, axis], len(members)) for axis in range(3)]
-        return (np.stack(sums, axis=1) / members[:, None])[enough]
+        sums = [np.bincount(cell, trust * values[:, axis], len(members)) for axis in range(3)]
+        return (np.stack(sums, axis=1) / total[:, None])[enough]
 
-    return Surface(SurfacePoints(mean(points), unit(mean(normals))))
+    return Surface(Shown(mean(points), unit(mean(normals)), (total / members)[enough]))
 
 
 # --- one frame onto another --------------------------------------------------------------------------------------
 
 
 def _lay(
-    one: Surface | SurfacePoints, other: Surface, other_from_one: Rigid3, reach_mm: float, least_mm: float
+    one: Surface | Shown, other: Surface, other_from_one: Rigid3, reach_mm: float, least_mm: float
 ) -> _Laid | None:
     """None where hardly anything is near."""
     points, normals = other_from_one.apply(one.points), other_from_one.rotate(one.normals)
@@ -228,8 +244,10 @@ def _lay(
     points, index = points[near], index[near]
     normals = unit(normals[near] + other.normals[index])
     distances = ((points - other.points[index]) * normals).sum(axis=1)
-    sigma = max(1.4826 * float(np.median(np.abs(distances))), least_mm)
-    return _Laid(points, normals, distances, sigma, float(near.mean()))
+    uncertain = np.sqrt(1 / one.trust[near] + 1 / other.trust[index])
+    uncertain /= np.median(uncertain)
+    sigma = max(1.4826 * float(np.median(np.abs(distances) / uncertain)), least_mm)
+    return _Laid(points, normals, distances, sigma * uncertain, sigma, float(near.mean()))
 
 
 def _rows(laid: _Laid) -> Float[np.ndarray, "n 6"]:
@@ -257,7 +275,7 @@ def _solved(
 
 
 def _onto(
-    one: Surface | SurfacePoints,
+    one: Surface | Shown,
     other: Surface,
     start: Rigid3,
     distance_mm: float,
@@ -433,7 +451,7 @@ def _together(
 
 
 def _compared(
-    some: Sequence[SurfacePoints],
+    some: Sequence[Shown],
     surfaces: Sequence[Surface],
     poses: Sequence[Rigid3],
     reach_mm: float,
@@ -510,7 +528,7 @@ def _covariance(pairs: Sequence[_Pair], count: int, block_mm: float) -> Float[np
 
 
 def _expected(
-    some: Sequence[SurfacePoints], pairs: Sequence[_Pair], poses: Sequence[Rigid3], distance_mm: float
+    some: Sequence[Shown], pairs: Sequence[_Pair], poses: Sequence[Rigid3], distance_mm: float
 ) -> Expectation | None:
     """How far the surface may be off by its poses; None for a single frame, and where none lies on another."""
     if not pairs:
