@@ -61,7 +61,7 @@ class Probe(Options):
     lights: Literal["white", "colour-coded", "in-turn"] | None = None
     """LEDs of a built-in design: white ones, or red, green and blue ones behind crossed polarisers, which plain enamel
     needs, or two such triples that take turns, without polarisers (default: white, but colour-coded with --texture
-    enamel)."""
+    enamel and natural)."""
     handpiece: Path | None = None
     """Your own handpiece.json, or COLMAP's rig_config.json, instead of a built-in design."""
     working_distance_mm: Annotated[float | None, Range(0.1, 100_000)] = None
