@@ -112,3 +112,15 @@ def test_marks_replace_the_colour_of_teeth_and_leave_the_gum(
     light = red[on_tooth] / colours[0]
     assert (bare[on_tooth] / light).min() > 0.3  # what is below is enamel again
     assert (bare[on_tooth] / light).max() < 0.9
+
+
+def test_lone_vertices_and_flat_teeth_do_no_harm() -> None:
+    """Meshes of users have both."""
+    vertices = np.concatenate([BALL.vertices, [[9.0, 9, 9], [1, 0, 8], [1, 3, 8], [1, 3, 9]]])
+    faces = np.concatenate([BALL.faces, [[0, 1, 1], [643, 644, 645]]])
+    labels = np.concatenate([np.full(len(BALL.faces), 47), [GUM, 46]])
+    for seed in range(20):
+        shares = natural_marks(Jaw(mesh=Mesh(vertices, faces), face_labels=labels), seed).shares
+        assert np.isfinite(shares).all()
+        assert shares.min() >= 0
+        assert shares.max() <= 1

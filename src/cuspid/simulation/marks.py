@@ -32,6 +32,8 @@ _FILLED, _AMALGAM = 0.25, 0.5
 _FILLING, _OFF_CENTRE, _UPWARDS = (0.32, 0.2), 0.1, 0.3
 """Longest and shortest radius of a filling and how far it lies off the middle, as shares of the width of its crown;
 cosine of the steepest surface that it covers."""
+_THINNEST_MM = 1e-3
+"""Crowns are never taken for thinner."""
 _FILLING_EDGE = 0.08
 """Width of its edge, as a share of its radius."""
 
@@ -82,8 +84,10 @@ def _far_from_gum(jaw: Jaw) -> Float[np.ndarray, "v"]:
 
 def _patches(mesh: Mesh, rng: np.random.Generator) -> Float[np.ndarray, "v"]:
     """From 0 to 1, evenly, changing over a millimetre or so."""
-    noise = diffused(mesh, _PATCH_MM, rng.normal(size=(len(mesh.vertices), 1)) / np.sqrt(mesh.vertex_areas)[:, None])
-    return np.asarray(noise[:, 0].argsort().argsort() / max(len(noise) - 1, 1))
+    areas = mesh.vertex_areas
+    white = rng.normal(size=len(areas)) / np.sqrt(np.where(areas > 0, areas, np.inf))  # some may be in no face
+    noise = diffused(mesh, _PATCH_MM, white[:, None])[:, 0]
+    return np.asarray(noise.argsort().argsort() / max(len(noise) - 1, 1))
 
 
 def _fillings(jaw: Jaw, rng: np.random.Generator) -> list[Float[np.ndarray, "v"]]:
@@ -95,7 +99,8 @@ def _fillings(jaw: Jaw, rng: np.random.Generator) -> list[Float[np.ndarray, "v"]
             continue
         vertices = np.unique(jaw.mesh.faces[jaw.tooth_faces(tooth)])
         plan, upwards = jaw.mesh.vertices[vertices, :2], jaw.mesh.vertex_normals[vertices, 2] > _UPWARDS
-        off = (plan - np.median(plan, axis=0)) / np.ptp(plan, axis=0).min() - _OFF_CENTRE * (np.array(shift) - 0.5)
+        width = max(float(np.ptp(plan, axis=0).min()), _THINNEST_MM)
+        off = (plan - np.median(plan, axis=0)) / width - _OFF_CENTRE * (np.array(shift) - 0.5)
         cosine, sine = np.cos(np.pi * turn), np.sin(np.pi * turn)
         radius = np.linalg.norm(off @ np.array([[cosine, -sine], [sine, cosine]]) / _FILLING, axis=1)
         inside = _ramp(-radius, -1 - _FILLING_EDGE, -1 + _FILLING_EDGE)
