@@ -279,12 +279,14 @@ def enamel(result: Result) -> str:
             "the motion of COLMAP's mapper. *clinical* has `--optics clinical` (defocus and diffraction, motion during "
             "the exposure, light below the surface, saliva, crosstalk, Bayer, JPEG), *dense* 20 frames instead of 10; "
             "*natural* has the texture `natural` (stains, fillings, vessels), *cross* also a sweep to the other side; "
-            "*artificial-clinical* has these optics, white light, and the texture `artificial`. Bars: under colour-coded, polarised light a mean "
-            "of 6 um (clinical 10 um) with 94 % within 50 um, in turn 12 um; artificial-clinical 4 um; of arches 20 um "
+            "*artificial-clinical* has these optics, white light, and the texture `artificial`. Bars: under "
+            "colour-coded, polarised light a mean of 6 um (clinical 10 um) with 94 % within 50 um, in turn 12 um; "
+            "artificial-clinical 4 um; of arches 20 um "
             "(clinical 30 um, artificial-clinical 6 um) and an inter-molar error of 40 um (clinical 60 um). Developed "
             "on phantom-0, ideal and clinical, on 048_lower, with which the places of the LEDs were chosen, too, on "
             "023_lower, and on arch-upper, ideal and clinical, and arch-phantom for paths; a limit was chosen with "
-            "phantom-1 in view; the others were looked at only at the end, but most also with earlier versions. Scans are of "
+            "phantom-1 in view; the others were looked at only at the end, but most also with earlier versions. "
+            "Scans are of "
             f"{commits}. `python benchmarks/enamel.py`.",
             "",
             _scans_table(told),
