@@ -56,11 +56,11 @@ def render_with_blender(
     Raises MissingDependencyError where Blender is not installed, InputError where a camera has lens distortion, a
     light has a lobe other than Lambert's, or teeth bear marks, which Blender does not offer.
     """
-    python = blender_python()
     if scene.optics != IDEAL:
         raise InputError("optics: Blender renders ideal ones only; use the renderer embree")
     if scene.appearance.marked:
         raise InputError("texture: Blender renders no stains, fillings and vessels; use the renderer embree")
+    python = blender_python()
     tasks = [(frame, camera) for frame in frames for camera in frame.cameras if not skip(frame.name, camera)]
     if not tasks:
         return
