@@ -240,6 +240,33 @@ def test_two_pieces_are_joined_where_a_later_frame_shows_both() -> None:
     assert errors_um(found, way).max() < 25
 
 
+def hills(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return 0.5 * np.sin(1.8 * x) * np.cos(1.5 * y + 0.3 * x) + 0.3 * np.sin(0.7 * x + 0.13 * x * x - y)
+
+
+def twins(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A ridge to the left that is there to the right again, between other hills."""
+    share = np.clip(3.0 - np.abs(x - 9), 0, 1)
+    share = share**2 * (3 - 2 * share)
+    return 5 + np.where(x < 0, hills(x, y), share * hills(x - 18, y) + (1 - share) * hills(y + 3, 0.8 * x))
+
+
+def test_what_looks_like_a_place_is_not_taken_for_it() -> None:
+    """One frame of the way to the right lies on the way to the left; its neighbours do not."""
+    left, right = np.linspace(-14, -4, 10), np.linspace(4, 14, 9)
+    way = {f"{k:05d}": Rigid3(np.eye(3), np.array([-x, 0, 0])) for k, x in enumerate([*left, *right])}
+    maps, names = depth_maps(way, height_field(twins, half_width_mm=19.0)), list(way)
+    options = SurfaceTrackingOptions(minimum_overlap=0.5)
+    a, b = (surface_of([m for m in maps if m.frame == names[k]], 5.0, options) for k in (4, 14))
+    lying = _onto(a, b, Rigid3.identity(), 5.0)
+    assert lying.laid is not None
+    assert lying.laid.share > 0.5
+    found = tracked(maps)
+    assert found.frames == tuple(names[: len(left)])
+    assert errors_um(found, way).max() < 25
+    assert {each.what for each in found.dropped} == {f"frame {name}" for name in names[len(left) :]}
+
+
 def test_polarisers_are_asked_for_where_there_are_none() -> None:
     maps = depth_maps(dict(list(OUT.items())[:2]), height_field(lambda x, y: 5 + 0 * x, half_width_mm=14.0))
     crossed = {"led": Light(position_mm=np.zeros(3), direction=np.array([0.0, 0, 1]), glare=0.03)}

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import groupby, islice
+from itertools import groupby, islice, product
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -52,6 +52,11 @@ _LAST_STEPS = 4
 """Steps with all points, once a few have found the place."""
 _FOUND_AGAIN = 0.5
 """Least overlap with a frame from long ago: smooth parts of two teeth are alike."""
+_WITNESSES, _LEAST_WITNESSES, _AGREED = 20, 2, 0.8
+"""Pairs of frames that are asked whether a piece was found in the right place, how many there must be at least, and how
+many of them must agree."""
+_NEAR = 0.25
+"""Largest motion between frames that see about the same: working distances, and radians."""
 _TUKEY = 3.0
 """Robust standard deviations beyond which a distance has no weight."""
 _LEAST_SIGMA = 0.0006
@@ -320,7 +325,7 @@ def _starts(motion: Rigid3 | None, distance_mm: float) -> Iterator[Rigid3]:
             yield Rigid3(np.eye(3), distance_mm * np.array([along, across, 0.0]))
 
 
-def _place(
+def _followed(
     surfaces: Sequence[Surface],
     placed: Mapping[int, Rigid3],
     frame: int,
@@ -328,23 +333,31 @@ def _place(
     options: SurfaceTrackingOptions,
     distance_mm: float,
 ) -> tuple[Rigid3 | None, str]:
-    """``rig_from_world`` of a frame, from those placed before; else why there is none.
-
-    First the latest few, then, where tracking is lost, all of them: the hand may have gone back.
-    """
+    """``rig_from_world`` of a frame, from the latest few placed before; else why there is none."""
     reason = "no earlier frame shows any surface"
-    for number, earlier in enumerate(list(placed)[::-1]):
-        starts = _starts(motion, distance_mm) if number < _BRIEFLY else (Rigid3.identity(),)
-        one, other = surfaces[earlier], surfaces[frame]
-        some = one.some(options.samples, np.random.default_rng([options.seed, frame]))
-        tried = max((_onto(some, other, start, distance_mm) for start in starts), key=lambda step: step.rank)
-        best = _onto(one, other, tried.this_from_other, distance_mm, _REACHES[-_LAST_STEPS:])
-        least = options.minimum_overlap if number < _BRIEFLY else max(options.minimum_overlap, _FOUND_AGAIN)
-        doubt = _doubt(best, least, options, distance_mm)
+    for number, earlier in enumerate(list(placed)[: -_BRIEFLY - 1 : -1]):
+        starts = _starts(motion, distance_mm)
+        step = _found(surfaces, earlier, frame, starts, options, distance_mm)
+        doubt = _doubt(step, options.minimum_overlap, options, distance_mm)
         if doubt is None:
-            return best.this_from_other @ placed[earlier], ""
+            return step.this_from_other @ placed[earlier], ""
         reason = doubt if number == 0 else reason
     return None, reason
+
+
+def _found(
+    surfaces: Sequence[Surface],
+    earlier: int,
+    frame: int,
+    starts: Iterable[Rigid3],
+    options: SurfaceTrackingOptions,
+    distance_mm: float,
+) -> _Step:
+    """A frame laid onto an earlier one from the best of some starts."""
+    one, other = surfaces[earlier], surfaces[frame]
+    some = one.some(options.samples, np.random.default_rng([options.seed, frame]))
+    tried = max((_onto(some, other, start, distance_mm) for start in starts), key=lambda step: step.rank)
+    return _onto(one, other, tried.this_from_other, distance_mm, _REACHES[-_LAST_STEPS:])
 
 
 def _chained(
@@ -356,8 +369,8 @@ def _chained(
 ) -> tuple[dict[int, Rigid3], list[Dropped]]:
     """``rig_from_world`` of the frames, one after the other.
 
-    A frame that lies neither on the latest piece nor on the largest begins a piece of its own, for it is not known
-    which of them is wrong. The largest is kept, with those that are found on it in the end.
+    A frame that lies neither on the end of the latest piece nor on that of the largest begins a piece of its own, for
+    it is not known which of them is wrong. The largest is kept, with those that are found on it in the end.
     """
     pieces, reasons, motion = list[dict[int, Rigid3]](), dict[int, str](), None
     for frame, surface in enumerate(surfaces):
@@ -366,9 +379,10 @@ def _chained(
             reasons[frame] = f"only {len(surface)} points of its surface"
             continue
         largest, pose = sorted(pieces, key=len)[-1:], None
-        for piece in largest + [latest for latest in pieces[-1:] if latest is not largest[0]]:
+        for piece in pieces[-1:] + [each for each in largest if each is not pieces[-1]]:
             moved_on = motion if frame - 1 in piece else None
-            pose, reasons[frame] = _place(surfaces, piece, frame, moved_on, options, distance_mm)
+            pose, reason = _followed(surfaces, piece, frame, moved_on, options, distance_mm)
+            reasons.setdefault(frame, reason)
             if pose is not None:
                 break
         if pose is None:
@@ -376,10 +390,7 @@ def _chained(
             pieces.append(piece)
         motion = pose @ piece[frame - 1].inverse() if frame - 1 in piece else None
         piece[frame] = pose
-    pieces.sort(key=len)
-    placed = pieces.pop() if pieces else {}
-    for piece in reversed(pieces):
-        placed |= _found_on(surfaces, placed, piece, options, distance_mm)
+    placed = _joined(surfaces, sorted(pieces, key=len, reverse=True), options, distance_mm)
     dropped = [
         Dropped(what=f"frame {name}", reason=reasons.get(frame) or "it lies only on frames that lie on no others")
         for frame, name in enumerate(names)
@@ -389,6 +400,23 @@ def _chained(
     return {frame: placed[frame] @ world_from_first for frame in sorted(placed)}, dropped
 
 
+def _joined(
+    surfaces: Sequence[Surface],
+    pieces: Sequence[Mapping[int, Rigid3]],
+    options: SurfaceTrackingOptions,
+    distance_mm: float,
+) -> dict[int, Rigid3]:
+    """The first piece, with all others that are found on it or on what was found."""
+    placed, left = dict(pieces[0]) if pieces else {}, list(pieces[1:])
+    while True:
+        found = [_found_on(surfaces, placed, piece, options, distance_mm) for piece in left]
+        if not any(found):
+            return placed
+        for each in found:
+            placed |= each
+        left = [piece for piece, there in zip(left, found, strict=True) if not there]
+
+
 def _found_on(
     surfaces: Sequence[Surface],
     placed: Mapping[int, Rigid3],
@@ -396,13 +424,60 @@ def _found_on(
     options: SurfaceTrackingOptions,
     distance_mm: float,
 ) -> dict[int, Rigid3]:
-    """The frames of a piece among those placed, if one of them is found there."""
+    """The frames of a piece among those placed, if one of them is found there and the others bear it out."""
+    overlap = max(options.minimum_overlap, _FOUND_AGAIN)
     for frame, pose in piece.items():
-        nearest_last = dict(sorted(placed.items(), key=lambda item: -abs(item[0] - frame)))
-        found, _ = _place(surfaces, nearest_last, frame, None, options, distance_mm)
-        if found is not None:
-            return {each: there @ pose.inverse() @ found for each, there in piece.items()}
+        for earlier in sorted(placed, key=lambda each: abs(each - frame)):
+            step = _found(surfaces, earlier, frame, [Rigid3.identity()], options, distance_mm)
+            if _doubt(step, overlap, options, distance_mm) is not None:
+                continue
+            found = pose.inverse() @ step.this_from_other @ placed[earlier]
+            there = {each: its @ found for each, its in piece.items()}
+            if _is_borne_out(surfaces, placed, there, overlap, options, distance_mm):
+                return there
     return {}
+
+
+def _is_borne_out(
+    surfaces: Sequence[Surface],
+    placed: Mapping[int, Rigid3],
+    there: Mapping[int, Rigid3],
+    overlap: float,
+    options: SurfaceTrackingOptions,
+    distance_mm: float,
+) -> bool:
+    """Whether frames that would look at the same place, if they were there, see the same: one that lies on another by
+    chance has neighbours that do not."""
+    near = [
+        pair for pair in product(placed, there) if _is_near(there[pair[1]] @ placed[pair[0]].inverse(), distance_mm)
+    ]
+    witnesses = near[:: max(len(near) // _WITNESSES, 1)]
+    steps = (
+        _onto(surfaces[a], surfaces[b], there[b] @ placed[a].inverse(), distance_mm, _REACHES[-_LAST_STEPS:])
+        for a, b in witnesses
+    )
+    agree = [_doubt(step, overlap, options, distance_mm) is None for step in steps]
+    return len(agree) >= _LEAST_WITNESSES and sum(agree) >= _AGREED * len(agree)
+
+
+def _is_near(motion: Rigid3, distance_mm: float) -> bool:
+    """Whether the handpiece sees about the same after a motion."""
+    across = float(np.linalg.norm(motion.translation)) / distance_mm
+    return max(across, float(np.linalg.norm(motion.rotation_vector))) < _NEAR
+
+
+_Blocks = set[tuple[int, ...]]
+
+
+def _blocks(surface: Surface, pose: Rigid3, distance_mm: float) -> _Blocks:
+    """Those of space that a surface fills."""
+    blocks = np.floor(pose.inverse().apply(surface.points) / (_BLOCKS * distance_mm)).astype(int)
+    return set(map(tuple, blocks.tolist()))
+
+
+def _shared(one: _Blocks, other: _Blocks) -> float:
+    """The part of the smaller surface that both share."""
+    return len(one & other) / max(min(len(one), len(other)), 1)
 
 
 def _neighbours(
@@ -414,11 +489,8 @@ def _neighbours(
     a third frame. The farther apart two frames are, the less alike are the errors of their surfaces, and what these do
     to a pose adds up along a path; pairs of one pass and another stay where these come closest.
     """
-    blocks = [
-        {tuple(each) for each in np.floor(pose.inverse().apply(surface.points) / (_BLOCKS * distance_mm)).astype(int)}
-        for surface, pose in zip(surfaces, poses, strict=True)
-    ]
-    shared = np.array([[len(one & other) / max(min(len(one), len(other)), 1) for other in blocks] for one in blocks])
+    blocks = [_blocks(surface, pose, distance_mm) for surface, pose in zip(surfaces, poses, strict=True)]
+    shared = np.array([[_shared(one, other) for other in blocks] for one in blocks])
     np.fill_diagonal(shared, 0.0)
     through_third = np.array([np.minimum(one, shared).max(axis=1) for one in shared])
     found = (shared > options.joint_overlap) & (shared >= through_third)
