@@ -90,9 +90,10 @@ class SurfaceTrackingOptions(Options):
     """Each frame is thinned to one point per cube of this side, as a share of the working distance (0.1 mm at 5 mm)."""
     minimum_overlap: Annotated[float, SHARE] = 0.3
     """Share (0 to 1) of a frame's surface that must lie on an earlier one for the frame to be placed."""
-    largest_scatter: Annotated[float, Range(0.0001, 1)] = 0.008
-    """Standard deviation of the distances between the surfaces of two frames, as a share of the working distance (0.04
-    mm at 5 mm), above which they do not fit each other."""
+    largest_scatter: Annotated[float, Range(0.0001, 1)] = 0.018
+    """Standard deviation of the distances between the surfaces of two frames, as a share of the working distance (0.09
+    mm at 5 mm), above which they do not fit each other; less where less of the surface lies on the other one, in
+    proportion."""
     least_relief: Annotated[float, SHARE] = 0.003
     """How much a surface must turn to hold another in place: least mean squared cosine between its normals and any
     direction; 0 is a plane, 1/3 a ball."""
@@ -304,7 +305,7 @@ def _doubt(step: _Step, overlap: float, options: SurfaceTrackingOptions, distanc
     if laid is None or laid.share < overlap:
         share = 0.0 if laid is None else laid.share
         return f"only {share:.0%} of its surface lies on that of an earlier frame"
-    if laid.sigma > options.largest_scatter * distance_mm:
+    if laid.sigma > laid.share * options.largest_scatter * distance_mm:
         return f"its surface scatters about that of earlier frames by {1000 * laid.sigma:.0f} um"
     if laid.relief < options.least_relief:
         return "its surface is too flat to be held in place by its shape"
