@@ -7,8 +7,7 @@
 Subjects are phantoms of the population, and jaws of your own, whose coarse faces are subdivided (Loop) first; the
 subdivided mesh is then the reference. All are filmed in 120 frames with full shake and the texture ``enamel``, for the
 method ``pair`` by two cameras, for ``return`` and ``s-shape`` on another way over the arch, for ``natural`` with the
-texture of that name. One JSON a subject and
-method goes to the results folder; what is there already is not made again.
+texture of that name. One JSON a subject and method goes to the results folder; what is there already is not made again.
 """
 
 from __future__ import annotations

@@ -286,6 +286,19 @@ def test_albedo_is_the_sum_of_the_octaves_at_each_point_and_black_where_nothing_
         np.testing.assert_allclose(colour, look.dark[material] + share * (look.light - look.dark)[material], rtol=1e-9)
 
 
+def test_veins_are_thin_red_and_leave_the_rest_of_the_gum_as_it_is() -> None:
+    points = np.random.default_rng(0).uniform(-20, 20, (20_000, 3))
+    gum = np.ones(len(points), dtype=np.uint8)
+    bare, veined = (albedo(points, gum, palette(APPEARANCES[name], 3)) for name in ("enamel", "natural"))
+    vein = np.array(APPEARANCES["natural"].gum.veins)
+    share = (bare - veined) / (bare - vein)
+    assert np.ptp(share, axis=1).max() < 1e-9  # the same of all colours: what is below is mixed with the vein
+    assert share.min() > -1e-12
+    assert share.max() < 1
+    assert 0.7 < (share[:, 0] < 0.01).mean() < 0.95
+    assert 0.005 < (share[:, 0] > 0.5).mean() < 0.1
+
+
 def test_presets_differ_in_contrast_and_seeds_in_pattern() -> None:
     points = np.random.default_rng(0).uniform(-20, 20, (10_000, 3))
     enamel = np.zeros(len(points), dtype=np.uint8)

@@ -52,6 +52,8 @@ _LAST_STEPS = 4
 """Steps with all points, once a few have found the place."""
 _FOUND_AGAIN = 0.5
 """Least overlap with a frame from long ago: smooth parts of two teeth are alike."""
+_FEW = 600
+"""Points of a frame by which most others are ruled out where a lost piece is looked for."""
 _WITNESSES, _LEAST_WITNESSES, _AGREED = 20, 2, 0.8
 """Pairs of frames that are asked whether a piece was found in the right place, how many there must be at least, and how
 many of them must agree."""
@@ -391,7 +393,7 @@ def _chained(
             pieces.append(piece)
         motion = pose @ piece[frame - 1].inverse() if frame - 1 in piece else None
         piece[frame] = pose
-    placed = _joined(surfaces, sorted(pieces, key=len, reverse=True), options, distance_mm)
+    placed = _joined(surfaces, sorted(pieces, key=len, reverse=True), options, distance_mm, progress)
     dropped = [
         Dropped(what=f"frame {name}", reason=reasons.get(frame) or "it lies only on frames that lie on no others")
         for frame, name in enumerate(names)
@@ -406,16 +408,21 @@ def _joined(
     pieces: Sequence[Mapping[int, Rigid3]],
     options: SurfaceTrackingOptions,
     distance_mm: float,
+    progress: Progress,
 ) -> dict[int, Rigid3]:
     """The first piece, with all others that are found on it or on what was found."""
     placed, left = dict(pieces[0]) if pieces else {}, list(pieces[1:])
-    while True:
-        found = [_found_on(surfaces, placed, piece, options, distance_mm) for piece in left]
-        if not any(found):
-            return placed
-        for each in found:
-            placed |= each
-        left = [piece for piece, there in zip(left, found, strict=True) if not there]
+    number = 0
+    while number < len(left):
+        progress("lost pieces", len(pieces) - len(left) + number, len(pieces))
+        found = _found_on(surfaces, placed, left[number], options, distance_mm)
+        if found:
+            placed |= found
+            del left[number]
+            number = 0  # what was found may show those that were not
+        else:
+            number += 1
+    return placed
 
 
 def _found_on(
@@ -427,9 +434,13 @@ def _found_on(
 ) -> dict[int, Rigid3]:
     """The frames of a piece among those placed, if one of them is found there and the others bear it out."""
     overlap = max(options.minimum_overlap, _FOUND_AGAIN)
+    few = {each: surfaces[each].some(_FEW, np.random.default_rng([options.seed, each])) for each in placed}
     for frame, pose in piece.items():
         for earlier in sorted(placed, key=lambda each: abs(each - frame)):
-            step = _found(surfaces, earlier, frame, [Rigid3.identity()], options, distance_mm)
+            tried = _onto(few[earlier], surfaces[frame], Rigid3.identity(), distance_mm)
+            if _doubt(tried, options.minimum_overlap, options, distance_mm) is not None:
+                continue
+            step = _found(surfaces, earlier, frame, [tried.this_from_other], options, distance_mm)
             if _doubt(step, overlap, options, distance_mm) is not None:
                 continue
             found = pose.inverse() @ step.this_from_other @ placed[earlier]
