@@ -1,6 +1,7 @@
 """Laws of the patches: what was truly moved is found where it went, and a lost patch says so."""
 
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -12,9 +13,10 @@ from scipy.spatial.transform import Rotation
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.mesh import Mesh
 from cuspid.motion.guided import GuidedOptions
-from cuspid.motion.patches import PatchOptions, align_patches, cut_patches, lengthen
-from cuspid.reconstruction import Tracks
+from cuspid.motion.patches import PatchOptions, align_patches, cut_patches, follow_points, lengthen
+from cuspid.reconstruction import Tracks, chosen_tracks
 from cuspid.sparse_model import SparseModel
 
 
@@ -74,15 +76,16 @@ def test_what_is_not_there_is_not_found() -> None:
     assert np.isnan(laid(here, here, border, border, warps)[1]).all()
 
 
-def over_a_wall(frames: int = 8) -> tuple[SparseModel, dict[str, np.ndarray]]:
-    """A camera that moves over a textured wall; every point is known from two frames alone, up to a pixel."""
+def over_a_wall(frames: int = 8, tilt_deg: float = 0) -> tuple[SparseModel, dict[str, np.ndarray]]:
+    """A camera that moves over a textured wall; every point is known from two frames alone."""
+    tilt = Rigid3.from_rotation_vector(np.deg2rad([0, tilt_deg, 0]), np.zeros(3))
     texture, camera = wall(3, 800), Camera.from_field_of_view(320, 240, 60.0)
     rng, px_per_mm = np.random.default_rng(1), 20.0
     poses, pictures = {}, {}
     for k in range(frames):
         rotation = Rotation.from_rotvec(np.deg2rad([2 * np.sin(k), 1.5 * np.cos(k), 3 * np.sin(2 * k)])).as_matrix()
         turned = rotation @ np.diag([1.0, -1.0, -1.0])
-        poses[f"{k}"] = Rigid3(turned, -turned @ [0.6 * k - 2.0, 0.1 * k, 14.0])
+        poses[f"{k}"] = Rigid3(turned, -turned @ [0.6 * k - 2.0, 0.1 * k, 14.0]) @ tilt
         plane = np.column_stack([poses[f"{k}"].rotation[:, :2], poses[f"{k}"].translation])
         calibration = np.array([[camera.focal_px[0], 0, 159.5], [0, camera.focal_px[1], 119.5], [0, 0, 1]])
         onto_wall = np.array([[px_per_mm, 0, 399.5], [0, px_per_mm, 399.5], [0, 0, 1]])
@@ -102,24 +105,53 @@ def over_a_wall(frames: int = 8) -> tuple[SparseModel, dict[str, np.ndarray]]:
     return SparseModel(camera=camera, cam_from_world=poses, tracks=tracks), pictures
 
 
+def errors_px(model: SparseModel, tracks: Tracks) -> np.ndarray:
+    """How far observations are from where the points truly are."""
+    poses = list(model.cam_from_world.values())
+    seen = zip(tracks.point_index, tracks.frame_index, strict=True)
+    true = [model.camera.project(poses[frame].apply(tracks.points[point])) for point, frame in seen]
+    return np.linalg.norm(tracks.pixels - true, axis=1)
+
+
 def test_points_are_followed_into_every_frame_that_sees_them() -> None:
     model, pictures = over_a_wall()
-    given_tracks, camera = model.tracks, model.camera
+    given_tracks = model.tracks
     longer = lengthen(model, lambda name: pictures[name], PatchOptions()).tracks
     second = longer.point_index >= len(given_tracks.points)
     assert len(longer.points) - len(given_tracks.points) >= 50
     assert np.array_equal(longer.pixels[~second], given_tracks.pixels)
-    poses = list(model.cam_from_world.values())
-    true = np.array(
-        [
-            camera.project(poses[frame].apply(longer.points[point : point + 1]))[0]
-            for point, frame in zip(longer.point_index[second], longer.frame_index[second], strict=True)
-        ]
-    )
-    errors = np.linalg.norm(longer.pixels[second] - true, axis=1)
+    errors = errors_px(model, chosen_tracks(longer, second))
     assert 0 < np.median(errors) < 0.1
     assert np.quantile(errors, 0.95) < 0.3
     assert second.sum() / 60 > 5
+
+
+def the_wall(z: float = 0.0) -> Mesh:
+    """The wall itself, or a copy that lies higher."""
+    corners = np.array([[-30, -30, z], [30, -30, z], [30, 30, z], [-30, 30, z]])
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+@pytest.mark.parametrize("tilt_deg", [-40, 40])
+def test_what_turns_away_from_the_camera_is_followed_once_the_surface_is_known(tilt_deg: float) -> None:
+    model, pictures = over_a_wall(tilt_deg=tilt_deg)
+    follow = partial(follow_points, model, lambda name: pictures[name], PatchOptions())
+    facing, along = follow(), follow(surface=the_wall())
+    assert len(along.points) >= 50
+    assert len(along.pixels) >= len(facing.pixels)
+    errors = errors_px(model, along)
+    assert 0 < np.median(errors) < 0.03
+    # 9 times as far off without.
+    assert np.quantile(errors_px(model, facing), 0.9) > 4 * np.quantile(errors, 0.9)
+
+
+def test_what_the_surface_does_not_show_or_occludes_is_not_followed() -> None:
+    model, pictures = over_a_wall()
+    follow = partial(follow_points, model, lambda name: pictures[name], PatchOptions())
+    right = the_wall().submesh(np.array([True, False]))
+    assert np.all(follow(surface=right).points[:, 0] > follow(surface=right).points[:, 1])
+    small = Mesh(np.array([[9.0, 9, 0], [9.1, 9, 0], [9, 9.1, 0]]), np.array([[0, 1, 2]]))
+    assert len(follow(surface=small).points) == 0
 
 
 def test_points_seen_in_too_few_frames_stay_as_they_were() -> None:

@@ -241,6 +241,19 @@ def test_a_film_of_another_scale_needs_no_more_cells(scene: Scene, surface: Heig
     assert found.heights.size < 2 * surface.heights.size
 
 
+def test_the_mesh_of_a_height_map_is_what_was_seen_of_it(surface: HeightMap) -> None:
+    known = np.zeros_like(surface.known)
+    known[3:7, 2:9] = True
+    mesh = replace(surface, known=known).mesh()
+    centres, (rows, columns) = mesh.face_centres, (4, 7)
+    assert len(mesh.faces) == 2 * (rows - 1) * (columns - 1)
+    assert np.all(mesh.face_normals[:, 2] > 0)
+    low = surface.places[3, 2, :2]
+    assert np.all(centres[:, :2] > low)
+    assert np.all(centres[:, :2] < low + surface.cell_mm * np.array([columns - 1, rows - 1]))
+    assert np.array_equal(mesh.vertices[np.unique(mesh.faces)], surface.places[3:7, 2:9].reshape(-1, 3))
+
+
 @pytest.mark.parametrize(
     "wrong",
     [{"cell_mm": 0.0}, {"window": 4}, {"window": 1}, {"large_jump": 0.01}, {"small_jump": -1.0}, {"exit_index": 0.9}],

@@ -25,7 +25,7 @@ from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.motion.location import MotionOptions
 from cuspid.motion.rig_film import film_options, locate_rig_film, of_camera
-from cuspid.motion.single import SingleOptions, locate_single
+from cuspid.motion.single import SingleMotion, SingleOptions, locate_single, refine_on_surface, with_observations
 from cuspid.pairing import stereo_pairs
 from cuspid.panorama import FrameUse
 from cuspid.progress import Progress, silent
@@ -34,7 +34,7 @@ from cuspid.simulation.film import FilmOptions, film
 from cuspid.stitching.compared import cameras_beside
 from cuspid.stitching.height_map import ScaleOptions
 from cuspid.stitching.mesh_views import MeshViewOptions, MeshViews, draw_mesh
-from cuspid.stitching.ortho import OrthoOptions, Stitched, orthophoto
+from cuspid.stitching.ortho import OrthoOptions, Stitched, find_surface, orthophoto
 from cuspid.stitching.thesis_method import ThesisOptions, stitch_as_thesis
 from cuspid.tolerances import NominalOptions
 
@@ -69,17 +69,33 @@ def stitch(sequence: ImageSequence, options: StitchOptions, *, progress: Progres
         return tuple(Stitched(panorama=panorama, motion=None, strip=None) for panorama in panoramas)
     motion = locate_single(sequence, options.motion, progress=progress)
     notes = (*sequence.notes, *motion.notes)
-    index = {name: number for number, name in enumerate(sequence.names)}
-    parts: list[Stitched] = []
-    for number, located in enumerate(motion.parts, start=1):
-        part = orthophoto(
-            *(located, motion.frames_of(number - 1), lambda name: sequence.image(index[name]), options),
-            working_distance_mm=sequence.working_distance_mm,
-            progress=progress,
+    stitched = [_stitched(sequence, motion, number, options, progress) for number in range(len(motion.parts))]
+    return tuple(
+        replace(
+            part,
+            panorama=replace(part.panorama, part=number, parts=len(stitched), notes=(*notes, *part.panorama.notes)),
         )
-        numbered = replace(part.panorama, part=number, parts=len(motion.parts), notes=(*notes, *part.panorama.notes))
-        parts.append(replace(part, panorama=numbered))
-    return tuple(parts)
+        for number, part in enumerate(stitched, start=1)
+    )
+
+
+def _stitched(
+    sequence: ImageSequence, motion: SingleMotion, number: int, options: StitchOptions, progress: Progress
+) -> Stitched:
+    """The panorama of a part of the motion, whose path is made more precise on the surface that it shows."""
+    index = {name: each for each, name in enumerate(sequence.names)}
+    located, distance_mm = motion.parts[number], sequence.working_distance_mm
+
+    def read(name: str) -> UInt8[np.ndarray, "h w 3"]:
+        return sequence.image(index[name])
+
+    if options.motion.on_surface:
+        shown = find_surface(located, read, options, working_distance_mm=distance_mm, progress=progress)
+        if shown.dense is not None:
+            surface = shown.dense.mesh()
+            located = refine_on_surface(shown.motion, surface, sequence, options.motion, progress=progress)
+    frames = with_observations(motion.frames_of(number), located)
+    return orthophoto(located, frames, read, options, working_distance_mm=distance_mm, progress=progress)
 
 
 def stitch_rig(capture: Capture, options: StitchOptions, *, progress: Progress = silent) -> Stitched:

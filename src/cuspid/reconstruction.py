@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -80,6 +80,26 @@ class Tracks:
     """For each observation: which camera, an index into ``rig.names``."""
     pixels: Float[np.ndarray, "o 2"]
     """For each observation: the place, in px of the (distorted) image."""
+
+
+def joined_tracks(first: Tracks, second: Tracks) -> Tracks:
+    """The points and observations of both."""
+    joined = {each.name: np.concatenate([getattr(t, each.name) for t in (first, second)]) for each in fields(Tracks)}
+    joined["point_index"][len(first.point_index) :] += len(first.points)
+    return Tracks(**joined)
+
+
+def chosen_tracks(tracks: Tracks, which: Bool[np.ndarray, "o"]) -> Tracks:
+    """Some of the observations, and the points that are seen in them."""
+    kept, number = np.unique(tracks.point_index[which], return_inverse=True)
+    return Tracks(
+        points=tracks.points[kept],
+        colors=tracks.colors[kept],
+        point_index=number.astype(np.int64),
+        frame_index=tracks.frame_index[which],
+        camera_index=tracks.camera_index[which],
+        pixels=tracks.pixels[which],
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -3,7 +3,9 @@
 Keypoints on plain enamel come and go: their tracks are short and their positions uncertain by about a pixel, so an arch
 bends. Once the poses are known, the patch around each point, from the frame that shows it nearest to the image centre,
 is projected into the neighbouring frames where it should be seen, and shifted until it fits (Lucas and Kanade 1981,
-with the template's gradients, Baker and Matthews 2004; gain, offset and slope of the light are free).
+with the template's gradients, Baker and Matthews 2004; gain, offset and slope of the light are free). It is projected
+as a plane that faces its camera, or, once the surface is known, as that: crowns turn away from the camera within a
+patch, and what is laid over them as a plane slides.
 """
 
 from __future__ import annotations
@@ -15,13 +17,15 @@ from typing import Annotated, NamedTuple, no_type_check
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET
+from cuspid.geometry import unit
 from cuspid.kernels import kernel
+from cuspid.mesh import Mesh
 from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import Tracks
+from cuspid.reconstruction import Tracks, chosen_tracks, joined_tracks
 from cuspid.sparse_model import SparseModel
 from cuspid.workers import map_in_threads
 
@@ -31,6 +35,10 @@ _LEAST_AREA = 1e-3
 """Smallest area of the image of a patch, as a share of its own, that can be aligned."""
 _STILL_PX = 0.003
 """The alignment ends when a step is shorter than this."""
+_FLAT = np.zeros((0, 0, 2))
+"""No bends."""
+_HIDDEN = 0.01
+"""A place is occluded where something stands before it by more than this share of its distance."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,8 +140,9 @@ def _template(patch, levels, slopes):
 
 @kernel
 @no_type_check
-def _aligned(patches, image, there, warps, limit, iterations, shifts, correlations):
-    """Fill in for every patch its shift from where it should be, and the correlation there; NaN where it is lost."""
+def _aligned(patches, image, there, warps, bends, limit, iterations, shifts, correlations):
+    """Fill in for every patch its shift from where it should be, and the correlation there; NaN where it is lost.
+    ``bends`` are empty where the warps are all."""
     radius = patches.shape[1] // 2 - 1
     count = (2 * radius + 1) ** 2
     levels, slopes, found = np.empty(count), np.empty((count, 2)), np.empty(count)
@@ -157,7 +166,12 @@ def _aligned(patches, image, there, warps, limit, iterations, shifts, correlatio
             k = 0
             for dy in range(-radius, radius + 1):
                 for dx in range(-radius, radius + 1):
-                    found[k] = _at(image, x + warp[0, 0] * dx + warp[0, 1] * dy, y + warp[1, 0] * dx + warp[1, 1] * dy)
+                    off_x = warp[0, 0] * dx + warp[0, 1] * dy
+                    off_y = warp[1, 0] * dx + warp[1, 1] * dy
+                    if len(bends) > 0:
+                        off_x += bends[n, k, 0]
+                        off_y += bends[n, k, 1]
+                    found[k] = _at(image, x + off_x, y + off_y)
                     k += 1
             _flatten(found, radius)
             power, common = (found**2).sum(), (found * levels).sum()
@@ -189,17 +203,18 @@ def align_patches(
     there_px: Float[np.ndarray, "n 2"],
     warps: Float[np.ndarray, "n 2 2"],
     options: AlignmentOptions,
+    bends_px: Float[np.ndarray, "m k 2"] = _FLAT,
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
     """Positions of patches (:func:`cut_patches`) in another image, px, and their correlation there (NaN where they are
     not found).
 
     ``warps`` map an offset from the middle of a patch to the one in the other image; ``there_px`` are the starting
-    positions.
+    positions. ``bends_px`` is what is added for each pixel of each patch, row by row, where the warps are not all.
     """
     shifts, correlations = np.empty_like(there_px), np.empty(len(there_px))
     start = np.ascontiguousarray(there_px - OPENCV_PIXEL_OFFSET)
     _aligned(
-        *(patches, picture, start, np.ascontiguousarray(warps)),
+        *(patches, picture, start, np.ascontiguousarray(warps), np.ascontiguousarray(bends_px)),
         *(options.limit_px, options.iterations, shifts, correlations),
     )
     return there_px + shifts, correlations
@@ -217,14 +232,139 @@ class _Poses(NamedTuple):
         poses = list(model.cam_from_world.values())
         return _Poses(np.stack([pose.rotation for pose in poses]), np.array([pose.translation for pose in poses]))
 
-    def inside(self, frame: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def inside(self, frame: int, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Points in the camera of a frame."""
-        return points @ self.rotations[frame].T + self.shifts[frame]
+        return np.asarray(points @ self.rotations[frame].T + self.shifts[frame])
+
+    def outside(self, frame: int, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Points of the camera of a frame in the world."""
+        return np.asarray((points - self.shifts[frame]) @ self.rotations[frame])
+
+    def centre(self, frame: int) -> Float[np.ndarray, "3"]:
+        """Where the camera of a frame is."""
+        return np.asarray(-self.rotations[frame].T @ self.shifts[frame])
 
     def directions(self, frame: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Unit vectors from points to the camera."""
-        towards = -self.rotations[frame].T @ self.shifts[frame] - points
-        return np.asarray(towards / np.linalg.norm(towards, axis=1, keepdims=True))
+        return unit(self.centre(frame) - points)
+
+
+class _Facets(NamedTuple):
+    """The patches of one frame, and what they show."""
+
+    frame: int
+    points: Int[np.ndarray, "k"]
+    """The points in their middle."""
+    levels: Float32[np.ndarray, "k s s"]
+    """As :func:`cut_patches` gives them."""
+    places: Float[np.ndarray, "k p 3"]
+    """What each of their pixels shows, row by row, in the world."""
+
+    @property
+    def middles(self) -> Float[np.ndarray, "k 3"]:
+        """What their middles show."""
+        return self.places[:, self.places.shape[1] // 2]
+
+    def some(self, which: Bool[np.ndarray, "k"]) -> _Facets:
+        """Some of them."""
+        return _Facets(self.frame, self.points[which], self.levels[which], self.places[which])
+
+
+class _Scene(NamedTuple):
+    """What is followed."""
+
+    model: SparseModel
+    poses: _Poses
+    surface: Mesh | None
+    options: PatchOptions
+
+    def facets(self, frame: int, own: Int[np.ndarray, "k"], picture: Float32[np.ndarray, "h w"]) -> _Facets:
+        """The patches around observations in a frame that show something known."""
+        tracks, camera, radius = self.model.tracks, self.model.camera, self.options.radius_px
+        middles, points = tracks.pixels[own], tracks.point_index[own]
+        steps = np.arange(-radius, radius + 1.0)
+        around = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+        rays = camera.rays(middles[:, None] + around)
+        if self.surface is None:
+            depths = self.poses.inside(frame, tracks.points[points])[:, 2:]
+        else:
+            centre = self.poses.centre(frame)
+            towards = (rays @ self.poses.rotations[frame]).reshape(-1, 3)
+            hits = self.surface.cast(np.broadcast_to(centre, towards.shape), towards)
+            depths = hits.distances.reshape(rays.shape[:2])
+        levels = cut_patches(picture, middles, radius)
+        known = np.isfinite(depths).all(axis=1)
+        places = self.poses.outside(frame, rays * np.where(known[:, None], depths, 1.0)[..., None])
+        return _Facets(frame, points, levels, places).some(known)
+
+    def visible(self, there: int, places: Float[np.ndarray, "k 3"]) -> Bool[np.ndarray, "k"]:
+        """Whether the surface occludes no place from a frame."""
+        if self.surface is None:
+            return np.ones(len(places), bool)
+        centre = np.broadcast_to(self.poses.centre(there), places.shape)
+        return np.asarray(self.surface.cast(centre, places - centre).distances > 1 - _HIDDEN)
+
+    def follow(
+        self, facets: _Facets, pictures: Mapping[int, Float32[np.ndarray, "h w"]], there: int
+    ) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"], Float[np.ndarray, "m 2"]]:
+        """Of the points of one frame those found in another: points, frames, pixels."""
+        camera, options, middles = self.model.camera, self.options, facets.middles
+        turn = np.sum(self.poses.directions(facets.frame, middles) * self.poses.directions(there, middles), axis=1)
+        expected = camera.project(self.poses.inside(there, middles))
+        seen = camera.contains(expected, 2.0 * options.radius_px) & (turn > np.cos(np.deg2rad(options.turn_deg)))
+        seen[seen] = self.visible(there, middles[seen])
+        facets, expected = facets.some(seen), expected[seen]
+        offsets = camera.project(self.poses.inside(there, facets.places)) - expected[:, None]
+        warps, bends = _straightened(offsets, options.radius_px)
+        pixels, correlation = align_patches(facets.levels, pictures[there], expected, warps, options, bends)
+        good = correlation > options.correlation
+        return facets.points[good], np.full(int(good.sum()), there), pixels[good]
+
+
+def _straightened(
+    offsets: Float[np.ndarray, "k p 2"], radius_px: int
+) -> tuple[Float[np.ndarray, "k 2 2"], Float[np.ndarray, "k p 2"]]:
+    """Offsets of the pixels of patches in another image: the linear maps that fit them best, and what is left."""
+    steps = np.arange(-radius_px, radius_px + 1.0)
+    around = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    warps = np.einsum("kpi,pj->kij", offsets, around) / np.sum(around[:, 0] ** 2)
+    return warps, offsets - around @ warps.swapaxes(1, 2)
+
+
+def follow_points(
+    model: SparseModel,
+    read: Callable[[str], UInt8[np.ndarray, "h w"]],
+    options: PatchOptions,
+    *,
+    surface: Mesh | None = None,
+    progress: Progress = silent,
+) -> Tracks:
+    """Tracks of the points of a model of one camera whose patches are found in enough frames.
+
+    ``read`` returns the image of a frame, given its name; only those within reach are in memory at a time.
+    ``surface``: what the patches show, in the world of the model; otherwise each is taken to face its camera.
+    """
+    own = _own_observations(model)
+    tracks, names = model.tracks, model.frames
+    scene, pictures = _Scene(model, _Poses.of(model), surface, options), dict[int, np.ndarray]()
+    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    for frame in range(len(names)):
+        near = range(max(0, frame - options.reach), min(len(names), frame + options.reach + 1))
+        kept = {other: pictures[other] for other in near if other in pictures}
+        pictures = kept | {n: smooth(read(names[n]), options.blur_px) for n in near if n not in kept}
+        mine = own[tracks.frame_index[own] == frame]
+        follow = partial(scene.follow, scene.facets(frame, mine, pictures[frame]), pictures)
+        found += [
+            (tracks.point_index[mine], np.full(len(mine), frame), tracks.pixels[mine]),
+            *map_in_threads(follow, [other for other in near if other != frame]),
+        ]
+        progress("patches", frame + 1, len(names))
+    point, seen_in, pixels = (np.concatenate(each) for each in zip(*found, strict=True))
+    often = np.bincount(point, minlength=len(tracks.points))[point] >= options.minimum_views
+    all_found = replace(
+        tracks, point_index=point, frame_index=seen_in, camera_index=np.zeros(len(point), np.int64), pixels=pixels
+    )
+    return chosen_tracks(all_found, often)
 
 
 def lengthen(
@@ -234,28 +374,9 @@ def lengthen(
     *,
     progress: Progress = silent,
 ) -> SparseModel:
-    """The model of one camera with a second track for each point whose patch was found in enough frames.
-
-    ``read`` returns the image of a frame, given its name; only those within reach are in memory at a time.
-    """
-    own = _own_observations(model)
-    tracks, names = model.tracks, model.frames
-    poses, pictures = _Poses.of(model), dict[int, np.ndarray]()
-    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    for frame in range(len(names)):
-        near = range(max(0, frame - options.reach), min(len(names), frame + options.reach + 1))
-        kept = {other: pictures[other] for other in near if other in pictures}
-        pictures = kept | {n: smooth(read(names[n]), options.blur_px) for n in near if n not in kept}
-        mine = np.flatnonzero(tracks.frame_index[own] == frame)
-        patches = cut_patches(pictures[frame], tracks.pixels[own[mine]], options.radius_px)
-        follow = partial(_follow, model, poses, pictures, frame, mine, patches, options)
-        found += [
-            (mine, np.full(len(mine), frame), tracks.pixels[own[mine]]),
-            *map_in_threads(follow, [other for other in near if other != frame]),
-        ]
-        progress("patches", frame + 1, len(names))
-    point, seen_in, pixels = (np.concatenate(each) for each in zip(*found, strict=True))
-    return replace(model, tracks=_with_second(tracks, point, seen_in, pixels, options))
+    """The model of one camera with a second track (:func:`follow_points`) for each point whose patch was found."""
+    second = follow_points(model, read, options, progress=progress)
+    return replace(model, tracks=joined_tracks(model.tracks, second))
 
 
 def _own_observations(model: SparseModel) -> Int[np.ndarray, "p"]:
@@ -264,48 +385,3 @@ def _own_observations(model: SparseModel) -> Int[np.ndarray, "p"]:
     off = np.linalg.norm(tracks.pixels - np.array([camera.width, camera.height]) / 2, axis=1)
     order = np.lexsort((off, tracks.point_index))
     return np.asarray(order[np.unique(tracks.point_index[order], return_index=True)[1]])
-
-
-def _follow(
-    model: SparseModel,
-    poses: _Poses,
-    pictures: Mapping[int, np.ndarray],
-    here: int,
-    mine: Int[np.ndarray, "k"],
-    patches: Float32[np.ndarray, "k s s"],
-    options: PatchOptions,
-    there: int,
-) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"], Float[np.ndarray, "m 2"]]:
-    """Of the points ``mine`` of one frame those found in another: points, frames, pixels."""
-    camera, points = model.camera, model.tracks.points[mine]
-    turn = np.sum(poses.directions(here, points) * poses.directions(there, points), axis=1)
-    depth = poses.inside(here, points)[:, 2]
-    expected = camera.project(poses.inside(there, points))
-    seen = camera.contains(expected, 2.0 * options.radius_px) & (turn > np.cos(np.deg2rad(options.turn_deg)))
-    points, mine, expected = points[seen], mine[seen], expected[seen]
-    step = (depth[seen] / float(np.mean(camera.focal_px)))[:, None]
-    beside = [camera.project(poses.inside(there, points + poses.rotations[here][axis] * step)) for axis in (0, 1)]
-    warps = np.stack([each - expected for each in beside], axis=-1)
-    pixels, correlation = align_patches(patches[seen], pictures[there], expected, warps, options)
-    good = correlation > options.correlation
-    return mine[good], np.full(int(good.sum()), there), pixels[good]
-
-
-def _with_second(
-    tracks: Tracks,
-    point: Int[np.ndarray, "m"],
-    frame: Int[np.ndarray, "m"],
-    pixels: Float[np.ndarray, "m 2"],
-    options: PatchOptions,
-) -> Tracks:
-    """The tracks, and behind them those of the patches."""
-    enough = np.bincount(point, minlength=len(tracks.points))[point] >= options.minimum_views
-    kept, number = np.unique(point[enough], return_inverse=True)
-    return Tracks(
-        points=np.concatenate([tracks.points, tracks.points[kept]]),
-        colors=np.concatenate([tracks.colors, tracks.colors[kept]]),
-        point_index=np.concatenate([tracks.point_index, len(tracks.points) + number]),
-        frame_index=np.concatenate([tracks.frame_index, frame[enough]]),
-        camera_index=np.concatenate([tracks.camera_index, np.zeros(int(enough.sum()), np.int64)]),
-        pixels=np.concatenate([tracks.pixels, pixels[enough]]),
-    )

@@ -17,7 +17,7 @@ from cuspid.capture import Capture, ImageSource
 from cuspid.motion.location import MotionOptions, locate
 from cuspid.motion.single import ENAMEL, SingleOptions, normalise_contrast
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import Reconstruction
+from cuspid.reconstruction import Reconstruction, chosen_tracks
 from cuspid.sparse_model import SparseModel
 
 
@@ -69,19 +69,15 @@ def of_camera(found: Reconstruction, camera: str, frames: Collection[str]) -> Sp
     tracks, mounted = found.tracks, found.rig[camera]
     has = np.array([name in frames for name in found.frames], dtype=bool)
     mine = (tracks.camera_index == found.rig.names.index(camera)) & has[tracks.frame_index]
-    kept, point_index = np.unique(tracks.point_index[mine], return_inverse=True)
+    seen = chosen_tracks(tracks, mine)
     return SparseModel(
         camera=mounted.camera,
         cam_from_world={
             name: mounted.cam_from_rig @ pose for name, pose in found.rig_from_world.items() if name in frames
         },
         tracks=replace(
-            tracks,
-            points=tracks.points[kept],
-            colors=tracks.colors[kept],
-            point_index=point_index.astype(np.int64),
-            frame_index=(np.cumsum(has) - 1)[tracks.frame_index[mine]],
-            camera_index=np.zeros(int(mine.sum()), np.int64),
-            pixels=tracks.pixels[mine],
+            seen,
+            frame_index=(np.cumsum(has) - 1)[seen.frame_index],
+            camera_index=np.zeros(len(seen.camera_index), np.int64),
         ),
     )

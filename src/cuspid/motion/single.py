@@ -22,17 +22,18 @@ from cuspid.camera import Camera
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3, best_similarity
 from cuspid.image_sequence import ImageSequence
+from cuspid.mesh import Mesh
 from cuspid.motion.adjustment import adjust_model
 from cuspid.motion.colmap import quiet, rigid_from_colmap
 from cuspid.motion.features import FeatureOptions, Features, detect
 from cuspid.motion.guided import GuidedOptions, refine
 from cuspid.motion.pairs import MatchingOptions, match_unguided
-from cuspid.motion.patches import PatchOptions, lengthen
+from cuspid.motion.patches import PatchOptions, follow_points, lengthen
 from cuspid.motion.revisits import look_alike
 from cuspid.options import SEED, SHARE, Options, Range
 from cuspid.panorama import FrameUse
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import Tracks
+from cuspid.reconstruction import Tracks, chosen_tracks, joined_tracks
 from cuspid.sparse_model import SparseModel
 from cuspid.workers import map_in_threads
 
@@ -71,7 +72,9 @@ class SingleOptions(Options):
     guided: GuidedOptions = field(default_factory=GuidedOptions)
     """How the mapper's poses are refined."""
     patches: PatchOptions = field(default_factory=PatchOptions)
-    """How points are finally followed into more frames."""
+    """How points are followed into more frames."""
+    on_surface: bool = True
+    """Whether they are followed once more on the dense surface, which is then found again."""
     focal_share: Annotated[float, Range(0.0001, 10)] = 0.03
     """Without a calibration: standard deviation of the mapper's focal length, as a share (0 to 1) of it."""
     bridge_steps: Annotated[tuple[int, ...], Range(1, 100_000)] = (1, 2, 3, 4, 5, 6, 8, 10)
@@ -509,6 +512,43 @@ def _refined(
     return adjust_model(longer, options.guided.adjustment)
 
 
+def refine_on_surface(
+    part: SparseModel,
+    surface: Mesh,
+    sequence: ImageSequence,
+    options: SingleOptions,
+    *,
+    progress: Progress = silent,
+) -> SparseModel:
+    """A part of the motion with its points followed over the surface that its frames show, in the world of the part,
+    and its poses adjusted to that; unchanged where a frame would be held by too few points."""
+    number = {name: index for index, name in enumerate(sequence.names)}
+
+    def read(name: str) -> UInt8[np.ndarray, "h w"]:
+        return normalise_contrast(sequence.image(number[name]), options)
+
+    followed = follow_points(part, read, options.patches, surface=surface, progress=progress)
+    if np.bincount(followed.frame_index, minlength=len(part.frames)).min() < options.minimum_matches:
+        return part
+    tracks = joined_tracks(_spanning(part.tracks, options.patches.reach), followed)
+    return adjust_model(replace(part, tracks=tracks), options.guided.adjustment)
+
+
+def _spanning(tracks: Tracks, reach: int) -> Tracks:
+    """Those that hold frames together which are farther apart than patches reach: where the camera came back."""
+    first, last = np.full(len(tracks.points), np.iinfo(np.int64).max), np.full(len(tracks.points), -1)
+    np.minimum.at(first, tracks.point_index, tracks.frame_index)
+    np.maximum.at(last, tracks.point_index, tracks.frame_index)
+    return chosen_tracks(tracks, (last - first > 2 * reach)[tracks.point_index])
+
+
+def with_observations(frames: Sequence[FrameUse], part: SparseModel) -> tuple[FrameUse, ...]:
+    """Frames, each with the number of observations that hold it in a part."""
+    counts = np.bincount(part.tracks.frame_index, minlength=len(part.frames)).tolist()
+    held = dict(zip(part.frames, counts, strict=True))
+    return tuple(replace(frame, inliers=held[frame.name]) if frame.name in held else frame for frame in frames)
+
+
 def _strangers(looks: Sequence[_Look], names: Sequence[str]) -> tuple[str, ...]:
     """A note where frames have little of the colours of a mouth."""
     strange = [name for name, look in zip(names, looks, strict=True) if look.mouth_share < 0.5]
@@ -577,18 +617,18 @@ def _uses(
     verified: Mapping[tuple[int, int], object],
 ) -> tuple[FrameUse, ...]:
     """What became of every frame."""
-    inliers: dict[str, int] = {}
-    for part in parts:
-        counts = np.bincount(part.tracks.frame_index, minlength=len(part.frames)).tolist()
-        inliers |= dict(zip(part.frames, counts, strict=True))
+    placed = {name for part in parts for name in part.frames}
 
     def use(index: int, name: str) -> FrameUse:
         if index in refused:
             return FrameUse(name=name, used=False, reason=refused[index])
-        if name in inliers:
-            return FrameUse(name=name, used=True, inliers=inliers[name])
+        if name in placed:
+            return FrameUse(name=name, used=True)
         partners = sum(index in pair for pair in verified)
         reason = f"does not agree with the {partners} frames that it matches" if partners else "matches no other frame"
         return FrameUse(name=name, used=False, reason=reason)
 
-    return tuple(use(index, name) for index, name in enumerate(names))
+    frames = tuple(use(index, name) for index, name in enumerate(names))
+    for part in parts:
+        frames = with_observations(frames, part)
+    return frames

@@ -19,6 +19,7 @@ from skimage.morphology import remove_small_holes
 
 from cuspid.geometry import Rigid3
 from cuspid.kernels import kernel
+from cuspid.mesh import Mesh
 from cuspid.options import Options, Range
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.trajectory import frames_there
@@ -137,6 +138,15 @@ class HeightMap:
         places, centre = np.array(places, order="C"), np.array(centre)  # of one kind for the compiler
         _mark_occluded(places, centre, self._occluder, self.corner, self.cell_mm, start, _OVER_MM, occluded)
         return occluded if self.visible is None else occluded & ~self._marked(self.visible, places[..., :2])
+
+    def mesh(self) -> Mesh:
+        """The seen surface as triangles that look up."""
+        cells = np.arange(self.heights.size).reshape(self.heights.shape)
+        corners = cells[:-1, :-1], cells[:-1, 1:], cells[1:, 1:], cells[1:, :-1]
+        a, b, c, d = (each.ravel() for each in corners)
+        faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+        seen = self.known.ravel()[faces].all(axis=1)
+        return Mesh(self.places.reshape(-1, 3).astype(np.float64), faces[seen])
 
     def known_at(self, xy: Float[np.ndarray, "h w 2"]) -> Bool[np.ndarray, "h w"]:
         """Whether the surface was seen at a grid of places; not so beyond the border."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
@@ -55,6 +56,35 @@ class Stitched:
     """The panorama unrolled along the arch; None where the camera hardly moved, or is not located."""
 
 
+class Shown(NamedTuple):
+    """What located frames show, in the occlusal frame."""
+
+    motion: SparseModel
+    """The frames."""
+    sparse: HeightMap
+    """The smooth surface through the points of the motion."""
+    dense: HeightMap | None
+    """The surface on which images agree; None where none are compared."""
+
+
+def find_surface(
+    located: SparseModel,
+    read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
+    options: OrthoOptions,
+    *,
+    working_distance_mm: float | None = None,
+    beside: Compared | None = None,
+    progress: Progress = silent,
+) -> Shown:
+    """What the frames of one model of the motion show; arguments as for :func:`orthophoto`.
+
+    Raises ReconstructionError where there are no points.
+    """
+    motion = in_occlusal_frame(located, _scale(options, working_distance_mm) if beside is None else None)
+    sparse = height_map(motion, options.height_map)
+    return Shown(motion, sparse, _dense(located, motion, sparse, read, beside, options.plane_sweep, progress))
+
+
 def orthophoto(
     located: SparseModel,
     frames: Sequence[FrameUse],
@@ -71,12 +101,10 @@ def orthophoto(
     world of the model, from which the surface is found; the model then is in millimetres and keeps its scale. Raises
     ReconstructionError where there are no points.
     """
-    scale = options.scale
-    if scale.working_distance_mm is None:
-        scale = replace(scale, working_distance_mm=working_distance_mm)
-    motion = in_occlusal_frame(located, scale if beside is None else None)
-    surface = height_map(motion, options.height_map)
-    dense = _dense(located, motion, surface, read, beside, options.plane_sweep, progress)
+    scale = _scale(options, working_distance_mm)
+    motion, surface, dense = find_surface(
+        located, read, options, working_distance_mm=working_distance_mm, beside=beside, progress=progress
+    )
     if dense is not None:
         level = level_by_crowns(dense)
         motion = transformed(motion, level)
@@ -109,6 +137,13 @@ def _dense(
         first = motion.frames[0]
         compared = beside.seen_from(located.cam_from_world[first].inverse() @ motion.cam_from_world[first])
     return plane_sweep(motion, compared, sparse, read, options, progress=progress)
+
+
+def _scale(options: OrthoOptions, working_distance_mm: float | None) -> ScaleOptions:
+    """What sets the scale: the nominal working distance, unless another is given."""
+    if options.scale.working_distance_mm is not None:
+        return options.scale
+    return replace(options.scale, working_distance_mm=working_distance_mm)
 
 
 def _scale_note(scale: ScaleOptions, *, given: bool) -> str:
