@@ -191,6 +191,11 @@ class Reconstruction:
         """Names of the located frames."""
         return tuple(self.rig_from_world)
 
+    @property
+    def told_by(self) -> str:
+        """What ``expectation`` follows from: surfaces, unlike tracks, tell nothing of the calibration."""
+        return "poses alone" if self.tracks is None else "poses and calibration"
+
     def with_cameras_as(self, names: Sequence[str]) -> Reconstruction:
         """The same reconstruction with its cameras in another order."""
         tracks = self.tracks

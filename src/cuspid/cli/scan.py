@@ -156,7 +156,7 @@ def reconstruct_capture(capture: Capture, out: Path, options: ReconstructionOpti
         save_expected_picture(out / "expected.png", mesh, sigma_um)
     console.print(f"{out / 'mesh.ply'}: {len(mesh.faces):,} faces")
     if found.expectation is not None:
-        _print_expected(found.expectation, sigma_um)
+        _print_expected(found.expectation, sigma_um, found.told_by)
 
 
 def _evaluate(mesh: Path, reference: Path, out: Path, source: Source, options: EvaluationOptions) -> None:
@@ -293,12 +293,12 @@ def _print_nominal(handpiece: Handpiece, options: NominalOptions) -> None:
     )
 
 
-def _print_expected(expected: Expectation, sigma_um: Float[np.ndarray, "v"]) -> None:
+def _print_expected(expected: Expectation, sigma_um: Float[np.ndarray, "v"], told_by: str) -> None:
     middle, most = np.percentile(sigma_um, [50, 95])
     console.print(
-        f"expected (one sigma): surface within {middle:.1f} µm (median; {most:.1f} for 95 % of it); by poses and "
-        f"calibration, scale within {expected.scale_sigma_ppm:.0f} ppm and the {expected.span_mm:.0f} mm from end to "
-        f"end within {expected.span_sigma_um:.1f} µm"
+        f"expected (one sigma): surface within {middle:.1f} µm (median; {most:.1f} for 95 % of it); by {told_by}, "
+        f"scale within {expected.scale_sigma_ppm:.0f} ppm and the {expected.span_mm:.0f} mm from end to end within "
+        f"{expected.span_sigma_um:.1f} µm"
     )
 
 

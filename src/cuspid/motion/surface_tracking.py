@@ -30,6 +30,7 @@ from cuspid.capture import Capture, Dropped
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3, unit
 from cuspid.motion.expectation import MOST_POINTS, expectation_of, steps_drawn
+from cuspid.motion.held_calibration import depth_sigma_mm
 from cuspid.options import SEED, SHARE, Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import DepthMap, Expectation, Reconstruction
@@ -76,10 +77,8 @@ _DAMPING, _HELD_BY_NOTHING = 1e-9, 1e-13
 out so little from it that more would freeze the bend."""
 _CONVERGED = 2e-6
 """Step of the joint adjustment, as a share of the working distance, that ends it."""
-_HELD = (
-    "motion: the frames were located by their surfaces, which do not refine the calibration: it is taken as exact; an "
-    "error of it is in the result, but not in the sigmas of its vertices"
-)
+_LEAST_DEPTH_MM = 0.0005
+"""Errors of depth below which a calibration counts as exact."""
 _LONG = 5.0
 """Length of a path, in working distances, from which on its drift is seen."""
 
@@ -654,7 +653,24 @@ def track_surfaces(
         rig_from_world={names[frame]: pose for frame, pose in zip(placed, poses, strict=True)},
         dropped=(*capture.left_out, *dropped),
         log={"surface_scatter_um": 1000 * scatter_mm},
-        notes=(_HELD, *_drift(poses, distance_mm), *glare_notes(capture.handpiece), *_lost(names, placed)),
+        notes=(
+            _held(capture.handpiece),
+            *_drift(poses, distance_mm),
+            *glare_notes(capture.handpiece),
+            *_lost(names, placed),
+        ),
+    )
+
+
+def _held(handpiece: Handpiece) -> str:
+    """What the calibration, which surfaces do not refine, does to them."""
+    taken = "motion: the frames were located by their surfaces, which do not refine the calibration"
+    sigma_mm = depth_sigma_mm(handpiece)
+    if sigma_mm < _LEAST_DEPTH_MM:
+        return f"{taken}: it is taken as exact; an error of it is in the result, but not in the sigmas of its vertices"
+    return (
+        f"{taken}, and with what is known of it depths are off by about {sigma_mm:.2g} mm; this is not in the sigmas "
+        "of the vertices, nor in what is expected of the scale: calibrate the handpiece (cuspid calibrate) for less"
     )
 
 

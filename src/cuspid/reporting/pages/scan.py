@@ -202,7 +202,7 @@ def _expected_tiles(found: Reconstruction) -> list[tuple[str, str, str]]:
     if found.refinement is not None:
         tiles.append(("refinement of the calibration, RMS", f"{found.refinement.rms_sigmas:.2f}", "σ"))
     if found.expectation is not None:
-        tiles.append(("scale, from poses and calibration, one σ", f"±{found.expectation.scale_sigma_ppm:.0f}", "ppm"))
+        tiles.append((f"scale, from {found.told_by}, one σ", f"±{found.expectation.scale_sigma_ppm:.0f}", "ppm"))
         span = f"{found.expectation.span_mm:.0f} mm from end to end, from these, one σ"
         tiles.append((span, f"±{found.expectation.span_sigma_um:.1f}", "µm"))
     return tiles
