@@ -54,3 +54,8 @@ def test_an_exact_handpiece_measures_exactly_and_a_larger_one_errs_in_proportion
     assert depth_sigma_mm(NominalOptions().of(larger).fill(larger)) == pytest.approx(3 * sigma, rel=1e-3)
     lone = replace(nominal, rig=Rig(dict(list(nominal.rig.cameras.items())[:1])))
     assert depth_sigma_mm(lone) == 0
+
+
+def test_two_cameras_in_one_place_tell_no_depth_and_end_nothing() -> None:
+    handpiece = Tolerances(place_mm=0.01).fill(beside(0.0, 8.0))
+    assert np.isfinite(depth_sigma_mm(handpiece))

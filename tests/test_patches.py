@@ -16,7 +16,8 @@ from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.motion.guided import GuidedOptions
 from cuspid.motion.patches import PatchOptions, align_patches, cut_patches, follow_points, lengthen
-from cuspid.reconstruction import Tracks, chosen_tracks
+from cuspid.motion.tracks import points_across
+from cuspid.reconstruction import Tracks, chosen_tracks, joined_tracks
 from cuspid.sparse_model import SparseModel
 
 
@@ -145,13 +146,31 @@ def test_what_turns_away_from_the_camera_is_followed_once_the_surface_is_known(t
     assert np.quantile(errors_px(model, facing), 0.9) > 4 * np.quantile(errors, 0.9)
 
 
-def test_what_the_surface_does_not_show_or_occludes_is_not_followed() -> None:
+def test_what_the_surface_occludes_is_not_followed() -> None:
+    """A plate that stands on the wall, between the first frame and places behind it, which the others see past it."""
+    model, pictures = over_a_wall()
+    follow = partial(follow_points, model, lambda name: pictures[name], PatchOptions())
+    plate = np.array([[0.8, -9, 0.01], [0.8, 9, 0.01], [0.8, 9, 3], [0.8, -9, 3]])
+    wall = the_wall()
+    standing = Mesh(np.vstack([wall.vertices, plate]), np.vstack([wall.faces, wall.faces + 4]))
+
+    def seen_first(tracks: Tracks) -> int:
+        behind = np.flatnonzero((tracks.points[:, 0] > 1.3) & (tracks.points[:, 0] < 1.6))
+        assert len(behind) >= 2
+        return int(np.sum(np.isin(tracks.point_index, behind) & (tracks.frame_index == 0)))
+
+    assert seen_first(follow(surface=wall)) >= 2
+    assert seen_first(follow(surface=standing)) == 0
+
+
+def test_what_the_surface_does_not_show_is_not_followed() -> None:
     model, pictures = over_a_wall()
     follow = partial(follow_points, model, lambda name: pictures[name], PatchOptions())
     right = the_wall().submesh(np.array([True, False]))
     assert np.all(follow(surface=right).points[:, 0] > follow(surface=right).points[:, 1])
     small = Mesh(np.array([[9.0, 9, 0], [9.1, 9, 0], [9, 9.1, 0]]), np.array([[0, 1, 2]]))
-    assert len(follow(surface=small).points) == 0
+    nothing = small.submesh(np.array([False]))
+    assert len(follow(surface=small).points) == len(follow(surface=nothing).points) == 0
 
 
 def test_points_seen_in_too_few_frames_stay_as_they_were() -> None:
@@ -159,6 +178,23 @@ def test_points_seen_in_too_few_frames_stay_as_they_were() -> None:
     options = replace(PatchOptions(), minimum_views=9)
     longer = lengthen(model, lambda name: pictures[name], options).tracks
     assert len(longer.points) == len(model.tracks.points)
+
+
+def test_tracks_are_taken_apart_and_joined() -> None:
+    tracks = over_a_wall()[0].tracks
+    early = tracks.frame_index == 3
+    joined = joined_tracks(chosen_tracks(tracks, early), chosen_tracks(tracks, ~early))
+    assert len(joined.points) == 2 * len(tracks.points)
+    assert np.array_equal(joined.pixels, np.concatenate([tracks.pixels[early], tracks.pixels[~early]]))
+    place = np.concatenate([tracks.points[tracks.point_index[each]] for each in (early, ~early)])
+    assert np.array_equal(joined.points[joined.point_index], place)
+
+
+def test_points_across_a_frame_are_counted() -> None:
+    """One from 0 to 3, one from 1 to 2, one in 2 alone, and none with number 3."""
+    point, frame = np.array([0, 0, 1, 1, 2, 4, 4]), np.array([0, 3, 2, 1, 2, 3, 4])
+    assert points_across(point, frame, 5).tolist() == [1, 2, 1, 1]
+    assert points_across(np.array([], np.int64), np.array([], np.int64), 3).tolist() == [0, 0]
 
 
 def test_each_round_needs_a_tolerance_and_a_depth_share() -> None:

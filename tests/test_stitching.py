@@ -30,6 +30,7 @@ from cuspid.stitching.gain_compensation import GainOptions, Samples, balance
 from cuspid.stitching.height_map import HeightMapOptions, ScaleOptions, height_map, in_occlusal_frame
 from cuspid.stitching.mosaic import unlit
 from cuspid.stitching.ortho import Stitched
+from cuspid.stitching.plane_sweep import PlaneSweepOptions
 from cuspid.stitching.seams import SeamOptions, choose
 from cuspid.trueness import GroundTruth
 from verbs import refused
@@ -131,6 +132,14 @@ def test_overlaps_inliers_and_notes_are_told(stitched: Stitched) -> None:
     assert all(frame.inliers is not None and frame.inliers > 30 for frame in frames)
     assert any("14 mm over the teeth" in note for note in stitched.panorama.notes)
     assert not any("came back" in note for note in stitched.panorama.notes)
+    assert not any("found again on the surface" in note for note in stitched.panorama.notes)
+
+
+def test_a_path_that_the_surface_does_not_hold_stays_and_a_note_tells(sequence: ImageSequence) -> None:
+    options = StitchOptions(plane_sweep=PlaneSweepOptions(agreement=0.99))
+    (made,) = stitch(sequence, options)
+    assert all(frame.used for frame in made.panorama.frames)
+    assert any("found again on the surface" in note for note in made.panorama.notes)
 
 
 def test_the_strip_is_as_long_as_the_way_of_the_camera(stitched: Stitched) -> None:

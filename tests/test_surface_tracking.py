@@ -13,6 +13,7 @@ from cuspid.capture import Capture, Frame
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3, unit
 from cuspid.mesh import Mesh
+from cuspid.motion.held_calibration import depth_sigma_mm
 from cuspid.motion.surface_tracking import (
     Shown,
     Surface,
@@ -27,6 +28,7 @@ from cuspid.progress import silent
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece, Light
 from cuspid.stereo.matching import coarser
+from cuspid.tolerances import NominalOptions, held
 from plain_scene import SIZE_PX
 from synthetic_scene import cast_depth, diamond, height_field
 from test_any_rig import InMemory, times
@@ -170,6 +172,18 @@ def test_the_error_of_a_path_is_expected(wide_px: float) -> None:
 
 def test_exact_surfaces_give_an_exact_path() -> None:
     assert errors_um(tracked(depth_maps(OUT, noise_mm=0.0)), OUT).max() < 2
+
+
+def test_what_an_uncertain_calibration_does_is_told() -> None:
+    """Exact: nothing. 0.2 degrees and 30 um of each camera: tenths of a millimetre."""
+    maps, drawn = depth_maps(OUT), held(diamond(SIZE_PX))
+    exact = track_surfaces(capture_of(drawn, tuple(OUT)), maps)
+    assert "taken as exact" in exact.notes[0]
+    assert exact.told_by == "poses alone"
+    nominal = NominalOptions().of(drawn).fill(drawn)
+    told = track_surfaces(capture_of(nominal, tuple(OUT)), maps).notes[0]
+    assert f"{depth_sigma_mm(nominal):.2g} mm" in told
+    assert 0.03 < depth_sigma_mm(nominal) < 0.3
 
 
 def test_a_path_that_comes_back_is_closed() -> None:

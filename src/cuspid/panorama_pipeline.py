@@ -8,7 +8,7 @@ views                = view_mesh(mesh, ...)                         the same vie
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -31,6 +31,7 @@ from cuspid.panorama import FrameUse
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
 from cuspid.simulation.film import FilmOptions, film
+from cuspid.sparse_model import SparseModel
 from cuspid.stitching.compared import cameras_beside
 from cuspid.stitching.height_map import ScaleOptions
 from cuspid.stitching.mesh_views import MeshViewOptions, MeshViews, draw_mesh
@@ -39,6 +40,9 @@ from cuspid.stitching.thesis_method import ThesisOptions, stitch_as_thesis
 from cuspid.tolerances import NominalOptions
 
 __all__ = ["FilmOptions", "MeshViewOptions", "StitchOptions", "film", "stitch", "stitch_rig", "view_mesh"]
+
+
+_NOT_ON_SURFACE = "motion: the path is less accurate, for too few points are found again on the surface"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,13 +93,30 @@ def _stitched(
     def read(name: str) -> UInt8[np.ndarray, "h w 3"]:
         return sequence.image(index[name])
 
-    if options.motion.on_surface:
-        shown = find_surface(located, read, options, working_distance_mm=distance_mm, progress=progress)
-        if shown.dense is not None:
-            surface = shown.dense.mesh()
-            located = refine_on_surface(shown.motion, surface, sequence, options.motion, progress=progress)
+    notes: tuple[str, ...] = ()
+    if options.motion.on_surface and options.plane_sweep.enabled:
+        refined = _on_surface(located, sequence, read, options, progress)
+        located = refined or located
+        notes = (
+            () if refined else ("motion: the path is less accurate, for too few points are found again on the surface",)
+        )
     frames = with_observations(motion.frames_of(number), located)
-    return orthophoto(located, frames, read, options, working_distance_mm=distance_mm, progress=progress)
+    made = orthophoto(located, frames, read, options, working_distance_mm=distance_mm, progress=progress)
+    return replace(made, panorama=replace(made.panorama, notes=(*notes, *made.panorama.notes)))
+
+
+def _on_surface(
+    located: SparseModel,
+    sequence: ImageSequence,
+    read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
+    options: StitchOptions,
+    progress: Progress,
+) -> SparseModel | None:
+    """A part of the motion, refined on the surface that its frames show; None where that does not hold it."""
+    shown = find_surface(located, read, options, working_distance_mm=sequence.working_distance_mm, progress=progress)
+    if shown.dense is None:
+        return None
+    return refine_on_surface(shown.motion, shown.dense.mesh(), sequence, options.motion, progress=progress)
 
 
 def stitch_rig(capture: Capture, options: StitchOptions, *, progress: Progress = silent) -> Stitched:

@@ -51,7 +51,7 @@ def _moved(place: Float[np.ndarray, "3"], cameras: list[MountedCamera]) -> Float
         motion = covariance_factor(mounted.covariance, _MOTION)
         square += by_place.T @ by_place
         factors.append(by_place.T @ np.hstack([by_camera[:, :_LENS] @ lens, by_camera[:, _LENS:] @ motion]))
-    return np.linalg.solve(square, np.hstack(factors))
+    return np.asarray(np.linalg.pinv(square) @ np.hstack(factors))
 
 
 def _seen(

@@ -31,7 +31,7 @@ from cuspid.motion.odometry import (
 )
 from cuspid.motion.pairs import MatchingOptions, frame_pairs, index_features, match_guided
 from cuspid.motion.pictures import Pictures
-from cuspid.motion.tracks import intersect_rays, join, thin
+from cuspid.motion.tracks import intersect_rays, join, points_across, thin
 from cuspid.options import SEED, SHARE, Options, Range
 from cuspid.pairing import PairingOptions, require_stereo, resolved_mm, stereo_pairs
 from cuspid.progress import Progress, silent
@@ -346,11 +346,7 @@ def stereo_ties(tracks: Tracks, frames: int) -> Int[np.ndarray, "k"]:
     seen = np.unique(np.stack([tracks.point_index, tracks.frame_index, tracks.camera_index], axis=1), axis=0)
     sightings, cameras = np.unique(seen[:, :2], axis=0, return_counts=True)
     point, frame = sightings[cameras >= 2].T
-    first, last = np.full(len(tracks.points), frames), np.full(len(tracks.points), -1)
-    np.minimum.at(first, point, frame)
-    np.maximum.at(last, point, frame)
-    at = np.arange(frames - 1)[:, None]
-    return np.asarray(((first <= at) & (at < last)).sum(axis=1))
+    return points_across(point, frame, frames)
 
 
 def _adjusted(

@@ -282,9 +282,7 @@ class _Scene(NamedTuple):
         """The patches around observations in a frame that show something known."""
         tracks, camera, radius = self.model.tracks, self.model.camera, self.options.radius_px
         middles, points = tracks.pixels[own], tracks.point_index[own]
-        steps = np.arange(-radius, radius + 1.0)
-        around = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-        rays = camera.rays(middles[:, None] + around)
+        rays = camera.rays(middles[:, None] + _around(radius))
         if self.surface is None:
             depths = self.poses.inside(frame, tracks.points[points])[:, 2:]
         else:
@@ -321,12 +319,17 @@ class _Scene(NamedTuple):
         return facets.points[good], np.full(int(good.sum()), there), pixels[good]
 
 
+def _around(radius_px: int) -> Float[np.ndarray, "p 2"]:
+    """Offsets of the pixels of a patch from its middle, row by row."""
+    steps = np.arange(-radius_px, radius_px + 1.0)
+    return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+
+
 def _straightened(
     offsets: Float[np.ndarray, "k p 2"], radius_px: int
 ) -> tuple[Float[np.ndarray, "k 2 2"], Float[np.ndarray, "k p 2"]]:
     """Offsets of the pixels of patches in another image: the linear maps that fit them best, and what is left."""
-    steps = np.arange(-radius_px, radius_px + 1.0)
-    around = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    around = _around(radius_px)
     warps = np.einsum("kpi,pj->kij", offsets, around) / np.sum(around[:, 0] ** 2)
     return warps, offsets - around @ warps.swapaxes(1, 2)
 

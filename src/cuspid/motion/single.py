@@ -30,6 +30,7 @@ from cuspid.motion.guided import GuidedOptions, refine
 from cuspid.motion.pairs import MatchingOptions, match_unguided
 from cuspid.motion.patches import PatchOptions, follow_points, lengthen
 from cuspid.motion.revisits import look_alike
+from cuspid.motion.tracks import first_and_last, points_across
 from cuspid.options import SEED, SHARE, Options, Range
 from cuspid.panorama import FrameUse
 from cuspid.progress import Progress, silent
@@ -519,26 +520,28 @@ def refine_on_surface(
     options: SingleOptions,
     *,
     progress: Progress = silent,
-) -> SparseModel:
+) -> SparseModel | None:
     """A part of the motion with its points followed over the surface that its frames show, in the world of the part,
-    and its poses adjusted to that; unchanged where a frame would be held by too few points."""
+    and its poses adjusted to that; None where too few are found to hold a frame, or what lies before one and behind
+    it, together."""
     number = {name: index for index, name in enumerate(sequence.names)}
 
     def read(name: str) -> UInt8[np.ndarray, "h w"]:
         return normalise_contrast(sequence.image(number[name]), options)
 
     followed = follow_points(part, read, options.patches, surface=surface, progress=progress)
-    if np.bincount(followed.frame_index, minlength=len(part.frames)).min() < options.minimum_matches:
-        return part
+    frames = len(part.frames)
+    held = np.bincount(followed.frame_index, minlength=frames)
+    together = points_across(followed.point_index, followed.frame_index, frames)
+    if min(held.min(), together.min()) < options.minimum_matches:
+        return None
     tracks = joined_tracks(_spanning(part.tracks, options.patches.reach), followed)
     return adjust_model(replace(part, tracks=tracks), options.guided.adjustment)
 
 
 def _spanning(tracks: Tracks, reach: int) -> Tracks:
     """Those that hold frames together which are farther apart than patches reach: where the camera came back."""
-    first, last = np.full(len(tracks.points), np.iinfo(np.int64).max), np.full(len(tracks.points), -1)
-    np.minimum.at(first, tracks.point_index, tracks.frame_index)
-    np.maximum.at(last, tracks.point_index, tracks.frame_index)
+    first, last = first_and_last(tracks.point_index, tracks.frame_index, len(tracks.points))
     return chosen_tracks(tracks, (last - first > 2 * reach)[tracks.point_index])
 
 

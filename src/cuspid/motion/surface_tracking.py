@@ -77,8 +77,8 @@ _DAMPING, _HELD_BY_NOTHING = 1e-9, 1e-13
 out so little from it that more would freeze the bend."""
 _CONVERGED = 2e-6
 """Step of the joint adjustment, as a share of the working distance, that ends it."""
-_LEAST_DEPTH_MM = 0.0005
-"""Errors of depth below which a calibration counts as exact."""
+_LEAST_DEPTH = 1e-4
+"""Errors of depth, as a share of the working distance, below which a calibration counts as exact."""
 _LONG = 5.0
 """Length of a path, in working distances, from which on its drift is seen."""
 
@@ -666,7 +666,7 @@ def _held(handpiece: Handpiece) -> str:
     """What the calibration, which surfaces do not refine, does to them."""
     taken = "motion: the frames were located by their surfaces, which do not refine the calibration"
     sigma_mm = depth_sigma_mm(handpiece)
-    if sigma_mm < _LEAST_DEPTH_MM:
+    if sigma_mm < _LEAST_DEPTH * handpiece.working_distance_mm:
         return f"{taken}: it is taken as exact; an error of it is in the result, but not in the sigmas of its vertices"
     return (
         f"{taken}, and with what is known of it depths are off by about {sigma_mm:.2g} mm; this is not in the sigmas "

@@ -78,6 +78,25 @@ def intersect_rays(
     return points
 
 
+def first_and_last(
+    point: Int[np.ndarray, "o"], frame: Int[np.ndarray, "o"], count: int
+) -> tuple[Int[np.ndarray, "p"], Int[np.ndarray, "p"]]:
+    """The first and the last frame in which each of ``count`` points was observed; for one that never was, the last is
+    -1."""
+    first, last = np.full(count, np.iinfo(np.int64).max), np.full(count, -1)
+    np.minimum.at(first, point, frame)
+    np.maximum.at(last, point, frame)
+    return first, last
+
+
+def points_across(point: Int[np.ndarray, "o"], frame: Int[np.ndarray, "o"], frames: int) -> Int[np.ndarray, "k"]:
+    """For each of so many frames except the last: the number of points that were observed in it or earlier, and again
+    in a later one."""
+    first, last = first_and_last(point, frame, int(point.max(initial=-1)) + 1)
+    at = np.arange(frames - 1)[:, None]
+    return np.asarray(((first <= at) & (at < last)).sum(axis=1))
+
+
 @kernel
 @no_type_check
 def _claim(order, start, cell_of):
