@@ -97,9 +97,7 @@ def _stitched(
     if options.motion.on_surface and options.plane_sweep.enabled:
         refined = _on_surface(located, sequence, read, options, progress)
         located = refined or located
-        notes = (
-            () if refined else ("motion: the path is less accurate, for too few points are found again on the surface",)
-        )
+        notes = () if refined else (_NOT_ON_SURFACE,)
     frames = with_observations(motion.frames_of(number), located)
     made = orthophoto(located, frames, read, options, working_distance_mm=distance_mm, progress=progress)
     return replace(made, panorama=replace(made.panorama, notes=(*notes, *made.panorama.notes)))
