@@ -24,7 +24,14 @@ from cuspid.image_sequence import ImageSequence
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.motion.location import MotionOptions
-from cuspid.motion.rig_film import film_options, locate_rig_film, of_camera
+from cuspid.motion.patches import PatchOptions
+from cuspid.motion.rig_film import (
+    film_options,
+    locate_rig_film,
+    of_camera,
+    refine_rig_on_surface,
+    surface_patches,
+)
 from cuspid.motion.single import SingleMotion, SingleOptions, locate_single, refine_on_surface, with_observations
 from cuspid.pairing import stereo_pairs
 from cuspid.panorama import FrameUse
@@ -32,7 +39,7 @@ from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
 from cuspid.simulation.film import FilmOptions, film
 from cuspid.sparse_model import SparseModel
-from cuspid.stitching.compared import cameras_beside
+from cuspid.stitching.compared import Compared, cameras_beside
 from cuspid.stitching.height_map import ScaleOptions
 from cuspid.stitching.mesh_views import MeshViewOptions, MeshViews, draw_mesh
 from cuspid.stitching.ortho import OrthoOptions, Stitched, find_surface, orthophoto
@@ -59,6 +66,8 @@ class StitchOptions(OrthoOptions):
     """Leave out frames that fail the examination of the thesis (method thesis)."""
     rig: MotionOptions = field(default_factory=film_options)
     """How the trajectory of a handpiece of two or more cameras is found (method ortho)."""
+    rig_patches: PatchOptions = field(default_factory=surface_patches)
+    """How its points are followed over the dense surface."""
     thesis: ThesisOptions = field(default_factory=ThesisOptions)
     """Settings of the method thesis."""
 
@@ -128,20 +137,66 @@ def stitch_rig(capture: Capture, options: StitchOptions, *, progress: Progress =
         raise InputError("stitch: --method thesis takes the images of one camera; give the folder of one camera")
     if options.scale != ScaleOptions():
         raise InputError("stitch: the cameras of the handpiece tell the scale; leave out --scale")
-    handpiece = NominalOptions().of(capture.handpiece).fill(capture.handpiece)
-    capture = replace(capture, handpiece=handpiece)
-    found = locate_rig_film(capture, options.rig, options.motion, progress=progress)
-    camera = _facing_down(found)
-    pairs = stereo_pairs(found.rig, handpiece.working_distance_mm, options.rig.pairing)
-    beside = cameras_beside(found, capture.frames, pairs, handpiece)
-    shown = of_camera(found, camera, {frame.name for frame in capture.frames if camera in frame.cameras})
+    capture = replace(capture, handpiece=NominalOptions().of(capture.handpiece).fill(capture.handpiece))
+    scene = _RigScene(capture, locate_rig_film(capture, options.rig, options.motion, progress=progress), options)
+    notes: tuple[str, ...] = ()
+    if options.motion.on_surface and options.plane_sweep.enabled:
+        refined = scene.on_surface(progress)
+        scene, notes = (scene, (_NOT_ON_SURFACE,)) if refined is None else (scene.located_as(refined), ())
+    made = scene.orthophoto(progress)
+    noted = (*_scale_notes(scene.found, scene.camera), *scene.found.notes, *notes)
+    return replace(made, panorama=replace(made.panorama, notes=noted))
 
-    def read(name: str) -> UInt8[np.ndarray, "h w 3"]:
+
+@dataclass(frozen=True, eq=False)
+class _RigScene:
+    """What the frames of a handpiece show, located."""
+
+    capture: Capture
+    found: Reconstruction
+    options: StitchOptions
+
+    def located_as(self, found: Reconstruction) -> _RigScene:
+        """The same with other poses."""
+        return replace(self, found=found)
+
+    @property
+    def camera(self) -> str:
+        """That whose picture it is."""
+        return _facing_down(self.found)
+
+    @property
+    def shown(self) -> SparseModel:
+        """The trajectory of that camera."""
+        has = {frame.name for frame in self.capture.frames if self.camera in frame.cameras}
+        return of_camera(self.found, self.camera, has)
+
+    def beside(self) -> Compared:
+        """The images of cameras of one instant."""
+        handpiece = self.capture.handpiece
+        pairs = stereo_pairs(self.found.rig, handpiece.working_distance_mm, self.options.rig.pairing)
+        return cameras_beside(self.found, self.capture.frames, pairs, handpiece)
+
+    def read(self, name: str) -> UInt8[np.ndarray, "h w 3"]:
+        """The image ``camera/frame``, or that of a frame and the camera whose picture it is."""
         one, _, frame = name.rpartition("/")
-        return capture.source.read(frame, one or camera)
+        return self.capture.source.read(frame, one or self.camera)
 
-    made = orthophoto(shown, _uses(capture, found, camera), read, options, beside=beside, progress=progress)
-    return replace(made, panorama=replace(made.panorama, notes=(*_scale_notes(found, camera), *found.notes)))
+    def on_surface(self, progress: Progress) -> Reconstruction | None:
+        """The poses, refined on the surface that the frames show; None where that does not hold them."""
+        shown, options = self.shown, self.options
+        seen = find_surface(shown, self.read, options, beside=self.beside(), progress=progress)
+        surface = seen.dense_in_world_of(shown)
+        if surface is None:
+            return None
+        return refine_rig_on_surface(
+            *(self.found, surface, self.capture, options.rig, options.motion, options.rig_patches), progress=progress
+        )
+
+    def orthophoto(self, progress: Progress) -> Stitched:
+        """The panorama."""
+        uses = _uses(self.capture, self.found, self.camera)
+        return orthophoto(self.shown, uses, self.read, self.options, beside=self.beside(), progress=progress)
 
 
 def _facing_down(found: Reconstruction) -> str:

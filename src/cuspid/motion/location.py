@@ -300,8 +300,13 @@ def locate_features(
         poses=list(trajectory.rig_from_world.values()),
     )
     adjusted = _adjusted(start, scan, options, read if options.least_squares.enabled else None, log, progress)
-    notes = (*adjusted.notes, *_loose_notes(adjusted, options.odometry.minimum_matches), *_advice(adjusted))
-    return replace(adjusted.with_cameras_as(given), log={**log, **adjusted.log}, notes=notes)
+    noted = with_advice(adjusted, options.odometry.minimum_matches)
+    return replace(noted.with_cameras_as(given), log={**log, **adjusted.log})
+
+
+def with_advice(found: Reconstruction, least: int) -> Reconstruction:
+    """With notes where fewer points than ``least`` tie frames together, and what would make the path more certain."""
+    return replace(found, notes=(*found.notes, *_loose_notes(found, least), *_advice(found)))
 
 
 def _loose_notes(found: Reconstruction, least: int) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ patch, and what is laid over them as a plane slides.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, NamedTuple, no_type_check
@@ -19,13 +19,14 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from cuspid.camera import OPENCV_PIXEL_OFFSET
-from cuspid.geometry import unit
+from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
+from cuspid.geometry import Rigid3, unit
 from cuspid.kernels import kernel
 from cuspid.mesh import Mesh
+from cuspid.motion.tracks import points_across
 from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import Tracks, chosen_tracks, joined_tracks
+from cuspid.reconstruction import Reconstruction, Tracks, chosen_tracks, joined_tracks
 from cuspid.sparse_model import SparseModel
 from cuspid.workers import map_in_threads
 
@@ -220,39 +221,51 @@ def align_patches(
     return there_px + shifts, correlations
 
 
-class _Poses(NamedTuple):
-    """The poses as arrays."""
+class _Views(NamedTuple):
+    """The images in which points are followed, those of a frame beside each other."""
 
-    rotations: np.ndarray
-    shifts: np.ndarray
+    names: tuple[str, ...]
+    """By which they are read."""
+    frames: Int[np.ndarray, "i"]
+    """The frame of each, in order."""
+    cameras: tuple[Camera, ...]
+    rotations: Float[np.ndarray, "i 3 3"]
+    shifts: Float[np.ndarray, "i 3"]
 
     @staticmethod
-    def of(model: SparseModel) -> _Poses:
-        """``cam_from_world`` of all frames."""
-        poses = list(model.cam_from_world.values())
-        return _Poses(np.stack([pose.rotation for pose in poses]), np.array([pose.translation for pose in poses]))
+    def of(
+        names: Sequence[str], frames: Int[np.ndarray, "i"], cameras: Sequence[Camera], cam_from_world: Sequence[Rigid3]
+    ) -> _Views:
+        """Images with their poses."""
+        rotations = np.stack([pose.rotation for pose in cam_from_world])
+        shifts = np.array([pose.translation for pose in cam_from_world])
+        return _Views(tuple(names), frames, tuple(cameras), rotations, shifts)
 
-    def inside(self, frame: int, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Points in the camera of a frame."""
-        return np.asarray(points @ self.rotations[frame].T + self.shifts[frame])
+    def inside(self, image: int, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Points in the camera of an image."""
+        return np.asarray(points @ self.rotations[image].T + self.shifts[image])
 
-    def outside(self, frame: int, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Points of the camera of a frame in the world."""
-        return np.asarray((points - self.shifts[frame]) @ self.rotations[frame])
+    def outside(self, image: int, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Points of the camera of an image in the world."""
+        return np.asarray((points - self.shifts[image]) @ self.rotations[image])
 
-    def centre(self, frame: int) -> Float[np.ndarray, "3"]:
-        """Where the camera of a frame is."""
-        return np.asarray(-self.rotations[frame].T @ self.shifts[frame])
+    def centre(self, image: int) -> Float[np.ndarray, "3"]:
+        """Where an image was taken from."""
+        return np.asarray(-self.rotations[image].T @ self.shifts[image])
 
-    def directions(self, frame: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def directions(self, image: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Unit vectors from points to the camera."""
-        return unit(self.centre(frame) - points)
+        return unit(self.centre(image) - points)
+
+    def near(self, frame: int, reach: int) -> Int[np.ndarray, "n"]:
+        """The images of frames that are at most so many before or after one."""
+        return np.flatnonzero(np.abs(self.frames - frame) <= reach)
 
 
 class _Facets(NamedTuple):
-    """The patches of one frame, and what they show."""
+    """The patches of one image, and what they show."""
 
-    frame: int
+    image: int
     points: Int[np.ndarray, "k"]
     """The points in their middle."""
     levels: Float32[np.ndarray, "k s s"]
@@ -267,56 +280,87 @@ class _Facets(NamedTuple):
 
     def some(self, which: Bool[np.ndarray, "k"]) -> _Facets:
         """Some of them."""
-        return _Facets(self.frame, self.points[which], self.levels[which], self.places[which])
+        return _Facets(self.image, self.points[which], self.levels[which], self.places[which])
 
 
 class _Scene(NamedTuple):
     """What is followed."""
 
-    model: SparseModel
-    poses: _Poses
+    views: _Views
+    tracks: Tracks
+    image_index: Int[np.ndarray, "o"]
+    """For each observation: the image."""
     surface: Mesh | None
     options: PatchOptions
 
-    def facets(self, frame: int, own: Int[np.ndarray, "k"], picture: Float32[np.ndarray, "h w"]) -> _Facets:
-        """The patches around observations in a frame that show something known."""
-        tracks, camera, radius = self.model.tracks, self.model.camera, self.options.radius_px
+    def own_observations(self) -> Int[np.ndarray, "p"]:
+        """The observation of each point that is nearest to the middle of its image."""
+        middles = np.array([[camera.width, camera.height] for camera in self.views.cameras]) / 2
+        off = np.linalg.norm(self.tracks.pixels - middles[self.image_index], axis=1)
+        order = np.lexsort((off, self.tracks.point_index))
+        return np.asarray(order[np.unique(self.tracks.point_index[order], return_index=True)[1]])
+
+    def facets(self, image: int, own: Int[np.ndarray, "k"], picture: Float32[np.ndarray, "h w"]) -> _Facets:
+        """The patches around observations in an image that show something known."""
+        tracks, camera, radius = self.tracks, self.views.cameras[image], self.options.radius_px
         middles, points = tracks.pixels[own], tracks.point_index[own]
         rays = camera.rays(middles[:, None] + _around(radius))
         if self.surface is None:
-            depths = self.poses.inside(frame, tracks.points[points])[:, 2:]
+            depths = self.views.inside(image, tracks.points[points])[:, 2:]
         else:
-            centre = self.poses.centre(frame)
-            towards = (rays @ self.poses.rotations[frame]).reshape(-1, 3)
+            centre = self.views.centre(image)
+            towards = (rays @ self.views.rotations[image]).reshape(-1, 3)
             hits = self.surface.cast(np.broadcast_to(centre, towards.shape), towards)
             depths = hits.distances.reshape(rays.shape[:2])
         levels = cut_patches(picture, middles, radius)
         known = np.isfinite(depths).all(axis=1)
-        places = self.poses.outside(frame, rays * np.where(known[:, None], depths, 1.0)[..., None])
-        return _Facets(frame, points, levels, places).some(known)
+        places = self.views.outside(image, rays * np.where(known[:, None], depths, 1.0)[..., None])
+        return _Facets(image, points, levels, places).some(known)
 
     def visible(self, there: int, places: Float[np.ndarray, "k 3"]) -> Bool[np.ndarray, "k"]:
-        """Whether the surface occludes no place from a frame."""
+        """Whether the surface occludes no place from an image."""
         if self.surface is None:
             return np.ones(len(places), bool)
-        centre = np.broadcast_to(self.poses.centre(there), places.shape)
+        centre = np.broadcast_to(self.views.centre(there), places.shape)
         return np.asarray(self.surface.cast(centre, places - centre).distances > 1 - _HIDDEN)
 
     def follow(
         self, facets: _Facets, pictures: Mapping[int, Float32[np.ndarray, "h w"]], there: int
     ) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"], Float[np.ndarray, "m 2"]]:
-        """Of the points of one frame those found in another: points, frames, pixels."""
-        camera, options, middles = self.model.camera, self.options, facets.middles
-        turn = np.sum(self.poses.directions(facets.frame, middles) * self.poses.directions(there, middles), axis=1)
-        expected = camera.project(self.poses.inside(there, middles))
+        """Of the points of one image those found in another: points, images, pixels."""
+        views, camera, options, middles = self.views, self.views.cameras[there], self.options, facets.middles
+        turn = np.sum(views.directions(facets.image, middles) * views.directions(there, middles), axis=1)
+        expected = camera.project(views.inside(there, middles))
         seen = camera.contains(expected, 2.0 * options.radius_px) & (turn > np.cos(np.deg2rad(options.turn_deg)))
         seen[seen] = self.visible(there, middles[seen])
         facets, expected = facets.some(seen), expected[seen]
-        offsets = camera.project(self.poses.inside(there, facets.places)) - expected[:, None]
+        offsets = camera.project(views.inside(there, facets.places)) - expected[:, None]
         warps, bends = _straightened(offsets, options.radius_px)
         pixels, correlation = align_patches(facets.levels, pictures[there], expected, warps, options, bends)
         good = correlation > options.correlation
         return facets.points[good], np.full(int(good.sum()), there), pixels[good]
+
+    def followed(
+        self, read: Callable[[str], UInt8[np.ndarray, "h w"]], progress: Progress
+    ) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"], Float[np.ndarray, "m 2"]]:
+        """All points where they are found, and in their own images: points, images, pixels. Only images within reach
+        are in memory at a time."""
+        own, views, pictures = self.own_observations(), self.views, dict[int, np.ndarray]()
+        found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        for image, frame in enumerate(views.frames.tolist()):
+            near = views.near(frame, self.options.reach).tolist()
+            kept = {other: pictures[other] for other in near if other in pictures}
+            pictures = kept | {n: smooth(read(views.names[n]), self.options.blur_px) for n in near if n not in kept}
+            mine = own[self.image_index[own] == image]
+            follow = partial(self.follow, self.facets(image, mine, pictures[image]), pictures)
+            found += [
+                (self.tracks.point_index[mine], np.full(len(mine), image), self.tracks.pixels[mine]),
+                *map_in_threads(follow, [other for other in near if other != image]),
+            ]
+            progress("patches", image + 1, len(views.names))
+        point, image_index, pixels = (np.concatenate(each) for each in zip(*found, strict=True))
+        often = np.bincount(point, minlength=len(self.tracks.points))[point] >= self.options.minimum_views
+        return point[often], image_index[often], pixels[often]
 
 
 def _around(radius_px: int) -> Float[np.ndarray, "p 2"]:
@@ -344,30 +388,66 @@ def follow_points(
 ) -> Tracks:
     """Tracks of the points of a model of one camera whose patches are found in enough frames.
 
-    ``read`` returns the image of a frame, given its name; only those within reach are in memory at a time.
-    ``surface``: what the patches show, in the world of the model; otherwise each is taken to face its camera.
+    ``read`` returns the image of a frame, given its name. ``surface``: what the patches show, in the world of the
+    model; otherwise each is taken to face its camera.
     """
-    own = _own_observations(model)
-    tracks, names = model.tracks, model.frames
-    scene, pictures = _Scene(model, _Poses.of(model), surface, options), dict[int, np.ndarray]()
-    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    for frame in range(len(names)):
-        near = range(max(0, frame - options.reach), min(len(names), frame + options.reach + 1))
-        kept = {other: pictures[other] for other in near if other in pictures}
-        pictures = kept | {n: smooth(read(names[n]), options.blur_px) for n in near if n not in kept}
-        mine = own[tracks.frame_index[own] == frame]
-        follow = partial(scene.follow, scene.facets(frame, mine, pictures[frame]), pictures)
-        found += [
-            (tracks.point_index[mine], np.full(len(mine), frame), tracks.pixels[mine]),
-            *map_in_threads(follow, [other for other in near if other != frame]),
-        ]
-        progress("patches", frame + 1, len(names))
-    point, seen_in, pixels = (np.concatenate(each) for each in zip(*found, strict=True))
-    often = np.bincount(point, minlength=len(tracks.points))[point] >= options.minimum_views
-    all_found = replace(
-        tracks, point_index=point, frame_index=seen_in, camera_index=np.zeros(len(point), np.int64), pixels=pixels
+    names, tracks = model.frames, model.tracks
+    views = _Views.of(names, np.arange(len(names)), (model.camera,) * len(names), tuple(model.cam_from_world.values()))
+    scene = _Scene(views, tracks, tracks.frame_index, surface, options)
+    point, frame, pixels = scene.followed(read, progress)
+    return _with_observations(tracks, point, frame, np.zeros_like(frame), pixels)
+
+
+def follow_rig_points(
+    found: Reconstruction,
+    read: Callable[[str, str], UInt8[np.ndarray, "h w"]],
+    options: PatchOptions,
+    *,
+    surface: Mesh,
+    progress: Progress = silent,
+) -> Tracks:
+    """As :func:`follow_points`, for a handpiece, into the images that have observations already; ``read`` returns the
+    image of a frame and a camera, given their names."""
+    tracks, cameras = found.tracks, tuple(found.rig.cameras.values())
+    assert tracks is not None
+    images, image_index = np.unique(
+        np.stack([tracks.frame_index, tracks.camera_index], axis=1), axis=0, return_inverse=True
     )
-    return chosen_tracks(all_found, often)
+    frame_of, camera_of = images.T
+    poses = tuple(found.rig_from_world.values())
+    views = _Views.of(
+        [f"{found.rig.names[c]}/{found.frames[f]}" for f, c in images],
+        frame_of,
+        [cameras[c].camera for c in camera_of],
+        [cameras[c].cam_from_rig @ poses[f] for f, c in images],
+    )
+
+    def image(name: str) -> UInt8[np.ndarray, "h w"]:
+        camera, _, frame = name.partition("/")
+        return read(frame, camera)
+
+    scene = _Scene(views, tracks, image_index.reshape(-1), surface, options)
+    point, seen_in, pixels = scene.followed(image, progress)
+    return _with_observations(tracks, point, frame_of[seen_in], camera_of[seen_in], pixels)
+
+
+def _with_observations(
+    tracks: Tracks,
+    point: Int[np.ndarray, "m"],
+    frame: Int[np.ndarray, "m"],
+    camera: Int[np.ndarray, "m"],
+    pixels: Float[np.ndarray, "m 2"],
+) -> Tracks:
+    """The points of tracks with other observations, if they have any."""
+    other = replace(tracks, point_index=point, frame_index=frame, camera_index=camera, pixels=pixels)
+    return chosen_tracks(other, np.ones(len(point), bool))
+
+
+def hold_together(tracks: Tracks, frames: int, least: int) -> bool:
+    """Whether at least so many points hold each of the frames, and what lies before it and behind."""
+    held = np.bincount(tracks.frame_index, minlength=frames)
+    across = points_across(tracks.point_index, tracks.frame_index, frames)
+    return bool(min(held.min(), across.min(initial=least)) >= least)
 
 
 def lengthen(
@@ -380,11 +460,3 @@ def lengthen(
     """The model of one camera with a second track (:func:`follow_points`) for each point whose patch was found."""
     second = follow_points(model, read, options, progress=progress)
     return replace(model, tracks=joined_tracks(model.tracks, second))
-
-
-def _own_observations(model: SparseModel) -> Int[np.ndarray, "p"]:
-    """The observation of each point that is nearest to the middle of its frame."""
-    tracks, camera = model.tracks, model.camera
-    off = np.linalg.norm(tracks.pixels - np.array([camera.width, camera.height]) / 2, axis=1)
-    order = np.lexsort((off, tracks.point_index))
-    return np.asarray(order[np.unique(tracks.point_index[order], return_index=True)[1]])

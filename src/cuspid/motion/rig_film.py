@@ -14,7 +14,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from cuspid.capture import Capture, ImageSource
-from cuspid.motion.location import MotionOptions, locate
+from cuspid.mesh import Mesh
+from cuspid.motion.adjustment import adjust
+from cuspid.motion.location import MotionOptions, locate, with_advice
+from cuspid.motion.patches import PatchOptions, follow_rig_points, hold_together
 from cuspid.motion.single import ENAMEL, SingleOptions, normalise_contrast
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, chosen_tracks
@@ -60,6 +63,41 @@ def locate_rig_film(
     placed.
     """
     return locate(replace(capture, source=_EvenContrast(capture.source, contrast)), options, progress=progress)
+
+
+def surface_patches() -> PatchOptions:
+    """The options of :func:`refine_rig_on_surface`. The path is true to scale already: what is found farther away is
+    wrong more often than not."""
+    return PatchOptions(radius_px=5, limit_px=1.5)
+
+
+def refine_rig_on_surface(
+    found: Reconstruction,
+    surface: Mesh,
+    capture: Capture,
+    options: MotionOptions,
+    contrast: SingleOptions,
+    patches: PatchOptions,
+    *,
+    progress: Progress = silent,
+) -> Reconstruction | None:
+    """What :func:`locate_rig_film` found, with its points followed over the surface that the frames show, in its world,
+    and all adjusted to that; None where too few are found to hold a frame, or what lies before one and behind it,
+    together."""
+    source = _EvenContrast(capture.source, contrast)
+
+    def read(frame: str, camera: str) -> UInt8[np.ndarray, "h w"]:
+        return source.read(frame, camera)[..., 0]
+
+    followed = follow_rig_points(found, read, patches, surface=surface, progress=progress)
+    least = options.odometry.minimum_matches
+    if not hold_together(followed, len(found.frames), least):
+        return None
+    rig = capture.handpiece.rig.in_own_order()
+    start = replace(found, tracks=followed, notes=()).with_cameras_as(rig.names)
+    # The calibration as it was given: the images have told once what they know of it.
+    adjusted = adjust(replace(start, rig=rig), options.adjustment)
+    return with_advice(adjusted, least).with_cameras_as(found.rig.names)
 
 
 def of_camera(found: Reconstruction, camera: str, frames: Collection[str]) -> SparseModel:

@@ -28,9 +28,9 @@ from cuspid.motion.colmap import quiet, rigid_from_colmap
 from cuspid.motion.features import FeatureOptions, Features, detect
 from cuspid.motion.guided import GuidedOptions, refine
 from cuspid.motion.pairs import MatchingOptions, match_unguided
-from cuspid.motion.patches import PatchOptions, follow_points, lengthen
+from cuspid.motion.patches import PatchOptions, follow_points, hold_together, lengthen
 from cuspid.motion.revisits import look_alike
-from cuspid.motion.tracks import first_and_last, points_across
+from cuspid.motion.tracks import first_and_last
 from cuspid.options import SEED, SHARE, Options, Range
 from cuspid.panorama import FrameUse
 from cuspid.progress import Progress, silent
@@ -530,10 +530,7 @@ def refine_on_surface(
         return normalise_contrast(sequence.image(number[name]), options)
 
     followed = follow_points(part, read, options.patches, surface=surface, progress=progress)
-    frames = len(part.frames)
-    held = np.bincount(followed.frame_index, minlength=frames)
-    together = points_across(followed.point_index, followed.frame_index, frames)
-    if min(held.min(), together.min()) < options.minimum_matches:
+    if not hold_together(followed, len(part.frames), options.minimum_matches):
         return None
     tracks = joined_tracks(_spanning(part.tracks, options.patches.reach), followed)
     return adjust_model(replace(part, tracks=tracks), options.guided.adjustment)

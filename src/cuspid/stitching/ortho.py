@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
+from cuspid.geometry import Rigid3
+from cuspid.mesh import Mesh
 from cuspid.panorama import FrameUse, Panorama, Strip
 from cuspid.progress import Progress, silent
 from cuspid.sparse_model import SparseModel
@@ -65,6 +67,12 @@ class Shown(NamedTuple):
     """The smooth surface through the points of the motion."""
     dense: HeightMap | None
     """The surface on which images agree; None where none are compared."""
+
+    def dense_in_world_of(self, located: SparseModel) -> Mesh | None:
+        """The surface on which images agree, in the world of the frames as they were located, in millimetres."""
+        if self.dense is None:
+            return None
+        return self.dense.mesh().transformed(_into_occlusal_frame(located, self.motion).inverse())
 
 
 def find_surface(
@@ -134,9 +142,14 @@ def _dense(
     if beside is None:
         compared = frames_beside(motion, options.baseline_share)
     else:
-        first = motion.frames[0]
-        compared = beside.seen_from(located.cam_from_world[first].inverse() @ motion.cam_from_world[first])
+        compared = beside.seen_from(_into_occlusal_frame(located, motion).inverse())
     return plane_sweep(motion, compared, sparse, read, options, progress=progress)
+
+
+def _into_occlusal_frame(located: SparseModel, motion: SparseModel) -> Rigid3:
+    """The motion between the worlds of a model in millimetres and of the same in the occlusal frame."""
+    first = motion.frames[0]
+    return motion.cam_from_world[first].inverse() @ located.cam_from_world[first]
 
 
 def _scale(options: OrthoOptions, working_distance_mm: float | None) -> ScaleOptions:
