@@ -8,7 +8,7 @@ views                = view_mesh(mesh, ...)                         the same vie
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -39,12 +39,21 @@ from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
 from cuspid.simulation.film import FilmOptions, film
 from cuspid.sparse_model import SparseModel
-from cuspid.stitching.compared import Compared, cameras_beside
+from cuspid.stitching.compared import cameras_beside
 from cuspid.stitching.height_map import ScaleOptions
 from cuspid.stitching.mesh_views import MeshViewOptions, MeshViews, draw_mesh
-from cuspid.stitching.ortho import OrthoOptions, Stitched, find_surface, orthophoto
+from cuspid.stitching.ortho import (
+    OrthoOptions,
+    Shown,
+    Stitched,
+    find_surface,
+    find_surface_again,
+    into_occlusal_frame,
+    orthophoto,
+)
 from cuspid.stitching.thesis_method import ThesisOptions, stitch_as_thesis
 from cuspid.tolerances import NominalOptions
+from cuspid.workers import computed_once
 
 __all__ = ["FilmOptions", "MeshViewOptions", "StitchOptions", "film", "stitch", "stitch_rig", "view_mesh"]
 
@@ -97,33 +106,22 @@ def _stitched(
 ) -> Stitched:
     """The panorama of a part of the motion, whose path is made more precise on the surface that it shows."""
     index = {name: each for each, name in enumerate(sequence.names)}
-    located, distance_mm = motion.parts[number], sequence.working_distance_mm
+    located, notes = motion.parts[number], tuple[str, ...]()
 
     def read(name: str) -> UInt8[np.ndarray, "h w 3"]:
         return sequence.image(index[name])
 
-    notes: tuple[str, ...] = ()
-    if options.motion.on_surface and options.plane_sweep.enabled:
-        refined = _on_surface(located, sequence, read, options, progress)
-        located = refined or located
-        notes = () if refined else (_NOT_ON_SURFACE,)
-    frames = with_observations(motion.frames_of(number), located)
-    made = orthophoto(located, frames, read, options, working_distance_mm=distance_mm, progress=progress)
-    return replace(made, panorama=replace(made.panorama, notes=(*notes, *made.panorama.notes)))
-
-
-def _on_surface(
-    located: SparseModel,
-    sequence: ImageSequence,
-    read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
-    options: StitchOptions,
-    progress: Progress,
-) -> SparseModel | None:
-    """A part of the motion, refined on the surface that its frames show; None where that does not hold it."""
     shown = find_surface(located, read, options, working_distance_mm=sequence.working_distance_mm, progress=progress)
-    if shown.dense is None:
-        return None
-    return refine_on_surface(shown.motion, shown.dense.mesh(), sequence, options.motion, progress=progress)
+    if options.motion.on_surface and shown.dense is not None:
+        refined = refine_on_surface(shown.motion, shown.dense.mesh(), sequence, options.motion, progress=progress)
+        if refined is None:
+            notes = (_NOT_ON_SURFACE,)
+        else:
+            shown = find_surface_again(shown, refined, read, options, progress=progress)
+    made = orthophoto(
+        shown, with_observations(motion.frames_of(number), shown.motion), read, options, progress=progress
+    )
+    return replace(made, panorama=replace(made.panorama, notes=(*notes, *made.panorama.notes)))
 
 
 def stitch_rig(capture: Capture, options: StitchOptions, *, progress: Progress = silent) -> Stitched:
@@ -139,64 +137,61 @@ def stitch_rig(capture: Capture, options: StitchOptions, *, progress: Progress =
         raise InputError("stitch: the cameras of the handpiece tell the scale; leave out --scale")
     capture = replace(capture, handpiece=NominalOptions().of(capture.handpiece).fill(capture.handpiece))
     scene = _RigScene(capture, locate_rig_film(capture, options.rig, options.motion, progress=progress), options)
-    notes: tuple[str, ...] = ()
-    if options.motion.on_surface and options.plane_sweep.enabled:
-        refined = scene.on_surface(progress)
-        scene, notes = (scene, (_NOT_ON_SURFACE,)) if refined is None else (scene.located_as(refined), ())
-    made = scene.orthophoto(progress)
+    shown, notes = scene.surface(progress), tuple[str, ...]()
+    if options.motion.on_surface and shown.dense is not None:
+        refined = scene.on_surface(shown, progress)
+        if refined is None:
+            notes = (_NOT_ON_SURFACE,)
+        else:
+            scene = replace(scene, found=refined)
+            shown = scene.surface(progress, before=shown)
+    uses = _uses(capture, scene.found, scene.camera)
+    made = orthophoto(shown, uses, scene.read, options, progress=progress)
     noted = (*_scale_notes(scene.found, scene.camera), *scene.found.notes, *notes)
     return replace(made, panorama=replace(made.panorama, notes=noted))
 
 
 @dataclass(frozen=True, eq=False)
 class _RigScene:
-    """What the frames of a handpiece show, located."""
+    """The frames of a handpiece, located."""
 
     capture: Capture
     found: Reconstruction
     options: StitchOptions
 
-    def located_as(self, found: Reconstruction) -> _RigScene:
-        """The same with other poses."""
-        return replace(self, found=found)
-
-    @property
+    @computed_once
     def camera(self) -> str:
         """That whose picture it is."""
         return _facing_down(self.found)
 
-    @property
-    def shown(self) -> SparseModel:
+    @computed_once
+    def path(self) -> SparseModel:
         """The trajectory of that camera."""
         has = {frame.name for frame in self.capture.frames if self.camera in frame.cameras}
         return of_camera(self.found, self.camera, has)
-
-    def beside(self) -> Compared:
-        """The images of cameras of one instant."""
-        handpiece = self.capture.handpiece
-        pairs = stereo_pairs(self.found.rig, handpiece.working_distance_mm, self.options.rig.pairing)
-        return cameras_beside(self.found, self.capture.frames, pairs, handpiece)
 
     def read(self, name: str) -> UInt8[np.ndarray, "h w 3"]:
         """The image ``camera/frame``, or that of a frame and the camera whose picture it is."""
         one, _, frame = name.rpartition("/")
         return self.capture.source.read(frame, one or self.camera)
 
-    def on_surface(self, progress: Progress) -> Reconstruction | None:
+    def surface(self, progress: Progress, before: Shown | None = None) -> Shown:
+        """What cameras of one instant agree on; near what they showed ``before``."""
+        handpiece = self.capture.handpiece
+        pairs = stereo_pairs(self.found.rig, handpiece.working_distance_mm, self.options.rig.pairing)
+        beside = cameras_beside(self.found, self.capture.frames, pairs, handpiece)
+        if before is None:
+            return find_surface(self.path, self.read, self.options, beside=beside, progress=progress)
+        return find_surface_again(before, self.path, self.read, self.options, beside=beside, progress=progress)
+
+    def on_surface(self, shown: Shown, progress: Progress) -> Reconstruction | None:
         """The poses, refined on the surface that the frames show; None where that does not hold them."""
-        shown, options = self.shown, self.options
-        seen = find_surface(shown, self.read, options, beside=self.beside(), progress=progress)
-        surface = seen.dense_in_world_of(shown)
-        if surface is None:
-            return None
+        assert shown.dense is not None
+        surface = shown.dense.mesh().transformed(into_occlusal_frame(self.path, shown.motion).inverse())
+        options = self.options
         return refine_rig_on_surface(
             *(self.found, surface, self.capture, options.rig, options.motion, options.rig_patches), progress=progress
         )
-
-    def orthophoto(self, progress: Progress) -> Stitched:
-        """The panorama."""
-        uses = _uses(self.capture, self.found, self.camera)
-        return orthophoto(self.shown, uses, self.read, self.options, beside=self.beside(), progress=progress)
 
 
 def _facing_down(found: Reconstruction) -> str:

@@ -7,10 +7,9 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
-from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
+from cuspid.geometry import Rigid3, best_similarity
 from cuspid.panorama import FrameUse, Panorama, Strip
 from cuspid.progress import Progress, silent
 from cuspid.sparse_model import SparseModel
@@ -67,12 +66,8 @@ class Shown(NamedTuple):
     """The smooth surface through the points of the motion."""
     dense: HeightMap | None
     """The surface on which images agree; None where none are compared."""
-
-    def dense_in_world_of(self, located: SparseModel) -> Mesh | None:
-        """The surface on which images agree, in the world of the frames as they were located, in millimetres."""
-        if self.dense is None:
-            return None
-        return self.dense.mesh().transformed(_into_occlusal_frame(located, self.motion).inverse())
+    scale: ScaleOptions | None
+    """What sets the scale; None where the cameras know it."""
 
 
 def find_surface(
@@ -84,43 +79,56 @@ def find_surface(
     beside: Compared | None = None,
     progress: Progress = silent,
 ) -> Shown:
-    """What the frames of one model of the motion show; arguments as for :func:`orthophoto`.
-
-    Raises ReconstructionError where there are no points.
-    """
-    motion = in_occlusal_frame(located, _scale(options, working_distance_mm) if beside is None else None)
-    sparse = height_map(motion, options.height_map)
-    return Shown(motion, sparse, _dense(located, motion, sparse, read, beside, options.plane_sweep, progress))
-
-
-def orthophoto(
-    located: SparseModel,
-    frames: Sequence[FrameUse],
-    read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
-    options: OrthoOptions,
-    *,
-    working_distance_mm: float | None = None,
-    beside: Compared | None = None,
-    progress: Progress = silent,
-) -> Stitched:
-    """The panorama of one model of the motion; ``read`` gives an image by its name.
+    """What the frames of one model of the motion show; ``read`` gives an image by its name.
 
     ``working_distance_mm``: nominal, from the calibration. ``beside``: images of the cameras of one instant, in the
     world of the model, from which the surface is found; the model then is in millimetres and keeps its scale. Raises
     ReconstructionError where there are no points.
     """
-    scale = _scale(options, working_distance_mm)
-    motion, surface, dense = find_surface(
-        located, read, options, working_distance_mm=working_distance_mm, beside=beside, progress=progress
-    )
+    scale = None
+    if beside is None:
+        given = options.scale.working_distance_mm
+        scale = replace(options.scale, working_distance_mm=working_distance_mm if given is None else given)
+    motion = in_occlusal_frame(located, scale)
+    sparse = height_map(motion, options.height_map)
+    return Shown(motion, sparse, _dense(located, motion, sparse, read, beside, options, progress), scale)
+
+
+def find_surface_again(
+    shown: Shown,
+    located: SparseModel,
+    read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
+    options: OrthoOptions,
+    *,
+    beside: Compared | None = None,
+    progress: Progress = silent,
+) -> Shown:
+    """What the same frames show whose poses are known better, with the surface near the one that they showed before;
+    arguments as for :func:`find_surface`."""
+    motion = _laid_onto(located, shown.motion, keeps_scale=beside is not None)
+    sparse = height_map(motion, options.height_map)
+    dense = _dense(located, motion, sparse, read, beside, options, progress, shown.dense)
+    return shown._replace(motion=motion, sparse=sparse, dense=dense)
+
+
+def orthophoto(
+    shown: Shown,
+    frames: Sequence[FrameUse],
+    read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
+    options: OrthoOptions,
+    *,
+    progress: Progress = silent,
+) -> Stitched:
+    """The panorama of what located frames show; ``read`` gives an image by its name."""
+    motion, surface, dense, scale = shown
     if dense is not None:
         level = level_by_crowns(dense)
         motion = transformed(motion, level)
         surface = uncovered(turned(dense, level), height_map(motion, options.height_map), motion)
     mosaic = compose(motion, surface, read, options.mosaic, progress=progress)
-    metric = beside is not None or scale.working_distance_mm is not None or scale.width_mm is not None
+    metric = scale is None or scale.working_distance_mm is not None or scale.width_mm is not None
     panorama = _panorama(mosaic, motion, frames, metric)
-    if beside is None:
+    if scale is not None:
         panorama = replace(panorama, notes=(_scale_note(scale, given=scale == options.scale),))
     strip = unroll(panorama, motion, surface, mosaic.canvas.mm_per_px, options.strip)
     in_its_units = motion if metric else motion.scaled(1 / mosaic.canvas.mm_per_px)
@@ -133,30 +141,40 @@ def _dense(
     sparse: HeightMap,
     read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
     beside: Compared | None,
-    options: PlaneSweepOptions,
+    options: OrthoOptions,
     progress: Progress,
+    start: HeightMap | None = None,
 ) -> HeightMap | None:
     """The surface on which cameras of one instant agree; without such, frames of one camera."""
-    if not options.enabled:
+    if not options.plane_sweep.enabled:
         return None
     if beside is None:
-        compared = frames_beside(motion, options.baseline_share)
+        compared = frames_beside(motion, options.plane_sweep.baseline_share)
     else:
-        compared = beside.seen_from(_into_occlusal_frame(located, motion).inverse())
-    return plane_sweep(motion, compared, sparse, read, options, progress=progress)
+        compared = beside.seen_from(into_occlusal_frame(located, motion).inverse())
+    return plane_sweep(motion, compared, sparse, read, options.plane_sweep, start=start, progress=progress)
 
 
-def _into_occlusal_frame(located: SparseModel, motion: SparseModel) -> Rigid3:
-    """The motion between the worlds of a model in millimetres and of the same in the occlusal frame."""
+def into_occlusal_frame(located: SparseModel, motion: SparseModel) -> Rigid3:
+    """The motion from the world of a model in millimetres to that of the same in the occlusal frame."""
     first = motion.frames[0]
     return motion.cam_from_world[first].inverse() @ located.cam_from_world[first]
 
 
-def _scale(options: OrthoOptions, working_distance_mm: float | None) -> ScaleOptions:
-    """What sets the scale: the nominal working distance, unless another is given."""
-    if options.scale.working_distance_mm is not None:
-        return options.scale
-    return replace(options.scale, working_distance_mm=working_distance_mm)
+def _laid_onto(model: SparseModel, other: SparseModel, *, keeps_scale: bool) -> SparseModel:
+    """A model in the world of another one of the same frames, to which its cameras lie nearest."""
+    depth = float(np.median(other.depths))
+    seen, there = _tripods(model, float(np.median(model.depths))), _tripods(other, depth)
+    scale, rotation, _ = best_similarity(seen, there)
+    scale = 1.0 if keeps_scale else scale
+    onto = Rigid3(rotation, there.mean(axis=0) - scale * rotation @ seen.mean(axis=0))
+    return transformed(model.scaled(scale), onto)
+
+
+def _tripods(model: SparseModel, length: float) -> Float[np.ndarray, "k 3"]:
+    """The centre of each camera, and points on its axes."""
+    legs = length * np.vstack([np.zeros(3), np.eye(3)])
+    return np.concatenate([pose.inverse().apply(legs) for pose in model.cam_from_world.values()])
 
 
 def _scale_note(scale: ScaleOptions, *, given: bool) -> str:

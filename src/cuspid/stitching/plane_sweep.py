@@ -137,6 +137,13 @@ class Grid(NamedTuple):
         columns, rows = (_POOL * np.ceil((high - low) / cell_mm / _POOL)).astype(int).tolist()
         return Grid(low, cell_mm, columns, rows)
 
+    @staticmethod
+    def of(surface: HeightMap) -> Grid:
+        """That of which a height map was pooled."""
+        rows, columns = surface.heights.shape
+        cell_mm = surface.cell_mm / _POOL
+        return Grid(surface.corner - surface.cell_mm / 2, cell_mm, _POOL * columns, _POOL * rows)
+
     @property
     def pooled(self) -> Grid:
         """The cells of the height map."""
@@ -375,29 +382,34 @@ def plane_sweep(
     read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
     options: PlaneSweepOptions,
     *,
+    start: HeightMap | None = None,
     progress: Progress = silent,
 ) -> HeightMap | None:
     """The surface on which images agree, in the occlusal frame; None where no two of them are compared.
 
     ``motion`` tells where the teeth are; ``sparse`` is the smooth surface through its points, which tells how high they
-    reach; ``read`` gives an image by its name.
+    reach; ``read`` gives an image by its name. ``start``: what was found with poses that were a little different; the
+    surface is looked for near it, and taken as known where that was.
     """
     if not compared.pairs:
         return None
     camera = motion.camera
     pixel_mm = float(np.median(motion.depths) / np.mean(camera.focal_px))
     finest_mm = 0.5 * pixel_mm / compared.baseline_share
-    grid = Grid.over(motion, max(options.cell_mm, pixel_mm))
+    grid = Grid.over(motion, max(options.cell_mm, pixel_mm)) if start is None else Grid.of(start)
     ceiling = sparse.at(grid.pooled.centres) + _ABOVE_MM
     step_mm = max(options.step_mm, finest_mm)
-    levels = np.arange(-options.depth_mm, float(sparse.heights.max()) + _ABOVE_MM + step_mm, step_mm)
-    pictures = _Pictures(compared, read, options.detail_px)
-    sweep = partial(_swept, compared, pictures, ceiling, options)
-    middle, rounds = float(levels.mean()), 1 + len(_FINER)
-    plane = _Ground.level(grid, middle)
-    surface, sure = sweep(plane, levels - middle, np.ones(ceiling.shape, bool), _part(progress, 0, rounds))
+    sweep = partial(_swept, compared, _Pictures(compared, read, options.detail_px), ceiling, options)
+    rounds = len(_FINER) + (start is None)
+    if start is None:
+        levels = np.arange(-options.depth_mm, float(sparse.heights.max()) + _ABOVE_MM + step_mm, step_mm)
+        middle, everywhere = float(levels.mean()), np.ones(ceiling.shape, bool)
+        plane = _Ground.level(grid, middle)
+        surface, sure = sweep(plane, levels - middle, everywhere, _part(progress, 0, rounds))
+    else:
+        surface, sure = start, start.known
     known = surface.known
-    for number, (finer, copies) in enumerate(_FINER, start=1):
+    for number, (finer, copies) in enumerate(_FINER, start=rounds - len(_FINER)):
         higher = max(step_mm / finer, finest_mm) * np.arange(-copies, copies + 1)
         surface, sure = sweep(_Ground.of(surface, grid), higher, sure, _part(progress, number, rounds))
     return replace(surface, known=known)
