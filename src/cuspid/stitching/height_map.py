@@ -52,8 +52,8 @@ _RIM_MM, _OVER_MM = 0.4, 0.2
 """The surface occludes what it stands over by more than the second, farther away than the first."""
 HOLE_MM2 = 20.0
 """Holes up to this size in what is known or seen of the teeth are none."""
-_CROWN_MM = 1.5
-"""Crowns lie no deeper below the smooth surface."""
+_CROWN_MM, _HOLLOW_MM = 1.5, 3.0
+"""Crowns lie no deeper below the smooth surface, and their hollows no deeper below the tips of the cusps."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -313,7 +313,7 @@ def uncovered(dense: HeightMap, sparse: HeightMap, motion: SparseModel) -> Heigh
     """A dense surface whose false rises do not occlude what the camera went over.
 
     Where seen surface lies all around a place of a crown that is occluded in every frame, something rises beside it
-    that cannot be: a highlight in a hollow. Gum far below the smooth surface may well be occluded by a crown.
+    that cannot be: a highlight in a hollow. Gum far below the cusps may well be occluded by a crown.
     """
     camera, cells, places = motion.camera, dense.known.shape, dense.places
     seen = np.zeros(cells, bool)
@@ -323,7 +323,7 @@ def uncovered(dense: HeightMap, sparse: HeightMap, motion: SparseModel) -> Heigh
         part = tuple(slice(at.min(initial=max(cells)), at.max(initial=-1) + 1) for at in np.nonzero(inside & ~seen))
         seen[part] |= inside[part] & ~dense.occludes(places[part], pose.inverse().translation)
     holes = remove_small_holes(seen, max_size=round(HOLE_MM2 / dense.cell_mm**2)) & ~seen
-    crown = dense.heights > sparse.at(places[..., :2]) - _CROWN_MM
+    crown = dense.heights > np.maximum(sparse.at(places[..., :2]) - _CROWN_MM, -_HOLLOW_MM)
     wide = cv2.dilate(holes.astype(np.uint8), _disc(_RIM_MM, dense.cell_mm)) > 0
     return replace(dense, visible=wide & crown)
 
