@@ -1,5 +1,6 @@
 """Laws of the patches: what was truly moved is found where it went, and a lost patch says so."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -15,9 +16,18 @@ from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.motion.guided import GuidedOptions
-from cuspid.motion.patches import PatchOptions, align_patches, cut_patches, follow_points, lengthen
+from cuspid.motion.patches import (
+    PatchOptions,
+    align_patches,
+    cut_patches,
+    follow_points,
+    follow_rig_points,
+    hold_together,
+    lengthen,
+)
 from cuspid.motion.tracks import points_across
-from cuspid.reconstruction import Tracks, chosen_tracks, joined_tracks
+from cuspid.reconstruction import Reconstruction, Tracks, chosen_tracks, joined_tracks
+from cuspid.rig import MountedCamera, Rig
 from cuspid.sparse_model import SparseModel
 
 
@@ -77,21 +87,27 @@ def test_what_is_not_there_is_not_found() -> None:
     assert np.isnan(laid(here, here, border, border, warps)[1]).all()
 
 
+def wall_pictures(poses: Mapping[str, Rigid3], camera: Camera) -> dict[str, np.ndarray]:
+    """What a camera sees of a textured wall from each pose."""
+    texture, px_per_mm = wall(3, 800), 20.0
+    calibration = np.array([[camera.focal_px[0], 0, 159.5], [0, camera.focal_px[1], 119.5], [0, 0, 1]])
+    onto_wall = np.array([[px_per_mm, 0, 399.5], [0, px_per_mm, 399.5], [0, 0, 1]])
+    planes = {name: np.column_stack([pose.rotation[:, :2], pose.translation]) for name, pose in poses.items()}
+    homographies = {name: calibration @ plane @ np.linalg.inv(onto_wall) for name, plane in planes.items()}
+    return {
+        name: cv2.warpPerspective(texture, homography, (320, 240)).astype(np.uint8)
+        for name, homography in homographies.items()
+    }
+
+
 def over_a_wall(frames: int = 8, tilt_deg: float = 0) -> tuple[SparseModel, dict[str, np.ndarray]]:
     """A camera that moves over a textured wall; every point is known from two frames alone."""
     tilt = Rigid3.from_rotation_vector(np.deg2rad([0, tilt_deg, 0]), np.zeros(3))
-    texture, camera = wall(3, 800), Camera.from_field_of_view(320, 240, 60.0)
-    rng, px_per_mm = np.random.default_rng(1), 20.0
-    poses, pictures = {}, {}
+    camera, rng, poses = Camera.from_field_of_view(320, 240, 60.0), np.random.default_rng(1), dict[str, Rigid3]()
     for k in range(frames):
         rotation = Rotation.from_rotvec(np.deg2rad([2 * np.sin(k), 1.5 * np.cos(k), 3 * np.sin(2 * k)])).as_matrix()
         turned = rotation @ np.diag([1.0, -1.0, -1.0])
         poses[f"{k}"] = Rigid3(turned, -turned @ [0.6 * k - 2.0, 0.1 * k, 14.0]) @ tilt
-        plane = np.column_stack([poses[f"{k}"].rotation[:, :2], poses[f"{k}"].translation])
-        calibration = np.array([[camera.focal_px[0], 0, 159.5], [0, camera.focal_px[1], 119.5], [0, 0, 1]])
-        onto_wall = np.array([[px_per_mm, 0, 399.5], [0, px_per_mm, 399.5], [0, 0, 1]])
-        homography = calibration @ plane @ np.linalg.inv(onto_wall)
-        pictures[f"{k}"] = cv2.warpPerspective(texture, homography, (320, 240)).astype(np.uint8)
     points = np.column_stack([rng.uniform(-3, 3, (60, 2)), np.zeros(60)])
     pairs = [(p, f) for p in range(60) for f in (3, 4)]
     pixels = np.array([camera.project(poses[f"{f}"].apply(points[p : p + 1]))[0] for p, f in pairs])
@@ -103,7 +119,8 @@ def over_a_wall(frames: int = 8, tilt_deg: float = 0) -> tuple[SparseModel, dict
         camera_index=np.zeros(len(pairs), np.int64),
         pixels=pixels,
     )
-    return SparseModel(camera=camera, cam_from_world=poses, tracks=tracks), pictures
+    model = SparseModel(camera=camera, cam_from_world=poses, tracks=tracks)
+    return model, wall_pictures(poses, camera)
 
 
 def errors_px(model: SparseModel, tracks: Tracks) -> np.ndarray:
@@ -171,6 +188,91 @@ def test_what_the_surface_does_not_show_is_not_followed() -> None:
     small = Mesh(np.array([[9.0, 9, 0], [9.1, 9, 0], [9, 9.1, 0]]), np.array([[0, 1, 2]]))
     nothing = small.submesh(np.array([False]))
     assert len(follow(surface=small).points) == len(follow(surface=nothing).points) == 0
+
+
+def pair_over_a_wall() -> tuple[Reconstruction, dict[str, dict[str, np.ndarray]]]:
+    """The same camera with another beside it, 1.5 mm away and turned by 6 degrees; one point is seen by both in every
+    frame."""
+    model, pictures = over_a_wall()
+    other = Rigid3.from_rotation_vector(np.deg2rad([0, 6.0, 0]), np.array([-1.5, 0, 0]))
+    beside = {name: other @ pose for name, pose in model.cam_from_world.items()}
+    camera, given = model.camera, model.tracks
+    middle = int(np.argmin(np.linalg.norm(given.points[:, :2], axis=1)))
+    both = [
+        (f, c, camera.project(pose.apply(given.points[middle, None]))[0])
+        for c, poses in enumerate((model.cam_from_world, beside))
+        for f, pose in enumerate(poses.values())
+    ]
+    others = given.point_index != middle
+    tracks = replace(
+        given,
+        point_index=np.concatenate([given.point_index[others], np.full(len(both), middle)]),
+        frame_index=np.concatenate([given.frame_index[others], [f for f, _, _ in both]]),
+        camera_index=np.concatenate([given.camera_index[others], [c for _, c, _ in both]]),
+        pixels=np.concatenate([given.pixels[others], [pixel for _, _, pixel in both]]),
+    )
+    rig = Rig({"a": MountedCamera(camera, Rigid3.identity()), "b": MountedCamera(camera, other)})
+    found = Reconstruction(rig=rig, rig_from_world=model.cam_from_world, tracks=tracks)
+    return found, {"a": pictures, "b": wall_pictures(beside, camera)}
+
+
+def test_points_are_followed_into_all_cameras_of_a_handpiece_in_whatever_order() -> None:
+    found, pictures = pair_over_a_wall()
+
+    def follow(found: Reconstruction) -> Tracks:
+        read = lambda frame, camera: pictures[camera][frame]  # noqa: E731
+        return follow_rig_points(found, read, PatchOptions(), surface=the_wall())
+
+    tracks = follow(found)
+    assert len(tracks.points) >= 50
+    for number, mounted in enumerate(found.rig.cameras.values()):
+        poses = [mounted.cam_from_rig @ pose for pose in found.rig_from_world.values()]
+        mine = np.flatnonzero(tracks.camera_index == number)
+        assert len(mine) > 150
+        points, frames = tracks.points[tracks.point_index[mine]], tracks.frame_index[mine]
+        true = [mounted.camera.project(poses[f].apply(point)) for f, point in zip(frames, points, strict=True)]
+        errors = np.linalg.norm(tracks.pixels[mine] - true, axis=1)
+        assert 0 < np.median(errors) < 0.05
+        assert np.quantile(errors, 0.95) < 0.2
+
+    def sightings(tracks: Tracks, names: Sequence[str]) -> set[tuple[object, ...]]:
+        seen = zip(tracks.frame_index, tracks.camera_index, tracks.pixels.round(6).tolist(), strict=True)
+        return {(int(frame), names[camera], *pixel) for frame, camera, pixel in seen}
+
+    other_way = follow(found.with_cameras_as(["b", "a"]))
+    assert sightings(other_way, ["b", "a"]) == sightings(tracks, ["a", "b"])
+
+
+def test_a_handpiece_of_one_camera_is_that_camera() -> None:
+    model, pictures = over_a_wall()
+    every = chosen_tracks(
+        joined_tracks(model.tracks, replace(model.tracks, frame_index=np.tile(np.arange(8), 15))), np.ones(240, bool)
+    )
+    model = replace(model, tracks=every)
+    rig = Rig({"camera": MountedCamera(model.camera, Rigid3.identity())})
+    found = Reconstruction(rig=rig, rig_from_world=model.cam_from_world, tracks=every)
+    options = PatchOptions()
+    alone = follow_points(model, lambda name: pictures[name], options, surface=the_wall())
+    mounted = follow_rig_points(found, lambda frame, _: pictures[frame], options, surface=the_wall())
+    for name in ("points", "point_index", "frame_index", "camera_index", "pixels"):
+        np.testing.assert_array_equal(getattr(mounted, name), getattr(alone, name))
+
+
+@pytest.mark.parametrize(("lost", "held"), [((), True), ((5,), False), ((2, 3), False)])
+def test_frames_hold_together_where_enough_points_are_seen_on_both_sides(lost: tuple[int, ...], held: bool) -> None:
+    """Twelve points in each two frames that follow each other."""
+    seen = [(12 * first + n, frame) for first in range(7) for n in range(12) for frame in (first, first + 1)]
+    point, frame = np.array([each for each in seen if each[1] not in lost]).T
+    tracks = Tracks(
+        points=np.zeros((84, 3)),
+        colors=np.zeros((84, 3), np.uint8),
+        point_index=point,
+        frame_index=frame,
+        camera_index=np.zeros(len(point), np.int64),
+        pixels=np.zeros((len(point), 2)),
+    )
+    assert hold_together(tracks, 8, 12) is held
+    assert not hold_together(tracks, 8, 13)
 
 
 def test_points_seen_in_too_few_frames_stay_as_they_were() -> None:
