@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from typing import Annotated, NamedTuple, no_type_check
 
 import cv2
@@ -38,6 +39,8 @@ _STILL_PX = 0.003
 """The alignment ends when a step is shorter than this."""
 _FLAT = np.zeros((0, 0, 2))
 """No bends."""
+_BLOCK = 8
+"""Images whose points are followed at a time."""
 _HIDDEN = 0.01
 """A place is occluded where something stands before it by more than this share of its distance."""
 
@@ -257,9 +260,9 @@ class _Views(NamedTuple):
         """Unit vectors from points to the camera."""
         return unit(self.centre(image) - points)
 
-    def near(self, frame: int, reach: int) -> Int[np.ndarray, "n"]:
-        """The images of frames that are at most so many before or after one."""
-        return np.flatnonzero(np.abs(self.frames - frame) <= reach)
+    def near(self, first: int, last: int, reach: int) -> Int[np.ndarray, "n"]:
+        """The images of frames from one to another, and of so many before and after them."""
+        return np.flatnonzero((self.frames >= first - reach) & (self.frames <= last + reach))
 
 
 class _Facets(NamedTuple):
@@ -340,6 +343,18 @@ class _Scene(NamedTuple):
         good = correlation > options.correlation
         return facets.points[good], np.full(int(good.sum()), there), pixels[good]
 
+    def followed_from(
+        self, pictures: Mapping[int, Float32[np.ndarray, "h w"]], start: tuple[int, Int[np.ndarray, "k"]]
+    ) -> list[tuple[Int[np.ndarray, "_"], Int[np.ndarray, "_"], Float[np.ndarray, "_ 2"]]]:
+        """Of an image some observations, and where their points are found in those near it: points, images, pixels."""
+        image, own = start
+        facets = self.facets(image, own, pictures[image])
+        near = self.views.near(self.views.frames[image], self.views.frames[image], self.options.reach)
+        return [
+            (self.tracks.point_index[own], np.full(len(own), image), self.tracks.pixels[own]),
+            *(self.follow(facets, pictures, other) for other in near.tolist() if other != image),
+        ]
+
     def followed(
         self, read: Callable[[str], UInt8[np.ndarray, "h w"]], progress: Progress
     ) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"], Float[np.ndarray, "m 2"]]:
@@ -347,17 +362,18 @@ class _Scene(NamedTuple):
         are in memory at a time."""
         own, views, pictures = self.own_observations(), self.views, dict[int, np.ndarray]()
         found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-        for image, frame in enumerate(views.frames.tolist()):
-            near = views.near(frame, self.options.reach).tolist()
-            kept = {other: pictures[other] for other in near if other in pictures}
-            pictures = kept | {n: smooth(read(views.names[n]), self.options.blur_px) for n in near if n not in kept}
-            mine = own[self.image_index[own] == image]
-            follow = partial(self.follow, self.facets(image, mine, pictures[image]), pictures)
-            found += [
-                (self.tracks.point_index[mine], np.full(len(mine), image), self.tracks.pixels[mine]),
-                *map_in_threads(follow, [other for other in near if other != image]),
-            ]
-            progress("patches", image + 1, len(views.names))
+        count = len(views.names)
+        for start in range(0, count, _BLOCK):
+            block = range(start, min(start + _BLOCK, count))
+            near = views.near(views.frames[block[0]], views.frames[block[-1]], self.options.reach).tolist()
+            new = [image for image in near if image not in pictures]
+            read_now = map_in_threads(lambda image: smooth(read(views.names[image]), self.options.blur_px), new)
+            pictures |= dict(zip(new, read_now, strict=True))
+            pictures = {image: pictures[image] for image in near}
+            mine = [own[self.image_index[own] == image] for image in block]
+            follow = partial(self.followed_from, pictures)
+            found += chain.from_iterable(map_in_threads(follow, zip(block, mine, strict=True)))
+            progress("patches", block[-1] + 1, count)
         point, image_index, pixels = (np.concatenate(each) for each in zip(*found, strict=True))
         often = np.bincount(point, minlength=len(self.tracks.points))[point] >= self.options.minimum_views
         return point[often], image_index[often], pixels[often]
