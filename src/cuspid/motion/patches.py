@@ -261,8 +261,8 @@ class _Views(NamedTuple):
         return unit(self.centre(image) - points)
 
     def near(self, first: int, last: int, reach: int) -> Int[np.ndarray, "n"]:
-        """The images of frames from one to another, and of so many before and after them."""
-        return np.flatnonzero((self.frames >= first - reach) & (self.frames <= last + reach))
+        """The images from the frame of one to that of another, and of so many frames before and after them."""
+        return np.flatnonzero((self.frames >= self.frames[first] - reach) & (self.frames <= self.frames[last] + reach))
 
 
 class _Facets(NamedTuple):
@@ -349,7 +349,7 @@ class _Scene(NamedTuple):
         """Of an image some observations, and where their points are found in those near it: points, images, pixels."""
         image, own = start
         facets = self.facets(image, own, pictures[image])
-        near = self.views.near(self.views.frames[image], self.views.frames[image], self.options.reach)
+        near = self.views.near(image, image, self.options.reach)
         return [
             (self.tracks.point_index[own], np.full(len(own), image), self.tracks.pixels[own]),
             *(self.follow(facets, pictures, other) for other in near.tolist() if other != image),
@@ -365,7 +365,7 @@ class _Scene(NamedTuple):
         count = len(views.names)
         for start in range(0, count, _BLOCK):
             block = range(start, min(start + _BLOCK, count))
-            near = views.near(views.frames[block[0]], views.frames[block[-1]], self.options.reach).tolist()
+            near = views.near(block[0], block[-1], self.options.reach).tolist()
             new = [image for image in near if image not in pictures]
             read_now = map_in_threads(lambda image: smooth(read(views.names[image]), self.options.blur_px), new)
             pictures |= dict(zip(new, read_now, strict=True))
