@@ -28,6 +28,9 @@ from cuspid.stitching.mosaic import Mosaic, MosaicOptions, compose
 from cuspid.stitching.plane_sweep import PlaneSweepOptions, plane_sweep
 from cuspid.stitching.strip import StripOptions, unroll
 
+_SLACK = 2.0
+"""The surface may lie so many times as far from the one before as the camera moved what it looks at."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class OrthoOptions:
@@ -107,7 +110,8 @@ def find_surface_again(
     arguments as for :func:`find_surface`."""
     motion = _laid_onto(located, shown.motion, keeps_scale=beside is not None)
     sparse = height_map(motion, options.height_map)
-    dense = _dense(located, motion, sparse, read, beside, options, progress, shown.dense)
+    start = None if shown.dense is None else (shown.dense, _SLACK * _moved(motion, shown.motion))
+    dense = _dense(located, motion, sparse, read, beside, options, progress, start)
     return shown._replace(motion=motion, sparse=sparse, dense=dense)
 
 
@@ -143,7 +147,7 @@ def _dense(
     beside: Compared | None,
     options: OrthoOptions,
     progress: Progress,
-    start: HeightMap | None = None,
+    start: tuple[HeightMap, float] | None = None,
 ) -> HeightMap | None:
     """The surface on which cameras of one instant agree; without such, frames of one camera."""
     if not options.plane_sweep.enabled:
@@ -163,16 +167,22 @@ def into_occlusal_frame(located: SparseModel, motion: SparseModel) -> Rigid3:
 
 def _laid_onto(model: SparseModel, other: SparseModel, *, keeps_scale: bool) -> SparseModel:
     """A model in the world of another one of the same frames, to which its cameras lie nearest."""
-    depth = float(np.median(other.depths))
-    seen, there = _tripods(model, float(np.median(model.depths))), _tripods(other, depth)
+    seen, there = _tripods(model, float(np.median(model.depths))), _tripods(other, float(np.median(other.depths)))
     scale, rotation, _ = best_similarity(seen, there)
     scale = 1.0 if keeps_scale else scale
     onto = Rigid3(rotation, there.mean(axis=0) - scale * rotation @ seen.mean(axis=0))
     return transformed(model.scaled(scale), onto)
 
 
+def _moved(model: SparseModel, other: SparseModel) -> float:
+    """The farthest way between what one and what the other has in the middle of the same frame."""
+    depth = float(np.median(other.depths))
+    ways = _tripods(model, depth)[3::4] - _tripods(other, depth)[3::4]
+    return float(np.linalg.norm(ways, axis=1).max())
+
+
 def _tripods(model: SparseModel, length: float) -> Float[np.ndarray, "k 3"]:
-    """The centre of each camera, and points on its axes."""
+    """The centre of each camera, and a point on each of its axes."""
     legs = length * np.vstack([np.zeros(3), np.eye(3)])
     return np.concatenate([pose.inverse().apply(legs) for pose in model.cam_from_world.values()])
 

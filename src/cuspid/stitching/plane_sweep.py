@@ -382,36 +382,37 @@ def plane_sweep(
     read: Callable[[str], UInt8[np.ndarray, "h w 3"]],
     options: PlaneSweepOptions,
     *,
-    start: HeightMap | None = None,
+    start: tuple[HeightMap, float] | None = None,
     progress: Progress = silent,
 ) -> HeightMap | None:
     """The surface on which images agree, in the occlusal frame; None where no two of them are compared.
 
     ``motion`` tells where the teeth are; ``sparse`` is the smooth surface through its points, which tells how high they
-    reach; ``read`` gives an image by its name. ``start``: what was found with poses that were a little different; the
-    surface is looked for near it, and taken as known where that was.
+    reach; ``read`` gives an image by its name. ``start``: what was found with poses that were a little different, and
+    how far from it the surface may lie, mm; it is looked for there alone, and taken as known where it was.
     """
     if not compared.pairs:
         return None
     camera = motion.camera
     pixel_mm = float(np.median(motion.depths) / np.mean(camera.focal_px))
     finest_mm = 0.5 * pixel_mm / compared.baseline_share
-    grid = Grid.over(motion, max(options.cell_mm, pixel_mm)) if start is None else Grid.of(start)
+    grid = Grid.over(motion, max(options.cell_mm, pixel_mm)) if start is None else Grid.of(start[0])
     ceiling = sparse.at(grid.pooled.centres) + _ABOVE_MM
     step_mm = max(options.step_mm, finest_mm)
     sweep = partial(_swept, compared, _Pictures(compared, read, options.detail_px), ceiling, options)
-    rounds = len(_FINER) + (start is None)
+    finer = [max(step_mm / parts, finest_mm) * np.arange(-copies, copies + 1) for parts, copies in _FINER]
     if start is None:
         levels = np.arange(-options.depth_mm, float(sparse.heights.max()) + _ABOVE_MM + step_mm, step_mm)
         middle, everywhere = float(levels.mean()), np.ones(ceiling.shape, bool)
-        plane = _Ground.level(grid, middle)
-        surface, sure = sweep(plane, levels - middle, everywhere, _part(progress, 0, rounds))
+        plane, part = _Ground.level(grid, middle), _part(progress, 0, 1 + len(finer))
+        surface, sure = sweep(plane, levels - middle, everywhere, part)
     else:
-        surface, sure = start, start.known
-    known = surface.known
-    for number, (finer, copies) in enumerate(_FINER, start=rounds - len(_FINER)):
-        higher = max(step_mm / finer, finest_mm) * np.arange(-copies, copies + 1)
-        surface, sure = sweep(_Ground.of(surface, grid), higher, sure, _part(progress, number, rounds))
+        (surface, off_mm), sure = start, start[0].known
+        finer = finer[max([n for n, higher in enumerate(finer) if higher[-1] >= off_mm], default=0) :]
+    known, before = surface.known, int(start is None)
+    for number, higher in enumerate(finer, start=before):
+        part = _part(progress, number, before + len(finer))
+        surface, sure = sweep(_Ground.of(surface, grid), higher, sure, part)
     return replace(surface, known=known)
 
 
