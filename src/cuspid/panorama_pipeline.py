@@ -60,6 +60,10 @@ __all__ = ["FilmOptions", "MeshViewOptions", "StitchOptions", "film", "stitch", 
 
 _NOT_ON_SURFACE = "motion: the path is less accurate, for too few points are found again on the surface"
 
+_SLIDING_PCT = 0.06
+"""What the scale of a film of bare teeth is off by beside what its points tell, because light that goes along with the
+camera makes them slide (root mean square of nine simulated films, docs/panorama-evaluation.md)."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class StitchOptions(OrthoOptions):
@@ -218,7 +222,8 @@ def _uses(capture: Capture, found: Reconstruction, camera: str) -> tuple[FrameUs
 def _scale_notes(found: Reconstruction, camera: str) -> Iterator[str]:
     """Where the scale and the picture are from."""
     expected = found.expectation
-    known = "" if expected is None else f", known to within {expected.scale_sigma_ppm / 1e4:.2g} % (one sigma)"
+    sigma_pct = None if expected is None else float(np.hypot(expected.scale_sigma_ppm / 1e4, _SLIDING_PCT))
+    known = "" if sigma_pct is None else f", known to within {sigma_pct:.2g} % (one sigma)"
     yield f"the scale is that of the handpiece{known}; the picture is that of camera {camera}"
 
 
