@@ -15,7 +15,9 @@ from cuspid.capture import Capture
 from cuspid.geometry import Rigid3, best_similarity
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
 from cuspid.jaw import Jaw
-from cuspid.motion.rig_film import of_camera
+from cuspid.motion.adjustment import AdjustmentOptions
+from cuspid.motion.rig_film import film_options, locate_rig_film, of_camera, refine_rig_on_surface, surface_patches
+from cuspid.motion.single import SingleOptions
 from cuspid.panorama_pipeline import StitchOptions, stitch_rig
 from cuspid.pipeline import RenderOptions, take_images
 from cuspid.reconstruction import Reconstruction, Tracks
@@ -86,6 +88,30 @@ def test_laid_over_the_surface_points_hold_the_path_nearer_to_the_truth(
     # 0.023 mm instead of 0.034.
     refined = storage.read_poses(pano / "poses.json").values()
     assert 0.002 < median(refined) < 0.85 * median(before.motion.cam_from_world.values())
+
+
+def test_over_the_true_surface_the_path_is_right_and_what_agrees_on_no_poses_changes_nothing(
+    film: tuple[Capture, GroundTruth], coarse_phantom: Jaw
+) -> None:
+    capture, truth = film
+    options, contrast = film_options(), SingleOptions()
+    found = locate_rig_film(capture, options, contrast)
+    surface = coarse_phantom.mesh.transformed(truth.rig_from_world[found.frames[0]])
+
+    def refined(adjustment: AdjustmentOptions) -> Reconstruction | None:
+        return refine_rig_on_surface(
+            *(found, surface, capture, replace(options, adjustment=adjustment), contrast, surface_patches())
+        )
+
+    def worst_mm(path: Reconstruction) -> float:
+        centres = (each.rig_from_world.values() for each in (path, truth))
+        return float(left_over(*(np.array([pose.inverse().translation for pose in poses]) for poses in centres)).max())
+
+    better = refined(options.adjustment)
+    assert better is not None
+    assert better.rig.names == found.rig.names
+    assert 0.001 < worst_mm(better) < 0.04
+    assert refined(AdjustmentOptions(minimum_angle_deg=89.0)) is None
 
 
 def test_pixels_show_what_lies_there_in_true_millimetres(pano: Path, film: tuple[Capture, GroundTruth]) -> None:

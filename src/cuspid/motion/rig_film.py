@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from cuspid.capture import Capture, ImageSource
+from cuspid.errors import ReconstructionError
 from cuspid.mesh import Mesh
 from cuspid.motion.adjustment import adjust
 from cuspid.motion.location import MotionOptions, locate, with_advice
@@ -83,7 +84,7 @@ def refine_rig_on_surface(
 ) -> Reconstruction | None:
     """What :func:`locate_rig_film` found, with its points followed over the surface that the frames show, in its world,
     and all adjusted to that; None where too few are found to hold a frame, or what lies before one and behind it,
-    together."""
+    together, or to agree on the poses."""
     source = _EvenContrast(capture.source, contrast)
 
     def read(frame: str, camera: str) -> UInt8[np.ndarray, "h w"]:
@@ -95,8 +96,11 @@ def refine_rig_on_surface(
         return None
     rig = capture.handpiece.rig.in_own_order()
     start = replace(found, tracks=followed, notes=()).with_cameras_as(rig.names)
-    # The calibration as it was given: the images have told once what they know of it.
-    adjusted = adjust(replace(start, rig=rig), options.adjustment)
+    try:
+        # The calibration as it was given: the images have told once what they know of it.
+        adjusted = adjust(replace(start, rig=rig), options.adjustment)
+    except ReconstructionError:
+        return None
     return with_advice(adjusted, least).with_cameras_as(found.rig.names)
 
 

@@ -533,7 +533,10 @@ def refine_on_surface(
     if not hold_together(followed, len(part.frames), options.minimum_matches):
         return None
     tracks = joined_tracks(_spanning(part.tracks, options.patches.reach), followed)
-    return adjust_model(replace(part, tracks=tracks), options.guided.adjustment)
+    try:
+        return adjust_model(replace(part, tracks=tracks), options.guided.adjustment)
+    except ReconstructionError:
+        return None
 
 
 def _spanning(tracks: Tracks, reach: int) -> Tracks:
