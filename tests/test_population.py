@@ -125,7 +125,13 @@ def closed_up() -> Jaw:
     return build_phantom(PhantomOptions(edge_mm=0.8, arch="upper", missing=(14, 24)))
 
 
-@pytest.fixture(params=["crowded", "closed_up"])
+@pytest.fixture(scope="module")
+def deep_rooted() -> Jaw:
+    """A root of it reaches 0.3 mm out of the box in which the surface is looked for."""
+    return build_phantom(draw_population("lower-12", 2, np.random.default_rng(0), PhantomOptions(edge_mm=0.8))[1])
+
+
+@pytest.fixture(params=["crowded", "closed_up", "deep_rooted"])
 def unusual(request: pytest.FixtureRequest) -> Jaw:
     return request.getfixturevalue(request.param)
 

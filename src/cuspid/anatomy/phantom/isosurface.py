@@ -28,8 +28,8 @@ CHUNK = 30_000
 def mesh_of(
     field: Field, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], edge_mm: float
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """The zero surface of a field as one closed mesh with well-shaped faces."""
-    volume = _sample_band(field, low, high, edge_mm)
+    """The zero surface of a field as one closed mesh with well-shaped faces; it is cut off where it leaves the box."""
+    volume = _with_border_outside(_sample_band(field, low, high, edge_mm), edge_mm)
     vertices, faces, _, _ = marching_cubes(volume, 0.0, gradient_direction="descent")
     vertices, faces = _largest_part(low + edge_mm * vertices.astype(float), faces.astype(np.int64))
     for _ in range(2):
@@ -51,6 +51,12 @@ def _sample_band(field: Field, low: Float[np.ndarray, "3"], high: Float[np.ndarr
         size //= 2
         cells = (2 * cells[near, None] + _inner(2)).reshape(-1, 3)
     return volume
+
+
+def _with_border_outside(volume: np.ndarray, distance: float) -> np.ndarray:
+    """The volume with nothing of the inside on its border, where the surface would be open."""
+    border = np.pad(np.zeros(np.subtract(volume.shape, 2), dtype=bool), 1, constant_values=True)
+    return np.where(border & (volume < 0), np.float32(distance), volume)
 
 
 def _inner(size: int) -> Int[np.ndarray, "c 3"]:
