@@ -58,5 +58,6 @@ def neighbours_of(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "p 2"]:
     """Pairs (p, 2) of faces that share an edge, in both orders, for a closed mesh."""
     edges = np.sort(edges_of(faces), axis=1)
     order = np.lexsort((edges[:, 1], edges[:, 0]))
+    assert np.array_equal(edges[order[::2]], edges[order[1::2]]), "the mesh is not closed"
     pairs = (order // 3).reshape(-1, 2)
     return np.concatenate([pairs, pairs[:, ::-1]])
