@@ -19,9 +19,16 @@ from cuspid.gloss import leaving
 from cuspid.reconstruction import Tracks
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.compared import Compared, frames_beside, partners
-from cuspid.stitching.height_map import HeightMap, HeightMapOptions, height_map, transformed, uncovered
+from cuspid.stitching.height_map import (
+    HeightMap,
+    HeightMapOptions,
+    ScaleOptions,
+    height_map,
+    transformed,
+    uncovered,
+)
 from cuspid.stitching.mosaic import Mosaic, MosaicOptions, compose
-from cuspid.stitching.ortho import OrthoOptions, find_surface, find_surface_again
+from cuspid.stitching.ortho import OrthoOptions, Shown, find_surface, find_surface_again
 from cuspid.stitching.plane_sweep import PlaneSweepOptions, plane_sweep
 
 HALF_MM, DEEP_MM, CAMERA_MM = 3.0, 4.0, 14.0
@@ -143,6 +150,9 @@ def test_a_better_path_lies_where_the_one_before_lay(scene: Scene, metric: bool)
     moved = transformed(scene.motion.scaled(1.03), elsewhere)
     again = find_surface_again(shown, moved, scene.read, options, beside=beside)
     kept = 1.03 if metric else 1.0
+    if not metric:
+        heights = [pose.inverse().translation[2] for pose in again.motion.cam_from_world.values()]
+        assert np.median(heights) == pytest.approx(14.0)
     centres, before = (
         np.array([pose.inverse().translation for pose in each.motion.cam_from_world.values()])
         for each in (again, shown)
@@ -152,6 +162,25 @@ def test_a_better_path_lies_where_the_one_before_lay(scene: Scene, metric: bool)
     assert np.abs(centres.mean(axis=0) - before.mean(axis=0)).max() < (0.3 if metric else 1e-6)
     if not metric:
         np.testing.assert_allclose(again.motion.tracks.points, shown.motion.tracks.points, atol=1e-6)
+
+
+def test_a_known_width_sets_the_scale_of_the_better_path_and_of_its_surface(scene: Scene) -> None:
+    """It finds the bar and the floor a twentieth wider than the path before did."""
+    options = OrthoOptions(scale=ScaleOptions(width_mm=30.0))
+    shown = find_surface(scene.motion, scene.read, options, working_distance_mm=14.0)
+    tracks = shown.motion.tracks
+    wider = replace(tracks, points=tracks.points * [1.05, 1.0, 1.0])
+    again = find_surface_again(shown, replace(shown.motion, tracks=wider), scene.read, options)
+
+    def width(each: Shown) -> float:
+        return float(np.diff(np.percentile(each.motion.tracks.points[:, 0], [0.2, 99.8]))[0])
+
+    assert width(again) == pytest.approx(width(shown), rel=0.001)
+    assert shown.dense is not None
+    assert again.dense is not None
+    assert again.dense.cell_mm == pytest.approx(shown.dense.cell_mm / 1.05, rel=0.01)
+    spans = [np.ptp(each.dense.places[each.dense.known][:, :2], axis=0) for each in (again, shown) if each.dense]
+    np.testing.assert_allclose(spans[0], spans[1] / 1.05, rtol=0.02)
 
 
 def test_what_is_textured_is_known_and_what_is_plain_or_beyond_is_not(surface: HeightMap) -> None:

@@ -139,6 +139,16 @@ class HeightMap:
         _mark_occluded(places, centre, self._occluder, self.corner, self.cell_mm, start, _OVER_MM, occluded)
         return occluded if self.visible is None else occluded & ~self._marked(self.visible, places[..., :2])
 
+    def scaled(self, scale: float) -> HeightMap:
+        """The same surface in a unit that is smaller by this factor."""
+        return HeightMap(
+            corner=scale * self.corner,
+            cell_mm=scale * self.cell_mm,
+            heights=self.heights * np.float32(scale),
+            known=self.known,
+            visible=self.visible,
+        )
+
     def mesh(self) -> Mesh:
         """The seen surface as triangles that look up."""
         cells = np.arange(self.heights.size).reshape(self.heights.shape)
@@ -183,12 +193,17 @@ def in_occlusal_frame(model: SparseModel, scale: ScaleOptions | None) -> SparseM
     above = world_from_model.apply(centres)
     front = _facing_front(above[: frames_there(above[:, :2])], world_from_model.apply(points))
     found = transformed(near, front @ world_from_model)
-    if scale is None:
-        return found.scaled(1 / nearer)
+    return found.scaled(1 / nearer if scale is None else scale_factor(found, scale))
+
+
+def scale_factor(model: SparseModel, scale: ScaleOptions) -> float:
+    """By what a motion in the occlusal frame is to be scaled: to the known width of the arch, else to the working
+    distance, else to `NOMINAL_MM`."""
     if scale.width_mm is not None:
-        return found.scaled(scale.width_mm / _width(found.tracks.points))
-    heights = _centres_and_axes(found)[0][:, 2]
-    return found.scaled((scale.working_distance_mm or NOMINAL_MM) / float(np.median(heights)))
+        nearer = NOMINAL_MM / float(np.median(model.depths))
+        return nearer * scale.width_mm / _width(nearer * model.tracks.points)
+    heights = _centres_and_axes(model)[0][:, 2]
+    return (scale.working_distance_mm or NOMINAL_MM) / float(np.median(heights))
 
 
 def _width(points: Float[np.ndarray, "p 3"]) -> float:

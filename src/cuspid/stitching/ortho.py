@@ -20,6 +20,7 @@ from cuspid.stitching.height_map import (
     ScaleOptions,
     height_map,
     in_occlusal_frame,
+    scale_factor,
     transformed,
     uncovered,
 )
@@ -106,13 +107,15 @@ def find_surface_again(
     beside: Compared | None = None,
     progress: Progress = silent,
 ) -> Shown:
-    """What the same frames show whose poses are known better, with the surface near the one that they showed before;
-    arguments as for :func:`find_surface`."""
+    """What the same frames show whose poses are known better, with the surface near the one that they showed before,
+    and scaled anew to what sets the scale; arguments as for :func:`find_surface`."""
     motion = _laid_onto(located, shown.motion, keeps_scale=beside is not None)
     sparse = height_map(motion, options.height_map)
     start = None if shown.dense is None else (shown.dense, _SLACK * _moved(motion, shown.motion))
     dense = _dense(located, motion, sparse, read, beside, options, progress, start)
-    return shown._replace(motion=motion, sparse=sparse, dense=dense)
+    factor = 1.0 if shown.scale is None else scale_factor(motion, shown.scale)
+    surface = None if dense is None else dense.scaled(factor)
+    return Shown(motion.scaled(factor), sparse.scaled(factor), surface, shown.scale)
 
 
 def orthophoto(
