@@ -14,9 +14,9 @@ METHODS = (
     *("ortho", "return", "s-shape", "natural", "pair"),
     *("thesis", "thesis-unexamined", "opencv-panorama", "opencv-scans"),
 )
-MEDIAN_MM, P95_MM, SSIM_TEETH, SSIM_CANVAS, WALL_S = 0.15, 0.5, 0.80, 0.93, 90.0
+MEDIAN_MM, P95_MM, SSIM_TEETH, SSIM_CANVAS, SCALE_PCT, WALL_S = 0.1, 0.5, 0.80, 0.93, 2.0, 45.0
 """Bars: greatest errors, least likeness, longest time."""
-PAIR_MEDIAN_MM, PAIR_MOLARS_MM, PAIR_WALL_S = 0.05, 0.15, 45.0
+PAIR_MEDIAN_MM, PAIR_MOLARS_MM = 0.05, 0.15
 """Bars for two cameras."""
 LOOKED_AT = frozenset(
     {"lower-14-0", "upper-14-0", "001_lower", "005_upper"}
@@ -28,7 +28,6 @@ LOOKED_AT = frozenset(
 def panoramas(results: Sequence[Result]) -> str:
     """All methods side by side, then the default method subject by subject, with one camera and with two."""
     by_method = {name: [each for each in results if each["method"] == name] for name in METHODS}
-    ortho = by_method["ortho"]
     return "\n".join(
         [
             "Phantoms of the population and real jaws (`benchmarks/panorama.py`), each filmed in 120 frames of "
@@ -46,21 +45,29 @@ def panoramas(results: Sequence[Result]) -> str:
                 [method_row(name, rows) for name, rows in by_method.items() if rows],
             ),
             "",
-            f"The default method, subject by subject. Bars: median {MEDIAN_MM} mm, P95 {P95_MM} mm, SSIM on teeth "
-            f"{SSIM_TEETH}, on the canvas {SSIM_CANVAS}, {WALL_S:.0f} s on 2 cores, complete, in one part. For a "
-            "fitted SSIM, one gain and offset (on the canvas: a gain) is removed first; `grey jaw` is the score of "
-            "constant grey in the outline of the jaw.",
+            f"One camera, subject by subject. Bars: median {MEDIAN_MM} mm, P95 {P95_MM} mm, SSIM on teeth "
+            f"{SSIM_TEETH}, on the canvas {SSIM_CANVAS}, scale within {SCALE_PCT:.0f} %, {WALL_S:.0f} s on 2 cores, "
+            "complete, in one part. For a fitted SSIM, one gain and offset (on the canvas: a gain) is removed first; "
+            "`grey jaw` is the score of constant grey in the outline of the jaw. *Shared*: other work had more than "
+            "half of the machine, so that the wall time is not judged. One pass along the arch:",
             "",
-            markdown_table(
-                (
-                    *("subject", "frames", "parts", "complete", "median mm", "P95 mm", "SSIM teeth", "grey jaw"),
-                    *("SSIM canvas", "grey jaw", "ZNCC teeth", "inter-molar mm", "scale %", "wall s", "CPU-s", "GiB"),
-                ),
-                [subject_row(result) for result in ortho],
-            ),
+            singles(by_method["ortho"]),
+            "",
+            "There and back again (`return`), as many frames:",
+            "",
+            singles(by_method["return"]),
             *pairs(by_method["pair"]),
         ]
     )
+
+
+def singles(results: Sequence[Result]) -> str:
+    """One camera, subject by subject."""
+    heads = (
+        *("subject", "frames", "parts", "complete", "median mm", "P95 mm", "SSIM teeth", "grey jaw"),
+        *("SSIM canvas", "grey jaw", "ZNCC teeth", "inter-molar mm", "scale %", "wall s", "CPU-s", "GiB"),
+    )
+    return markdown_table(heads, [subject_row(result) for result in results])
 
 
 def pairs(results: Sequence[Result]) -> list[str]:
@@ -75,7 +82,7 @@ def pairs(results: Sequence[Result]) -> list[str]:
     return [
         "",
         f"Two cameras, subject by subject; the scale is theirs. Bars: median {PAIR_MEDIAN_MM} mm, inter-molar distance "
-        f"{PAIR_MOLARS_MM} mm, {PAIR_WALL_S:.0f} s on 2 cores. *Tilt* is the angle between the directions of the "
+        f"{PAIR_MOLARS_MM} mm, {WALL_S:.0f} s on 2 cores. *Tilt* is the angle between the directions of the "
         "picture and of the jaw's occlusal frame, beside it the median of the error along the picture's own. SSIM is "
         "fitted; *seen* is what the frames saw of the jaw, and `grey jaw` its score there. Subjects on which the "
         f"method was developed: {', '.join(sorted(LOOKED_AT))}; all others were looked at only at the end.",
@@ -90,16 +97,15 @@ def pair_row(result: Result) -> list[str]:
     if result["failure"] is not None or score["geometry"] is None:
         return [name, "-", f"no: {result['failure']}", *["-"] * 10, str(took["wall_s"]), str(took["cpu_s"]), "-"]
     geometry, picture, molars = score["geometry"], score["picture"], score["inter_molar_error_mm"]
-    near = molars is None or abs(molars) <= PAIR_MOLARS_MM
     return [
         *(name, f"{score['frames_used']} of {score['frames']}", "yes" if score["complete"] else "**no**"),
         *(mark(geometry["median_mm"], PAIR_MEDIAN_MM, 3), f"{geometry['p95_mm']:.2f}"),
         *(f"{geometry['tilt_deg']:.1f}", f"{geometry['own_median_mm']:.3f}"),
-        "-" if molars is None else f"{molars:+.2f}" if near else f"**{molars:+.2f}** (missed)",
+        "-" if molars is None else within(molars, PAIR_MOLARS_MM, 2),
         *(f"{geometry['scale_error_pct']:+.2f}", f"{score['coverage_pct']:.1f}"),
         *(f"{picture['ssim_teeth_fitted']:.2f}", f"{picture['ssim_seen_fitted']:.2f}"),
         f"{score['trivial']['grey jaw']['ssim_seen_fitted']:.2f}",
-        *(mark(took["wall_s"], PAIR_WALL_S, 0), f"{took['cpu_s']:.0f}", f"{took['peak_gib']:.1f}"),
+        *(wall(took), f"{took['cpu_s']:.0f}", f"{took['peak_gib']:.1f}"),
     ]
 
 
@@ -146,14 +152,25 @@ def subject_row(result: Result) -> list[str]:
         *(least(picture["ssim_full_fitted"], SSIM_CANVAS), f"{grey['ssim_full_fitted']:.2f}"),
         f"{picture['zncc']:.2f}",
         "-" if inter_molar is None else f"{inter_molar:+.2f}",
-        "-" if geometry["scale_error_pct"] is None else f"{geometry['scale_error_pct']:+.1f}",
-        *(mark(took["wall_s"], WALL_S, 0), f"{took['cpu_s']:.0f}", f"{took['peak_gib']:.1f}"),
+        "-" if geometry["scale_error_pct"] is None else within(geometry["scale_error_pct"], SCALE_PCT, 1),
+        *(wall(took), f"{took['cpu_s']:.0f}", f"{took['peak_gib']:.1f}"),
     ]
 
 
 def least(value: float, limit: float) -> str:
     """A figure, marked where it is below the limit."""
     return f"{value:.2f}" if value >= limit else f"**{value:.2f}** (missed)"
+
+
+def within(value: float, limit: float, digits: int) -> str:
+    """A figure with its sign, marked where it is farther from 0 than the limit."""
+    return f"{value:+.{digits}f}" if abs(value) <= limit else f"**{value:+.{digits}f}** (missed)"
+
+
+def wall(took: Mapping[str, float]) -> str:
+    """Wall time, judged where the method had more than one core, as it has on a machine of its own."""
+    shared = took["wall_s"] > took["cpu_s"]
+    return f"{took['wall_s']:.0f} (shared)" if shared else mark(took["wall_s"], WALL_S, 0)
 
 
 def at(value: Any, path: Sequence[str]) -> Any:
