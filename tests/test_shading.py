@@ -136,30 +136,6 @@ def test_lights_that_are_not_told_are_asked_for(images: dict[str, np.ndarray]) -
     assert DepthEstimator(two, OPTIONS).measure(images, "7")  # texture does not ask
 
 
-def off_by_sigmas(noise_dn: float, cameras: int) -> tuple[float, float]:
-    """With so much noise that changes over two pixels, as a Bayer filter and JPEG leave it: the usual standard
-    deviation, in what gives confidence 1, and the usual error as a multiple of it."""
-    whole, rng = lit(), np.random.default_rng(0)
-    handpiece = replace(whole, rig=Rig({name: whole.rig[name] for name in whole.rig.names[:cameras]}))
-    images = of_one_frame(photographs(handpiece, FRAME))
-    for name, image in images.items():
-        grain = cv2.GaussianBlur(rng.standard_normal(image.shape), (0, 0), 2.0)
-        images[name] = np.clip(np.rint(image + noise_dn * grain / grain.std()), 0, 255).astype(np.uint8)
-    confidence = replace(ShadingOptions().confidence, best_sigma=0.01)
-    options = replace(OPTIONS, shading=ShadingOptions(confidence=confidence))
-    maps = DepthEstimator(handpiece, options, signal="shading").measure(images, "00000")
-    sigmas = np.concatenate([each.confidence[each.known] for each in maps]) ** -0.5
-    return float(np.median(sigmas)), float(np.median(np.abs(errors_um(maps)) / sigmas))
-
-
-@pytest.mark.parametrize("cameras", [4, 2])
-def test_standard_deviations_follow_the_noise(cameras: int) -> None:
-    """Two cameras cannot contradict each other: what they leave in their windows tells the noise."""
-    (calm, calm_off), (noisy, noisy_off) = off_by_sigmas(0.0, cameras), off_by_sigmas(2.0, cameras)
-    assert 2 < noisy / calm < 5
-    assert 0.8 < noisy_off / calm_off < 1.35
-
-
 def test_neighbours_tell_how_well_a_smooth_surface_is_known() -> None:
     sigma, known = np.full((40, 50), 3.0), np.ones((40, 50), dtype=bool)
     assert shading._pooled(sigma, known) == pytest.approx(3.0)

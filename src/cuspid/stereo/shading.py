@@ -58,14 +58,10 @@ _COLOURED = 0.2
 """Difference of the colours (unit vectors) of two lights from which on they are told apart."""
 _COMMON_DN, _LEAST_DN, _ABOVE_ZERO = 100.0, 4.0, 600.0
 """Brightness for which ratios are scaled, below which they are not taken, and what keeps them positive."""
-_BESIDES_PX = 0.2
-"""Standard deviation of a depth where noise is nothing."""
-_FOLLOWED = 6.0
-"""Variance of the noise as a multiple of what is left of it in the window of a fit, which follows it: noise of smooth
-images hardly changes over a window (4.7 to 7.2 for images with and without Bayer filter, JPEG and scattering)."""
-_NOISE_PX, _NOISIEST = 3.0, 25.0
-"""Standard deviation, in pixels of the depth map, of the weight by which neighbours tell the variance of the noise, and
-the multiple of its median beyond which one of them tells no more."""
+_SIGMA_PX, _LEAST_VARIANCE = 1.7, 1e-9
+"""Standard deviation (px) of a depth whose fit gives 1 px, and the least variance of a fit. Errors are as the square
+root of what fits give: samples that overlap understate them, a smooth start keeps them small where images tell little.
+"""
 _POOLED_PX, _TINY = 2.0, 1e-12
 """Standard deviation, in pixels of the depth map, of the weight by which neighbours tell how well a smooth surface is
 known."""
@@ -102,7 +98,7 @@ class ShadingOptions(Options):
     """A camera whose brightness differs by more (RMS over the window, digital numbers) sees something else."""
     camera_lag_dn: Annotated[float, Range(0, 255)] = 2.0
     """A camera whose difference exceeds the best one's by more sees something else."""
-    bend_px: Annotated[float, Range(0.001, 1000)] = 0.1
+    bend_px: Annotated[float, Range(0.001, 1000)] = 0.14
     """How much a surface bends from one pixel of the depth map to the next: change of its slope, px of disparity.
     Smaller values make surfaces smoother where the images tell little about them."""
     glare_dn: Annotated[float, Range(0.001, 1000)] = 0.05
@@ -111,7 +107,7 @@ class ShadingOptions(Options):
     """Refractive index of the surface, by which less of its light leaves it at grazing angles; 1 for what is matte.
     Only lights of one colour need it."""
     confidence: ConfidenceOptions = field(
-        default_factory=lambda: ConfidenceOptions(agreement_sigmas=0.7, largest_sigma=8.0, best_sigma=1.0)
+        default_factory=lambda: ConfidenceOptions(agreement_sigmas=1.0, largest_sigma=4.0, best_sigma=1.0)
     )
     """Checks and weights. Shade is broad: the limits are wider than those for texture. Smooth surfaces agree easily
     where two cameras are deceived alike, so that standard deviations excuse less."""
@@ -149,6 +145,8 @@ class _Fit(NamedTuple):
     highest: float
     lenient: int
     """Iterations that let cameras in which do not agree well yet: the start may be some pixels off."""
+    correlation: float
+    """Of weighted samples, by which their normal equations understate a variance."""
 
 
 # --- what is compared --------------------------------------------------------------------------------------------
@@ -364,54 +362,52 @@ def _compare(view, fit, u, v, plane, systems):
 @kernel(**FAST)
 @no_type_check
 def _combine(systems, rms, lag, total):
-    """Sum the equations of the cameras that see the same; returns how many, and the variance of the noise: what the
-    depths that each of them alone would have differ by tells it, and for a single one the differences in its window."""
+    """Sum the equations of the cameras that see the same; returns how many, and their mean squared difference."""
     best = systems[:, 9].min()
     total[:] = 0
-    used, left, spread = 0, 0.0, 0.0
+    used, square = 0, 0.0
     for j in range(len(systems)):
         if systems[j, 9] <= rms and systems[j, 9] <= best + lag:
             used += 1
-            left += systems[j, 9] ** 2
-            spread += systems[j, 6] ** 2 / max(systems[j, 0], _TINY)
+            square += systems[j, 9] ** 2
             for k in range(9):
                 total[k] += systems[j, k]
     total[3] += used * _SLANT_DAMPING
     total[5] += used * _SLANT_DAMPING
-    return used, spread / (used - 1) if used > 1 else _FOLLOWED * left
+    return used, square / max(used, 1)
 
 
 @kernel(**FAST)
 @no_type_check
 def _refine_plane(view, fit, u, v, plane, systems, total, step):
-    """Gauss-Newton from a plane, changed in place; returns the variance of q for noise of 1 DN^2, the variance of the
-    noise, and the number of cameras, 0 if it failed."""
-    variance, noise, used = 0.0, 0.0, 0
+    """Gauss-Newton from a plane, changed in place; returns the variance of q and the number of cameras, 0 if it
+    failed."""
+    variance, used = 0.0, 0
     for iteration in range(fit.iterations):
         _compare(view, fit, u, v, plane, systems)
         rms = fit.camera_rms if iteration >= fit.lenient else 3 * fit.camera_rms
-        used, noise = _combine(systems, rms, fit.lag, total)
+        used, square = _combine(systems, rms, fit.lag, total)
         factor = solve(total, step) if used > 0 else -1.0
         if factor < 0:
-            return 0.0, 0.0, 0
-        variance = (1 + used) * factor  # the noise of the reference is common to all of them
+            return 0.0, 0
+        variance = square * factor * fit.correlation
         length = abs(step[0])
         shrink = 1.0 if length <= 1 else 1 / length
         for k in range(3):
             plane[k] += shrink * step[k]
         if length < fit.converged and iteration >= fit.lenient:
             break
-    return variance, noise, used
+    return variance, used
 
 
 @kernel(**FAST)
 @no_type_check
 def _refine_all(view, fit, rows, columns, planes):
-    """For each pixel of the grid q, its variance for noise of 1 DN^2, the variance of the noise, and the number of
-    cameras, 0 where nothing is found. The planes, from which it starts, become those found."""
+    """For each pixel of the grid q, its variance, and the number of cameras, 0 where nothing is found. The planes, from
+    which it starts, become those found."""
     height, width = view.images.shape[1:3]
     radius = _STRIDE * (fit.window.shape[0] // 2)
-    out = np.zeros((rows.size, columns.size, 4))
+    out = np.zeros((rows.size, columns.size, 3))
     systems, total, step = np.zeros((view.others.size, 11)), np.zeros(9), np.zeros(3)
     plane = np.zeros(3)
     for r in range(rows.size):
@@ -419,9 +415,9 @@ def _refine_all(view, fit, rows, columns, planes):
             u, v = columns[c], rows[r]
             if radius <= u < width - radius and radius <= v < height - radius:
                 plane[:] = planes[r, c]
-                variance, noise, used = _refine_plane(view, fit, u, v, plane, systems, total, step)
+                variance, used = _refine_plane(view, fit, u, v, plane, systems, total, step)
                 if used > 0 and fit.lowest <= plane[0] <= fit.highest:
-                    out[r, c, 0], out[r, c, 1], out[r, c, 2], out[r, c, 3] = plane[0], variance, noise, used
+                    out[r, c, 0], out[r, c, 1], out[r, c, 2] = plane[0], variance, used
                     planes[r, c] = plane
     return out
 
@@ -572,8 +568,8 @@ class _Refinement:
         view = self._view._replace(images=images, trust=trust)
         fit = self._fit._replace(lenient=lenient)
         found = _refine_all(view, fit, self._rows, self._columns, self._planes)
-        known = found[..., 3] > 0
-        sigma = np.sqrt(_BESIDES_PX**2 + found[..., 1] * _around_it(found[..., 2], known))
+        sigma = _SIGMA_PX * np.maximum(found[..., 1], _LEAST_VARIANCE) ** 0.25
+        known = found[..., 2] > 0
         q = smoothed(np.where(known, found[..., 0], np.nan), sigma, self._bend_px, self._colours)
         self._restart(q)
         scale = self._geometry.scale
@@ -584,14 +580,6 @@ class _Refinement:
         along = [_slope(q, axis) / self._spacing_px for axis in (1, 0)]
         for channel, values in enumerate((q, *along)):
             self._planes[..., channel] = np.where(np.isfinite(values), values, self._planes[..., channel])
-
-
-def _around_it(noise: Float[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """The mean variance of the noise around each pixel that is known; 0 elsewhere."""
-    most = _NOISIEST * float(np.median(noise[known])) if known.any() else 0.0
-    total = cv2.GaussianBlur(np.where(known, np.minimum(noise, most), 0.0), (0, 0), _NOISE_PX)
-    weight = cv2.GaussianBlur(known.astype(np.float64), (0, 0), _NOISE_PX)
-    return np.where(known, total / np.maximum(weight, _TINY), 0.0)
 
 
 def _pooled(sigma: Float[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
@@ -610,8 +598,9 @@ def _slope(values: Float[np.ndarray, "h w"], axis: int) -> Float[np.ndarray, "h 
 
 
 def _fit(options: ShadingOptions, lowest: float, highest: float) -> _Fit:
+    window = options.window
     return _Fit(
-        window=options.window,
+        window=window,
         iterations=options.iterations,
         converged=options.converged_px,
         camera_rms=options.camera_rms_dn,
@@ -619,4 +608,5 @@ def _fit(options: ShadingOptions, lowest: float, highest: float) -> _Fit:
         lowest=lowest,
         highest=highest,
         lenient=0,
+        correlation=float((window**2).sum() / window.sum()),
     )
