@@ -170,8 +170,11 @@ def test_a_campaign_measures_what_no_longer_holds(freshness, repository, monkeyp
     monkeypatch.setattr(campaign, "ROOT", repository)
     monkeypatch.setattr(campaign, "RESULTS", results)
     monkeypatch.setattr(campaign, "BENCHMARKS", [campaign.Benchmark(*each) for each in toys])
+    compiled: list[Path] = []  # a scan of some minutes, of which nothing here is measured
+    monkeypatch.setattr(campaign, "compile_all", compiled.append)
     monkeypatch.setattr("sys.argv", ["campaign.py", "--work", str(repository / "work")])
     campaign.main()
+    assert [(each / "checkout").is_dir() for each in compiled] == [True]
     said = capsys.readouterr().out
     assert "mouth: 0.0 min\n" in said
     assert "precision: 0.0 min, failed, see " in said
