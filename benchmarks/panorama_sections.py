@@ -15,7 +15,7 @@ METHODS = (
     *("thesis", "thesis-unexamined", "opencv-panorama", "opencv-scans"),
 )
 MEDIAN_MM, P95_MM, SSIM_TEETH, SSIM_CANVAS, SCALE_PCT, WALL_S = 0.1, 0.5, 0.80, 0.93, 2.0, 45.0
-"""Bars: greatest errors, least likeness, longest time."""
+"""Bars for one camera: greatest errors, least likeness; and for all, the longest time."""
 PAIR_MEDIAN_MM, PAIR_MOLARS_MM = 0.05, 0.15
 """Bars for two cameras."""
 LOOKED_AT = frozenset(
@@ -26,7 +26,7 @@ LOOKED_AT = frozenset(
 
 
 def panoramas(results: Sequence[Result]) -> str:
-    """All methods side by side, then the default method subject by subject, with one camera and with two."""
+    """All methods side by side, then subject by subject one camera on two paths, and two cameras."""
     by_method = {name: [each for each in results if each["method"] == name] for name in METHODS}
     return "\n".join(
         [

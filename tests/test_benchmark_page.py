@@ -215,3 +215,15 @@ def test_what_is_foretold_is_what_was_measured_where_that_was(freshness, alone, 
     assert sections.foretold(alone, share, cores) == pytest.approx(several)
     assert sections.foretold(alone, share, 10**9) >= alone - (alone - several) * cores / (cores - 1) - 1e-6
     assert sections.parallel_share(alone, 1.1 * alone, cores) == 0
+
+
+@pytest.mark.parametrize(
+    ("wall_s", "cpu_s", "told"), [(40, 70, "40"), (60, 90, "**60** (missed)"), (60, 50, "60 (shared)")]
+)
+def test_no_wall_time_of_a_shared_machine_is_judged(freshness, wall_s, cpu_s, told):
+    assert import_module("panorama_sections").wall({"wall_s": wall_s, "cpu_s": cpu_s}) == told
+
+
+@pytest.mark.parametrize(("value", "told"), [(-2.0, "-2.0"), (2.04, "**+2.0** (missed)"), (-3.0, "**-3.0** (missed)")])
+def test_a_figure_is_within_its_limit_on_both_sides(freshness, value, told):
+    assert import_module("panorama_sections").within(value, 2.0, 1) == told
