@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.ndimage import binary_erosion, gaussian_filter
+from scipy.ndimage import gaussian_filter
 
 from cuspid.capture import Capture, Frame
 from cuspid.errors import ReconstructionError
@@ -137,23 +137,6 @@ def test_what_is_hardly_known_does_not_hold_a_path_back() -> None:
     trusted, distrusted = (errors_um(tracked(held_back(trust)), OUT).max() for trust in (1.0, 0.02))
     assert trusted > 2 * distrusted
     assert 0.1 < distrusted < 15
-
-
-def bent_up(maps: Sequence[DepthMap], border_px: int) -> list[DepthMap]:
-    """Depth maps that are 50 µm off in a border of so many pixels."""
-    made = []
-    for each in maps:
-        inside = binary_erosion(each.known, np.ones((3, 3)), iterations=border_px)
-        made.append(replace(each, depth_mm=np.where(inside, each.depth_mm, each.depth_mm + np.float32(0.05))))
-    return made
-
-
-def test_borders_of_depth_maps_do_not_move_a_path() -> None:
-    maps = depth_maps(OUT, noise_mm=0.002)
-    straight, narrow, wide = (tracked(each) for each in (maps, bent_up(maps, 2), bent_up(maps, 8)))
-    for name, pose in straight.rig_from_world.items():
-        assert narrow.rig_from_world[name].matrix == pytest.approx(pose.matrix, abs=1e-12)
-    assert 3 * errors_um(straight, OUT).max() < errors_um(wide, OUT).max() < 100
 
 
 def test_only_relative_trust_matters() -> None:

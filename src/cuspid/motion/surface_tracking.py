@@ -21,7 +21,6 @@ from functools import partial
 from itertools import groupby, islice, product
 from typing import Annotated, NamedTuple
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
@@ -42,10 +41,6 @@ _JUMP = 0.06
 """Neighbours in a depth map that lie farther apart, as a share of the working distance, are not on one surface."""
 _LEAST_COSINE = 0.3
 """Of the angle between surface and line of sight: what is seen more obliquely is too noisy to lay anything on."""
-_BORDER_PX = 3
-"""Width of the border of a depth map that is left out, px: there windows and the smooth surface look to one side only,
-and what they err by moves along with the view.
-"""
 _LEAST_MEMBERS = 3
 """Depths that make a point."""
 _ALIKE = 0.7
@@ -205,8 +200,6 @@ def _shown(depth_map: DepthMap, jump_mm: float) -> Shown:
     """The points of a depth map that have neighbours on all sides, in the rig frame."""
     camera = depth_map.camera
     rays = camera.rays(camera.pixel_centres().reshape(-1, 2)).reshape(camera.height, camera.width, 3)
-    window = np.ones(2 * (2 * _BORDER_PX + 1,), np.uint8)
-    inside = cv2.erode(depth_map.known.astype(np.uint8), window, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
     points = rays * np.where(depth_map.known, depth_map.depth_mm, np.nan)[..., None]
     right, down = np.full((2, *points.shape), np.nan)
     right[:, 1:-1], down[1:-1] = points[:, 2:] - points[:, :-2], points[2:] - points[:-2]
@@ -215,7 +208,7 @@ def _shown(depth_map: DepthMap, jump_mm: float) -> Shown:
     normals, facing = normals * np.sign(facing)[..., None], np.abs(facing)
     with np.errstate(invalid="ignore"):
         smooth = np.maximum(np.linalg.norm(right, axis=-1), np.linalg.norm(down, axis=-1)) < jump_mm
-        good = inside & smooth & (facing > _LEAST_COSINE)
+        good = smooth & (facing > _LEAST_COSINE)
     rig_from_cam = depth_map.cam_from_rig.inverse()
     return Shown(
         rig_from_cam.apply(points[good]), rig_from_cam.rotate(normals[good]), depth_map.confidence[good].astype(float)
