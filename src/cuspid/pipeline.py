@@ -45,6 +45,7 @@ from cuspid.stereo.stage import StoredDepthMaps, measure_depth, measure_enough_d
 from cuspid.stereo.temporal import TemporalOptions
 from cuspid.surface.cleaning import CleaningOptions
 from cuspid.surface.fusion import FusionOptions
+from cuspid.surface.sharp_edges import SharpEdgeOptions
 from cuspid.surface.stage import find_holes, fuse
 from cuspid.tolerances import NominalOptions, held
 from cuspid.trueness import GroundTruth
@@ -113,6 +114,8 @@ class ReconstructionOptions(Options):
     """How depth maps are fused into one surface."""
     cleaning: CleaningOptions = field(default_factory=CleaningOptions)
     """What is removed from the surface."""
+    sharp_edges: SharpEdgeOptions = field(default_factory=SharpEdgeOptions)
+    """How sharp edges are restored."""
 
 
 def reconstruct(
@@ -170,7 +173,7 @@ def surface(
     else:
         depths = _textured_depth(of_size, found, lengths_mm[0], folder, options, progress)
     give_back()
-    how = _of_quality(options, lengths_mm[0]), options.cleaning
+    how = _of_quality(options, lengths_mm[0]), options.cleaning, options.sharp_edges
     return fuse(
         *(depths, depths.digest, _poses(found, depths), *lengths_mm, folder, *how),
         expected=found.expectation,

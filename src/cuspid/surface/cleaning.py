@@ -41,7 +41,7 @@ class Hole:
 
 @dataclass(frozen=True, kw_only=True)
 class CleaningReport:
-    """What was removed and which holes remain."""
+    """What was removed or moved, and which holes remain."""
 
     removed_pieces: int
     """Floating pieces."""
@@ -57,6 +57,8 @@ class CleaningReport:
     """Open places inside the surface, largest first."""
     outer_boundary_mm: float
     """Length of the outer boundaries, one for each piece."""
+    sharpened_vertices: int = 0
+    """Vertices that were moved afterwards onto sharp edges (:mod:`cuspid.surface.sharp_edges`)."""
 
 
 def clean(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from cuspid.surface.cleaning import CleaningOptions, clean
 from cuspid.surface.fusion import Fused, FusionOptions
 from cuspid.surface.fusion import find_holes as find_holes_of_depth_maps
 from cuspid.surface.fusion import fuse as fuse_depth_maps
+from cuspid.surface.sharp_edges import SharpEdgeOptions, sharpened
 from cuspid.workers import usable_cores
 
 _CODE = ("surface",)
@@ -58,19 +60,20 @@ def fuse(
     folder: Path,
     fusion: FusionOptions,
     cleaning: CleaningOptions,
+    sharp_edges: SharpEdgeOptions,
     *,
     expected: Expectation | None = None,
     progress: Progress = silent,
 ) -> tuple[Mesh, Float[np.ndarray, "v"]]:
-    """One clean mesh: ``mesh.ply`` with colour and ``sigma_um``, ``mesh.stl``, and what was removed in ``mesh.json``.
-    Also returns the standard deviation of each vertex along its normal (um): that of its depth and, if they are
-    ``expected``, of the poses and the calibration.
+    """One clean mesh: ``mesh.ply`` with colour and ``sigma_um``, ``mesh.stl``, and in ``mesh.json`` what was removed
+    and how many vertices were moved onto sharp edges. Also returns the standard deviation of each vertex along its
+    normal (um): that of its depth and, if they are ``expected``, of the poses and the calibration.
 
     ``made_from`` is the digest of the depth maps, which may be iterated more than once; ``detail_mm`` is the detail
     that the handpiece shows, ``working_distance_mm`` how far it is held from the teeth. Raises ReconstructionError
     where they contain nothing.
     """
-    stage = Stage("mesh", folder, [fusion, cleaning, detail_mm, working_distance_mm], _CODE)
+    stage = Stage("mesh", folder, [fusion, cleaning, sharp_edges, detail_mm, working_distance_mm], _CODE)
     files = [folder / name for name in ("mesh.json", "mesh.stl", "mesh.ply")]
 
     def write() -> None:
@@ -79,10 +82,12 @@ def fuse(
             raise ReconstructionError(
                 "no surface: the depth maps are empty; the images need texture (spray, powder) or sharper focus"
             )
-        mesh, report = clean(raw.mesh, working_distance_mm, cleaning)
-        write_json(files[0], report)
+        cleaned, report = clean(raw.mesh, working_distance_mm, cleaning)
+        sigma_um = _sigma_um(cleaned, raw, expected)
+        mesh, moved = sharpened(cleaned, detail_mm, sharp_edges)
+        write_json(files[0], replace(report, sharpened_vertices=moved))
         write_mesh(files[1], mesh)
-        write_mesh(files[2], mesh, values={SIGMA: _sigma_um(mesh, raw, expected)})
+        write_mesh(files[2], mesh, values={SIGMA: sigma_um})
 
     inputs = {"depths": made_from, "poses": digest_of(dict(rig_from_world)), "expected": digest_of(expected)}
     stage.make(inputs, files, write)
