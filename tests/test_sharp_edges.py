@@ -119,7 +119,7 @@ def test_faces_are_never_turned_over() -> None:
 def test_limits() -> None:
     mesh = roof(edge(1.0), 0.3)
     assert sharpened(mesh, DETAIL_MM, SharpEdgeOptions(enabled=False)) == (mesh, 0)
-    assert sharpened(mesh, DETAIL_MM, SharpEdgeOptions(farthest=0.01))[1] < 5
+    assert sharpened(mesh, DETAIL_MM, SharpEdgeOptions(most_outwards=0.01))[1] < 5
     assert sharpened(mesh, DETAIL_MM, SharpEdgeOptions(least_angle_deg=120))[1] == 0
     assert sharpened(mesh, DETAIL_MM, SharpEdgeOptions(roundness=0))[1] == 0
     nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))

@@ -51,8 +51,8 @@ class SharpEdgeOptions(Options):
     inner: Annotated[float, Range(0, 1000)] = 5.0
     """What lies within this distance from an edge may be rounded or cut off, and does not tell where it is (0.06 mm at
     12 um)."""
-    farthest: Annotated[float, Range(0.01, 1000)] = 5.0
-    """No vertex is moved farther (0.06 mm at 12 um)."""
+    most_outwards: Annotated[float, Range(0.01, 1000)] = 2.0
+    """What lies farther below an edge than measuring rounds it (0.024 mm at 12 um) is round."""
     flatness: Annotated[float, Range(0.001, 1000)] = 0.5
     """Largest RMS distance of the flanks from planes (0.006 mm at 12 um)."""
     least_angle_deg: Annotated[float, Range(1, 179)] = 30.0
@@ -88,7 +88,7 @@ def _moved(
 ) -> Float[np.ndarray, "v 3"]:
     """The vertices, with those of the candidates that an edge asks for on it."""
     foot, along = _lines(mesh, candidates, detail_mm, options)
-    places = _onto_edges(mesh, foot, along, options.farthest * detail_mm)
+    places = _onto_edges(mesh, foot, along, options.most_outwards * detail_mm)
     return _without_turned(mesh, np.flatnonzero(np.isfinite(places[:, 0])), places)
 
 
@@ -179,7 +179,7 @@ def _lines(
 
 
 def _onto_edges(
-    mesh: Mesh, foot: Float[np.ndarray, "v 3"], along: Float[np.ndarray, "v 3"], farthest_mm: float
+    mesh: Mesh, foot: Float[np.ndarray, "v 3"], along: Float[np.ndarray, "v 3"], most_mm: float
 ) -> Float[np.ndarray, "v 3"]:
     """New places of the vertices, NaN for those that stay: of the two ends of each side of a face that crosses an edge,
     the one that is nearer to it comes to lie on it. Then no face cuts it off."""
@@ -195,8 +195,8 @@ def _onto_edges(
         distances.append(np.linalg.norm(away - lengthwise, axis=1))
     first = distances[0] <= distances[1]
     near, place = np.where(first, *ends), np.where(first[:, None], *feet)
-    crossed = (sides[0] * sides[1] < 0) & (np.minimum(*distances) < farthest_mm)
-    crossed &= ((place - mesh.vertices[near]) * mesh.vertex_normals[near]).sum(axis=1) > 0
+    outwards = ((place - mesh.vertices[near]) * mesh.vertex_normals[near]).sum(axis=1)
+    crossed = (sides[0] * sides[1] < 0) & (outwards > 0) & (outwards < most_mm)
     places = np.full(mesh.vertices.shape, np.nan)
     places[near[crossed]] = place[crossed]
     own = np.isfinite(places[:, 0]) & np.isfinite(foot[:, 0])
