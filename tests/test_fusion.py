@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cache
@@ -18,10 +19,13 @@ from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.reconstruction import DepthMap
 from cuspid.stereo.stage import StoredDepthMaps
+from cuspid.surface.cleaning import CleaningOptions
 from cuspid.surface.evidence import Evidence, observe, observe_foot
 from cuspid.surface.fusion import FusionOptions, Votes, find_holes
 from cuspid.surface.fusion import fuse as fuse_depth_maps
+from cuspid.surface.sharp_edges import SharpEdgeOptions
 from cuspid.surface.stage import find_holes as find_holes_once
+from cuspid.surface.stage import fuse as fuse_once
 from cuspid.surface.volume import around, find, pack, unpack
 from synthetic_scene import diamond, height_field, true_depth_map
 
@@ -263,6 +267,23 @@ def test_a_sharp_ridge_keeps_its_edge() -> None:
     near = np.abs(mesh.vertices[:, 0]) < 0.1
     assert near.sum() > 100
     assert 0 < np.mean(np.abs(signed_um(mesh, RIDGE)[near])) < 8
+
+
+def test_the_mesh_of_a_scan_has_its_sharp_edges(tmp_path: Path) -> None:
+    """The stage moves vertices onto them, and tells how many; the same depth maps without that cut them off."""
+    maps = depth_maps(height_field(lambda x, y: 5 + 0.8 * np.abs(x + 0.3 * y + 0.013), count=401))
+    y = np.linspace(-1, 1, 100)
+    ridge = np.column_stack([-0.3 * y - 0.013, y, np.full(100, 5.0)])
+    off_um, moved = [], []
+    for enabled in (False, True):
+        options = FusionOptions(voxel_mm=0.05), CleaningOptions(), SharpEdgeOptions(enabled=enabled)
+        mesh, sigma_um = fuse_once(maps, "a", POSES, 0.03, 5.0, tmp_path, *options)
+        assert len(sigma_um) == len(mesh.vertices)
+        off_um.append(1000 * mesh.closest(ridge)[0].mean())
+        moved.append(json.loads((tmp_path / "mesh.json").read_text())["sharpened_vertices"])
+    assert moved[0] == 0 < 20 < moved[1]
+    assert off_um[0] > 8
+    assert off_um[1] < 2
 
 
 def test_coarse_voxels_do_not_coarsen_the_vertices() -> None:

@@ -31,7 +31,7 @@ _RINGS = 2
 _LEAST_FLANK = 0.12
 """Share of the surface around that each flank must have."""
 _ROUNDS = 6
-"""Of the search for the two directions, and that from which on a flank is what lies within a quarter of the angle."""
+"""Of the search for the two directions."""
 _WIDE = 0.85
 """Cosine of the angle within which a flank's faces are looked for at first."""
 _MOST_FACES, _LEAST_FACES = 8192, 20
