@@ -68,7 +68,7 @@ def prepared(results: Sequence[Result]) -> str:
         (result["case"], tooth, *_margin(entry))
         for result in results
         for tooth, entry in result.get("margins", {}).items()
-        if result["case"] in (f"prepared-{tooth}", arch)
+        if result["case"] in (f"prepared-{tooth}", f"all-round-{tooth}", arch)
     ]
     margin_head = ("scan", "FDI", "evaluated %", "found %", "mean", "SD", "P95", "max", "outward", "detector's floor")
     return "\n".join(

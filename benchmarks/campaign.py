@@ -70,6 +70,7 @@ BENCHMARKS = (
     case("real-arch", "--jaw {jaws}/fullarch_upper_137k.ply"),
     *(case(f"prepared-{tooth}") for tooth in (35, 36, 42, 45, 46)),
     case("prepared-arch"),
+    *(case(f"all-round-{tooth}") for tooth in (35, 36, 42, 45)),
     case("spheres"),
     Benchmark("fuzz", "fuzz.py --out {out}"),
     Benchmark("kill", "kill.py --work {work} --out {out}"),

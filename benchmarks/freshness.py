@@ -54,7 +54,9 @@ class Maker:
 
 _SCAN = ("scan", "jaws")
 MAKERS: Mapping[str, Maker] = {
-    **dict.fromkeys(("molar-*", "arch", "real-arch", "spheres", "prepared-*"), Maker("run", _SCAN, release=True)),
+    **dict.fromkeys(
+        ("molar-*", "arch", "real-arch", "spheres", "prepared-*", "all-round-*"), Maker("run", _SCAN, release=True)
+    ),
     "motion-*": Maker("compare_motion", _SCAN),
     "qualities": Maker("qualities", _SCAN, runs=("staged",)),
     "live": Maker("live", _SCAN),

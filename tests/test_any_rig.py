@@ -361,6 +361,8 @@ def test_what_was_asked_for_goes_before_the_quality() -> None:
     assert pipeline.settled(asked).left_share == 1
     assert pipeline.settled(replace(asked, left_share=0.3)).left_share == 0.3
     assert pipeline.settled(asked).stereo.refinement.bend_px == 1000
+    assert pipeline.settled(asked).fusion.finer_bends is False
+    assert pipeline.settled(replace(asked, fusion=FusionOptions(finer_bends=True))).fusion.finer_bends is True
     fine = ReconstructionOptions(quality="fine")
     assert pipeline.settled(fine).stereo.grid_px < pipeline.settled(ReconstructionOptions()).stereo.grid_px
     assert pipeline.settled(replace(fine, stereo=StereoOptions(spacing_px=5))).stereo.grid_px == 5

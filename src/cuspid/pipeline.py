@@ -257,7 +257,7 @@ def settled(options: ReconstructionOptions) -> ReconstructionOptions:
 
 def _drafted(options: ReconstructionOptions) -> ReconstructionOptions:
     """As for a draft, where nothing else was asked for."""
-    tracking, temporal = options.tracking, options.temporal
+    tracking, temporal, fusion = options.tracking, options.temporal, options.fusion
     features = tracking.features
     if features.count is None:
         features = replace(features, count=_DRAFT_KEYPOINTS)
@@ -267,10 +267,13 @@ def _drafted(options: ReconstructionOptions) -> ReconstructionOptions:
         temporal = replace(temporal, left_share=_DRAFT_TEMPORAL_LEFT_SHARE)
     if temporal.small_holes is None:
         temporal = replace(temporal, small_holes=False)
+    if fusion.finer_bends is None:
+        fusion = replace(fusion, finer_bends=False)
     stereo = options.stereo
     if stereo.refinement.bend_px is None:
         stereo = replace(stereo, refinement=replace(stereo.refinement, bend_px=_DRAFT_BEND_PX))
-    return replace(options, tracking=replace(tracking, features=features), stereo=stereo, temporal=temporal)
+    tracking = replace(tracking, features=features)
+    return replace(options, tracking=tracking, stereo=stereo, temporal=temporal, fusion=fusion)
 
 
 def as_known(handpiece: Handpiece, options: ReconstructionOptions) -> Handpiece:

@@ -15,7 +15,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import IO
@@ -30,6 +30,8 @@ PACKAGES = ("cuspid", "numpy", "numba", "opencv-contrib-python-headless", "pycol
 PREPARED = (46, 45, 42, 36, 35)
 """Teeth (FDI) of the thesis' reference model (Fig 3.20), in the order B, C, D, F, E of its Table 3.2: cracked, crown,
 full-contour crown, and two inlays."""
+WITH_MARGIN = (45, 42, 36, 35)
+"""Those of them that have a margin."""
 ONE_PASS = ("--passes", "turns")
 """Whole arches are measured in one pass, as the thesis scans them."""
 _LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
@@ -122,7 +124,8 @@ class ScanCase:
 
 
 def scan_cases(jaw: Path | None = None) -> dict[str, ScanCase]:
-    """Three seeds of a molar, the arch, a user's own arch, the sphere arch, and the thesis' reference model."""
+    """Three seeds of a molar, the arch, a user's own arch, the sphere arch, the thesis' reference model, and its teeth
+    with margins from all sides."""
     table = {
         f"molar-seed{seed}": ScanCase(seed=seed, simulate=("--tooth", "46", "--jaw-seed", str(seed)))
         for seed in range(3)
@@ -131,7 +134,13 @@ def scan_cases(jaw: Path | None = None) -> dict[str, ScanCase]:
     if jaw is not None:
         table["real-arch"] = ScanCase(jaw=str(jaw.resolve()), simulate=ONE_PASS)
     table["spheres"] = ScanCase(jaw="spheres.ply", make=("phantom", "--spheres"), simulate=ONE_PASS)
-    return table | prepared_cases()
+    prepared = prepared_cases()
+    return table | prepared | {f"all-round-{tooth}": _all_round(prepared[f"prepared-{tooth}"]) for tooth in WITH_MARGIN}
+
+
+def _all_round(case: ScanCase) -> ScanCase:
+    """The same, with further passes where two cameras would see little."""
+    return replace(case, simulate=(*case.simulate, "--passes", "auto"))
 
 
 def prepared_cases() -> dict[str, ScanCase]:

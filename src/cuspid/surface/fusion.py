@@ -3,8 +3,9 @@
 The first pass blends signed distances in a sparse volume, whose zero level gives the topology. The second evaluates
 every depth map at every vertex and moves the vertex along its normal to the robust weighted mean of the surfaces that
 were seen, which removes the rounding by the voxels; it also counts the maps that saw the vertex, and averages its
-colour. A vertex that too few maps confirm from its outer side, or for which none has a depth, is dropped: this removes
-ghosts, back walls, and what is only extrapolated past the borders of all maps.
+colour. Where the surface bends, as at edges, the mesh gets vertices at half the spacing before. A vertex that too few
+maps confirm from its outer side, or for which none has a depth, is dropped: this removes ghosts, back walls, and what
+is only extrapolated past the borders of all maps.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from cuspid.mesh import Mesh, used_vertices
 from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import DepthMap, SurfacePoints
+from cuspid.surface.bends import bent, halved
 from cuspid.surface.cleaning import hole_rims
 from cuspid.surface.evidence import Evidence, colors_of, observe
 from cuspid.surface.meshing import extract
@@ -60,6 +62,9 @@ class FusionOptions(Options):
     weight."""
     least_maps: Annotated[int, Range(1, 10_000)] = 2
     """Number of depth maps that must confirm a vertex."""
+    finer_bends: bool | None = None
+    """Vertices at half the spacing where the surface bends by more than 20 degrees from vertex to vertex, as at edges.
+    Default: yes, but not for a draft."""
 
     def voxel_for(self, detail_mm: float) -> float:
         """Spacing of the grid for a handpiece, mm."""
@@ -96,7 +101,7 @@ def find_holes(
     """Places on the rims of the holes of the mesh that :func:`fuse` would give on a grid of twice the spacing. Same
     arguments as there."""
     options = options or FusionOptions()
-    coarse = replace(options, voxel_mm=2 * options.voxel_for(detail_mm))
+    coarse = replace(options, voxel_mm=2 * options.voxel_for(detail_mm), finer_bends=False)
     votes = _votes(depth_maps, rig_from_world, detail_mm, coarse, "holes", progress)
     mesh = votes.outcome(options.least_maps).mesh
     rims = hole_rims(mesh)
@@ -124,7 +129,8 @@ def _votes(
     for batch in map_batches(reached, _located(depth_maps, rig_from_world)):
         volume.integrate([where for _, where in batch])
         progress(stage, batch[-1][0], 2 * half)
-    votes = Votes.on(extract(volume, options.least_weight))
+    rough = extract(volume, options.least_weight)
+    votes = Votes.on(halved(rough, bent(rough, _RINGS)) if options.finer_bends is not False else rough)
     del volume
 
     def in_view(one: _Located) -> Voter:
@@ -166,6 +172,13 @@ def _located(depth_maps: Iterable[DepthMap], rig_from_world: Mapping[str, Rigid3
 
 _USUAL = 3
 """The scatter of a vertex is estimated as if this many more frames had the usual one, because few frames see it."""
+_RINGS = 1
+"""So many vertices beside a place where the surface bends get finer faces, too."""
+_LEAST_FACING = 0.7
+"""A depth map that sees a surface turned farther away than this from a vertex (cosine between their normals) sees
+another one, as beyond an edge."""
+_LEAST_FRONTAL = 0.02
+"""Votes count as if the camera looked along the surface no more than this (cosine)."""
 CHUNK = 256
 """Number of vertices that are tested together for being in the view of a depth map."""
 
@@ -321,10 +334,13 @@ def _vote(
                 continue
             distance = seen[0]
             facing = normal[0] * seen[2] + normal[1] * seen[3] + normal[2] * seen[4]
-            if abs(distance) >= agreement or facing < 0.3:
+            if abs(distance) >= agreement or facing < _LEAST_FACING:
                 continue
             closeness = 1 - (distance / agreement) ** 2
-            weight = seen[1] * closeness * closeness
+            # Seen along the surface, the pixel of a vertex beside an edge shows mostly the other side of the edge.
+            frontal = -(x[0] * normal[0] + x[1] * normal[1] + x[2] * normal[2])
+            frontal = max(frontal / np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2]), _LEAST_FRONTAL)
+            weight = seen[1] * frontal * (facing * facing * closeness) ** 2
             moment[n, 0] += weight
             # A vertex outside of the surface moves against its normal.
             moment[n, 1] -= weight * distance / facing

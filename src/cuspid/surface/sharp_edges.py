@@ -21,13 +21,12 @@ from jaxtyping import Bool, Float, Int
 from cuspid.kernels import kernel
 from cuspid.mesh import Mesh, used_vertices
 from cuspid.options import Options, Range
+from cuspid.surface.bends import bent
 from cuspid.surface.volume import around, pack
 from cuspid.workers import in_shares
 
-_BENT_DEG = 20.0
-"""Neighbouring normals differ by more beside an edge."""
 _RINGS = 2
-"""So many vertices beside such a place are tried, too."""
+"""So many vertices beside a place where the surface bends are tried, too."""
 _LEAST_FLANK = 0.12
 """Share of the surface around that each flank must have."""
 _ROUNDS = 6
@@ -69,17 +68,15 @@ def sharpened(mesh: Mesh, detail_mm: float, options: SharpEdgeOptions | None = N
     ``detail_mm`` is the detail that the handpiece shows (:func:`cuspid.pairing.detail_mm`).
     """
     options = options or SharpEdgeOptions()
-    bent = np.zeros(len(mesh.vertices), dtype=bool)
-    if options.enabled:
-        _mark_bent(mesh.faces, mesh.vertex_normals, np.cos(np.deg2rad(_BENT_DEG)), bent)
-    if not bent.any():
+    if not options.enabled:
         return mesh, 0
-    for _ in range(_RINGS):
-        bent = _with_neighbours(mesh.faces, bent)
-    near = _within_reach(mesh, bent, options.reach * detail_mm)
+    candidates = bent(mesh, _RINGS)
+    if not candidates.any():
+        return mesh, 0
+    near = _within_reach(mesh, candidates, options.reach * detail_mm)
     used = used_vertices(mesh.faces[near], len(mesh.vertices))
     vertices = mesh.vertices.copy()
-    vertices[used] = _moved(mesh.submesh(near), np.flatnonzero(bent[used]), detail_mm, options)
+    vertices[used] = _moved(mesh.submesh(near), np.flatnonzero(candidates[used]), detail_mm, options)
     return replace(mesh, vertices=vertices), int((vertices != mesh.vertices).any(axis=1).sum())
 
 
@@ -90,29 +87,6 @@ def _moved(
     foot, along = _lines(mesh, candidates, detail_mm, options)
     places = _onto_edges(mesh, foot, along, options.most_outwards * detail_mm)
     return _without_turned(mesh, np.flatnonzero(np.isfinite(places[:, 0])), places)
-
-
-@kernel
-@no_type_check
-def _mark_bent(faces, normals, cosine, bent):
-    """Mark both ends of each side of a face along which the surface turns by more than an angle."""
-    for face in faces:
-        for k in range(3):
-            one, other = face[k], face[(k + 1) % 3]
-            if _dot(normals[one], normals[other]) < cosine:
-                bent[one] = bent[other] = True
-
-
-@kernel
-@no_type_check
-def _with_neighbours(faces, marked):
-    """What is marked, and the vertices that share a face with it."""
-    more = marked.copy()
-    for face in faces:
-        if marked[face[0]] or marked[face[1]] or marked[face[2]]:
-            for corner in face:
-                more[corner] = True
-    return more
 
 
 def _within_reach(mesh: Mesh, candidates: Bool[np.ndarray, "v"], reach_mm: float) -> Bool[np.ndarray, "f"]:
@@ -173,8 +147,8 @@ def _lines(
         _find_lines(surface, candidates, share, shares, limits, foot, along)
 
     in_shares(work)
-    outwards = ((foot - mesh.vertices) * mesh.vertex_normals).sum(axis=1) > 0
-    foot[~outwards] = along[~outwards] = np.nan
+    inwards = ~(_outwards(mesh, np.arange(len(foot)), foot) > 0)
+    foot[inwards] = along[inwards] = np.nan
     return foot, along
 
 
@@ -195,13 +169,19 @@ def _onto_edges(
         distances.append(np.linalg.norm(away - lengthwise, axis=1))
     first = distances[0] <= distances[1]
     near, place = np.where(first, *ends), np.where(first[:, None], *feet)
-    outwards = ((place - mesh.vertices[near]) * mesh.vertex_normals[near]).sum(axis=1)
+    outwards = _outwards(mesh, near, place)
     crossed = (sides[0] * sides[1] < 0) & (outwards > 0) & (outwards < most_mm)
     places = np.full(mesh.vertices.shape, np.nan)
     places[near[crossed]] = place[crossed]
-    own = np.isfinite(places[:, 0]) & np.isfinite(foot[:, 0])
+    own = np.flatnonzero(np.isfinite(places[:, 0]) & np.isfinite(foot[:, 0]))
+    own = own[_outwards(mesh, own, foot[own]) < most_mm]
     places[own] = foot[own]
     return places
+
+
+def _outwards(mesh: Mesh, vertices: Int[np.ndarray, "n"], places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """How far outwards of vertices these places lie, mm."""
+    return np.asarray(((places - mesh.vertices[vertices]) * mesh.vertex_normals[vertices]).sum(axis=1))
 
 
 def _without_turned(
