@@ -93,23 +93,35 @@ def test_no_vertex_lies_where_no_map_has_a_depth() -> None:
     assert np.any([is_measured(each, vertices) for each in maps], axis=0).mean() > 0.998
 
 
-@pytest.mark.parametrize("noise_mm", [0.002, 0.01])
-def test_depth_is_as_uncertain_as_it_says(noise_mm: float) -> None:
-    """Each frame is off by a smooth error of its own; where all three see the surface."""
+def off_and_said_um(noise_mm: float, others: float) -> tuple[np.ndarray, np.ndarray]:
+    """How far vertices are off where all three frames see them, each with a smooth error of its own, and how far they
+    are said to be; the confidence of the other two is that of the first times ``others``."""
     rng = np.random.default_rng(0)
     noisy = []
     for each in depth_maps(HILLS, names=("west",)):
         error = cv2.resize(
             rng.normal(0, noise_mm, (12, 12)), each.depth_mm.shape[::-1], interpolation=cv2.INTER_NEAREST
         )
-        noisy.append(replace(each, depth_mm=each.depth_mm + cv2.GaussianBlur(error, (0, 0), 1.5).astype(np.float32)))
+        depth = each.depth_mm + cv2.GaussianBlur(error, (0, 0), 1.5).astype(np.float32)
+        share = np.float32(1.0 if each.frame == "00000" else others)
+        noisy.append(replace(each, depth_mm=depth, confidence=share * each.confidence))
     fused = fuse_depth_maps(noisy, POSES, DETAIL_MM)
     assert len(fused.sigma_mm) == len(fused.mesh.vertices) > 3000
     inside = np.abs(fused.mesh.vertices[:, :2] - fused.mesh.vertices[:, :2].mean(axis=0)).max(axis=1) < 1.5
-    off, said = signed_um(fused.mesh, HILLS)[inside], 1000 * fused.sigma_mm[inside]
+    return signed_um(fused.mesh, HILLS)[inside], 1000 * fused.sigma_mm[inside]
+
+
+@pytest.mark.parametrize("noise_mm", [0.002, 0.01])
+def test_depth_is_as_uncertain_as_it_says(noise_mm: float) -> None:
+    off, said = off_and_said_um(noise_mm, 1.0)
     assert 0.7 < np.sqrt(np.mean(said**2) / np.mean(off**2)) < 1.4
     assert 0.55 < np.mean(np.abs(off) < said) < 0.85
     assert 0.88 < np.mean(np.abs(off) < 2 * said) < 0.99
+
+
+def test_frames_that_count_less_make_depth_less_certain() -> None:
+    off, said = off_and_said_um(0.01, 0.15)
+    assert 0.7 < np.sqrt(np.mean(said**2) / np.mean(off**2)) < 1.4
 
 
 def test_maps_of_one_frame_count_as_one() -> None:
@@ -276,16 +288,17 @@ def seen_from(*turns: float) -> dict[str, Rigid3]:
     return {f"{k:05d}": Rigid3(rotation, middle - rotation @ middle) for k, rotation in enumerate(turned)}
 
 
-@pytest.mark.parametrize("turns", [(0.0, 0.9), (-0.7, 0.7), (0.0, 0.9, -0.2)])
-def test_a_flank_is_not_pulled_to_the_other_one_of_its_edge(turns: tuple[float, ...]) -> None:
-    """A camera that looks along a flank sees it coarsely: its pixels there show mostly the other flank."""
+@pytest.mark.parametrize(("turns", "most_um"), [((0.0, 0.9), 0.25), ((-0.7, 0.7), 0.78), ((0.0, 0.9, -0.2), 0.2)])
+def test_a_flank_is_not_pulled_to_the_other_one_of_its_edge(turns: tuple[float, ...], most_um: float) -> None:
+    """A camera that looks along a flank sees it coarsely: its pixels there show mostly the other flank. Without one of
+    the three measures against that, the mean is a tenth to a half larger; without all, five to ten times."""
     roof = height_field(lambda x, y: 5 + np.abs(x + 0.3 * y + 0.013), 2.0, count=401)
     mesh = fuse(depth_maps(roof, seen_from(*turns)), seen_from(*turns))
     x, y, _ = mesh.vertices.T
     across = np.sqrt(2) * np.abs(x + 0.3 * y + 0.013) / np.hypot(1, 0.3)
     beside = (across > 0.03) & (across < 0.15) & (np.abs(y) < 0.8)
     assert beside.sum() > 500
-    assert 0 < np.abs(signed_um(mesh, roof)[beside]).mean() < 1.0
+    assert 0 < np.abs(signed_um(mesh, roof)[beside]).mean() < most_um
 
 
 def test_the_mesh_is_finer_where_it_bends() -> None:

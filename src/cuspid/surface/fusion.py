@@ -172,6 +172,8 @@ def _located(depth_maps: Iterable[DepthMap], rig_from_world: Mapping[str, Rigid3
 
 _USUAL = 3
 """The scatter of a vertex is estimated as if this many more frames had the usual one, because few frames see it."""
+_SEVERAL = 1.5
+"""The usual scatter is that of vertices with more frames than this."""
 _RINGS = 1
 """So many vertices beside a place where the surface bends get finer faces, too."""
 _LEAST_FACING = 0.7
@@ -217,8 +219,10 @@ class Votes:
     """Number of depth maps that confirm the vertex."""
     measured: Bool[np.ndarray, "v"]
     """Whether one of them has a depth there itself; others may only extrapolate from nearby depths."""
-    frames: Int[np.ndarray, "v 2"]
-    """Number of frames that confirm it, and the last of them: the maps of a frame are consecutive."""
+    last: Int[np.ndarray, "v"]
+    """The last frame that confirms it: the maps of a frame are consecutive."""
+    frames: Float[np.ndarray, "v 2"]
+    """Sum of the weights of that frame, and the sum of the squares of such sums of all frames."""
 
     @staticmethod
     def on(rough: Mesh) -> Votes:
@@ -229,9 +233,9 @@ class Votes:
         for ball, chunk in zip(balls, chunks, strict=True):
             ball[:3] = (chunk.min(axis=0) + chunk.max(axis=0)) / 2
             ball[3] = np.linalg.norm(chunk - ball[:3], axis=1).max()
-        whole = np.zeros((count, 2), dtype=np.int64)
-        maps, measured = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool)
-        return Votes(rough, balls, np.zeros((count, 3)), np.zeros((count, 3)), maps, measured, whole)
+        moment, color, frames = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 2))
+        maps, last = np.zeros((2, count), dtype=np.int64)
+        return Votes(rough, balls, moment, color, maps, np.zeros(count, dtype=bool), last, frames)
 
     def in_view(self, evidence: Evidence, depth_map: DepthMap, cam_from_world: Rigid3, frame: int) -> Voter:
         """A depth map with the vertices that it may see; ``frame`` is the number of its frame, starting from 1."""
@@ -259,6 +263,7 @@ class Votes:
                     self.color,
                     self.maps,
                     self.measured,
+                    self.last,
                     self.frames,
                     voter.frame,
                 )
@@ -288,8 +293,9 @@ class Votes:
     def _sigma_mm(self) -> Float[np.ndarray, "v"]:
         mean, square = (self.moment[:, 1:] / np.maximum(self.moment[:, :1], 1e-12)).T
         variance = np.maximum(square - mean**2, 0)
-        frames = np.maximum(self.frames[:, 0], 1)
-        several = frames > 1
+        # As many frames of equal weight (L. Kish, Survey Sampling, 1965).
+        frames = np.maximum(self.moment[:, 0] ** 2 / np.maximum(self.frames[:, 1], 1e-24), 1)
+        several = frames > _SEVERAL
         told = variance[several] * frames[several] / (frames[several] - 1)
         usual = np.median(told) if len(told) else 0.0
         return np.asarray(np.sqrt((frames * variance + _USUAL * usual) / (frames - 1 + _USUAL) / frames))
@@ -315,6 +321,7 @@ def _vote(
     color,
     maps,
     measured,
+    last,
     frames,
     frame,
 ):
@@ -349,5 +356,7 @@ def _vote(
                 color[n, channel] += weight * colors[int(seen[5]), channel]
             maps[n] += 1
             measured[n] |= known[int(seen[5])]
-            if frames[n, 1] != frame:
-                frames[n, 0], frames[n, 1] = frames[n, 0] + 1, frame
+            if last[n] != frame:
+                last[n], frames[n, 0] = frame, 0
+            frames[n, 1] += (2 * frames[n, 0] + weight) * weight
+            frames[n, 0] += weight
