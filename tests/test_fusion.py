@@ -291,7 +291,7 @@ def seen_from(*turns: float) -> dict[str, Rigid3]:
 @pytest.mark.parametrize(("turns", "most_um"), [((0.0, 0.9), 0.25), ((-0.7, 0.7), 0.78), ((0.0, 0.9, -0.2), 0.2)])
 def test_a_flank_is_not_pulled_to_the_other_one_of_its_edge(turns: tuple[float, ...], most_um: float) -> None:
     """A camera that looks along a flank sees it coarsely: its pixels there show mostly the other flank. Without one of
-    the three measures against that, the mean is a tenth to a half larger; without all, five to ten times."""
+    the three measures against that, the mean is a tenth to a half larger; without all, four to seven times."""
     roof = height_field(lambda x, y: 5 + np.abs(x + 0.3 * y + 0.013), 2.0, count=401)
     mesh = fuse(depth_maps(roof, seen_from(*turns)), seen_from(*turns))
     x, y, _ = mesh.vertices.T
