@@ -2,12 +2,15 @@
 
     python benchmarks/panorama.py --out benchmarks/results/panorama [--jaws FILE_OR_FOLDER ...] [--work FOLDER]
         [--subject lower-14-0 ...] [--films-only]
-        [--method ortho return s-shape natural pair thesis thesis-unexamined opencv-panorama opencv-scans]
+        [--method ortho callipers return s-shape cross natural pair thesis thesis-unexamined
+                  opencv-panorama opencv-scans]
 
 Subjects are phantoms of the population, and jaws of your own, whose coarse faces are subdivided (Loop) first; the
 subdivided mesh is then the reference. All are filmed in 120 frames with full shake and the texture ``enamel``, for the
-method ``pair`` by two cameras, for ``return`` and ``s-shape`` on another way over the arch, for ``natural`` with the
-texture of that name. One JSON a subject and method goes to the results folder; what is there already is not made again.
+method ``pair`` by two cameras, for ``return``, ``s-shape`` and ``cross`` on another way over the arch (``cross`` needs
+surface between its sides), for ``natural`` with the texture of that name. ``callipers`` is told the width of the true
+arch over its teeth, read to half a millimetre. One JSON a subject and method goes to the results folder; what is there
+already is not made again.
 """
 
 from __future__ import annotations
@@ -34,7 +37,7 @@ from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.phantom.population import GroupName, draw_population
 from cuspid.evaluation.panorama import PanoramaEvaluationOptions
-from cuspid.jaw import Jaw
+from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh, edges_of
 
 PHANTOMS: tuple[tuple[GroupName, int], ...] = (
@@ -97,6 +100,7 @@ FILMS: Mapping[str, tuple[str, ...]] = {
     "film-pair": ("--camera.cameras", "2"),
     "film-return": ("--path", "return"),
     "film-s-shape": ("--path", "s-shape"),
+    "film-cross": ("--path", "cross"),
     "film-natural": ("--texture", "natural"),
 }
 """Films of a subject, and by which options."""
@@ -164,6 +168,18 @@ def stitched(*options: str) -> Callable[[Path, Path, int], list[str]]:
     return lambda capture, out, _: [*CUSPID, "stitch", str(capture), "--method", *options, "--out", str(out)]
 
 
+def measured_across(capture: Path, out: Path, limit_s: int) -> list[str]:
+    """The command of one who has measured the width of the arch."""
+    return [*stitched("ortho")(capture, out, limit_s), "--scale.width-mm", f"{calliper_mm(capture.parents[1])}"]
+
+
+def calliper_mm(folder: Path) -> float:
+    """Greatest width of a subject over its teeth, as callipers tell it."""
+    jaw = storage.read_jaw(folder / "jaw.ply")
+    teeth = jaw.mesh.faces if jaw.face_labels is None else jaw.mesh.faces[jaw.face_labels != GUM]
+    return round(2 * float(np.ptp(jaw.mesh.vertices[teeth, 0]))) / 2
+
+
 def opencv(mode: str) -> Callable[[Path, Path, int], list[str]]:
     """The command of a mode of OpenCV's Stitcher."""
     script = str(Path(__file__).with_name("opencv_stitcher.py"))
@@ -175,7 +191,8 @@ def opencv(mode: str) -> Callable[[Path, Path, int], list[str]]:
 CUSPID = (sys.executable, "-m", "cuspid")
 METHODS: Mapping[str, Callable[[Path, Path, int], list[str]]] = {
     "ortho": stitched("ortho"),
-    **dict.fromkeys(("pair", "return", "s-shape", "natural"), stitched("ortho")),
+    "callipers": measured_across,
+    **dict.fromkeys(("pair", "return", "s-shape", "cross", "natural"), stitched("ortho")),
     "thesis": stitched("thesis"),
     "thesis-unexamined": stitched("thesis", "--no-examination"),
     "opencv-panorama": opencv("panorama"),

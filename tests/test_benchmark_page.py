@@ -227,3 +227,14 @@ def test_no_wall_time_of_a_shared_machine_is_judged(freshness, wall_s, cpu_s, to
 @pytest.mark.parametrize(("value", "told"), [(-2.0, "-2.0"), (2.04, "**+2.0** (missed)"), (-3.0, "**-3.0** (missed)")])
 def test_a_figure_is_within_its_limit_on_both_sides(freshness, value, told):
     assert import_module("panorama_sections").within(value, 2.0, 1) == told
+
+
+def test_a_path_is_counted_by_its_films_and_those_without_an_arch_are_within_no_limit(freshness):
+    def film(subject, median_mm, scale_pct, complete=True):
+        geometry = {"median_mm": median_mm, "p95_mm": 3 * median_mm, "scale_error_pct": scale_pct}
+        return {"subject": subject, "score": {"geometry": geometry, "complete": complete}}
+
+    one_pass = [film("a", 0.3, 5.0), film("b", 0.05, 5.0), film("c", 0.4, 5.0)]
+    swung = [film("a", 0.1, -2.0), film("b", 0.15, 3.0, complete=False), {"subject": "c", "score": None}]
+    row = import_module("panorama_sections").path_row("s-shape", swung, {each["subject"]: each for each in one_pass})
+    assert row == ["`s-shape`", "3", "0.12 (0.10-0.15)", "0.38 (0.30-0.45)", "1", "2", "1", "1", "1 of 2"]
