@@ -16,7 +16,6 @@ from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.gloss import leaving
-from cuspid.panorama import FrameUse
 from cuspid.reconstruction import Tracks
 from cuspid.sparse_model import SparseModel
 from cuspid.stitching.compared import Compared, frames_beside, partners
@@ -24,13 +23,12 @@ from cuspid.stitching.height_map import (
     HeightMap,
     HeightMapOptions,
     ScaleOptions,
-    crown_width,
     height_map,
     transformed,
     uncovered,
 )
 from cuspid.stitching.mosaic import Mosaic, MosaicOptions, compose
-from cuspid.stitching.ortho import OrthoOptions, Shown, find_surface, find_surface_again, orthophoto
+from cuspid.stitching.ortho import OrthoOptions, Shown, find_surface, find_surface_again
 from cuspid.stitching.plane_sweep import PlaneSweepOptions, plane_sweep
 
 HALF_MM, DEEP_MM, CAMERA_MM = 3.0, 4.0, 14.0
@@ -183,39 +181,6 @@ def test_a_known_width_sets_the_scale_of_the_better_path_and_of_its_surface(scen
     assert again.dense.cell_mm == pytest.approx(shown.dense.cell_mm / 1.05, rel=0.01)
     spans = [np.ptp(each.dense.places[each.dense.known][:, :2], axis=0) for each in (again, shown) if each.dense]
     np.testing.assert_allclose(spans[0], spans[1] / 1.05, rtol=0.02)
-
-
-@pytest.mark.parametrize("width_mm", [15.0, 17.0])
-def test_a_panorama_is_as_wide_as_was_measured_wherever_the_points_of_its_path_end(
-    scene: Scene, width_mm: float
-) -> None:
-    """The points reach farther out than the surface that is found; over smooth enamel it is the other way round."""
-    options = OrthoOptions(scale=ScaleOptions(width_mm=width_mm))
-    shown = find_surface(scene.motion, scene.read, options, working_distance_mm=14.0)
-    made = orthophoto(shown, [FrameUse(name=name, used=True) for name in scene.motion.frames], scene.read, options)
-    assert made.panorama.mm_per_px is not None
-    columns = np.flatnonzero(made.panorama.mm_per_px * made.panorama.covered.sum(axis=0) >= 1.0)
-    assert np.ptp(columns) * made.panorama.mm_per_px == pytest.approx(width_mm, rel=0.03)
-
-
-@given(st.floats(40, 80), st.floats(5.5, 12), st.floats(0.05, 0.4), st.floats(-30, 30))
-def test_the_width_of_crowns_is_that_between_their_equators(
-    width_mm: float, gum_mm: float, cell_mm: float, shift_mm: float
-) -> None:
-    """Two rows of crowns with gum beside them, and a speck outside that callipers do not touch."""
-    x, y = (np.arange(-half, half, cell_mm) for half in (width_mm / 2 + 8, 5.0))
-    off = np.abs(np.abs(x) - width_mm / 2 + 4.0)
-    heights = np.broadcast_to(np.where(off < 4.0, -0.25 * off**2, -gum_mm), (len(y), len(x))).astype(np.float32).copy()
-    heights[: max(1, int(0.9 / cell_mm)), 0] = 0.0
-    surface = HeightMap(
-        corner=np.array([x[0] + shift_mm, y[0]]), cell_mm=cell_mm, heights=heights, known=np.ones(heights.shape, bool)
-    )
-    assert crown_width(surface) == pytest.approx(width_mm, abs=2.1 * cell_mm)
-
-
-def test_where_nothing_is_known_no_crown_has_a_width() -> None:
-    heights = np.zeros((20, 20), np.float32)
-    assert crown_width(HeightMap(corner=np.zeros(2), cell_mm=0.4, heights=heights, known=heights > 0)) is None
 
 
 def test_what_is_textured_is_known_and_what_is_plain_or_beyond_is_not(surface: HeightMap) -> None:

@@ -13,7 +13,7 @@ from typing import Annotated, no_type_check
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from scipy.ndimage import gaussian_filter, grey_dilation, maximum_filter
+from scipy.ndimage import gaussian_filter, grey_dilation
 from scipy.spatial import KDTree
 from skimage.morphology import remove_small_holes
 
@@ -52,9 +52,6 @@ _RIM_MM, _OVER_MM = 0.4, 0.2
 """The surface occludes what it stands over by more than the second, farther away than the first."""
 HOLE_MM2 = 20.0
 """Holes up to this size in what is known or seen of the teeth are none."""
-_BESIDE_MM, _EQUATOR_MM, _LEAST_RIM_MM = 6.0, 4.5, 1.0
-"""A crown is widest no deeper than the second below the highest place within the first, and below the occlusal plane;
-the third is how much of it callipers must touch."""
 _CROWN_MM, _HOLLOW_MM = 1.5, 3.0
 """Crowns lie no deeper below the smooth surface, and their hollows no deeper below the tips of the cusps."""
 
@@ -67,8 +64,7 @@ class ScaleOptions(Options):
     """Median height of the camera above the cusp tips; default: that of the calibration file. Without either, no
     millimetres are stated."""
     width_mm: Annotated[float | None, Range(1, 1000)] = None
-    """Known greatest width of the arch across the teeth, left to right, as callipers tell it; takes precedence over the
-    working distance."""
+    """Known greatest width of the arch across the teeth, left to right; takes precedence over the working distance."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,8 +198,7 @@ def in_occlusal_frame(model: SparseModel, scale: ScaleOptions | None) -> SparseM
 
 def scale_factor(model: SparseModel, scale: ScaleOptions) -> float:
     """By what a motion in the occlusal frame is to be scaled: to the known width of the arch, else to the working
-    distance, else to `NOMINAL_MM`. Smooth enamel has no points where an arch is widest, so that its width is a few
-    percent too small here: see :func:`crown_width`."""
+    distance, else to `NOMINAL_MM`."""
     if scale.width_mm is not None:
         nearer = NOMINAL_MM / float(np.median(model.depths))
         return nearer * scale.width_mm / _width(nearer * model.tracks.points)
@@ -215,16 +210,6 @@ def _width(points: Float[np.ndarray, "p 3"]) -> float:
     """Extent along X of what lies near the occlusal plane."""
     teeth = points[np.abs(points[:, 2]) < _TEETH_MM]
     return float(np.diff(np.percentile(teeth[:, 0], [0.2, 99.8]))[0])
-
-
-def crown_width(surface: HeightMap) -> float | None:
-    """The greatest width of the arch across its crowns along X, as callipers tell it; None without crowns."""
-    cell = surface.cell_mm
-    heights = np.where(surface.known, surface.heights, -np.inf)
-    tops = np.maximum(maximum_filter(heights, 1 + 2 * round(_BESIDE_MM / cell)), 0.0)
-    crowns = heights > tops - _EQUATOR_MM
-    wide = np.flatnonzero(cell * crowns.sum(axis=0) >= _LEAST_RIM_MM)
-    return cell * float(wide[-1] - wide[0] + 1) if len(wide) else None
 
 
 def transformed(model: SparseModel, new_from_world: Rigid3) -> SparseModel:

@@ -18,7 +18,6 @@ from cuspid.stitching.height_map import (
     HeightMap,
     HeightMapOptions,
     ScaleOptions,
-    crown_width,
     height_map,
     in_occlusal_frame,
     scale_factor,
@@ -133,7 +132,6 @@ def orthophoto(
         level = level_by_crowns(dense)
         motion = transformed(motion, level)
         surface = uncovered(turned(dense, level), height_map(motion, options.height_map), motion)
-        motion, surface = _as_wide_as_known(motion, surface, scale)
     mosaic = compose(motion, surface, read, options.mosaic, progress=progress)
     metric = scale is None or scale.working_distance_mm is not None or scale.width_mm is not None
     panorama = _panorama(mosaic, motion, frames, metric)
@@ -142,16 +140,6 @@ def orthophoto(
     strip = unroll(panorama, motion, surface, mosaic.canvas.mm_per_px, options.strip)
     in_its_units = motion if metric else motion.scaled(1 / mosaic.canvas.mm_per_px)
     return Stitched(panorama=panorama, motion=in_its_units, strip=strip)
-
-
-def _as_wide_as_known(
-    motion: SparseModel, surface: HeightMap, scale: ScaleOptions | None
-) -> tuple[SparseModel, HeightMap]:
-    """Both at the scale at which the crowns are as wide as somebody measured."""
-    found = None if scale is None or scale.width_mm is None else crown_width(surface)
-    if scale is None or scale.width_mm is None or found is None:
-        return motion, surface
-    return motion.scaled(scale.width_mm / found), surface.scaled(scale.width_mm / found)
 
 
 def _dense(
