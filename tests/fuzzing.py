@@ -54,6 +54,8 @@ from test_cli_stitch import picture, write_calibration
 from test_colmap import make_capture, make_found, without_rig, write
 from test_panorama import small_panorama
 from test_panorama_evaluation import known_film, write_truth
+from test_rescaling import panorama as stitched_panorama
+from test_rescaling import write as write_stitched
 
 LONGEST_S = 10.0
 """Of work; waiting may take more on a busy machine."""
@@ -257,6 +259,7 @@ BOARD = ("--columns", "6", "--rows", "5", "--square-mm", "1", "--instants", "1",
 FILM = ("--handpiece", "@handpiece.json", "--frames", "3", "--supersampling", "1")
 SHORT = ("--points", "10", "--samples", "1", "--finalists", "1", "--evaluations", "4")
 SEARCH = ("--jaw", "@jaw.ply", "--teeth", str(TOOTH), *SHORT)
+MEASURED = ("--distance", "3", "4", "36", "22", "47.5")
 SCAN = ("--frames", "2", "--length-mm", "0.8", "--supersampling", "1")
 
 
@@ -362,6 +365,10 @@ def _footage(folder: Path) -> None:
     (folder / "footage" / "times.csv").write_text("\n".join(["camera,frame,time", *rows]))
 
 
+def _stitched(folder: Path) -> None:
+    write_stitched(folder / "panorama", stitched_panorama())
+
+
 def _score(folder: Path) -> None:
     known = known_film(small_jaw())
     write_truth(known, folder)
@@ -417,6 +424,7 @@ SCENARIOS: Mapping[str, Scenario] = {
     "stitch of a mesh": Scenario(
         _arch, verb("stitch", "--mesh", "@jaw.ply", "--view.mm-per-px", "2", "--out", f"@{_OUT}")
     ),
+    "rescale": Scenario(_stitched, verb("rescale", "@panorama", *MEASURED, "--out", f"@{_OUT}")),
     "stitch-eval": Scenario(_score, verb("stitch-eval", "@panorama", "@truth", "--out", f"@{_OUT}")),
 }
 

@@ -17,6 +17,7 @@ FEWER = {
     **dict.fromkeys(("reconstruct", "evaluate", "measure", "simulate", "precision", "film"), 4),
     **dict.fromkeys(("box", "design", "live", "stitch", "stitch of a mesh", "stitch-eval", "visibility"), 2),
     **dict.fromkeys(("mean shape", "resume"), 2),
+    "rescale": 8,
 }
 """Of those that take longest."""
 

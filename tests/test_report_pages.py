@@ -6,16 +6,18 @@ import base64
 import re
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from cuspid import cli
+from cuspid import cli, storage
 from cuspid.jaw import Jaw
+from cuspid.panorama import Panorama
 from report_folders import tooth_alone, write_comparison, write_scan, write_score, write_shape
+from test_rescaling import panorama
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed: pip install playwright")
 
@@ -341,6 +343,70 @@ def test_on_a_phone(browser, pages):
     assert phone.page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
     assert phone.complaints == []
     phone.page.context.close()
+
+
+PLACED = """() => {
+  const around = document.querySelector(".zoomed").getBoundingClientRect();
+  const picture = document.querySelector(".zoomed img").getBoundingClientRect();
+  return [...document.querySelectorAll(".marks circle")].map((dot) => [
+    (Number(dot.getAttribute("cx")) + around.left - picture.left) / picture.width,
+    (Number(dot.getAttribute("cy")) + around.top - picture.top) / picture.height]);
+}"""
+"""Where the marks are, as shares of the picture."""
+
+
+def test_two_clicks_on_a_panorama_measure_and_tell_how_to_scale_it(browser, tmp_path):
+    shown = write_wide(tmp_path / "pano 1")
+    cli.main(["report", str(tmp_path / "pano 1")])
+    visited = visit(browser, tmp_path / "pano 1" / "report.html", viewer=False)
+    page, output = visited.page, visited.page.locator("[data-measures] output")
+    box = page.locator(".zoomed img").bounding_box()
+
+    def at(across: float, down: float) -> tuple[float, float]:
+        return box["x"] + across * box["width"], box["y"] + down * box["height"]
+
+    page.mouse.click(*at(0.2, 0.3))
+    assert not output.is_visible()
+    page.mouse.move(*at(0.5, 0.5))
+    page.mouse.down()
+    page.mouse.move(*at(0.52, 0.5), steps=4)
+    page.mouse.up()
+    page.locator("[data-zoom=reset]").first.click()
+    page.wait_for_timeout(200)
+    assert len(page.evaluate(PLACED)) == 1, "to move the picture marks nothing"
+    page.mouse.click(*at(0.8, 0.7))
+    height, width = shown.covered.shape
+    mm = shown.mm_per_px * np.hypot(0.6 * width, 0.4 * height)
+    told = output.inner_text()
+    assert float(told.split(" mm")[0]) == pytest.approx(mm, rel=0.02)
+    command = re.search(r"cuspid rescale 'pano 1' --distance ([\d. ]+) MM --out 'pano 1-mm'", told)
+    pixels = np.array(command[1].split(), float).reshape(2, 2)
+    np.testing.assert_allclose(pixels, [[0.2 * width, 0.3 * height], [0.8 * width, 0.7 * height]], atol=3)
+    placed = np.array(page.evaluate(PLACED))
+    page.locator("[data-zoom=in]").first.click()
+    page.wait_for_timeout(200)
+    np.testing.assert_allclose(page.evaluate(PLACED), placed, atol=0.005)
+    page.mouse.dblclick(*at(0.5, 0.5))
+    assert page.evaluate(PLACED) == []
+    assert not output.is_visible()
+    assert visited.complaints == []
+    page.context.close()
+
+
+def write_wide(folder: Path) -> Panorama:
+    """A panorama of 400 x 300 px; a click on it is as exact as a pixel of the screen."""
+    small = panorama()
+    shape, columns = (300, 400), np.arange(400, dtype=np.float32)
+    wide = replace(
+        small,
+        image=np.full((*shape, 3), 90, np.uint8),
+        covered=np.ones(shape, bool),
+        frame_index=np.zeros(shape, np.int16),
+        frame_pixel=np.zeros((*shape, 2), np.float32),
+        height_mm=np.broadcast_to(columns, shape).copy(),
+    )
+    storage.write_panorama(folder, wide)
+    return wide
 
 
 def test_the_thesis_beside_ours_is_read_on_a_phone(browser, tmp_path):

@@ -69,6 +69,7 @@ COMMANDS: Mapping[str, Callable[..., Any]] = _Verbs(
         "live": "live",
         "evaluate": "scan",
         "stitch": "panorama",
+        "rescale": "rescaling",
         "reproduce": "reproduction",
         "repeat": "repeat",
         "report": "report",

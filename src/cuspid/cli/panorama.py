@@ -139,7 +139,7 @@ def _clear(out: Path) -> None:
 def _write(folder: Path, part: Stitched) -> None:
     if part.motion is not None:
         storage.write_poses(folder / "poses.json", part.motion.cam_from_world)
-        save_camera_path(folder / "camera_path.png", part.panorama, part.motion)
+        save_camera_path(folder / "camera_path.png", part.panorama, part.motion.cam_from_world)
     if part.strip is not None:
         storage.write_strip(folder, part.strip)
     storage.write_panorama(folder, part.panorama)

@@ -336,7 +336,11 @@ def _read_panorama(folder: Path, run: Mapping[str, Any]) -> PanoramaResult:
     there = tuple(each for each in folders if (each / "panorama.json").exists())
     if not there:
         raise InputError(f"{folder}: the panorama is not complete; run the same cuspid stitch command again")
-    pictures = _pictures(there[0], {"camera_path.png": "The path of the camera over the arch"})
+    captions = {
+        "distances.png": "What the scale is from: distances that were measured between places of the arch",
+        "camera_path.png": "The path of the camera over the arch",
+    }
+    pictures = _pictures(there[0], captions)
     return PanoramaResult(
         name=folder.resolve().name,
         run=run,

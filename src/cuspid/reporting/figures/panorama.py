@@ -1,45 +1,45 @@
-"""Pictures of panoramas: the camera's path over the arch."""
+"""Pictures of panoramas: the camera's path over the arch, and distances that were measured on it."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.patheffects import Normal, Stroke
 
+from cuspid.geometry import Rigid3
 from cuspid.panorama import Panorama
 from cuspid.reporting.figures.drawing import new_figure, save_figure
-from cuspid.sparse_model import SparseModel
 
 _TICK = 10
 """Every so many frames one is named."""
 _WIDTH_IN = 8.0
+_MARK = "#ffd23f"
 
 
-def save_camera_path(path: Path, panorama: Panorama, motion: SparseModel) -> None:
+def save_camera_path(path: Path, panorama: Panorama, cam_from_world: Mapping[str, Rigid3]) -> None:
     """The panorama with the place of the camera at each frame, and below it height and tilt over the frames.
 
-    ``motion`` is in the world of the panorama.
+    ``cam_from_world`` has the frames by their names; the world is that of the panorama.
     """
-    poses = [pose.inverse() for pose in motion.cam_from_world.values()]
+    poses = [pose.inverse() for pose in cam_from_world.values()]
     centres = np.array([pose.translation for pose in poses])
     axes = np.array([pose.rotation[:, 2] for pose in poses])
     height, width = panorama.covered.shape
     above_in = min(max(0.82 * _WIDTH_IN * height / width, 2.0), 9.0)  # The axis' names and the colours have the rest.
     figure = new_figure(_WIDTH_IN, above_in + 2.9, dpi=110, layout="constrained")
     above, below = figure.subplots(2, 1, height_ratios=[above_in, 1.7])
-    _draw_above(above, panorama, centres, axes, motion.frames)
+    _draw_above(above, panorama, centres, axes, tuple(cam_from_world))
     _draw_heights(below, panorama, centres, axes)
     save_figure(figure, path)
 
 
 def _draw_above(axis: Axes, panorama: Panorama, centres: np.ndarray, axes: np.ndarray, names: tuple[str, ...]) -> None:
     """The panorama seen from above with the camera's centres, coloured by time, and where it looked."""
-    height, width = panorama.covered.shape
-    corners = panorama.world_from_pixels(np.array([[0.0, height], [width, 0.0]]))
-    extent = (corners[0, 0], corners[1, 0], corners[0, 1], corners[1, 1])
-    axis.imshow(panorama.image, extent=extent, interpolation="antialiased")
+    extent = _draw_picture(axis, panorama)
     places = centres[:, :2]
     looks = places - axes[:, :2] / axes[:, 2:] * centres[:, 2:]
     axis.plot(*places.T, color="white", linewidth=0.7)
@@ -50,11 +50,43 @@ def _draw_above(axis: Axes, panorama: Panorama, centres: np.ndarray, axes: np.nd
         label = axis.annotate(names[index], places[index], (5, 3), textcoords="offset points", fontsize=7)
         label.set(color="white", path_effects=[Stroke(linewidth=1.8, foreground="black"), Normal()])
     axis.figure.colorbar(dots, ax=axis, label="located frame", fraction=0.04, pad=0.02, aspect=35)
-    unit = "mm" if panorama.mm_per_px else "px"
-    axis.set(xlabel=f"x, {unit}", ylabel=f"y, {unit} (front up)", title="Path of the camera over the teeth")
+    axis.set_title("Path of the camera over the teeth")
     axis.set_xlim(min(extent[0], places[:, 0].min()), max(extent[1], places[:, 0].max()))
     axis.set_ylim(min(extent[2], places[:, 1].min()), max(extent[3], places[:, 1].max()))
-    axis.set_facecolor("black")
+
+
+def save_distances(
+    path: Path,
+    panorama: Panorama,
+    places_px: Sequence[Float[np.ndarray, "2 2"]],
+    measured_mm: Sequence[float],
+    lengths_mm: Sequence[float],
+) -> None:
+    """The panorama with measured distances between the places that they join, and what they are in the panorama."""
+    height, width = panorama.covered.shape
+    figure = new_figure(_WIDTH_IN, min(max(_WIDTH_IN * height / width, 2.0), 11.0), dpi=140, layout="constrained")
+    axis = figure.subplots()
+    _draw_picture(axis, panorama)
+    for pixels, measured, length in zip(places_px, measured_mm, lengths_mm, strict=True):
+        ends = panorama.world_from_pixels(pixels)
+        axis.plot(*ends.T, color=_MARK, linewidth=1, marker="o", markersize=7, markerfacecolor="none")
+        label = axis.annotate(
+            f"{measured:g} mm measured, {length:.2f} here", ends.mean(axis=0), (0, 4), textcoords="offset points"
+        )
+        label.set(ha="center", color="white", path_effects=[Stroke(linewidth=2, foreground="black"), Normal()])
+    axis.set_title("Measured distances")
+    save_figure(figure, path)
+
+
+def _draw_picture(axis: Axes, panorama: Panorama) -> tuple[float, float, float, float]:
+    """The panorama in its world; gives its borders: left, right, lower, upper."""
+    height, width = panorama.covered.shape
+    corners = panorama.world_from_pixels(np.array([[0.0, height], [width, 0.0]]))
+    extent = (corners[0, 0], corners[1, 0], corners[0, 1], corners[1, 1])
+    axis.imshow(panorama.image, extent=extent, interpolation="antialiased")
+    unit = "mm" if panorama.mm_per_px else "px"
+    axis.set(xlabel=f"x, {unit}", ylabel=f"y, {unit} (front up)", facecolor="black")
+    return extent
 
 
 def _draw_heights(axis: Axes, panorama: Panorama, centres: np.ndarray, axes: np.ndarray) -> None:

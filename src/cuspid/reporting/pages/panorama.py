@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -54,12 +55,22 @@ def _part(part: Panorama, folder: Path) -> dict[str, Any]:
         "title": "The arch from above" if part.parts == 1 else f"Part {part.part} of {part.parts}",
         "picture": jpeg_uri(_on_ground(part.image, part.covered), widest_px=_WIDEST_PX),
         "caption": f"{width} × {height} px",
+        "width_px": width,
+        "mm_per_px": part.mm_per_px,
+        "rescale": shlex.quote(_named(folder)) if part.frames else None,
+        "scaled": shlex.quote(f"{_named(folder)}-mm"),
         "strips": [
             (caption, photo_uri(folder / file, widest_px=_WIDEST_PX))
             for file, caption in _STRIPS.items()
             if (folder / file).exists()
         ],
     }
+
+
+def _named(folder: Path) -> str:
+    """A folder by its last name, that of a part with the folder that it is in: pages name no folders of a machine."""
+    whole = folder.resolve()
+    return f"{whole.parent.name}/{whole.name}" if whole.name.startswith("part-") else whole.name
 
 
 _STRIPS = {

@@ -1,0 +1,103 @@
+"""Give a panorama the scale of distances that were measured in the mouth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from tyro.conf import Positional, UseAppendAction, arg
+
+from cuspid import storage
+from cuspid.cli.report import report
+from cuspid.cli.shared import console
+from cuspid.errors import InputError
+from cuspid.options import Range
+from cuspid.reporting.figures.panorama import save_camera_path, save_distances
+from cuspid.stitching.rescaling import MeasuredDistance, Rescaled, rescaled, scaled_pose
+from cuspid.storage.strips import write_scaled_strip
+from cuspid.values import LONGEST_MM
+
+_LEAST_MM = 0.1
+
+
+def rescale(
+    panorama: Annotated[Path, Positional],
+    *,
+    out: Path,
+    distance: Annotated[
+        UseAppendAction[tuple[tuple[float, float, float, float, float], ...]],
+        arg(metavar="U1 V1 U2 V2 MM"),
+        Range(-LONGEST_MM, LONGEST_MM),
+    ],
+) -> None:
+    """Scale a panorama by distances that were measured in the mouth, with callipers between two cusps on either side of
+    the arch, for example. Pictures stay as they are, all lengths become those of the measurement.
+
+    Args:
+        panorama: Folder that cuspid stitch wrote; of a sequence that broke, that of a part.
+        out: Folder for the scaled panorama: the files of stitch, and distances.json and distances.png.
+        distance: Two places of panorama.png, in px from its upper left corner, and how many mm lie between them. The
+            page of the panorama gives the pixels of places that are clicked on. Of several (give it again), the scale
+            suits all as well as can be, and what each is off by is told.
+    """
+    if not distance:
+        raise InputError("rescale: give at least one --distance U1 V1 U2 V2 MM")
+    measured = tuple(_measured(each) for each in distance)
+    if out.resolve() == panorama.resolve():
+        raise InputError(f"rescale: {out}: is the panorama itself; give another folder as --out")
+    if not (panorama / "panorama.json").exists() and (panorama / "part-1").is_dir():
+        raise InputError(f"{panorama}: has parts; give one of them: {panorama / 'part-1'}")
+    before = storage.read_panorama(panorama)
+    found = rescaled(before, measured)
+    hashes = {name: storage.hash_file(panorama / name) for name in ("panorama.json", "panorama.png", "source.npz")}
+    with storage.claimed_folder(out, "rescale", {"distance": distance}, hashes, replace=True):
+        _write(panorama, out, found, measured)
+    _print(found, measured, unit="px" if before.mm_per_px is None else "mm")
+    report(out)
+
+
+def _measured(given: tuple[float, float, float, float, float]) -> MeasuredDistance:
+    """A distance of the command line."""
+    if given[-1] < _LEAST_MM:
+        raise InputError(f"rescale: --distance: {given[-1]:g} mm; it must be {_LEAST_MM} mm or more")
+    return MeasuredDistance(places_px=np.reshape(given[:4], (2, 2)), mm=given[-1])
+
+
+def _write(folder: Path, out: Path, found: Rescaled, measured: tuple[MeasuredDistance, ...]) -> None:
+    """All that stitch wrote, in the new millimetres, and what they are from."""
+    if (folder / "strip.json").exists():
+        write_scaled_strip(folder, out, found.factor)
+    if (folder / "poses.json").exists():
+        poses = storage.read_poses(folder / "poses.json")
+        scaled = {name: scaled_pose(pose, found.factor) for name, pose in poses.items()}
+        storage.write_poses(out / "poses.json", scaled)
+        save_camera_path(out / "camera_path.png", found.panorama, scaled)
+    rows = [
+        {"places_px": each.places_px, "measured_mm": each.mm, "panorama_mm": length}
+        for each, length in zip(measured, found.lengths_mm, strict=True)
+    ]
+    storage.write_json(out / "distances.json", {"factor": found.factor, "distances": rows})
+    save_distances(
+        out / "distances.png",
+        found.panorama,
+        [each.places_px for each in measured],
+        [each.mm for each in measured],
+        found.lengths_mm.tolist(),
+    )
+    storage.write_panorama(out, found.panorama)
+
+
+def _print(found: Rescaled, measured: tuple[MeasuredDistance, ...], unit: str) -> None:
+    table = Table(title="Distances", title_justify="left")
+    for head in ("between", "measured, mm", f"before, {unit}", "now, mm", "off, %"):
+        table.add_column(head, justify="left" if head == "between" else "right")
+    for each, length in zip(measured, found.lengths_mm, strict=True):
+        first, second = (f"({u:g}, {v:g})" for u, v in each.places_px)
+        off = f"{100 * (length / each.mm - 1):+.2f}"
+        table.add_row(f"{first} {second}", f"{each.mm:g}", f"{length / found.factor:.2f}", f"{length:.2f}", off)
+    Console().print(table)
+    for note in found.panorama.notes:
+        console.print(f"note: {note}")
