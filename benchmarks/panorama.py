@@ -2,7 +2,7 @@
 
     python benchmarks/panorama.py --out benchmarks/results/panorama [--jaws FILE_OR_FOLDER ...] [--work FOLDER]
         [--subject lower-14-0 ...] [--films-only]
-        [--method ortho callipers return s-shape cross natural pair thesis thesis-unexamined
+        [--method ortho cusps callipers return s-shape cross natural pair thesis thesis-unexamined
                   opencv-panorama opencv-scans]
 
 Subjects are phantoms of the population, and jaws of your own, whose coarse faces are subdivided (Loop) first; the
@@ -36,7 +36,7 @@ from cuspid.anatomy.jaw_files import jaw_files, load_jaw
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.phantom.population import GroupName, draw_population
-from cuspid.evaluation.panorama import PanoramaEvaluationOptions
+from cuspid.evaluation.panorama import PanoramaEvaluationOptions, TracedPixels, trace_pixels
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh, edges_of
 
@@ -50,6 +50,8 @@ PHANTOMS: tuple[tuple[GroupName, int], ...] = (
 EDGE_MM = 0.25
 """Edge of the phantoms' faces, and about that to which other jaws are subdivided."""
 FEWEST_FRAMES_PCT = PanoramaEvaluationOptions().fewest_frames_pct
+CLICK_MM, TRACED = 0.1, 300_000
+"""How far beside a cusp one clicks (one standard deviation), and of how many pixels the cusps are those of."""
 SUPERSAMPLING = 1
 """Rays through a pixel along each side."""
 
@@ -180,6 +182,31 @@ def calliper_mm(folder: Path) -> float:
     return round(2 * float(np.ptp(jaw.mesh.vertices[teeth, 0]))) / 2
 
 
+def scaled_by_cusps(capture: Path, out: Path, limit_s: int) -> list[str]:
+    """The command of one who has measured between the highest cusps of the first molars, and clicks on them."""
+    folder = capture.parents[1]
+    panorama = storage.read_panorama(folder / "ortho")
+    traced = trace_pixels(panorama, storage.read_truth(folder / "film" / "truth"), TRACED)
+    shown = [cusp(traced, tooth) for tooth in molars(traced)]
+    true_mm = np.linalg.norm(np.diff(traced.true_mm[shown], axis=0))
+    pixels = panorama.pixels_from_world(traced.placed[shown])
+    beside_px = CLICK_MM / panorama.mm_per_px * np.random.default_rng(len(traced.labels)).normal(size=(2, 2))
+    measured = (*(f"{each:.0f}" for each in (pixels + beside_px).ravel()), f"{round(2 * true_mm) / 2}")
+    return [*CUSPID, "rescale", str(folder / "ortho"), "--distance", *measured, "--out", str(out)]
+
+
+def molars(traced: TracedPixels) -> tuple[int, int]:
+    """The first molars of both sides, otherwise the second, of the jaw that is shown."""
+    there = set(traced.labels.tolist())
+    pairs = ((quadrant + tooth, quadrant + 10 + tooth) for tooth in (6, 7) for quadrant in (10, 30))
+    return next(pair for pair in pairs if there.issuperset(pair))
+
+
+def cusp(traced: TracedPixels, tooth: int) -> int:
+    """The highest of the pixels that show a tooth."""
+    return int(np.argmax(np.where(traced.labels == tooth, traced.true_mm[:, 2], -np.inf)))
+
+
 def opencv(mode: str) -> Callable[[Path, Path, int], list[str]]:
     """The command of a mode of OpenCV's Stitcher."""
     script = str(Path(__file__).with_name("opencv_stitcher.py"))
@@ -191,6 +218,7 @@ def opencv(mode: str) -> Callable[[Path, Path, int], list[str]]:
 CUSPID = (sys.executable, "-m", "cuspid")
 METHODS: Mapping[str, Callable[[Path, Path, int], list[str]]] = {
     "ortho": stitched("ortho"),
+    "cusps": scaled_by_cusps,
     "callipers": measured_across,
     **dict.fromkeys(("pair", "return", "s-shape", "cross", "natural"), stitched("ortho")),
     "thesis": stitched("thesis"),

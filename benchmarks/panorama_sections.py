@@ -12,6 +12,7 @@ Result = Mapping[str, Any]
 
 ONE_CAMERA = {
     "ortho": "One pass along the arch",
+    "cusps": "The same panoramas, scaled by the distance of two cusps, read to half a millimetre (`cusps`)",
     "callipers": "The same films, and the width of the arch over the teeth, read to half a millimetre (`callipers`)",
     "return": "There and back again (`return`)",
     "s-shape": "One pass, swung to either side (`s-shape`)",
@@ -40,7 +41,8 @@ def panoramas(results: Sequence[Result]) -> str:
             "Phantoms of the population and real jaws (`benchmarks/panorama.py`), each filmed in 120 frames of "
             "640 x 480 px with full hand shake, texture `enamel`; `pair` is the default method on the film of two "
             "cameras 5 mm apart, `return`, `s-shape` and `cross` on a film of that path, `natural` on one of teeth "
-            "with what real ones bear (texture `natural`); `callipers` is told the width of the arch. "
+            "with what real ones bear (texture `natural`); `callipers` is told the width of the arch; `cusps` is "
+            "`ortho`, scaled by `cuspid rescale` (whose times it tells) to the distance between two cusps. "
             "docs/panorama-evaluation.md explains the figures. *No arch* counts the panoramas that failed: too few "
             "frames, collapsed, or nowhere near the "
             "jaw. Medians are over those that did not fail.",

@@ -190,17 +190,21 @@ def _tripods(model: SparseModel, length: float) -> Float[np.ndarray, "k 3"]:
     return np.concatenate([pose.inverse().apply(legs) for pose in model.cam_from_world.values()])
 
 
+_TRUER = "measure between two cusps, and cuspid rescale makes it truer"
+
+
 def _scale_note(scale: ScaleOptions, *, given: bool) -> str:
     if scale.width_mm is not None:
-        return f"the scale assumes an arch {scale.width_mm:g} mm wide"
+        return f"the scale assumes an arch {scale.width_mm:g} mm wide; {_TRUER}"
     if scale.working_distance_mm is None:
         return (
-            "the scale is not known, so nothing is in millimetres: give --scale.working-distance-mm or --scale.width-mm"
+            "the scale is not known, so nothing is in millimetres: give --scale.working-distance-mm, or measure "
+            "between two cusps and use cuspid rescale"
         )
     source = "as given" if given else "as the calibration says"
     return (
         f"the scale assumes a camera held {scale.working_distance_mm:g} mm over the teeth, {source}; "
-        "it is no more accurate than that"
+        f"it is no more accurate than that: {_TRUER}"
     )
 
 
