@@ -2,13 +2,13 @@
 
     python benchmarks/panorama.py --out benchmarks/results/panorama [--jaws FILE_OR_FOLDER ...] [--work FOLDER]
         [--subject lower-14-0 ...] [--films-only]
-        [--method ortho cusps callipers return s-shape cross natural pair thesis thesis-unexamined
-                  opencv-panorama opencv-scans]
+        [--method ortho cusps callipers return s-shape cross natural natural-return pair thesis
+                  thesis-unexamined opencv-panorama opencv-scans]
 
 Subjects are phantoms of the population, and jaws of your own, whose coarse faces are subdivided (Loop) first; the
 subdivided mesh is then the reference. All are filmed in 120 frames with full shake and the texture ``enamel``, for the
 method ``pair`` by two cameras, for ``return``, ``s-shape`` and ``cross`` on another way over the arch (``cross`` needs
-surface between its sides), for ``natural`` with the texture of that name. ``callipers`` is told the width of the true
+surface between its sides), for ``natural`` with the texture of that name, for ``natural-return`` with both. ``callipers`` is told the width of the true
 arch over its teeth, read to half a millimetre. One JSON a subject and method goes to the results folder; what is there
 already is not made again.
 """
@@ -104,6 +104,7 @@ FILMS: Mapping[str, tuple[str, ...]] = {
     "film-s-shape": ("--path", "s-shape"),
     "film-cross": ("--path", "cross"),
     "film-natural": ("--texture", "natural"),
+    "film-natural-return": ("--texture", "natural", "--path", "return"),
 }
 """Films of a subject, and by which options."""
 
@@ -220,7 +221,7 @@ METHODS: Mapping[str, Callable[[Path, Path, int], list[str]]] = {
     "ortho": stitched("ortho"),
     "cusps": scaled_by_cusps,
     "callipers": measured_across,
-    **dict.fromkeys(("pair", "return", "s-shape", "cross", "natural"), stitched("ortho")),
+    **dict.fromkeys(("pair", "return", "s-shape", "cross", "natural", "natural-return"), stitched("ortho")),
     "thesis": stitched("thesis"),
     "thesis-unexamined": stitched("thesis", "--no-examination"),
     "opencv-panorama": opencv("panorama"),

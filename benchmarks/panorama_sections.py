@@ -18,6 +18,7 @@ ONE_CAMERA = {
     "s-shape": "One pass, swung to either side (`s-shape`)",
     "cross": "Along the arch, and straight across to the other side (`cross`)",
     "natural": "One pass over teeth with what real ones bear (`natural`)",
+    "natural-return": "There and back again over such teeth (`natural-return`)",
 }
 """What the films of one camera show, by the method that takes them."""
 METHODS = (*ONE_CAMERA, "pair", "thesis", "thesis-unexamined", "opencv-panorama", "opencv-scans")

@@ -142,7 +142,7 @@ Result = ScanResult | ShapeResult | StudyResult | PanoramaResult | ScoreResult |
 
 def read_result(folder: Path, reference: Path | None = None, unit: Unit = "mm") -> Result:
     """What lies in a folder that ``run``, ``evaluate``, ``shape``, ``sweep``, ``compare``, ``repeat``, ``stitch``,
-    ``stitch-eval`` or ``calibrate`` wrote.
+    ``rescale``, ``stitch-eval`` or ``calibrate`` wrote.
 
     ``reference``: the mesh (in a unit) with which a scan was compared, or the folder ``truth`` of a simulation, where
     the folder does not hold it. Raises InputError where there is nothing to report, a file is damaged, or the reference
@@ -159,7 +159,7 @@ def read_result(folder: Path, reference: Path | None = None, unit: Unit = "mm") 
     made = f"; it holds only {', '.join(run)}" if run else ""
     raise InputError(
         f"{folder}: nothing to report{made}; give the --out folder of run, reconstruct, evaluate, shape, sweep, "
-        "compare, repeat, stitch, stitch-eval or calibrate"
+        "compare, repeat, stitch, rescale, stitch-eval or calibrate"
     )
 
 
