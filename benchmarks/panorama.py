@@ -8,9 +8,11 @@
 Subjects are phantoms of the population, and jaws of your own, whose coarse faces are subdivided (Loop) first; the
 subdivided mesh is then the reference. All are filmed in 120 frames with full shake and the texture ``enamel``, for the
 method ``pair`` by two cameras, for ``return``, ``s-shape`` and ``cross`` on another way over the arch (``cross`` needs
-surface between its sides), for ``natural`` with the texture of that name, for ``natural-return`` with both. ``callipers`` is told the width of the true
-arch over its teeth, read to half a millimetre. One JSON a subject and method goes to the results folder; what is there
-already is not made again.
+surface between its sides), for ``natural`` with the texture of that name, for ``natural-return`` with both.
+``callipers`` is told the width of the true arch over its teeth, read to half a millimetre; ``cusps`` scales the
+panorama of ``ortho``, which is to be made before, by the distance between two cusps of the first molars, read to half a
+millimetre, each clicked on 0.1 mm (one standard deviation) beside it. One JSON a subject and method goes to the results
+folder; what is there already is not made again.
 """
 
 from __future__ import annotations
