@@ -32,7 +32,14 @@ from cuspid.motion.rig_film import (
     refine_rig_on_surface,
     surface_patches,
 )
-from cuspid.motion.single import SingleMotion, SingleOptions, locate_single, refine_on_surface, with_observations
+from cuspid.motion.single import (
+    SingleMotion,
+    SingleOptions,
+    locate_single,
+    loose_notes,
+    refine_on_surface,
+    with_observations,
+)
 from cuspid.pairing import stereo_pairs
 from cuspid.panorama import FrameUse
 from cuspid.progress import Progress, silent
@@ -125,7 +132,8 @@ def _stitched(
     made = orthophoto(
         shown, with_observations(motion.frames_of(number), shown.motion), read, options, progress=progress
     )
-    return replace(made, panorama=replace(made.panorama, notes=(*notes, *made.panorama.notes)))
+    loose = loose_notes(made.panorama.frames)
+    return replace(made, panorama=replace(made.panorama, notes=(*notes, *made.panorama.notes, *loose)))
 
 
 def stitch_rig(capture: Capture, options: StitchOptions, *, progress: Progress = silent) -> Stitched:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -13,8 +13,10 @@ from cuspid import panorama_pipeline, storage
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
 from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
 from cuspid.image_sequence import ImageSequence
-from cuspid.panorama import FrameUse
+from cuspid.motion.single import loosely_held
+from cuspid.panorama import FrameUse, Panorama
 from cuspid.panorama_pipeline import MeshViewOptions, StitchOptions
 from cuspid.progress import Progress
 from cuspid.reporting.figures.panorama import save_camera_path
@@ -139,10 +141,16 @@ def _clear(out: Path) -> None:
 def _write(folder: Path, part: Stitched) -> None:
     if part.motion is not None:
         storage.write_poses(folder / "poses.json", part.motion.cam_from_world)
-        save_camera_path(folder / "camera_path.png", part.panorama, part.motion.cam_from_world)
+        save_path_picture(folder, part.panorama, part.motion.cam_from_world)
     if part.strip is not None:
         storage.write_strip(folder, part.strip)
     storage.write_panorama(folder, part.panorama)
+
+
+def save_path_picture(folder: Path, panorama: Panorama, cam_from_world: Mapping[str, Rigid3]) -> None:
+    """camera_path.png, with the frames that are held loosely."""
+    loose = {frame.name for stretch in loosely_held(panorama.frames) for frame in stretch}
+    save_camera_path(folder / "camera_path.png", panorama, cam_from_world, loose)
 
 
 def _print(parts: tuple[Stitched, ...], folders: list[Path]) -> None:

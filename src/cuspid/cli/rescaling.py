@@ -11,11 +11,12 @@ from rich.table import Table
 from tyro.conf import Positional, UseAppendAction, arg
 
 from cuspid import storage
+from cuspid.cli.panorama import save_path_picture
 from cuspid.cli.report import report
 from cuspid.cli.shared import console
 from cuspid.errors import InputError
 from cuspid.options import Range
-from cuspid.reporting.figures.panorama import save_camera_path, save_distances
+from cuspid.reporting.figures.panorama import save_distances
 from cuspid.stitching.rescaling import MeasuredDistance, Rescaled, rescaled, scaled_pose
 from cuspid.storage.strips import write_scaled_strip
 from cuspid.values import LONGEST_MM
@@ -74,7 +75,7 @@ def _write(folder: Path, out: Path, found: Rescaled, measured: tuple[MeasuredDis
         poses = storage.read_poses(folder / "poses.json")
         scaled = {name: scaled_pose(pose, found.factor) for name, pose in poses.items()}
         storage.write_poses(out / "poses.json", scaled)
-        save_camera_path(out / "camera_path.png", found.panorama, scaled)
+        save_path_picture(out, found.panorama, scaled)
     rows = [
         {"places_px": each.places_px, "measured_mm": each.mm, "panorama_mm": length}
         for each, length in zip(measured, found.lengths_mm, strict=True)

@@ -50,6 +50,9 @@ _LIT, _PALE, _WARM = 40, 50, (35, 165)
 to 180) lies below the first or above the second value are red to yellow, like gums and dentine."""
 _WINDOW = 15
 """Number of frames with whose sharpness that of a frame is compared."""
+_LOOSE, _NEAR, _MOST_TOLD = 0.5, 4, 3
+"""A frame is held loosely by less than this share of the usual number of observations; those that lie no farther apart
+are one stretch, and the first and last so many frames are the ends; and so many stretches are told."""
 
 
 ENAMEL = FeatureOptions(count=2500, contrast=0.004, edge=30.0)
@@ -550,6 +553,45 @@ def with_observations(frames: Sequence[FrameUse], part: SparseModel) -> tuple[Fr
     counts = np.bincount(part.tracks.frame_index, minlength=len(part.frames)).tolist()
     held = dict(zip(part.frames, counts, strict=True))
     return tuple(replace(frame, inliers=held[frame.name]) if frame.name in held else frame for frame in frames)
+
+
+def loosely_held(frames: Sequence[FrameUse]) -> tuple[tuple[FrameUse, ...], ...]:
+    """Stretches of the trajectory that are held by less than half of the observations that its frames have in the
+    median, the weakest first; its ends do not count, for nothing hangs on them. None where observations are not known.
+
+    There the path bends two to four times as often as elsewhere (docs/panorama-evaluation.md).
+    """
+    used = [frame for frame in frames if frame.used]
+    counts = [frame.inliers for frame in used if frame.inliers is not None]
+    if not used or len(counts) < len(used):
+        return ()
+    few = np.flatnonzero(np.array(counts) < _LOOSE * np.median(counts))
+    few = few[(few >= _NEAR) & (few < len(used) - _NEAR)]
+    stretches = np.split(few, np.flatnonzero(np.diff(few) > _NEAR) + 1) if len(few) else []
+    found = sorted(stretches, key=lambda stretch: min(counts[index] for index in stretch))
+    return tuple(tuple(used[stretch[0] : stretch[-1] + 1]) for stretch in found)
+
+
+def loose_notes(frames: Sequence[FrameUse]) -> tuple[str, ...]:
+    """A note where the trajectory is held loosely."""
+    stretches = loosely_held(frames)
+    if not stretches:
+        return ()
+    usual = np.median([frame.inliers for frame in frames if frame.used and frame.inliers is not None])
+    told = [_stretch(stretch) for stretch in stretches[:_MOST_TOLD]]
+    more = f", and at {len(stretches) - len(told)} other places" if len(stretches) > len(told) else ""
+    return (
+        f"the path is held loosely at {', '.join(told)}{more}, where {usual:.0f} are usual: it may bend there "
+        "(camera_path.png); film there again, more slowly",
+    )
+
+
+def _stretch(frames: Sequence[FrameUse]) -> str:
+    """``frames 034 to 041 (63 points)``."""
+    fewest = min(frame.inliers for frame in frames if frame.inliers is not None)
+    first, last = frames[0].name, frames[-1].name
+    named = f"frame {first}" if first == last else f"frames {first} to {last}"
+    return f"{named} ({fewest} points)"
 
 
 def _strangers(looks: Sequence[_Look], names: Sequence[str]) -> tuple[str, ...]:

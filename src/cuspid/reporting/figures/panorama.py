@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +20,13 @@ _WIDTH_IN = 8.0
 _MARK = "#ffd23f"
 
 
-def save_camera_path(path: Path, panorama: Panorama, cam_from_world: Mapping[str, Rigid3]) -> None:
+def save_camera_path(
+    path: Path, panorama: Panorama, cam_from_world: Mapping[str, Rigid3], loose: Collection[str] = ()
+) -> None:
     """The panorama with the place of the camera at each frame, and below it height and tilt over the frames.
 
-    ``cam_from_world`` has the frames by their names; the world is that of the panorama.
+    ``cam_from_world`` has the frames by their names; the world is that of the panorama. ``loose``: frames to be marked
+    as held loosely.
     """
     poses = [pose.inverse() for pose in cam_from_world.values()]
     centres = np.array([pose.translation for pose in poses])
@@ -33,6 +36,9 @@ def save_camera_path(path: Path, panorama: Panorama, cam_from_world: Mapping[str
     figure = new_figure(_WIDTH_IN, above_in + 2.9, dpi=110, layout="constrained")
     above, below = figure.subplots(2, 1, height_ratios=[above_in, 1.7])
     _draw_above(above, panorama, centres, axes, tuple(cam_from_world))
+    held_loosely = np.array([name in loose for name in cam_from_world], dtype=bool)
+    if held_loosely.any():
+        _mark_loose(above, centres[held_loosely])
     _draw_heights(below, panorama, centres, axes)
     save_figure(figure, path)
 
@@ -53,6 +59,13 @@ def _draw_above(axis: Axes, panorama: Panorama, centres: np.ndarray, axes: np.nd
     axis.set_title("Path of the camera over the teeth")
     axis.set_xlim(min(extent[0], places[:, 0].min()), max(extent[1], places[:, 0].max()))
     axis.set_ylim(min(extent[2], places[:, 1].min()), max(extent[3], places[:, 1].max()))
+
+
+def _mark_loose(axis: Axes, centres: np.ndarray) -> None:
+    """Rings around places of the camera."""
+    x, y = centres[:, :2].T
+    axis.scatter(x, y, s=60, facecolors="none", edgecolors="#ff5a4f", linewidths=1.2, label="held loosely")
+    axis.legend(loc="lower right", fontsize=8)
 
 
 def save_distances(
