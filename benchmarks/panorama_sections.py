@@ -98,7 +98,7 @@ def path_row(name: str, results: Sequence[Result], pass_of: Mapping[str, Result]
         *(str(sum(error <= limit for error in ours.values())) for limit in (MEDIAN_MM, ALL_MEDIAN_MM)),
         str(sum(each is not None and abs(each) <= SCALE_PCT for each in scales)),
         str(sum(bool(each["score"] and each["score"]["complete"]) for each in results)),
-        "-" if name == "ortho" else f"{sum(own < other for own, other in both)} of {len(both)}",
+        "-" if name in ("ortho", "cusps") else f"{sum(own < other for own, other in both)} of {len(both)}",
     ]
 
 
