@@ -559,7 +559,8 @@ def loosely_held(frames: Sequence[FrameUse]) -> tuple[tuple[FrameUse, ...], ...]
     """Stretches of the trajectory that are held by less than half of the observations that its frames have in the
     median, the weakest first; its ends do not count, for nothing hangs on them. None where observations are not known.
 
-    There the path bends two to four times as often as elsewhere (docs/panorama-evaluation.md).
+    There a path of one way bends two to four times as often as elsewhere; of one there and back it tells little
+    (docs/panorama-evaluation.md).
     """
     used = [frame for frame in frames if frame.used]
     counts = [frame.inliers for frame in used if frame.inliers is not None]
