@@ -193,7 +193,7 @@ def scaled_by_cusps(capture: Path, out: Path, limit_s: int) -> list[str]:
     shown = [cusp(traced, tooth) for tooth in molars(traced)]
     true_mm = np.linalg.norm(np.diff(traced.true_mm[shown], axis=0))
     pixels = panorama.pixels_from_world(traced.placed[shown])
-    beside_px = CLICK_MM / panorama.mm_per_px * np.random.default_rng(len(traced.labels)).normal(size=(2, 2))
+    beside_px = CLICK_MM / panorama.mm_per_px * np.random.default_rng(len(traced.labels)).normal(size=(2, 2))  # type: ignore[operator]
     measured = (*(f"{each:.0f}" for each in (pixels + beside_px).ravel()), f"{round(2 * true_mm) / 2}")
     return [*CUSPID, "rescale", str(folder / "ortho"), "--distance", *measured, "--out", str(out)]
 
