@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cuspid import storage
+from cuspid.cli.panorama import clear
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
@@ -236,3 +237,29 @@ def test_the_panorama_itself_parts_and_meshes_are_refused(tmp_path: Path, capsys
     write(tmp_path / "mesh", replace(panorama(), method="mesh"))
     assert "view of a mesh" in refused(capsys, "rescale", tmp_path / "mesh", "--out", tmp_path / "out", *measured)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("file", ["poses.json", "strip.csv", "strip.json", "source.npz"])
+def test_a_damaged_file_leaves_nothing_behind(tmp_path: Path, capsys: pytest.CaptureFixture[str], file: str) -> None:
+    write(tmp_path / "pano", panorama())
+    (tmp_path / "pano" / file).write_bytes(b"column,along\n1")
+    line = refused(capsys, "rescale", tmp_path / "pano", "--out", tmp_path / "out", "--distance", 3, 3, 20, 20, 5)
+    assert file in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_panorama_is_overwritten_and_nothing_of_an_earlier_one_stays(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    measured = ("--distance", 3, 3, 20, 20, 5)
+    for name in ("pano", "other"):
+        write(tmp_path / name, panorama())
+    line = refused(capsys, "rescale", tmp_path / "pano", "--out", tmp_path / "other", *measured)
+    assert "other: holds a panorama of cuspid stitch" in line
+    run("rescale", tmp_path / "pano", "--out", tmp_path / "out", *measured)
+    for file in ("strip.json", "poses.json"):
+        (tmp_path / "other" / file).unlink()
+    run("rescale", tmp_path / "other", "--out", tmp_path / "out", *measured)
+    assert not any((tmp_path / "out" / file).exists() for file in ("strip.png", "poses.json", "camera_path.png"))
+    clear(tmp_path / "out")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"run.json", "report.html"}

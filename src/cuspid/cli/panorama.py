@@ -66,7 +66,7 @@ def _stitch_frames(frames: Path, out: Path, calibration: Path | None, options: S
         with storage.claimed_folder(out, "stitch", {"stitch": options}, hashes, replace=True):
             parts = panorama_pipeline.stitch(sequence, options, progress=progress)
             folders = [out if len(parts) == 1 else out / f"part-{part.panorama.part}" for part in parts]
-            _clear(out)
+            clear(out)
             for folder, part in zip(folders, parts, strict=True):
                 _write(folder, part)
     _print(parts, folders)
@@ -84,7 +84,7 @@ def _stitch_rig(folder: Path, out: Path, options: StitchOptions) -> None:
         hashes = storage.hash_capture(capture)
         with storage.claimed_folder(out, "stitch", {"stitch": options}, hashes, replace=True):
             made = panorama_pipeline.stitch_rig(capture, options, progress=progress)
-            _clear(out)
+            clear(out)
             _write(out, made)
     _print((made,), [out])
 
@@ -93,7 +93,7 @@ def _view_mesh(path: Path, out: Path, unit: storage.Unit, options: MeshViewOptio
     mesh, hashes = storage.read_mesh(path, unit), {"mesh": storage.hash_file(path)}
     with show_progress() as progress, storage.claimed_folder(out, "stitch", {"view": options}, hashes, replace=True):
         views, occlusal_from_mesh = panorama_pipeline.view_mesh(mesh, options, progress=progress)
-        _clear(out)
+        clear(out)
         for name, strip in views.strips.items():
             storage.write_strip(out if name == "occlusal" else out / name, strip)
         storage.write_json(out / "orientation.json", {"occlusal_from_mesh": occlusal_from_mesh.matrix})
@@ -124,12 +124,12 @@ def _hashes(sequence: ImageSequence, calibration: Path | None) -> dict[str, str]
 
 _FILES = (
     *("panorama.png", "panorama.json", "panorama.pgw", "source.npz", "frames.csv", "poses.json", "camera_path.png"),
-    *("strip.png", "strip.json", "strip.csv", "orientation.json"),
+    *("strip.png", "strip.json", "strip.csv", "orientation.json", "distances.json", "distances.png"),
 )
-"""What a panorama or the views of a mesh consist of."""
+"""What a panorama, scaled or not, or the views of a mesh consist of."""
 
 
-def _clear(out: Path) -> None:
+def clear(out: Path) -> None:
     """Remove what an earlier run made: not every run makes all of it, and the rest would be shown as of this one."""
     for folder in (*out.glob("part-*"), out / "buccal", out / "lingual", out):
         for name in _FILES:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -11,14 +12,16 @@ from rich.table import Table
 from tyro.conf import Positional, UseAppendAction, arg
 
 from cuspid import storage
-from cuspid.cli.panorama import save_path_picture
+from cuspid.cli.panorama import clear, save_path_picture
 from cuspid.cli.report import report
 from cuspid.cli.shared import console
 from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
 from cuspid.options import Range
 from cuspid.reporting.figures.panorama import save_distances
 from cuspid.stitching.rescaling import MeasuredDistance, Rescaled, rescaled, scaled_pose
-from cuspid.storage.strips import write_scaled_strip
+from cuspid.storage.files import read_manifest
+from cuspid.storage.strips import read_scaled_strip, write_scaled_strip
 from cuspid.values import LONGEST_MM
 
 _LEAST_MM = 0.1
@@ -51,11 +54,17 @@ def rescale(
         raise InputError(f"rescale: {out}: is the panorama itself; give another folder as --out")
     if not (panorama / "panorama.json").exists() and (panorama / "part-1").is_dir():
         raise InputError(f"{panorama}: has parts; give one of them: {panorama / 'part-1'}")
-    before = storage.read_panorama(panorama)
+    if "stitch" in read_manifest(out):
+        raise InputError(f"rescale: {out}: holds a panorama of cuspid stitch; give another folder as --out")
+    before, poses = storage.read_panorama(panorama), _poses(panorama)
     found = rescaled(before, measured)
+    strip = read_scaled_strip(panorama, found.factor) if (panorama / "strip.json").exists() else None
     hashes = {name: storage.hash_file(panorama / name) for name in ("panorama.json", "panorama.png", "source.npz")}
     with storage.claimed_folder(out, "rescale", {"distance": distance}, hashes, replace=True):
-        _write(panorama, out, found, measured)
+        clear(out)
+        if strip is not None:
+            write_scaled_strip(out, strip)
+        _write(out, found, poses, measured)
     _print(found, measured, unit="px" if before.mm_per_px is None else "mm")
     report(out)
 
@@ -67,12 +76,15 @@ def _measured(given: tuple[float, float, float, float, float]) -> MeasuredDistan
     return MeasuredDistance(places_px=np.reshape(given[:4], (2, 2)), mm=given[-1])
 
 
-def _write(folder: Path, out: Path, found: Rescaled, measured: tuple[MeasuredDistance, ...]) -> None:
-    """All that stitch wrote, in the new millimetres, and what they are from."""
-    if (folder / "strip.json").exists():
-        write_scaled_strip(folder, out, found.factor)
-    if (folder / "poses.json").exists():
-        poses = storage.read_poses(folder / "poses.json")
+def _poses(panorama: Path) -> Mapping[str, Rigid3]:
+    """Of the camera, none where the method locates none."""
+    file = panorama / "poses.json"
+    return storage.read_poses(file) if file.exists() else {}
+
+
+def _write(out: Path, found: Rescaled, poses: Mapping[str, Rigid3], measured: tuple[MeasuredDistance, ...]) -> None:
+    """All but the strip in the new millimetres, and what they are from."""
+    if poses:
         scaled = {name: scaled_pose(pose, found.factor) for name, pose in poses.items()}
         storage.write_poses(out / "poses.json", scaled)
         save_path_picture(out, found.panorama, scaled)
