@@ -281,6 +281,23 @@ def test_what_looks_like_a_place_is_not_taken_for_it() -> None:
     assert {each.what for each in found.dropped} == {f"frame {name}" for name in names[len(left) :]}
 
 
+def in_a_disc(one: DepthMap, bent_mm: float) -> DepthMap:
+    """Nothing is known but in a disc, whose outermost pixels are bent."""
+    rows, columns = np.mgrid[: one.depth_mm.shape[0], : one.depth_mm.shape[1]]
+    radius = np.hypot(rows - 40, columns - 40)
+    depth = one.depth_mm + bent_mm * np.maximum(radius - 29, 0)
+    return replace(one, depth_mm=depth.astype(np.float32), confidence=one.confidence * (radius < 30))
+
+
+@pytest.mark.parametrize("border_px", [0, 2])
+def test_what_is_wrong_along_borders_is_not_laid_onto_others(border_px: int) -> None:
+    options, maps = SurfaceTrackingOptions(border_px=border_px), depth_maps({"00000": Rigid3.identity()})
+    straight, bent = (surface_of([in_a_disc(each, mm) for each in maps], 5.0, options) for mm in (0.0, 0.03))
+    same = straight.points.shape == bent.points.shape and bool((straight.points == bent.points).all())
+    assert same == (border_px == 2)
+    assert len(bent) > 1000
+
+
 def test_polarisers_are_asked_for_where_there_are_none() -> None:
     maps = depth_maps(dict(list(OUT.items())[:2]), height_field(lambda x, y: 5 + 0 * x, half_width_mm=14.0))
     crossed = {"led": Light(position_mm=np.zeros(3), direction=np.array([0.0, 0, 1]), glare=0.03)}

@@ -21,6 +21,7 @@ from functools import partial
 from itertools import groupby, islice, product
 from typing import Annotated, NamedTuple
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
@@ -89,6 +90,9 @@ class SurfaceTrackingOptions(Options):
 
     thinning: Annotated[float, Range(0.0001, 1)] = 0.02
     """Each frame is thinned to one point per cube of this side, as a share of the working distance (0.1 mm at 5 mm)."""
+    border_px: Annotated[int, Range(0, 1000)] = 2
+    """Depths within so many pixels of a depth map (in each direction) of one that is not known are not laid onto
+    others: surfaces are smoothed from one side only there, and turn along with the cameras."""
     minimum_overlap: Annotated[float, SHARE] = 0.3
     """Share (0 to 1) of a frame's surface that must lie on an earlier one for the frame to be placed."""
     largest_scatter: Annotated[float, Range(0.0001, 1)] = 0.018
@@ -196,7 +200,7 @@ class _Step:
 # --- surfaces of frames ------------------------------------------------------------------------------------------
 
 
-def _shown(depth_map: DepthMap, jump_mm: float) -> Shown:
+def _shown(depth_map: DepthMap, jump_mm: float, border_px: int) -> Shown:
     """The points of a depth map that have neighbours on all sides, in the rig frame."""
     camera = depth_map.camera
     rays = camera.rays(camera.pixel_centres().reshape(-1, 2)).reshape(camera.height, camera.width, 3)
@@ -208,16 +212,22 @@ def _shown(depth_map: DepthMap, jump_mm: float) -> Shown:
     normals, facing = normals * np.sign(facing)[..., None], np.abs(facing)
     with np.errstate(invalid="ignore"):
         smooth = np.maximum(np.linalg.norm(right, axis=-1), np.linalg.norm(down, axis=-1)) < jump_mm
-        good = smooth & (facing > _LEAST_COSINE)
+        good = smooth & (facing > _LEAST_COSINE) & _away_from_border(depth_map.known, border_px)
     rig_from_cam = depth_map.cam_from_rig.inverse()
     return Shown(
         rig_from_cam.apply(points[good]), rig_from_cam.rotate(normals[good]), depth_map.confidence[good].astype(float)
     )
 
 
+def _away_from_border(known: Bool[np.ndarray, "h w"], border_px: int) -> Bool[np.ndarray, "h w"]:
+    """Pixels with no unknown one so close; beyond the image nothing is unknown."""
+    window = np.ones((2 * border_px + 1,) * 2, np.uint8)
+    return cv2.erode(known.astype(np.uint8), window).astype(bool)
+
+
 def surface_of(depth_maps: Iterable[DepthMap], working_distance_mm: float, options: SurfaceTrackingOptions) -> Surface:
     """What the depth maps of a frame show, thinned out: the mean of what lies in one cube and faces one way."""
-    parts = [_shown(each, _JUMP * working_distance_mm) for each in depth_maps]
+    parts = [_shown(each, _JUMP * working_distance_mm, options.border_px) for each in depth_maps]
     nothing = Shown(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
     points, normals, trust = (np.concatenate(each) for each in zip(nothing, *parts, strict=True))
     cubes = np.floor(points / (options.thinning * working_distance_mm)).astype(np.int64)
