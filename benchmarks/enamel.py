@@ -30,7 +30,7 @@ from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
 from cuspid.jaw import Jaw
 from cuspid.pipeline import ReconstructionOptions
-from cuspid.rig import Handpiece
+from cuspid.rig import Handpiece, Rig
 from cuspid.simulation.appearance import Preset
 from cuspid.simulation.optics import OpticsOptions
 from cuspid.simulation.path.scan import ScanPathOptions
@@ -46,15 +46,15 @@ REAL = {"005_upper": 11, "010_upper": 16, "023_lower": 36, "034_upper": 21, "048
 DENSE = 20
 """Frames of a tooth that is scanned with twice as many as usual."""
 ARCHES = {"arch-phantom": "0", "arch-upper": "fullarch_upper_137k"}
-VARIANTS = ("glossy", "white-crossed", "white", "in-turn")
-"""Colour-coded without polarisers; white with them; white without; six LEDs a group in turn without: of the phantom of
-seed 0."""
+VARIANTS = ("glossy", "white-crossed", "white", "in-turn", "pairs")
+"""Colour-coded without polarisers; white with them; white without; six LEDs a group in turn without; two of the four
+cameras of each group, those that are farther apart: of the phantom of seed 0."""
 METHODS = {
     "as-texture": ReconstructionOptions(signal="texture"),
     "colmap": ReconstructionOptions(signal="texture", motion="colmap"),
 }
-"""How else the images of the phantom of seed 0 are reconstructed: by keypoints and correlation, with cuspid's motion or
-COLMAP's."""
+"""How else the images of the phantom of seed 0, plain and natural, are reconstructed: by keypoints and correlation,
+with cuspid's motion or COLMAP's."""
 _TEXTURED: dict[str, Value] = {"light": "white", "optics": "clinical", "texture": "artificial"}
 
 
@@ -79,7 +79,9 @@ def cases(folder: Path) -> Iterator[Case]:
     for name, jaw in phantoms.items():
         yield Case(name=f"{name}-in-turn-dense", parameters={**jaw, **plain, **in_turn})
     for method in METHODS:
-        yield Case(name=f"phantom-0-{method}", parameters={**phantoms["phantom-0"], **plain, "method": method})
+        for kind, look in (("", {}), ("natural-", {"texture": "natural"})):
+            parameters: dict[str, Value] = {**phantoms["phantom-0"], **plain, **look, "method": method}
+            yield Case(name=f"phantom-0-{kind}{method}", parameters=parameters)
     for name, tooth in REAL.items():
         file = _file_of(name, folder)
         if file is not None:
@@ -94,6 +96,7 @@ def cases(folder: Path) -> Iterator[Case]:
                 name=f"{name}-clinical-cross", parameters={**whole, **plain, "optics": "clinical", "cross": True}
             )
             yield Case(name=f"{name}-artificial-clinical", parameters={**whole, **_TEXTURED})
+            yield Case(name=f"{name}-in-turn", parameters={**whole, **plain, "light": "in-turn"})
 
 
 def _file_of(name: str, folder: Path) -> str | None:
@@ -104,8 +107,10 @@ def lit(light: str) -> Handpiece:
     """The twelve cameras under one kind of light."""
     if light == "in-turn":
         return twelve_cameras(DesignOptions(lights="in-turn"))
-    coded = light in ("coded", "glossy")
+    coded = light in ("coded", "glossy", "pairs")
     made = twelve_cameras(DesignOptions(lights="colour-coded" if coded else "white"))
+    if light == "pairs":
+        return replace(made, rig=Rig({name: made.rig[name] for name in made.rig.names if name[1:] in ("1", "2")}))
     glare = {"glossy": 1.0, "white-crossed": 0.03}.get(light)
     if glare is None:
         return made
