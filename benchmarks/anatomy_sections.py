@@ -295,6 +295,49 @@ def enamel(result: Result) -> str:
     )
 
 
+def plain_frames(result: Result) -> str:
+    """Single frames of plain enamel, and single steps between them."""
+    told = {name: scan for name, scan in result["scans"].items() if scan["failure"] is None}
+    return "\n".join(
+        [
+            "Sixteen frames of twelve cameras over each tooth, 1 mm apart, texture `enamel`, colour-coded LEDs behind "
+            "crossed polarisers. Of all pixels that see the jaw in the range of depth: depth by light and shade, and "
+            "beside it OpenCV's StereoSGBM of the widest pair of each group, rectified at full resolution, checked "
+            "both ways. *Per cosine*: how much farther than the truth a surface comes out that turns from facing the "
+            "camera to being seen from the side is the negative of it. Steps: each frame laid onto the next from its "
+            "true place; mean of what they are off by and its standard error, which is chance, in the frame of the "
+            "handpiece (x along the arch, z up): what differs from 0 by more bends an arch. "
+            "`python benchmarks/plain_frames.py`.",
+            "",
+            markdown_table(
+                (
+                    *("tooth", "depth, %", "within 50 um, %", "median, um", "per cosine, um"),
+                    *("SGBM: depth, %", "within 50 um, %", "median, um"),
+                    *("steps: turn about z, mrad", "pitch about y, mrad", "along x, um"),
+                ),
+                [
+                    (
+                        name,
+                        *(_jaw_figure(scan, key) for key in _PLAIN_FRAME),
+                        *(_mean_and_error(scan, step) for step in ("turn_z", "pitch_y", "along_x")),
+                    )
+                    for name, scan in told.items()
+                ],
+            ),
+        ]
+    )
+
+
+_PLAIN_FRAME = (
+    *("known_pct", "within_50_um_pct", "median_um", "per_cosine_um"),
+    *("sgbm_known_pct", "sgbm_within_50_um_pct", "sgbm_median_um"),
+)
+
+
+def _mean_and_error(scan: Result, step: str) -> str:
+    return f"{scan[f'step_{step}']:+.2f} ± {scan[f'step_{step}_error']:.2f}"
+
+
 def real_gloss(result: Result) -> str:
     """Photographs of a ball whose lights and normals are known."""
     ways = {

@@ -91,6 +91,7 @@ BENCHMARKS = (
     Benchmark("live", "live.py phantom {jaws}/fullarch_upper_137k.ply --work {work} --out {out}"),
     Benchmark("expectations", "expectations.py --work {work} --out {out}"),
     Benchmark("enamel", "enamel.py {jaws} --work {work} --out {out}"),
+    Benchmark("plain_frames", "plain_frames.py {jaws} --work {work} --out {out}"),
     Benchmark("jaws_plan", "jaws.py {jaws} --plan --work {work} --out {out}"),
     Benchmark("jaws_half", "jaws.py {jaws} --size half --work {work} --out {out}"),
     Benchmark(

@@ -73,6 +73,7 @@ MAKERS: Mapping[str, Maker] = {
     "stereo_pairs": Maker("stereo_pairs"),
     "jaws_*": Maker("jaws"),
     "enamel": Maker("enamel", plain=True),
+    "plain_frames": Maker("plain_frames", plain=True),
     "real_gloss": Maker("real_gloss", plain=True),
     "manufacturing*": Maker("manufacturing"),
     "expectations": Maker("expectations"),

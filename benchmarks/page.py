@@ -176,6 +176,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
     "jaws_full": ("Real jaws at full size", anatomy_sections.jaws),
     "jaws_full_auto": ("Real jaws at full size, with further passes", anatomy_sections.jaws),
     "enamel": ("Plain enamel", anatomy_sections.enamel),
+    "plain_frames": ("Single frames of plain enamel", anatomy_sections.plain_frames),
     "real_gloss": ("A real glossy ball", anatomy_sections.real_gloss),
     "targets": ("Boards and terraces", handpiece_sections.targets),
     "manufacturing": ("Handpieces not built exactly as drawn", handpiece_sections.manufacturing),
