@@ -303,9 +303,9 @@ def plain_frames(result: Result) -> str:
             "Sixteen frames of twelve cameras over each tooth, 1 mm apart, texture `enamel`, colour-coded LEDs behind "
             "crossed polarisers. Of all pixels that see the jaw in the range of depth: depth by light and shade, and "
             "beside it OpenCV's StereoSGBM of the widest pair of each group, rectified at full resolution, checked "
-            "both ways. *Per cosine*: how much farther than the truth a surface comes out that turns from facing the "
-            "camera to being seen from the side is the negative of it. Steps: each frame laid onto the next from its "
-            "true place; mean of what they are off by and its standard error, which is chance, in the frame of the "
+            "both ways. *Per cosine*: by how much depths change, as errors, with the cosine between line of sight and "
+            "normal; below 0, oblique surfaces come out too far. Steps: each frame laid onto the next from its true "
+            "place; mean of what they are off by and its standard error, which is chance, in the frame of the "
             "handpiece (x along the arch, z up): what differs from 0 by more bends an arch. "
             "`python benchmarks/plain_frames.py`.",
             "",
