@@ -297,7 +297,6 @@ def enamel(result: Result) -> str:
 
 def plain_frames(result: Result) -> str:
     """Single frames of plain enamel, and single steps between them."""
-    told = {name: scan for name, scan in result["scans"].items() if scan["failure"] is None}
     return "\n".join(
         [
             "Sixteen frames of twelve cameras over each tooth, 1 mm apart, texture `enamel`, colour-coded LEDs behind "
@@ -313,15 +312,16 @@ def plain_frames(result: Result) -> str:
                 (
                     *("tooth", "depth, %", "within 50 um, %", "median, um", "per cosine, um"),
                     *("SGBM: depth, %", "within 50 um, %", "median, um"),
-                    *("steps: turn about z, mrad", "pitch about y, mrad", "along x, um"),
+                    *("steps: turn about z, mrad", "pitch about y, mrad", "along x, um", "failure"),
                 ),
                 [
                     (
                         name,
                         *(_jaw_figure(scan, key) for key in _PLAIN_FRAME),
                         *(_mean_and_error(scan, step) for step in ("turn_z", "pitch_y", "along_x")),
+                        scan["failure"] or "",
                     )
-                    for name, scan in told.items()
+                    for name, scan in result["scans"].items()
                 ],
             ),
         ]
@@ -335,7 +335,8 @@ _PLAIN_FRAME = (
 
 
 def _mean_and_error(scan: Result, step: str) -> str:
-    return f"{scan[f'step_{step}']:+.2f} ± {scan[f'step_{step}_error']:.2f}"
+    mean, error = scan.get(f"step_{step}"), scan.get(f"step_{step}_error")
+    return "" if mean is None else f"{mean:+.2f} ± {error:.2f}"
 
 
 def real_gloss(result: Result) -> str:

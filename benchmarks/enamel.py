@@ -12,7 +12,6 @@ too, each with the commit that it is of.
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import time
 from collections.abc import Iterator
@@ -21,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from jaws import is_asked, scanned
+from jaws import figures_of, parser_of, scanned
 from run import conditions
 
 from cuspid.anatomy.jaw_files import load_jaw
@@ -35,8 +34,8 @@ from cuspid.simulation.appearance import Preset
 from cuspid.simulation.optics import OpticsOptions
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.simulation.stage import SimulationOptions
-from cuspid.storage import read_json, write_json
-from cuspid.studies.grid import Case, Value, run_grid
+from cuspid.storage import write_json
+from cuspid.studies.grid import Case, Value
 from cuspid.studies.scan_cases import commit
 
 HERE = Path(__file__).parent
@@ -150,26 +149,10 @@ def judge(
 
 def main() -> None:
     """Scan what is asked for and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--work", type=Path, default=Path("build/enamel"))
-    parser.add_argument("--out", type=Path, default=HERE / "results" / "enamel.json")
-    parser.add_argument("--only", nargs="*", help="names of cases or parts of them; default: all")
-    parser.add_argument("--add", action="store_true", help="to what the result file holds of other scans")
-    arguments = parser.parse_args()
-    known = list(cases(arguments.folder))
-    chosen = [each for each in known if arguments.only is None or is_asked(each.name, arguments.only, known)]
-    outcomes = run_grid(
-        chosen,
-        partial(judge, scans=arguments.work / "unfinished"),
-        arguments.work,
-        workers=1,
-        progress=lambda stage, done, total: print(f"{stage}: {done} of {total}", flush=True),
-    )
-    before = read_json(arguments.out)["scans"] if arguments.add and arguments.out.exists() else {}
-    scans = before | {each.case.name: {**each.figures, "failure": each.failure} for each in outcomes}
-    ordered = {each.name: scans[each.name] for each in known if each.name in scans}
-    write_json(arguments.out, {"scans": ordered, **conditions()})
+    arguments = parser_of(__doc__, Path("build/enamel"), HERE / "results" / "enamel.json").parse_args()
+    how = partial(judge, scans=arguments.work / "unfinished")
+    scans = figures_of(list(cases(arguments.folder)), how, arguments.work, arguments.out, arguments)
+    write_json(arguments.out, {"scans": scans, **conditions()})
 
 
 if __name__ == "__main__":

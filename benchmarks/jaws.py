@@ -40,7 +40,7 @@ from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.rig import Handpiece
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 from cuspid.storage import read_json, read_poses, write_json
-from cuspid.studies.grid import Case, Value, run_grid
+from cuspid.studies.grid import Case, Value, Work, run_grid
 from cuspid.studies.scan_cases import commit
 
 HERE = Path(__file__).parent
@@ -198,42 +198,47 @@ def is_asked(name: str, words: list[str], known: list[Case]) -> bool:
     return any(word == name or (word not in names and word in name) for word in words)
 
 
-def asked() -> argparse.Namespace:
-    """What the command line says."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def parser_of(description: str | None, work: Path, out: Path | None) -> argparse.ArgumentParser:
+    """Of a benchmark that scans the jaws of a folder, by case."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--work", type=Path, default=Path("build/jaws"))
-    parser.add_argument("--out", type=Path, default=None, help="default: benchmarks/results/jaws_<what>.json")
-    parser.add_argument("--size", choices=("half", "full"), default="half", help="of the images: 250 or 500 px")
-    parser.add_argument("--passes", choices=("turns", "auto"), default="turns")
+    parser.add_argument("--work", type=Path, default=work)
+    parser.add_argument("--out", type=Path, default=out)
     parser.add_argument("--only", nargs="*", help="names of cases or parts of them; default: all")
-    parser.add_argument("--plan", action="store_true", help="only plan the paths")
-    parser.add_argument("--add", action="store_true", help="to what the result file holds of other jaws")
-    return parser.parse_args()
+    parser.add_argument("--add", action="store_true", help="to what the result file holds of other cases")
+    return parser
 
 
-def main() -> None:
-    """Scan what is asked for and write the figures."""
-    arguments = asked()
-    auto = ["auto"] if arguments.passes == "auto" else []
-    kind = "_".join(["plan" if arguments.plan else arguments.size, *auto])
-    pixels = 500 if arguments.size == "full" else 250
-    files = {path.stem: path for path in sorted(arguments.folder.rglob("*.ply"))}
-    known = list(cases(files))
+def figures_of(known: list[Case], how: Work, work: Path, out: Path, arguments: argparse.Namespace) -> dict[str, Value]:
+    """By the names of the cases that are asked for, in the order of all; with ``--add`` also of those in ``out``."""
     chosen = [each for each in known if arguments.only is None or is_asked(each.name, arguments.only, known)]
-    work = arguments.work / kind
     outcomes = run_grid(
         chosen,
-        partial(judge, pixels=pixels, passes=arguments.passes, plan_only=arguments.plan, scans=work / "unfinished"),
+        how,
         work,
         workers=1,
         progress=lambda stage, done, total: print(f"{stage}: {done} of {total}", flush=True),
     )
-    out = arguments.out or HERE / "results" / f"jaws_{kind}.json"
     before = read_json(out)["scans"] if arguments.add and out.exists() else {}
     scans = before | {each.case.name: {**each.figures, "failure": each.failure} for each in outcomes}
-    ordered = {each.name: scans[each.name] for each in known if each.name in scans}
-    write_json(out, {"kind": kind, "cases": len(known), "scans": ordered, **conditions()})
+    return {each.name: scans[each.name] for each in known if each.name in scans}
+
+
+def main() -> None:
+    """Scan what is asked for and write the figures."""
+    parser = parser_of(__doc__, Path("build/jaws"), None)
+    parser.add_argument("--size", choices=("half", "full"), default="half", help="of the images: 250 or 500 px")
+    parser.add_argument("--passes", choices=("turns", "auto"), default="turns")
+    parser.add_argument("--plan", action="store_true", help="only plan the paths")
+    arguments = parser.parse_args()
+    auto = ["auto"] if arguments.passes == "auto" else []
+    kind = "_".join(["plan" if arguments.plan else arguments.size, *auto])
+    pixels = 500 if arguments.size == "full" else 250
+    known = list(cases({path.stem: path for path in sorted(arguments.folder.rglob("*.ply"))}))
+    work, out = arguments.work / kind, arguments.out or HERE / "results" / f"jaws_{kind}.json"
+    how = partial(judge, pixels=pixels, passes=arguments.passes, plan_only=arguments.plan, scans=work / "unfinished")
+    scans = figures_of(known, how, work, out, arguments)
+    write_json(out, {"kind": kind, "cases": len(known), "scans": scans, **conditions()})
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Hold single frames of plain enamel, and single steps from one to the next, against the truth.
 
-    python benchmarks/plain_frames.py [FOLDER] [--work build/plain_frames] [--only phantom-0-41] [--add]
+    python benchmarks/plain_frames.py FOLDER [--work build/plain_frames] [--only phantom-0-41] [--add]
 
 FOLDER holds labelled meshes of real jaws. Sixteen frames pass over a tooth, 1 mm apart. Their depth is measured by
 light and shade, and for comparison with OpenCV's StereoSGBM, of the widest pairs of each group, rectified at full
@@ -12,7 +12,6 @@ the worse with a tenth of the work.
 
 from __future__ import annotations
 
-import argparse
 import shutil
 from collections.abc import Iterator, Mapping
 from functools import partial
@@ -22,7 +21,7 @@ from typing import Literal, NamedTuple
 import cv2
 import numpy as np
 from enamel import PHANTOMS, REAL, jaw_of, lit
-from jaws import is_asked
+from jaws import figures_of, parser_of
 from jaxtyping import Float, UInt8
 from run import conditions
 
@@ -40,8 +39,8 @@ from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.stereo.initial_depth import initial_pairs, semi_global
 from cuspid.stereo.matching import DepthEstimator
 from cuspid.stereo.rectification import RectifiedPair, rectify
-from cuspid.storage import read_json, read_poses, write_json
-from cuspid.studies.grid import Case, Value, run_grid
+from cuspid.storage import read_poses, write_json
+from cuspid.studies.grid import Case, Value
 from cuspid.studies.scan_cases import commit
 
 HERE = Path(__file__).parent
@@ -62,14 +61,14 @@ class Compared(NamedTuple):
     """Of the angle between the line of sight and the true normal."""
 
 
-def cases(folder: Path | None) -> Iterator[Case]:
+def cases(folder: Path) -> Iterator[Case]:
     """Molars and front teeth, ideal and clinical."""
     teeth: dict[str, dict[str, Value]] = {}
     for seed, molar in PHANTOMS.items():
         for tooth in (molar, FRONT):
             teeth[f"phantom-{seed}-{tooth}"] = {"jaw": str(seed), "tooth": tooth}
     for name, tooth in REAL.items():
-        file = next(map(str, folder.rglob(f"{name}.ply")), None) if folder else None
+        file = next(map(str, folder.rglob(f"{name}.ply")), None)
         if file is not None:
             teeth[f"{name}-{tooth}"] = {"jaw": file, "tooth": tooth}
     for name, each in teeth.items():
@@ -189,26 +188,10 @@ def judge(*, jaw: str, tooth: int, optics: Literal["ideal", "clinical"], scans: 
 
 def main() -> None:
     """Measure what is asked for and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, nargs="?")
-    parser.add_argument("--work", type=Path, default=Path("build/plain_frames"))
-    parser.add_argument("--out", type=Path, default=HERE / "results" / "plain_frames.json")
-    parser.add_argument("--only", nargs="*", help="names of cases or parts of them; default: all")
-    parser.add_argument("--add", action="store_true", help="to what the result file holds of other teeth")
-    arguments = parser.parse_args()
-    known = list(cases(arguments.folder))
-    chosen = [each for each in known if arguments.only is None or is_asked(each.name, arguments.only, known)]
-    outcomes = run_grid(
-        chosen,
-        partial(judge, scans=arguments.work / "unfinished"),
-        arguments.work,
-        workers=1,
-        progress=lambda stage, done, total: print(f"{stage}: {done} of {total}", flush=True),
-    )
-    before = read_json(arguments.out)["scans"] if arguments.add and arguments.out.exists() else {}
-    scans = before | {each.case.name: {**each.figures, "failure": each.failure} for each in outcomes}
-    ordered = {each.name: scans[each.name] for each in known if each.name in scans}
-    write_json(arguments.out, {"scans": ordered, **conditions()})
+    arguments = parser_of(__doc__, Path("build/plain_frames"), HERE / "results" / "plain_frames.json").parse_args()
+    how = partial(judge, scans=arguments.work / "unfinished")
+    scans = figures_of(list(cases(arguments.folder)), how, arguments.work, arguments.out, arguments)
+    write_json(arguments.out, {"scans": scans, **conditions()})
 
 
 if __name__ == "__main__":
