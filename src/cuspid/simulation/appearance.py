@@ -45,6 +45,9 @@ class Material:
     ask for it."""
     veins: Colour | None = None
     """Linear RGB albedo of thin lines through it, as of vessels; None for none."""
+    stipple_mm: float = 0.0
+    """Standard deviation of the height of its stippling, where marks have any. It turns normals, and leaves the shape
+    as it is."""
     applied: bool = False
     """Whether the texture is sprayed or painted on, as fine as the cameras need it, rather than the surface's own."""
 
@@ -67,7 +70,7 @@ class Appearance:
     gum: Material
     """Gingiva."""
     marked: bool = False
-    """Whether teeth bear what real ones do (:func:`cuspid.simulation.marks.natural_marks`)."""
+    """Whether teeth and gum bear what real ones do (:func:`cuspid.simulation.marks.natural_marks`)."""
 
     def seen_by(self, footprint_mm: float) -> Appearance:
         """Both materials as :meth:`Material.seen_by`."""
@@ -109,14 +112,14 @@ APPEARANCES: Mapping[str, Appearance] = MappingProxyType(
         "enamel": Appearance(enamel=_ENAMEL, gum=_GUM),
         "natural": Appearance(
             enamel=replace(_ENAMEL, dark=(0.70, 0.60, 0.42), light=(0.80, 0.73, 0.58)),
-            gum=replace(_GUM, veins=(0.36, 0.03, 0.03)),
+            gum=replace(_GUM, veins=(0.36, 0.03, 0.03), stipple_mm=0.01),
             marked=True,
         ),
     }
 )
 """Presets: ``artificial`` is a strong matte texture on everything (the thesis' condition), ``powder`` a weak matte
 speckle like that of scanning spray, ``enamel`` plain, glossy and wet, ``natural`` the same with dentine that shines
-through, stained fissures, fillings, and gums with vessels."""
+through, stained fissures, fillings, and stippled gums with vessels."""
 
 
 class Palette(NamedTuple):
@@ -138,6 +141,10 @@ class Palette(NamedTuple):
     """Colour of the veins of each material; negative for none."""
     veins_from_jaw: np.ndarray
     """(2, 3, 4): as for the octaves, of the noise along whose zeros veins run, and of that by which they fade."""
+    stipple_mm: np.ndarray
+    """Height of the stippling of each material."""
+    stipple_from_jaw: np.ndarray
+    """(3, 4): as for the octaves, of the noise that is that height."""
 
 
 def scattering_mm(appearance: Appearance, materials: UInt8[np.ndarray, "f"]) -> Float[np.ndarray, "f 3"]:
@@ -176,6 +183,8 @@ def palette(appearance: Appearance, seed: int, saliva: float = 0.0) -> Palette:
         noise_from_jaw=noise_from_jaw,
         veins=np.array([material.veins or (-1.0,) * 3 for material in materials]),
         veins_from_jaw=_lattices(_VEINS_MM, rng),
+        stipple_mm=np.array([material.stipple_mm for material in materials]),
+        stipple_from_jaw=_lattices((_STIPPLES_MM,), rng)[0],
     )
 
 
@@ -196,6 +205,11 @@ _VEINS_MM = (1.8, 2.6)
 """Distance of veins, and over which they fade."""
 _VEIN = 0.04
 """Half width of a vein, as a share of their distance."""
+_STIPPLES_MM = 0.44
+"""Wavelength of noise that has 2.6 hollows per square millimetre of a surface, as papillae have on average (J.
+Bergstroem, Journal of Clinical Periodontology 11, 1984: 423)."""
+_STEP = 0.05
+"""Over which the slope of that noise is taken, in wavelengths."""
 
 
 @kernel(fastmath=True, inline="always")
@@ -235,6 +249,29 @@ def gradient_noise(x, y, z):
     a += v * (b - a)
     c += v * (d - c)
     return a + w * (c - a)
+
+
+@kernel(fastmath=True)
+@no_type_check
+def stippled(normal, point, height_mm, noise_from_jaw):
+    """The unit normal of a surface on which a noise of this height lies (bump mapping; Blinn 1978)."""
+    m = noise_from_jaw
+    x = m[0, 0] * point[0] + m[0, 1] * point[1] + m[0, 2] * point[2] + m[0, 3]
+    y = m[1, 0] * point[0] + m[1, 1] * point[1] + m[1, 2] * point[2] + m[1, 3]
+    z = m[2, 0] * point[0] + m[2, 1] * point[1] + m[2, 2] * point[2] + m[2, 3]
+    here, scale = gradient_noise(x, y, z), height_mm / (GRADIENT_NOISE_SD * _STEP)
+    u = scale * (gradient_noise(x + _STEP, y, z) - here)
+    v = scale * (gradient_noise(x, y + _STEP, z) - here)
+    w = scale * (gradient_noise(x, y, z + _STEP) - here)
+    slope = (
+        m[0, 0] * u + m[1, 0] * v + m[2, 0] * w,
+        m[0, 1] * u + m[1, 1] * v + m[2, 1] * w,
+        m[0, 2] * u + m[1, 2] * v + m[2, 2] * w,
+    )
+    upwards = 1 + slope[0] * normal[0] + slope[1] * normal[1] + slope[2] * normal[2]
+    a, b, c = upwards * normal[0] - slope[0], upwards * normal[1] - slope[1], upwards * normal[2] - slope[2]
+    inverse = 1 / np.sqrt(a * a + b * b + c * c)
+    return a * inverse, b * inverse, c * inverse
 
 
 @kernel(fastmath=True)

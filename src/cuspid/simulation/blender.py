@@ -59,7 +59,7 @@ def render_with_blender(
     if scene.optics != IDEAL:
         raise InputError("optics: Blender renders ideal ones only; use the renderer embree")
     if scene.appearance.marked:
-        raise InputError("texture: Blender renders no stains, fillings and vessels; use the renderer embree")
+        raise InputError("texture: Blender renders no stains, fillings, vessels and stippling; use the renderer embree")
     python = blender_python()
     tasks = [(frame, camera) for frame in frames for camera in frame.cameras if not skip(frame.name, camera)]
     if not tasks:

@@ -29,7 +29,7 @@ class FilmOptions(RenderOptions):
 
     texture: Preset = "enamel"
     """Surface: artificial (strong matte texture, the thesis' condition), powder (weak speckle), enamel (plain, wet),
-    natural (the same, with stained fissures, fillings and vessels)."""
+    natural (the same, with stained fissures, fillings, vessels and stippled gum)."""
     path: FreePathOptions = field(default_factory=FreePathOptions)
     """How the hand moves the camera."""
 

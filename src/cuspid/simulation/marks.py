@@ -1,9 +1,9 @@
-"""What real teeth bear besides their shape: dentine that shines through, stained fissures, fillings.
+"""What teeth and gums bear besides their shape: dentine that shines through, stained fissures, fillings; stippling.
 
-All follow from the shape, by how far a surface that is softened over a length lies above each point: enamel is thin in
-the hollows of the chewing surface, at necks and behind front teeth, and thick at cusps and edges, so that hollows are
-yellower; and what discolours teeth stays in fissures. Each is a share per vertex, by which a colour replaces the one
-below.
+What teeth bear follows from the shape, by how far a surface that is softened over a length lies above each point:
+enamel is thin in the hollows of the chewing surface, at necks and behind front teeth, and thick at cusps and edges, so
+that hollows are yellower; and what discolours teeth stays in fissures. Each is a share per vertex, by which a colour
+replaces the one below. Gum is stippled where it is attached.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float32
+from scipy.spatial import cKDTree
 
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
@@ -36,14 +37,20 @@ _THINNEST_MM = 1e-3
 """Crowns are never taken for thinner."""
 _FILLING_EDGE = 0.08
 """Width of its edge, as a share of its radius."""
+_FREE_MM, _ATTACHED_MM = (0.4, 1.0), (4.0, 6.0)
+"""Distances from teeth: where the margin, which is smooth, becomes attached gum, and where that ends."""
 
 
 @dataclass(frozen=True)
 class Marks:
-    """Colours of what teeth bear (linear RGB albedo), from the lowest to the topmost, and the share of each."""
+    """What a jaw bears."""
 
     colours: Float[np.ndarray, "k 3"]
+    """Of what is on teeth (linear RGB albedo), from the lowest to the topmost."""
     shares: Float32[np.ndarray, "v k"]
+    """How much of each is on a vertex."""
+    stippled: Float32[np.ndarray, "v"]
+    """How much of the stippling of its material a vertex has."""
 
 
 DENTINE, STAIN, COMPOSITE, AMALGAM = (0.66, 0.46, 0.21), (0.16, 0.08, 0.03), (0.70, 0.63, 0.49), (0.10, 0.10, 0.11)
@@ -51,7 +58,8 @@ DENTINE, STAIN, COMPOSITE, AMALGAM = (0.66, 0.46, 0.21), (0.16, 0.08, 0.03), (0.
 
 def no_marks(mesh: Mesh) -> Marks:
     """None."""
-    return Marks(np.zeros((0, 3)), np.zeros((len(mesh.vertices), 0), dtype=np.float32))
+    count = len(mesh.vertices)
+    return Marks(np.zeros((0, 3)), np.zeros((count, 0), np.float32), np.zeros(count, np.float32))
 
 
 def natural_marks(jaw: Jaw, seed: int) -> Marks:
@@ -60,7 +68,7 @@ def natural_marks(jaw: Jaw, seed: int) -> Marks:
     dentine = _ramp(hollow_mm(mesh, _BROAD_MM), *_HOLLOW_MM)
     stain = _ramp(hollow_mm(mesh, _FINE_MM), *_FISSURE_MM) * _patches(mesh, rng) * _far_from_gum(jaw)
     shares = np.column_stack([dentine, stain, *_fillings(jaw, rng)])
-    return Marks(np.array([DENTINE, STAIN, COMPOSITE, AMALGAM]), shares.astype(np.float32))
+    return Marks(np.array([DENTINE, STAIN, COMPOSITE, AMALGAM]), shares.astype(np.float32), _attached_gum(jaw))
 
 
 def hollow_mm(mesh: Mesh, length_mm: float) -> Float[np.ndarray, "v"]:
@@ -80,6 +88,19 @@ def _far_from_gum(jaw: Jaw) -> Float[np.ndarray, "v"]:
     if jaw.face_labels is not None:
         on_tooth[jaw.mesh.faces[jaw.face_labels == GUM]] = 0
     return _ramp(diffused(jaw.mesh, _GUM_MM, on_tooth[:, None])[:, 0], 0.8, 1.0)
+
+
+def _attached_gum(jaw: Jaw) -> Float32[np.ndarray, "v"]:
+    """How much each vertex is of attached gum, which is stippled, 0 to 1: the margin at the teeth and the mucosa far
+    from them are smooth."""
+    share = np.zeros(len(jaw.mesh.vertices), dtype=np.float32)
+    if jaw.face_labels is None or not jaw.teeth:
+        return share
+    gum = np.unique(jaw.mesh.faces[jaw.face_labels == GUM])
+    teeth = np.unique(jaw.mesh.faces[jaw.face_labels != GUM])
+    away = cKDTree(jaw.mesh.vertices[teeth]).query(jaw.mesh.vertices[gum], workers=1)[0]
+    share[gum] = _ramp(away, *_FREE_MM) * (1 - _ramp(away, *_ATTACHED_MM))
+    return share
 
 
 def _patches(mesh: Mesh, rng: np.random.Generator) -> Float[np.ndarray, "v"]:

@@ -39,6 +39,7 @@ from cuspid.simulation.appearance import (
     face_materials,
     palette,
     scattering_mm,
+    stippled,
 )
 from cuspid.simulation.marks import natural_marks, no_marks
 from cuspid.simulation.optics import IDEAL, Optics, mixed, recorded, through_lens
@@ -100,7 +101,8 @@ class Scene:
         marks = natural_marks(self.jaw, self.seed) if self.appearance.marked else no_marks(mesh)
         return ShadedMesh(
             read_only(mesh.faces),  # arrays from another process are writable: the shading would be compiled once more
-            *(mesh.face_normals, mesh.vertex_normals, face_materials(self.jaw), marks.colours, marks.shares),
+            *(mesh.face_normals, mesh.vertex_normals, face_materials(self.jaw)),
+            *(marks.colours, marks.shares, marks.stippled),
         )
 
     @computed_once
@@ -143,6 +145,8 @@ class ShadedMesh(NamedTuple):
     mark_colours: np.ndarray
     marks: np.ndarray
     """Share of each mark at each vertex."""
+    stippled: np.ndarray
+    """How much of the stippling of its material each vertex has."""
 
 
 _NONE: Float[np.ndarray, "0 3"] = np.zeros((0, 3))
@@ -492,16 +496,23 @@ def _places(rays, surface):
 
 @kernel(fastmath=True)
 @no_type_check
+def _mixed(rays, i, surface, values):
+    """What a hit has of a value of each vertex."""
+    corners, total = surface.faces[rays.faces[i]], 0.0
+    for corner in range(3):
+        total += rays.barycentric[i, corner] * values[corners[corner]]
+    return total
+
+
+@kernel(fastmath=True)
+@no_type_check
 def _mark(rays, surface, albedos):
     """Replace what lies below the marks of teeth by them."""
     for i in range(len(rays.faces)):
         if rays.faces[i] < 0 or surface.materials[rays.faces[i]] != 0:
             continue
-        corners = surface.faces[rays.faces[i]]
         for mark in range(len(surface.mark_colours)):
-            share = 0.0
-            for corner in range(3):
-                share += rays.barycentric[i, corner] * surface.marks[corners[corner], mark]
+            share = _mixed(rays, i, surface, surface.marks[:, mark])
             for c in range(3):
                 albedos[i, c] += share * (surface.mark_colours[mark, c] - albedos[i, c])
 
@@ -517,6 +528,9 @@ def _shade(rays, albedos, surface, palette, lights, lit, ambient, row, below, ou
         pixel = i // samples
         m = surface.materials[rays.faces[i]]
         point, normal = _point(rays, i), _normal(rays, i, surface)
+        if palette.stipple_mm[m] > 0:
+            height = palette.stipple_mm[m] * _mixed(rays, i, surface, surface.stippled)
+            normal = stippled(normal, point, height, palette.stipple_from_jaw)
         albedo = (albedos[i, 0], albedos[i, 1], albedos[i, 2])
         direction = rays.directions[i]
         inverse = 1 / np.sqrt(_dot(direction, direction))
@@ -550,7 +564,8 @@ def _entering_light(scene: Scene, lights: Lamps) -> Float[np.ndarray, "v 3"]:
     shares = np.zeros((len(mesh.vertices), len(lights.positions)))
     reflectance = np.zeros(len(mesh.vertices))
     reflectance[mesh.faces] = scene.palette.reflectance[materials][:, None]
-    _entering(mesh.vertices, mesh.vertex_normals, reflectance, lights, shares)
+    heights = scene.palette.stipple_mm[1] * scene.surface.stippled
+    _entering(mesh.vertices, mesh.vertex_normals, heights, scene.palette, reflectance, lights, shares)
     lit = shares > NOTICEABLE * shares.sum(axis=1, keepdims=True)
     _darken(lit, mesh.occluded(*_segments(mesh.vertices, lit, lights.positions)))
     return np.einsum("vl,lc->vc", np.where(lit, shares, 0.0), lights.intensities)
@@ -558,10 +573,12 @@ def _entering_light(scene: Scene, lights: Lamps) -> Float[np.ndarray, "v 3"]:
 
 @kernel(fastmath=True)
 @no_type_check
-def _entering(points, normals, reflectance, lights, shares):
+def _entering(points, normals, heights, palette, reflectance, lights, shares):
     """Fill in the share of each light that enters at each point, if nothing hides it."""
     for i in range(len(points)):
         normal = (normals[i, 0], normals[i, 1], normals[i, 2])
+        if heights[i] > 0:
+            normal = stippled(normal, points[i], heights[i], palette.stipple_from_jaw)
         for k in range(len(lights.positions)):
             towards, falloff = _incoming(points[i], k, lights)
             cosine = max(0.0, _dot(normal, towards))

@@ -41,7 +41,7 @@ class RenderOptions(Options):
 
     texture: Preset = "artificial"
     """Surface: artificial (strong matte texture, the thesis' condition), powder (weak speckle), enamel (plain, wet),
-    natural (the same, with stained fissures, fillings and vessels)."""
+    natural (the same, with stained fissures, fillings, vessels and stippled gum)."""
     renderer: Literal["embree", "blender"] = "embree"
     """embree: ray casting (default). blender: Blender Cycles with subsurface scattering (needs its own environment)."""
     supersampling: Annotated[int, Range(1, 16)] = 2
