@@ -56,6 +56,19 @@ def test_a_tooth_that_is_not_there(tmp_path, capsys, coarse_phantom):
     assert not (tmp_path / "scan").exists()
 
 
+@pytest.mark.parametrize("existed", [False, True])
+def test_without_blender_nothing_is_written(tmp_path, capsys, monkeypatch, coarse_phantom, existed):
+    monkeypatch.delenv("CUSPID_BLENDER_PYTHON", raising=False)
+    storage.write_jaw(tmp_path / "jaw.ply", coarse_phantom)
+    out = tmp_path / "scan"
+    if existed:
+        out.mkdir()
+    for verb in ("simulate", "film"):
+        assert "Blender" in refused(capsys, verb, tmp_path / "jaw.ply", "--renderer", "blender", "--out", out)
+        assert out.exists() == existed
+        assert not existed or not any(out.iterdir())
+
+
 def test_plain_enamel_has_crossed_polarisers_unless_others_are_asked_for(capsys):
     def glare(probe, texture):
         return {light.glare for light in load_probe(suited(probe, texture)).lights.values()}

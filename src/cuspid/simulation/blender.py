@@ -14,6 +14,7 @@ import subprocess
 import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,9 @@ import numpy as np
 from cuspid.capture import Frame
 from cuspid.errors import InputError, MissingDependencyError
 from cuspid.geometry import Rigid3, axes_about
-from cuspid.rig import Light, MountedCamera
-from cuspid.simulation.appearance import face_materials
-from cuspid.simulation.optics import IDEAL
+from cuspid.rig import Handpiece, Light, MountedCamera
+from cuspid.simulation.appearance import Appearance, face_materials
+from cuspid.simulation.optics import IDEAL, Optics
 from cuspid.simulation.raycast import Scene, Sink, image_rng, metered_gains
 from cuspid.simulation.sensor import record
 
@@ -53,14 +54,9 @@ def render_with_blender(
 ) -> Iterator[tuple[str, str]]:
     """As :func:`cuspid.simulation.raycast.render_capture`, by Blender with ``processes`` threads.
 
-    Raises MissingDependencyError where Blender is not installed, InputError where a camera has lens distortion, a
-    light has a lobe other than Lambert's, or teeth bear marks, which Blender does not offer.
+    Raises what :func:`check_blender` does.
     """
-    if scene.optics != IDEAL:
-        raise InputError("optics: Blender renders ideal ones only; use the renderer embree")
-    if scene.appearance.marked:
-        raise InputError("texture: Blender renders no stains, fillings, vessels and stippling; use the renderer embree")
-    python = blender_python()
+    python = check_blender(scene.handpiece, scene.appearance, scene.optics)
     tasks = [(frame, camera) for frame in frames for camera in frame.cameras if not skip(frame.name, camera)]
     if not tasks:
         return
@@ -77,9 +73,33 @@ def render_with_blender(
             yield frame, camera
 
 
-def blender_python() -> Path:
-    """The Python interpreter that has bpy. Raises MissingDependencyError, saying how to get it."""
-    given = os.environ.get(PYTHON_VARIABLE)
+def check_blender(handpiece: Handpiece, appearance: Appearance, optics: Optics) -> Path:
+    """The Python interpreter that has bpy, if Blender can render that.
+
+    Raises MissingDependencyError where Blender is not installed, InputError where a camera has lens distortion, a
+    light has a lobe other than Lambert's or a polariser, optics are not ideal, or teeth bear marks, none of which
+    Blender offers.
+    """
+    if optics != IDEAL:
+        raise InputError("optics: Blender renders ideal ones only; use the renderer embree")
+    if appearance.marked:
+        raise InputError("texture: Blender renders no stains, fillings, vessels and stippling; use the renderer embree")
+    for name in handpiece.rig.names:
+        if np.any(handpiece.rig[name].camera.distortion):
+            raise InputError(f"camera {name}: Blender cannot render this lens distortion; use the renderer embree")
+    for name, light in handpiece.lights.items():
+        if light.lobe_exponent != 1:
+            raise InputError(
+                f"light {name}: Blender's have lobe exponent 1, not {light.lobe_exponent:g}; use the renderer embree"
+            )
+        if light.glare != 1:
+            raise InputError(f"light {name}: Blender has no polarisers (glare is not 1); use the renderer embree")
+    return _with_bpy(os.environ.get(PYTHON_VARIABLE))
+
+
+@cache
+def _with_bpy(given: str | None) -> Path:
+    """This Python interpreter. Raises MissingDependencyError where it has no bpy, saying how to get one that has."""
     if not given:
         raise MissingDependencyError(f"Blender is not set up: {_HOW_TO}")
     try:
@@ -132,7 +152,7 @@ def _write_scene(
                 "frame": frame.name,
                 "name": name,
                 "seed": zlib.crc32(f"{scene.seed}/{frame.name}/{name}".encode()) & 0x7FFFFFFF,
-                "camera": _camera(name, scene.handpiece.rig[name], poses[frame.name]),
+                "camera": _camera(scene.handpiece.rig[name], poses[frame.name]),
                 "lights": [_light(light, poses[frame.name]) for light in scene.handpiece.lights_on(frame.lighting)],
             }
             for frame, name in tasks
@@ -141,10 +161,8 @@ def _write_scene(
     (folder / "scene.json").write_text(json.dumps(description))
 
 
-def _camera(name: str, mounted: MountedCamera, rig_from_world: Rigid3) -> dict[str, Any]:
+def _camera(mounted: MountedCamera, rig_from_world: Rigid3) -> dict[str, Any]:
     camera = mounted.camera
-    if np.any(camera.distortion):
-        raise InputError(f"camera {name}: Blender cannot render this lens distortion; use the renderer embree")
     return {
         "width": camera.width,
         "height": camera.height,
@@ -155,12 +173,6 @@ def _camera(name: str, mounted: MountedCamera, rig_from_world: Rigid3) -> dict[s
 
 
 def _light(light: Light, rig_from_world: Rigid3) -> dict[str, Any]:
-    if light.lobe_exponent != 1:
-        raise InputError(
-            f"light: Blender's disc lights have lobe exponent 1, not {light.lobe_exponent}; use the renderer embree"
-        )
-    if light.glare != 1:
-        raise InputError("light: Blender has no polarisers (glare is not 1); use the renderer embree")
     world_from_rig = rig_from_world.inverse()
     # Blender's area lights shine along -Z; about that axis any turn will do.
     axis = -world_from_rig.rotate(light.direction)

@@ -17,7 +17,7 @@ from cuspid.options import SEED, Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece
 from cuspid.simulation.appearance import APPEARANCES, Preset
-from cuspid.simulation.blender import render_with_blender
+from cuspid.simulation.blender import check_blender, render_with_blender
 from cuspid.simulation.lights import lit
 from cuspid.simulation.manufacturing import ManufacturingOptions, built, told
 from cuspid.simulation.optics import OpticsOptions
@@ -72,10 +72,11 @@ def simulate(
     images are kept; a run that is resumed gives the same bits as one that was not interrupted.
     """
     handpiece = lit(handpiece)
+    true, known = built(handpiece, options.manufacturing), told(handpiece, options.manufacturing)
+    _check(true, options)
     path = plan_scan_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
     overlaps = path.minimum_overlap, path.mean_overlap
     write_path(folder / "truth" / "path.json", *overlaps, path.seen, path.cross_sweep)
-    true, known = built(handpiece, options.manufacturing), told(handpiece, options.manufacturing)
     return take_images(jaw, true, path.rig_from_world, folder, options, known=known, progress=progress)
 
 
@@ -94,6 +95,7 @@ def take_images(
     if options.optics.scattering and not any(APPEARANCES[options.texture].enamel.scattering_mm):
         _LOG.info(f"optics: --scattering changes nothing, for light does not go below the texture {options.texture}")
     handpiece = lit(handpiece)
+    _check(handpiece, options)
     frames, poses = lit_frames(handpiece, rig_from_world)
     truth = GroundTruth(jaw=jaw, handpiece=handpiece, rig_from_world=poses)
     write_truth(folder / "truth", truth)
@@ -103,6 +105,12 @@ def take_images(
         progress("images", done, total)
     # As it will be read: a rotation may differ in its last bit once it was written, and results go by that.
     return replace(capture, handpiece=read_handpiece(folder / "capture" / "handpiece.json")), truth
+
+
+def _check(handpiece: Handpiece, options: RenderOptions) -> None:
+    """Refuse what cannot be rendered before anything is written."""
+    if options.renderer == "blender":
+        check_blender(handpiece, APPEARANCES[options.texture], options.optics.settled)
 
 
 def _render(folder: Path, capture: Capture, truth: GroundTruth, options: RenderOptions) -> Iterator[tuple[int, int]]:

@@ -245,13 +245,15 @@ def claimed_folder(
     """:func:`claim_folder` for the work in the block. Leaves no trace where the work is refused before it wrote;
     results that are to be replaced stay those of the run that made them until the work is done."""
     existed = folder.exists()
+    empty = not folder.is_dir() or not any(folder.iterdir())
     entry = claim_folder(folder, stage, settings, inputs, replace=replace)
     try:
         yield
     except CuspidError:
-        if not existed and [path.name for path in folder.iterdir()] == ["run.json"]:
+        if empty and [path.name for path in folder.iterdir()] == ["run.json"]:
             (folder / "run.json").unlink()
-            folder.rmdir()
+            if not existed:
+                folder.rmdir()
         raise
     if read_manifest(folder).get(stage) != entry:
         _enter(folder, stage, entry)
