@@ -13,6 +13,7 @@ from synthetic_scene import height_field
 from test_surface_tracking import OUT, depth_maps
 
 DISTANCE_MM = 5.0
+TURN = Rigid3.from_rotation_vector(np.array([0, 0, 2e-3]), np.array([0.004, 0, 0]))
 
 
 @pytest.fixture
@@ -37,7 +38,7 @@ def surfaces(turned: Rigid3 | None = None) -> list[Surface]:
 def test_steps_tell_what_goes_along_from_frame_to_frame(plain_frames) -> None:
     poses = list(OUT.values())
     right = plain_frames.steps(surfaces(), poses, DISTANCE_MM)
-    wrong = plain_frames.steps(surfaces(Rigid3.from_rotation_vector([0, 0, 2e-3], [0.004, 0, 0])), poses, DISTANCE_MM)
+    wrong = plain_frames.steps(surfaces(TURN), poses, DISTANCE_MM)
     assert abs(right["step_turn_z"]) < 0.2
     assert abs(right["step_along_x"]) < 1
     assert wrong["step_turn_z"] - right["step_turn_z"] == pytest.approx(2, rel=0.2)
