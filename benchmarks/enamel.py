@@ -45,6 +45,8 @@ REAL = {"005_upper": 11, "010_upper": 16, "023_lower": 36, "034_upper": 21, "048
 DENSE = 20
 """Frames of a tooth that is scanned with twice as many as usual."""
 ARCHES = {"arch-phantom": "0", "arch-upper": "fullarch_upper_137k"}
+OTHER_ARCHES = {"arch-phantom-1": "1", "arch-phantom-2": "2"}
+"""Scanned under colour-coded, polarised light only."""
 VARIANTS = ("glossy", "white-crossed", "white", "in-turn", "pairs")
 """Colour-coded without polarisers; white with them; white without; six LEDs a group in turn without; two of the four
 cameras of each group, those that are farther apart: of the phantom of seed 0."""
@@ -85,17 +87,17 @@ def cases(folder: Path) -> Iterator[Case]:
         file = _file_of(name, folder)
         if file is not None:
             yield Case(name=name, parameters={"jaw": file, "tooth": tooth, **plain})
-    for name, jaw_name in ARCHES.items():
+    for name, jaw_name in (ARCHES | OTHER_ARCHES).items():
         file = jaw_name if jaw_name.isdigit() else _file_of(jaw_name, folder)
         if file is not None:
             whole: dict[str, Value] = {"jaw": file, "tooth": None}
             yield Case(name=name, parameters={**whole, **plain})
             yield Case(name=f"{name}-clinical", parameters={**whole, **plain, "optics": "clinical"})
-            yield Case(
-                name=f"{name}-clinical-cross", parameters={**whole, **plain, "optics": "clinical", "cross": True}
-            )
-            yield Case(name=f"{name}-artificial-clinical", parameters={**whole, **_TEXTURED})
-            yield Case(name=f"{name}-in-turn", parameters={**whole, **plain, "light": "in-turn"})
+            if name in ARCHES:
+                cross: dict[str, Value] = {"optics": "clinical", "cross": True}
+                yield Case(name=f"{name}-clinical-cross", parameters={**whole, **plain, **cross})
+                yield Case(name=f"{name}-artificial-clinical", parameters={**whole, **_TEXTURED})
+                yield Case(name=f"{name}-in-turn", parameters={**whole, **plain, "light": "in-turn"})
 
 
 def _file_of(name: str, folder: Path) -> str | None:
