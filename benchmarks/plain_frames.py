@@ -29,7 +29,8 @@ from cuspid import pipeline
 from cuspid.capture import Capture
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
-from cuspid.motion.surface_tracking import Surface, SurfaceTrackingOptions, _together, surface_of
+from cuspid.motion.surface_tracking import SurfaceTrackingOptions, adjusted
+from cuspid.motion.surfaces import Surface, surface_of
 from cuspid.pairing import camera_groups, stereo_pairs
 from cuspid.pipeline import SimulationOptions
 from cuspid.progress import silent
@@ -141,7 +142,7 @@ def steps(surfaces: list[Surface], poses: list[Rigid3], distance_mm: float) -> d
     options, twists = SurfaceTrackingOptions(), []
     for k in range(len(poses) - 1):
         true = poses[k + 1] @ poses[k].inverse()
-        (first, second), *_ = _together(surfaces[k : k + 2], poses[k : k + 2], options, distance_mm, silent)
+        (first, second), *_ = adjusted(surfaces[k : k + 2], poses[k : k + 2], options, distance_mm, silent)
         off = second @ first.inverse() @ true.inverse()
         twists.append(1000 * np.concatenate([off.rotation_vector, off.translation]))
     mean, error = np.mean(twists, axis=0), np.std(twists, axis=0, ddof=1) / np.sqrt(len(twists))
@@ -151,7 +152,7 @@ def steps(surfaces: list[Surface], poses: list[Rigid3], distance_mm: float) -> d
 
 def measured(capture: Capture, truth: Mesh, poses: Mapping[str, Rigid3]) -> dict[str, Value]:
     """The figures of a capture."""
-    handpiece = capture.handpiece
+    handpiece, options = capture.handpiece, SurfaceTrackingOptions()
     estimator = DepthEstimator(handpiece, signal="shading")
     rectified = widest_pairs(handpiece)
     surfaces, shaded, matched = [], list[Compared](), list[Compared]()
@@ -164,7 +165,8 @@ def measured(capture: Capture, truth: Mesh, poses: Mapping[str, Rigid3]) -> dict
             shaded.append(compared(truth, rays, depth, each.cam_from_rig @ pose, handpiece.depth_range_mm))
         grays = {name: cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for name, image in images.items()}
         matched += by_semi_global(rectified, grays, truth, pose, handpiece.depth_range_mm)
-        surfaces.append(surface_of(maps, handpiece.working_distance_mm, SurfaceTrackingOptions()))
+        distance_mm, border_px = handpiece.working_distance_mm, options.border_px
+        surfaces.append(surface_of(maps, distance_mm, thinning=options.thinning, border_px=border_px))
     placed = [poses[frame.name] for frame in capture.frames]
     return {
         "frames": len(placed),

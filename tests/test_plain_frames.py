@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from cuspid.geometry import Rigid3
-from cuspid.motion.surface_tracking import Surface, SurfaceTrackingOptions, surface_of
+from cuspid.motion.surfaces import Surface
 from synthetic_scene import height_field
-from test_surface_tracking import OUT, depth_maps
+from test_surface_tracking import OUT, depth_maps, surface
 
 DISTANCE_MM = 5.0
 TURN = Rigid3.from_rotation_vector(np.array([0, 0, 2e-3]), np.array([0.004, 0, 0]))
@@ -30,7 +30,7 @@ def surfaces(turned: Rigid3 | None = None) -> list[Surface]:
         shown = [
             replace(each, cam_from_rig=each.cam_from_rig @ error.inverse()) for each in maps if each.frame == frame
         ]
-        made.append(surface_of(shown, DISTANCE_MM, SurfaceTrackingOptions()))
+        made.append(surface(shown, frame))
         error = (turned or Rigid3.identity()) @ error
     return made
 

@@ -14,16 +14,8 @@ from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3, unit
 from cuspid.mesh import Mesh
 from cuspid.motion.held_calibration import depth_sigma_mm
-from cuspid.motion.surface_tracking import (
-    Shown,
-    Surface,
-    SurfaceTrackingOptions,
-    _drift,
-    _onto,
-    _together,
-    surface_of,
-    track_surfaces,
-)
+from cuspid.motion.surface_tracking import SurfaceTrackingOptions, _drift, _onto, adjusted, track_surfaces
+from cuspid.motion.surfaces import Shown, Surface, surface_of
 from cuspid.progress import silent
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece, Light
@@ -71,6 +63,13 @@ def depth_maps(
     return made
 
 
+def surface(
+    maps: Sequence[DepthMap], frame: str = "00000", border_px: int = SurfaceTrackingOptions().border_px
+) -> Surface:
+    thinning = SurfaceTrackingOptions().thinning
+    return surface_of([each for each in maps if each.frame == frame], 5.0, thinning=thinning, border_px=border_px)
+
+
 def tracked(maps: Sequence[DepthMap], options: SurfaceTrackingOptions = SurfaceTrackingOptions()) -> Reconstruction:
     names = list(dict.fromkeys(each.frame for each in maps))
     return track_surfaces(capture_of(diamond(SIZE_PX), names), maps, options)
@@ -113,7 +112,7 @@ def test_a_long_path_that_was_found_bent_is_straightened() -> None:
         pairs = zip(poses, way, strict=True)
         return max(1000 * float(np.linalg.norm((one @ other.inverse()).inverse().translation)) for one, other in pairs)
 
-    straight, _, expected = _together(surfaces, bent, SurfaceTrackingOptions(samples=500), 5.0, silent)
+    straight, _, expected = adjusted(surfaces, bent, SurfaceTrackingOptions(samples=500), 5.0, silent)
     assert off_um(bent) > 200
     assert 1 < off_um(straight) < 50
     assert expected is not None
@@ -270,9 +269,7 @@ def test_what_looks_like_a_place_is_not_taken_for_it() -> None:
     left, right = np.linspace(-14, -4, 10), np.linspace(4, 14, 9)
     way = {f"{k:05d}": Rigid3(np.eye(3), np.array([-x, 0, 0])) for k, x in enumerate([*left, *right])}
     maps, names = depth_maps(way, height_field(twins, half_width_mm=19.0)), list(way)
-    options = SurfaceTrackingOptions(minimum_overlap=0.5)
-    a, b = (surface_of([m for m in maps if m.frame == names[k]], 5.0, options) for k in (4, 14))
-    lying = _onto(a, b, Rigid3.identity(), 5.0)
+    lying = _onto(surface(maps, names[4]), surface(maps, names[14]), Rigid3.identity(), 5.0)
     assert lying.laid is not None
     assert lying.laid.share > 0.5
     found = tracked(maps)
@@ -291,8 +288,8 @@ def in_a_disc(one: DepthMap, bent_mm: float) -> DepthMap:
 
 @pytest.mark.parametrize("border_px", [0, 2])
 def test_what_is_wrong_along_borders_is_not_laid_onto_others(border_px: int) -> None:
-    options, maps = SurfaceTrackingOptions(border_px=border_px), depth_maps({"00000": Rigid3.identity()})
-    straight, bent = (surface_of([in_a_disc(each, mm) for each in maps], 5.0, options) for mm in (0.0, 0.03))
+    maps = depth_maps({"00000": Rigid3.identity()})
+    straight, bent = (surface([in_a_disc(each, mm) for each in maps], border_px=border_px) for mm in (0.0, 0.03))
     same = straight.points.shape == bent.points.shape and bool((straight.points == bent.points).all())
     assert same == (border_px == 2)
     assert len(bent) > 1000
@@ -330,9 +327,8 @@ def test_a_long_path_is_said_to_drift() -> None:
 
 
 def test_rounding_does_not_add_up_along_a_path() -> None:
-    options = SurfaceTrackingOptions()
     maps = depth_maps(dict(list(OUT.items())[:2]))
-    one, other = (surface_of([m for m in maps if m.frame == name], 5.0, options) for name in ("00000", "00001"))
+    one, other = (surface(maps, name) for name in ("00000", "00001"))
     off = Rigid3(OUT["00001"].rotation @ (np.eye(3) + 4e-7 * np.eye(3)[::-1]), OUT["00001"].translation)
     found = _onto(one, other, off, 5.0).this_from_other.rotation
     np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-12)

@@ -2,50 +2,29 @@
 
 The depth maps of each frame are metric, so that frames are placed by laying their surfaces onto each other: first each
 onto an earlier one, by iterative closest points with point-to-plane distances (Y. Chen, G. Medioni, Image and Vision
-Computing 10, 1992) and a motion model; then all at once, over the pairs of frames that show most of the same surface,
-whether consecutive or not. A pair counts for as much as its surfaces overlap and as little as they scatter about each
-other, and a point for as much as its depth is known: what is smooth because the images tell little there goes along
-with the cameras, so that it would hold them back. Thus drift is spread where it is least certain, and a path that comes
-back is closed.
-
-How far the poses may be off follows from how the gradients of all pairs scatter from one block of space to the next
-(covariance of an M-estimate with clusters, as for tracks): surfaces are smooth, so that their errors hang together
-within a block, whichever frames show it.
+Computing 10, 1992) and a motion model; then all at once (:mod:`cuspid.motion.surface_adjustment`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import groupby, islice, product
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy import sparse
-from scipy.spatial import cKDTree
 
 from cuspid.capture import Capture, Dropped
 from cuspid.errors import ReconstructionError
-from cuspid.geometry import Rigid3, unit
-from cuspid.motion.expectation import MOST_POINTS, expectation_of, steps_drawn
+from cuspid.geometry import Rigid3
 from cuspid.motion.held_calibration import depth_sigma_mm
+from cuspid.motion.surface_adjustment import lay_together, neighbours
+from cuspid.motion.surfaces import LEAST_MATCHES, Laid, Shown, Surface, lay, moved, solved, surface_of
 from cuspid.options import SEED, SHARE, Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import DepthMap, Expectation, Reconstruction
 from cuspid.rig import Handpiece
-from cuspid.workers import map_in_threads
 
-_JUMP = 0.06
-"""Neighbours in a depth map that lie farther apart, as a share of the working distance, are not on one surface."""
-_LEAST_COSINE = 0.3
-"""Of the angle between surface and line of sight: what is seen more obliquely is too noisy to lay anything on."""
-_LEAST_MEMBERS = 3
-"""Depths that make a point."""
-_ALIKE = 0.7
-"""Cosine of the largest angle between the normals of the same place in two frames."""
 _REACHES = (0.2, 0.2, 0.14, 0.14, 0.1, 0.1, 0.06, 0.06, 0.04, 0.04, 0.03, 0.03)
 """Largest distance between the same place in two frames, step by step, as a share of the working distance."""
 _FIRST_STEPS = (0.0, -0.2, 0.2, -0.4, 0.4)
@@ -61,23 +40,12 @@ _WITNESSES, _LEAST_WITNESSES, _AGREED = 20, 2, 0.8
 many of them must agree."""
 _NEAR = 0.25
 """Largest motion between frames that see about the same: working distances, and radians."""
-_TUKEY = 3.0
-"""Robust standard deviations beyond which a distance has no weight."""
-_LEAST_SIGMA = 0.0006
-"""Standard deviation of distances, as a share of the working distance, below which none is assumed."""
-_LEAST_MATCHES = 100
-_BRIEFLY, _BLOCKS = 3, 0.1
-"""Frames back that are tried first, and side of the blocks by which overlap is told, as share of the working distance
-(mm for 10 mm)."""
+_BRIEFLY = 3
+"""Frames back that are tried first."""
+_DAMPING = 1e-9
+"""Share of the diagonal that is added to the normal equations of one pair."""
 _LITTLE_GLARE = 0.1
 """Share of mirror reflections that does little harm."""
-_CLUSTER = 0.2
-"""Side of the blocks within which errors of surfaces hang together, as a share of the working distance."""
-_DAMPING, _HELD_BY_NOTHING = 1e-9, 1e-13
-"""Shares of the diagonal that are added to the normal equations of one pair, and of all: what bends a whole path stands
-out so little from it that more would freeze the bend."""
-_CONVERGED = 2e-6
-"""Step of the joint adjustment, as a share of the working distance, that ends it."""
 _LEAST_DEPTH = 1e-4
 """Errors of depth, as a share of the working distance, below which a calibration counts as exact."""
 _LONG = 5.0
@@ -115,81 +83,12 @@ class SurfaceTrackingOptions(Options):
     """Seed of the choice of these points."""
 
 
-class Shown(NamedTuple):
-    """Points of a surface that a frame shows, in its rig frame."""
-
-    points: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    trust: Float[np.ndarray, "n"]
-    """Inverse variance, in any unit."""
-
-
-class Surface:
-    """What a frame shows, ready to be asked for the nearest point."""
-
-    def __init__(self, shown: Shown) -> None:
-        self.points, self.normals, self.trust = shown
-        self._tree = cKDTree(self.points)
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def nearest(
-        self, points: Float[np.ndarray, "n 3"], reach_mm: float
-    ) -> tuple[Bool[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-        """Whether a point lies within reach, and which."""
-        distance, index = self._tree.query(points, distance_upper_bound=reach_mm)
-        near = np.isfinite(distance)
-        return near, np.where(near, index, 0)
-
-    def some(self, count: int, rng: np.random.Generator) -> Shown:
-        """A random choice of the points."""
-        chosen = rng.permutation(len(self))[:count]
-        return Shown(self.points[chosen], self.normals[chosen], self.trust[chosen])
-
-
-class _Laid(NamedTuple):
-    """How one surface lies on another."""
-
-    points: np.ndarray
-    """Of the first, in the frame of the second."""
-    normals: np.ndarray
-    """Mean of both."""
-    distances: np.ndarray
-    """Along them."""
-    sigmas: np.ndarray
-    """Standard deviation of each."""
-    sigma: float
-    """That of a typical one."""
-    share: float
-    """Of the first surface that lies on the second."""
-
-    @property
-    def _off(self) -> Float[np.ndarray, "n"]:
-        return np.asarray(np.minimum((self.distances / (_TUKEY * self.sigmas)) ** 2, 1.0))
-
-    @property
-    def weights(self) -> Float[np.ndarray, "n"]:
-        """Tukey's, over the variance."""
-        return np.asarray((1 - self._off) ** 2 / self.sigmas**2)
-
-    @property
-    def slopes(self) -> Float[np.ndarray, "n"]:
-        """How much weight times distance changes with the distance."""
-        return np.asarray((1 - self._off) * (1 - 5 * self._off) / self.sigmas**2)
-
-    @property
-    def relief(self) -> float:
-        """See :attr:`SurfaceTrackingOptions.least_relief`."""
-        return float(np.linalg.eigvalsh(self.normals.T @ self.normals / len(self.normals))[0])
-
-
 @dataclass(frozen=True, eq=False)
 class _Step:
     """A frame laid onto another one."""
 
     this_from_other: Rigid3
-    laid: _Laid | None
+    laid: Laid | None
 
     @property
     def rank(self) -> float:
@@ -197,98 +96,7 @@ class _Step:
         return 0.0 if self.laid is None else self.laid.share / self.laid.sigma
 
 
-# --- surfaces of frames ------------------------------------------------------------------------------------------
-
-
-def _shown(depth_map: DepthMap, jump_mm: float, border_px: int) -> Shown:
-    """The points of a depth map that have neighbours on all sides, in the rig frame."""
-    camera = depth_map.camera
-    rays = camera.rays(camera.pixel_centres().reshape(-1, 2)).reshape(camera.height, camera.width, 3)
-    points = rays * np.where(depth_map.known, depth_map.depth_mm, np.nan)[..., None]
-    right, down = np.full((2, *points.shape), np.nan)
-    right[:, 1:-1], down[1:-1] = points[:, 2:] - points[:, :-2], points[2:] - points[:-2]
-    normals = unit(np.cross(down, right))
-    facing = -(normals * points).sum(axis=-1) / np.linalg.norm(points, axis=-1)
-    normals, facing = normals * np.sign(facing)[..., None], np.abs(facing)
-    with np.errstate(invalid="ignore"):
-        smooth = np.maximum(np.linalg.norm(right, axis=-1), np.linalg.norm(down, axis=-1)) < jump_mm
-        good = smooth & (facing > _LEAST_COSINE) & _away_from_border(depth_map.known, border_px)
-    rig_from_cam = depth_map.cam_from_rig.inverse()
-    return Shown(
-        rig_from_cam.apply(points[good]), rig_from_cam.rotate(normals[good]), depth_map.confidence[good].astype(float)
-    )
-
-
-def _away_from_border(known: Bool[np.ndarray, "h w"], border_px: int) -> Bool[np.ndarray, "h w"]:
-    """Pixels with no unknown one so close; beyond the image nothing is unknown."""
-    window = np.ones((2 * border_px + 1,) * 2, np.uint8)
-    return cv2.erode(known.astype(np.uint8), window).astype(bool)
-
-
-def surface_of(depth_maps: Iterable[DepthMap], working_distance_mm: float, options: SurfaceTrackingOptions) -> Surface:
-    """What the depth maps of a frame show, thinned out: the mean of what lies in one cube and faces one way."""
-    parts = [_shown(each, _JUMP * working_distance_mm, options.border_px) for each in depth_maps]
-    nothing = Shown(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-    points, normals, trust = (np.concatenate(each) for each in zip(nothing, *parts, strict=True))
-    cubes = np.floor(points / (options.thinning * working_distance_mm)).astype(np.int64)
-    sides = np.abs(normals).argmax(axis=1, keepdims=True) if len(normals) else np.zeros((0, 1), int)
-    facing = sides + 3 * (np.take_along_axis(normals, sides, axis=1) > 0)
-    _, cell, members = np.unique(
-        np.concatenate([cubes, facing], axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    cell, enough = cell.reshape(-1), members >= _LEAST_MEMBERS
-    total = np.bincount(cell, trust, len(members))
-
-    def mean(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-        sums = [np.bincount(cell, trust * values[:, axis], len(members)) for axis in range(3)]
-        return (np.stack(sums, axis=1) / total[:, None])[enough]
-
-    return Surface(Shown(mean(points), unit(mean(normals)), (total / members)[enough]))
-
-
 # --- one frame onto another --------------------------------------------------------------------------------------
-
-
-def _lay(
-    one: Surface | Shown, other: Surface, other_from_one: Rigid3, reach_mm: float, least_mm: float
-) -> _Laid | None:
-    """None where hardly anything is near."""
-    points, normals = other_from_one.apply(one.points), other_from_one.rotate(one.normals)
-    near, index = other.nearest(points, reach_mm)
-    near &= (normals * other.normals[index]).sum(axis=1) > _ALIKE
-    if near.sum() < _LEAST_MATCHES:
-        return None
-    points, index = points[near], index[near]
-    normals = unit(normals[near] + other.normals[index])
-    distances = ((points - other.points[index]) * normals).sum(axis=1)
-    uncertain = np.sqrt(1 / one.trust[near] + 1 / other.trust[index])
-    uncertain /= np.median(uncertain)
-    sigma = max(1.4826 * float(np.median(np.abs(distances) / uncertain)), least_mm)
-    return _Laid(points, normals, distances, sigma * uncertain, sigma, float(near.mean()))
-
-
-def _rows(laid: _Laid) -> Float[np.ndarray, "n 6"]:
-    """What a small motion (rotation vector, translation) of the points does to their distances."""
-    return np.concatenate([np.cross(laid.points, laid.normals), laid.normals], axis=1)
-
-
-def _equations(laid: _Laid) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]:
-    """Normal equations of that motion."""
-    rows = _rows(laid)
-    weighted = rows * laid.weights[:, None]
-    return weighted.T @ rows, weighted.T @ laid.distances
-
-
-def _moved(motion: Float[np.ndarray, "6"]) -> Rigid3:
-    return Rigid3.from_rotation_vector(motion[:3], motion[3:])
-
-
-def _solved(
-    matrix: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n *k"], damping: float = _DAMPING
-) -> Float[np.ndarray, "n *k"]:
-    """With a damping that only matters where nothing is known."""
-    diagonal = np.diag(matrix)
-    return np.asarray(np.linalg.solve(matrix + damping * np.diag(np.maximum(diagonal, diagonal.mean())), right))
 
 
 def _onto(
@@ -299,15 +107,15 @@ def _onto(
     reaches: Sequence[float] = _REACHES,
 ) -> _Step:
     """Lay a surface onto another one, from a pose nearby."""
-    pose, least_mm = start, _LEAST_SIGMA * distance_mm
+    pose = start
     for reach in reaches:
-        laid = _lay(one, other, pose, reach * distance_mm, least_mm)
+        laid = lay(one, other, pose, reach, distance_mm)
         if laid is None:
             return _Step(pose, None)
-        pose = _moved(-_solved(*_equations(laid))) @ pose
+        pose = moved(-solved(*laid.normal_equations(), _DAMPING)) @ pose
     # A start that was made of other poses is a rotation only up to rounding, which would double from frame to frame.
     pose = Rigid3.from_rotation_vector(pose.rotation_vector, pose.translation)
-    return _Step(pose, _lay(one, other, pose, reaches[-1] * distance_mm, least_mm))
+    return _Step(pose, lay(one, other, pose, reaches[-1], distance_mm))
 
 
 def _doubt(step: _Step, overlap: float, options: SurfaceTrackingOptions, distance_mm: float) -> str | None:
@@ -387,7 +195,7 @@ def _chained(
     pieces, reasons, motion = list[dict[int, Rigid3]](), dict[int, str](), None
     for frame, surface in enumerate(surfaces):
         progress("odometry", frame + 1, len(surfaces))
-        if len(surface) < _LEAST_MATCHES:
+        if len(surface) < LEAST_MATCHES:
             reasons[frame] = f"only {len(surface)} points of its surface"
             continue
         largest, pose = sorted(pieces, key=len)[-1:], None
@@ -487,38 +295,7 @@ def _is_near(motion: Rigid3, distance_mm: float) -> bool:
     return max(across, float(np.linalg.norm(motion.rotation_vector))) < _NEAR
 
 
-_Blocks = set[tuple[int, ...]]
-
-
-def _blocks(surface: Surface, pose: Rigid3, distance_mm: float) -> _Blocks:
-    """Those of space that a surface fills."""
-    blocks = np.floor(pose.inverse().apply(surface.points) / (_BLOCKS * distance_mm)).astype(int)
-    return set(map(tuple, blocks.tolist()))
-
-
-def _shared(one: _Blocks, other: _Blocks) -> float:
-    """The part of the smaller surface that both share."""
-    return len(one & other) / max(min(len(one), len(other)), 1)
-
-
-def _neighbours(
-    surfaces: Sequence[Surface], poses: Sequence[Rigid3], options: SurfaceTrackingOptions, distance_mm: float
-) -> list[tuple[int, int]]:
-    """Pairs of frames that show the same surface, told by the blocks of space that it fills, in both orders.
-
-    Only relative neighbours (G. Toussaint, Pattern Recognition 12, 1980): a pair is left out if both overlap more with
-    a third frame. The farther apart two frames are, the less alike are the errors of their surfaces, and what these do
-    to a pose adds up along a path; pairs of one pass and another stay where these come closest.
-    """
-    blocks = [_blocks(surface, pose, distance_mm) for surface, pose in zip(surfaces, poses, strict=True)]
-    shared = np.array([[_shared(one, other) for other in blocks] for one in blocks])
-    np.fill_diagonal(shared, 0.0)
-    through_third = np.array([np.minimum(one, shared).max(axis=1) for one in shared])
-    found = (shared > options.joint_overlap) & (shared >= through_third)
-    return [(int(one), int(other)) for one, other in np.argwhere(found)]
-
-
-def _together(
+def adjusted(
     surfaces: Sequence[Surface],
     poses: Sequence[Rigid3],
     options: SurfaceTrackingOptions,
@@ -527,112 +304,10 @@ def _together(
 ) -> tuple[list[Rigid3], float, Expectation | None]:
     """The poses with which all surfaces that overlap lie on each other best, their mean scatter, mm, and what follows
     for the surface."""
-    rng, found = np.random.default_rng(options.seed), list(poses)
+    rng = np.random.default_rng(options.seed)
     some = [surface.some(options.samples, rng) for surface in surfaces]
-    pairs = _neighbours(surfaces, poses, options, distance_mm)
-    reach_mm, least_mm, laid = _REACHES[-3] * distance_mm, _LEAST_SIGMA * distance_mm, list[_Laid | None]()
-    for number in range(options.rounds):
-        laid = map_in_threads(partial(_compared, some, surfaces, found, reach_mm, least_mm), pairs)
-        step = _joint_step(_in_world(pairs, laid, found), len(found))
-        found = [pose @ _moved(motion).inverse() for pose, motion in zip(found, step, strict=True)]
-        progress("adjustment", number + 1, options.rounds)
-        if np.abs(step[:, 3:]).max() < _CONVERGED * distance_mm:
-            break
-    progress("adjustment", options.rounds, options.rounds)
-    scatter = float(np.mean([each.sigma for each in laid if each is not None] or [0.0]))
-    return found, scatter, _expected(some, _in_world(pairs, laid, found), found, distance_mm)
-
-
-def _compared(
-    some: Sequence[Shown],
-    surfaces: Sequence[Surface],
-    poses: Sequence[Rigid3],
-    reach_mm: float,
-    least_mm: float,
-    pair: tuple[int, int],
-) -> _Laid | None:
-    """Some points of one frame on the surface of another."""
-    one, other = pair
-    return _lay(some[one], surfaces[other], poses[other] @ poses[one].inverse(), reach_mm, least_mm)
-
-
-_Pair = tuple[int, int, _Laid]
-"""Two frames, and how the surface of the first lies on that of the second, in the world."""
-
-
-def _in_world(pairs: Sequence[tuple[int, int]], laid: Sequence[_Laid | None], poses: Sequence[Rigid3]) -> list[_Pair]:
-    """The pairs that lie on each other."""
-    world_from_rig = [pose.inverse() for pose in poses]
-    return [
-        (
-            *(one, other),
-            each._replace(
-                points=world_from_rig[other].apply(each.points), normals=world_from_rig[other].rotate(each.normals)
-            ),
-        )
-        for (one, other), each in zip(pairs, laid, strict=True)
-        if each is not None
-    ]
-
-
-def _joint_equations(pairs: Sequence[_Pair], count: int) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n"]]:
-    """Normal equations of small motions of all frames, in the world; the first frame stays."""
-    matrix, right = np.zeros((count, 6, count, 6)), np.zeros((count, 6))
-    for one, other, each in pairs:
-        block, side = _equations(each)
-        matrix[one, :, one] += block
-        matrix[other, :, other] += block
-        matrix[one, :, other] -= block
-        matrix[other, :, one] -= block
-        right[one] -= side
-        right[other] += side
-    free = 6 * (count - 1)
-    return matrix[1:, :, 1:].reshape(free, free), right[1:].ravel()
-
-
-def _joint_step(pairs: Sequence[_Pair], count: int) -> Float[np.ndarray, "f 6"]:
-    """Small motions of all frames that bring surfaces together."""
-    step = np.zeros((count, 6))
-    if pairs:
-        step[1:] = _solved(*_joint_equations(pairs, count), _HELD_BY_NOTHING).reshape(-1, 6)
-    return step
-
-
-def _covariance(pairs: Sequence[_Pair], count: int, block_mm: float) -> Float[np.ndarray, "n n"]:
-    """Covariance of these motions, from how the gradients of all pairs scatter from block to block of space (Huber, 5th
-    Berkeley Symposium, 1967), with the blocks that the motions have used up taken off their number."""
-    gradients, blocks, frames = [], [], []
-    for one, other, each in pairs:
-        gradient = _rows(each) * (each.weights * each.distances)[:, None]
-        gradients += [-gradient, gradient]
-        blocks += [np.floor(each.points / block_mm).astype(np.int64)] * 2
-        frames += [np.full(len(gradient), one), np.full(len(gradient), other)]
-    block = np.unique(np.concatenate(blocks), axis=0, return_inverse=True)[1].reshape(-1)
-    columns = 6 * np.concatenate(frames)[:, None] + np.arange(6)
-    rows = np.broadcast_to(block[:, None], columns.shape)
-    shape = block.max() + 1, 6 * count
-    by_block = sparse.coo_array((np.concatenate(gradients).ravel(), (rows.ravel(), columns.ravel())), shape).tocsr()
-    scatter = (by_block.T @ by_block).toarray()[6:, 6:]
-    matrix, _ = _joint_equations(pairs, count)
-    slope = sum(each.slopes.sum() for *_, each in pairs) / sum(each.weights.sum() for *_, each in pairs)
-    left = max(1 - len(matrix) / shape[0], 1 / shape[0])
-    solved = partial(_solved, matrix, damping=_HELD_BY_NOTHING)
-    return solved(solved(scatter).T) / (slope**2 * left)
-
-
-def _expected(
-    some: Sequence[Shown], pairs: Sequence[_Pair], poses: Sequence[Rigid3], distance_mm: float
-) -> Expectation | None:
-    """How far the surface may be off by its poses; None for a single frame, and where none lies on another."""
-    if not pairs:
-        return None
-    each = max(MOST_POINTS // len(poses), 1)
-    parts = [pose.inverse().apply(shown.points[:each]) for shown, pose in zip(some, poses, strict=True)]
-    points = np.concatenate(parts)
-    owner = np.repeat(np.arange(len(poses)), [len(part) for part in parts])
-    steps = steps_drawn(_covariance(pairs, len(poses), _CLUSTER * distance_mm)).T.reshape(-1, len(poses) - 1, 6)
-    of_points = np.pad(steps, ((0, 0), (1, 0), (0, 0)))[:, owner]
-    return expectation_of(points, np.cross(of_points[..., :3], points) + of_points[..., 3:])
+    pairs = neighbours(surfaces, poses, options.joint_overlap, distance_mm)
+    return lay_together(surfaces, some, poses, pairs, distance_mm, options.rounds, progress)
 
 
 def track_surfaces(
@@ -651,12 +326,12 @@ def track_surfaces(
     names, surfaces = [], []
     for name, maps in groupby(depths, key=lambda depth_map: depth_map.frame):
         names.append(name)
-        surfaces.append(surface_of(maps, distance_mm, options))
+        surfaces.append(surface_of(maps, distance_mm, thinning=options.thinning, border_px=options.border_px))
         progress("surfaces", len(names), max(len(capture.frames), len(names)))
     placed, dropped = _chained(surfaces, names, options, distance_mm, progress)
     _require_enough(len(placed), len(names), dropped, capture.handpiece, options)
     kept = [surfaces[frame] for frame in placed]
-    poses, scatter_mm, expectation = _together(kept, list(placed.values()), options, distance_mm, progress)
+    poses, scatter_mm, expectation = adjusted(kept, list(placed.values()), options, distance_mm, progress)
     return Reconstruction(
         rig=capture.handpiece.rig,
         expectation=expectation,
