@@ -42,6 +42,24 @@ HERE = Path(__file__).parent
 PHANTOMS = {0: 46, 1: 36, 2: 46}
 """Tooth by seed of a lower jaw."""
 REAL = {"005_upper": 11, "010_upper": 16, "023_lower": 36, "034_upper": 21, "048_lower": 43}
+UNSEEN = {
+    "001_lower": 46,
+    "001_upper": 13,
+    "005_lower": 44,
+    "008_lower": 31,
+    "008_upper": 27,
+    "010_lower": 32,
+    "014_lower": 45,
+    "014_upper": 16,
+    "023_upper": 23,
+    "029_lower": 34,
+    "029_upper": 21,
+    "034_lower": 37,
+    "048_upper": 22,
+    "067_upper": 15,
+}
+"""Tooth by file of jaws with which nothing was developed, scanned under clinical optics: first molars, canines, first
+premolars, central incisors and so on in turn."""
 DENSE = 20
 """Frames of a tooth that is scanned with twice as many as usual."""
 ARCHES = {"arch-phantom": "0", "arch-upper": "fullarch_upper_137k"}
@@ -83,10 +101,11 @@ def cases(folder: Path) -> Iterator[Case]:
         for kind, look in (("", {}), ("natural-", {"texture": "natural"})):
             parameters: dict[str, Value] = {**phantoms["phantom-0"], **plain, **look, "method": method}
             yield Case(name=f"phantom-0-{kind}{method}", parameters=parameters)
-    for name, tooth in REAL.items():
-        file = _file_of(name, folder)
-        if file is not None:
-            yield Case(name=name, parameters={"jaw": file, "tooth": tooth, **plain})
+    for teeth, suffix, optics in ((REAL, "", "ideal"), (UNSEEN, "-clinical", "clinical")):
+        for name, tooth in teeth.items():
+            file = _file_of(name, folder)
+            if file is not None:
+                yield Case(name=f"{name}{suffix}", parameters={"jaw": file, "tooth": tooth, **plain, "optics": optics})
     for name, jaw_name in (ARCHES | OTHER_ARCHES).items():
         file = jaw_name if jaw_name.isdigit() else _file_of(jaw_name, folder)
         if file is not None:
