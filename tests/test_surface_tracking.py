@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from cuspid.capture import Capture, Frame
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3, unit
 from cuspid.mesh import Mesh
+from cuspid.motion.expectation import expectation_of
 from cuspid.motion.held_calibration import depth_sigma_mm
 from cuspid.motion.surface_tracking import SurfaceTrackingOptions, _drift, _onto, adjusted, track_surfaces
 from cuspid.motion.surfaces import Shown, Surface, surface_of
@@ -92,12 +93,18 @@ def test_a_path_is_found_from_surfaces() -> None:
     assert 10 < found.log["surface_scatter_um"] < 25
 
 
-def test_a_long_path_that_was_found_bent_is_straightened() -> None:
-    rng, way, bent, surfaces = np.random.default_rng(0), [], [], []
-    for k in range(50):
+Errors = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Of heights at places."""
+
+
+def strip(frames: int, rng: np.random.Generator, error: Errors) -> tuple[list[Surface], list[Rigid3]]:
+    """What frames 1 mm apart show of hills, and where they were; ``error`` is added to the height at places of the rig
+    frame."""
+    surfaces, way = [], []
+    for k in range(frames):
         x, y = rng.uniform(-2.5, 2.5, (2, 1500))
         u = x + k
-        z = 0.5 * np.sin(1.8 * u) * np.cos(1.5 * y + 0.3 * u) + rng.normal(0, 0.003, len(x))
+        z = 0.5 * np.sin(1.8 * u) * np.cos(1.5 * y + 0.3 * u) + error(x, y)
         slope_x = 0.9 * np.cos(1.8 * u) * np.cos(1.5 * y + 0.3 * u) - 0.15 * np.sin(1.8 * u) * np.sin(1.5 * y + 0.3 * u)
         slope_y = -0.75 * np.sin(1.8 * u) * np.sin(1.5 * y + 0.3 * u)
         surfaces.append(
@@ -106,7 +113,13 @@ def test_a_long_path_that_was_found_bent_is_straightened() -> None:
             )
         )
         way.append(Rigid3(np.eye(3), np.array([-k, 0.0, 0.0])))
-        bent.append(Rigid3.from_rotation_vector(np.array([0, 0, 2e-4 * k]), np.array([-k, 1e-4 * k**2, 0])))
+    return surfaces, way
+
+
+def test_a_long_path_that_was_found_bent_is_straightened() -> None:
+    rng = np.random.default_rng(0)
+    surfaces, way = strip(50, rng, lambda x, y: rng.normal(0, 0.003, len(x)))
+    bent = [Rigid3.from_rotation_vector(np.array([0, 0, 2e-4 * k]), np.array([-k, 1e-4 * k**2, 0])) for k in range(50)]
 
     def off_um(poses: Sequence[Rigid3]) -> float:
         pairs = zip(poses, way, strict=True)
@@ -117,6 +130,36 @@ def test_a_long_path_that_was_found_bent_is_straightened() -> None:
     assert 1 < off_um(straight) < 50
     assert expected is not None
     assert 0.5 < expected.span_sigma_um < 10
+
+
+def of_the_cameras(rng: np.random.Generator) -> Errors:
+    """The same smooth error in each frame."""
+    waves, phases = rng.normal(0, 1.5, (2, 8)), rng.uniform(0, 2 * np.pi, 8)
+    return lambda x, y: 0.004 * np.cos(np.outer(x, waves[0]) + np.outer(y, waves[1]) + phases).sum(axis=1)
+
+
+def of_chance(rng: np.random.Generator) -> Errors:
+    """Another for each point."""
+    return lambda x, y: rng.normal(0, 0.01, len(x))
+
+
+@pytest.mark.parametrize("errors", [of_the_cameras, of_chance])
+def test_what_a_path_is_off_by_is_expected(errors: Callable[[np.random.Generator], Errors]) -> None:
+    """Also where errors go along with the cameras, and so add up from frame to frame."""
+    bends, stated = [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        surfaces, way = strip(20, rng, errors(rng))
+        found, _, expected = adjusted(surfaces, way, SurfaceTrackingOptions(samples=500), 5.0, silent)
+        assert expected is not None
+        frames = np.array_split(expected.points, len(way))
+        true = np.concatenate(
+            [(one.inverse() @ other).apply(some) for one, other, some in zip(way, found, frames, strict=True)]
+        )
+        off = expectation_of(expected.points, (true - expected.points)[None])
+        bends.append(np.trace(off.covariance.mean(axis=0)))
+        stated.append(np.trace(expected.covariance.mean(axis=0)))
+    assert 0.6 < np.sqrt(np.mean(bends) / np.mean(stated)) < 1.6
 
 
 def held_back(trust: float) -> list[DepthMap]:

@@ -4,18 +4,19 @@ most of the same surface, whether consecutive or not.
 A pair counts for as much as its surfaces overlap and as little as they scatter about each other. Thus drift is spread
 where it is least certain, and a path that comes back is closed.
 
-How far the poses may be off follows from how the gradients of all pairs scatter from one block of space to the next
-(covariance of an M-estimate with clusters, as for tracks): surfaces are smooth, so that their errors hang together
-within a block, whichever frames show it.
+How far the poses may be off follows from how the gradients of all pairs scatter (covariance of an M-estimate with
+clusters, as for tracks), from one block of space to the next, for surfaces are smooth, so that their errors hang
+together within a block, whichever frames show it; and from one part of the view to the next, for some errors go along
+with the cameras, through all frames.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy import sparse
 
 from cuspid.geometry import Rigid3
@@ -29,11 +30,14 @@ _REACH = 0.04
 """Largest distance between the same place in two frames, as a share of the working distance."""
 _BLOCK = 0.1
 """Side of the blocks by which overlap is told, as a share of the working distance."""
-_CLUSTER = 0.2
-"""Side of the blocks within which errors of surfaces hang together, as a share of the working distance."""
+_IN_SPACE, _IN_VIEW = 0.2, 0.8
+"""Sides of the blocks of space, and of those that go along with the handpiece, within which errors of surfaces hang
+together, as shares of the working distance."""
 _DAMPING = 1e-13
 """Share of the diagonal that is added to the normal equations: what bends a whole path stands out so little from it
 that more would freeze the bend."""
+_MOTION = 6
+"""Parameters of a motion."""
 _CONVERGED = 2e-6
 """Step of the joint adjustment, as a share of the working distance, that ends it."""
 
@@ -147,33 +151,51 @@ def _step(pairs: Sequence[_Pair], count: int) -> Float[np.ndarray, "f 6"]:
     return step
 
 
-def _covariance(pairs: Sequence[_Pair], count: int, block_mm: float) -> Float[np.ndarray, "n n"]:
-    """Covariance of these motions, from how the gradients of all pairs scatter from block to block of space (Huber, 5th
-    Berkeley Symposium, 1967), with the blocks that the motions have used up taken off their number."""
+def _covariance(pairs: Sequence[_Pair], poses: Sequence[Rigid3], distance_mm: float) -> Float[np.ndarray, "n n"]:
+    """Covariance of these motions, from how the gradients of all pairs scatter (Huber, 5th Berkeley Symposium, 1967)
+    from block to block of space, and of the view; what scatters within both would be counted twice (C. Cameron, J.
+    Gelbach, D. Miller, Journal of Business and Economic Statistics 29, 2011)."""
+    matrix, _ = _equations(pairs, len(poses))
+
+    def in_space(one: int, laid: Laid) -> Float[np.ndarray, "n 3"]:
+        return np.floor(laid.points / (_IN_SPACE * distance_mm))
+
+    def in_view(one: int, laid: Laid) -> Float[np.ndarray, "n 3"]:
+        return np.floor(poses[one].apply(laid.points) / (_IN_VIEW * distance_mm))
+
+    def in_both(one: int, laid: Laid) -> Float[np.ndarray, "n 6"]:
+        return np.concatenate([in_space(one, laid), in_view(one, laid)], axis=1)
+
+    scatter = (
+        _scatter(pairs, in_space, len(poses), len(matrix))
+        + _scatter(pairs, in_view, len(poses), 1)
+        - _scatter(pairs, in_both, len(poses), len(matrix))
+    )
+    slope = sum(each.slopes.sum() for *_, each in pairs) / sum(each.weights.sum() for *_, each in pairs)
+    found = solved(matrix, solved(matrix, scatter, _DAMPING).T, _DAMPING) / slope**2
+    values, vectors = np.linalg.eigh((found + found.T) / 2)
+    return np.asarray((vectors * np.clip(values, 0, None)) @ vectors.T)
+
+
+def _scatter(
+    pairs: Sequence[_Pair], blocks_of: Callable[[int, Laid], Float[np.ndarray, "n k"]], count: int, used: int
+) -> Float[np.ndarray, "m m"]:
+    """How the gradients scatter from block to block of points, of which the motions use up so many."""
     gradients, blocks, frames = [], [], []
     for one, other, each in pairs:
-        at, gradient = _by_block(each, block_mm)
-        gradients += [-gradient, gradient]
-        blocks += [at, at]
-        frames += [np.full(len(at), one), np.full(len(at), other)]
+        gradient = each.rows * (each.weights * each.distances)[:, None]
+        shown, inside = np.unique(blocks_of(one, each), axis=0, return_inverse=True)
+        sums = np.stack([np.bincount(inside.reshape(-1), column, len(shown)) for column in gradient.T], axis=1)
+        gradients += [-sums, sums]
+        blocks += [shown, shown]
+        frames += [np.full(len(shown), one), np.full(len(shown), other)]
     block = np.unique(np.concatenate(blocks), axis=0, return_inverse=True)[1].reshape(-1)
-    columns = 6 * np.concatenate(frames)[:, None] + np.arange(6)
+    columns = _MOTION * np.concatenate(frames)[:, None] + np.arange(_MOTION)
     rows = np.broadcast_to(block[:, None], columns.shape)
-    shape = block.max() + 1, 6 * count
-    scattered = sparse.coo_array((np.concatenate(gradients).ravel(), (rows.ravel(), columns.ravel())), shape).tocsr()
-    scatter = (scattered.T @ scattered).toarray()[6:, 6:]
-    matrix, _ = _equations(pairs, count)
-    slope = sum(each.slopes.sum() for *_, each in pairs) / sum(each.weights.sum() for *_, each in pairs)
-    left = max(1 - len(matrix) / shape[0], 1 / shape[0])
-    return solved(matrix, solved(matrix, scatter, _DAMPING).T, _DAMPING) / (slope**2 * left)
-
-
-def _by_block(laid: Laid, block_mm: float) -> tuple[Int[np.ndarray, "b 3"], Float[np.ndarray, "b 6"]]:
-    """The blocks of space that points lie in, and the sum of their gradients in each."""
-    gradient = laid.rows * (laid.weights * laid.distances)[:, None]
-    blocks, inside = np.unique(np.floor(laid.points / block_mm).astype(np.int64), axis=0, return_inverse=True)
-    inside = inside.reshape(-1)
-    return blocks, np.stack([np.bincount(inside, each, len(blocks)) for each in gradient.T], axis=1)
+    shape = block.max() + 1, _MOTION * count
+    by_block = sparse.coo_array((np.concatenate(gradients).ravel(), (rows.ravel(), columns.ravel())), shape).tocsr()
+    left = max(1 - used / shape[0], 1 / shape[0])
+    return (by_block.T @ by_block).toarray()[_MOTION:, _MOTION:] / left
 
 
 def _expected(
@@ -186,6 +208,6 @@ def _expected(
     parts = [pose.inverse().apply(shown.points[:each]) for shown, pose in zip(some, poses, strict=True)]
     points = np.concatenate(parts)
     owner = np.repeat(np.arange(len(poses)), [len(part) for part in parts])
-    steps = steps_drawn(_covariance(pairs, len(poses), _CLUSTER * distance_mm)).T.reshape(-1, len(poses) - 1, 6)
+    steps = steps_drawn(_covariance(pairs, poses, distance_mm)).T.reshape(-1, len(poses) - 1, 6)
     of_points = np.pad(steps, ((0, 0), (1, 0), (0, 0)))[:, owner]
     return expectation_of(points, np.cross(of_points[..., :3], points) + of_points[..., 3:])
