@@ -242,7 +242,7 @@ def jaws(result: Result) -> str:
     planned = [scan for scan in scans.values() if scan["failure"] is None]
     return "\n".join(
         [
-            f"{len(scans)} of {result['cases']} cases were tried; {len(planned)} finished. A name with "
+            f"{len(scans)} of {result['cases']} cases were tried{_at(planned)}; {len(planned)} finished. A name with "
             "*smooth* stands for a coarse jaw after two Loop subdivisions; quadrants, single teeth and jaws with gaps "
             "are cut from smooth ones, rotated at random and without labels. Twelve cameras, seed 0; bar for planning: "
             f"{_LONGEST_PLAN_S:g} s; machine load at the end: {result['load'][0]:g}. "
@@ -253,9 +253,22 @@ def jaws(result: Result) -> str:
     )
 
 
+def _commits(scans: Iterable[Result]) -> set[str]:
+    """Those that scans are of."""
+    return {str(scan["commit"]) for scan in scans if scan.get("commit")}
+
+
+def _at(scans: Iterable[Result]) -> str:
+    """Where all are of one commit, which."""
+    commits = _commits(scans)
+    return f" (at commit {commits.pop()})" if len(commits) == 1 else ""
+
+
 def _scans_table(scans: Mapping[str, Result]) -> str:
-    """A row of figures for each scan."""
+    """A row of figures for each scan; with its commit, where not all are of one."""
     heads = [head for head, key in _JAW_COLUMNS.items() if any(key in scan for scan in scans.values())]
+    if len(_commits(scans.values())) == 1:
+        heads.remove("commit")
     rows = [
         (name, *(_jaw_figure(scan, _JAW_COLUMNS[head]) for head in heads), scan["failure"] or scan.get("notes") or "")
         for name, scan in scans.items()
