@@ -36,8 +36,6 @@ together, as shares of the working distance."""
 _DAMPING = 1e-13
 """Share of the diagonal that is added to the normal equations: what bends a whole path stands out so little from it
 that more would freeze the bend."""
-_MOTION = 6
-"""Parameters of a motion."""
 _CONVERGED = 2e-6
 """Step of the joint adjustment, as a share of the working distance, that ends it."""
 
@@ -152,9 +150,12 @@ def _step(pairs: Sequence[_Pair], count: int) -> Float[np.ndarray, "f 6"]:
 
 
 def _covariance(pairs: Sequence[_Pair], poses: Sequence[Rigid3], distance_mm: float) -> Float[np.ndarray, "n n"]:
-    """Covariance of these motions, from how the gradients of all pairs scatter (Huber, 5th Berkeley Symposium, 1967)
-    from block to block of space, and of the view; what scatters within both would be counted twice (C. Cameron, J.
-    Gelbach, D. Miller, Journal of Business and Economic Statistics 29, 2011)."""
+    """Covariance of the motions of all frames but the first (rotation vector, translation in mm, in the world).
+
+    It follows from how the gradients of all pairs scatter (Huber, 5th Berkeley Symposium, 1967) from block to block of
+    space, and of the view; what scatters within both would be counted twice (C. Cameron, J. Gelbach, D. Miller, Journal
+    of Business and Economic Statistics 29, 2011).
+    """
     matrix, _ = _equations(pairs, len(poses))
 
     def in_space(one: int, laid: Laid) -> Float[np.ndarray, "n 3"]:
@@ -190,12 +191,12 @@ def _scatter(
         blocks += [shown, shown]
         frames += [np.full(len(shown), one), np.full(len(shown), other)]
     block = np.unique(np.concatenate(blocks), axis=0, return_inverse=True)[1].reshape(-1)
-    columns = _MOTION * np.concatenate(frames)[:, None] + np.arange(_MOTION)
+    columns = 6 * np.concatenate(frames)[:, None] + np.arange(6)
     rows = np.broadcast_to(block[:, None], columns.shape)
-    shape = block.max() + 1, _MOTION * count
+    shape = block.max() + 1, 6 * count
     by_block = sparse.coo_array((np.concatenate(gradients).ravel(), (rows.ravel(), columns.ravel())), shape).tocsr()
     left = max(1 - used / shape[0], 1 / shape[0])
-    return (by_block.T @ by_block).toarray()[_MOTION:, _MOTION:] / left
+    return (by_block.T @ by_block).toarray()[6:, 6:] / left
 
 
 def _expected(

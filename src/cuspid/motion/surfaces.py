@@ -190,6 +190,7 @@ def moved(motion: Float[np.ndarray, "6"]) -> Rigid3:
 def solved(
     matrix: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n *k"], damping: float
 ) -> Float[np.ndarray, "n *k"]:
-    """With a share of the diagonal added, which only matters where nothing is known."""
+    """The solution of normal equations, with a share of their diagonal added, which only matters where nothing is
+    known."""
     diagonal = np.diag(matrix)
     return np.asarray(np.linalg.solve(matrix + damping * np.diag(np.maximum(diagonal, diagonal.mean())), right))
