@@ -208,6 +208,13 @@ def test_several_distances_are_given_one_after_the_other(tmp_path: Path, capsys:
     assert "look whether the places" in capsys.readouterr().err.replace("\n", " ")
 
 
+def test_the_page_of_a_killed_run_names_its_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write(tmp_path / "pano", panorama())
+    run("rescale", tmp_path / "pano", "--out", tmp_path / "out", "--distance", 3, 4, 36, 22, 40.0)
+    (tmp_path / "out" / "panorama.json").unlink()
+    assert "run the same cuspid rescale command again" in refused(capsys, "report", tmp_path / "out")
+
+
 @pytest.mark.parametrize(
     ("given", "told"),
     [

@@ -328,14 +328,15 @@ def _rows(folder: Path) -> list[Mapping[str, str]]:
 
 
 def _is_panorama(folder: Path, run: Mapping[str, Any]) -> bool:
-    return "stitch" in run or (folder / "panorama.json").exists()
+    return bool(run.keys() & {"stitch", "rescale"}) or (folder / "panorama.json").exists()
 
 
 def _read_panorama(folder: Path, run: Mapping[str, Any]) -> PanoramaResult:
     folders = [folder, *sorted(folder.glob("part-*"))]
     there = tuple(each for each in folders if (each / "panorama.json").exists())
     if not there:
-        raise InputError(f"{folder}: the panorama is not complete; run the same cuspid stitch command again")
+        verb = "rescale" if "rescale" in run else "stitch"
+        raise InputError(f"{folder}: the panorama is not complete; run the same cuspid {verb} command again")
     captions = {
         "distances.png": "What the scale is from: distances that were measured between places of the arch",
         "camera_path.png": "The path of the camera over the arch",
