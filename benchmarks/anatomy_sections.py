@@ -298,7 +298,7 @@ def enamel(result: Result) -> str:
             "on phantom-0, ideal and clinical, on 048_lower, with which the places of the LEDs were chosen, too, on "
             "023_lower, and on arch-upper, ideal and clinical, and arch-phantom for paths; a limit was chosen with "
             "phantom-1 in view; the others were looked at only at the end, but most also with earlier versions. Real "
-            "jaws that are *clinical*, and the arch of phantom 1, were scanned once, at the end. "
+            "jaws that are *clinical*, and the arches of phantoms 1 and 2, were scanned once, at the end. "
             "`python benchmarks/enamel.py`.",
             "",
             _scans_table(told),

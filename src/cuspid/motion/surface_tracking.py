@@ -367,7 +367,7 @@ def _drift(poses: Sequence[Rigid3], distance_mm: float) -> tuple[str, ...]:
         return ()
     return (
         f"motion: over {extent_mm:.0f} mm, small errors from surface to surface add up: in simulation the ends of a "
-        "whole arch come out up to 0.05 mm off, or 0.2 with poor optics or without polarisers; do not rely on "
+        "whole arch come out up to 0.1 mm off, or 0.2 with poor optics or without polarisers; do not rely on "
         "distances across it",
     )
 
