@@ -57,6 +57,10 @@ class Blinded:
         """As the other."""
         return self.whole.size(self.black.get(frame, frame), camera)
 
+    def mask(self, frame: str, camera: str) -> UInt8[np.ndarray, "h w"] | None:
+        """As the other."""
+        return self.whole.mask(self.black.get(frame, frame), camera)
+
     def digest(self, frame: str, camera: str) -> str:
         """As the other, marked where it is black."""
         return self.whole.digest(self.black.get(frame, frame), camera) + ("-black" if frame in self.black else "")

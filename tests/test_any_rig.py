@@ -53,6 +53,9 @@ class InMemory:
         height, width = self.images[frame, camera].shape[:2]
         return width, height
 
+    def mask(self, frame: str, camera: str) -> np.ndarray | None:
+        return None
+
     def digest(self, frame: str, camera: str) -> str:
         return hashlib.sha256(self.images[frame, camera].tobytes()).hexdigest()
 

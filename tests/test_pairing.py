@@ -14,7 +14,15 @@ from cuspid import storage
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import essential_four, six_cameras, twelve_cameras
-from cuspid.pairing import PairingOptions, camera_groups, guess_working_distance_mm, stereo_pairs
+from cuspid.pairing import (
+    PairingOptions,
+    camera_groups,
+    guess_working_distance_mm,
+    rank_by_points,
+    rank_sources,
+    stereo_pairs,
+    worth_of_angle,
+)
 
 DESIGNS = Path(__file__).parent.parent / "benchmarks" / "designs"
 FOUND = [storage.read_handpiece(path) for path in sorted(DESIGNS.glob("*.json"))]
@@ -77,13 +85,61 @@ def test_groups_follow_from_what_is_asked_of_a_pair():
     assert camera_groups(rig, 5.0, PairingOptions(minimum_overlap=0.9)) == (("a",), ("b",), ("c",))
 
 
-@given(st.floats(0.1, 170.0))
+def around(*degrees: float) -> dict[str, Rigid3]:
+    """Cameras on a circle of 5 mm that look at its middle."""
+    back = Rigid3(np.eye(3), np.array([0, 0, 5.0]))
+    return {
+        f"c{angle:g}": back @ Rigid3.from_rotation_vector(np.array([0, np.deg2rad(angle), 0]), np.zeros(3))
+        for angle in degrees
+    }
+
+
+@given(st.floats(0.1, 80.0))
 def test_the_largest_angle_of_a_pair_is_still_one(angle):
-    turned = Rigid3.from_rotation_vector(np.array([0, np.deg2rad(angle), 0]), np.zeros(3))
-    rig = rig_of(a=shifted(0), b=turned)
-    assert rig.angle_deg("a", "b") == pytest.approx(angle)
-    assert stereo_pairs(rig, 5.0, PairingOptions(minimum_overlap=0.0, maximum_angle_deg=angle)) == (("a", "b"),)
+    rig = rig_of(**around(0, angle))
+    names = rig.names
+    assert rig.angle_deg(*names) == pytest.approx(angle)
+    assert rig.meeting_deg(*names, 5.0) == pytest.approx(angle)
+    assert stereo_pairs(rig, 5.0, PairingOptions(minimum_overlap=0.0, maximum_angle_deg=angle)) == (names,)
     assert stereo_pairs(rig, 5.0, PairingOptions(minimum_overlap=0.0, maximum_angle_deg=0.99 * angle)) == ()
+
+
+@given(st.floats(5.0, 40.0), st.integers(5, 9))
+def test_a_ring_is_no_group_each_camera_has_its_neighbours(step, count):
+    rig = rig_of(**around(*(step * k for k in range(count))))
+    ranked = rank_sources(rig, 5.0, PairingOptions(minimum_overlap=0.1))
+    for k, name in enumerate(rig.names):
+        neighbours = {rig.names[j] for j in (k - 1, k + 1) if 0 <= j < count}
+        near = {other for other in ranked[name] if rig.angle_deg(name, other) < 2 * step - 0.01}
+        assert near == neighbours or step < 8
+        assert all(rig.angle_deg(name, other) <= 45.001 for other in ranked[name])
+
+
+@given(st.permutations(["c0", "c7", "c15", "c24", "c33", "c41"]))
+def test_sources_do_not_depend_on_the_order_of_the_cameras(names):
+    poses = around(0, 7, 15, 24, 33, 41)
+    ranked = rank_sources(rig_of(**poses), 5.0)
+    permuted = rank_sources(rig_of(**{name: poses[name] for name in names}), 5.0)
+    assert {name: set(sources) for name, sources in permuted.items()} == {k: set(v) for k, v in ranked.items()}
+    assert ranked["c0"][0] == "c15"
+
+
+def test_views_share_points_or_are_no_sources():
+    rng = np.random.default_rng(0)
+    points = rng.normal(0, 1, (300, 3)) + [0, 0, 100]
+    centres = np.array([[0, 0, 0], [30.0, 0, 0], [0, 33.0, 0], [31.0, 30, 0], [400.0, 0, 100]])
+    half = np.arange(150)
+    sightings = [(v, p) for v, seen in enumerate((range(300), half, half + 150, half + 150, range(300))) for p in seen]
+    ranked = rank_by_points(centres, points, np.array(sightings))
+    assert ranked[0] == (1, 2, 3)
+    assert set(ranked[2]) == {0, 3} and set(ranked[1]) == {0}
+    assert ranked[4] == ()
+
+
+@given(st.floats(0.0, 180.0))
+def test_no_angle_is_a_wall(angle):
+    at, beside = worth_of_angle(np.array([angle, angle + 0.01]))
+    assert 0 <= at <= 1 and abs(at - beside) < 0.002
 
 
 @pytest.mark.parametrize("wrong", [{"minimum_overlap": 1.1}, {"maximum_angle_deg": -1.0}])

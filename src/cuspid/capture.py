@@ -134,8 +134,13 @@ class ImageSource(Protocol):
         """Width and height in px, without decoding the image. Raises InputError where it is missing or damaged."""
         ...
 
+    def mask(self, frame: str, camera: str) -> UInt8[np.ndarray, "h w"] | None:
+        """Zero where the image shows what does not belong to the object; None where all of it counts. Raises InputError
+        where the mask is of another size, or leaves nothing."""
+        ...
+
     def digest(self, frame: str, camera: str) -> str:
-        """SHA-256 of the stored image. Raises InputError where it is missing."""
+        """SHA-256 of the stored image and its mask. Raises InputError where it is missing."""
         ...
 
     def where(self, frame: str, camera: str) -> str:
@@ -146,6 +151,45 @@ class ImageSource(Protocol):
 def image_name(frame: str, camera: str, suffix: str) -> str:
     """Name of an image in COLMAP's rig layout: ``<camera>/<frame>.png``."""
     return f"{camera}/{frame}{suffix}"
+
+
+def mask_paths(folder: Path, stem: str, suffix: str) -> tuple[Path, Path]:
+    """Where the mask of an image may lie: under its own name as PNG, or as COLMAP has it."""
+    return folder / f"{stem}.png", folder / f"{stem}{suffix}.png"
+
+
+def read_mask(image: Path, mask: Path | None) -> UInt8[np.ndarray, "h w"] | None:
+    """What of an image counts, from the file of its mask or else from its own opacity; None where all of it does.
+
+    Raises InputError where the mask is damaged, of another size, or leaves nothing.
+    """
+    if mask is None and not has_opacity(image):
+        return None
+    if mask is None:
+        counts = np.ascontiguousarray(read_rgba(image)[..., 3])
+    else:
+        if (size := image_size(mask)) != (whole := image_size(image)):
+            raise InputError(f"{mask}: {size[0]} x {size[1]} px, but its image has {whole[0]} x {whole[1]} px")
+        counts = read_image(mask).max(axis=2)
+    if not counts.any():
+        raise InputError(f"{mask or image}: the mask leaves nothing of the image; white is what counts")
+    return counts
+
+
+def has_opacity(path: Path) -> bool:
+    """Whether an image file states the opacity of its pixels."""
+    image_size(path)
+    with Image.open(path) as image:
+        return image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of an image file, read once for each of its states. Raises InputError where it cannot be read."""
+    try:
+        state = path.stat()
+        return _file_digest(path, state.st_size, state.st_mtime_ns)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); put the image back") from error
 
 
 @cache
@@ -176,14 +220,21 @@ class ImageFolder:
         """As :meth:`ImageSource.size`."""
         return image_size(self.path(frame, camera))
 
+    def mask_path(self, frame: str, camera: str) -> Path | None:
+        """Path of the mask of an image, ``masks/<camera>/<frame>.png`` or COLMAP's ``<frame>.jpg.png``, if there is
+        one."""
+        beside = self.folder / "masks" / camera
+        return next((path for path in mask_paths(beside, frame, self.suffix) if path.is_file()), None)
+
+    def mask(self, frame: str, camera: str) -> UInt8[np.ndarray, "h w"] | None:
+        """As :meth:`ImageSource.mask`; without a mask of its own, the opacity of the image."""
+        return read_mask(self.path(frame, camera), self.mask_path(frame, camera))
+
     def digest(self, frame: str, camera: str) -> str:
         """As :meth:`ImageSource.digest`."""
-        path = self.path(frame, camera)
-        try:
-            state = path.stat()
-            return _file_digest(path, state.st_size, state.st_mtime_ns)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror}); put the image back") from error
+        mask = self.mask_path(frame, camera)
+        image = file_digest(self.path(frame, camera))
+        return image if mask is None else hashlib.sha256(f"{image} {file_digest(mask)}".encode()).hexdigest()
 
     def where(self, frame: str, camera: str) -> str:
         """As :meth:`ImageSource.where`."""
@@ -211,6 +262,14 @@ class HalvedImages:
     def size(self, frame: str, camera: str) -> tuple[int, int]:
         """As :meth:`ImageSource.size`."""
         return halved_size(*self.whole.size(frame, camera))
+
+    def mask(self, frame: str, camera: str) -> UInt8[np.ndarray, "h w"] | None:
+        """As :meth:`ImageSource.mask`."""
+        mask = self.whole.mask(frame, camera)
+        if mask is None:
+            return None
+        size = halved_size(mask.shape[1], mask.shape[0])
+        return np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
 
     def digest(self, frame: str, camera: str) -> str:
         """As :meth:`ImageSource.digest`."""
@@ -257,6 +316,11 @@ class Capture:
     def images(self, frame: Frame) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
         """The images of all cameras that have one of a frame, as :meth:`image`."""
         return {name: self.image(frame, name) for name in frame.cameras}
+
+    def masks(self, frame: Frame) -> dict[str, UInt8[np.ndarray, "h w"]]:
+        """The masks of those cameras that have one of a frame, as :meth:`ImageSource.mask`."""
+        masks = {name: self.source.mask(frame.name, name) for name in frame.cameras}
+        return {name: mask for name, mask in masks.items() if mask is not None}
 
     def check_image(self, frame: Frame, camera: str) -> None:
         """Raise what :meth:`image` would, as far as can be told without decoding the image."""

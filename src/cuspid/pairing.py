@@ -1,22 +1,37 @@
-"""Which cameras of a rig are matched with each other, at what distance, and what they resolve: choices that are based
-on the measures of :class:`cuspid.rig.Rig`."""
+"""Which views are matched with each other, at what distance, and what they resolve.
+
+A *reference* view is matched with its own *sources*: the best few by the angle under which both see a point, and by how
+much of what the one sees the other sees too. For the cameras of a rig, this follows from their calibration; for located
+views of anything, from the sparse points that they share (:func:`rank_by_points`).
+"""
 
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Annotated
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from cuspid.errors import InputError
+from cuspid.geometry import unit
 from cuspid.graph import parts_of
 from cuspid.options import SHARE, Options, Range
 from cuspid.rig import Handpiece, Rig
 
 _ROUNDING_DEG = 1e-5
+_BEST_DEG = 8.0, 20.0
+"""Angles between two lines of sight from and up to which nothing is lost: less gives less depth, more another picture
+of the same surface."""
+_FALL_DEG = 15.0
+"""Beyond, what a source is worth falls as a Gaussian function of this standard deviation."""
+_LEAST_SHARED = 12
+"""Number of sparse points that two views must share to be matched."""
+_SHARED_ENOUGH = 150
+"""Number of shared points from which on more of them tell no more."""
 _CONVERGING_DEG = 10.0
 """Axes that converge less than this may meet far behind what the cameras were mounted for."""
 _SHARED = 0.6
@@ -30,19 +45,82 @@ class PairingOptions(Options):
 
     minimum_overlap: Annotated[float, SHARE] = 0.4
     """Share (0 to 1) of what either camera sees at the working distance that the other must see too."""
-    maximum_angle_deg: Annotated[float, Range(0, 180)] = 30.0
+    maximum_angle_deg: Annotated[float, Range(0, 180)] = 45.0
     """Largest angle between their optical axes."""
+    maximum_sources: Annotated[int, Range(1, 100)] = 8
+    """Each view is matched with no more than this many others, the best ones."""
+    minimum_share: Annotated[float, SHARE] = 0.15
+    """A view is not matched with those that are worth less than this share (0 to 1) of the best one: 20 degrees apart
+    is best, 33 degrees are worth 0.7 of it, 40 degrees 0.4 and 50 degrees 0.1."""
+
+
+def worth_of_angle(angle_deg: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """What a source is worth (0 to 1) for lines of sight that meet at an angle: a soft choice of 8 to 20 degrees."""
+    least, most = _BEST_DEG
+    return np.minimum(angle_deg / least, 1) * np.exp(-0.5 * (np.maximum(angle_deg - most, 0) / _FALL_DEG) ** 2)
+
+
+def rank_sources(
+    rig: Rig, distance_mm: float, options: PairingOptions = PairingOptions()
+) -> Mapping[str, tuple[str, ...]]:
+    """For each camera the others that it is matched with, best first, for a surface at the given distance."""
+    names, worth = rig.names, np.zeros((len(rig.names),) * 2)
+    for one, other in combinations(range(len(names)), 2):
+        pair = names[one], names[other]
+        if rig.angle_deg(*pair) > options.maximum_angle_deg + _ROUNDING_DEG:
+            continue
+        shared = _shared(rig, pair, distance_mm)
+        if shared >= options.minimum_overlap:
+            angles = np.array([rig.meeting_deg(*pair, distance_mm), rig.meeting_deg(*pair[::-1], distance_mm)])
+            worth[one, other], worth[other, one] = shared * worth_of_angle(angles)
+    return {name: tuple(names[k] for k in _best(row, options)) for name, row in zip(names, worth, strict=True)}
+
+
+def rank_by_points(
+    centres: Float[np.ndarray, "v 3"],
+    points: Float[np.ndarray, "p 3"],
+    sightings: Int[np.ndarray, "s 2"],
+    options: PairingOptions = PairingOptions(),
+) -> tuple[tuple[int, ...], ...]:
+    """For each view the others that it is matched with, best first, by the points that both see.
+
+    ``centres`` are the projection centres of the views, ``sightings`` pairs of a view and a point that it sees.
+    """
+    sees = np.zeros((len(centres), len(points)), dtype=bool)
+    sees[sightings[:, 0], sightings[:, 1]] = True
+    ranked = []
+    for reference in range(len(centres)):
+        worth = np.zeros(len(centres))
+        mine = np.flatnonzero(sees[reference])
+        towards = unit(centres[reference] - points[mine])
+        for other in np.flatnonzero(sees[:, mine].sum(axis=1) >= _LEAST_SHARED) if len(mine) else ():
+            both = sees[other, mine]
+            cosine = np.einsum("ni,ni->n", towards[both], unit(centres[other] - points[mine[both]]))
+            angle_deg = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
+            # The median angle, since most points of a view are seen again at its best side only.
+            enough = min(1.0, np.sqrt(both.sum() / min(_SHARED_ENOUGH, len(mine))))
+            worth[other] = enough * worth_of_angle(np.median(angle_deg))
+        worth[reference] = 0
+        ranked.append(_best(worth, options))
+    return tuple(ranked)
+
+
+def _best(worth: Float[np.ndarray, "v"], options: PairingOptions) -> tuple[int, ...]:
+    """Indices of the views that are worth enough, best first."""
+    order = np.argsort(-worth, kind="stable")[: options.maximum_sources]
+    least = options.minimum_share * worth.max(initial=0.0)
+    return tuple(int(k) for k in order if worth[k] > 0 and worth[k] >= least)
 
 
 def stereo_pairs(
     rig: Rig, distance_mm: float, options: PairingOptions = PairingOptions()
 ) -> tuple[tuple[str, str], ...]:
-    """Pairs of cameras that depth is measured from, for a surface at the given distance."""
+    """Pairs of cameras of which one is matched with the other, for a surface at the given distance."""
+    sources = rank_sources(rig, distance_mm, options)
     return tuple(
         (first, second)
         for first, second in combinations(rig.names, 2)
-        if rig.angle_deg(first, second) <= options.maximum_angle_deg + _ROUNDING_DEG
-        and _shared(rig, (first, second), distance_mm) >= options.minimum_overlap
+        if second in sources[first] or first in sources[second]
     )
 
 
@@ -63,7 +141,8 @@ def guess_working_distance_mm(rig: Rig) -> tuple[float, str]:
     camera begins to share enough with its best partner (median; within a factor of two for the designs that come with
     cuspid). Raises InputError if no two of the cameras can be a pair.
     """
-    pairs = stereo_pairs(rig, 1.0, PairingOptions(minimum_overlap=0.0))
+    limit_deg = PairingOptions.maximum_angle_deg
+    pairs = [pair for pair in combinations(rig.names, 2) if rig.angle_deg(*pair) <= limit_deg]
     if not pairs:
         raise InputError("the working distance cannot be told from the cameras: no two of them look the same way")
     if min(rig.angle_deg(*pair) for pair in pairs) >= _CONVERGING_DEG:

@@ -34,15 +34,21 @@ from cuspid.motion.location import MotionOptions
 from cuspid.motion.stage import MotionMethod, locate, locate_by_surfaces, take_poses
 from cuspid.motion.surface_tracking import SurfaceTrackingOptions
 from cuspid.options import SHARE, Options
-from cuspid.pairing import detail_mm
+from cuspid.pairing import detail_mm, stereo_pairs
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
 from cuspid.rig import Handpiece
 from cuspid.simulation.stage import RenderOptions, SimulationOptions, simulate, take_images
+from cuspid.stereo.across import AcrossOptions
 from cuspid.stereo.matching import Signal, StereoOptions
 from cuspid.stereo.signal import signal_of
-from cuspid.stereo.stage import StoredDepthMaps, measure_depth, measure_enough_depth, measure_temporal_depth
-from cuspid.stereo.temporal import TemporalOptions
+from cuspid.stereo.stage import (
+    StoredDepthMaps,
+    measure_depth,
+    measure_depth_across,
+    measure_enough_depth,
+    measure_view_depth,
+)
 from cuspid.surface.cleaning import CleaningOptions
 from cuspid.surface.fusion import FusionOptions
 from cuspid.surface.sharp_edges import SharpEdgeOptions
@@ -63,8 +69,9 @@ __all__ = [
     "load_reference",
     "locate",
     "measure_depth",
+    "measure_depth_across",
     "measure_enough_depth",
-    "measure_temporal_depth",
+    "measure_view_depth",
     "reconstruct",
     "scannable",
     "simulate",
@@ -75,7 +82,7 @@ __all__ = [
 Quality = Literal["draft", "standard", "fine"]
 _DRAFT_KEYPOINTS, _DRAFT_HALVINGS = 500, 2
 _LEFT_SHARE, _DRAFT_LEFT_SHARE = 0.005, 1.0
-_DRAFT_TEMPORAL_LEFT_SHARE, _DRAFT_BEND_PX = 0.03, 1000.0
+_DRAFT_ACROSS_LEFT_SHARE, _DRAFT_BEND_PX = 0.03, 1000.0
 _FINE_SPACING_PX, _FINE_VOXELS = 2, 0.5
 
 
@@ -103,9 +110,9 @@ class ReconstructionOptions(Options):
     """What is matched: texture, or the light and shade of plain surfaces, where the frames are then located by their
     surfaces. auto: texture if the images hold any."""
     stereo: StereoOptions = field(default_factory=StereoOptions)
-    """Depth within a frame."""
-    temporal: TemporalOptions = field(default_factory=TemporalOptions)
-    """Depth from consecutive frames, where only one camera of a group saw the surface."""
+    """Depth of a view from those that it is matched with."""
+    across: AcrossOptions = field(default_factory=AcrossOptions)
+    """Depth from consecutive frames, where only one camera of a handpiece saw the surface."""
     tracking: MotionOptions = field(default_factory=MotionOptions)
     """Features, odometry and adjustment for the method ``rig``."""
     surfaces: SurfaceTrackingOptions = field(default_factory=SurfaceTrackingOptions)
@@ -167,15 +174,15 @@ def surface(
     give_back()
     options = settled(options)
     of_size = sized(replace(capture, handpiece=replace(capture.handpiece, rig=found.rig)), options)
-    lengths_mm = detail_mm(of_size.handpiece), capture.handpiece.working_distance_mm
+    detail = detail_mm(of_size.handpiece)
     if matched(capture, options) == "shading":
         depths = _shaded_depth(capture, folder, options, progress)
     else:
-        depths = _textured_depth(of_size, found, lengths_mm[0], folder, options, progress)
+        depths = _textured_depth(of_size, found, detail, folder, options, progress)
     give_back()
-    how = _of_quality(options, lengths_mm[0]), options.cleaning, options.sharp_edges
+    how = _of_quality(options, detail), options.cleaning, options.sharp_edges
     return fuse(
-        *(depths, depths.digest, _poses(found, depths), *lengths_mm, folder, *how),
+        *(depths, depths.digest, _poses(found, depths), detail, folder, *how),
         expected=found.expectation,
         progress=progress,
     )
@@ -208,6 +215,9 @@ def _textured_depth(
 ) -> StoredDepthMaps:
     """Depth within frames and, where only one camera of a group saw the surface, from consecutive ones."""
     assert options.left_share is not None
+    handpiece = capture.handpiece
+    if not stereo_pairs(handpiece.rig, handpiece.working_distance_mm, options.stereo.pairing):
+        return measure_view_depth(capture, found, folder / "depth", options.stereo, progress=progress)
     agreement_mm = options.fusion.agreement * detail
     depths = measure_enough_depth(
         *(capture, found, folder / "depth", options.stereo),
@@ -215,14 +225,14 @@ def _textured_depth(
         left_share=options.left_share,
         progress=progress,
     )
-    if not options.temporal.enabled:
+    if not options.across.enabled:
         return depths
     holes = None
-    if found.tracks is not None and options.temporal.small_holes is not False and options.temporal.left_share != 0:
+    if found.tracks is not None and options.across.small_holes is not False and options.across.left_share != 0:
         located = depths, depths.digest, _poses(found, depths)
         holes = find_holes(*located, detail, folder, _of_quality(options, detail), progress=progress)
-    return depths | measure_temporal_depth(
-        *(capture, found, depths, folder / "depth-temporal", options.temporal),
+    return depths | measure_depth_across(
+        *(capture, found, depths, folder / "depth-across", options.across, options.stereo),
         agreement_mm=agreement_mm,
         least_maps=options.fusion.least_maps,
         holes=holes,
@@ -257,23 +267,23 @@ def settled(options: ReconstructionOptions) -> ReconstructionOptions:
 
 def _drafted(options: ReconstructionOptions) -> ReconstructionOptions:
     """As for a draft, where nothing else was asked for."""
-    tracking, temporal, fusion = options.tracking, options.temporal, options.fusion
+    tracking, across, fusion = options.tracking, options.across, options.fusion
     features = tracking.features
     if features.count is None:
         features = replace(features, count=_DRAFT_KEYPOINTS)
     if features.halvings is None:
         features = replace(features, halvings=_DRAFT_HALVINGS)
-    if temporal.left_share is None:
-        temporal = replace(temporal, left_share=_DRAFT_TEMPORAL_LEFT_SHARE)
-    if temporal.small_holes is None:
-        temporal = replace(temporal, small_holes=False)
+    if across.left_share is None:
+        across = replace(across, left_share=_DRAFT_ACROSS_LEFT_SHARE)
+    if across.small_holes is None:
+        across = replace(across, small_holes=False)
     if fusion.finer_bends is None:
         fusion = replace(fusion, finer_bends=False)
     stereo = options.stereo
     if stereo.refinement.bend_px is None:
         stereo = replace(stereo, refinement=replace(stereo.refinement, bend_px=_DRAFT_BEND_PX))
     tracking = replace(tracking, features=features)
-    return replace(options, tracking=tracking, stereo=stereo, temporal=temporal, fusion=fusion)
+    return replace(options, tracking=tracking, stereo=stereo, across=across, fusion=fusion)
 
 
 def as_known(handpiece: Handpiece, options: ReconstructionOptions) -> Handpiece:

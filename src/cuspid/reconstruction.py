@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import reduce
+from itertools import pairwise
+from operator import add
 from types import MappingProxyType
 
 import numpy as np
@@ -20,6 +23,53 @@ _NEAREST = 4
 """Number of nearest points from which a vertex is judged."""
 _AT_ONCE = 50_000
 """Vertices that are judged together; the nearest points of millions would take gigabytes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Funnel:
+    """How many pixels of depth maps are left from step to step."""
+
+    pixels: int
+    """Those of the images that are not masked out, on the grid."""
+    begun: int
+    """Of these, with an initial depth from a pair of views."""
+    matched: int
+    """With a depth from all views."""
+    agreed: int
+    """With a depth that is certain enough, and that other views agree with."""
+    kept: int
+    """In connected pieces that are large enough."""
+
+    def __add__(self, other: Funnel) -> Funnel:
+        return Funnel(**{each.name: getattr(self, each.name) + getattr(other, each.name) for each in fields(Funnel)})
+
+    @property
+    def shares_pct(self) -> dict[str, float]:
+        """What is left at each step, % of the pixels."""
+        whole = max(self.pixels, 1)
+        return {name: round(100 * getattr(self, name) / whole, 2) for name in ("begun", "matched", "agreed", "kept")}
+
+    @property
+    def narrowest(self) -> str:
+        """The step that takes the largest share of what the one before left."""
+        steps = [each.name for each in fields(Funnel)]
+        left = [getattr(self, after) / max(getattr(self, before), 1) for before, after in pairwise(steps)]
+        return steps[1 + left.index(min(left))]
+
+    @property
+    def summary(self) -> str:
+        """One line for the user."""
+        begun, matched, agreed, kept = self.shares_pct.values()
+        return (
+            f"of the pixels, {begun:.3g} % have an initial depth, {matched:.3g} % a matched one, {agreed:.3g} % one that "
+            f"other views agree with, {kept:.3g} % one in a large enough piece"
+        )
+
+
+def sum_funnels(funnels: Iterable[Funnel | None]) -> Funnel | None:
+    """Of several depth maps; None if none of them has one."""
+    known = [funnel for funnel in funnels if funnel is not None]
+    return reduce(add, known) if known else None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -40,6 +90,8 @@ class DepthMap:
     """0 (unknown) to 1: a weight like an inverse variance, relative to the best pixels. float32."""
     color: UInt8[np.ndarray, "h w 3"] | None = None
     """RGB seen at each pixel."""
+    funnel: Funnel | None = None
+    """How many of its pixels were left from step to step."""
 
     @property
     def known(self) -> Bool[np.ndarray, "h w"]:

@@ -140,8 +140,18 @@ class Rig:
 
     def angle_deg(self, first: str, second: str) -> float:
         """Angle between the optical axes of two cameras."""
-        cosine = self[first].axis_in_rig @ self[second].axis_in_rig
-        return float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
+        return _between_deg(self[first].axis_in_rig, self[second].axis_in_rig)
+
+    def meeting_deg(self, first: str, second: str, distance_mm: float) -> float:
+        """Angle under which two cameras see the point at a distance on the axis of the first."""
+        one, other = self[first], self[second]
+        along = distance_mm * one.axis_in_rig
+        return _between_deg(along, one.centre_in_rig + along - other.centre_in_rig)
+
+
+def _between_deg(one: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) -> float:
+    cosine = one @ other / max(float(np.linalg.norm(one) * np.linalg.norm(other)), float(np.finfo(np.float64).tiny))
+    return float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -28,6 +28,8 @@ from cuspid.workers import map_in_threads
 
 DESCRIPTOR_NORM = 512.0
 """Euclidean length of a descriptor before rounding."""
+_BRIGHT_PERCENTILE, _DARK_DN = 99.5, 128.0
+"""An image is dark if its brightest pixels, from this percentile on, are below this grey level."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,11 +118,19 @@ def _colors_at(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "n 2
     return image[row, column]
 
 
+def brighten(gray: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    """A dark image stretched to the whole range: the contrast of a keypoint is a share of it. Others as they are."""
+    bright = float(np.percentile(gray[::2, ::2], _BRIGHT_PERCENTILE))
+    if not 0 < bright < _DARK_DN:
+        return gray
+    return np.asarray(cv2.convertScaleAbs(gray, alpha=255 / bright), dtype=np.uint8)
+
+
 def detect(image: UInt8[np.ndarray, "h w 3"], options: FeatureOptions | None = None) -> Features:
     """Keypoints of an RGB image, evenly distributed."""
     options = options or FeatureOptions()
     height, width = image.shape[:2]
-    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    gray = brighten(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8))
     searched = options.size_for(width, height)
     if searched != (width, height):
         gray = cv2.resize(gray, searched, interpolation=cv2.INTER_AREA)

@@ -43,6 +43,12 @@ _LOOSE_SCALE_PPM, _LOOSE_SPAN_PPM = 1000.0, 300.0
 """Standard deviations of the scale and, apart from it, of the length of a scan, above which advice is given."""
 
 
+_HELD = (
+    "calibration: held as in the file, since the images of the one frame share too few points to refine it: its cameras "
+    "stand far apart, or the surface shows little detail"
+)
+
+
 @dataclass(frozen=True, kw_only=True)
 class MotionOptions(Options):
     """How the trajectory of the handpiece is found from features."""
@@ -299,7 +305,12 @@ def locate_features(
         clouds=[clouds[f] for f in trajectory.rig_from_world],
         poses=list(trajectory.rig_from_world.values()),
     )
-    adjusted = _adjusted(start, scan, options, read if options.least_squares.enabled else None, log, progress)
+    try:
+        adjusted = _adjusted(start, scan, options, read if options.least_squares.enabled else None, log, progress)
+    except ReconstructionError:
+        if len(scan.frames) > 1:
+            raise
+        adjusted = replace(start, notes=(*start.notes, _HELD))  # the rig alone tells where the cameras of a frame are
     noted = with_advice(adjusted, options.odometry.minimum_matches)
     return replace(noted.with_cameras_as(given), log={**log, **adjusted.log})
 

@@ -42,6 +42,9 @@ class _EvenContrast:
     def size(self, frame: str, camera: str) -> tuple[int, int]:
         return self.source.size(frame, camera)
 
+    def mask(self, frame: str, camera: str) -> UInt8[np.ndarray, "h w"] | None:
+        return self.source.mask(frame, camera)
+
     def digest(self, frame: str, camera: str) -> str:
         return self.source.digest(frame, camera)
 

@@ -79,6 +79,8 @@ class Measured:
     """NaN where unknown."""
     sigma_mm: Float[np.ndarray, "h w"]
     """Standard deviation estimated by the refinement."""
+    begun: int = 0
+    """Number of pixels that had an initial depth."""
 
 
 def sample_inverse_depth(
@@ -104,16 +106,15 @@ def sample_inverse_depth(
 
 
 def agreement(
-    measured: Sequence[Measured], index: int, resolution: Resolution, options: ConfidenceOptions
+    one: Measured, others: Sequence[Measured], resolution: Resolution, options: ConfidenceOptions
 ) -> Int[np.ndarray, "h w"]:
-    """For each pixel of one camera: number of cameras whose depth agrees, minus those that see through the point."""
-    one = measured[index]
+    """For each pixel of one camera: number of others whose depth agrees, minus those that see through the point."""
     votes = np.zeros(one.depth_mm.shape, dtype=np.int64)
     known = np.isfinite(one.depth_mm)
     rays = one.camera.rays(one.camera.pixel_centres()[known])
     in_rig = one.cam_from_rig.inverse().apply(rays * one.depth_mm[known, None].astype(np.float64))
-    tolerance = _tolerance_mm(one, len(measured), resolution, options)[known]
-    for other in (*measured[:index], *measured[index + 1 :]):
+    tolerance = _tolerance_mm(one, 1 + len(others), resolution, options)[known]
+    for other in others:
         in_other = other.cam_from_rig.apply(in_rig)
         with np.errstate(invalid="ignore"):
             behind = 1 / sample_inverse_depth(other.depth_mm, other.camera.project(in_other)) - in_other[:, 2]
@@ -131,7 +132,7 @@ def _tolerance_mm(
 
 
 def at_near_borders(
-    pair: Sequence[Measured], index: int, radius: int, resolution: Resolution, options: ConfidenceOptions
+    one: Measured, other: Measured, radius: int, resolution: Resolution, options: ConfidenceOptions
 ) -> Bool[np.ndarray, "h w"]:
     """True for pixels of one of two cameras where there is another surface behind within ``radius`` pixels of the grid:
     a window there sees mostly the nearer one, whose depth extends past its border.
@@ -139,7 +140,6 @@ def at_near_borders(
     Another surface is what lies farther behind than the disparity gradient limit lets one surface fall, and what is
     not the slope of a steep surface, which rises on one side as it falls on the other.
     """
-    one, other = pair[index], pair[1 - index]
     sideways = (one.cam_from_rig @ other.cam_from_rig.inverse()).translation[:2]
     gradient_limit = GRADIENT_LIMIT / max(float(one.camera.focal_px.mean() * np.linalg.norm(sideways)), _TINY)
     least = options.border_jump * resolution.mm / resolution.working_distance_mm**2

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from cuspid.options import Options, Range
+from cuspid.pairing import worth_of_angle
 from cuspid.rig import Rig
 from cuspid.stereo.rectification import RectifiedPair
 
@@ -81,19 +82,22 @@ def _semi_global_one_way(
     return np.where(known, disparity, np.nan).astype(np.float32)
 
 
-def initial_pairs(rig: Rig, group: Sequence[str], pairs: Sequence[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
-    """For each camera of a group, the stereo pair with its widest-baseline partner; no pair twice."""
-    chosen: dict[frozenset[str], tuple[str, str]] = {}
-    for name in group:
-        partners = [pair for pair in pairs if name in pair]
-        if partners:
-            widest = max(partners, key=lambda pair: _baseline_mm(rig, pair))
-            chosen.setdefault(frozenset(widest), widest)
-    return tuple(chosen.values())
+def initial_pairs(
+    rig: Rig, sources: Mapping[str, Sequence[str]], distance_mm: float
+) -> Mapping[str, tuple[str, str]]:
+    """For each view that has sources, the pair with the source that suits an initial match best: with a wide baseline,
+    as long as both images look alike."""
+    return {
+        name: (name, max(others, key=lambda other: _suits(rig, name, other, distance_mm)))
+        for name, others in sources.items()
+        if others
+    }
 
 
-def _baseline_mm(rig: Rig, pair: tuple[str, str]) -> float:
-    return float(np.linalg.norm(rig[pair[0]].centre_in_rig - rig[pair[1]].centre_in_rig))
+def _suits(rig: Rig, name: str, other: str, distance_mm: float) -> float:
+    angle_deg = rig.meeting_deg(name, other, distance_mm)
+    alike = float(worth_of_angle(np.array(angle_deg))) * rig.overlap(name, other, distance_mm)
+    return float(np.sin(np.deg2rad(angle_deg))) * alike
 
 
 def initial_points(

@@ -17,8 +17,8 @@ from jaxtyping import Float, Float32, Int, UInt8
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.options import Options, Range
-from cuspid.pairing import PairingOptions, camera_groups, require_stereo, resolved_mm, stereo_pairs
-from cuspid.reconstruction import DepthMap
+from cuspid.pairing import PairingOptions, camera_groups, rank_sources, require_stereo, resolved_mm
+from cuspid.reconstruction import DepthMap, Funnel
 from cuspid.rig import Handpiece, Rig
 from cuspid.stereo.confidence import (
     ConfidenceOptions,
@@ -30,7 +30,7 @@ from cuspid.stereo.confidence import (
     sure_enough,
     without_speckle,
 )
-from cuspid.stereo.initial_depth import PairMatcher, initial_pairs, initial_points, semi_global
+from cuspid.stereo.initial_depth import initial_pairs, initial_points, semi_global
 from cuspid.stereo.rectification import IdealView, RectifiedPair, rectify
 from cuspid.stereo.refinement import SCORE, VARIANCE, GroupGeometry, Q, RefinementOptions, image_noise, refine
 from cuspid.stereo.shading import ShadedView, ShadingOptions, brightness, correction, shaded_depths
@@ -67,20 +67,60 @@ Signal = Literal["texture", "shading"]
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
-    """Cameras that see the same surface, with everything that is computed only once."""
+class ViewSet:
+    """Views that are matched with each other, with everything that is computed only once."""
 
     views: tuple[IdealView, ...]
-    """The cameras, without distortion."""
+    """Without distortion."""
+    sources: tuple[tuple[int, ...], ...]
+    """For each view the indices of those that it is matched with; none for one that is a source only."""
     pairs: tuple[RectifiedPair, ...]
     """Pairs that give the initial depths."""
-    geometry: tuple[GroupGeometry, ...]
-    """Geometry with each camera as the reference."""
+    layers: tuple[tuple[int, ...], ...]
+    """For each view the indices of the pairs whose depths it begins with."""
+    geometry: tuple[GroupGeometry | None, ...]
+    """Geometry with each view as the reference; None for one that is a source only."""
     grids: tuple[Camera, ...]
-    """The pinhole camera of the depth map of each camera."""
-    corrections: tuple[Float32[np.ndarray, "_ _ 1"], ...]
-    """What makes the brightness of each camera comparable (:func:`cuspid.stereo.shading.correction`); none where
-    texture is matched."""
+    """The pinhole camera of the depth map of each view."""
+    corrections: tuple[Float32[np.ndarray, "_ _ 1"], ...] = ()
+    """What makes the brightness of each view comparable (:func:`cuspid.stereo.shading.correction`); none where texture
+    is matched."""
+
+    @property
+    def references(self) -> tuple[int, ...]:
+        """Indices of the views that get a depth map."""
+        return tuple(index for index, sources in enumerate(self.sources) if sources)
+
+
+def prepare_views(
+    rig: Rig, sources: Mapping[str, Sequence[str]], distance_mm: float, options: StereoOptions
+) -> ViewSet:
+    """Views, given as cameras in a common frame, those of which ``sources`` names others being references.
+
+    ``distance_mm`` is how far from them the surface lies, about.
+    """
+    names = list(rig.names)
+    index = {name: k for k, name in enumerate(names)}
+    views = tuple(IdealView.of(name, rig[name]) for name in names)
+    others = tuple(tuple(sorted(index[each] for each in sources.get(name, ()))) for name in names)
+    chosen: dict[frozenset[str], tuple[str, str]] = {}
+    for pair in initial_pairs(rig, sources, distance_mm).values():
+        chosen.setdefault(frozenset(pair), pair)
+    pairs = [(index[one], index[other]) for one, other in chosen.values()]
+    return ViewSet(
+        views=views,
+        sources=others,
+        pairs=tuple(rectify(pair, rig[pair[0]], rig[pair[1]], options.initial_scale) for pair in chosen.values()),
+        layers=tuple(
+            tuple(k for k, pair in enumerate(pairs) if set(pair) <= {reference, *others[reference]})
+            for reference in range(len(names))
+        ),
+        geometry=tuple(
+            group_geometry(views, reference, others[reference]) if others[reference] else None
+            for reference in range(len(names))
+        ),
+        grids=tuple(coarser(view.camera, options.grid_px) for view in views),
+    )
 
 
 def coarser(camera: Camera, spacing_px: int) -> Camera:
@@ -95,19 +135,18 @@ def coarser(camera: Camera, spacing_px: int) -> Camera:
     )
 
 
-def group_geometry(views: Sequence[IdealView], reference: int) -> GroupGeometry:
-    """How pixels of a reference view, with their inverse depth, map into the other views."""
-    others = [index for index in range(len(views)) if index != reference]
+def group_geometry(views: Sequence[IdealView], reference: int, sources: Sequence[int]) -> GroupGeometry:
+    """How pixels of a reference view, with their inverse depth, map into its sources."""
     inverse_matrix = np.linalg.inv(views[reference].camera.opencv_matrix)
     rig_from_reference = views[reference].cam_from_rig.inverse()
     infinite, parallax = [], []
-    for index in others:
+    for index in sources:
         other_from_reference = views[index].cam_from_rig @ rig_from_reference
         matrix = views[index].camera.opencv_matrix
         infinite.append(matrix @ other_from_reference.rotation @ inverse_matrix)
         parallax.append(matrix @ other_from_reference.translation)
     scale = max(float(np.linalg.norm(shift)) for shift in parallax)
-    return GroupGeometry(np.array(infinite), np.array(parallax) / scale, scale, np.array(others))
+    return GroupGeometry(np.array(infinite), np.array(parallax) / scale, scale, np.array(sources))
 
 
 def initial_layer(points_in_rig: Float[np.ndarray, "n 3"], view: IdealView, grid: Camera) -> Float[np.ndarray, "h w"]:
@@ -147,49 +186,55 @@ class DepthEstimator:
         self,
         handpiece: Handpiece,
         options: StereoOptions | None = None,
-        matcher: PairMatcher = semi_global,
         *,
         signal: Signal = "texture",
         resolution_mm: float | None = None,
     ) -> None:
-        """Prepare the groups. Raises InputError where no two cameras see the same surface.
+        """Raises InputError where no two cameras see the same surface.
 
         ``resolution_mm`` is the unit of limits and confidences, by default what the handpiece resolves.
         """
         self.handpiece = handpiece
-        self.options = options or StereoOptions()
-        self.matcher, self.signal = matcher, signal
-        self.confidence = self.options.confidence if signal == "texture" else self.options.shading.confidence
+        self.options, self.signal = options or StereoOptions(), signal
+        self.checks = self.options.confidence if signal == "texture" else self.options.shading.confidence
         self.resolution = Resolution(resolution_mm or resolved_mm(handpiece), handpiece.working_distance_mm)
-        self._prepared: dict[tuple[str, ...], Group] = {}
+        self._prepared: dict[tuple[str, ...], tuple[ViewSet, ...]] = {}
         self._preparing = Lock()
         require_stereo(handpiece, self.options.pairing)
 
-    def _groups(self, cameras: tuple[str, ...]) -> list[Group]:
-        """The groups that some of the cameras make, whatever their order."""
+    def _view_sets(self, cameras: tuple[str, ...]) -> tuple[ViewSet, ...]:
+        """The cameras in sets that can be measured one after the other, whatever their order."""
         if not cameras:
-            return []
+            return ()
         rig = Rig({name: self.handpiece.rig[name] for name in cameras}).in_own_order()
-        groups = camera_groups(rig, self.handpiece.working_distance_mm, self.options.pairing)
-        return [self._group(rig, names) for names in groups if len(names) > 1]
-
-    def _group(self, rig: Rig, names: tuple[str, ...]) -> Group:
         with self._preparing:
-            if names not in self._prepared:
-                self._prepared[names] = self._prepare(rig, names)
-            return self._prepared[names]
+            if rig.names not in self._prepared:
+                self._prepared[rig.names] = self._prepare(rig)
+            return self._prepared[rig.names]
 
-    def _prepare(self, rig: Rig, names: tuple[str, ...]) -> Group:
-        views = tuple(IdealView.of(name, rig[name]) for name in names)
-        possible = stereo_pairs(rig, self.handpiece.working_distance_mm, self.options.pairing)
-        pairs = initial_pairs(rig, names, possible)
-        lit = names if self.signal == "shading" else ()
-        return Group(
-            views=views,
-            pairs=tuple(rectify(pair, rig[pair[0]], rig[pair[1]], self.options.initial_scale) for pair in pairs),
-            geometry=tuple(group_geometry(views, index) for index in range(len(views))),
-            grids=tuple(coarser(view.camera, self.options.grid_px) for view in views),
-            corrections=tuple(correction(rig[name].camera, self.handpiece.sensor_of(name)) for name in lit),
+    def _prepare(self, rig: Rig) -> tuple[ViewSet, ...]:
+        distance_mm = self.handpiece.working_distance_mm
+        sets = list[ViewSet]()
+        for names in camera_groups(rig, distance_mm, self.options.pairing):
+            if len(names) > 1:
+                part = Rig({name: rig[name] for name in names})
+                if self.signal == "texture":
+                    sources = rank_sources(part, distance_mm, self.options.pairing)
+                    sets.append(prepare_views(part, sources, distance_mm, self.options))
+                else:
+                    sets.append(self._prepare_shading(part, distance_mm))
+        return tuple(sets)
+
+    def _prepare_shading(self, part: Rig, distance_mm: float) -> ViewSet:
+        """Every view with all others."""
+        sources = {name: tuple(other for other in part.names if other != name) for name in part.names}
+        prepared = prepare_views(part, sources, distance_mm, self.options)
+        sensors = [self.handpiece.sensor_of(name) for name in part.names]
+        return replace(
+            prepared,
+            corrections=tuple(
+                correction(part[name].camera, sensor) for name, sensor in zip(part.names, sensors, strict=True)
+            ),
         )
 
     def measure(
@@ -198,13 +243,15 @@ class DepthEstimator:
         frame: str,
         lighting: str | None = None,
         *,
+        masks: Mapping[str, UInt8[np.ndarray, "h w"]] | None = None,
         alone: bool = False,
     ) -> tuple[DepthMap, ...]:
         """Depth maps of a frame, one for each camera with a stereo partner, from RGB or grey images by camera name,
         taken under a lighting pattern of the handpiece.
 
-        A camera of the handpiece that is not among them, or whose image is blank, saw nothing of the frame. ``alone``:
-        no other frame is measured meanwhile, so that the cameras of a group are measured side by side.
+        A camera of the handpiece that is not among them, or whose image is blank, saw nothing of the frame. ``masks``
+        are zero where an image shows what is not to be measured. ``alone``: no other frame is measured meanwhile, so
+        that the views are measured side by side.
 
         Raises InputError where shading is to be matched and it is not told which of several patterns was on.
         """
@@ -215,39 +262,23 @@ class DepthEstimator:
                 f"frame's lighting in capture.json ({known}), or import the footage with --lightings"
             )
         names = self.handpiece.rig.names
-        groups = self._groups(tuple(name for name in names if name in images and not _is_blank(images[name])))
         work = map_in_threads if alone else _one_by_one
-        found = [each for group in groups for each in self._measure_group(group, images, frame, lighting, work)]
+        found = list[DepthMap]()
+        for views in self._view_sets(tuple(name for name in names if name in images and not _is_blank(images[name]))):
+            if self.signal == "shading":
+                measured = self._by_shading(views, images, lighting)
+            else:
+                measured = measure_views(views, images, self.handpiece.depth_range_mm, self.options, work)
+            found += depth_maps_of(
+                views, measured, images, masks or {}, frame, self.resolution, self.checks, self.options.grid_px
+            )
         return tuple(sorted(found, key=lambda depth_map: names.index(depth_map.camera_name)))
 
-    def _measure_group(
-        self,
-        group: Group,
-        images: Mapping[str, UInt8[np.ndarray, "h w *c"]],
-        frame: str,
-        lighting: str | None,
-        work: _Map,
-    ) -> list[DepthMap]:
-        by_shading = self.signal == "shading"
-        measured = self._by_shading(group, images, lighting) if by_shading else self._by_texture(group, images, work)
-        return [
-            self._depth_map(measured, index, view, images[view.name], frame) for index, view in enumerate(group.views)
-        ]
-
-    def _by_texture(
-        self, group: Group, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], work: _Map
-    ) -> list[Measured]:
-        grays = {view.name: gray(images[view.name]) for view in group.views}
-        depth_range = self.handpiece.depth_range_mm
-        initial = work(lambda pair: initial_points(pair, grays, self.matcher, depth_range), group.pairs)
-        stack, sizes = stack_images([view.resample(grays[view.name]) for view in group.views])
-        return work(lambda index: self._measure_reference(group, index, initial, stack, sizes), range(len(group.views)))
-
     def _by_shading(
-        self, group: Group, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], lighting: str | None
-    ) -> list[Measured]:
-        stack = brightness(group.views, [_rgb(images[view.name]) for view in group.views], group.corrections)
-        views = [
+        self, views: ViewSet, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], lighting: str | None
+    ) -> Mapping[int, Measured]:
+        stack = brightness(views.views, [_rgb(images[view.name]) for view in views.views], views.corrections)
+        shaded = [
             ShadedView(
                 grid=grid,
                 size=(view.camera.height, view.camera.width),
@@ -255,64 +286,131 @@ class DepthEstimator:
                 lights=[light.in_frame(view.cam_from_rig) for light in self.handpiece.lights_on(lighting)],
                 gamma=self.handpiece.sensor_of(view.name).gamma,
             )
-            for view, grid, geometry in zip(group.views, group.grids, group.geometry, strict=True)
+            for view, grid, geometry in zip(views.views, views.grids, views.geometry, strict=True)
+            if geometry is not None
         ]
         options = self.options
-        depths = shaded_depths(stack, views, self.handpiece.depth_range_mm, options.grid_px, options.shading)
-        return [
-            Measured(grid, view.cam_from_rig, *found)
-            for view, grid, found in zip(group.views, group.grids, depths, strict=True)
-        ]
+        depths = shaded_depths(stack, shaded, self.handpiece.depth_range_mm, options.grid_px, options.shading)
+        return {
+            index: Measured(grid, view.cam_from_rig, *found)
+            for index, (view, grid, found) in enumerate(zip(views.views, views.grids, depths, strict=True))
+        }
 
-    def _measure_reference(
-        self,
-        group: Group,
-        index: int,
-        initial: Sequence[Float[np.ndarray, "_ 3"]],
-        stack: Float[np.ndarray, "c h w"],
-        sizes: Int[np.ndarray, "c 2"],
-    ) -> Measured:
-        view, grid, geometry = group.views[index], group.grids[index], group.geometry[index]
-        layers = np.stack([initial_layer(points, view, grid) for points in initial])
-        planes = refine(
-            stack,
-            sizes,
-            index,
-            geometry,
-            layers,
-            self.handpiece.depth_range_mm,
-            self.options.grid_px,
-            image_noise(stack[index, : sizes[index, 0], : sizes[index, 1]]),
-            self.options.refinement,
-        )
-        found = planes[..., SCORE] > 0
-        depth = geometry.scale / np.where(found, planes[..., Q], np.nan)
-        sigma = np.sqrt(planes[..., VARIANCE]) * depth**2 / geometry.scale
-        return Measured(grid, view.cam_from_rig, depth, sigma)
 
-    def _depth_map(
-        self,
-        measured: Sequence[Measured],
-        index: int,
-        view: IdealView,
-        image: UInt8[np.ndarray, "h w *c"],
-        frame: str,
-    ) -> DepthMap:
-        one, resolution, options = measured[index], self.resolution, self.confidence
-        keep = (agreement(measured, index, resolution, options) > 0) & sure_enough(one, resolution, options)
-        if len(measured) == 2:
-            radius = -(-options.border_px // self.options.grid_px)
-            keep &= ~at_near_borders(measured, index, radius, resolution, options)
-        keep = without_speckle(np.where(keep, one.depth_mm, np.nan), resolution, options)
-        return DepthMap(
-            frame=frame,
-            camera_name=view.name,
-            camera=one.camera,
-            cam_from_rig=one.cam_from_rig,
-            depth_mm=np.where(keep, one.depth_mm, np.nan).astype(np.float32),
-            confidence=confidence(one.sigma_mm, keep, resolution, options),
-            color=_color_grid(view.resample(image), self.options.grid_px),
+def measure_views(
+    views: ViewSet,
+    images: Mapping[str, UInt8[np.ndarray, "h w *c"]],
+    depth_range_mm: tuple[float, float],
+    options: StereoOptions,
+    work: _Map = _one_by_one,
+) -> Mapping[int, Measured]:
+    """Depth of each reference of a set of views by texture, before the checks, by its index."""
+    grays = {view.name: gray(images[view.name]) for view in views.views}
+    initial = work(lambda pair: initial_points(pair, grays, semi_global, depth_range_mm), views.pairs)
+    stack, sizes = stack_images([view.resample(grays[view.name]) for view in views.views])
+
+    def measure(index: int) -> Measured:
+        return _measure_reference(views, index, initial, stack, sizes, depth_range_mm, options)
+
+    return dict(zip(views.references, work(measure, views.references), strict=True))
+
+
+def _measure_reference(
+    views: ViewSet,
+    index: int,
+    initial: Sequence[Float[np.ndarray, "_ 3"]],
+    stack: Float[np.ndarray, "c h w"],
+    sizes: Int[np.ndarray, "c 2"],
+    depth_range_mm: tuple[float, float],
+    options: StereoOptions,
+) -> Measured:
+    view, grid, geometry = views.views[index], views.grids[index], views.geometry[index]
+    assert geometry is not None
+    layers = np.stack([initial_layer(initial[pair], view, grid) for pair in views.layers[index]])
+    planes = refine(
+        stack,
+        sizes,
+        index,
+        geometry,
+        layers,
+        depth_range_mm,
+        options.grid_px,
+        image_noise(stack[index, : sizes[index, 0], : sizes[index, 1]]),
+        options.refinement,
+    )
+    found = planes[..., SCORE] > 0
+    depth = geometry.scale / np.where(found, planes[..., Q], np.nan)
+    sigma = np.sqrt(np.maximum(planes[..., VARIANCE], 0)) * depth**2 / geometry.scale
+    return Measured(grid, view.cam_from_rig, depth, sigma, int(np.isfinite(layers).any(axis=0).sum()))
+
+
+def depth_maps_of(
+    views: ViewSet,
+    measured: Mapping[int, Measured],
+    images: Mapping[str, UInt8[np.ndarray, "h w *c"]],
+    masks: Mapping[str, UInt8[np.ndarray, "h w"]],
+    frame: str,
+    resolution: Resolution,
+    checks: ConfidenceOptions,
+    grid_px: int,
+) -> list[DepthMap]:
+    """The depth maps of the references of a set, all of which were measured."""
+    return [
+        checked_depth_map(
+            measured[index],
+            [measured[source] for source in views.sources[index] if source in measured],
+            images[view.name],
+            masks.get(view.name),
+            view,
+            frame,
+            resolution,
+            checks,
+            grid_px,
         )
+        for index, view in ((index, views.views[index]) for index in views.references)
+    ]
+
+
+def checked_depth_map(
+    one: Measured,
+    others: Sequence[Measured],
+    image: UInt8[np.ndarray, "h w *c"],
+    mask: UInt8[np.ndarray, "h w"] | None,
+    view: IdealView,
+    frame: str,
+    resolution: Resolution,
+    checks: ConfidenceOptions,
+    grid_px: int,
+) -> DepthMap:
+    """The depths of a view that those of its sources agree with.
+
+    ``image`` is the view's, as it was taken; its ``mask`` is zero where it shows what is not to be measured.
+    """
+    counts = np.ones(one.depth_mm.shape, dtype=bool)
+    if mask is not None:
+        counts = _grid_of(view.resample_mask(mask), grid_px) > 0
+    agreed = counts & (agreement(one, others, resolution, checks) > 0) & sure_enough(one, resolution, checks)
+    if len(others) == 1:
+        agreed &= ~at_near_borders(one, others[0], -(-checks.border_px // grid_px), resolution, checks)
+    keep = without_speckle(np.where(agreed, one.depth_mm, np.nan), resolution, checks)
+    matched = int((counts & np.isfinite(one.depth_mm)).sum())
+    funnel = Funnel(
+        pixels=int(counts.sum()),
+        begun=max(one.begun, matched),
+        matched=matched,
+        agreed=int(agreed.sum()),
+        kept=int(keep.sum()),
+    )
+    return DepthMap(
+        frame=frame,
+        camera_name=view.name,
+        camera=one.camera,
+        cam_from_rig=one.cam_from_rig,
+        depth_mm=np.where(keep, one.depth_mm, np.nan).astype(np.float32),
+        confidence=confidence(one.sigma_mm, keep, resolution, checks),
+        color=_rgb(_grid_of(view.resample(image), grid_px)),
+        funnel=funnel,
+    )
 
 
 def gray(image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w"]:
@@ -334,8 +432,7 @@ def _is_blank(image: UInt8[np.ndarray, "h w *c"]) -> bool:
     return bool(cv2.meanStdDev(image)[1].max() < _BLANK_DN)
 
 
-def _color_grid(image: UInt8[np.ndarray, "h w *c"], spacing_px: int) -> UInt8[np.ndarray, "r s 3"]:
-    """RGB at the pixels of the grid."""
+def _grid_of(image: UInt8[np.ndarray, "h w *c"], spacing_px: int) -> UInt8[np.ndarray, "r s *c"]:
+    """The pixels of the grid."""
     start = spacing_px // 2
-    picked = image[start::spacing_px, start::spacing_px]
-    return np.ascontiguousarray(_rgb(picked))
+    return np.ascontiguousarray(image[start::spacing_px, start::spacing_px])

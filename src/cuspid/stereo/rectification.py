@@ -56,6 +56,12 @@ class IdealView:
             return image
         return np.asarray(cv2.remap(image, *self.maps, cv2.INTER_CUBIC), dtype=np.uint8)
 
+    def resample_mask(self, mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+        """As :meth:`resample`, for the nearest pixel: what is masked out stays so, and so is what nothing was seen of."""
+        if self.maps is None:
+            return mask
+        return np.asarray(cv2.remap(mask, *self.maps, cv2.INTER_NEAREST), dtype=np.uint8)
+
     def resample_values(self, values: Float32[np.ndarray, "h w 3"], beyond: float) -> Float32[np.ndarray, "h w 3"]:
         """As :meth:`resample`, for values of pixels, linearly; ``beyond`` where the real camera saw nothing."""
         if self.maps is None:

@@ -32,12 +32,15 @@ Q, Q_U, Q_V, SCORE, VARIANCE, SUPPORT = range(6)
 """Channels of a refined field: the plane, mean ZNCC of the cameras used, variance of q, number of cameras."""
 
 _ROUNDING_DN = 12**-0.5
+_FLAT_DN = 0.05
+"""Noise of a window in which next to nothing changes: no sensor made it."""
 
 _BEND_PX = 0.75
 _SIDES = ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
 """Rows and columns towards which half windows lie."""
 
-_DARK_DN = 16
+_DARK_DN, _DARK_SHARE = 16, 0.1
+"""Pixels below this level, or below this share of an image's brightest ones if that is less, are dark."""
 _RATIOS = 1.001, 3.999
 """Mean squared differences 4 px apart, over those 2 px apart: fine noise has 1, a slope 4."""
 _DETAILS, _SIGMAS_PX, _REACH = 0.65, (2.0, 3.0), 1.5
@@ -145,11 +148,12 @@ class _Buffers(NamedTuple):
 
 
 def image_noise(image: Float[np.ndarray, "h w"]) -> float:
-    """Standard deviation of the noise of an image (Immerkaer 1996), from its smoothest tenth; at least that of rounding
-    to integers."""
+    """Standard deviation of the noise of an image (Immerkaer 1996), from the smoothest tenth of what is not flat, as a
+    background that was masked out is; at least that of rounding to integers."""
     mask = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]).astype(np.float32) / 6
-    power = cv2.boxFilter(cv2.filter2D(image, -1, mask) ** 2, -1, (15, 15))
-    return max(float(np.sqrt(np.quantile(power[::5, ::5], 0.1))), _ROUNDING_DN)
+    power = cv2.boxFilter(cv2.filter2D(image, -1, mask) ** 2, -1, (15, 15))[::5, ::5]
+    noisy = power[power > _FLAT_DN**2]
+    return max(float(np.sqrt(np.quantile(noisy, 0.1))), _ROUNDING_DN) if noisy.size else _ROUNDING_DN
 
 
 def detail_px(image: Float[np.ndarray, "h w"], noise_dn: float) -> float:
@@ -167,9 +171,10 @@ def detail_px(image: Float[np.ndarray, "h w"], noise_dn: float) -> float:
 def _mean_squared_difference(image: Float[np.ndarray, "h w"], distance: int) -> float:
     """Of pixels so far apart in their row or column, neither of them dark; 0 if there are none."""
     total, count = 0.0, 0
+    dark = min(_DARK_DN, _DARK_SHARE * float(np.quantile(image[::5, ::5], 0.99)))
     for each in (image, image.T):
         here, there = each[distance:], each[:-distance]
-        lit = (here > _DARK_DN) & (there > _DARK_DN)
+        lit = (here > dark) & (there > dark)
         total += float(((here - there)[lit] ** 2).sum(dtype=np.float64))
         count += int(lit.sum())
     return total / max(count, 1)

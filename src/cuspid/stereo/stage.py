@@ -5,30 +5,54 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
 
+from cuspid.camera import Camera
 from cuspid.capture import Capture, Frame
 from cuspid.geometry import Rigid3
 from cuspid.pairing import camera_groups
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import DepthMap, Reconstruction, SurfacePoints
 from cuspid.stereo.holes import Sightings, Views, covering
-from cuspid.stereo.matching import DepthEstimator, Signal, StereoOptions
-from cuspid.stereo.temporal import TemporalOptions, measure_temporal, moving_pair
+from cuspid.stereo.across import (
+    AcrossOptions,
+    LocatedView,
+    locate_views,
+    measure_moving_cameras,
+    moving_pair,
+    view_resolution,
+)
+from cuspid.stereo.confidence import Measured
+from cuspid.stereo.matching import (
+    DepthEstimator,
+    Signal,
+    StereoOptions,
+    checked_depth_map,
+    coarser,
+    gray,
+    measure_views,
+    prepare_views,
+)
+from cuspid.stereo.rectification import IdealView
 from cuspid.storage.captures import hash_frame
-from cuspid.storage.files import digest_of
+from cuspid.storage.files import digest_of, read_arrays, write_arrays
 from cuspid.storage.handpieces import hash_handpiece
+from cuspid.rig import Rig
 from cuspid.storage.reconstructions import read_depth_maps, write_depth_maps
 from cuspid.storage.stages import Stage
 from cuspid.tolerances import held
 from cuspid.workers import map_ahead, map_in_threads
 
 _CODE = ("stereo",)
+_KEPT_IMAGES = 32
+"""Images that are kept in memory for the next views."""
 _LEFT_SHARE = 0.005
-"""Share of the sparse points that temporal stereo need not reach."""
+"""Share of the sparse points that matching across frames need not reach."""
 _LEAST_PLACES = 5
 """Number of places on a surface that make it worth matching a camera with itself."""
 _TIMES = 2
@@ -81,7 +105,13 @@ def measure_depth(
     estimator = estimator or DepthEstimator(capture.handpiece, options, signal=signal)
 
     def measure(frame: Frame) -> tuple[DepthMap, ...]:
-        return estimator.measure(capture.images(frame), frame.name, frame.lighting, alone=len(capture.frames) == 1)
+        return estimator.measure(
+            capture.images(frame),
+            frame.name,
+            frame.lighting,
+            masks=capture.masks(frame),
+            alone=len(capture.frames) == 1,
+        )
 
     def inputs(frame: Frame) -> dict[str, str]:
         return {"frame": hash_frame(capture, frame)}
@@ -154,12 +184,13 @@ def _between(
     )
 
 
-def measure_temporal_depth(
+def measure_depth_across(
     capture: Capture,
     found: Reconstruction,
     depths: Iterable[DepthMap],
     folder: Path,
-    options: TemporalOptions,
+    options: AcrossOptions,
+    stereo: StereoOptions,
     *,
     agreement_mm: float,
     least_maps: int,
@@ -167,10 +198,10 @@ def measure_temporal_depth(
     progress: Progress = silent,
 ) -> StoredDepthMaps:
     """Depth maps of cameras matched with themselves at the next located frame of the same lighting pattern, kept in
-    ``folder``, for those cameras that fill holes (:attr:`TemporalOptions.left_share`). Holes are where fewer than
+    ``folder``, for those cameras that fill holes (:attr:`AcrossOptions.left_share`). Holes are where fewer than
     ``least_maps`` of ``depths`` confirm the sparse points within ``agreement_mm``, and the further places given as
     ``holes``."""
-    steps = _steps(capture, found.rig_from_world, options)
+    steps = _steps(capture, found.rig_from_world, stereo)
     left_share = _LEFT_SHARE if options.left_share is None else options.left_share
     if found.tracks is not None and left_share > 0:
         sightings = Sightings.of(found, found.tracks)
@@ -185,15 +216,121 @@ def measure_temporal_depth(
     def measure(frame: Frame) -> tuple[DepthMap, ...]:
         step = steps[frame.name]
         now, after = capture.images(step.now), capture.images(step.after)
-        return measure_temporal(capture.handpiece, now, after, step.motion, frame.name, options)
+        masks = capture.masks(step.now) | {f"{name}+": mask for name, mask in capture.masks(step.after).items()}
+        return measure_moving_cameras(
+            capture.handpiece, now, after, masks, step.motion, frame.name, options, stereo
+        )
 
     def inputs(frame: Frame) -> dict[str, str]:
         step = steps[frame.name]
         now, after = hash_frame(capture, step.now), hash_frame(capture, step.after)
         return {"frame": now, "after": after, "motion": digest_of(step.motion)}
 
-    stage = Stage("temporal depth", folder, options, _CODE)
+    stage = Stage("depth across frames", folder, [options, stereo], _CODE)
     return _measure_all(capture, [step.now for step in steps.values()], measure, inputs, stage, progress)
+
+
+def measure_view_depth(
+    capture: Capture,
+    found: Reconstruction,
+    folder: Path,
+    options: StereoOptions,
+    *,
+    progress: Progress = silent,
+) -> StoredDepthMaps:
+    """Depth maps of every image of the located frames, each from those images of any frame that suit it, kept in
+    ``folder``. This needs no rig: one camera is enough."""
+    views = locate_views(capture.handpiece, capture.frames, found, options.pairing)
+    read = lru_cache(maxsize=_KEPT_IMAGES)(lambda k: gray(capture.image(views[k].frame, views[k].camera)))
+
+    def inputs(k: int) -> dict[str, str]:
+        of = [views[j] for j in (k, *views[k].sources)]
+        images = [capture.source.digest(view.frame.name, view.camera) for view in of]
+        return {"images": digest_of(images), "views": digest_of([(each.mounted, each.depth_range_mm) for each in of])}
+
+    def measure(k: int) -> Measured:
+        view, of = views[k], (k, *views[k].sources)
+        rig = Rig({_number(j): views[j].mounted for j in of})
+        prepared = prepare_views(rig, {_number(k): [_number(j) for j in view.sources]}, view.distance_mm, options)
+        return measure_views(prepared, {_number(j): read(j) for j in of}, view.depth_range_mm, options)[0]
+
+    stage = Stage("matching", folder / "matched", options, _CODE)
+
+    def keep(k: int) -> _Matched:
+        file = stage.folder / f"{views[k].frame.name}.{views[k].camera}.npz"
+        return _Matched(file, stage.make(inputs(k), [file], lambda: _write_measured(file, measure(k))))
+
+    used = [k for k, view in enumerate(views) if view.sources]
+    matched = dict(zip(used, map_in_threads(keep, used, stage=stage.name, progress=progress), strict=True))
+    return _check_views(capture, views, matched, folder, options, progress)
+
+
+class _Matched(NamedTuple):
+    """Depth of a view before the checks, on disk."""
+
+    file: Path
+    key: str
+
+
+def _check_views(
+    capture: Capture,
+    views: Sequence[LocatedView],
+    matched: Mapping[int, _Matched],
+    folder: Path,
+    options: StereoOptions,
+    progress: Progress,
+) -> StoredDepthMaps:
+    """The depth maps of views, frame by frame, from what was matched."""
+    ideal = {name: IdealView.of(name, mounted) for name, mounted in capture.handpiece.rig.cameras.items()}
+    grids = {name: coarser(view.camera, options.grid_px) for name, view in ideal.items()}
+    by_frame = dict[str, list[int]]()
+    for k in matched:
+        by_frame.setdefault(views[k].frame.name, []).append(k)
+
+    def measured(k: int) -> Measured:
+        return _read_measured(matched[k].file, grids[views[k].camera], views[k].mounted.cam_from_rig)
+
+    def check(k: int) -> DepthMap:
+        view = views[k]
+        checked = checked_depth_map(
+            measured(k),
+            [measured(j) for j in view.sources if j in matched],
+            capture.image(view.frame, view.camera),
+            capture.masks(view.frame).get(view.camera),
+            ideal[view.camera],
+            view.frame.name,
+            view_resolution(views, k),
+            options.confidence,
+            options.grid_px,
+        )
+        return replace(checked, cam_from_rig=ideal[view.camera].cam_from_rig)
+
+    stage = Stage("depth", folder, options, _CODE)
+
+    def keep(name: str) -> tuple[Path, str]:
+        file, of = folder / f"{name}.npz", by_frame[name]
+        keys = [matched[j].key for k in of for j in (k, *views[k].sources) if j in matched]
+        masks = [capture.source.mask_digest(name, views[k].camera) for k in of]
+        inputs = {"matched": digest_of(keys), "masks": digest_of(masks)}
+        return file, stage.make(inputs, [file], lambda: write_depth_maps(file, [check(k) for k in of]))
+
+    return StoredDepthMaps(dict(map_in_threads(keep, by_frame, stage=stage.name, progress=progress)))
+
+
+def _write_measured(file: Path, measured: Measured) -> None:
+    arrays = {name: getattr(measured, name).astype(np.float32) for name in ("depth_mm", "sigma_mm")}
+    write_arrays(file, arrays | {"begun": np.array(measured.begun)})
+
+
+def _read_measured(file: Path, grid: Camera, cam_from_world: Rigid3) -> Measured:
+    arrays = read_arrays(file, remedy="give the command again: it is made anew")
+    depth_mm, sigma_mm = (arrays[name].astype(np.float64) for name in ("depth_mm", "sigma_mm"))
+    return Measured(grid, cam_from_world, depth_mm, sigma_mm, int(arrays["begun"]))
+
+
+def _number(k: int) -> str:
+    """A name for a view."""
+    return f"{k:06}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +347,7 @@ class _Step:
         return replace(self, now=now, after=after)
 
 
-def _steps(capture: Capture, rig_from_world: Mapping[str, Rigid3], options: TemporalOptions) -> dict[str, _Step]:
+def _steps(capture: Capture, rig_from_world: Mapping[str, Rigid3], stereo: StereoOptions) -> dict[str, _Step]:
     """From each located frame, by its name, to the next of its lighting pattern, with the cameras that moved enough."""
     following = _following([frame for frame in capture.frames if frame.name in rig_from_world])
     cameras, steps = capture.handpiece.rig.in_own_order().names, dict[str, _Step]()
@@ -219,7 +356,7 @@ def _steps(capture: Capture, rig_from_world: Mapping[str, Rigid3], options: Temp
             after = following[now.name]
             motion = rig_from_world[after.name] @ rig_from_world[now.name].inverse()
             both = [camera for camera in cameras if camera in now.cameras and camera in after.cameras]
-            moved = [c for c in both if moving_pair(capture.handpiece, c, motion, options) is not None]
+            moved = [c for c in both if moving_pair(capture.handpiece, c, motion, stereo.pairing) is not None]
             if moved:
                 steps[now.name] = _Step(now, after, motion).of(moved)
     return steps

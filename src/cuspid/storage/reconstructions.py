@@ -11,7 +11,7 @@ import numpy as np
 
 from cuspid.capture import Dropped
 from cuspid.geometry import Rigid3
-from cuspid.reconstruction import DepthMap, Expectation, Reconstruction, Refinement, SurfacePoints, Tracks
+from cuspid.reconstruction import DepthMap, Funnel, Expectation, Reconstruction, Refinement, SurfacePoints, Tracks
 from cuspid.rig import Handpiece
 from cuspid.storage.files import as_declared, read_arrays, read_json, reading, to_plain, write_arrays, write_json
 from cuspid.storage.handpieces import (
@@ -130,6 +130,7 @@ def write_depth_maps(path: Path, depth_maps: Sequence[DepthMap]) -> None:
             "camera_name": depth.camera_name,
             "camera": camera_to_json(depth.camera),
             "cam_from_rig": depth.cam_from_rig.matrix,
+            "funnel": depth.funnel,
         }
         for depth in depth_maps
     ]
@@ -152,6 +153,7 @@ def read_depth_maps(path: Path) -> tuple[DepthMap, ...]:
                 depth_mm=arrays[f"{index}.depth_mm"],
                 confidence=arrays[f"{index}.confidence"].astype(np.float32),
                 color=arrays[f"{index}.color"] if f"{index}.color" in arrays else None,
+                funnel=None if entry.get("funnel") is None else as_declared(Funnel, **entry["funnel"]),
             )
             for index, entry in enumerate(header)
         )

@@ -43,7 +43,7 @@ from cuspid.simulation.appearance import Preset
 from cuspid.simulation.path.overlap import image_overlap
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path, steady_poses
 from cuspid.stereo.matching import StereoOptions
-from cuspid.stereo.temporal import TemporalOptions
+from cuspid.stereo.across import AcrossOptions
 from cuspid.studies.camera_pair import Direction, baseline_axis, camera_pair, facing
 from cuspid.studies.grid import Case, Outcome, Value, run_grid
 from cuspid.studies.trial import Trial, TrialOptions, run_trial
@@ -103,7 +103,7 @@ class SweepOptions(Options):
     pairing: PairingOptions = field(default_factory=lambda: PairingOptions(minimum_overlap=0.0))
     """When the two cameras are matched at all. By default whatever their overlap at the distance is, because a wide,
     parallel pair overlaps more behind it."""
-    temporal: bool = False
+    across: bool = False
     """Also measure depth from consecutive frames, which reveals less of what the pair itself can do."""
     contenders: Annotated[int, Range(1, 1000)] = 2
     """How many of the best settings by completeness, and as many by accuracy, are repeated, besides that of the
@@ -295,7 +295,7 @@ def _reconstruction(options: SweepOptions) -> ReconstructionOptions:
     stereo = StereoOptions(pairing=options.pairing)
     return ReconstructionOptions(
         stereo=stereo,
-        temporal=TemporalOptions(enabled=options.temporal, stereo=stereo),
+        across=AcrossOptions(enabled=options.across),
         tracking=MotionOptions(pairing=options.pairing),
     )
 

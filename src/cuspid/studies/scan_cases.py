@@ -36,7 +36,7 @@ ONE_PASS = ("--passes", "turns")
 """Whole arches are measured in one pass, as the thesis scans them."""
 _LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 _PR_SET_PDEATHSIG = 1
-_STAGES = ("depth", "depth-temporal", "motion")
+_STAGES = ("depth", "depth-across", "motion")
 
 
 def timed(*command: str, log: IO[bytes] | None = None) -> tuple[int, dict[str, float]]:

@@ -5,6 +5,7 @@ Faces are *connected* across edges that exactly two of them share.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple, no_type_check
 
@@ -19,14 +20,17 @@ from cuspid.options import Options, Range
 
 @dataclass(frozen=True, kw_only=True)
 class CleaningOptions(Options):
-    """Cleaning of a fused mesh. Lengths are given in working distances of the handpiece."""
+    """Cleaning of a fused mesh. Lengths are given in details: what the images resolve of the surface (12 um for the
+    built-in handpieces), about a pixel."""
 
-    least_piece_width: Annotated[float, Range(0, 1000)] = 0.283
-    """Connected pieces with less area than a square of this side, in working distances (2 mm2 at 5 mm), are removed."""
+    least_piece_width: Annotated[float, Range(0, 100_000)] = 118.0
+    """Connected pieces with less area than a square of this side, in details (2 mm2 at 12 um), are removed."""
     least_piece_share: Annotated[float, Range(0, 1)] = 0.005
     """Connected pieces with less than this share of the total area are removed."""
-    ghost_depth: Annotated[float, Range(0, 1000)] = 0.1
-    """A face that looks at the back of another one within this many working distances (0.5 mm at 5 mm) is removed."""
+    spared_piece_share: Annotated[float, Range(0, 1)] = 0.05
+    """Connected pieces with at least this share of the area of the largest one are kept, however small."""
+    ghost_depth: Annotated[float, Range(0, 100_000)] = 41.6
+    """A face that looks at the back of another one within this many details (0.5 mm at 12 um) is removed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,24 +63,24 @@ class CleaningReport:
     """Length of the outer boundaries, one for each piece."""
     sharpened_vertices: int = 0
     """Vertices that were moved afterwards onto sharp edges (:mod:`cuspid.surface.sharp_edges`)."""
+    funnel: Mapping[str, float] | None = None
+    """What was left of the pixels from step to step, % (:class:`cuspid.reconstruction.Funnel`); None where that is not
+    known."""
 
 
-def clean(
-    mesh: Mesh, working_distance_mm: float, options: CleaningOptions | None = None
-) -> tuple[Mesh, CleaningReport]:
+def clean(mesh: Mesh, detail_mm: float, options: CleaningOptions | None = None) -> tuple[Mesh, CleaningReport]:
     """A manifold mesh without floating pieces and ghosts, and a report. An empty mesh stays empty.
 
-    ``working_distance_mm`` is that of the handpiece; it is the unit of lengths.
+    ``detail_mm`` is the detail that the images show (:func:`cuspid.pairing.detail_mm`), the unit of lengths.
     """
     options = options or CleaningOptions()
-    ghosts = ghost_faces(mesh, options.ghost_depth * working_distance_mm)
+    ghosts = ghost_faces(mesh, options.ghost_depth * detail_mm)
     cleaned = mesh.submesh(~ghosts)
     crowded = non_manifold_faces(cleaned)
     cleaned = cleaned.submesh(~crowded)
     sides = _Sides.of(cleaned)
     cleaned, split = _with_split_fans(cleaned, sides)  # which leaves the sides as they are
-    least_mm2 = (options.least_piece_width * working_distance_mm) ** 2
-    floating, pieces = _floating(cleaned.face_areas, sides.face_pieces, least_mm2, options.least_piece_share)
+    floating, pieces = _floating(cleaned.face_areas, sides.face_pieces, detail_mm, options)
     cleaned = cleaned.submesh(~floating)
     outer, holes = boundaries(cleaned)
     report = CleaningReport(
@@ -174,12 +178,13 @@ def non_manifold_faces(mesh: Mesh) -> Bool[np.ndarray, "f"]:
 
 
 def _floating(
-    areas: Float[np.ndarray, "f"], pieces: Int[np.ndarray, "f"], least_mm2: float, least_share: float
+    areas: Float[np.ndarray, "f"], pieces: Int[np.ndarray, "f"], detail_mm: float, options: CleaningOptions
 ) -> tuple[Bool[np.ndarray, "f"], int]:
-    """Faces of pieces that are smaller than a given area or than a share of the total, and the number of such
+    """Faces of pieces that are small in details or beside the total, and beside the largest one; and the number of such
     pieces."""
     area = np.bincount(pieces, areas)
-    small = area < max(least_mm2, least_share * area.sum())
+    least_mm2 = max((options.least_piece_width * detail_mm) ** 2, options.least_piece_share * area.sum())
+    small = (area < least_mm2) & (area < options.spared_piece_share * area.max(initial=0.0))
     return small[pieces], int(small.sum())
 
 

@@ -14,7 +14,7 @@ from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.progress import Progress, silent
-from cuspid.reconstruction import DepthMap, Expectation, SurfacePoints
+from cuspid.reconstruction import DepthMap, Expectation, Funnel, SurfacePoints, sum_funnels
 from cuspid.storage.files import digest_of, write_json
 from cuspid.storage.meshes import SIGMA, read_mesh_file, write_mesh
 from cuspid.storage.reconstructions import read_surface_points, write_surface_points
@@ -56,7 +56,6 @@ def fuse(
     made_from: str,
     rig_from_world: Mapping[str, Rigid3],
     detail_mm: float,
-    working_distance_mm: float,
     folder: Path,
     fusion: FusionOptions,
     cleaning: CleaningOptions,
@@ -70,22 +69,20 @@ def fuse(
     normal (um): that of its depth and, if they are ``expected``, of the poses and the calibration.
 
     ``made_from`` is the digest of the depth maps, which may be iterated more than once; ``detail_mm`` is the detail
-    that the handpiece shows, ``working_distance_mm`` how far it is held from the teeth. Raises ReconstructionError
-    where they contain nothing.
+    that the handpiece shows. Raises ReconstructionError where no surface is left, and tells what took it.
     """
-    stage = Stage("mesh", folder, [fusion, cleaning, sharp_edges, detail_mm, working_distance_mm], _CODE)
+    stage = Stage("mesh", folder, [fusion, cleaning, sharp_edges, detail_mm], _CODE)
     files = [folder / name for name in ("mesh.json", "mesh.stl", "mesh.ply")]
 
     def write() -> None:
         raw = fuse_depth_maps(depths, rig_from_world, detail_mm, fusion, progress=progress)
-        if not len(raw.mesh.faces):
-            raise ReconstructionError(
-                "no surface: the depth maps are empty; the images need texture (spray, powder) or sharper focus"
-            )
-        cleaned, report = clean(raw.mesh, working_distance_mm, cleaning)
+        funnel = sum_funnels(depth_map.funnel for depth_map in depths)
+        cleaned, report = clean(raw.mesh, detail_mm, cleaning)
+        if not len(cleaned.faces):
+            raise ReconstructionError(f"no surface: {_what_took_it(funnel, len(raw.mesh.faces))}")
         sigma_um = _sigma_um(cleaned, raw, expected)
         mesh, moved = sharpened(cleaned, detail_mm, sharp_edges)
-        write_json(files[0], replace(report, sharpened_vertices=moved))
+        write_json(files[0], replace(report, sharpened_vertices=moved, funnel=None if funnel is None else funnel.shares_pct))
         write_mesh(files[1], mesh)
         write_mesh(files[2], mesh, values={SIGMA: sigma_um})
 
@@ -93,6 +90,23 @@ def fuse(
     stage.make(inputs, files, write)
     made = read_mesh_file(files[2])
     return made.mesh, made.vertex_values[SIGMA]
+
+
+def _what_took_it(funnel: Funnel | None, faces: int) -> str:
+    """Why nothing is left, and what to change."""
+    if funnel is None or not funnel.kept:
+        told = "the depth maps are empty" if funnel is None else f"the depth maps are empty ({funnel.summary})"
+        advice = {
+            "begun": "the images overlap too little, are out of focus, or their depth lies outside the depth range of "
+            "the calibration",
+            "matched": "the images need texture (spray, powder), sharper focus or more light, or the calibration is off",
+            "agreed": "views contradict each other: check the calibration and the poses",
+            "kept": "what agrees is scattered: the images need more texture or sharper focus",
+        }
+        return f"{told}; {advice[funnel.narrowest] if funnel else 'the images need texture or sharper focus'}"
+    if not faces:
+        return f"no {FusionOptions.least_maps} depth maps confirm the same surface ({funnel.summary}); check the poses"
+    return f"cleaning removed all of {faces:,} faces; lower --cleaning.least-piece-width ({funnel.summary})"
 
 
 def _sigma_um(mesh: Mesh, raw: Fused, expected: Expectation | None) -> Float[np.ndarray, "v"]:
