@@ -30,6 +30,7 @@ from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Arch, Jaw
 from cuspid.memory import give_back
 from cuspid.mesh import Mesh
+from cuspid.motion.epipolar_check import epipolar_offset_px
 from cuspid.motion.location import MotionOptions
 from cuspid.motion.stage import MotionMethod, locate, locate_by_surfaces, take_poses
 from cuspid.motion.surface_tracking import SurfaceTrackingOptions
@@ -53,7 +54,7 @@ from cuspid.surface.cleaning import CleaningOptions
 from cuspid.surface.fusion import FusionOptions
 from cuspid.surface.sharp_edges import SharpEdgeOptions
 from cuspid.surface.stage import find_holes, fuse
-from cuspid.tolerances import NominalOptions, held
+from cuspid.tolerances import NominalOptions, held, is_nominal
 from cuspid.trueness import GroundTruth
 from cuspid.visibility import VisibilityOptions, scannable_faces
 
@@ -84,6 +85,8 @@ _DRAFT_KEYPOINTS, _DRAFT_HALVINGS = 500, 2
 _LEFT_SHARE, _DRAFT_LEFT_SHARE = 0.005, 1.0
 _DRAFT_ACROSS_LEFT_SHARE, _DRAFT_BEND_PX = 0.03, 1000.0
 _FINE_SPACING_PX, _FINE_VOXELS = 2, 0.5
+_FITS_PX = 1.0
+"""Matches may lie this far from their epipolar lines for a calibration to be taken as it is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,15 +153,32 @@ def find_poses(
 ) -> Reconstruction:
     """The poses of the frames, and the calibration adjusted to the images (first part of :func:`reconstruct`)."""
     options = settled(options)
-    handpiece = as_known(capture.handpiece, options)
-    capture = replace(capture, handpiece=handpiece)
+    nominal = options.calibration == "refined" and is_nominal(capture.handpiece)
+    capture = replace(capture, handpiece=as_known(capture.handpiece, options))
     if colmap_model is not None:
         return take_poses(capture, colmap_model, folder / "motion")
     if matched(capture, options) == "shading":
         depths = _shaded_depth(capture, folder, options, progress)
         made_from, how = depths.digest, options.surfaces
         return locate_by_surfaces(capture, depths, made_from, folder / "motion", how, progress=progress)
-    return locate(capture, folder / "motion", options.tracking, options.motion, progress=progress)
+    capture, notes = _hold_what_fits(capture, nominal, folder / "motion", options, progress)
+    found = locate(capture, folder / "motion", options.tracking, options.motion, progress=progress)
+    return replace(found, notes=(*notes, *found.notes))
+
+
+def _hold_what_fits(
+    capture: Capture, nominal: bool, folder: Path, options: ReconstructionOptions, progress: Progress
+) -> tuple[Capture, tuple[str, ...]]:
+    """One instant with the calibration held, and a note, where that states no uncertainty and the images do not
+    contradict it."""
+    if not nominal or len(capture.frames) > 1 or options.motion != "rig":
+        return capture, ()
+    offset_px = epipolar_offset_px(capture, options.tracking, cache=folder / "cache", progress=progress)
+    if offset_px is not None and offset_px > _FITS_PX:
+        return capture, ()
+    told = "too little is matched to refine it" if offset_px is None else f"its epipolar lines fit within {offset_px:.1f} px"
+    note = f"calibration: held as in the file, which states no uncertainty: {told}"
+    return replace(capture, handpiece=held(capture.handpiece)), (note,)
 
 
 def surface(

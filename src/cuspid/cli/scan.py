@@ -146,7 +146,7 @@ def reconstruct_capture(capture: Capture, out: Path, options: ReconstructionOpti
             )
             for note in glare_notes(capture.handpiece):
                 console.print(f"note: {note}")
-        elif options.calibration == "refined" and is_nominal(capture.handpiece):
+        elif options.calibration == "refined" and is_nominal(capture.handpiece) and len(capture.frames) > 1:
             _print_nominal(capture.handpiece, options.nominal)
         with show_progress() as progress:
             found = pipeline.find_poses(capture, out, options, colmap_model=model, progress=progress)

@@ -22,6 +22,8 @@ from cuspid.options import Options, Range
 GRADIENT_LIMIT = 2 / 3
 """Largest change of disparity of one surface, px per px of one of the images: a disparity gradient of 1 (P. Burt,
 B. Julesz, Science 208, 1980), which is measured between the two images."""
+_SMOOTH_CONFIDENCE = 0.03
+"""Of half a pixel of disparity beside a twelfth of one."""
 _TINY = float(np.finfo(np.float32).tiny)
 
 
@@ -37,6 +39,8 @@ class ConfidenceOptions(Options):
     or more look; or some standard deviations if that is more."""
     agreement_sigmas: Annotated[float, Range(0, 100)] = 3.0
     """How many standard deviations."""
+    smooth_sigmas: Annotated[float, Range(0, 100)] = 2.0
+    """Depths of smooth surfaces agree within so many standard deviations, that is, within a pixel of disparity."""
     largest_sigma: Annotated[float, Range(0.001, 1000)] = 5 / 6
     """A depth with a larger standard deviation, in resolutions (0.01 mm at 12 um), is dropped."""
     best_sigma: Annotated[float, Range(0.0001, 100)] = 1 / 6
@@ -81,6 +85,10 @@ class Measured:
     """Standard deviation estimated by the refinement."""
     begun: int = 0
     """Number of pixels that had an initial depth."""
+    planes: Float[np.ndarray, "h w 6"] | None = None
+    """The planes that the depths are of (:mod:`cuspid.stereo.refinement`), if they were measured by texture."""
+    smooth: Bool[np.ndarray, "h w"] | None = None
+    """Where a depth is that of a smooth surface instead (:mod:`cuspid.stereo.regularised`)."""
 
 
 def sample_inverse_depth(
@@ -116,10 +124,24 @@ def agreement(
     tolerance = _tolerance_mm(one, 1 + len(others), resolution, options)[known]
     for other in others:
         in_other = other.cam_from_rig.apply(in_rig)
+        pixels = other.camera.project(in_other)
         with np.errstate(invalid="ignore"):
-            behind = 1 / sample_inverse_depth(other.depth_mm, other.camera.project(in_other)) - in_other[:, 2]
-        votes[known] += (np.abs(behind) <= tolerance).astype(int) - (behind > 3 * tolerance).astype(int)
+            behind = 1 / sample_inverse_depth(other.depth_mm, pixels) - in_other[:, 2]
+        within = np.maximum(tolerance, _smooth_tolerance_mm(other, pixels, options))
+        votes[known] += (np.abs(behind) <= within).astype(int) - (behind > 3 * within).astype(int)
     return votes
+
+
+def _smooth_tolerance_mm(
+    other: Measured, pixels: Float[np.ndarray, "n 2"], options: ConfidenceOptions
+) -> Float[np.ndarray, "n"]:
+    """How far off the depths of a smooth surface may be at some places of its view; 0 where there is another depth."""
+    if other.smooth is None:
+        return np.zeros(len(pixels))
+    inside = other.camera.contains(pixels, 1e-6)
+    column, row = np.where(inside[:, None], pixels, 0).astype(np.int64).T
+    smooth = inside & other.smooth[row, column]
+    return np.where(smooth, options.smooth_sigmas * np.nan_to_num(other.sigma_mm[row, column]), 0.0)
 
 
 def _tolerance_mm(
@@ -127,8 +149,10 @@ def _tolerance_mm(
 ) -> Float[np.ndarray, "h w"]:
     """How far from each other the depths of two of so many cameras may be."""
     if cameras == 2:
-        return options.pair_agreement * resolution.at(one.depth_mm)
-    return np.maximum(options.agreement * resolution.at(one.depth_mm), options.agreement_sigmas * one.sigma_mm)
+        usual = options.pair_agreement * resolution.at(one.depth_mm)
+    else:
+        usual = np.maximum(options.agreement * resolution.at(one.depth_mm), options.agreement_sigmas * one.sigma_mm)
+    return usual if one.smooth is None else np.where(one.smooth, options.smooth_sigmas * one.sigma_mm, usual)
 
 
 def at_near_borders(
@@ -168,8 +192,9 @@ def _moved(values: Float[np.ndarray, "h w"], down: int, right: int) -> Float[np.
 
 
 def sure_enough(one: Measured, resolution: Resolution, options: ConfidenceOptions) -> Bool[np.ndarray, "h w"]:
-    """True where the standard deviation of the depth is small enough."""
-    return np.asarray(one.sigma_mm <= options.largest_sigma * resolution.at(one.depth_mm))
+    """True where the standard deviation of the depth is small enough; that of a smooth surface is known to be large."""
+    sure = np.asarray(one.sigma_mm <= options.largest_sigma * resolution.at(one.depth_mm))
+    return sure if one.smooth is None else sure | one.smooth
 
 
 def without_speckle(
@@ -186,12 +211,12 @@ def without_speckle(
 
 
 def confidence(
-    sigma_mm: Float[np.ndarray, "h w"],
-    keep: Bool[np.ndarray, "h w"],
-    resolution: Resolution,
-    options: ConfidenceOptions,
+    one: Measured, keep: Bool[np.ndarray, "h w"], resolution: Resolution, options: ConfidenceOptions
 ) -> Float[np.ndarray, "h w"]:
-    """Inverse variance relative to the best pixels, at most 1; 0 where a depth is not kept."""
+    """Inverse variance relative to the best pixels, at most 1; 0 where a depth is not kept. Smooth surfaces have so
+    little that they fill what nothing else does."""
     best_mm = options.best_sigma * resolution.mm
-    weight = (best_mm / np.maximum(sigma_mm, best_mm)) ** 2
+    weight = (best_mm / np.maximum(one.sigma_mm, best_mm)) ** 2
+    if one.smooth is not None:
+        weight = np.where(one.smooth, _SMOOTH_CONFIDENCE, weight)
     return np.where(keep, weight, 0).astype(np.float32)

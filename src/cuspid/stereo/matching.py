@@ -33,10 +33,18 @@ from cuspid.stereo.confidence import (
 from cuspid.stereo.initial_depth import initial_pairs, initial_points, semi_global
 from cuspid.stereo.rectification import IdealView, RectifiedPair, rectify
 from cuspid.stereo.refinement import SCORE, VARIANCE, GroupGeometry, Q, RefinementOptions, image_noise, refine
+from cuspid.stereo.regularised import sweep
 from cuspid.stereo.shading import ShadedView, ShadingOptions, brightness, correction, shaded_depths
 from cuspid.workers import map_in_threads
 
 _SPACING_PX = 3
+_OUTLYING_SIGMAS = 4.0
+"""Planes that lie so far from a smooth surface, in its standard deviations, are outliers."""
+MOST_AGREED, WEAKLY_AGREED = 0.8, 0.6
+"""Shares of the pixels with an initial depth that views should agree on: with less than the first they are matched in
+wider windows, with less than the second, after that, the rest is made smooth."""
+WIDENINGS = (2, 3)
+"""How many times wider these are, one after the other."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -268,7 +276,9 @@ class DepthEstimator:
             if self.signal == "shading":
                 measured = self._by_shading(views, images, lighting)
             else:
-                measured = measure_views(views, images, self.handpiece.depth_range_mm, self.options, work)
+                measured = measure_views(
+                    views, images, self.handpiece.depth_range_mm, self.resolution, self.options, work
+                )
             found += depth_maps_of(
                 views, measured, images, masks or {}, frame, self.resolution, self.checks, self.options.grid_px
             )
@@ -297,51 +307,132 @@ class DepthEstimator:
         }
 
 
+class Match:
+    """The images of a set of views, ready to be matched by texture."""
+
+    def __init__(
+        self,
+        views: ViewSet,
+        images: Mapping[str, UInt8[np.ndarray, "h w *c"]],
+        depth_range_mm: tuple[float, float],
+        options: StereoOptions,
+        work: _Map = _one_by_one,
+    ) -> None:
+        """RGB or grey images by the names of the views."""
+        grays = {view.name: gray(images[view.name]) for view in views.views}
+        self._views, self._range_mm, self._options = views, depth_range_mm, options
+        self._initial = work(lambda pair: initial_points(pair, grays, semi_global, depth_range_mm), views.pairs)
+        self._stack, self._sizes = stack_images([view.resample(grays[view.name]) for view in views.views])
+
+    def measure(
+        self, index: int, known: Float[np.ndarray, "h w 6"] | None = None, *, widening: int = 1
+    ) -> Measured:
+        """Depth of a reference view before the checks; further to planes that are ``known``, as :func:`refine`."""
+        view, grid, geometry = (each[index] for each in (self._views.views, self._views.grids, self._views.geometry))
+        assert geometry is not None
+        height, width = self._sizes[index]
+        layers = np.stack([initial_layer(self._initial[pair], view, grid) for pair in self._views.layers[index]])
+        planes = refine(
+            self._stack,
+            self._sizes,
+            index,
+            geometry,
+            layers,
+            self._range_mm,
+            self._options.grid_px,
+            image_noise(self._stack[index, :height, :width]),
+            self._options.refinement,
+            known=known,
+            widening=widening,
+        )
+        found = planes[..., SCORE] > 0
+        depth = geometry.scale / np.where(found, planes[..., Q], np.nan)
+        sigma = np.sqrt(np.maximum(planes[..., VARIANCE], 0)) * depth**2 / geometry.scale
+        begun = int(np.isfinite(layers).any(axis=0).sum())
+        return Measured(grid, view.cam_from_rig, depth, sigma, begun, planes.astype(np.float32))
+
+
+    def regularise(self, index: int, one: Measured, agreed: Float[np.ndarray, "h w 6"]) -> Measured:
+        """What was measured of a view where other views agree with it (planes) and a smooth surface through the same
+        images does, too (:mod:`cuspid.stereo.regularised`); elsewhere that surface: where texture is weak, much agrees
+        by chance."""
+        geometry = self._views.geometry[index]
+        assert geometry is not None
+        near, far = self._range_mm
+        height, width = self._sizes[index]
+        q, sigma_q = sweep(
+            self._stack,
+            self._sizes,
+            index,
+            geometry,
+            (geometry.scale / far, geometry.scale / near),
+            self._options.grid_px,
+            image_noise(self._stack[index, :height, :width]),
+        )
+        with np.errstate(invalid="ignore"):
+            smooth = (agreed[..., SCORE] == 0) | (np.abs(agreed[..., Q] - q) > _OUTLYING_SIGMAS * sigma_q)
+        depth = np.where(smooth, geometry.scale / q, one.depth_mm)
+        sigma = np.where(smooth, sigma_q * depth**2 / geometry.scale, one.sigma_mm)
+        return replace(one, depth_mm=depth, sigma_mm=sigma, smooth=smooth & np.isfinite(depth))
+
+
 def measure_views(
     views: ViewSet,
     images: Mapping[str, UInt8[np.ndarray, "h w *c"]],
     depth_range_mm: tuple[float, float],
+    resolution: Resolution,
     options: StereoOptions,
     work: _Map = _one_by_one,
+    *,
+    widenings: Sequence[int] = WIDENINGS,
 ) -> Mapping[int, Measured]:
-    """Depth of each reference of a set of views by texture, before the checks, by its index."""
-    grays = {view.name: gray(images[view.name]) for view in views.views}
-    initial = work(lambda pair: initial_points(pair, grays, semi_global, depth_range_mm), views.pairs)
-    stack, sizes = stack_images([view.resample(grays[view.name]) for view in views.views])
+    """Depth of each reference of a set of views by texture, before the last checks, by its index.
 
-    def measure(index: int) -> Measured:
-        return _measure_reference(views, index, initial, stack, sizes, depth_range_mm, options)
+    Where other views contradict much of what was matched, as with weak texture, the rest of the view is matched again
+    in wider windows, from the planes that others agree with.
+    """
+    match = Match(views, images, depth_range_mm, options, work)
+    measured = dict(zip(views.references, work(match.measure, views.references), strict=True))
+    for widening in widenings:
+        before = dict(measured)
 
-    return dict(zip(views.references, work(measure, views.references), strict=True))
+        def again(index: int, widening: int = widening, before: Mapping[int, Measured] = before) -> Measured:
+            agreed = agreed_planes(before[index], sources_of(views, index, before), resolution, options.confidence)
+            return before[index] if agreed is None else match.measure(index, agreed, widening=widening)
+
+        measured = dict(zip(views.references, work(again, views.references), strict=True))
+    if not widenings:
+        return measured
+    matched = measured
+
+    def regularise(index: int) -> Measured:
+        agreed = agreed_planes(
+            matched[index], sources_of(views, index, matched), resolution, options.confidence, WEAKLY_AGREED
+        )
+        return matched[index] if agreed is None else match.regularise(index, matched[index], agreed)
+
+    return dict(zip(views.references, work(regularise, views.references), strict=True))
 
 
-def _measure_reference(
-    views: ViewSet,
-    index: int,
-    initial: Sequence[Float[np.ndarray, "_ 3"]],
-    stack: Float[np.ndarray, "c h w"],
-    sizes: Int[np.ndarray, "c 2"],
-    depth_range_mm: tuple[float, float],
-    options: StereoOptions,
-) -> Measured:
-    view, grid, geometry = views.views[index], views.grids[index], views.geometry[index]
-    assert geometry is not None
-    layers = np.stack([initial_layer(initial[pair], view, grid) for pair in views.layers[index]])
-    planes = refine(
-        stack,
-        sizes,
-        index,
-        geometry,
-        layers,
-        depth_range_mm,
-        options.grid_px,
-        image_noise(stack[index, : sizes[index, 0], : sizes[index, 1]]),
-        options.refinement,
-    )
-    found = planes[..., SCORE] > 0
-    depth = geometry.scale / np.where(found, planes[..., Q], np.nan)
-    sigma = np.sqrt(np.maximum(planes[..., VARIANCE], 0)) * depth**2 / geometry.scale
-    return Measured(grid, view.cam_from_rig, depth, sigma, int(np.isfinite(layers).any(axis=0).sum()))
+def sources_of(views: ViewSet, index: int, measured: Mapping[int, Measured]) -> list[Measured]:
+    """What was measured of the sources of a view."""
+    return [measured[source] for source in views.sources[index] if source in measured]
+
+
+def agreed_planes(
+    one: Measured,
+    others: Sequence[Measured],
+    resolution: Resolution,
+    checks: ConfidenceOptions,
+    enough: float = MOST_AGREED,
+) -> Float[np.ndarray, "h w 6"] | None:
+    """The planes of a view that others agree with; None where these are ``enough`` (a share) of what it began with, so
+    that it is not worth looking for more."""
+    assert one.planes is not None
+    agreed = (agreement(one, others, resolution, checks) > 0) & sure_enough(one, resolution, checks)
+    if agreed.sum() >= enough * one.begun:
+        return None
+    return np.asarray(one.planes * agreed[..., None], dtype=np.float64)
 
 
 def depth_maps_of(
@@ -358,7 +449,7 @@ def depth_maps_of(
     return [
         checked_depth_map(
             measured[index],
-            [measured[source] for source in views.sources[index] if source in measured],
+            sources_of(views, index, measured),
             images[view.name],
             masks.get(view.name),
             view,
@@ -407,7 +498,7 @@ def checked_depth_map(
         camera=one.camera,
         cam_from_rig=one.cam_from_rig,
         depth_mm=np.where(keep, one.depth_mm, np.nan).astype(np.float32),
-        confidence=confidence(one.sigma_mm, keep, resolution, checks),
+        confidence=confidence(one, keep, resolution, checks),
         color=_rgb(_grid_of(view.resample(image), grid_px)),
         funnel=funnel,
     )

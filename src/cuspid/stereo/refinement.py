@@ -180,12 +180,16 @@ def _mean_squared_difference(image: Float[np.ndarray, "h w"], distance: int) -> 
     return total / max(count, 1)
 
 
-def window_size(options: RefinementOptions, image: Float[np.ndarray, "h w"], noise_dn: float) -> tuple[int, float]:
-    """Half the side of the window that suits an image, and the standard deviation of its weight, px."""
+def window_size(
+    options: RefinementOptions, image: Float[np.ndarray, "h w"], noise_dn: float, widening: int = 1
+) -> tuple[int, float]:
+    """Half the side of the window that suits an image, and the standard deviation of its weight, px; so many times
+    wider."""
     sigma_px = options.window_sigma_px
     if sigma_px is None:
         sigma_px = float(np.clip(_DETAILS * detail_px(image, noise_dn), *_SIGMAS_PX))
-    return options.radius_px or max(int(_REACH * sigma_px), 1), sigma_px
+    sigma_px *= widening
+    return (options.radius_px or 0) * widening or max(int(_REACH * sigma_px), 1), sigma_px
 
 
 def patch_window(radius_px: int, sigma_px: float) -> Float[np.ndarray, "3 k"]:
@@ -508,10 +512,9 @@ def _visit(view, limits, buffers, initial, field, row, column, direction):
 
 @kernel(**FAST)
 @no_type_check
-def _refine_field(view, limits, buffers, initial, propagations):
-    """Visit the pixels that have no plane yet, in raster order and against it, ``propagations`` times."""
-    rows, columns = initial.shape[1:]
-    field = np.zeros((rows, columns, 6))
+def _refine_field(view, limits, buffers, initial, field, propagations):
+    """Visit the pixels of the field that have no plane yet, in raster order and against it, ``propagations`` times."""
+    rows, columns = field.shape[:2]
     for number in range(2 * propagations):
         direction = 1 - 2 * (number % 2)
         for i in range(rows):
@@ -588,15 +591,20 @@ def refine(
     spacing_px: int,
     noise_dn: float,
     options: RefinementOptions,
+    *,
+    known: Float[np.ndarray, "rows columns 6"] | None = None,
+    widening: int = 1,
 ) -> Float[np.ndarray, "rows columns 6"]:
-    """Refined planes on a grid of every ``spacing_px``-th pixel; SCORE is 0 where nothing was found.
+    """Refined planes on a grid of every ``spacing_px``-th pixel; SCORE is 0 where nothing was found. Those that are
+    ``known`` stay; the others are sought from them and the initial depths, in windows that are ``widening`` times as
+    wide as usual.
 
     ``images`` are grey values 0 to 255 in float32, padded to one size; ``sizes`` are their true heights and widths.
     ``initial_mm`` are layers of initial depths on the grid, NaN where there is none; ``noise_dn`` is the noise of the
     reference image.
     """
     height, width = sizes[reference]
-    radius, sigma_px = window_size(options, images[reference, :height, :width], noise_dn)
+    radius, sigma_px = window_size(options, images[reference, :height, :width], noise_dn, widening)
     window = patch_window(radius, sigma_px)
     near, far = depth_range_mm
     view = _View(
@@ -626,7 +634,8 @@ def refine(
     )
     buffers = _new_buffers(window.shape[1], len(geometry.others), len(initial_mm))
     initial = np.nan_to_num(geometry.scale / initial_mm).astype(np.float64)
-    field = _refine_field(view, limits, buffers, initial, options.propagations)
+    field = np.zeros((*initial.shape[1:], 6)) if known is None else known.copy()
+    field = _refine_field(view, limits, buffers, initial, field, options.propagations)
     halves = [half_window(window, side) for side in _SIDES]
     views = tuple(view._replace(window=half) for half in halves)
     reach = -(-radius // spacing_px)

@@ -29,13 +29,15 @@ from cuspid.stereo.across import (
 )
 from cuspid.stereo.confidence import Measured
 from cuspid.stereo.matching import (
+    WIDENINGS,
     DepthEstimator,
+    Match,
     Signal,
     StereoOptions,
+    agreed_planes,
     checked_depth_map,
     coarser,
     gray,
-    measure_views,
     prepare_views,
 )
 from cuspid.stereo.rectification import IdealView
@@ -242,27 +244,49 @@ def measure_view_depth(
     ``folder``. This needs no rig: one camera is enough."""
     views = locate_views(capture.handpiece, capture.frames, found, options.pairing)
     read = lru_cache(maxsize=_KEPT_IMAGES)(lambda k: gray(capture.image(views[k].frame, views[k].camera)))
+    grids = _grids(capture.handpiece.rig, options)
 
-    def inputs(k: int) -> dict[str, str]:
-        of = [views[j] for j in (k, *views[k].sources)]
-        images = [capture.source.digest(view.frame.name, view.camera) for view in of]
-        return {"images": digest_of(images), "views": digest_of([(each.mounted, each.depth_range_mm) for each in of])}
-
-    def measure(k: int) -> Measured:
+    def match(k: int) -> Match:
         view, of = views[k], (k, *views[k].sources)
         rig = Rig({_number(j): views[j].mounted for j in of})
         prepared = prepare_views(rig, {_number(k): [_number(j) for j in view.sources]}, view.distance_mm, options)
-        return measure_views(prepared, {_number(j): read(j) for j in of}, view.depth_range_mm, options)[0]
+        return Match(prepared, {_number(j): read(j) for j in of}, view.depth_range_mm, options)
 
-    stage = Stage("matching", folder / "matched", options, _CODE)
+    def read_back(k: int) -> Measured:
+        return _read_measured(matched[k].file, grids[views[k].camera], views[k].mounted.cam_from_rig)
 
-    def keep(k: int) -> _Matched:
+    def first(k: int) -> _Matched:
+        of = [views[j] for j in (k, *views[k].sources)]
+        images = [capture.source.digest(view.frame.name, view.camera) for view in of]
+        inputs = {"images": digest_of(images), "views": digest_of([(each.mounted, each.depth_range_mm) for each in of])}
         file = stage.folder / f"{views[k].frame.name}.{views[k].camera}.npz"
-        return _Matched(file, stage.make(inputs(k), [file], lambda: _write_measured(file, measure(k))))
+        return _Matched(file, stage.make(inputs, [file], lambda: _write_measured(file, match(k).measure(0))))
+
+    def again(k: int) -> _Matched:
+        others = [j for j in views[k].sources if j in matched]
+        one = read_back(k)
+        agreed = agreed_planes(one, list(map(read_back, others)), view_resolution(views, k), options.confidence)
+        if agreed is None:
+            return matched[k]
+        file = stage.folder / matched[k].file.name
+        inputs = {"matched": digest_of([matched[j].key for j in (k, *others)])}
+        write = lambda: _write_measured(file, match(k).measure(0, agreed, widening=widening))  # noqa: E731
+        return _Matched(file, stage.make(inputs, [file], write))
 
     used = [k for k, view in enumerate(views) if view.sources]
-    matched = dict(zip(used, map_in_threads(keep, used, stage=stage.name, progress=progress), strict=True))
+    stage = Stage("matching", folder / "matched", options, _CODE)
+    matched = dict(zip(used, map_in_threads(first, used, stage=stage.name, progress=progress), strict=True))
+    for widening in WIDENINGS:
+        stage = Stage(f"wider windows ({widening})", folder / f"matched-{widening}", options, _CODE)
+        matched = dict(zip(used, map_in_threads(again, used, stage=stage.name, progress=progress), strict=True))
     return _check_views(capture, views, matched, folder, options, progress)
+
+
+def _grids(rig: Rig, options: StereoOptions) -> dict[str, Camera]:
+    """The camera of the depth maps of each camera."""
+    return {
+        name: coarser(IdealView.of(name, mounted).camera, options.grid_px) for name, mounted in rig.cameras.items()
+    }
 
 
 class _Matched(NamedTuple):
@@ -282,7 +306,7 @@ def _check_views(
 ) -> StoredDepthMaps:
     """The depth maps of views, frame by frame, from what was matched."""
     ideal = {name: IdealView.of(name, mounted) for name, mounted in capture.handpiece.rig.cameras.items()}
-    grids = {name: coarser(view.camera, options.grid_px) for name, view in ideal.items()}
+    grids = _grids(capture.handpiece.rig, options)
     by_frame = dict[str, list[int]]()
     for k in matched:
         by_frame.setdefault(views[k].frame.name, []).append(k)
@@ -318,14 +342,14 @@ def _check_views(
 
 
 def _write_measured(file: Path, measured: Measured) -> None:
-    arrays = {name: getattr(measured, name).astype(np.float32) for name in ("depth_mm", "sigma_mm")}
+    arrays = {name: getattr(measured, name).astype(np.float32) for name in ("depth_mm", "sigma_mm", "planes")}
     write_arrays(file, arrays | {"begun": np.array(measured.begun)})
 
 
 def _read_measured(file: Path, grid: Camera, cam_from_world: Rigid3) -> Measured:
     arrays = read_arrays(file, remedy="give the command again: it is made anew")
     depth_mm, sigma_mm = (arrays[name].astype(np.float64) for name in ("depth_mm", "sigma_mm"))
-    return Measured(grid, cam_from_world, depth_mm, sigma_mm, int(arrays["begun"]))
+    return Measured(grid, cam_from_world, depth_mm, sigma_mm, int(arrays["begun"]), arrays["planes"])
 
 
 def _number(k: int) -> str:

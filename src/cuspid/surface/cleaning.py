@@ -23,8 +23,8 @@ class CleaningOptions(Options):
     """Cleaning of a fused mesh. Lengths are given in details: what the images resolve of the surface (12 um for the
     built-in handpieces), about a pixel."""
 
-    least_piece_width: Annotated[float, Range(0, 100_000)] = 118.0
-    """Connected pieces with less area than a square of this side, in details (2 mm2 at 12 um), are removed."""
+    least_piece_width: Annotated[float, Range(0, 100_000)] = 40.0
+    """Connected pieces with less area than a square of this side, in details (0.2 mm2 at 12 um), are removed."""
     least_piece_share: Annotated[float, Range(0, 1)] = 0.005
     """Connected pieces with less than this share of the total area are removed."""
     spared_piece_share: Annotated[float, Range(0, 1)] = 0.05
