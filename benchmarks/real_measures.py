@@ -14,14 +14,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
-from cuspid.evaluation.distance import SignedDistance
 from cuspid.geometry import Rigid3, best_similarity
 from cuspid.mesh import Mesh
 from cuspid.reconstruction import DepthMap
+from cuspid.rig import MountedCamera
 from cuspid.simulation.raycast import render_depth
 
-SAMPLES = 100_000
-"""Points of a surface from which a distance is told."""
 AGREEING_PX = 1.0
 """A left-out view agrees with the surface where it need not be moved by more."""
 _LEAST_GREY_SD = 2.0
@@ -43,22 +41,23 @@ def median_to_points_mm(points: Float[np.ndarray, "n 3"], mesh: Mesh) -> float:
 
 
 @dataclass(frozen=True)
-class SurfaceDistance:
-    """How far a surface lies from a reference, where it lies over or under it."""
+class SeenDistance:
+    """How far a surface lies from a reference, at the pixels at which a camera sees both."""
 
     median_mm: float
-    """Median of the unsigned distances; NaN where nothing is comparable."""
-    comparable_pct: float
-    """Share of the surface (%) whose closest point is not past a border of the reference."""
+    """Median of the distances of the surface's points from the reference; NaN where there are none."""
+    covered_pct: float
+    """Share of the pixels that show the reference (%) that show the surface, too."""
 
 
-def surface_distance(mesh: Mesh, reference: Mesh) -> SurfaceDistance:
-    """Of points uniform by area on a mesh, those past the border of the reference left out."""
-    points, _ = mesh.sample(SAMPLES, np.random.default_rng(0))
-    closest = SignedDistance(reference).closest_points(points)
-    over = ~closest.past_border
-    median = float(np.median(np.abs(closest.signed_mm[over]))) if over.any() else float("nan")
-    return SurfaceDistance(median, 100 * float(over.mean()))
+def seen_distance(mesh: Mesh, reference: Mesh, camera: Camera, cam_from_world: Rigid3) -> SeenDistance:
+    """Of the points of a mesh that a camera sees, where it would see the reference as well."""
+    ours, theirs = (render_depth(each, camera, cam_from_world) for each in (mesh, reference))
+    both = np.isfinite(ours) & np.isfinite(theirs)
+    rays = camera.rays(camera.pixel_centres()[both])
+    points = cam_from_world.inverse().apply(rays * ours[both][:, None])
+    median = median_to_points_mm(points, reference) if both.any() else float("nan")
+    return SeenDistance(median, coverage_pct(np.isfinite(ours), np.isfinite(theirs)))
 
 
 def seen_by_all(points: Float[np.ndarray, "n 3"], cameras: Mapping[str, tuple[Camera, Rigid3]]) -> Bool[np.ndarray, "n"]:
@@ -92,15 +91,16 @@ def outside_pct(mesh: Mesh, box: Box, margin_mm: float = 1.0) -> float:
 # --- Pixels -----------------------------------------------------------------------------------------------------------
 
 
-def mask_at(depth: DepthMap, camera: Camera, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """A mask of the image of a camera at the pixels of a depth map of it, which may be coarser and undistorted. A pixel
-    that the image does not show is not masked."""
+def mask_at(depth: DepthMap, mounted: MountedCamera, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "r c"]:
+    """A mask of the image of a camera at the pixels of a depth map of it, which may be coarser, undistorted and turned.
+    A pixel that the image does not show is not masked."""
     rays = depth.camera.rays(depth.camera.pixel_centres())
-    pixels = camera.project(rays)
-    inside = camera.contains(pixels)
+    turn = mounted.cam_from_rig.rotation @ depth.cam_from_rig.rotation.T
+    pixels = mounted.camera.project(rays @ turn.T)
+    inside = mounted.camera.contains(pixels)
     column, row = np.floor(np.where(inside[..., None], pixels, 0)).astype(int).reshape(-1, 2).T
-    chosen = mask[np.minimum(row, camera.height - 1), np.minimum(column, camera.width - 1)]
-    return inside & chosen.reshape(inside.shape)
+    chosen = mask[np.minimum(row, mounted.camera.height - 1), np.minimum(column, mounted.camera.width - 1)]
+    return np.asarray(inside & chosen.reshape(inside.shape))
 
 
 def coverage_pct(known: Bool[np.ndarray, "h w"], within: Bool[np.ndarray, "h w"]) -> float:

@@ -33,12 +33,12 @@ SETS: Mapping[str, Set] = {
     "opencas": Set(kind="opencas", folder="opencas"),
     **{f"robovision-{name}": Set(kind="robovision", folder=f"robovision-{name}") for name in ROBOVISION},
     "dtu": Set(kind="dtu", folder="dtu"),
-    "dtu-left-out": Set(kind="dtu", folder="dtu", left_out=("c08", "c20", "c32")),
+    "dtu-left-out": Set(kind="dtu", folder="dtu", left_out=("c08", "c32", "c36")),
     "temple-four": Set(
         kind="temple",
         folder="middlebury-templeR",
-        only=("templeR0013", "templeR0014", "templeR0015", "templeR0016"),
-        left_out=("templeR0012", "templeR0017"),
+        only=("templeR0014", "templeR0015", "templeR0016", "templeR0017"),
+        left_out=("templeR0013", "templeR0018"),
     ),
     "temple": Set(kind="temple", folder="middlebury-templeR"),
     "temple-left-out": Set(
