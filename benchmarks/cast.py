@@ -3,10 +3,10 @@ cast.
 
     python benchmarks/cast.py JAW.ply [--photographs 60] [--scale 1] [--work build/cast] [--out FILE] [--render]
 
-JAW is a mesh of a jaw that is not part of the project. WORK/photos holds the photographs (JPEG, with the focal length in
-their EXIF), WORK/truth the cast, the poses, the camera and the board, which no reconstruction is given; the size of the
-board's squares is, as a user would measure it. ``--scale`` 0.25 renders 1000 x 750 px for quick trials. ``--render``
-only renders. Photographs that are there are kept.
+JAW is a mesh of a jaw that is not part of the project. WORK/photos holds the photographs (JPEG, with the focal length
+in their EXIF), WORK/truth the cast, the poses, the camera and the board, which no reconstruction is given; it is told
+the size of the board's squares, as a user would measure it. ``--scale`` 0.25 renders 1000 x 750 px for quick trials.
+``--render`` only renders. Photographs that are there are kept.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from cast_judging import judged
 from cast_scene import CastScene, build_scene, hand_held, phone, photograph, radiance, rays_of
 from PIL import Image
-from real import told
+from real_runs import told
 from run import conditions
 
 from cuspid.anatomy.jaw_files import load_jaw
@@ -29,7 +29,7 @@ from cuspid.board import Board
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.rig import Sensor
-from cuspid.storage import write_json, write_jaw, write_poses
+from cuspid.storage import write_jaw, write_json, write_poses
 from cuspid.storage.files import whole_file
 from cuspid.storage.handpieces import camera_to_json, rigid_to_json
 from cuspid.studies.scan_cases import timed
@@ -56,9 +56,7 @@ def render(jaw: Path, folder: Path, count: int, scale: float, seed: int) -> None
     write_jaw(truth / "jaw.ply", cast)
     write_poses(truth / "poses.json", dict(zip(names, poses, strict=True)))
     write_json(truth / "camera.json", camera_to_json(camera))
-    write_json(
-        truth / "board.json", {**asdict(BOARD), "board_from_world": rigid_to_json(scene.board_from_world)}
-    )
+    write_json(truth / "board.json", {**asdict(BOARD), "board_from_world": rigid_to_json(scene.board_from_world)})
     gain = _gain(scene, poses)
     rays = rays_of(camera, 1 if scale > 0.6 else 2)
     for k, (name, pose) in enumerate(zip(names, poses, strict=True)):

@@ -30,8 +30,8 @@ TABLE = (0.055, 0.075, 0.085)
 """Of a dark cloth."""
 PAPER, INK = 0.80, 0.03
 GRAIN = ((0.028, 0.030), (0.06, 0.022), (0.13, 0.010), (0.6, 0.006), (2.2, 0.010), (9.0, 0.018))
-"""Wavelength (mm) and standard deviation, as a share of the albedo, of the octaves of the plaster: grain of 20 to 60 um,
-and weak mottling."""
+"""Wavelength (mm) and standard deviation, as a share of the albedo, of the octaves of the plaster: grain of 20 to 60
+um, and weak mottling."""
 WEAVE = ((0.5, 0.10), (1.0, 0.08), (6.0, 0.05))
 """Of the cloth."""
 PIT_MM, PIT_LEVEL, PIT_SHARE = 0.4, 0.76, 0.25
@@ -320,9 +320,7 @@ FEW, RINGS_OF_FEW = 30, ((0.65, 50.0, 190.0), (0.2, 72.0, 190.0))
 _AFAR_MM = 320.0
 
 
-def hand_held(
-    cast: Mesh, scene: CastScene, count: int, rng: np.random.Generator
-) -> list[Rigid3]:
+def hand_held(cast: Mesh, scene: CastScene, count: int, rng: np.random.Generator) -> list[Rigid3]:
     """``cam_from_world`` of each photograph: rings around the cast, and some of cast and board from afar."""
     middle = cast.bounds.mean(axis=0) + [0.0, 0.0, 0.2 * np.ptp(cast.bounds[:, 2])]
     board_middle = scene.board_from_world.inverse().apply(np.array([[*scene.board.size_mm, 0.0]]) / 2)[0]
@@ -343,7 +341,11 @@ def hand_held(
 
 
 def _looking(
-    target: Float[np.ndarray, "3"], azimuth_deg: float, elevation_deg: float, distance_mm: float, rng: np.random.Generator
+    target: Float[np.ndarray, "3"],
+    azimuth_deg: float,
+    elevation_deg: float,
+    distance_mm: float,
+    rng: np.random.Generator,
 ) -> Rigid3:
     """From a direction towards a point, the horizon level but for the hand."""
     a, e = np.deg2rad([azimuth_deg, elevation_deg])

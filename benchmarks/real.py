@@ -13,9 +13,7 @@ file holds of other sets.
 from __future__ import annotations
 
 import argparse
-import re
 import shutil
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -23,54 +21,19 @@ from typing import Any
 
 from real_baselines import BASELINES
 from real_judging import measured
-from real_sets import SETS, Set, offered
+from real_runs import kept, run
+from real_sets import SETS, offered
 from run import conditions
 
 from cuspid.storage import read_json, write_json
-from cuspid.studies.scan_cases import commit, timed
 
 HERE = Path(__file__).parent
-TIMED_OUT = 124
-_WARNING = re.compile(rb"^.*\.py:\d+: \w*Warning: .*$", re.MULTILINE)
-
-
-def run(each: Set, data: Path, folder: Path, timeout_s: float) -> dict[str, Any]:
-    """Reconstruct a set into ``folder/out``, with the log and the record of the run beside it."""
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    given, out, log = offered(each, data, folder / "given"), folder / "out", folder / "log.txt"
-    command = [sys.executable, "-m", "cuspid", "reconstruct", str(given), "--out", str(out), *each.arguments]
-    with log.open("wb") as stream:
-        status, took = timed("timeout", "-k", "20", str(timeout_s), *command, log=stream)
-    record = {**told(status, log.read_bytes()), **took, "timeout_s": timeout_s, "commit": commit()}
-    write_json(folder / "run.json", record)
-    return record
-
-
-def told(status: int, log: bytes) -> dict[str, Any]:
-    """What a run said: how it ended, and in its last line why."""
-    lines = [line.strip() for line in log.decode(errors="replace").splitlines() if line.strip()]
-    timed_out, traceback = status == TIMED_OUT, b"Traceback (most recent call last)" in log
-    return {
-        "status": "timed out" if timed_out else "traceback" if traceback else "refused" if status else "done",
-        "exit_code": status,
-        "traceback": traceback,
-        "warnings": len(_WARNING.findall(log)),
-        "last_line": "" if not lines else _last(lines),
-    }
-
-
-def _last(lines: list[str]) -> str:
-    """The last message of the program, whole where it was wrapped over some lines."""
-    begin = next((k for k in reversed(range(len(lines))) if lines[k].startswith("cuspid: ")), len(lines) - 1)
-    return " ".join(lines[begin:])[:400]
 
 
 def row(name: str, arguments: argparse.Namespace) -> dict[str, Any]:
     """All that is known of one set."""
     each, folder = SETS[name], arguments.work / name
-    record = folder / "run.json"
-    ran = read_json(record) if record.exists() and not arguments.again else None
+    ran = None if arguments.again else kept(folder / "run.json", each)
     ran = run(each, arguments.data, folder, arguments.timeout) if ran is None else ran
     pictures = None if arguments.pictures is None else arguments.pictures / name
     found = measured(each, arguments.data, folder / "out", pictures)
@@ -83,14 +46,14 @@ def baselines(name: str, arguments: argparse.Namespace, pictures: Path | None) -
     each, results = SETS[name], dict[str, Any]()
     for method, make in BASELINES[each.kind].items():
         folder = arguments.work / "baselines" / f"{name}-{method}"
-        if not (folder / "took.json").exists():
+        took = kept(folder / "took.json", each)
+        if took is None:
             shutil.rmtree(folder, ignore_errors=True)
-            given = offered(each, arguments.data, folder / "given")
-            took = make(given, folder / "out")
+            took = {**make(offered(each, arguments.data, folder / "given"), folder / "out"), "set": asdict(each)}
             write_json(folder / "took.json", took)
         shown = None if pictures is None else pictures.with_name(f"{name}-{method}")
         found = measured(each, arguments.data, folder / "out", shown)
-        results[method] = {**read_json(folder / "took.json"), **found}
+        results[method] = {**took, **found}
     return results
 
 

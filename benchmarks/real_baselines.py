@@ -78,7 +78,7 @@ def matched(
     grey = [cv2.cvtColor(each, cv2.COLOR_RGB2GRAY) for each in (left, right)]
     lowest = int(np.floor(lowest_px))
     count = 16 * int(np.ceil((highest_px - lowest + 1) / 16))
-    height, width = grey[0].shape
+    width = grey[0].shape[1]
     shifted = np.zeros_like(grey[1])
     kept = max(width - lowest, 0)
     shifted[:, width - kept :] = grey[1][:, :kept]
@@ -98,7 +98,9 @@ def matched(
     return np.where((found >= 0) & (grey[0] > 0), found + lowest, np.nan).astype(np.float32)
 
 
-def _as_depth(pair: RectifiedPair, disparity: Float32[np.ndarray, "h w"], image: UInt8[np.ndarray, "h w 3"]) -> DepthMap:
+def _as_depth(
+    pair: RectifiedPair, disparity: Float32[np.ndarray, "h w"], image: UInt8[np.ndarray, "h w 3"]
+) -> DepthMap:
     """A depth map of the first virtual camera."""
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = (pair.camera.focal_px[0] * pair.baseline_mm / disparity).astype(np.float32)

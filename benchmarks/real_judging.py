@@ -296,7 +296,9 @@ def draw(mesh: Mesh, each: Set, source: Path, folder: Path) -> None:
             axes = Rotation.from_euler("y", turn, degrees=True).as_matrix() @ base
             views.append(render(drawn, axes, width_px=_PICTURE_PX, supersampling=1).image)
         height = max(view.shape[0] for view in views)
-        padded = [cv2.copyMakeBorder(v, 0, height - v.shape[0], 0, 8, cv2.BORDER_CONSTANT, value=(255,) * 3) for v in views]
+        padded = [
+            cv2.copyMakeBorder(v, 0, height - v.shape[0], 0, 8, cv2.BORDER_CONSTANT, value=(255,) * 3) for v in views
+        ]
         cv2.imwrite(str(folder / f"{name}.png"), cv2.cvtColor(np.hstack(padded), cv2.COLOR_RGB2BGR))
 
 

@@ -25,7 +25,7 @@ AGREEING_PX = 1.0
 _LEAST_GREY_SD = 2.0
 _TOLERANCE = 3e-3
 """Of depth, relative, within which a neighbour is held to see the same point."""
-_EROSION_PX = 5
+_EROSION_PX = 3
 """Pixels next to those without a value, whose displacement is not looked at."""
 
 
@@ -60,7 +60,9 @@ def seen_distance(mesh: Mesh, reference: Mesh, camera: Camera, cam_from_world: R
     return SeenDistance(median, coverage_pct(np.isfinite(ours), np.isfinite(theirs)))
 
 
-def seen_by_all(points: Float[np.ndarray, "n 3"], cameras: Mapping[str, tuple[Camera, Rigid3]]) -> Bool[np.ndarray, "n"]:
+def seen_by_all(
+    points: Float[np.ndarray, "n 3"], cameras: Mapping[str, tuple[Camera, Rigid3]]
+) -> Bool[np.ndarray, "n"]:
     """Whether points lie in front of each camera (with its ``cam_from_world``) and in its image."""
     inside = [camera.contains(camera.project(pose.apply(points))) for camera, pose in cameras.values()]
     return np.all(inside, axis=0)
@@ -155,7 +157,7 @@ def displacement_px(
     grey[1] = np.where(valid, grey[1], grey[0])
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow.setFinestScale(0)
-    found = flow.calc(*[_normalised(each) for each in grey], None)
+    found = np.asarray(flow.calc(_normalised(grey[0]), _normalised(grey[1]), np.zeros((*valid.shape, 2), np.float32)))
     size = 2 * _EROSION_PX + 1
     inner = cv2.erode(valid.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
     return np.where(inner, np.linalg.norm(found, axis=-1), np.nan).astype(np.float32)
