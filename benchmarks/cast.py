@@ -35,8 +35,8 @@ from cuspid.storage.handpieces import camera_to_json, rigid_to_json
 from cuspid.studies.scan_cases import timed
 
 HERE = Path(__file__).parent
-BOARD = Board(columns=5, rows=7, square_mm=7.93, dictionary="4X4_50")
-"""Drawn with squares of 8 mm, printed a little small, measured on the print."""
+BOARD = Board(square_mm=4.96)
+"""As ``cuspid target`` draws it, with squares of 5 mm, printed a little small and measured on the print."""
 SENSOR = Sensor(noise_dn=1.8, shot_noise_share=0.7)
 BRIGHT, BRIGHT_PERCENTILE = 0.72, 99.0
 """The exposure, the same for all photographs, puts this percentile of some of them at this share of full scale."""
@@ -85,8 +85,7 @@ def _write_jpeg(file: Path, image: np.ndarray, camera: Camera) -> None:
 
 def reconstruct(folder: Path, timeout_s: float) -> dict[str, Any]:
     """As a user would, by default options, with the board's measured squares."""
-    board = ["--board.columns", str(BOARD.columns), "--board.rows", str(BOARD.rows)]
-    board += ["--board.dictionary", BOARD.dictionary, "--board.square-mm", f"{BOARD.square_mm:g}"]
+    board = ["--square-mm", f"{BOARD.square_mm:g}"]
     command = [sys.executable, "-m", "cuspid", "reconstruct", str(folder / "photos"), "--out", str(folder / "out")]
     log = folder / "log.txt"
     with log.open("wb") as stream:

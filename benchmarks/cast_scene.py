@@ -168,8 +168,17 @@ def rays_of(camera: Camera, samples: int) -> RowRays:
     for begin in range(0, dense.height, rows):
         end = min(begin + rows, dense.height)
         x, y = np.meshgrid(np.arange(dense.width) + 0.5, np.arange(begin, end) + 0.5)
-        parts.append(dense.rays(np.stack([x, y], axis=-1).reshape(-1, 2)).astype(np.float32))
+        parts.append(_undistorted(dense, np.stack([x, y], axis=-1).reshape(-1, 2)))
     return RowRays(camera, samples, np.concatenate(parts))
+
+
+def _undistorted(camera: Camera, pixels: Float[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n 3"]:
+    """As ``camera.rays`` for a lens with k1 alone, which is all that :func:`phone` has, by fixed-point iteration."""
+    seen = (pixels - camera.principal_point_px) / camera.focal_px
+    ideal = seen
+    for _ in range(6):
+        ideal = seen / (1 + camera.distortion[0] * (ideal**2).sum(axis=1, keepdims=True))
+    return np.concatenate([ideal, np.ones((len(ideal), 1))], axis=1).astype(np.float32)
 
 
 def photograph(
