@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from real_judging import found_poses, mesh_of
 from real_measures import pose_difference
 
@@ -45,9 +45,9 @@ def judged(out: Path, truth: Path) -> dict[str, Any]:
         return figures
     jaw = read_jaw(truth / "jaw.ply")
     camera = camera_from_json(read_json(truth / "camera.json"))
-    crowns = jaw.mesh.submesh(crown_faces(jaw) & visible_faces(jaw.mesh, camera, known))
+    wanted = crown_faces(jaw) & visible_faces(jaw.mesh, camera, known)
     laid = laid_on(mesh, found, known, with_scale=not figures["scaled"])
-    return {**figures, "faces": len(mesh.faces), **crown_figures(laid, crowns)}
+    return {**figures, "faces": len(mesh.faces), **crown_figures(laid, jaw.mesh, wanted)}
 
 
 def crown_faces(jaw: Jaw) -> Bool[np.ndarray, "f"]:
@@ -81,23 +81,25 @@ def laid_on(mesh: Mesh, found: Mapping[str, Rigid3], known: Mapping[str, Rigid3]
     return Mesh(places, mesh.faces)
 
 
-def crown_figures(mesh: Mesh, crowns: Mesh) -> dict[str, float]:
-    """Deviation of a scan nearby from crowns, um, after the best rigid motion, and how much of them it has (%)."""
-    near = mesh.submesh(mesh.face_areas > 0)
-    near = near.submesh(crowns.closest(near.face_centres)[0] <= NEAR_MM)
+def crown_figures(scan: Mesh, reference: Mesh, wanted: Bool[np.ndarray, "f"]) -> dict[str, float]:
+    """Deviation of a scan nearby, um, from those faces of a reference, after the best rigid motion, and how much of
+    them it has (%). What lies nearest to other faces does not count."""
+    near = scan.submesh(scan.face_areas > 0)
+    near = near.submesh(reference.submesh(wanted).closest(near.face_centres)[0] <= NEAR_MM)
     if not len(near.faces):
         return {"crowns_complete_pct": 0.0}
-    surface, options = SignedDistance(crowns), RegistrationOptions()
+    surface, options = SignedDistance(reference), RegistrationOptions()
     points = near.sample(_SAMPLES, np.random.default_rng(0))[0]
-    pose = refine(points[::4], surface, Rigid3.identity(), options)
-    closest = surface.closest_points(pose.apply(points))
-    deviation_um = 1000 * np.abs(closest.signed_mm[~closest.on_border & (np.abs(closest.signed_mm) <= NEAR_MM)])
-    wanted: Float[np.ndarray, "n 3"] = crowns.sample(_SAMPLES, np.random.default_rng(1))[0]
-    distances = near.closest(pose.inverse().apply(wanted))[0]
+    few = points[wanted[reference.closest(points)[1]]][::4]
+    pose = refine(few, surface, Rigid3.identity(), options)
+    distances, faces, _ = reference.closest(pose.apply(points))
+    deviation_um = 1000 * distances[wanted[faces] & (distances <= NEAR_MM)]
+    there = reference.submesh(wanted).sample(_SAMPLES, np.random.default_rng(1))[0]
+    left = near.closest(pose.inverse().apply(there))[0]
     return {
         "mean_abs_um": float(deviation_um.mean()),
         "p95_um": float(np.percentile(deviation_um, 95)),
         "within_100_um_pct": 100 * float(np.mean(deviation_um <= 100)),
-        "crowns_complete_pct": 100 * float(np.mean(distances <= COMPLETE_MM)),
-        "surface_scale_error_pct": 100 * (best_scale(points[::4], surface, pose, options) - 1),
+        "crowns_complete_pct": 100 * float(np.mean(left <= COMPLETE_MM)),
+        "surface_scale_error_pct": 100 * (best_scale(few, surface, pose, options) - 1),
     }

@@ -267,14 +267,15 @@ def _rigid(pose: pycolmap.Rigid3d) -> Rigid3:
 
 
 def known_poses(source: Path) -> dict[str, Rigid3]:
-    """``cam_from_world`` by name: of a capture's calibration, or of the text of a COLMAP model."""
+    """``cam_from_world`` by name: of a capture's calibration, or of the text of a COLMAP model, of which only some of the
+    photographs may be there."""
     if (source / "handpiece.json").exists():
         rig = read_handpiece(source / "handpiece.json").rig
         return {name: mounted.cam_from_rig for name, mounted in rig.cameras.items()}
-    poses = {}
+    poses, there = dict[str, Rigid3](), {file.stem for file in (source / "images").iterdir()}
     for line in (source / "sparse" / "images.txt").read_text().splitlines():
         words = line.split()
-        if len(words) == 10 and not line.startswith("#"):
+        if len(words) == 10 and not line.startswith("#") and Path(words[9]).stem in there:
             w, x, y, z, *shift = map(float, words[1:8])
             poses[Path(words[9]).stem] = Rigid3(Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(shift))
     return poses

@@ -193,3 +193,32 @@ def test_a_log_tells_how_a_run_ended():
     assert told(1, b"Traceback (most recent call last):\nValueError: x\n")["status"] == "traceback"
     assert told(124, b"")["status"] == "timed out"
     assert told(0, b"fine\n")["status"] == "done"
+
+
+def test_crowns_are_off_by_as_much_as_they_were_grown():
+    """Of a ball whose upper half is wanted; a scan elsewhere does not count."""
+    judging = import_module("cast_judging")
+    true, grown = ball(10.0, (0, 0, 0)), ball(10.05, (0, 0, 0))
+    wanted = true.face_centres[:, 2] > 0
+    far = ball(3.0, (0, 0, -40))
+    scan = Mesh(
+        np.concatenate([grown.vertices, far.vertices]), np.concatenate([grown.faces, far.faces + len(grown.vertices)])
+    )
+    found = judging.crown_figures(scan, true, wanted)
+    assert 20 < found["mean_abs_um"] < 52  # a shift takes some of it off the half
+    assert found["crowns_complete_pct"] == 100
+    assert 0.1 < found["surface_scale_error_pct"] < 0.6
+    same = judging.crown_figures(true, true, wanted)
+    assert same["mean_abs_um"] < 1e-3
+    assert judging.crown_figures(far, true, wanted) == {"crowns_complete_pct": 0.0}
+
+
+def test_faces_that_three_photographs_show_are_visible():
+    judging = import_module("cast_judging")
+    above = Rigid3(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0, 60]))
+    true = ball(10.0, (0, 0, 0))
+    seen = judging.visible_faces(true, CAMERA, {name: above for name in "abc"})
+    cosine = true.face_centres[:, 2] / 10
+    assert seen[cosine > 0.5].all()
+    assert not seen[cosine < 0.2].any()
+    assert not judging.visible_faces(true, CAMERA, {name: above for name in "ab"}).any()
