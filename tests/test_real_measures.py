@@ -195,9 +195,10 @@ def test_a_log_tells_how_a_run_ended():
     assert told(0, b"fine\n")["status"] == "done"
 
 
-def test_crowns_are_off_by_as_much_as_they_were_grown():
+def test_crowns_are_off_by_as_much_as_they_were_grown(monkeypatch):
     """Of a ball whose upper half is wanted; a scan elsewhere does not count."""
     judging = import_module("cast_judging")
+    monkeypatch.setattr(judging, "_SAMPLES", 4000)
     true, grown = ball(10.0, (0, 0, 0)), ball(10.05, (0, 0, 0))
     wanted = true.face_centres[:, 2] > 0
     far = ball(3.0, (0, 0, -40))
