@@ -30,8 +30,8 @@ TABLE = (0.055, 0.075, 0.085)
 """Of a dark cloth."""
 PAPER, INK = 0.80, 0.03
 GRAIN = ((0.045, 0.055), (0.09, 0.050), (0.2, 0.022), (0.6, 0.012), (2.2, 0.012), (9.0, 0.018))
-"""Wavelength (mm) and standard deviation, as a share of the albedo, of the octaves of the plaster: grain whose spots, of
-half a wavelength, are 20 to 60 um large, and weak mottling."""
+"""Wavelength (mm) and standard deviation, as a share of the albedo, of the octaves of the plaster: grain whose spots,
+of half a wavelength, are 20 to 60 um large, and weak mottling."""
 WEAVE = ((0.5, 0.10), (1.0, 0.08), (6.0, 0.05))
 """Of the cloth."""
 PIT_MM, PIT_LEVEL, PIT_SHARE = 0.4, 0.76, 0.25

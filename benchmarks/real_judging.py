@@ -249,17 +249,17 @@ def _view(source: Path, rig: Rig, name: str) -> View:
 
 
 def found_poses(out: Path) -> dict[str, Rigid3]:
-    """``cam_from_world`` of located photographs, by their names without ending: of COLMAP's model where there is one,
-    the largest of several, otherwise of ``poses.json``."""
+    """``cam_from_world`` of located photographs, by their names without ending: of ``poses.json`` where there is one,
+    otherwise of the largest of COLMAP's models."""
+    files = sorted(out.glob("**/poses.json"), key=lambda file: len(file.parts))
+    if files:
+        return {Path(name).stem: pose for name, pose in read_poses(files[0]).items()}
     models = []
     for file in [*out.glob("**/images.bin"), *out.glob("**/images.txt")]:
         model = pycolmap.Reconstruction(str(file.parent))
         placed = [model.images[index] for index in model.reg_image_ids()]
         models.append({Path(image.name).stem: _rigid(image.cam_from_world()) for image in placed})
-    if models:
-        return max(models, key=len)
-    files = list(out.glob("**/poses.json"))
-    return read_poses(files[0]) if files else {}
+    return max(models, key=len, default={})
 
 
 def _rigid(pose: pycolmap.Rigid3d) -> Rigid3:
@@ -267,8 +267,8 @@ def _rigid(pose: pycolmap.Rigid3d) -> Rigid3:
 
 
 def known_poses(source: Path) -> dict[str, Rigid3]:
-    """``cam_from_world`` by name: of a capture's calibration, or of the text of a COLMAP model, of which only some of the
-    photographs may be there."""
+    """``cam_from_world`` by name: of a capture's calibration, or of the text of a COLMAP model, of which only
+    some of the photographs may be there."""
     if (source / "handpiece.json").exists():
         rig = read_handpiece(source / "handpiece.json").rig
         return {name: mounted.cam_from_rig for name, mounted in rig.cameras.items()}
