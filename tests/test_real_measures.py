@@ -218,8 +218,8 @@ def test_faces_that_three_photographs_show_are_visible():
     judging = import_module("cast_judging")
     above = Rigid3(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0, 60]))
     true = ball(10.0, (0, 0, 0))
-    seen = judging.visible_faces(true, CAMERA, {name: above for name in "abc"})
+    seen = judging.visible_faces(true, CAMERA, dict.fromkeys("abc", above))
     cosine = true.face_centres[:, 2] / 10
     assert seen[cosine > 0.5].all()
     assert not seen[cosine < 0.2].any()
-    assert not judging.visible_faces(true, CAMERA, {name: above for name in "ab"}).any()
+    assert not judging.visible_faces(true, CAMERA, dict.fromkeys("ab", above)).any()
