@@ -61,7 +61,7 @@ def asked() -> argparse.Namespace:
     """What the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--only", nargs="*", help="names of sets or their beginnings; default: all")
+    parser.add_argument("--only", nargs="*", help="names of sets, or beginnings of names; default: all")
     parser.add_argument("--out", type=Path, default=HERE / "results" / "real.json")
     parser.add_argument("--work", type=Path, default=Path("build/real"))
     parser.add_argument("--pictures", type=Path, help="where pictures of the meshes go, for people to look at")
@@ -71,10 +71,15 @@ def asked() -> argparse.Namespace:
     return parser.parse_args()
 
 
+def is_asked(name: str, word: str) -> bool:
+    """Whether a set is meant: by its name or, where a word is none, by its beginning."""
+    return name == word or (word not in SETS and name.startswith(word))
+
+
 def main() -> None:
     """Run and measure what is asked for, and write the figures after each set."""
     arguments = asked()
-    chosen = [name for name in SETS if not arguments.only or name.startswith(tuple(arguments.only))]
+    chosen = [name for name in SETS if not arguments.only or any(is_asked(name, word) for word in arguments.only)]
     before: Mapping[str, Any] = read_json(arguments.out)["scans"] if arguments.only and arguments.out.exists() else {}
     rows = dict(before)
     for name in chosen:

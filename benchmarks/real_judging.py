@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -153,16 +153,16 @@ def _dtu(each: Set, source: Path, out: Path, mesh: Mesh | None, depths: list[Dep
     """Depth within the masks, and views that were left out."""
     rig = read_handpiece(source / "handpiece.json").rig
     masks = {name: _read_mask(mask_file(source, name)) for name in rig.names}
-    found = _masked_coverage(depths, rig, masks)
+    found = _masked_coverage(depths, rig, masks, _used(each, source))
     return {**found, **_left_out(each, source, rig, mesh, masks)}
 
 
 def _temple(each: Set, source: Path, out: Path, mesh: Mesh | None, depths: list[DepthMap]) -> Figures:
     """The published box, views that were left out, and silhouettes before the black background."""
     rig = read_handpiece(source / "handpiece.json").rig
-    wanted = sorted({*each.left_out, *(depth.camera_name for depth in depths)})
+    wanted = {*each.left_out, *_used(each, source)}
     masks = {name: _bright(read_image(image_file(source, name))) for name in wanted}
-    found = _masked_coverage(depths, rig, masks)
+    found = _masked_coverage(depths, rig, masks, _used(each, source))
     if mesh is not None:
         gaps = box_gaps_mm(mesh, TEMPLE_BOX_MM)
         found |= {
@@ -206,16 +206,24 @@ def _bright(image: np.ndarray) -> Bool[np.ndarray, "h w"]:
     return filled > 0
 
 
-def _masked_coverage(depths: list[DepthMap], rig: Rig, masks: Mapping[str, Bool[np.ndarray, "h w"]]) -> Figures:
-    """Share of the masked pixels of each view (%) that have a depth in any of its depth maps."""
-    shares: dict[str, float] = {}
+def _used(each: Set, source: Path) -> list[str]:
+    """The views that the reconstruction was shown."""
+    return [name for name in each.only or cameras_of(source) if name not in each.left_out]
+
+
+def _masked_coverage(
+    depths: list[DepthMap], rig: Rig, masks: Mapping[str, Bool[np.ndarray, "h w"]], used: Sequence[str]
+) -> Figures:
+    """Share of the masked pixels of each view that was used (%) that have a depth in its best depth map; none where it
+    has no depth map."""
+    if not depths:
+        return {}
+    shares = dict.fromkeys(used, 0.0)
     for depth in depths:
-        if depth.camera_name in masks:
+        if depth.camera_name in shares:
             within = mask_at(depth, rig[depth.camera_name], masks[depth.camera_name])
             share = coverage_pct(depth.known, within)
-            shares[depth.camera_name] = max(share, shares.get(depth.camera_name, 0.0))
-    if not shares:
-        return {}
+            shares[depth.camera_name] = max(share, shares[depth.camera_name])
     values = list(shares.values())
     return {
         "masked_views": len(values),
@@ -231,8 +239,7 @@ def _left_out(
     """Every view that was left out, seen through the mesh from its neighbours that were not."""
     if mesh is None or not each.left_out:
         return {}
-    used = [name for name in each.only or cameras_of(source) if name not in each.left_out]
-    found = {}
+    used, found = _used(each, source), dict[str, Any]()
     for name in each.left_out:
         nearest = sorted(used, key=lambda other: rig.angle_deg(name, other))[:NEIGHBOURS]
         views = [_view(source, rig, other) for other in nearest]
@@ -308,6 +315,6 @@ def _looking(each: Set, source: Path) -> Float[np.ndarray, "3 3"]:
     if not (source / "handpiece.json").exists():
         return np.diag([1.0, -1.0, -1.0])
     rig = read_handpiece(source / "handpiece.json").rig
-    used = [name for name in each.only or rig.names if name not in each.left_out]
+    used = _used(each, source)
     rotation = rig[used[len(used) // 2]].cam_from_rig.rotation
     return rotation * np.array([[1.0], [-1.0], [-1.0]])

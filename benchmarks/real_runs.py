@@ -54,5 +54,5 @@ def _last(lines: list[str]) -> str:
 def kept(record: Path, each: Set) -> dict[str, Any] | None:
     """What was recorded of an earlier run, if the set was the same then."""
     found = read_json(record) if record.exists() else None
-    same = found is not None and found["set"] == json.loads(json.dumps(asdict(each)))
+    same = found is not None and found.get("set") == json.loads(json.dumps(asdict(each)))
     return found if same else None
