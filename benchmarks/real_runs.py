@@ -27,7 +27,10 @@ def run(each: Set, data: Path, folder: Path, timeout_s: float) -> dict[str, Any]
     command = [sys.executable, "-m", "cuspid", "reconstruct", str(given), "--out", str(out), *each.arguments]
     with log.open("wb") as stream:
         status, took = timed("timeout", "-k", "20", str(timeout_s), *command, log=stream)
-    record = {**told(status, log.read_bytes()), **took, "timeout_s": timeout_s, "commit": commit(), "set": asdict(each)}
+    said = log.read_bytes()
+    for where in (given, out, data.resolve(), folder.resolve()):  # no result tells of the machine's folders
+        said = said.replace(str(where).encode(), where.name.encode())
+    record = {**told(status, said), **took, "timeout_s": timeout_s, "commit": commit(), "set": asdict(each)}
     write_json(folder / "run.json", record)
     return record
 

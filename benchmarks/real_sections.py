@@ -45,7 +45,8 @@ def real(result: Result) -> str:
 
 def _run_row(name: str, scan: Result) -> tuple[object, ...]:
     run, found = scan["run"], scan["found"]
-    ended = run["status"] if run["status"] == "done" else f"**{run['status']}**: {_plain(run['last_line'])}"
+    said = "" if run["status"] == "timed out" else f": {_plain(run['last_line'])}"
+    ended = run["status"] if run["status"] == "done" else f"**{run['status']}**{said}"
     faces = f"{found['faces']:,}" if found["faces"] else "**0** (missed)"
     warnings = f"**{run['warnings']}** (missed)" if run["warnings"] else 0
     coverage = found["coverage_pct"]
