@@ -1,16 +1,16 @@
 """Measure anew what no longer holds, one benchmark after the other, all at one commit: the current one unless told.
 
     python benchmarks/campaign.py [--release] [--commit C] [--list] [--only NAME ...] [--hours H] [--work FOLDER]
-                                  [--jaws FOLDER] [--pairs FOLDER] [--ball FOLDER]
+                                  [--jaws FOLDER] [--pairs FOLDER] [--ball FOLDER] [--photographs FOLDER]
 
 The commit is checked out into the work folder, so that work can go on meanwhile. Each result goes to
 benchmarks/results as soon as it is there; a campaign that was stopped goes on with what does not hold by then
 (:mod:`freshness`), and finished parts of most benchmarks are kept in the work folder. With ``--release`` it measures
 the benchmarks of a release, those that are not of this very commit; to go on with them after other commits, name
 theirs. Nothing is begun after ``--hours``. Scans of your own (``--jaws``), rectified photographs of two cameras
-(``--pairs``) and photographs of a glossy ball (``--ball``) are not part of the project: without them, the benchmarks
-that need them are left out. Then make the page (``python benchmarks/page.py``). Pictures for the documentation stay in
-the work folder.
+(``--pairs``), photographs of a glossy ball (``--ball``) and sets of real photographs (``--photographs``) are not part
+of the project: without them, the benchmarks that need them are left out. Then make the page
+(``python benchmarks/page.py``). Pictures for the documentation stay in the work folder.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from pathlib import Path
 from freshness import ROOT, changes, maker_of
 
 RESULTS = ROOT / "benchmarks" / "results"
-GIVEN = ("jaws", "pairs", "ball")
+GIVEN = ("jaws", "pairs", "ball", "photographs")
 """What is not part of the project."""
 
 
@@ -42,13 +42,11 @@ class Benchmark:
     """Of the result: a file in benchmarks/results, without its ending."""
     command: str
     """Script and options; ``{out}`` is the file, ``{folder}`` its folder, ``{work}`` a folder of its own, and
-    ``{jaws}``, ``{pairs}`` and ``{ball}`` are what the user gives."""
+    ``{jaws}``, ``{pairs}``, ``{ball}`` and ``{photographs}`` are what the user gives."""
 
     def needs(self, given: Mapping[str, Path]) -> list[str]:
         """Options that must be given, but were not."""
-        return [
-            f"--{what}" for what in ("jaws", "pairs", "ball") if f"{{{what}}}" in self.command and what not in given
-        ]
+        return [f"--{what}" for what in GIVEN if f"{{{what}}}" in self.command and what not in given]
 
     def holds(self, release: str | None) -> bool:
         """Whether there is a result that holds: one of the commit of the release where there is one."""
@@ -86,6 +84,8 @@ BENCHMARKS = (
     Benchmark("grid", "grid.py --out {out}"),
     Benchmark("stereo_pairs", "stereo_pairs.py {pairs} --out {out}"),
     Benchmark("real_gloss", "real_gloss.py {ball} --out {out}"),
+    Benchmark("real", "real.py --data {photographs} --work {work} --out {out}"),
+    Benchmark("cast", "cast.py {jaws}/fullarch_upper_137k.ply --work {work} --out {out}"),
     Benchmark("any_rig", "any_rig.py --work {work} --out {out}"),
     Benchmark("qualities", "qualities.py {jaws}/fullarch_upper_137k.ply --work {work} --out {out}"),
     Benchmark("live", "live.py phantom {jaws}/fullarch_upper_137k.ply --work {work} --out {out}"),

@@ -19,6 +19,7 @@ from typing import Any
 import anatomy_sections
 import handpiece_sections
 import panorama_sections
+import real_sections
 import trust_sections
 from freshness import changes, maker_of
 
@@ -170,6 +171,8 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
     "design_comparison_full_size": ("Six cameras or twelve, full-size images", handpiece_sections.design_comparison),
     "any_rig": ("Any rig", handpiece_sections.any_rig),
     "stereo_pairs": ("Photographs from two cameras", handpiece_sections.stereo_pairs),
+    "real": ("Real photographs", real_sections.real),
+    "cast": ("A plaster cast and one camera", real_sections.cast),
     "jaws_plan": ("Real jaws: the scan path", anatomy_sections.jaws),
     "jaws_half": ("Real jaws at half size", anatomy_sections.jaws),
     "jaws_half_auto": ("Real jaws at half size, with further passes", anatomy_sections.jaws),
