@@ -42,7 +42,7 @@ from cuspid.rig import Handpiece
 from cuspid.simulation.stage import RenderOptions, SimulationOptions, simulate, take_images
 from cuspid.stereo.across import AcrossOptions
 from cuspid.stereo.matching import Signal, StereoOptions
-from cuspid.stereo.signal import signal_of
+from cuspid.stereo.signal import choose_signal
 from cuspid.stereo.stage import (
     StoredDepthMaps,
     measure_depth,
@@ -210,7 +210,7 @@ def surface(
 
 def matched(capture: Capture, options: ReconstructionOptions) -> Signal:
     """What the images of a capture are matched by."""
-    return signal_of(capture) if options.signal == "auto" else options.signal
+    return choose_signal(sized(capture, options), options.stereo) if options.signal == "auto" else options.signal
 
 
 def sized(capture: Capture, options: ReconstructionOptions) -> Capture:

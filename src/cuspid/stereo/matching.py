@@ -33,11 +33,13 @@ from cuspid.stereo.confidence import (
 from cuspid.stereo.initial_depth import initial_pairs, initial_points, semi_global
 from cuspid.stereo.rectification import IdealView, RectifiedPair, rectify
 from cuspid.stereo.refinement import SCORE, VARIANCE, GroupGeometry, Q, RefinementOptions, image_noise, refine
-from cuspid.stereo.regularised import sweep
+from cuspid.stereo.regularised import even_out, sweep
 from cuspid.stereo.shading import ShadedView, ShadingOptions, brightness, correction, shaded_depths
 from cuspid.workers import map_in_threads
 
 _SPACING_PX = 3
+_WEAK_SIGMA_PX = 0.15
+"""Standard deviation (px of disparity) that a depth from weak texture has at least: what looks alike need not be."""
 _OUTLYING_SIGMAS = 4.0
 """Planes that lie so far from a smooth surface, in its standard deviations, are outliers."""
 MOST_AGREED, WEAKLY_AGREED = 0.8, 0.6
@@ -372,7 +374,9 @@ class Match:
         with np.errstate(invalid="ignore"):
             smooth = (agreed[..., SCORE] == 0) | (np.abs(agreed[..., Q] - q) > _OUTLYING_SIGMAS * sigma_q)
         depth = np.where(smooth, geometry.scale / q, one.depth_mm)
-        sigma = np.where(smooth, sigma_q * depth**2 / geometry.scale, one.sigma_mm)
+        step_mm = depth**2 / geometry.scale
+        sigma = np.where(smooth, sigma_q * step_mm, np.maximum(one.sigma_mm, _WEAK_SIGMA_PX * step_mm))
+        depth = even_out(depth, sigma, float(one.camera.focal_px.mean()))
         return replace(one, depth_mm=depth, sigma_mm=sigma, smooth=smooth & np.isfinite(depth))
 
 

@@ -23,9 +23,11 @@ _SMALL, _LARGE = 0.3, 1.5
 """Penalties of a step by one label and of a jump, where a perfect match costs 0 and none 1."""
 _LEAST_ZNCC = 0.2
 """What correlates less than this is no match."""
-_EVEN_LABELS, _EVEN_PX = 2.0, 4.0
-"""Labels are evened out over this distance (px) where they differ by no more than about a pixel of disparity: what is
-left of their steps would tilt the surface."""
+_REACH, _STEEP = 5, 0.15
+"""Depths are evened out over so many pixels of the grid, where their noise would tilt the surface by more than this
+from pixel to pixel."""
+_SAME_SIGMAS = 3.0
+"""Depths that differ by more, in standard deviations, belong to different surfaces."""
 SIGMA_PX = 0.5
 """Standard deviation of the disparity, px at the size of the images that were compared."""
 
@@ -60,8 +62,7 @@ def sweep(
         zncc[..., number] = best.mean(axis=0)
     chosen = semi_global(1 - zncc, _SMALL, _LARGE)
     at = np.take_along_axis(zncc, np.rint(chosen).astype(np.int64)[..., None], axis=2)[..., 0]
-    even = cv2.bilateralFilter(chosen.astype(np.float32), -1, _EVEN_LABELS, _EVEN_PX)
-    q = np.where(at >= _LEAST_ZNCC, low + step * even.astype(np.float64), np.nan)
+    q = np.where(at >= _LEAST_ZNCC, low + step * chosen, np.nan)
     return _on_grid(q, np.linalg.inv(to_full), (height, width), spacing_px), SIGMA_PX / scale
 
 
@@ -124,3 +125,26 @@ def _on_grid(
     y = np.rint(from_full[1, 1] * rows + from_full[1, 2]).astype(np.int64).clip(0, values.shape[0] - 1)
     x = np.rint(from_full[0, 0] * columns + from_full[0, 2]).astype(np.int64).clip(0, values.shape[1] - 1)
     return values[np.ix_(y, x)]
+
+
+def even_out(
+    depth_mm: Float[np.ndarray, "h w"], sigma_mm: Float[np.ndarray, "h w"], focal_px: float
+) -> Float[np.ndarray, "h w"]:
+    """Depths on a grid of a camera with this focal length (px of the grid), averaged with those of the same surface
+    around them where their own noise would tilt it; a surface needs normals."""
+    inverse, spread = 1 / depth_mm, sigma_mm / depth_mm**2
+    total, weight = np.zeros_like(inverse), np.zeros_like(inverse)
+    padded = [np.pad(each, _REACH, constant_values=np.nan) for each in (inverse, spread)]
+    height, width = inverse.shape
+    for down in range(2 * _REACH + 1):
+        for right in range(2 * _REACH + 1):
+            there, of = (each[down : down + height, right : right + width] for each in padded)
+            near = np.exp(-2 * ((down - _REACH) ** 2 + (right - _REACH) ** 2) / _REACH**2)
+            with np.errstate(invalid="ignore"):
+                same = np.abs(there - inverse) < _SAME_SIGMAS * np.hypot(of, spread)
+            share = np.where(same, near / np.maximum(of, spread) ** 2, 0)
+            total += np.where(same, share * there, 0)
+            weight += share
+    with np.errstate(invalid="ignore", divide="ignore"):
+        tilted = sigma_mm > _STEEP * depth_mm / focal_px
+        return np.where(tilted & (weight > 0), weight / total, depth_mm)

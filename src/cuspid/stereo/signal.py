@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from cuspid.capture import Capture
-from cuspid.stereo.matching import Signal, gray
+from cuspid.capture import Capture, Frame
+from cuspid.reconstruction import sum_funnels
+from cuspid.stereo.matching import DepthEstimator, Signal, StereoOptions, gray
 
+_MOST_OF_IT = 0.4
+"""Share of the pixels with a depth by texture from which on shade need not be tried."""
 _LOOKED_AT = 24
 """Images that are looked at, spread over the capture."""
 _FINE_PX, _COARSE_PX, _WINDOW_PX = 1.5, 3.0, 15
@@ -24,13 +29,41 @@ under clinical optics, most images 0.8-0.95), plain enamel 0.12-0.2, in images o
 1.5 DN makes 0.12. Photographs of real teeth have 0.15-0.25 or, sharpened, 0.5-0.85 (median 0.55)."""
 
 
-def signal_of(capture: Capture) -> Signal:
-    """What depth is best measured from, by the detail of the smoothest tenth of what is lit."""
+def choose_signal(capture: Capture, options: StereoOptions) -> Signal:
+    """What depth is best measured from.
+
+    Shade tells something only where the lights are known. Where they are, and what is lit shows little detail, a few
+    frames are matched both ways, and the way that gives more depth on which the views agree is taken.
+    """
+    if not capture.handpiece.lights or _shows_detail(capture):
+        return "texture"
+    frames = [capture.frames[k] for k in sorted({0, len(capture.frames) // 2})]
+    by_texture = _agreed_share(capture, frames, options, "texture")
+    if by_texture >= _MOST_OF_IT:
+        return "texture"
+    return "texture" if by_texture >= _agreed_share(capture, frames, options, "shading") else "shading"
+
+
+def _agreed_share(capture: Capture, frames: Sequence[Frame], options: StereoOptions, signal: Signal) -> float:
+    """Share of the pixels of some frames that get a depth which is kept."""
+    estimator = DepthEstimator(capture.handpiece, options, signal=signal)
+    funnel = sum_funnels(
+        depth_map.funnel
+        for frame in frames
+        for depth_map in estimator.measure(
+            capture.images(frame), frame.name, frame.lighting, masks=capture.masks(frame), alone=True
+        )
+    )
+    return 0.0 if funnel is None else funnel.kept / max(funnel.pixels, 1)
+
+
+def _shows_detail(capture: Capture) -> bool:
+    """Whether even the smoothest tenth of what is lit shows the detail of a texture."""
     images = [(frame, camera) for frame in capture.frames for camera in frame.cameras]
     chosen = {images[k] for k in np.linspace(0, len(images) - 1, _LOOKED_AT).astype(int)} if images else set()
     grays = [gray(capture.image(*each)) for each in sorted(chosen, key=images.index)]
     details = [(detail, _least_dn(image)) for image in grays if (detail := detail_dn(image)) is not None]
-    return "texture" if not details or np.median([one / least for one, least in details]) >= 1 else "shading"
+    return not details or bool(np.median([one / least for one, least in details]) >= 1)
 
 
 def _least_dn(image: UInt8[np.ndarray, "h w"]) -> float:
