@@ -24,7 +24,7 @@ from cuspid.pipeline import ReconstructionOptions
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece, MountedCamera, Rig
 from cuspid.stereo import DepthEstimator, StereoOptions
-from cuspid.stereo.temporal import TemporalOptions
+from cuspid.stereo.across import AcrossOptions
 from cuspid.surface.fusion import FusionOptions
 from cuspid.tolerances import EXACT
 from synthetic_scene import diamond, height_field, render
@@ -357,8 +357,8 @@ def test_fine_is_the_same_scan_with_more_faces(folder: Path) -> None:
 
 
 def test_what_was_asked_for_goes_before_the_quality() -> None:
-    asked = ReconstructionOptions(quality="draft", temporal=TemporalOptions(left_share=0.2))
-    assert pipeline.settled(asked).temporal.left_share == 0.2
+    asked = ReconstructionOptions(quality="draft", across=AcrossOptions(left_share=0.2))
+    assert pipeline.settled(asked).across.left_share == 0.2
     assert pipeline.settled(asked).tracking.features.count == 500
     assert pipeline.settled(asked).tracking.features.size_for(640, 480) == (160, 120)
     assert pipeline.settled(asked).left_share == 1

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
 
 from builders import joined, moved, sphere
 from cuspid.mesh import Mesh
@@ -13,11 +15,11 @@ from cuspid.surface.cleaning import clean as clean_mesh
 from synthetic_scene import height_field
 
 SHEET = height_field(lambda x, y: 5 + 0.2 * np.sin(x), half_width_mm=2.0, count=41)
-WORKING_DISTANCE_MM = 5.0
+DETAIL_MM = 0.012
 
 
 def clean(mesh: Mesh) -> tuple[Mesh, CleaningReport]:
-    return clean_mesh(mesh, WORKING_DISTANCE_MM)
+    return clean_mesh(mesh, DETAIL_MM)
 
 
 def test_a_good_surface_is_left_alone() -> None:
@@ -31,7 +33,7 @@ def test_a_good_surface_is_left_alone() -> None:
 
 
 def test_floating_pieces_go() -> None:
-    crumb = moved(sphere(0.2, 3), (0, 0, -3))
+    crumb = moved(sphere(0.1, 3), (0, 0, -3))
     cleaned, report = clean(joined(SHEET, crumb))
     assert report.removed_pieces == 1
     assert report.removed_piece_faces == len(crumb.faces)
@@ -85,7 +87,7 @@ def test_surfaces_that_touch_in_a_point_are_parted() -> None:
 
 
 def test_pieces_are_counted_by_shared_edges() -> None:
-    crumbs = [moved(sphere(0.1, 2), (0, 0, -3)), moved(sphere(0.2, 2), (0, 0, -5))]
+    crumbs = [moved(sphere(0.1, 2), (0, 0, -3)), moved(sphere(0.12, 2), (0, 0, -5))]
     cleaned, report = clean(joined(SHEET, moved(SHEET, (0, 0, 2)), *crumbs))
     assert report.removed_pieces == 2
     assert report.removed_piece_faces == sum(len(crumb.faces) for crumb in crumbs)
@@ -107,4 +109,15 @@ def test_nothing_stays_nothing() -> None:
     cleaned, report = clean(empty)
     assert len(cleaned.faces) == 0
     assert report.holes == ()
-    assert len(clean(sphere(0.1, 3))[0].faces) == 0
+
+
+@given(factor=st.floats(1e-3, 1e3), radius=st.floats(0.01, 0.3))
+def test_a_surface_is_never_removed_whole_however_small(factor: float, radius: float) -> None:
+    """What is small is so beside the rest. At any scale the same is removed."""
+    alone = sphere(radius, 3)
+    assert len(clean(alone)[0].faces) == len(alone.faces)
+    both = joined(SHEET, moved(alone, (0, 0, -3)))
+    scaled = Mesh(factor * both.vertices, both.faces)
+    kept = len(clean_mesh(scaled, factor * DETAIL_MM)[0].faces)
+    assert kept == len(clean(both)[0].faces)
+    assert (kept == len(both.faces)) == (alone.face_areas.sum() >= (40 * DETAIL_MM) ** 2)

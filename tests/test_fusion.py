@@ -317,7 +317,7 @@ def test_the_mesh_of_a_scan_has_its_sharp_edges(tmp_path: Path) -> None:
     off_um, moved = [], []
     for enabled in (False, True):
         options = FusionOptions(voxel_mm=0.05), CleaningOptions(), SharpEdgeOptions(enabled=enabled)
-        mesh, sigma_um = fuse_once(maps, "a", POSES, 0.03, 5.0, tmp_path, *options)
+        mesh, sigma_um = fuse_once(maps, "a", POSES, 0.03, tmp_path, *options)
         assert len(sigma_um) == len(mesh.vertices)
         off_um.append(1000 * mesh.closest(ridge)[0].mean())
         moved.append(json.loads((tmp_path / "mesh.json").read_text())["sharpened_vertices"])

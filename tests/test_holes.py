@@ -20,7 +20,7 @@ from cuspid.reconstruction import DepthMap, Reconstruction, SurfacePoints, Track
 from cuspid.stereo import stage
 from cuspid.stereo.holes import Sightings, Views, covering
 from cuspid.stereo.matching import StereoOptions
-from cuspid.stereo.temporal import TemporalOptions
+from cuspid.stereo.across import AcrossOptions
 from synthetic_scene import diamond
 
 SETS = st.lists(st.sets(st.integers(0, 39), max_size=15), max_size=12)
@@ -160,16 +160,18 @@ def matched(
     left_share: float,
     holes: SurfacePoints | None = None,
 ) -> list[list[str]]:
-    """The cameras that temporal stereo is measured of, frame by frame."""
+    """The cameras that are matched with themselves in the next frame, frame by frame."""
     capture, asked = folder_capture(folder, diamond(), ("00000", "00001")), list[list[str]]()
     for frame, name in product(("00000", "00001"), diamond().rig.names):
         camera = diamond().rig[name].camera
         blank = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
         storage.write_image(image_path(capture, frame, name), blank)
-    monkeypatch.setattr(stage, "measure_temporal", lambda _, now, after, *__: asked.append(sorted(now)) or ())
-    options = TemporalOptions(left_share=left_share)
-    stage.measure_temporal_depth(
-        *(capture, found, maps, folder / "temporal", options), agreement_mm=0.08, least_maps=2, holes=holes
+    monkeypatch.setattr(stage, "measure_moving_cameras", lambda _, now, after, *__: asked.append(sorted(now)) or ())
+    stage.measure_depth_across(
+        *(capture, found, maps, folder / "across", AcrossOptions(left_share=left_share), StereoOptions()),
+        agreement_mm=0.08,
+        least_maps=2,
+        holes=holes,
     )
     return asked
 

@@ -170,14 +170,14 @@ def test_the_order_of_the_cameras_decides_nothing(images: dict[str, np.ndarray])
 def test_plain_images_are_told_from_textured_ones() -> None:
     rng = np.random.default_rng(1)
     capture = plain_scan()
-    assert choose_signal(capture) == "shading"
+    assert choose_signal(capture, OPTIONS) == "shading"
     speckled = {}
     for frame in WAY:
         for name in capture.handpiece.rig.names:
             image = capture.source.read(frame, name).astype(float)
             speckle = np.kron(rng.normal(0, 12, (40, 40, 1)), np.ones((4, 4, 1)))
             speckled[frame, name] = np.clip(image + speckle, 0, 255).astype(np.uint8)
-    assert choose_signal(capture_of(capture.handpiece, speckled)) == "texture"
+    assert choose_signal(capture_of(capture.handpiece, speckled), OPTIONS) == "texture"
 
 
 @pytest.mark.parametrize(("grain_dn", "signal"), [(0.0, "shading"), (3.0, "texture")])
@@ -197,7 +197,7 @@ def test_faint_grain_on_large_images_is_texture(grain_dn: float, signal: str) ->
             images[frame, name] = np.clip(image + grain_dn * grain / grain.std(), 0, 255).astype(np.uint8)
     details = [detail_dn(gray(image)) for image in images.values()]
     assert all(0.65 < each < 1.2 for each in details if each is not None) == (grain_dn > 0)
-    assert choose_signal(capture_of(handpiece, images)) == signal
+    assert choose_signal(capture_of(handpiece, images), OPTIONS) == signal
 
 
 def test_noise_is_no_texture() -> None:

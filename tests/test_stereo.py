@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.pairing import camera_groups, stereo_pairs
+from cuspid.pairing import rank_sources
 from cuspid.reconstruction import DepthMap
 from cuspid.rig import Handpiece, MountedCamera, Rig
 from cuspid.stereo.confidence import (
@@ -28,7 +28,7 @@ from cuspid.stereo.confidence import (
     without_speckle,
 )
 from cuspid.stereo.initial_depth import initial_pairs, semi_global
-from cuspid.stereo.matching import DepthEstimator, Group, StereoOptions, coarser, group_geometry
+from cuspid.stereo.matching import DepthEstimator, StereoOptions, ViewSet, coarser, group_geometry
 from cuspid.stereo.rectification import IdealView, rectify
 from cuspid.stereo.refinement import (
     RefinementOptions,
@@ -238,9 +238,9 @@ def test_what_frames_have_in_common_is_prepared_once(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("cuspid.workers.usable_cores", lambda: 8)
     prepared, together, prepare = [], Barrier(8), DepthEstimator._prepare
 
-    def told(self: DepthEstimator, rig: Rig, names: tuple[str, ...]) -> Group:
-        prepared.append(names)
-        return prepare(self, rig, names)
+    def told(self: DepthEstimator, rig: Rig) -> tuple[ViewSet, ...]:
+        prepared.append(rig.names)
+        return prepare(self, rig)
 
     monkeypatch.setattr(DepthEstimator, "_prepare", told)
     estimator, images = DepthEstimator(diamond(), StereoOptions(spacing_px=8)), hills_images()
@@ -303,7 +303,7 @@ def test_coarser_pinhole_keeps_the_rays(spacing: int, size: int) -> None:
 def test_group_geometry_projects_as_the_cameras_do() -> None:
     rig = diamond(turn_rad=0.05).rig
     views = [IdealView.of(name, mounted) for name, mounted in rig.cameras.items()]
-    geometry = group_geometry(views, 1)
+    geometry = group_geometry(views, 1, (0, 2, 3))
     point = np.array([0.3, -0.2, 5.1])
     in_reference = views[1].cam_from_rig.apply(point)
     pixel = views[1].camera.project(in_reference) - 0.5
@@ -324,12 +324,12 @@ def test_semi_global_matching_finds_a_known_shift() -> None:
     assert not np.any(known[:, :11])
 
 
-def test_each_camera_gets_its_widest_partner() -> None:
+def test_each_camera_gets_its_widest_partner_that_sees_the_same() -> None:
     handpiece = diamond()
-    group = camera_groups(handpiece.rig, 5.0)[0]
-    assert set(initial_pairs(handpiece.rig, group, stereo_pairs(handpiece.rig, 5.0))) == {
-        ("west", "east"),
-        ("north", "south"),
+    pairs = initial_pairs(handpiece.rig, rank_sources(handpiece.rig, 5.0), 5.0)
+    assert {frozenset(pair) for pair in pairs.values()} == {
+        frozenset({"west", "east"}),
+        frozenset({"north", "south"}),
     }
 
 
@@ -348,31 +348,31 @@ PLACES = ((0, 0), 0.0), ((0.5, 0), 0.06), ((0, 0.5), -0.5)
 
 def test_cameras_that_agree_vote_for_a_depth_and_others_against() -> None:
     measured = [flat((0, 0), 5.0), flat((0.5, 0), 5.01), flat((0, 0.5), 5.5), flat((0.5, 0.5), 4.5)]
-    votes = agreement(measured, 0, RESOLUTION, ConfidenceOptions())[10, 10]
+    votes = agreement(measured[0], measured[1:], RESOLUTION, ConfidenceOptions())[10, 10]
     # The second agrees, the third looks through the point, the fourth sees something in front and knows nothing of it.
     assert votes == 0
-    assert agreement(measured[:2], 0, RESOLUTION, ConfidenceOptions())[10, 10] == 1
-    assert agreement(measured[::3], 0, RESOLUTION, ConfidenceOptions())[10, 10] == 0
+    assert agreement(measured[0], measured[1:2], RESOLUTION, ConfidenceOptions())[10, 10] == 1
+    assert agreement(measured[0], measured[3:], RESOLUTION, ConfidenceOptions())[10, 10] == 0
 
 
 @pytest.mark.parametrize(("sigmas", "votes"), [(3.0, 1), (1.0, 0)])
 def test_uncertain_depths_may_differ_by_some_of_their_sigmas(sigmas: float, votes: int) -> None:
     measured = [replace(flat(at, 5 + off), sigma_mm=np.full((20, 20), 0.04)) for at, off in PLACES]
     options = ConfidenceOptions(agreement_sigmas=sigmas)
-    assert agreement(measured, 0, RESOLUTION, options)[10, 10] == votes
+    assert agreement(measured[0], measured[1:], RESOLUTION, options)[10, 10] == votes
 
 
 def test_two_cameras_alone_must_agree_better() -> None:
     measured = [flat((0, 0), 5.0), flat((0.5, 0), 5.02), flat((0, 0.5), 4.5)]
-    assert agreement(measured, 0, RESOLUTION, ConfidenceOptions())[10, 10] == 1
-    assert agreement(measured[:2], 0, RESOLUTION, ConfidenceOptions())[10, 10] == 0
+    assert agreement(measured[0], measured[1:], RESOLUTION, ConfidenceOptions())[10, 10] == 1
+    assert agreement(measured[0], measured[1:2], RESOLUTION, ConfidenceOptions())[10, 10] == 0
 
 
 def test_the_near_side_of_a_border_is_found() -> None:
     depth = np.full((20, 20), 5.0)
     depth[:, :10], depth[:3] = 4.0, np.nan
     pair = [replace(flat((0, 0), 5.0), depth_mm=depth), flat((2.5, 0), 5.0)]
-    borders = at_near_borders(pair, 0, 2, RESOLUTION, ConfidenceOptions())
+    borders = at_near_borders(*pair, 2, RESOLUTION, ConfidenceOptions())
     assert borders[3:, 8:10].all()
     assert not borders[:, :8].any()
     assert not borders[:, 10:].any()
@@ -389,7 +389,7 @@ def sloping(slant_deg: float, towards_deg: float) -> np.ndarray:
 @given(slant_deg=st.floats(0, 55), towards_deg=st.floats(0, 360), baseline_mm=st.floats(0.3, 5))
 def test_a_steep_surface_has_no_borders_within(slant_deg: float, towards_deg: float, baseline_mm: float) -> None:
     pair = [replace(flat((0, 0), 5.0), depth_mm=sloping(slant_deg, towards_deg)), flat((baseline_mm, 0), 5.0)]
-    borders = at_near_borders(pair, 0, 2, RESOLUTION, ConfidenceOptions())
+    borders = at_near_borders(*pair, 2, RESOLUTION, ConfidenceOptions())
     assert not borders[2:-2, 2:-2].any()
 
 
@@ -476,8 +476,9 @@ def test_speckle_goes_and_surface_stays() -> None:
 def test_confidence_is_inverse_variance_up_to_one(sigma: float) -> None:
     options = ConfidenceOptions()
     sigmas, keep = np.array([[sigma, 2 * sigma]]), np.array([[True, True]])
-    weight = confidence(sigmas, keep, RESOLUTION, options)
+    one = Measured(Camera.from_field_of_view(2, 1, 62.0), Rigid3.identity(), np.full((1, 2), 5.0), sigmas)
+    weight = confidence(one, keep, RESOLUTION, options)
     assert 0 < weight[0, 1] <= weight[0, 0] <= 1
     if sigma > options.best_sigma * RESOLUTION.mm:
         assert weight[0, 0] == pytest.approx(4 * weight[0, 1], rel=1e-5)
-    assert not confidence(sigmas, ~keep, RESOLUTION, options).any()
+    assert not confidence(one, ~keep, RESOLUTION, options).any()

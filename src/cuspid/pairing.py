@@ -57,7 +57,8 @@ class PairingOptions(Options):
 def worth_of_angle(angle_deg: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """What a source is worth (0 to 1) for lines of sight that meet at an angle: a soft choice of 8 to 20 degrees."""
     least, most = _BEST_DEG
-    return np.minimum(angle_deg / least, 1) * np.exp(-0.5 * (np.maximum(angle_deg - most, 0) / _FALL_DEG) ** 2)
+    fall = np.exp(-0.5 * (np.maximum(angle_deg - most, 0) / _FALL_DEG) ** 2)
+    return np.asarray(np.minimum(angle_deg / least, 1) * fall)
 
 
 def rank_sources(
@@ -99,7 +100,7 @@ def rank_by_points(
             angle_deg = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
             # The median angle, since most points of a view are seen again at its best side only.
             enough = min(1.0, np.sqrt(both.sum() / min(_SHARED_ENOUGH, len(mine))))
-            worth[other] = enough * worth_of_angle(np.median(angle_deg))
+            worth[other] = enough * worth_of_angle(np.array(np.median(angle_deg)))
         worth[reference] = 0
         ranked.append(_best(worth, options))
     return tuple(ranked)

@@ -19,7 +19,7 @@ from cuspid.errors import InputError
 from cuspid.options import Options, Range
 from cuspid.pairing import PairingOptions, camera_groups, rank_sources, require_stereo, resolved_mm
 from cuspid.reconstruction import DepthMap, Funnel
-from cuspid.rig import Handpiece, Rig
+from cuspid.rig import MID_GREY_DN, Handpiece, Rig
 from cuspid.stereo.confidence import (
     ConfidenceOptions,
     Measured,
@@ -35,9 +35,11 @@ from cuspid.stereo.rectification import IdealView, RectifiedPair, rectify
 from cuspid.stereo.refinement import SCORE, VARIANCE, GroupGeometry, Q, RefinementOptions, image_noise, refine
 from cuspid.stereo.regularised import even_out, sweep
 from cuspid.stereo.shading import ShadedView, ShadingOptions, brightness, correction, shaded_depths
-from cuspid.workers import map_in_threads
+from cuspid.workers import computed_once, map_in_threads
 
 _SPACING_PX = 3
+_SHADE_PX = 4.0
+"""What is wider than this is shade."""
 _WEAK_SIGMA_PX = 0.15
 """Standard deviation (px of disparity) that a depth from weak texture has at least: what looks alike need not be."""
 _OUTLYING_SIGMAS = 4.0
@@ -279,7 +281,8 @@ class DepthEstimator:
                 measured = self._by_shading(views, images, lighting)
             else:
                 measured = measure_views(
-                    views, images, self.handpiece.depth_range_mm, self.resolution, self.options, work
+                    *(views, images, self.handpiece.depth_range_mm, self.resolution, self.options, work),
+                    shaded=bool(self.handpiece.lights),
                 )
             found += depth_maps_of(
                 views, measured, images, masks or {}, frame, self.resolution, self.checks, self.options.grid_px
@@ -319,12 +322,23 @@ class Match:
         depth_range_mm: tuple[float, float],
         options: StereoOptions,
         work: _Map = _one_by_one,
+        *,
+        shaded: bool,
     ) -> None:
-        """RGB or grey images by the names of the views."""
+        """RGB or grey images by the names of the views. ``shaded``: their brightness may be shade that does not stay
+        on the surface, since lights move with the camera, or stand close by: wide windows must not gather it."""
+        self._shaded = shaded
         grays = {view.name: gray(images[view.name]) for view in views.views}
         self._views, self._range_mm, self._options = views, depth_range_mm, options
         self._initial = work(lambda pair: initial_points(pair, grays, semi_global, depth_range_mm), views.pairs)
         self._stack, self._sizes = stack_images([view.resample(grays[view.name]) for view in views.views])
+
+    @computed_once
+    def _wide(self) -> Float[np.ndarray, "c h w"]:
+        """What wide windows see: the images, without what changes slowly where that may be shade."""
+        if not self._shaded:
+            return self._stack
+        return np.stack([image - cv2.GaussianBlur(image, (0, 0), _SHADE_PX) + MID_GREY_DN for image in self._stack])
 
     def measure(
         self, index: int, known: Float[np.ndarray, "h w 6"] | None = None, *, widening: int = 1
@@ -335,7 +349,7 @@ class Match:
         height, width = self._sizes[index]
         layers = np.stack([initial_layer(self._initial[pair], view, grid) for pair in self._views.layers[index]])
         planes = refine(
-            self._stack,
+            self._stack if widening == 1 else self._wide,
             self._sizes,
             index,
             geometry,
@@ -363,7 +377,7 @@ class Match:
         near, far = self._range_mm
         height, width = self._sizes[index]
         q, sigma_q = sweep(
-            self._stack,
+            self._wide,
             self._sizes,
             index,
             geometry,
@@ -388,6 +402,7 @@ def measure_views(
     options: StereoOptions,
     work: _Map = _one_by_one,
     *,
+    shaded: bool,
     widenings: Sequence[int] = WIDENINGS,
 ) -> Mapping[int, Measured]:
     """Depth of each reference of a set of views by texture, before the last checks, by its index.
@@ -395,7 +410,7 @@ def measure_views(
     Where other views contradict much of what was matched, as with weak texture, the rest of the view is matched again
     in wider windows, from the planes that others agree with.
     """
-    match = Match(views, images, depth_range_mm, options, work)
+    match = Match(views, images, depth_range_mm, options, work, shaded=shaded)
     measured = dict(zip(views.references, work(match.measure, views.references), strict=True))
     for widening in widenings:
         before = dict(measured)

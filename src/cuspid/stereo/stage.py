@@ -250,7 +250,7 @@ def measure_view_depth(
         view, of = views[k], (k, *views[k].sources)
         rig = Rig({_number(j): views[j].mounted for j in of})
         prepared = prepare_views(rig, {_number(k): [_number(j) for j in view.sources]}, view.distance_mm, options)
-        return Match(prepared, {_number(j): read(j) for j in of}, view.depth_range_mm, options)
+        return Match(prepared, {_number(j): read(j) for j in of}, view.depth_range_mm, options, shaded=True)
 
     def read_back(k: int) -> Measured:
         return _read_measured(matched[k].file, grids[views[k].camera], views[k].mounted.cam_from_rig)

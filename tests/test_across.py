@@ -1,4 +1,4 @@
-"""Depth from two frames: right where the motion is right, and modest."""
+"""Depth across frames: right where the motion is right, and modest beside depth of a single frame."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import pytest
 
 from cuspid.geometry import Rigid3
 from cuspid.rig import Handpiece, Rig, Sensor
-from cuspid.stereo.temporal import TemporalOptions, measure_temporal, moving_pair
+from cuspid.pairing import PairingOptions
+from cuspid.stereo.across import AcrossOptions, measure_moving_cameras, moving_pair
+from cuspid.stereo.matching import StereoOptions
 from synthetic_scene import cast_depth, diamond, height_field, render
 
 HILLS = height_field(lambda x, y: 5 + 0.25 * np.sin(1.8 * x) * np.cos(1.5 * y))
@@ -28,8 +30,8 @@ def test_one_moving_camera_measures_depth(sensors: dict[str, Sensor]) -> None:
     handpiece = replace(diamond(), sensors=sensors) if sensors else handpiece
     mounted = handpiece.rig["west"]
     images = [{"west": render(HILLS, mounted, pose, rng)} for pose in (Rigid3.identity(), STEP)]
-    options = TemporalOptions(confidence_share=0.1)
-    found = measure_temporal(handpiece, images[0], images[1], STEP, "00000", options)
+    options = AcrossOptions(confidence_share=0.1), StereoOptions()
+    found = measure_moving_cameras(handpiece, images[0], images[1], {}, STEP, "00000", *options)
     assert [depth_map.camera_name for depth_map in found] == ["west", "west+"]
     for depth_map in found:
         # Both are given in the rig frame of the first frame, which is the world here.
@@ -44,8 +46,8 @@ def test_one_moving_camera_measures_depth(sensors: dict[str, Sensor]) -> None:
 
 def test_a_camera_that_hardly_moved_is_left_out() -> None:
     still = Rigid3(np.eye(3), np.array([-0.1, 0, 0]))
-    assert moving_pair(lone_camera(), "west", still, TemporalOptions()) is None
-    assert moving_pair(lone_camera(), "west", STEP, TemporalOptions()) is not None
+    assert moving_pair(lone_camera(), "west", still, PairingOptions()) is None
+    assert moving_pair(lone_camera(), "west", STEP, PairingOptions()) is not None
 
 
 def test_a_camera_that_moved_along_its_axis_or_turned_away_is_left_out() -> None:
@@ -53,4 +55,4 @@ def test_a_camera_that_moved_along_its_axis_or_turned_away_is_left_out() -> None
     turned = Rigid3.from_rotation_vector(np.array([0, 0.6, 0]), np.array([-1.1, 0, 0]))
     away = Rigid3(np.eye(3), np.array([-5.0, 0, 0]))
     for motion in (closer, turned, away):
-        assert moving_pair(lone_camera(), "west", motion, TemporalOptions()) is None
+        assert moving_pair(lone_camera(), "west", motion, PairingOptions()) is None
