@@ -116,17 +116,22 @@ def _colors_at(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "n 2
     return image[row, column]
 
 
-def detect(image: UInt8[np.ndarray, "h w 3"], options: FeatureOptions | None = None) -> Features:
-    """Keypoints of an RGB image, evenly distributed."""
+def detect(
+    image: UInt8[np.ndarray, "h w 3"],
+    options: FeatureOptions | None = None,
+    mask: UInt8[np.ndarray, "h w"] | None = None,
+) -> Features:
+    """Keypoints of an RGB image, evenly distributed; with a mask, only where it is not zero."""
     options = options or FeatureOptions()
     height, width = image.shape[:2]
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     searched = options.size_for(width, height)
     if searched != (width, height):
         gray = cv2.resize(gray, searched, interpolation=cv2.INTER_AREA)
+        mask = None if mask is None else cv2.resize(mask, searched, interpolation=cv2.INTER_NEAREST)
     px = np.array([width, height]) / searched
     sift = cv2.SIFT.create(contrastThreshold=options.contrast, edgeThreshold=options.edge, enable_precise_upscale=True)
-    keypoints = sift.detect(gray, None)
+    keypoints = sift.detect(gray, mask)
     if options.upright:
         keypoints = without_doubles(keypoints)
     most = options.count_for(width, height)
