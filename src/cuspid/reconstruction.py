@@ -159,7 +159,8 @@ class Expectation:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Reconstruction:
-    """Located frames, in millimetres, unless ``has_scale`` is False. The world frame is the rig frame of the first located frame."""
+    """Located frames, in millimetres unless ``has_scale`` is False. The world frame is the rig frame of the first
+    located frame."""
 
     rig: Rig
     """Refined calibration (the given one if it was held fixed)."""

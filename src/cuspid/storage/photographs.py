@@ -120,7 +120,9 @@ def _sizes(paths: Sequence[Path]) -> tuple[dict[Path, tuple[int, int]], list[Dro
         raise InputError(f"{small[0]}: too small; each side needs at least {LEAST_PX} px")
     again = [stem for stem, count in Counter(path.stem for path in sizes).items() if count > 1]
     if again:
-        raise InputError(f"{paths[0].parent}: {again[0]} is there more than once, with other suffixes; keep one of each")
+        raise InputError(
+            f"{paths[0].parent}: {again[0]} is there more than once, with other suffixes; keep one of each"
+        )
     return sizes, left_out
 
 
@@ -199,8 +201,8 @@ class _Exif:
         """Of a file; what cannot be understood counts as not told."""
         try:
             with Image.open(path) as image:
-                if image.format == "TIFF":  # which Pillow turns by itself
-                    return _Exif()
+                if image.format == "TIFF" or (image.format == "PNG" and "exif" not in image.info):
+                    return _Exif()  # TIFF is turned by Pillow itself, and of PNG all would be decoded to be asked
                 exif = image.getexif()
                 inner = exif.get_ifd(ExifTags.IFD.Exif)
             orientation = int(exif.get(ExifTags.Base.Orientation, UPRIGHT))
