@@ -58,11 +58,11 @@ class PhotographOptions(Options):
     """How photographs of one camera are located."""
 
     features: FeatureOptions = field(
-        default_factory=lambda: FeatureOptions(count=8000, contrast=0.02, cell_px=32, upright=False)
+        default_factory=lambda: FeatureOptions(count=6000, contrast=0.02, cell_px=32, upright=False)
     )
     """Keypoints; the camera may be turned in any way from one photograph to the next."""
     plain_features: FeatureOptions = field(
-        default_factory=lambda: FeatureOptions(count=8000, contrast=0.01, edge=20.0, cell_px=32, upright=False)
+        default_factory=lambda: FeatureOptions(count=6000, contrast=0.01, edge=20.0, cell_px=32, upright=False)
     )
     """Keypoints of photographs with even local contrast, where too few were located by the others: plaster, enamel,
     varnish."""
