@@ -223,11 +223,12 @@ def verified_pairs(database: Path, features: Mapping[int, Features], order: Sequ
     return found
 
 
-def with_focal_lengths(database: Path, photographs: Photographs, focal_share: float) -> None:
-    """Start from another guess of the focal lengths that neither a calibration nor EXIF tells."""
+def with_focal_lengths(database: Path, photographs: Photographs, shares: Mapping[int, float]) -> None:
+    """Start from other guesses of the focal lengths that neither a calibration nor EXIF tells, by number of the camera,
+    or by 0 for any, as shares of the longer side."""
     with pycolmap.Database.open(database) as opened:
         for number, known in enumerate(photographs.cameras.values(), start=1):
-            opened.update_camera(first_guess(known, number, focal_share))
+            opened.update_camera(first_guess(known, number, shares.get(number, shares.get(0))))
 
 
 def camera_of(camera: pycolmap.Camera, what: str) -> Camera:

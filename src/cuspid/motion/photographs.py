@@ -42,8 +42,10 @@ from cuspid.sparse_model import PhotoModel
 
 LEAST_PHOTOGRAPHS = 3
 """Two tell no more than a direction from each other."""
-_OTHER_FOCALS = (2.4, 0.75)
-"""Of the longer side: where COLMAP's guess (1.2) leads nowhere, a tele and a wide-angle lens."""
+_OTHER_FOCALS: tuple[dict[int, float], ...] = ({0: 1.2}, {0: 2.4}, {0: 0.75})
+"""Of the longer side: where COLMAP's guess (1.2) leads nowhere, a tele and a wide-angle lens; 0 is any camera."""
+_TELLING = 5
+"""A model of so many photographs tells a focal length."""
 _STILL_PAIRS = 0.5
 """Where more than this share of the pairs show the same at the same place, the camera stood still."""
 _LENS_GAIN = 0.03
@@ -205,19 +207,29 @@ def _models(
     plain: bool,
     progress: Progress,
 ) -> list[pycolmap.Reconstruction]:
-    """COLMAP's models, largest first; from other guesses of the focal length too, where it is not told and the first
-    one does not locate all."""
+    """COLMAP's models, largest first. Where the first does not locate all, once more with fewer matches, from the focal
+    length that it found, or from other guesses where it found none."""
     if not pairs or stood_still(pairs):
         return []
-    models = _map(photographs, database, count, options, plain=plain, progress=progress)
+    models = _map(photographs, database, count, options, loose=plain, progress=progress)
+    found = _focal_shares(models)
     told = all(each.calibrated is not None or each.focal_px is not None for each in photographs.cameras.values())
-    for focal_share in () if told else _OTHER_FOCALS:
+    for focal_share in (found,) if found or told else _OTHER_FOCALS:
         if models and models[0].num_reg_images() == count:
             break
         with_focal_lengths(database, photographs, focal_share)
-        others = _map(photographs, database, count, options, plain=plain, progress=progress)
+        others = _map(photographs, database, count, options, loose=True, progress=progress)
         models = max(models, others, key=lambda each: _size(each[0]) if each else (0, 0))
     return models
+
+
+def _focal_shares(models: Sequence[pycolmap.Reconstruction]) -> dict[int, float]:
+    """Focal lengths that a model of several photographs has found, by number of the camera, as shares of the longer
+    side."""
+    if not models or models[0].num_reg_images() < _TELLING:
+        return {}
+    cameras = models[0].cameras.items()
+    return {number: float(camera.params[0]) / max(camera.width, camera.height) for number, camera in cameras}
 
 
 def _size(model: pycolmap.Reconstruction) -> tuple[int, int]:
@@ -230,7 +242,7 @@ def stood_still(pairs: Sequence[Pair]) -> bool:
 
 
 def _mapper_options(
-    photographs: Photographs, options: PhotographOptions, plain: bool
+    photographs: Photographs, options: PhotographOptions, loose: bool
 ) -> pycolmap.IncrementalPipelineOptions:
     """COLMAP's defaults, repeatable; calibrated cameras are held."""
     # Threads would add in another order in each run, and bundle adjustment makes much of that.
@@ -241,7 +253,7 @@ def _mapper_options(
     numbered = enumerate(photographs.cameras.values(), start=1)
     how.constant_cameras = {number for number, known in numbered if known.calibrated is not None}
     how.mapper.constant_cameras = how.constant_cameras
-    if plain or len(photographs.names) < 2 * LEAST_PHOTOGRAPHS:
+    if loose or len(photographs.names) < 2 * LEAST_PHOTOGRAPHS:
         how.mapper.init_min_num_inliers, how.mapper.init_min_tri_angle = 40, 6.0
         how.mapper.abs_pose_min_num_inliers, how.mapper.abs_pose_min_inlier_ratio = 15, 0.15
     return how
@@ -253,7 +265,7 @@ def _map(
     count: int,
     options: PhotographOptions,
     *,
-    plain: bool,
+    loose: bool,
     progress: Progress,
 ) -> list[pycolmap.Reconstruction]:
     placed = 0
@@ -264,7 +276,7 @@ def _map(
         progress("mapping", placed, count)
 
     with tempfile.TemporaryDirectory(dir=database.parent) as folder:
-        how = _mapper_options(photographs, options, plain)
+        how = _mapper_options(photographs, options, loose)
         models = pycolmap.incremental_mapping(database, folder, folder, how, next_image_callback=tell)
     progress("mapping", count, count)
     return sorted(models.values(), key=_size, reverse=True)
