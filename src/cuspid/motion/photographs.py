@@ -50,6 +50,8 @@ _STILL_PAIRS = 0.5
 """Where more than this share of the pairs show the same at the same place, the camera stood still."""
 _LENS_GAIN = 0.03
 """Share of the RMS error that a further lens parameter must take away, not to be left at zero."""
+_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
+"""COLMAP's models of a lens, each with all parameters of the one before it."""
 _MANY_PER_CAMERA = 8
 _LOSS_PX, _WORST_SIGMAS, _LEAST_PX = 1.0, 4.0, 1.0
 _NARROW_DEG = 2.0
@@ -289,14 +291,15 @@ def refined(model: pycolmap.Reconstruction, held: frozenset[int]) -> tuple[pycol
     """A model adjusted with as many parameters of the lens as its photographs bear, without what does not fit, and its
     RMS reprojection error, px.
 
-    A parameter more must pay: one that the images do not determine turns with the poses.
+    A parameter more must pay: one that the images do not determine turns with the poses. The principal point stays in
+    the middle: it can hardly be told from a turn of the camera, above all in a ring of photographs.
     """
     rms = _adjusted(model, held)
     by_camera = dict.fromkeys(model.cameras, 0)
     for identifier in model.reg_image_ids():
         by_camera[model.images[identifier].camera_id] += 1
     free = {number for number, count in by_camera.items() if number not in held and count >= _MANY_PER_CAMERA}
-    for kind in ("RADIAL", "OPENCV") if free else ():
+    for kind in _MODELS[1:] if free else ():
         wider = pycolmap.Reconstruction(model)
         for number in free:
             _widen(wider.cameras[number], kind)
