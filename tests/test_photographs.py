@@ -18,13 +18,13 @@ from cuspid.geometry import best_similarity
 from cuspid.motion.colmap import write_model
 from cuspid.motion.photograph_poses import take_photograph_poses
 from cuspid.motion.photographs import PhotographOptions, locate_photographs
-from cuspid.motion.scale import ScaleOptions
+from cuspid.motion.scale import PhotoScaleOptions
 from cuspid.photographs import Photograph
 from cuspid.storage.photographs import is_photographs, read_photographs
 from photo_scene import BOARD, BOARD_PLACE_MM, WIDE, scene
 from synthetic_scene import speckle
 
-BOARD_OPTIONS = ScaleOptions(columns=BOARD.columns, rows=BOARD.rows, square_mm=BOARD.square_mm)
+BOARD_OPTIONS = PhotoScaleOptions(columns=BOARD.columns, rows=BOARD.rows, square_mm=BOARD.square_mm)
 
 
 @pytest.fixture(scope="module")
@@ -91,13 +91,15 @@ def test_a_measured_distance_sets_the_scale(model, photographs):
     ends[1, 2] = 0.0
     one, other = "IMG_00", "IMG_03"
     places = [WIDE.project(true[name].apply(ends)).ravel().tolist() for name in (one, other)]
-    given = (one, *places[0], f"{other}.png", *places[1], float(np.linalg.norm(ends[1] - ends[0])))
-    scale = photograph_pipeline.find_scale(model, photographs, ScaleOptions(distance=(given,)))
+    given = (*places[0], *places[1], float(np.linalg.norm(ends[1] - ends[0])))
+    between = (one, f"{other}.png")
+    options = PhotoScaleOptions(between=between, distance=given)
+    scale = photograph_pipeline.find_scale(model, photographs, options)
     expected, _, _ = best_similarity(centres(model.cam_from_world.values()), centres(true.values()))
     assert 0 < abs(scale.mm_per_unit / expected - 1) < 0.01
-    swapped = (one, *places[0], other, *places[1][2:], *places[1][:2], 7.0)
+    swapped = (*places[0], *places[1][2:], *places[1][:2], 7.0)
     with pytest.raises(InputError, match="not the same"):
-        photograph_pipeline.find_scale(model, photographs, ScaleOptions(distance=(swapped,)))
+        photograph_pipeline.find_scale(model, photographs, replace(options, distance=swapped))
 
 
 def test_without_a_scale_nothing_is_in_millimetres(model, photographs, tmp_path, monkeypatch):
@@ -315,7 +317,7 @@ def test_a_board_that_no_photograph_shows_is_told(model, photographs):
 
 def test_two_ways_to_the_scale_are_refused():
     with pytest.raises(CuspidError, match="both set the scale"):
-        ScaleOptions(square_mm=3.0, distance=(("a", 1.0, 1.0, 2.0, 2.0, "b", 1.0, 1.0, 2.0, 2.0, 5.0),))
+        PhotoScaleOptions(square_mm=3.0, between=("a", "b"), distance=(1.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0, 2.0, 5.0))
 
 
 def test_damaged_photographs_are_left_out_with_a_reason(tmp_path):

@@ -7,7 +7,6 @@ and the result says so (``has_scale``).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from cuspid.geometry import Rigid3
 from cuspid.motion.colmap import hash_sparse, write_model
 from cuspid.motion.photograph_poses import take_photograph_poses
 from cuspid.motion.photographs import PhotographOptions, locate_photographs
-from cuspid.motion.scale import BoardSighting, PickedDistance, ScaleOptions, scale_by_board, scale_by_distances
+from cuspid.motion.scale import BoardSighting, PhotoScaleOptions, PickedDistance, scale_by_board, scale_by_distances
 from cuspid.photographs import Photographs
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
@@ -37,8 +36,8 @@ from cuspid.workers import map_in_threads
 __all__ = [
     "UNITS",
     "LocatedPhotographs",
+    "PhotoScaleOptions",
     "PhotographOptions",
-    "ScaleOptions",
     "depth_range",
     "find_scale",
     "handed_over",
@@ -69,14 +68,14 @@ def locate(
     photographs: Photographs,
     folder: Path,
     options: PhotographOptions | None = None,
-    scale: ScaleOptions | None = None,
+    scale: PhotoScaleOptions | None = None,
     *,
     colmap_model: Path | None = None,
     progress: Progress = silent,
 ) -> LocatedPhotographs:
     """Locate photographs, found once and kept in ``folder``: a COLMAP model, poses, ``handpiece.json``, ``scale.json``
     and the sparse points as ``points.ply``. With a COLMAP model, its poses are taken instead of found."""
-    options, scale = options or PhotographOptions(), scale or ScaleOptions()
+    options, scale = options or PhotographOptions(), scale or PhotoScaleOptions()
     settings = {"options": options, "scale": scale, "poses": colmap_model is not None}
     stage = Stage("photographs", folder, settings, _CODE)
     inputs = storage.hash_photographs(photographs)
@@ -96,7 +95,7 @@ def locate(
 
 
 def find_scale(
-    model: PhotoModel, photographs: Photographs, options: ScaleOptions, *, progress: Progress = silent
+    model: PhotoModel, photographs: Photographs, options: PhotoScaleOptions, *, progress: Progress = silent
 ) -> Scale | None:
     """What tells how large things are, None where nothing does: a board before distances."""
     board = options.board
@@ -104,7 +103,7 @@ def find_scale(
         sightings = _sightings(photographs, board, progress)
         return scale_by_board(model, sightings, board, len(photographs.names))
     if options.distance:
-        return scale_by_distances(model, [_picked(each, photographs) for each in options.distance])
+        return scale_by_distances(model, _picked(options, photographs))
     return None
 
 
@@ -157,12 +156,16 @@ def _sightings(photographs: Photographs, board: Board, progress: Progress) -> li
     return [each for each in found if each is not None]
 
 
-def _picked(given: Sequence[str | float], photographs: Photographs) -> PickedDistance:
-    """A distance of the command line: two photographs, and two places in each, in px of the upright picture."""
-    taken = [photographs[str(given[at])] for at in (0, 5)]
-    places = np.array([given[1:5], given[6:10]], dtype=np.float64).reshape(2, 2, 2)
-    pixels = np.stack([[each.in_sensor(place) for place in two] for each, two in zip(taken, places, strict=True)])
-    return PickedDistance(frames=(taken[0].name, taken[1].name), pixels=pixels, mm=float(given[10]))
+def _picked(options: PhotoScaleOptions, photographs: Photographs) -> list[PickedDistance]:
+    """The distances of the command line, whose places are px of the upright pictures."""
+    assert options.between is not None
+    taken = [photographs[name] for name in options.between]
+    picked = []
+    for *places, mm in options.distances:
+        upright = np.array(places, dtype=np.float64).reshape(2, 2, 2)
+        pixels = np.stack([[each.in_sensor(end) for end in two] for each, two in zip(taken, upright, strict=True)])
+        picked.append(PickedDistance(frames=(taken[0].name, taken[1].name), pixels=pixels, mm=mm))
+    return picked
 
 
 def _write(folder: Path, located: LocatedPhotographs) -> None:

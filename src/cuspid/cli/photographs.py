@@ -7,7 +7,7 @@ from pathlib import Path
 from cuspid import photograph_pipeline, pipeline, storage
 from cuspid.cli.shared import console, show_progress
 from cuspid.motion.colmap import hash_sparse
-from cuspid.photograph_pipeline import LocatedPhotographs, PhotographOptions, ScaleOptions
+from cuspid.photograph_pipeline import LocatedPhotographs, PhotographOptions, PhotoScaleOptions
 from cuspid.photographs import Photographs
 from cuspid.pipeline import ReconstructionOptions
 from cuspid.progress import Progress
@@ -21,7 +21,7 @@ def reconstruct_photographs(
     handpiece: Path | None,
     options: ReconstructionOptions,
     photographs: PhotographOptions,
-    scale: ScaleOptions,
+    scale: PhotoScaleOptions,
     model: Path | None = None,
 ) -> None:
     """Reconstruct, and tell how it went. ``model``: a COLMAP model, whose poses are taken."""
@@ -63,7 +63,7 @@ def _print(located: LocatedPhotographs, given: Photographs) -> None:
     if scale is None:
         console.print(
             "note: nothing tells the scale: the result has none, and its lengths are not millimetres; give --square-mm "
-            "for a board in the photographs, or a measured --distance"
+            "for a board in the photographs, or a measured --distance --between two of them"
         )
         return
     near, far = located.capture.handpiece.depth_range_mm

@@ -28,7 +28,7 @@ from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.motion.colmap import hash_model
 from cuspid.motion.photographs import PhotographOptions
-from cuspid.motion.scale import ScaleOptions
+from cuspid.motion.scale import PhotoScaleOptions
 from cuspid.motion.surface_tracking import glare_notes
 from cuspid.options import Range
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
@@ -87,7 +87,7 @@ def reconstruct(
     handpiece: Path | None = None,
     working_distance_mm: Annotated[float | None, Range(0.1, 100_000)] = None,
     from_poses: Path | None = None,
-    scale: Annotated[ScaleOptions, Flat] = ScaleOptions(),
+    scale: Annotated[PhotoScaleOptions, Flat] = PhotoScaleOptions(),
     photographs: PhotographOptions = PhotographOptions(),
     reconstruction: Annotated[ReconstructionOptions, Flat] = ReconstructionOptions(),
 ) -> None:
@@ -106,7 +106,7 @@ def reconstruct(
         given = reconstruction, photographs, scale, from_poses
         reconstruct_photographs(capture, out, handpiece, *given)
         return
-    if scale != ScaleOptions():
+    if scale != PhotoScaleOptions():
         raise InputError("--square-mm and --distance are for photographs of one camera; a handpiece knows the scale")
     reconstruct_capture(storage.read_capture(capture, handpiece, working_distance_mm), out, reconstruction, from_poses)
 

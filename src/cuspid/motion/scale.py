@@ -18,6 +18,7 @@ from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import best_similarity
 from cuspid.options import Range
 from cuspid.sparse_model import PhotoModel, Scale
+from cuspid.values import LONGEST_MM
 
 _LEAST_CORNERS = 6
 _ROUNDS = 8
@@ -27,32 +28,46 @@ _OUTLIER_SIGMAS = 4.0
 _BENT_SHARE, _BENT_SIGMAS = 0.002, 3.0
 """A board is bent where its corners lie off a plane by more than this share of its size, and this many times as far as
 they are off within it."""
+_NUMBERS = 9
+"""Of a distance: two ends in each of two photographs, and the mm between them."""
 _LEAST_MM, _READING_MM = 0.01, 0.1
 """The shortest distance, and an error in reading callipers."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScaleOptions(BoardPattern):
+class PhotoScaleOptions(BoardPattern):
     """What tells how large things are that one camera has photographed: a board, or measured distances."""
 
     square_mm: Annotated[float | None, Range(0.001, 10_000)] = None
     """Side of a square of a board that some photographs show, as measured on the print: it sets the scale."""
-    distance: tuple[tuple[str, float, float, float, float, str, float, float, float, float, float], ...] = ()
-    """A measured distance that sets the scale: a photograph, x and y of its two ends there (px, as viewers show it),
-    another photograph, x and y of the same ends there, and how many mm lie between them. May be given again."""
+    between: tuple[str, str] | None = None
+    """Two photographs from different sides in which the ends of measured distances were picked."""
+    distance: Annotated[tuple[float, ...], Range(-LONGEST_MM, LONGEST_MM)] = ()
+    """A measured distance that sets the scale: x and y of its two ends in the first of these photographs (px, as
+    viewers show it), x and y of the same ends in the second, and how many mm lie between them: nine numbers, and nine
+    more for each further distance."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for each in self.distance:
-            if not each[-1] >= _LEAST_MM or not np.isfinite([*each[1:5], *each[6:]]).all():
-                raise InputError(
-                    f"--distance: {each[-1]:g} mm between finite places; it must be {_LEAST_MM} mm or more"
-                )
-            if each[0] == each[5]:
-                raise InputError(f"--distance: {each[0]} twice; give two photographs from different sides")
         if self.distance and self.square_mm is not None:
             raise InputError("--distance and --square-mm both set the scale; give one of them")
+        if bool(self.distance) != (self.between is not None):
+            raise InputError("--distance needs --between, the two photographs in which its ends were picked, and back")
+        if self.between is not None and self.between[0] == self.between[1]:
+            raise InputError(f"--between: {self.between[0]} twice; give two photographs from different sides")
+        if len(self.distance) % _NUMBERS:
+            raise InputError(
+                f"--distance: {len(self.distance)} numbers; it takes X Y X Y X Y X Y MM, {_NUMBERS} for each"
+            )
+        for mm in self.distance[_NUMBERS - 1 :: _NUMBERS]:
+            if mm < _LEAST_MM:
+                raise InputError(f"--distance: {mm:g} mm; it must be {_LEAST_MM} mm or more")
         _ = self.board  # which checks the pattern
+
+    @property
+    def distances(self) -> tuple[tuple[float, ...], ...]:
+        """The nine numbers of each distance."""
+        return tuple(self.distance[k : k + _NUMBERS] for k in range(0, len(self.distance), _NUMBERS))
 
     @property
     def board(self) -> Board | None:
