@@ -16,10 +16,13 @@ from cuspid import cli, photograph_pipeline
 from cuspid.errors import CuspidError, InputError, ReconstructionError
 from cuspid.geometry import best_similarity
 from cuspid.motion.colmap import write_model
+from cuspid.motion.photograph_matches import detect_in_all
 from cuspid.motion.photograph_poses import take_photograph_poses
 from cuspid.motion.photographs import PhotographOptions, locate_photographs
-from cuspid.motion.scale import PhotoScaleOptions
-from cuspid.photographs import Photograph
+from cuspid.motion.scale import BoardSighting, PhotoScaleOptions, scale_by_board
+from cuspid.photographs import PhotoCamera, Photograph
+from cuspid.reconstruction import Tracks
+from cuspid.sparse_model import PhotoModel
 from cuspid.storage.photographs import is_photographs, read_photographs
 from photo_scene import BOARD, BOARD_PLACE_MM, WIDE, scene
 from synthetic_scene import speckle
@@ -83,6 +86,51 @@ def test_a_bent_board_is_told(model, photographs, monkeypatch):
     monkeypatch.setattr(type(BOARD), "corners", bent)
     (note,) = photograph_pipeline.find_scale(model, photographs, BOARD_OPTIONS).notes
     assert "bent" in note
+
+
+@pytest.mark.parametrize("kind", ["charuco", "chessboard"])
+def test_the_scale_of_exact_corners_is_exact(kind):
+    """In units of half a millimetre, with half of the chessboards numbered from the other end, and a corner astray."""
+    board = replace(BOARD, kind=kind)
+    in_world = board.corners + [*BOARD_PLACE_MM, 0.0]
+    tracks = Tracks(
+        points=np.zeros((0, 3)),
+        colors=np.zeros((0, 3), np.uint8),
+        point_index=np.zeros(0, int),
+        frame_index=np.zeros(0, int),
+        camera_index=np.zeros(0, int),
+        pixels=np.zeros((0, 2)),
+    )
+    exact = PhotoModel(
+        cameras={"camera": WIDE},
+        camera_of=dict.fromkeys(scene().poses, "camera"),
+        cam_from_world=scene().poses,
+        tracks=tracks,
+    ).scaled(2.0)
+    sightings = []
+    for k, (name, pose) in enumerate(scene().poses.items()):
+        pixels = WIDE.project(pose.apply(in_world))
+        pixels[5] += [0.0, 40.0] if k == 2 else 0.0
+        sightings.append(
+            BoardSighting(frame=name, corner=board.orders[-1 if k % 2 else 0], pixels=pixels)
+            if kind == "chessboard"
+            else BoardSighting(frame=name, corner=np.arange(len(pixels)), pixels=pixels)
+        )
+    scale = scale_by_board(exact, sightings, board, len(sightings))
+    assert scale.mm_per_unit == pytest.approx(0.5, rel=1e-6)
+    assert scale.residual_mm < 1e-4
+    with pytest.raises(ReconstructionError, match="1 of these could be"):
+        scale_by_board(exact, [replace(sightings[0], frame="elsewhere"), sightings[1]], board, 8)
+
+
+def test_a_calibration_is_held(photographs):
+    known = {"camera": PhotoCamera(size=(WIDE.width, WIDE.height), calibrated=WIDE)}
+    found = locate_photographs(replace(photographs, cameras=known))
+    assert found.cameras["camera"] is WIDE
+    true = scene().poses
+    scale, rotation, shift = best_similarity(centres(found.cam_from_world.values()), centres(true.values()))
+    off = scale * centres(found.cam_from_world.values()) @ rotation.T + shift - centres(true.values())
+    assert 0 < np.linalg.norm(off, axis=1).max() < 0.1
 
 
 def test_a_measured_distance_sets_the_scale(model, photographs):
@@ -229,8 +277,6 @@ def test_keypoints_outside_of_masks_are_not_used(folder, tmp_path):
         left = np.zeros((WIDE.height, WIDE.width), np.uint8)
         left[:, : WIDE.width // 2] = 255
         Image.fromarray(left).save(tmp_path / f"masks/{name}.png")
-    from cuspid.motion.photograph_matches import detect_in_all
-
     found = read_photographs(tmp_path, tmp_path)
     features, _ = detect_in_all(
         found.photographs[:2],
