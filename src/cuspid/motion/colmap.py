@@ -272,7 +272,11 @@ def read_sparse(folder: Path) -> pycolmap.Reconstruction:
                 for path in needed:
                     (Path(made) / path.name).write_bytes(read_bytes(path, "arrays"))
                 (Path(made) / f"{MODEL_FILES[2]}{suffix}").write_bytes(empty)
-                return _read(Path(made))
+                try:
+                    return _read(Path(made))
+                except InputError as error:
+                    message = f"{candidate}: the COLMAP model is damaged or of another version; export it again"
+                    raise InputError(message) from error
     return _read(folder)
 
 
