@@ -455,11 +455,12 @@ def _unplaced(order: Sequence[Photograph], found: _Attempt) -> list[Dropped]:
 
 def _notes(photographs: Photographs, model: PhotoModel, found: _Attempt) -> list[str]:
     notes = []
-    if len(found.models) > 1:
-        sizes = ", ".join(str(each.num_reg_images()) for each in found.models[1:])
+    placed, *others = (set(each.reg_image_ids()) for each in found.models)
+    apart = [len(other) for other in others if not other <= placed]
+    if apart:
         notes.append(
-            f"the largest of {len(found.models)} models is taken, with {found.located} photographs; the others have "
-            f"{sizes}: take photographs between them"
+            f"the largest of {1 + len(apart)} models is taken, with {found.located} photographs; the others have "
+            f"{', '.join(map(str, apart))}: take photographs between them"
         )
     for name, camera in model.cameras.items():
         known = photographs.cameras[name]
