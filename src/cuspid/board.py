@@ -26,8 +26,8 @@ Dictionary = Literal[
 
 
 @dataclass(frozen=True, kw_only=True)
-class Board(Options):
-    """A ChArUco board (a chessboard with a marker in each light square) or a plain chessboard."""
+class BoardPattern(Options):
+    """What is printed on a board, whatever its size."""
 
     kind: Literal["charuco", "chessboard"] = "charuco"
     """With markers (charuco), which tell the corners apart, so that the board may be seen in part, or without
@@ -36,8 +36,6 @@ class Board(Options):
     """Squares in a row."""
     rows: Annotated[int, Range(3, 100)] = 11
     """Squares in a column."""
-    square_mm: Annotated[float, Range(0.001, 10_000)] = 1.0
-    """Side of a square, as measured on the printed board."""
     marker_share: Annotated[float, Range(0.1, 0.95)] = 0.75
     """Side of a marker, as a share (0 to 1) of the side of its square."""
     dictionary: Dictionary = "4X4_1000"
@@ -46,6 +44,14 @@ class Board(Options):
     """Layout of OpenCV before 4.6 for boards with an even number of rows: a marker in the first corner."""
     inverted: bool = False
     """Light and dark are swapped."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Board(BoardPattern):
+    """A ChArUco board (a chessboard with a marker in each light square) or a plain chessboard."""
+
+    square_mm: Annotated[float, Range(0.001, 10_000)] = 1.0
+    """Side of a square, as measured on the printed board."""
     terraces: Annotated[int, Range(1, 50)] = 1
     """Number of flat pieces of whole columns, each higher than the one before; 1 is a flat board."""
     step_mm: Annotated[float, Range(0.001, 10_000)] = 1.0

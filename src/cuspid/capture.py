@@ -42,13 +42,19 @@ def read_deep(path: Path) -> UInt8[np.ndarray, "h w *c"] | UInt16[np.ndarray, "h
     return _decoded(path, None)
 
 
+def read_as_stored(path: Path) -> UInt8[np.ndarray, "h w 4"]:
+    """As :func:`read_rgba`, but in the grid of the sensor, whichever way the camera was held."""
+    return _decoded(path, "RGBA", upright=False)
+
+
 def _decoded(
-    path: Path, mode: Literal["RGB", "RGBA"] | None
+    path: Path, mode: Literal["RGB", "RGBA"] | None, *, upright: bool = True
 ) -> UInt8[np.ndarray, "h w *c"] | UInt16[np.ndarray, "h w"]:
     image_size(path)
     try:
         with Image.open(path) as image:
-            ImageOps.exif_transpose(image, in_place=True)
+            if upright:
+                ImageOps.exif_transpose(image, in_place=True)
             if mode is None and (image.mode == "L" or image.mode.startswith("I;16")):
                 return np.asarray(image).astype(np.uint8 if image.mode == "L" else np.uint16)
             deep = image.mode.startswith("I;16")
@@ -85,8 +91,9 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def _upright_size(image: Image.Image) -> tuple[int, int]:
-    """A camera that is held on its side keeps its image lying and says so; PNG would be decoded to be asked."""
-    lying = image.format != "PNG" and image.getexif().get(ExifTags.Base.Orientation) in (5, 6, 7, 8)
+    """A camera that is held on its side keeps its image lying and says so; PNG would be decoded to be asked, and Pillow
+    turns TIFF by itself."""
+    lying = image.format not in ("PNG", "TIFF") and image.getexif().get(ExifTags.Base.Orientation) in (5, 6, 7, 8)
     return (image.height, image.width) if lying else image.size
 
 
@@ -183,20 +190,20 @@ def has_opacity(path: Path) -> bool:
         return image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
 
 
-def file_digest(path: Path) -> str:
-    """SHA-256 of an image file, read once for each of its states. Raises InputError where it cannot be read."""
-    try:
-        state = path.stat()
-        return _file_digest(path, state.st_size, state.st_mtime_ns)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); put the image back") from error
-
-
 @cache
 def _file_digest(path: Path, size: int, modified_ns: int) -> str:
     """SHA-256 of a file, read once for each of its states."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of an image file, read once for each of its states. Raises InputError where it is missing."""
+    try:
+        state = path.stat()
+        return _file_digest(path, state.st_size, state.st_mtime_ns)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); put the image back") from error
 
 
 @dataclass(frozen=True)
@@ -232,9 +239,8 @@ class ImageFolder:
 
     def digest(self, frame: str, camera: str) -> str:
         """As :meth:`ImageSource.digest`."""
-        mask = self.mask_path(frame, camera)
-        image = file_digest(self.path(frame, camera))
-        return image if mask is None else hashlib.sha256(f"{image} {file_digest(mask)}".encode()).hexdigest()
+        paths = self.path(frame, camera), self.mask_path(frame, camera)
+        return " ".join(file_digest(path) for path in paths if path is not None)
 
     def where(self, frame: str, camera: str) -> str:
         """As :meth:`ImageSource.where`."""

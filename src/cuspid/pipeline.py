@@ -85,6 +85,8 @@ _DRAFT_KEYPOINTS, _DRAFT_HALVINGS = 500, 2
 _LEFT_SHARE, _DRAFT_LEFT_SHARE = 0.005, 1.0
 _DRAFT_ACROSS_LEFT_SHARE, _DRAFT_BEND_PX = 0.03, 1000.0
 _FINE_SPACING_PX, _FINE_VOXELS = 2, 0.5
+_MOST_PX = {"draft": 1_000_000, "standard": 3_500_000}
+"""Images with more pixels than this are halved before depth is measured."""
 _FITS_PX = 1.0
 """Matches may lie this far from their epipolar lines for a calibration to be taken as it is."""
 
@@ -176,7 +178,11 @@ def _hold_what_fits(
     offset_px = epipolar_offset_px(capture, options.tracking, cache=folder / "cache", progress=progress)
     if offset_px is not None and offset_px > _FITS_PX:
         return capture, ()
-    told = "too little is matched to refine it" if offset_px is None else f"its epipolar lines fit within {offset_px:.1f} px"
+    told = (
+        "too little is matched to refine it"
+        if offset_px is None
+        else f"its epipolar lines fit within {offset_px:.1f} px"
+    )
     note = f"calibration: held as in the file, which states no uncertainty: {told}"
     return replace(capture, handpiece=held(capture.handpiece)), (note,)
 
@@ -204,6 +210,7 @@ def surface(
     return fuse(
         *(depths, depths.digest, _poses(found, depths), detail, folder, *how),
         expected=found.expectation,
+        has_scale=found.has_scale,
         progress=progress,
     )
 
@@ -214,8 +221,17 @@ def matched(capture: Capture, options: ReconstructionOptions) -> Signal:
 
 
 def sized(capture: Capture, options: ReconstructionOptions) -> Capture:
-    """With images of the size that depth is measured from."""
-    return capture.halved() if options.quality == "draft" else capture
+    """With images of the size that depth is measured from: photographs of many megapixels are reduced."""
+    if options.quality == "draft":
+        capture = capture.halved()
+    while options.quality != "fine" and _largest_px(capture) > _MOST_PX[options.quality]:
+        capture = capture.halved()
+    return capture
+
+
+def _largest_px(capture: Capture) -> int:
+    """Number of pixels of the largest images."""
+    return max(each.camera.width * each.camera.height for each in capture.handpiece.rig.cameras.values())
 
 
 def _shaded_depth(

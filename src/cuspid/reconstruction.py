@@ -211,7 +211,8 @@ class Expectation:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Reconstruction:
-    """Located frames, in millimetres. The world frame is the rig frame of the first located frame."""
+    """Located frames, in millimetres unless ``has_scale`` is False. The world frame is the rig frame of the first
+    located frame."""
 
     rig: Rig
     """Refined calibration (the given one if it was held fixed)."""
@@ -230,6 +231,9 @@ class Reconstruction:
     the left of ``rig_from_world``."""
     reprojection_rms_px: float | None = None
     """RMS reprojection error of the sparse model."""
+    has_scale: bool = True
+    """False where nothing tells how large things are, as for the photographs of one camera: lengths are then in an
+    arbitrary unit, whatever the names of the fields say."""
     log: Mapping[str, float | int] = field(default_factory=dict)
     """Counts, and durations of the stages in seconds; units are in the keys."""
     notes: tuple[str, ...] = ()

@@ -15,6 +15,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from cuspid import pipeline, storage
 from cuspid.capture import Capture
+from cuspid.cli.photographs import reconstruct_photographs
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress, suited
 from cuspid.errors import InputError
@@ -26,6 +27,8 @@ from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.motion.colmap import hash_model
+from cuspid.motion.photographs import PhotographOptions
+from cuspid.motion.scale import PhotoScaleOptions
 from cuspid.motion.surface_tracking import glare_notes
 from cuspid.options import Range
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
@@ -84,18 +87,27 @@ def reconstruct(
     handpiece: Path | None = None,
     working_distance_mm: Annotated[float | None, Range(0.1, 100_000)] = None,
     from_poses: Path | None = None,
+    scale: Annotated[PhotoScaleOptions, Flat] = PhotoScaleOptions(),
+    photographs: PhotographOptions = PhotographOptions(),
     reconstruction: Annotated[ReconstructionOptions, Flat] = ReconstructionOptions(),
 ) -> None:
-    """Reconstruct poses and a mesh in millimetres from images and a handpiece file.
+    """Reconstruct poses and a mesh: in millimetres from images and a handpiece file, or from photographs of one camera,
+    whose scale a board or a measured distance tells.
 
     Args:
-        capture: Folder with images/<camera>/<frame>.png.
+        capture: Folder with images/<camera>/<frame>.png of a handpiece, folder of photographs, or video of one camera.
         out: Folder for depth/, motion/, mesh.ply and mesh.stl.
-        handpiece: Calibration (default: handpiece.json in the capture folder).
+        handpiece: Calibration (default: handpiece.json in the capture folder; photographs do not need one).
         working_distance_mm: Distance from the cameras to the teeth, for a rig_config.json, which does not contain it
             (guessed unless given).
         from_poses: Folder of a COLMAP model whose poses are used instead of finding them.
     """
+    if storage.is_photographs(capture, handpiece):
+        given = reconstruction, photographs, scale, from_poses
+        reconstruct_photographs(capture, out, handpiece, *given)
+        return
+    if scale != PhotoScaleOptions():
+        raise InputError("--square-mm and --distance are for photographs of one camera; a handpiece knows the scale")
     reconstruct_capture(storage.read_capture(capture, handpiece, working_distance_mm), out, reconstruction, from_poses)
 
 

@@ -8,6 +8,7 @@ repeatable bit for bit.
 from __future__ import annotations
 
 import shutil
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -140,9 +141,15 @@ def to_colmap(
     return model
 
 
-def write_model(folder: Path, found: Reconstruction, capture: Capture) -> None:
-    """Write COLMAP's sparse model (binary) to a folder, completely or not at all. Raises OutputError."""
+def write_model(folder: Path, found: Reconstruction, capture: Capture, names: Mapping[str, str] | None = None) -> None:
+    """Write COLMAP's sparse model (binary) to a folder, completely or not at all. Raises OutputError.
+
+    ``names``: of the image file of each frame, for photographs, which are not in COLMAP's rig layout.
+    """
     model = to_colmap(found, capture.frames, capture.source.suffix)
+    if names is not None:
+        for image in model.images.values():
+            image.name = names[Path(image.name).stem]
     with whole_files(folder) as part:
         try:
             model.write(part)
@@ -252,6 +259,36 @@ def _read(folder: Path) -> pycolmap.Reconstruction:
         return pycolmap.Reconstruction(folder)
     except (RuntimeError, ValueError, IndexError, MemoryError, KeyError, OverflowError) as error:
         raise InputError(f"{folder}: the COLMAP model cannot be read; copy or export it again") from error
+
+
+def read_sparse(folder: Path) -> pycolmap.Reconstruction:
+    """A model from disk, which may lack ``points3D``: cameras and images are enough. Raises InputError."""
+    for candidate in (folder, folder / "0", folder / "sparse", folder / "sparse" / "0"):
+        for suffix, empty in ((".bin", bytes(8)), (".txt", b"# none\n")):
+            needed = [candidate / f"{name}{suffix}" for name in MODEL_FILES[:2]]
+            if not all(path.is_file() for path in needed) or (candidate / f"{MODEL_FILES[2]}{suffix}").is_file():
+                continue
+            with tempfile.TemporaryDirectory() as made:
+                for path in needed:
+                    (Path(made) / path.name).write_bytes(read_bytes(path, "arrays"))
+                (Path(made) / f"{MODEL_FILES[2]}{suffix}").write_bytes(empty)
+                try:
+                    return _read(Path(made))
+                except InputError as error:
+                    message = f"{candidate}: the COLMAP model is damaged or of another version; export it again"
+                    raise InputError(message) from error
+    return _read(folder)
+
+
+def hash_sparse(folder: Path) -> str:
+    """As :func:`hash_model`, for a model that may lack ``points3D``; "" where there is none."""
+    for candidate in (folder, folder / "0", folder / "sparse", folder / "sparse" / "0"):
+        names = (*MODEL_FILES, "rigs", "frames")
+        files = sorted(candidate.iterdir()) if candidate.is_dir() else []
+        found = {path.name: hash_file(path) for path in files if path.stem in names and path.is_file()}
+        if found:
+            return digest_of(found)
+    return ""
 
 
 def _match_names(model: pycolmap.Reconstruction, capture: Capture, source: str) -> _PosedImages:

@@ -126,17 +126,22 @@ def brighten(gray: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     return np.asarray(cv2.convertScaleAbs(gray, alpha=255 / bright), dtype=np.uint8)
 
 
-def detect(image: UInt8[np.ndarray, "h w 3"], options: FeatureOptions | None = None) -> Features:
-    """Keypoints of an RGB image, evenly distributed."""
+def detect(
+    image: UInt8[np.ndarray, "h w 3"],
+    options: FeatureOptions | None = None,
+    mask: UInt8[np.ndarray, "h w"] | None = None,
+) -> Features:
+    """Keypoints of an RGB image, evenly distributed; with a mask, only where it is not zero."""
     options = options or FeatureOptions()
     height, width = image.shape[:2]
     gray = brighten(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8))
     searched = options.size_for(width, height)
     if searched != (width, height):
         gray = cv2.resize(gray, searched, interpolation=cv2.INTER_AREA)
+        mask = None if mask is None else cv2.resize(mask, searched, interpolation=cv2.INTER_NEAREST)
     px = np.array([width, height]) / searched
     sift = cv2.SIFT.create(contrastThreshold=options.contrast, edgeThreshold=options.edge, enable_precise_upscale=True)
-    keypoints = sift.detect(gray, None)
+    keypoints = sift.detect(gray, mask)
     if options.upright:
         keypoints = without_doubles(keypoints)
     most = options.count_for(width, height)
@@ -162,13 +167,14 @@ def _detect_kept(
     pictures: Pictures, frame: Frame, camera: str, options: FeatureOptions, stage: Stage | None
 ) -> Features:
     """Features of one image of a capture, from the results of an earlier run where they are there."""
+    mask = pictures.capture.source.mask(frame.name, camera)
     if stage is None:
-        return detect(pictures.image(frame, camera), options)
+        return detect(pictures.image(frame, camera), options, mask)
     path = stage.folder / camera / f"{frame.name}.npz"
     key = stage.key({"image": pictures.capture.source.digest(frame.name, camera)})
     if stage.has(key, [path]):
         return _load(path)
-    features = detect(pictures.image(frame, camera), options)
+    features = detect(pictures.image(frame, camera), options, mask)
     write_arrays(path, {name: getattr(features, name) for name in ("pixels", "descriptors", "colors")})
     stage.record(key, [path])
     return features

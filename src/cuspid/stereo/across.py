@@ -79,9 +79,7 @@ def measure_moving_cameras(
         measured = measure_views(
             *(views, both, handpiece.depth_range_mm, resolution, stereo), shaded=True, widenings=()
         )
-        found += depth_maps_of(
-            views, measured, both, masks, frame, resolution, stereo.confidence, stereo.grid_px
-        )
+        found += depth_maps_of(views, measured, both, masks, frame, resolution, stereo.confidence, stereo.grid_px)
     return tuple(
         replace(depth_map, confidence=(options.confidence_share * depth_map.confidence).astype(np.float32))
         for depth_map in found
@@ -130,9 +128,7 @@ def locate_views(
     see, or, where there are none, by how their fields of view overlap at the working distance."""
     rig = handpiece.rig
     images = [(f, c) for f in frames if f.name in found.rig_from_world for c in f.cameras]
-    places = [
-        MountedCamera(rig[c].camera, rig[c].cam_from_rig @ found.rig_from_world[f.name]) for f, c in images
-    ]
+    places = [MountedCamera(rig[c].camera, rig[c].cam_from_rig @ found.rig_from_world[f.name]) for f, c in images]
     sightings = _sightings([(f.name, c) for f, c in images], found)
     sources = _rank(places, sightings, found, handpiece.working_distance_mm, options)
     views = list[LocatedView]()

@@ -82,9 +82,7 @@ def _semi_global_one_way(
     return np.where(known, disparity, np.nan).astype(np.float32)
 
 
-def initial_pairs(
-    rig: Rig, sources: Mapping[str, Sequence[str]], distance_mm: float
-) -> Mapping[str, tuple[str, str]]:
+def initial_pairs(rig: Rig, sources: Mapping[str, Sequence[str]], distance_mm: float) -> Mapping[str, tuple[str, str]]:
     """For each view that has sources, the pair with the source that suits an initial match best: with a wide baseline,
     as long as both images look alike."""
     return {

@@ -340,9 +340,7 @@ class Match:
             return self._stack
         return np.stack([image - cv2.GaussianBlur(image, (0, 0), _SHADE_PX) + MID_GREY_DN for image in self._stack])
 
-    def measure(
-        self, index: int, known: Float[np.ndarray, "h w 6"] | None = None, *, widening: int = 1
-    ) -> Measured:
+    def measure(self, index: int, known: Float[np.ndarray, "h w 6"] | None = None, *, widening: int = 1) -> Measured:
         """Depth of a reference view before the checks; further to planes that are ``known``, as :func:`refine`."""
         view, grid, geometry = (each[index] for each in (self._views.views, self._views.grids, self._views.geometry))
         assert geometry is not None
@@ -366,7 +364,6 @@ class Match:
         sigma = np.sqrt(np.maximum(planes[..., VARIANCE], 0)) * depth**2 / geometry.scale
         begun = int(np.isfinite(layers).any(axis=0).sum())
         return Measured(grid, view.cam_from_rig, depth, sigma, begun, planes.astype(np.float32))
-
 
     def regularise(self, index: int, one: Measured, agreed: Float[np.ndarray, "h w 6"]) -> Measured:
         """What was measured of a view where other views agree with it (planes) and a smooth surface through the same

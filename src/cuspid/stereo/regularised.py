@@ -54,7 +54,13 @@ def sweep(
     zncc = np.empty((*one.shape, len(labels)), dtype=np.float32)
     for number, q in enumerate(labels):
         seen = [
-            _zncc(one, mean, variance, *_warped(other, np.linalg.inv(back) @ (a + q * _column(b)) @ to_full, one.shape), noise_dn)
+            _zncc(
+                one,
+                mean,
+                variance,
+                *_warped(other, np.linalg.inv(back) @ (a + q * _column(b)) @ to_full, one.shape),
+                noise_dn,
+            )
             for (other, back), a, b in zip(others, geometry.infinite, geometry.parallax, strict=True)
         ]
         # Half of the sources may look past what is in front of the surface there.

@@ -219,9 +219,7 @@ def measure_depth_across(
         step = steps[frame.name]
         now, after = capture.images(step.now), capture.images(step.after)
         masks = capture.masks(step.now) | {f"{name}+": mask for name, mask in capture.masks(step.after).items()}
-        return measure_moving_cameras(
-            capture.handpiece, now, after, masks, step.motion, frame.name, options, stereo
-        )
+        return measure_moving_cameras(capture.handpiece, now, after, masks, step.motion, frame.name, options, stereo)
 
     def inputs(frame: Frame) -> dict[str, str]:
         step = steps[frame.name]
@@ -284,9 +282,7 @@ def measure_view_depth(
 
 def _grids(rig: Rig, options: StereoOptions) -> dict[str, Camera]:
     """The camera of the depth maps of each camera."""
-    return {
-        name: coarser(IdealView.of(name, mounted).camera, options.grid_px) for name, mounted in rig.cameras.items()
-    }
+    return {name: coarser(IdealView.of(name, mounted).camera, options.grid_px) for name, mounted in rig.cameras.items()}
 
 
 class _Matched(NamedTuple):

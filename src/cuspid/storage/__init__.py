@@ -36,8 +36,10 @@ from cuspid.storage.meshes import (
     read_mesh,
     read_mesh_file,
     write_mesh,
+    write_points,
 )
 from cuspid.storage.panoramas import read_panorama, write_panorama, write_strip
+from cuspid.storage.photographs import hash_photographs, is_photographs, read_photographs
 from cuspid.storage.reconstructions import (
     read_depth_maps,
     read_poses,
@@ -89,9 +91,11 @@ __all__ = [
     "digest_of",
     "hash_capture",
     "hash_file",
+    "hash_photographs",
     "hash_source",
     "images_in",
     "is_jaw",
+    "is_photographs",
     "read_capture",
     "read_depth_maps",
     "read_frame_times",
@@ -103,6 +107,7 @@ __all__ = [
     "read_mesh",
     "read_mesh_file",
     "read_panorama",
+    "read_photographs",
     "read_poses",
     "read_reconstruction",
     "read_reference_render",
@@ -126,6 +131,7 @@ __all__ = [
     "write_mesh",
     "write_panorama",
     "write_path",
+    "write_points",
     "write_poses",
     "write_reconstruction",
     "write_reference_render",

@@ -47,7 +47,8 @@ def read_capture(folder: Path, handpiece: Path | None = None, working_distance_m
     images = folder / "images"
     if not images.is_dir():
         raise InputError(
-            f"{folder}: it contains no folder 'images'; give the folder that holds images/<camera>/<frame>.png"
+            f"{folder}: it contains no folder 'images'; give the folder that holds images/<camera>/<frame>.png, or one "
+            "of photographs"
         )
     known = read_handpiece(handpiece or folder / "handpiece.json", working_distance_mm)
     unknown = {path.name for path in images.iterdir() if path.is_dir()} - set(known.rig.names)

@@ -27,6 +27,7 @@ MM_PER_UNIT: Mapping[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25
 """Length units that a mesh file may be in."""
 
 _PLACE_AND_COLOR = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"}
+_COLOR = ("red", "green", "blue")
 _PLY_ELEMENT = re.compile(rb"^element\s+(\w+)\s+(\d{1,400})\s*$", re.MULTILINE)
 _LONGEST_HEADER = 1 << 16
 _LEAST_AREA = 1e-9
@@ -167,9 +168,10 @@ def write_mesh(
     face_labels: Int[np.ndarray, "f"] | None = None,
     *,
     values: Mapping[str, Float[np.ndarray, "v"]] = MappingProxyType({}),
+    comment: str | None = None,
 ) -> None:
-    """Write a mesh in mm: binary PLY (with colour, labels and values of the vertices by name), binary STL or OBJ, by
-    the file's suffix. CloudCompare shows such values as scalar fields."""
+    """Write a mesh in mm: binary PLY (with colour, labels, values of the vertices by name, and a comment of one line),
+    binary STL or OBJ, by the file's suffix. CloudCompare shows such values as scalar fields."""
     exported = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
     with _let_go(exported):
         for name, each in values.items():
@@ -177,4 +179,19 @@ def write_mesh(
         if face_labels is not None:
             exported.face_attributes["label"] = face_labels.astype(np.int32)
         data = exported.export(file_type=path.suffix.lower().lstrip("."))
-    write_bytes(path, data.encode() if isinstance(data, str) else data)
+    data = data.encode() if isinstance(data, str) else data
+    if comment is not None and data.startswith(b"ply\n"):
+        data = data.replace(b"\nelement ", f"\ncomment {comment}\nelement ".encode(), 1)
+    write_bytes(path, data)
+
+
+def write_points(path: Path, points: Float[np.ndarray, "n 3"], colors: UInt8[np.ndarray, "n 3"], comment: str) -> None:
+    """Write points with their colours as binary PLY, with a comment of one line."""
+    rows = np.zeros(len(points), dtype=[(axis, "<f8") for axis in "xyz"] + [(c, "u1") for c in _COLOR])
+    for number, axis in enumerate("xyz"):
+        rows[axis] = points[:, number]
+    for number, name in enumerate(_COLOR):
+        rows[name] = colors[:, number]
+    properties = [f"property double {axis}" for axis in "xyz"] + [f"property uchar {name}" for name in _COLOR]
+    header = ["ply", "format binary_little_endian 1.0", f"comment {comment}", f"element vertex {len(points)}"]
+    write_bytes(path, "\n".join([*header, *properties, "end_header", ""]).encode() + rows.tobytes())

@@ -56,6 +56,7 @@ def write_reconstruction(folder: Path, reconstruction: Reconstruction, handpiece
     write_json(
         folder / "reconstruction.json",
         {
+            "scale": "known" if reconstruction.has_scale else "unknown",
             "frames_located": len(reconstruction.rig_from_world),
             "frames_dropped": reconstruction.dropped,
             "points": 0 if reconstruction.tracks is None else len(reconstruction.tracks.points),
@@ -85,6 +86,7 @@ def read_reconstruction(folder: Path) -> Reconstruction:
             dropped=tuple(as_declared(Dropped, **entry) for entry in value["frames_dropped"]),
             pose_covariance=None if covariance is None else np.array(covariance, dtype=np.float64),
             reprojection_rms_px=value["reprojection_rms_px"],
+            has_scale=value.get("scale") != "unknown",
             log=value["log"],
             notes=tuple(value.get("notes", ())),
         )

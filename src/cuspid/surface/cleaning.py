@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple, no_type_check
+from typing import Annotated, Literal, NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -63,6 +63,8 @@ class CleaningReport:
     """Length of the outer boundaries, one for each piece."""
     sharpened_vertices: int = 0
     """Vertices that were moved afterwards onto sharp edges (:mod:`cuspid.surface.sharp_edges`)."""
+    scale: Literal["known", "unknown"] = "known"
+    """unknown: nothing tells the scale, and all lengths are in a unit of their own, whatever the names say."""
     funnel: Mapping[str, float] | None = None
     """What was left of the pixels from step to step, % (:class:`cuspid.reconstruction.Funnel`); None where that is not
     known."""

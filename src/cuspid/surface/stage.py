@@ -62,6 +62,7 @@ def fuse(
     sharp_edges: SharpEdgeOptions,
     *,
     expected: Expectation | None = None,
+    has_scale: bool = True,
     progress: Progress = silent,
 ) -> tuple[Mesh, Float[np.ndarray, "v"]]:
     """One clean mesh: ``mesh.ply`` with colour and ``sigma_um``, ``mesh.stl``, and in ``mesh.json`` what was removed
@@ -82,11 +83,22 @@ def fuse(
             raise ReconstructionError(f"no surface: {_what_took_it(funnel, len(raw.mesh.faces))}")
         sigma_um = _sigma_um(cleaned, raw, expected)
         mesh, moved = sharpened(cleaned, detail_mm, sharp_edges)
-        write_json(files[0], replace(report, sharpened_vertices=moved, funnel=None if funnel is None else funnel.shares_pct))
+        scale = "known" if has_scale else "unknown"
+        write_json(
+            files[0],
+            replace(
+                report, scale=scale, sharpened_vertices=moved, funnel=None if funnel is None else funnel.shares_pct
+            ),
+        )
         write_mesh(files[1], mesh)
-        write_mesh(files[2], mesh, values={SIGMA: sigma_um})
+        comment = None if has_scale else "scale unknown: lengths are not in mm"
+        write_mesh(files[2], mesh, values={SIGMA: sigma_um}, comment=comment)
 
-    inputs = {"depths": made_from, "poses": digest_of(dict(rig_from_world)), "expected": digest_of(expected)}
+    inputs = {
+        "depths": made_from,
+        "poses": digest_of(dict(rig_from_world)),
+        "expected": digest_of([expected, has_scale]),
+    }
     stage.make(inputs, files, write)
     made = read_mesh_file(files[2])
     return made.mesh, made.vertex_values[SIGMA]
