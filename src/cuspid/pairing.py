@@ -47,7 +47,7 @@ class PairingOptions(Options):
     """Share (0 to 1) of what either camera sees at the working distance that the other must see too."""
     maximum_angle_deg: Annotated[float, Range(0, 180)] = 45.0
     """Largest angle between their optical axes."""
-    maximum_sources: Annotated[int, Range(1, 100)] = 8
+    maximum_sources: Annotated[int, Range(1, 100)] = 6
     """Each view is matched with no more than this many others, the best ones."""
     minimum_share: Annotated[float, SHARE] = 0.15
     """A view is not matched with those that are worth less than this share (0 to 1) of the best one: 20 degrees apart

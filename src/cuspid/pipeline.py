@@ -87,6 +87,8 @@ _DRAFT_ACROSS_LEFT_SHARE, _DRAFT_BEND_PX = 0.03, 1000.0
 _FINE_SPACING_PX, _FINE_VOXELS = 2, 0.5
 _MOST_PX = {"draft": 1_000_000, "standard": 3_500_000}
 """Images with more pixels than this are halved before depth is measured."""
+_MOST_DEPTHS = 150_000
+"""Number of depths in a view, unless it is asked for more."""
 _FITS_PX = 1.0
 """Matches may lie this far from their epipolar lines for a calibration to be taken as it is."""
 
@@ -229,6 +231,14 @@ def sized(capture: Capture, options: ReconstructionOptions) -> Capture:
     return capture
 
 
+def _spaced(stereo: StereoOptions, capture: Capture) -> StereoOptions:
+    """With depth at so many pixels that a view of large images has not many more than one of a handpiece's."""
+    spacing_px = round(float(np.sqrt(_largest_px(capture) / _MOST_DEPTHS)))
+    if stereo.spacing_px is not None or spacing_px <= stereo.grid_px:
+        return stereo
+    return replace(stereo, spacing_px=spacing_px)
+
+
 def _largest_px(capture: Capture) -> int:
     """Number of pixels of the largest images."""
     return max(each.camera.width * each.camera.height for each in capture.handpiece.rig.cameras.values())
@@ -251,12 +261,12 @@ def _textured_depth(
 ) -> StoredDepthMaps:
     """Depth within frames and, where only one camera of a group saw the surface, from consecutive ones."""
     assert options.left_share is not None
-    handpiece = capture.handpiece
-    if not stereo_pairs(handpiece.rig, handpiece.working_distance_mm, options.stereo.pairing):
-        return measure_view_depth(capture, found, folder / "depth", options.stereo, progress=progress)
+    handpiece, stereo = capture.handpiece, _spaced(options.stereo, capture)
+    if not stereo_pairs(handpiece.rig, handpiece.working_distance_mm, stereo.pairing):
+        return measure_view_depth(capture, found, folder / "depth", stereo, progress=progress)
     agreement_mm = options.fusion.agreement * detail
     depths = measure_enough_depth(
-        *(capture, found, folder / "depth", options.stereo),
+        *(capture, found, folder / "depth", stereo),
         agreement_mm=agreement_mm,
         left_share=options.left_share,
         progress=progress,
@@ -268,7 +278,7 @@ def _textured_depth(
         located = depths, depths.digest, _poses(found, depths)
         holes = find_holes(*located, detail, folder, _of_quality(options, detail), progress=progress)
     return depths | measure_depth_across(
-        *(capture, found, depths, folder / "depth-across", options.across, options.stereo),
+        *(capture, found, depths, folder / "depth-across", options.across, stereo),
         agreement_mm=agreement_mm,
         least_maps=options.fusion.least_maps,
         holes=holes,

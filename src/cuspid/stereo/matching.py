@@ -38,6 +38,8 @@ from cuspid.stereo.shading import ShadedView, ShadingOptions, brightness, correc
 from cuspid.workers import computed_once, map_in_threads
 
 _SPACING_PX = 3
+_BLUR_SHARE = 0.5
+"""Standard deviation of the blur of images that only some pixels are sampled of, as a share of their distance."""
 _SHADE_PX = 4.0
 """What is wider than this is shade."""
 _WEAK_SIGMA_PX = 0.15
@@ -327,18 +329,27 @@ class Match:
     ) -> None:
         """RGB or grey images by the names of the views. ``shaded``: their brightness may be shade that does not stay
         on the surface, since lights move with the camera, or stand close by: wide windows must not gather it."""
-        self._shaded = shaded
+        self._shaded, self._blurred = shaded, dict[int, Float[np.ndarray, "c h w"]]()
         grays = {view.name: gray(images[view.name]) for view in views.views}
         self._views, self._range_mm, self._options = views, depth_range_mm, options
         self._initial = work(lambda pair: initial_points(pair, grays, semi_global, depth_range_mm), views.pairs)
         self._stack, self._sizes = stack_images([view.resample(grays[view.name]) for view in views.views])
 
     @computed_once
-    def _wide(self) -> Float[np.ndarray, "c h w"]:
+    def _detail(self) -> Float[np.ndarray, "c h w"]:
         """What wide windows see: the images, without what changes slowly where that may be shade."""
         if not self._shaded:
             return self._stack
         return np.stack([image - cv2.GaussianBlur(image, (0, 0), _SHADE_PX) + MID_GREY_DN for image in self._stack])
+
+    def _seen(self, widening: int) -> Float[np.ndarray, "c h w"]:
+        """The images for windows that are so many times wider, of which as many fewer pixels are sampled."""
+        if widening == 1:
+            return self._stack
+        if widening not in self._blurred:
+            blurs = [cv2.GaussianBlur(image, (0, 0), _BLUR_SHARE * widening) for image in self._detail]
+            self._blurred[widening] = np.stack(blurs)
+        return self._blurred[widening]
 
     def measure(self, index: int, known: Float[np.ndarray, "h w 6"] | None = None, *, widening: int = 1) -> Measured:
         """Depth of a reference view before the checks; further to planes that are ``known``, as :func:`refine`."""
@@ -346,15 +357,16 @@ class Match:
         assert geometry is not None
         height, width = self._sizes[index]
         layers = np.stack([initial_layer(self._initial[pair], view, grid) for pair in self._views.layers[index]])
+        seen = self._seen(widening)
         planes = refine(
-            self._stack if widening == 1 else self._wide,
+            seen,
             self._sizes,
             index,
             geometry,
             layers,
             self._range_mm,
             self._options.grid_px,
-            image_noise(self._stack[index, :height, :width]),
+            image_noise(seen[index, :height, :width]),
             self._options.refinement,
             known=known,
             widening=widening,
@@ -374,7 +386,7 @@ class Match:
         near, far = self._range_mm
         height, width = self._sizes[index]
         q, sigma_q = sweep(
-            self._wide,
+            self._detail,
             self._sizes,
             index,
             geometry,

@@ -192,9 +192,9 @@ def window_size(
     return (options.radius_px or 0) * widening or max(int(_REACH * sigma_px), 1), sigma_px
 
 
-def patch_window(radius_px: int, sigma_px: float) -> Float[np.ndarray, "3 k"]:
-    """Offsets du and dv over the window, row by row, and Gaussian weights with sum 1."""
-    offsets = np.arange(-radius_px, radius_px + 1)
+def patch_window(radius_px: int, sigma_px: float, step_px: int = 1) -> Float[np.ndarray, "3 k"]:
+    """Offsets du and dv over the window, row by row, of every so many pixels, and Gaussian weights with sum 1."""
+    offsets = step_px * np.arange(-(radius_px // step_px), radius_px // step_px + 1)
     du, dv = np.meshgrid(offsets, offsets)
     weights = np.exp(-0.5 * (du**2 + dv**2) / sigma_px**2)
     return np.stack([du.ravel(), dv.ravel(), (weights / weights.sum()).ravel()]).astype(np.float32)
@@ -597,7 +597,7 @@ def refine(
 ) -> Float[np.ndarray, "rows columns 6"]:
     """Refined planes on a grid of every ``spacing_px``-th pixel; SCORE is 0 where nothing was found. Those that are
     ``known`` stay; the others are sought from them and the initial depths, in windows that are ``widening`` times as
-    wide as usual.
+    wide as usual, with samples as far apart: the images should be that blurred.
 
     ``images`` are grey values 0 to 255 in float32, padded to one size; ``sizes`` are their true heights and widths.
     ``initial_mm`` are layers of initial depths on the grid, NaN where there is none; ``noise_dn`` is the noise of the
@@ -605,7 +605,7 @@ def refine(
     """
     height, width = sizes[reference]
     radius, sigma_px = window_size(options, images[reference, :height, :width], noise_dn, widening)
-    window = patch_window(radius, sigma_px)
+    window = patch_window(radius, sigma_px, widening)
     near, far = depth_range_mm
     view = _View(
         images=images,

@@ -330,8 +330,7 @@ def _check_views(
     def keep(name: str) -> tuple[Path, str]:
         file, of = folder / f"{name}.npz", by_frame[name]
         keys = [matched[j].key for k in of for j in (k, *views[k].sources) if j in matched]
-        masks = [capture.source.mask_digest(name, views[k].camera) for k in of]
-        inputs = {"matched": digest_of(keys), "masks": digest_of(masks)}
+        inputs = {"matched": digest_of(keys)}
         return file, stage.make(inputs, [file], lambda: write_depth_maps(file, [check(k) for k in of]))
 
     return StoredDepthMaps(dict(map_in_threads(keep, by_frame, stage=stage.name, progress=progress)))
