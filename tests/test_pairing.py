@@ -94,7 +94,7 @@ def around(*degrees: float) -> dict[str, Rigid3]:
     }
 
 
-@given(st.floats(0.1, 80.0))
+@given(st.floats(0.1, 70.0))
 def test_the_largest_angle_of_a_pair_is_still_one(angle):
     rig = rig_of(**around(0, angle))
     names = rig.names
@@ -104,7 +104,7 @@ def test_the_largest_angle_of_a_pair_is_still_one(angle):
     assert stereo_pairs(rig, 5.0, PairingOptions(minimum_overlap=0.0, maximum_angle_deg=0.99 * angle)) == ()
 
 
-@given(st.floats(5.0, 40.0), st.integers(5, 9))
+@given(st.floats(5.0, 30.0), st.integers(5, 9))
 def test_a_ring_is_no_group_each_camera_has_its_neighbours(step, count):
     rig = rig_of(**around(*(step * k for k in range(count))))
     ranked = rank_sources(rig, 5.0, PairingOptions(minimum_overlap=0.1))
@@ -127,7 +127,7 @@ def test_sources_do_not_depend_on_the_order_of_the_cameras(names):
 def test_views_share_points_or_are_no_sources():
     rng = np.random.default_rng(0)
     points = rng.normal(0, 1, (300, 3)) + [0, 0, 100]
-    centres = np.array([[0, 0, 0], [30.0, 0, 0], [0, 33.0, 0], [31.0, 30, 0], [400.0, 0, 100]])
+    centres = np.array([[0, 0, 0], [30.0, 0, 0], [0, 33.0, 0], [31.0, 30, 0], [0.0, 0, 10000]])
     half = np.arange(150)
     sightings = [(v, p) for v, seen in enumerate((range(300), half, half + 150, half + 150, range(300))) for p in seen]
     ranked = rank_by_points(centres, points, np.array(sightings))

@@ -28,6 +28,8 @@ _BEST_DEG = 8.0, 20.0
 of the same surface."""
 _FALL_DEG = 15.0
 """Beyond, what a source is worth falls as a Gaussian function of this standard deviation."""
+_LEAST_WORTH = 1e-3
+"""What is worth less is no source, even if there is no other: lines of sight that meet at 75 degrees, say."""
 _LEAST_SHARED = 12
 """Number of sparse points that two views must share to be matched."""
 _SHARED_ENOUGH = 150
@@ -109,8 +111,8 @@ def rank_by_points(
 def _best(worth: Float[np.ndarray, "v"], options: PairingOptions) -> tuple[int, ...]:
     """Indices of the views that are worth enough, best first."""
     order = np.argsort(-worth, kind="stable")[: options.maximum_sources]
-    least = options.minimum_share * worth.max(initial=0.0)
-    return tuple(int(k) for k in order if worth[k] > 0 and worth[k] >= least)
+    least = max(options.minimum_share * worth.max(initial=0.0), _LEAST_WORTH)
+    return tuple(int(k) for k in order if worth[k] >= least)
 
 
 def stereo_pairs(

@@ -76,9 +76,7 @@ def measure_moving_cameras(
             continue
         both = {name: images[name], moved: next_images[name]}
         views = prepare_views(pair, {name: (moved,), moved: (name,)}, handpiece.working_distance_mm, stereo)
-        measured = measure_views(
-            *(views, both, handpiece.depth_range_mm, resolution, stereo), shaded=True, widenings=()
-        )
+        measured = measure_views(views, both, handpiece.depth_range_mm, resolution, stereo, widenings=())
         found += depth_maps_of(views, measured, both, masks, frame, resolution, stereo.confidence, stereo.grid_px)
     return tuple(
         replace(depth_map, confidence=(options.confidence_share * depth_map.confidence).astype(np.float32))

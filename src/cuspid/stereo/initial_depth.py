@@ -107,8 +107,34 @@ def initial_points(
     """Points in the rig frame, mm, that a pair matcher finds within the depth range."""
     near, far = depth_range_mm
     first, second = pair.resample(images[pair.names[0]], images[pair.names[1]])
-    disparity = matcher(first, second, (pair.disparity(far), pair.disparity(near)))
-    rows, columns = np.nonzero(np.isfinite(disparity))
-    depth = pair.disparity(1.0) / disparity[rows, columns].astype(np.float64)
-    rays = pair.camera.rays(np.stack([columns, rows], axis=-1) + 0.5)
+    low, high = pair.disparity(far), pair.disparity(near)
+    start, end = _shared_columns(first, second, (low, high))
+    if start >= end:
+        return np.zeros((0, 3))
+    # Nothing is matched where only one of the images shows anything, nor at disparities below the lowest one.
+    shift = int(np.floor(low))
+    found = matcher(first[:, start:end].copy(), _shifted(second, shift)[:, start:end], (low - shift, high - shift))
+    rows, columns = np.nonzero(np.isfinite(found))
+    depth = pair.disparity(1.0) / (found[rows, columns].astype(np.float64) + shift)
+    rays = pair.camera.rays(np.stack([columns + start, rows], axis=-1) + 0.5)
     return pair.first_from_rig.inverse().apply(rays * depth[:, None])
+
+
+def _shared_columns(
+    first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"], disparities: tuple[float, float]
+) -> tuple[int, int]:
+    """Columns of the first image, from and up to which it shows something that the second may show, too."""
+    here, there = (np.flatnonzero(image.any(axis=0)) for image in (first, second))
+    if not len(here) or not len(there):
+        return 0, 0
+    low, high = int(np.floor(disparities[0])), int(np.ceil(disparities[1]))
+    return max(int(here[0]), int(there[0]) + low), min(int(here[-1]), int(there[-1]) + high) + 1
+
+
+def _shifted(image: UInt8[np.ndarray, "h w"], columns: int) -> UInt8[np.ndarray, "h w"]:
+    """The image so many columns to the right, black where it shows nothing."""
+    moved = np.zeros_like(image)
+    width = image.shape[1]
+    if abs(columns) < width:
+        moved[:, max(columns, 0) : width + min(columns, 0)] = image[:, max(-columns, 0) : width - max(columns, 0)]
+    return moved

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from threading import Lock
 from typing import Annotated, Any, Literal
 
@@ -284,7 +285,7 @@ class DepthEstimator:
             else:
                 measured = measure_views(
                     *(views, images, self.handpiece.depth_range_mm, self.resolution, self.options, work),
-                    shaded=bool(self.handpiece.lights),
+                    widenings=() if self.handpiece.lights else WIDENINGS,
                 )
             found += depth_maps_of(
                 views, measured, images, masks or {}, frame, self.resolution, self.checks, self.options.grid_px
@@ -325,14 +326,14 @@ class Match:
         options: StereoOptions,
         work: _Map = _one_by_one,
         *,
-        shaded: bool,
+        shaded: bool = False,
     ) -> None:
         """RGB or grey images by the names of the views. ``shaded``: their brightness may be shade that does not stay
         on the surface, since lights move with the camera, or stand close by: wide windows must not gather it."""
         self._shaded, self._blurred = shaded, dict[int, Float[np.ndarray, "c h w"]]()
         grays = {view.name: gray(images[view.name]) for view in views.views}
         self._views, self._range_mm, self._options = views, depth_range_mm, options
-        self._initial = work(lambda pair: initial_points(pair, grays, semi_global, depth_range_mm), views.pairs)
+        self._grays, self._work = grays, work
         self._stack, self._sizes = stack_images([view.resample(grays[view.name]) for view in views.views])
 
     @computed_once
@@ -351,12 +352,35 @@ class Match:
             self._blurred[widening] = np.stack(blurs)
         return self._blurred[widening]
 
-    def measure(self, index: int, known: Float[np.ndarray, "h w 6"] | None = None, *, widening: int = 1) -> Measured:
-        """Depth of a reference view before the checks; further to planes that are ``known``, as :func:`refine`."""
-        view, grid, geometry = (each[index] for each in (self._views.views, self._views.grids, self._views.geometry))
-        assert geometry is not None
-        height, width = self._sizes[index]
+    @computed_once
+    def _initial(self) -> list[Float[np.ndarray, "_ 3"]]:
+        """Points that each pair of views finds."""
+        find = partial(initial_points, images=self._grays, matcher=semi_global, depth_range_mm=self._range_mm)
+        return self._work(find, self._views.pairs)
+
+    def measure(self, index: int) -> Measured:
+        """Depth of a reference view before the checks."""
+        view, grid = self._views.views[index], self._views.grids[index]
         layers = np.stack([initial_layer(self._initial[pair], view, grid) for pair in self._views.layers[index]])
+        return self._refined(index, layers, begun=int(np.isfinite(layers).any(axis=0).sum()))
+
+    def widen(self, index: int, one: Measured, agreed: Float[np.ndarray, "h w 6"], widening: int) -> Measured:
+        """What was measured of a view where other views agree with it (planes), and what these planes, carried on to
+        the rest of it, lead to in wider windows."""
+        none = np.full((1, *one.depth_mm.shape), np.nan)
+        return self._refined(index, none, begun=one.begun, known=agreed, widening=widening)
+
+    def _refined(
+        self,
+        index: int,
+        layers: Float[np.ndarray, "l h w"],
+        *,
+        begun: int,
+        known: Float[np.ndarray, "h w 6"] | None = None,
+        widening: int = 1,
+    ) -> Measured:
+        geometry, (height, width) = self._views.geometry[index], self._sizes[index]
+        assert geometry is not None
         seen = self._seen(widening)
         planes = refine(
             seen,
@@ -374,8 +398,8 @@ class Match:
         found = planes[..., SCORE] > 0
         depth = geometry.scale / np.where(found, planes[..., Q], np.nan)
         sigma = np.sqrt(np.maximum(planes[..., VARIANCE], 0)) * depth**2 / geometry.scale
-        begun = int(np.isfinite(layers).any(axis=0).sum())
-        return Measured(grid, view.cam_from_rig, depth, sigma, begun, planes.astype(np.float32))
+        cam_from_rig = self._views.views[index].cam_from_rig
+        return Measured(self._views.grids[index], cam_from_rig, depth, sigma, begun, planes.astype(np.float32))
 
     def regularise(self, index: int, one: Measured, agreed: Float[np.ndarray, "h w 6"]) -> Measured:
         """What was measured of a view where other views agree with it (planes) and a smooth surface through the same
@@ -411,22 +435,23 @@ def measure_views(
     options: StereoOptions,
     work: _Map = _one_by_one,
     *,
-    shaded: bool,
     widenings: Sequence[int] = WIDENINGS,
 ) -> Mapping[int, Measured]:
     """Depth of each reference of a set of views by texture, before the last checks, by its index.
 
     Where other views contradict much of what was matched, as with weak texture, the rest of the view is matched again
-    in wider windows, from the planes that others agree with.
+    in windows that are so many times wider (``widenings``), from the planes that others agree with, and then made
+    smooth. That is not for surfaces under close lights that are known: what is weak there may be their shade, which
+    is another matter (:mod:`cuspid.stereo.shading`).
     """
-    match = Match(views, images, depth_range_mm, options, work, shaded=shaded)
+    match = Match(views, images, depth_range_mm, options, work)
     measured = dict(zip(views.references, work(match.measure, views.references), strict=True))
     for widening in widenings:
         before = dict(measured)
 
         def again(index: int, widening: int = widening, before: Mapping[int, Measured] = before) -> Measured:
             agreed = agreed_planes(before[index], sources_of(views, index, before), resolution, options.confidence)
-            return before[index] if agreed is None else match.measure(index, agreed, widening=widening)
+            return before[index] if agreed is None else match.widen(index, before[index], agreed, widening)
 
         measured = dict(zip(views.references, work(again, views.references), strict=True))
     if not widenings:

@@ -68,7 +68,7 @@ def sweep(
         zncc[..., number] = best.mean(axis=0)
     chosen = semi_global(1 - zncc, _SMALL, _LARGE)
     at = np.take_along_axis(zncc, np.rint(chosen).astype(np.int64)[..., None], axis=2)[..., 0]
-    q = np.where(at >= _LEAST_ZNCC, low + step * chosen, np.nan)
+    q = np.where(at >= _LEAST_ZNCC, np.clip(low + step * chosen, low, high), np.nan)
     return _on_grid(q, np.linalg.inv(to_full), (height, width), spacing_px), SIGMA_PX / scale
 
 

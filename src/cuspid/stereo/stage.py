@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt8
 
 from cuspid.camera import Camera
 from cuspid.capture import Capture, Frame
@@ -241,17 +241,21 @@ def measure_view_depth(
     """Depth maps of every image of the located frames, each from those images of any frame that suit it, kept in
     ``folder``. This needs no rig: one camera is enough."""
     views = locate_views(capture.handpiece, capture.frames, found, options.pairing)
-    read = lru_cache(maxsize=_KEPT_IMAGES)(lambda k: gray(capture.image(views[k].frame, views[k].camera)))
-    grids = _grids(capture.handpiece.rig, options)
+    ideal = {name: IdealView.of(name, mounted) for name, mounted in capture.handpiece.rig.cameras.items()}
+
+    @lru_cache(maxsize=_KEPT_IMAGES)
+    def read(k: int) -> UInt8[np.ndarray, "h w"]:
+        return ideal[views[k].camera].resample(gray(capture.image(views[k].frame, views[k].camera)))
 
     def match(k: int) -> Match:
         view, of = views[k], (k, *views[k].sources)
-        rig = Rig({_number(j): views[j].mounted for j in of})
+        rig = Rig({_number(j): replace(views[j].mounted, camera=ideal[views[j].camera].camera) for j in of})
         prepared = prepare_views(rig, {_number(k): [_number(j) for j in view.sources]}, view.distance_mm, options)
         return Match(prepared, {_number(j): read(j) for j in of}, view.depth_range_mm, options, shaded=True)
 
     def read_back(k: int) -> Measured:
-        return _read_measured(matched[k].file, grids[views[k].camera], views[k].mounted.cam_from_rig)
+        grid = coarser(ideal[views[k].camera].camera, options.grid_px)
+        return _read_measured(matched[k].file, grid, views[k].mounted.cam_from_rig)
 
     def first(k: int) -> _Matched:
         of = [views[j] for j in (k, *views[k].sources)]
@@ -268,7 +272,7 @@ def measure_view_depth(
             return matched[k]
         file = stage.folder / matched[k].file.name
         inputs = {"matched": digest_of([matched[j].key for j in (k, *others)])}
-        write = lambda: _write_measured(file, match(k).measure(0, agreed, widening=widening))  # noqa: E731
+        write = lambda: _write_measured(file, match(k).widen(0, one, agreed, widening))  # noqa: E731
         return _Matched(file, stage.make(inputs, [file], write))
 
     used = [k for k, view in enumerate(views) if view.sources]
@@ -295,14 +299,14 @@ class _Matched(NamedTuple):
 def _check_views(
     capture: Capture,
     views: Sequence[LocatedView],
+    ideal: Mapping[str, IdealView],
     matched: Mapping[int, _Matched],
     folder: Path,
     options: StereoOptions,
     progress: Progress,
 ) -> StoredDepthMaps:
     """The depth maps of views, frame by frame, from what was matched."""
-    ideal = {name: IdealView.of(name, mounted) for name, mounted in capture.handpiece.rig.cameras.items()}
-    grids = _grids(capture.handpiece.rig, options)
+    grids = {name: coarser(view.camera, options.grid_px) for name, view in ideal.items()}
     by_frame = dict[str, list[int]]()
     for k in matched:
         by_frame.setdefault(views[k].frame.name, []).append(k)
