@@ -140,6 +140,23 @@ def _evaluate(folder: Path) -> None:
     pipeline.evaluate(scan, against.jaw, EvaluationOptions(align=False, samples=2000))
 
 
+def _units(folder: Path) -> None:
+    """An arch in mm, and the same in text in whatever unit a damaged number makes of it."""
+    mesh = arch(1.6).mesh
+    storage.write_mesh(folder / "reference.stl", mesh)
+    loaded = trimesh.Trimesh(mesh.vertices / 1000, mesh.faces, process=False)
+    (folder / "metres.ply").write_bytes(loaded.export(file_type="ply", encoding="ascii"))
+
+
+def _compare_units(folder: Path) -> None:
+    """As the verb does until the surfaces are aligned."""
+    for unit in ("m", "mm", "um"):
+        with contextlib.suppress(CuspidError):
+            scan = storage.read_mesh(folder / "metres.ply", unit)
+            measured = storage.MeasuredFile(path=folder / "metres.ply", mesh=scan, unit=unit)
+            pipeline.load_reference(folder / "reference.stl", scan=measured)
+
+
 def _landmarks(folder: Path) -> None:
     points = small_jaw().landmarks
     storage.write_landmarks(folder / "own.json", points, "mesh")
@@ -404,6 +421,7 @@ SCENARIOS: Mapping[str, Scenario] = {
     "design": Scenario(_demand, verb("design", "@brief.toml", *SEARCH, "--out", f"@{_OUT}")),
     "reproduce": Scenario(_results, verb("reproduce", "--results", "@results", "--no-run", "--out", f"@{_OUT}")),
     "evaluate": Scenario(_meshes, _evaluate),
+    "units": Scenario(_units, _compare_units),
     "measure": Scenario(_arch, verb("measure", "@jaw.ply", "--out", f"@{_OUT}")),
     "simulate": Scenario(_probe, verb("simulate", "@jaw.ply", *PROBE, *SCAN, "--out", f"@{_OUT}")),
     "precision": Scenario(_probe, verb("precision", "@jaw.ply", *PROBE, "--out", f"@{_OUT}")),

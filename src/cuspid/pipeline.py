@@ -305,12 +305,16 @@ class Reference:
     """SHA-256 of the files, by what they contain."""
 
 
-def load_reference(path: Path, *, unit: storage.Unit = "mm", arch: Arch | None = None) -> Reference:
+def load_reference(
+    path: Path, *, unit: storage.Unit = "mm", arch: Arch | None = None, scan: storage.MeasuredFile | None = None
+) -> Reference:
     """What a scan is compared with: a mesh file, or the ``truth`` folder of a simulation, which also knows which faces
-    could be seen."""
+    could be seen. Raises InputError where a mesh is too small or too large for teeth, or for the ``scan``."""
     if not path.is_dir():
-        return _loaded_reference(path, unit, arch)
+        return _loaded_reference(path, unit, arch, scan)
     truth = storage.read_truth(path)
+    if scan is not None:
+        storage.require_one_unit(scan, storage.MeasuredFile(path=path, mesh=truth.jaw.mesh, unit="mm"))
     seen = scannable(truth, VisibilityOptions())
     return Reference(
         jaw=truth.jaw,
@@ -320,15 +324,29 @@ def load_reference(path: Path, *, unit: storage.Unit = "mm", arch: Arch | None =
     )
 
 
-def _loaded_reference(path: Path, unit: storage.Unit, arch: Arch | None) -> Reference:
+def _loaded_reference(
+    path: Path, unit: storage.Unit, arch: Arch | None, scan: storage.MeasuredFile | None
+) -> Reference:
     hashes = {"reference": storage.hash_file(path)}
     if storage.is_jaw(path):
         jaw = storage.read_jaw(path)
+        _require_sizes(storage.MeasuredFile(path=path, mesh=jaw.mesh, unit="mm", option=_REFERENCE_UNIT), scan)
         return Reference(jaw=jaw, scannable=None, crown=crown_surface(jaw), hashes=hashes)
     mesh, labels, _ = storage.read_labelled_mesh(path, unit)
+    _require_sizes(storage.MeasuredFile(path=path, mesh=mesh, unit=unit, option=_REFERENCE_UNIT), scan)
     jaw = Jaw(mesh=mesh, face_labels=labels, arch=arch)
     crown = crown_surface(jaw, find_occlusal_frame(mesh).occlusal_from_mesh)
     return Reference(jaw=jaw, scannable=None, crown=crown, hashes=hashes)
+
+
+_REFERENCE_UNIT = "--reference-unit"
+
+
+def _require_sizes(reference: storage.MeasuredFile, scan: storage.MeasuredFile | None) -> None:
+    """Before anything is looked for that takes memory by the size."""
+    if scan is not None:
+        storage.require_one_unit(scan, reference)
+    storage.require_size(reference)
 
 
 def crown_surface(

@@ -13,7 +13,8 @@ from cuspid.geometry import Rigid3
 from cuspid.jaw import ARCHES, Arch, Jaw
 from cuspid.storage.jaws import is_jaw, read_jaw, read_labelled_mesh
 from cuspid.storage.landmarks import MARKUPS_SUFFIX, read_landmarks
-from cuspid.storage.meshes import MESH_SUFFIXES, Unit
+from cuspid.storage.meshes import MESH_SUFFIXES
+from cuspid.storage.units import Unit
 
 
 def load_jaw(path: Path, *, unit: Unit = "mm", arch: Arch | None = None) -> tuple[Jaw, tuple[str, ...]]:

@@ -91,6 +91,7 @@ def _stitch_rig(folder: Path, out: Path, options: StitchOptions) -> None:
 
 def _view_mesh(path: Path, out: Path, unit: storage.Unit, options: MeshViewOptions) -> None:
     mesh, hashes = storage.read_mesh(path, unit), {"mesh": storage.hash_file(path)}
+    storage.require_size(storage.MeasuredFile(path=path, mesh=mesh, unit=unit))
     with show_progress() as progress, storage.claimed_folder(out, "stitch", {"view": options}, hashes, replace=True):
         views, occlusal_from_mesh = panorama_pipeline.view_mesh(mesh, options, progress=progress)
         clear(out)

@@ -29,10 +29,8 @@ from cuspid.storage.jaws import is_jaw, read_jaw, read_labelled_mesh, write_jaw
 from cuspid.storage.landmarks import MARKUPS_SUFFIX, LandmarkFile, LandmarkFrame, read_landmarks, write_landmarks
 from cuspid.storage.meshes import (
     MESH_SUFFIXES,
-    MM_PER_UNIT,
     SIGMA,
     MeshFile,
-    Unit,
     read_mesh,
     read_mesh_file,
     write_mesh,
@@ -62,6 +60,7 @@ from cuspid.storage.shapes import read_shape_model, write_shape_model
 from cuspid.storage.tables import csv_table, write_table
 from cuspid.storage.trueness import trueness_summary, write_trueness
 from cuspid.storage.truths import read_truth, write_path, write_truth
+from cuspid.storage.units import MM_PER_UNIT, MeasuredFile, Unit, require_one_unit, require_size
 from cuspid.storage.videos import write_video
 
 __all__ = [
@@ -75,6 +74,7 @@ __all__ = [
     "CalibrationResult",
     "LandmarkFile",
     "LandmarkFrame",
+    "MeasuredFile",
     "MeshFile",
     "PanoramaResult",
     "Result",
@@ -112,6 +112,8 @@ __all__ = [
     "read_shape_model",
     "read_truth",
     "reading",
+    "require_one_unit",
+    "require_size",
     "rig_sources",
     "trueness_summary",
     "whole_file",

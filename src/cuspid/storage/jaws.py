@@ -13,7 +13,8 @@ from cuspid.inputs import require_file
 from cuspid.jaw import ARCHES, FDI_FROM_UNIVERSAL, Arch, Jaw, Landmark, Sphere
 from cuspid.mesh import Mesh
 from cuspid.storage.files import read_json, reading, write_json
-from cuspid.storage.meshes import MESH_SUFFIXES, MeshFile, Unit, read_mesh_file, write_mesh
+from cuspid.storage.meshes import MESH_SUFFIXES, MeshFile, read_mesh_file, write_mesh
+from cuspid.storage.units import Unit
 from cuspid.values import LONGEST_MM, number, numbers, one_line, shown
 
 _LARGEST_LABEL = 10_000

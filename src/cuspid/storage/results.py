@@ -29,10 +29,11 @@ from cuspid.storage.captures import read_capture
 from cuspid.storage.files import hash_file, read_json, read_manifest, reading
 from cuspid.storage.handpieces import read_handpiece
 from cuspid.storage.jaws import is_jaw, read_jaw, read_labelled_mesh
-from cuspid.storage.meshes import SIGMA, MeshFile, Unit, read_mesh_file
+from cuspid.storage.meshes import SIGMA, MeshFile, read_mesh_file
 from cuspid.storage.panoramas import read_panorama
 from cuspid.storage.reconstructions import read_reconstruction
 from cuspid.storage.shapes import read_shape_model
+from cuspid.storage.units import Unit
 from cuspid.values import LONGEST_MM, numbers
 
 
