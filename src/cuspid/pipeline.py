@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float
 
 from cuspid import storage
 from cuspid.anatomy.crowns import crowns_of
+from cuspid.anatomy.jaw_files import Labelling
 from cuspid.anatomy.orientation import find_occlusal_frame
 from cuspid.capture import Capture
 from cuspid.evaluation.crown import OpenCrown, open_parts, pieces
@@ -303,15 +304,22 @@ class Reference:
     """The open crown surface; None if nothing is crown or looks like it."""
     hashes: Mapping[str, str]
     """SHA-256 of the files, by what they contain."""
+    notes: tuple[str, ...] = ()
+    """How its files were understood."""
 
 
 def load_reference(
-    path: Path, *, unit: storage.Unit = "mm", arch: Arch | None = None, scan: storage.MeasuredFile | None = None
+    path: Path,
+    *,
+    unit: storage.Unit = "mm",
+    arch: Arch | None = None,
+    scan: storage.MeasuredFile | None = None,
+    labelling: Labelling = Labelling(),
 ) -> Reference:
     """What a scan is compared with: a mesh file, or the ``truth`` folder of a simulation, which also knows which faces
     could be seen. Raises InputError where a mesh is too small or too large for teeth, or for the ``scan``."""
     if not path.is_dir():
-        return _loaded_reference(path, unit, arch, scan)
+        return _loaded_reference(path, unit, arch, scan, labelling)
     truth = storage.read_truth(path)
     if scan is not None:
         storage.require_one_unit(scan, storage.MeasuredFile(path=path, mesh=truth.jaw.mesh, unit="mm"))
@@ -325,7 +333,7 @@ def load_reference(
 
 
 def _loaded_reference(
-    path: Path, unit: storage.Unit, arch: Arch | None, scan: storage.MeasuredFile | None
+    path: Path, unit: storage.Unit, arch: Arch | None, scan: storage.MeasuredFile | None, labelling: Labelling
 ) -> Reference:
     hashes = {"reference": storage.hash_file(path)}
     if storage.is_jaw(path):
@@ -334,9 +342,15 @@ def _loaded_reference(
         return Reference(jaw=jaw, scannable=None, crown=crown_surface(jaw), hashes=hashes)
     mesh, labels, _ = storage.read_labelled_mesh(path, unit)
     _require_sizes(storage.MeasuredFile(path=path, mesh=mesh, unit=unit, option=_REFERENCE_UNIT), scan)
+    occlusal = find_occlusal_frame(mesh)
+    notes: tuple[str, ...] = ()
+    if labels is not None:
+        upright = mesh.transformed(occlusal.occlusal_from_mesh)
+        numbered = labelling.fdi(path, labels, upright, arch=arch, sure=not occlusal.notes)
+        labels, notes = numbered.labels, numbered.notes
     jaw = Jaw(mesh=mesh, face_labels=labels, arch=arch)
-    crown = crown_surface(jaw, find_occlusal_frame(mesh).occlusal_from_mesh)
-    return Reference(jaw=jaw, scannable=None, crown=crown, hashes=hashes)
+    crown = crown_surface(jaw, occlusal.occlusal_from_mesh)
+    return Reference(jaw=jaw, scannable=None, crown=crown, hashes=hashes, notes=notes)
 
 
 _REFERENCE_UNIT = "--reference-unit"

@@ -180,7 +180,11 @@ def _measure_trueness(
     file = storage.read_mesh_file(mesh, source.unit)
     scan, sigma_um = file.mesh, file.vertex_values.get(storage.SIGMA)
     measured = storage.MeasuredFile(path=mesh, mesh=scan, unit=source.unit)
-    against = pipeline.load_reference(reference, unit=reference_unit, arch=source.arch, scan=measured)
+    against = pipeline.load_reference(
+        reference, unit=reference_unit, arch=source.arch, scan=measured, labelling=source.labelling
+    )
+    for note in against.notes:
+        console.print(f"note: {note}")
     known, hashes = against.jaw, {**against.hashes, "mesh": storage.hash_file(mesh)}
     with storage.claimed_folder(out, "evaluate", {"evaluation": options}, hashes, replace=True):
         trueness = pipeline.evaluate(

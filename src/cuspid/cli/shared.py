@@ -14,7 +14,8 @@ from rich.progress import Progress as Bars
 from tyro.conf import arg
 
 from cuspid import storage
-from cuspid.anatomy.jaw_files import load_jaw
+from cuspid.anatomy.jaw_files import Labelling, load_jaw
+from cuspid.anatomy.numbering import Numbering
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
@@ -48,8 +49,17 @@ class Source(Options):
     """Length unit of the mesh file."""
     arch: Arch | None = None
     """Which jaw the file contains, if its teeth are to be numbered; for the phantom, lower by default."""
+    labels: Numbering = "auto"
+    """Numbers of the tooth labels in the file; found out from where the teeth stand unless given."""
+    label_map: Path | None = None
+    """JSON file of each label in the mesh file and its FDI number, for other numbers: {"1": 47, "2": 46}."""
     jaw_seed: Annotated[int, SEED] = 0
     """Seed that selects the individual of the built-in phantom."""
+
+    @property
+    def labelling(self) -> Labelling:
+        """How the tooth labels of the file are understood."""
+        return Labelling(numbering=self.labels, label_map=self.label_map)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +98,7 @@ def load_source(mesh: Path | None, source: Source) -> Jaw:
     """The jaw of a file in the occlusal frame, or the phantom; prints notes on what was found or is uncertain."""
     if mesh is None:
         return build_phantom(PhantomOptions(arch=source.arch or "lower", seed=source.jaw_seed))
-    jaw, notes = load_jaw(mesh, unit=source.unit, arch=source.arch)
+    jaw, notes = load_jaw(mesh, unit=source.unit, arch=source.arch, labelling=source.labelling)
     for note in notes:
         console.print(f"note: {note}")
     return jaw

@@ -25,7 +25,7 @@ from cuspid.storage.files import (
 )
 from cuspid.storage.frame_times import TIMES_FILES, read_frame_times
 from cuspid.storage.handpieces import read_handpiece, read_rig_config, write_handpiece, write_rig_config
-from cuspid.storage.jaws import is_jaw, read_jaw, read_labelled_mesh, write_jaw
+from cuspid.storage.jaws import is_jaw, read_jaw, read_label_map, read_labelled_mesh, write_jaw
 from cuspid.storage.landmarks import MARKUPS_SUFFIX, LandmarkFile, LandmarkFrame, read_landmarks, write_landmarks
 from cuspid.storage.meshes import (
     MESH_SUFFIXES,
@@ -98,6 +98,7 @@ __all__ = [
     "read_handpiece",
     "read_jaw",
     "read_json",
+    "read_label_map",
     "read_labelled_mesh",
     "read_landmarks",
     "read_mesh",
