@@ -35,6 +35,7 @@ from cuspid.board import Board
 from cuspid.capture import read_image
 from cuspid.errors import CuspidError
 from cuspid.evaluation.deviation import EvaluationOptions
+from cuspid.facing import facing_outwards
 from cuspid.handpiece.brief import read_brief
 from cuspid.handpiece.designs import DESIGNS
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
@@ -130,7 +131,7 @@ def _meshes(folder: Path) -> None:
 def _read_meshes(folder: Path) -> None:
     for path in sorted(folder.glob("*.*")):
         if path.suffix in storage.MESH_SUFFIXES:
-            storage.read_labelled_mesh(path)
+            facing_outwards(storage.read_labelled_mesh(path)[0])
     storage.read_jaw(folder / "jaw.ply")
 
 

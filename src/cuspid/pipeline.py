@@ -27,6 +27,7 @@ from cuspid.anatomy.orientation import find_occlusal_frame
 from cuspid.capture import Capture
 from cuspid.evaluation.crown import OpenCrown, open_parts, pieces
 from cuspid.evaluation.deviation import EvaluationOptions, evaluate
+from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Arch, Jaw
 from cuspid.memory import give_back
@@ -342,15 +343,17 @@ def _loaded_reference(
         return Reference(jaw=jaw, scannable=None, crown=crown_surface(jaw), hashes=hashes)
     mesh, labels, _ = storage.read_labelled_mesh(path, unit)
     _require_sizes(storage.MeasuredFile(path=path, mesh=mesh, unit=unit, option=_REFERENCE_UNIT), scan)
+    mesh, notes = facing_outwards(mesh)
     occlusal = find_occlusal_frame(mesh)
-    notes: tuple[str, ...] = ()
     if labels is not None:
         upright = mesh.transformed(occlusal.occlusal_from_mesh)
         numbered = labelling.fdi(path, labels, upright, arch=arch, sure=not occlusal.notes)
-        labels, notes = numbered.labels, numbered.notes
+        labels, notes = numbered.labels, (*notes, *numbered.notes)
     jaw = Jaw(mesh=mesh, face_labels=labels, arch=arch)
     crown = crown_surface(jaw, occlusal.occlusal_from_mesh)
-    return Reference(jaw=jaw, scannable=None, crown=crown, hashes=hashes, notes=notes)
+    return Reference(
+        jaw=jaw, scannable=None, crown=crown, hashes=hashes, notes=tuple(f"reference: {note}" for note in notes)
+    )
 
 
 _REFERENCE_UNIT = "--reference-unit"

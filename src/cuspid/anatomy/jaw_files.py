@@ -13,6 +13,7 @@ from cuspid.anatomy.landmarks.scheme import in_frame, missing, validate
 from cuspid.anatomy.numbering import Numbered, Numbering, number_teeth
 from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, labels_from_colors
 from cuspid.errors import InputError
+from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
 from cuspid.jaw import ARCHES, Arch, Jaw
 from cuspid.mesh import Mesh
@@ -67,10 +68,11 @@ def _load_oriented(
     if is_jaw(path):
         return read_jaw(path), (), Rigid3.identity()
     mesh, labels, colors = read_labelled_mesh(path, unit)
-    notes = check_scale(mesh, unit)
+    scale = check_scale(mesh, unit)
+    mesh, facing = facing_outwards(mesh)
     occlusal = find_occlusal_frame(mesh)
     moved = mesh.transformed(occlusal.occlusal_from_mesh)
-    notes = (*notes, *occlusal.notes)
+    notes = (*scale, *facing, *occlusal.notes)
     if labels is not None:
         numbered = labelling.fdi(path, labels, moved, arch=arch, sure=not occlusal.notes)
         labels, notes = numbered.labels, (*notes, *numbered.notes)

@@ -75,6 +75,9 @@ def find_occlusal_frame(mesh: Mesh) -> OcclusalFrame:
     level = _level(mesh, start)
     relief = _relief(mesh, level)
     crowns = relief.crowns()
+    if len(crowns) == 0:
+        note = "occlusal frame: unsure, as nothing looks like a crown; check the picture"
+        return OcclusalFrame(occlusal_from_mesh=level, notes=(*notes_up, note))
     anterior, notes_front = _anterior(crowns[:, :2])
     centre = np.array([*crowns[:, :2].mean(axis=0), relief.tips()[:, 2].mean()])
     turn = np.array([[anterior[1], -anterior[0], 0], [anterior[0], anterior[1], 0], [0, 0, 1.0]])

@@ -13,6 +13,7 @@ from cuspid import panorama_pipeline, storage
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
 from cuspid.errors import InputError
+from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
 from cuspid.image_sequence import ImageSequence
 from cuspid.motion.single import loosely_held
@@ -92,6 +93,7 @@ def _stitch_rig(folder: Path, out: Path, options: StitchOptions) -> None:
 def _view_mesh(path: Path, out: Path, unit: storage.Unit, options: MeshViewOptions) -> None:
     mesh, hashes = storage.read_mesh(path, unit), {"mesh": storage.hash_file(path)}
     storage.require_size(storage.MeasuredFile(path=path, mesh=mesh, unit=unit))
+    mesh, facing = facing_outwards(mesh)
     with show_progress() as progress, storage.claimed_folder(out, "stitch", {"view": options}, hashes, replace=True):
         views, occlusal_from_mesh = panorama_pipeline.view_mesh(mesh, options, progress=progress)
         clear(out)
@@ -102,7 +104,7 @@ def _view_mesh(path: Path, out: Path, unit: storage.Unit, options: MeshViewOptio
     width_mm, depth_mm = views.panorama.size_mm or (0.0, 0.0)
     strips = ", ".join(views.strips) or "none"
     console.print(f"{out / 'panorama.png'}: {width_mm:.1f} x {depth_mm:.1f} mm; strips: {strips}")
-    for note in views.panorama.notes:
+    for note in (*facing, *views.panorama.notes):
         console.print(f"note: {note}")
 
 

@@ -22,6 +22,7 @@ from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.evaluation.margin import MarginError, cut_margins, margin_error
 from cuspid.evaluation.spheres import SphereReport, evaluate_spheres
 from cuspid.evaluation.trajectory import trajectory_error
+from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
@@ -178,12 +179,12 @@ def _measure_trueness(
     mesh: Path, reference: Path, out: Path, source: Source, options: EvaluationOptions, reference_unit: storage.Unit
 ) -> None:
     file = storage.read_mesh_file(mesh, source.unit)
-    scan, sigma_um = file.mesh, file.vertex_values.get(storage.SIGMA)
+    (scan, facing), sigma_um = facing_outwards(file.mesh), file.vertex_values.get(storage.SIGMA)
     measured = storage.MeasuredFile(path=mesh, mesh=scan, unit=source.unit)
     against = pipeline.load_reference(
         reference, unit=reference_unit, arch=source.arch, scan=measured, labelling=source.labelling
     )
-    for note in against.notes:
+    for note in (*(f"scan: {note}" for note in facing), *against.notes):
         console.print(f"note: {note}")
     known, hashes = against.jaw, {**against.hashes, "mesh": storage.hash_file(mesh)}
     with storage.claimed_folder(out, "evaluate", {"evaluation": options}, hashes, replace=True):

@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from cuspid.capture import Capture
 from cuspid.errors import InputError
+from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
 from cuspid.inputs import read_text
 from cuspid.jaw import FDI_FROM_UNIVERSAL, GUM, Jaw
@@ -251,7 +252,7 @@ def _reference(folder: Path, run: Mapping[str, Any], given: Path | None, unit: U
     mesh, labels, _ = read_labelled_mesh(path, unit)
     # Labels of another numbering, which the evaluation understood, would name the wrong teeth.
     fdi = labels is not None and teeth <= set(map(str, np.unique(labels))) <= _FDI
-    return Jaw(mesh=mesh, face_labels=labels if fdi else None)
+    return Jaw(mesh=facing_outwards(mesh)[0], face_labels=labels if fdi else None)
 
 
 _FDI = {str(GUM), *map(str, FDI_FROM_UNIVERSAL.values())}
