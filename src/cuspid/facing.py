@@ -52,6 +52,12 @@ def facing_outwards(mesh: Mesh) -> tuple[Mesh, tuple[str, ...]]:
     return (_turned(mesh, turned) if turned.any() else mesh), notes
 
 
+def pieces_of(mesh: Mesh) -> Int[np.ndarray, "f"]:
+    """The number of the piece of each face; faces that share an edge are of one piece."""
+    one, other, _ = _neighbours(mesh)
+    return _linked(len(mesh.faces), one, other)
+
+
 def _told(mesh: Mesh, turned: Bool[np.ndarray, "f"]) -> str:
     share = float(mesh.face_areas[turned].sum() / max(float(mesh.face_areas.sum()), 1e-300))
     return "all" if turned.all() else f"{turned.sum()} of {len(turned)} ({share:.0%} of the surface)"

@@ -11,12 +11,13 @@ from jaxtyping import Int
 from cuspid.anatomy.landmarks.estimation import with_estimates
 from cuspid.anatomy.landmarks.scheme import in_frame, missing, validate
 from cuspid.anatomy.numbering import Numbered, Numbering, number_teeth
-from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, labels_from_colors
+from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, labels_from_colors, require_one_jaw
 from cuspid.errors import InputError
 from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
 from cuspid.jaw import ARCHES, Arch, Jaw
 from cuspid.mesh import Mesh
+from cuspid.storage.files import reading
 from cuspid.storage.jaws import is_jaw, read_jaw, read_label_map, read_labelled_mesh
 from cuspid.storage.landmarks import MARKUPS_SUFFIX, read_landmarks
 from cuspid.storage.meshes import MESH_SUFFIXES
@@ -70,6 +71,8 @@ def _load_oriented(
     mesh, labels, colors = read_labelled_mesh(path, unit)
     scale = check_scale(mesh, unit)
     mesh, facing = facing_outwards(mesh)
+    with reading(path):
+        require_one_jaw(mesh)
     occlusal = find_occlusal_frame(mesh)
     moved = mesh.transformed(occlusal.occlusal_from_mesh)
     notes = (*scale, *facing, *occlusal.notes)

@@ -10,6 +10,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from cuspid import panorama_pipeline, storage
+from cuspid.anatomy.orientation import require_one_jaw
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
 from cuspid.errors import InputError
@@ -94,6 +95,8 @@ def _view_mesh(path: Path, out: Path, unit: storage.Unit, options: MeshViewOptio
     mesh, hashes = storage.read_mesh(path, unit), {"mesh": storage.hash_file(path)}
     storage.require_size(storage.MeasuredFile(path=path, mesh=mesh, unit=unit))
     mesh, facing = facing_outwards(mesh)
+    with storage.reading(path):
+        require_one_jaw(mesh)
     with show_progress() as progress, storage.claimed_folder(out, "stitch", {"view": options}, hashes, replace=True):
         views, occlusal_from_mesh = panorama_pipeline.view_mesh(mesh, options, progress=progress)
         clear(out)
