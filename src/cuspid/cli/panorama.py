@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 from cuspid import panorama_pipeline, storage
 from cuspid.anatomy.orientation import require_one_jaw
 from cuspid.cli.report import report
-from cuspid.cli.shared import Flat, console, show_progress
+from cuspid.cli.shared import Flat, console, named, show_progress
 from cuspid.errors import InputError
 from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
@@ -182,10 +182,3 @@ def left_out(frames: Iterable[FrameUse]) -> list[str]:
         if not frame.used and frame.reason is not None and not frame.reason.startswith("in part "):
             names.setdefault(frame.reason.split(":")[0], []).append(frame.name)
     return [f"{len(each)} frames, {reason}: {named(each)}" for reason, each in names.items()]
-
-
-def named(names: list[str], most: int = 6) -> str:
-    """Names on one line; if there are many, those in the middle are left out."""
-    if len(names) <= most:
-        return ", ".join(names)
-    return f"{', '.join(names[: most - 1])} ... {names[-1]}"

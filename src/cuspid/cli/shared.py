@@ -120,3 +120,10 @@ def suited(probe: Probe, texture: Preset) -> Probe:
     if plain:
         console.print("note: plain enamel takes coloured lights and crossed polarisers (--lights white for others)")
     return replace(probe, lights="colour-coded" if plain else "white")
+
+
+def named(names: list[str], most: int = 6) -> str:
+    """Names on one line; if there are many, those in the middle are left out."""
+    if len(names) <= most:
+        return ", ".join(names)
+    return f"{', '.join(names[: most - 1])} ... {names[-1]}"
