@@ -28,6 +28,7 @@ import trimesh
 from boards import photographs, scene, undistorted
 from builders import image_path, write_frames
 from cuspid import cli, pipeline, storage
+from cuspid.anatomy.jaw_files import Labelling, load_jaw
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.arch_curve import arch_curve
@@ -364,6 +365,30 @@ def _photographs(folder: Path) -> None:
     photographs(folder / "photos", replace(whole, cameras=halved), Board(columns=6, rows=5, square_mm=3.0))
 
 
+def _labelled(folder: Path) -> None:
+    """An arch whose labels run along it, and what they are."""
+    jaw = arch(1.6)
+    assert jaw.face_labels is not None
+    row = [*range(37, 30, -1), *range(41, 48)]
+    along = np.array([row.index(label) + 1 if label in row else 0 for label in jaw.face_labels.tolist()])
+    storage.write_mesh(folder / "jaw_lower.ply", jaw.mesh, along)
+    (folder / "map.json").write_text(json.dumps({str(number): fdi for number, fdi in enumerate(row, start=1)}))
+
+
+def _read_labels(folder: Path) -> None:
+    """As the verbs do that take a jaw, with and without the map."""
+    for table in (None, folder / "map.json"):
+        load_jaw(folder / "jaw_lower.ply", labelling=Labelling(label_map=table))
+
+
+def _beside(folder: Path) -> None:
+    """Images in folders with what systems put beside them."""
+    _images(folder)
+    for each in ("frames", "jpg"):
+        (folder / each / "._0.png").write_bytes(b"Mac OS X")
+        (folder / each / "@eaDir").mkdir()
+
+
 def _footage(folder: Path) -> None:
     """Films of two cameras in two kinds of videos, images of a third one, and when they were taken."""
     verb("handpiece", "--design", "four", "--width-px", "96", "--height-px", "96", "--out", "@.")(folder)
@@ -401,6 +426,8 @@ SCENARIOS: Mapping[str, Scenario] = {
     "brief": Scenario(_brief, lambda folder: read_brief(folder / "brief.toml")),
     "scan": Scenario(_scan, _read_scan),
     "images": Scenario(_images, _read_images),
+    "files of systems": Scenario(_beside, _read_images),
+    "labels": Scenario(_labelled, _read_labels),
     "calibrations": Scenario(_calibrations, _read_calibrations),
     "panorama": Scenario(_panorama, lambda folder: storage.read_panorama(folder / "panorama")),
     "colmap": Scenario(_colmap, lambda folder: read_model(folder / "model", storage.read_capture(folder / "capture"))),

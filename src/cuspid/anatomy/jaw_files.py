@@ -15,9 +15,10 @@ from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, labels_
 from cuspid.errors import InputError
 from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
+from cuspid.inputs import is_there
 from cuspid.jaw import ARCHES, Arch, Jaw
 from cuspid.mesh import Mesh
-from cuspid.storage.files import reading
+from cuspid.storage.files import finished, reading
 from cuspid.storage.jaws import is_jaw, read_jaw, read_label_map, read_labelled_mesh
 from cuspid.storage.landmarks import MARKUPS_SUFFIX, read_landmarks
 from cuspid.storage.meshes import MESH_SUFFIXES
@@ -88,7 +89,9 @@ def jaw_files(folder: Path) -> list[Path]:
     """The mesh files of a folder, or the one file that is given. Raises InputError where there is none."""
     if folder.is_file():
         return [folder]
-    found = sorted(path for path in folder.glob("*") if path.suffix.lower() in MESH_SUFFIXES)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such file or folder")
+    found = sorted(path for path in finished(folder) if path.suffix.lower() in MESH_SUFFIXES)
     if not found:
         raise InputError(f"{folder}: there are no jaw meshes in it; give a folder with STL, PLY or OBJ files")
     return found
@@ -111,7 +114,7 @@ def load_landmarked_jaw(
     """
     jaw, notes, occlusal_from_mesh = _load_oriented(path, unit, arch or named_arch(path), labelling)
     beside = (path.with_suffix(suffix) for suffix in (".landmarks.json", MARKUPS_SUFFIX))
-    file = landmarks or next((each for each in beside if each.exists()), None)
+    file = landmarks or next((each for each in beside if is_there(each)), None)
     if file is not None:
         given = read_landmarks(file)
         validate(given.landmarks, jaw.teeth, source=str(file))

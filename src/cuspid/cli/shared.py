@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
@@ -18,6 +19,7 @@ from cuspid.anatomy.jaw_files import Labelling, load_jaw
 from cuspid.anatomy.numbering import Numbering
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.errors import InputError
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.jaw import Arch, Jaw
 from cuspid.options import SEED, Options, Range
@@ -37,6 +39,7 @@ class _Messages(Console):
 
 console = _Messages(stderr=True, markup=False, emoji=False)
 
+_ONE_PLACE_MM = 1e-6
 Flat = arg(name="")
 """The fields of a nested options value appear without a prefix."""
 
@@ -107,9 +110,18 @@ def load_source(mesh: Path | None, source: Source) -> Jaw:
 def load_probe(probe: Probe) -> Handpiece:
     """The handpiece of a file, or a built-in design."""
     if probe.handpiece is not None:
-        return storage.read_handpiece(probe.handpiece, probe.working_distance_mm)
+        device = storage.read_handpiece(probe.handpiece, probe.working_distance_mm)
+        _require_places(probe.handpiece, device)
+        return device
     distance_mm = probe.working_distance_mm or DesignOptions.working_distance_mm
     return DESIGNS[probe.design](DesignOptions(working_distance_mm=distance_mm, lights=probe.lights or "white"))
+
+
+def _require_places(path: Path, device: Handpiece) -> None:
+    """Raise InputError where all cameras are at one place: they see the same, and no depth."""
+    centres = np.stack([each.cam_from_rig.inverse().translation for each in device.rig.cameras.values()])
+    if len(centres) > 1 and np.ptp(centres, axis=0).max() < _ONE_PLACE_MM:
+        raise InputError(f"{path}: all {len(centres)} cameras are at one place, which shows no depth; give theirs")
 
 
 def suited(probe: Probe, texture: Preset) -> Probe:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Int, UInt8
 
 from cuspid.errors import InputError
-from cuspid.inputs import require_file
+from cuspid.inputs import is_there, require_file
 from cuspid.jaw import ARCHES, FDI_FROM_UNIVERSAL, GUM, Arch, Jaw, Landmark, Sphere
 from cuspid.mesh import Mesh
 from cuspid.storage.files import read_json, reading, write_json
@@ -40,7 +40,7 @@ def read_labelled_mesh(
 
 def _labels_of(path: Path, file: MeshFile) -> Int[np.ndarray, "f"] | None:
     beside = path.with_name(f"{path.stem}_facelabels.npy")
-    if beside.exists():
+    if is_there(beside):
         return _whole(beside, _read_array(beside))
     return _whole(path, file.face_values["label"]) if "label" in file.face_values else None
 
@@ -98,7 +98,7 @@ def write_jaw(path: Path, jaw: Jaw) -> None:
 def is_jaw(path: Path) -> bool:
     """Whether :func:`write_jaw` wrote a mesh file, so that its frame is known and more than the mesh may be read."""
     beside = path.with_suffix(".json")
-    if path.suffix.lower() not in MESH_SUFFIXES or not beside.is_file():
+    if path.suffix.lower() not in MESH_SUFFIXES or not is_there(beside):
         return False
     extra = read_json(beside)
     return isinstance(extra, dict) and extra.get("frame") == OCCLUSAL
