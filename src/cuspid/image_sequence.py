@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -30,8 +31,9 @@ class ImageSequence:
     """Nominal distance of the camera from the teeth, if the calibration states it."""
     notes: tuple[str, ...] = ()
     """What was found while reading, one line each."""
-    as_recorded: bool = False
-    """Images are taken as the sensor recorded them, not turned upright: the camera was held in different ways."""
+    orientations: tuple[int, ...] = ()
+    """EXIF orientation of each frame, where the camera was held in different ways: images then are taken as its sensor
+    recorded them, not turned upright."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -44,8 +46,8 @@ class ImageSequence:
     def image(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
         """RGB image of a frame. Raises InputError where the file is missing, damaged, or of another size."""
         image = read_image(self.paths[index])
-        if self.as_recorded:
-            image = np.ascontiguousarray(recorded(image, exif_orientation(self.paths[index])))
+        if self.orientations:
+            image = np.ascontiguousarray(recorded(image, self.orientations[index]))
         if image.shape[1::-1] != self.size:
             raise InputError(f"{self.paths[index]}: its size changed while it was in use; start again")
         return image
@@ -54,7 +56,7 @@ class ImageSequence:
 def exif_orientation(path: Path) -> int:
     """How an image was held when it was taken, as EXIF has it: 1 (upright) to 8; 1 where the file does not say."""
     try:
-        with Image.open(path) as image:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
             found = image.getexif().get(_ORIENTATION, 1)
     except Exception:  # what is wrong with the file is told where it is read
         return 1

@@ -7,6 +7,7 @@ import io
 import logging
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import wraps
 from importlib import import_module
@@ -112,6 +113,7 @@ class _Notes(logging.Handler):
 def main(arguments: list[str] | None = None) -> None:
     """Run a verb; a known error prints one line on stderr and exits with status 1."""
     _require_streams()
+    warnings.filterwarnings("ignore", module="PIL")  # what is wrong with an image is told where it is read
     log = logging.getLogger("cuspid")
     log.setLevel(logging.INFO)
     log.handlers = [_Notes()]

@@ -91,7 +91,8 @@ def name_order(name: str) -> list[tuple[str, int]]:
 
 def _of_folder(folder: Path) -> ImageSequence:
     paths = images_in(folder)
-    ways = {exif_orientation(path) for path in paths}
+    orientations = tuple(map(exif_orientation, paths))
+    ways = set(orientations)
     if len(ways) < 2:
         return ImageSequence(source=folder, paths=tuple(paths), size=_common_size(folder, paths))
     note = (
@@ -99,7 +100,7 @@ def _of_folder(folder: Path) -> ImageSequence:
         "the sensor recorded them, none is turned upright"
     )
     size = _common_size(folder, paths, as_recorded=True)
-    return ImageSequence(source=folder, paths=tuple(paths), size=size, notes=(note,), as_recorded=True)
+    return ImageSequence(source=folder, paths=tuple(paths), size=size, notes=(note,), orientations=orientations)
 
 
 def _of_capture(folder: Path) -> ImageSequence:
