@@ -86,7 +86,7 @@ class Board(Options):
     def corners(self) -> Float[np.ndarray, "n 3"]:
         """The points where four squares meet, mm."""
         column, row = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
-        places = self.square_mm * np.stack([column, row, 0 * row], axis=-1).reshape(-1, 3)
+        places = self.square_mm * np.stack([column, row, 0.0 * row], axis=-1).reshape(-1, 3)
         places[:, 2] -= self.step_mm * self._terrace_of(column.ravel())
         return places
 
