@@ -95,3 +95,20 @@ def test_each_file_has_its_own_unit(tmp_path: Path) -> None:
         scan=storage.MeasuredFile(path=tmp_path / "metres.stl", mesh=scan, unit="m"),
     )
     assert found.jaw.mesh.bounds == pytest.approx(scan.bounds, abs=1e-4)
+
+
+@pytest.mark.parametrize(("size_mm", "refused"), [(0.06, True), (1.5, False), (6.0, False)])
+def test_a_small_simulated_scan_is_compared_with_its_truth(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size_mm: float, refused: bool
+) -> None:
+    class Known:
+        jaw = horseshoe(120, 40)
+
+    def seen(*given: object) -> None:
+        raise LookupError
+
+    monkeypatch.setattr(storage, "read_truth", lambda path: Known)
+    monkeypatch.setattr(pipeline, "scannable", seen)
+    part = measured(scaled(JAW, size_mm / 58.6))
+    with pytest.raises(InputError if refused else LookupError):
+        pipeline.load_reference(tmp_path, scan=part)

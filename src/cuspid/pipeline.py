@@ -322,7 +322,7 @@ def load_reference(
     if not path.is_dir():
         return _loaded_reference(path, unit, arch, scan, labelling)
     truth = storage.read_truth(path)
-    if scan is not None:
+    if scan is not None and not _SMALLEST_SCAN_MM < scan.width_mm < _LARGEST_SCAN_MM:
         storage.require_one_unit(scan, storage.MeasuredFile(path=path, mesh=truth.jaw.mesh, unit="mm"))
     seen = scannable(truth, VisibilityOptions())
     return Reference(
@@ -357,6 +357,8 @@ def _loaded_reference(
 
 
 _REFERENCE_UNIT = "--reference-unit"
+_SMALLEST_SCAN_MM, _LARGEST_SCAN_MM = 0.3, 300.0
+"""Extent of what a simulated handpiece scans, which may be a small part of a tooth."""
 
 
 def _require_sizes(reference: storage.MeasuredFile, scan: storage.MeasuredFile | None) -> None:
