@@ -28,6 +28,7 @@ import trimesh
 from boards import photographs, scene, undistorted
 from builders import image_path, write_frames
 from cuspid import cli, pipeline, storage
+from cuspid.anatomy.jaw_files import Labelling, load_jaw
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.arch_curve import arch_curve
@@ -35,6 +36,7 @@ from cuspid.board import Board
 from cuspid.capture import read_image
 from cuspid.errors import CuspidError
 from cuspid.evaluation.deviation import EvaluationOptions
+from cuspid.facing import facing_outwards
 from cuspid.handpiece.brief import read_brief
 from cuspid.handpiece.designs import DESIGNS
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
@@ -130,7 +132,7 @@ def _meshes(folder: Path) -> None:
 def _read_meshes(folder: Path) -> None:
     for path in sorted(folder.glob("*.*")):
         if path.suffix in storage.MESH_SUFFIXES:
-            storage.read_labelled_mesh(path)
+            facing_outwards(storage.read_labelled_mesh(path)[0])
     storage.read_jaw(folder / "jaw.ply")
 
 
@@ -138,6 +140,23 @@ def _evaluate(folder: Path) -> None:
     """As the verb does, but for its pictures, which take the most time."""
     scan, against = storage.read_mesh(folder / "binary.stl"), pipeline.load_reference(folder / "text.ply")
     pipeline.evaluate(scan, against.jaw, EvaluationOptions(align=False, samples=2000))
+
+
+def _units(folder: Path) -> None:
+    """An arch in mm, and the same in text in whatever unit a damaged number makes of it."""
+    mesh = arch(1.6).mesh
+    storage.write_mesh(folder / "reference.stl", mesh)
+    loaded = trimesh.Trimesh(mesh.vertices / 1000, mesh.faces, process=False)
+    (folder / "metres.ply").write_bytes(loaded.export(file_type="ply", encoding="ascii"))
+
+
+def _compare_units(folder: Path) -> None:
+    """As the verb does until the surfaces are aligned."""
+    for unit in ("m", "mm", "um"):
+        with contextlib.suppress(CuspidError):
+            scan = storage.read_mesh(folder / "metres.ply", unit)
+            measured = storage.MeasuredFile(path=folder / "metres.ply", mesh=scan, unit=unit)
+            pipeline.load_reference(folder / "reference.stl", scan=measured)
 
 
 def _landmarks(folder: Path) -> None:
@@ -346,6 +365,30 @@ def _photographs(folder: Path) -> None:
     photographs(folder / "photos", replace(whole, cameras=halved), Board(columns=6, rows=5, square_mm=3.0))
 
 
+def _labelled(folder: Path) -> None:
+    """An arch whose labels run along it, and what they are."""
+    jaw = arch(1.6)
+    assert jaw.face_labels is not None
+    row = [*range(37, 30, -1), *range(41, 48)]
+    along = np.array([row.index(label) + 1 if label in row else 0 for label in jaw.face_labels.tolist()])
+    storage.write_mesh(folder / "jaw_lower.ply", jaw.mesh, along)
+    (folder / "map.json").write_text(json.dumps({str(number): fdi for number, fdi in enumerate(row, start=1)}))
+
+
+def _read_labels(folder: Path) -> None:
+    """As the verbs do that take a jaw, with and without the map."""
+    for table in (None, folder / "map.json"):
+        load_jaw(folder / "jaw_lower.ply", labelling=Labelling(label_map=table))
+
+
+def _beside(folder: Path) -> None:
+    """Images in folders with what systems put beside them."""
+    _images(folder)
+    for each in ("frames", "jpg"):
+        (folder / each / "._0.png").write_bytes(b"Mac OS X")
+        (folder / each / "@eaDir").mkdir()
+
+
 def _footage(folder: Path) -> None:
     """Films of two cameras in two kinds of videos, images of a third one, and when they were taken."""
     verb("handpiece", "--design", "four", "--width-px", "96", "--height-px", "96", "--out", "@.")(folder)
@@ -383,6 +426,8 @@ SCENARIOS: Mapping[str, Scenario] = {
     "brief": Scenario(_brief, lambda folder: read_brief(folder / "brief.toml")),
     "scan": Scenario(_scan, _read_scan),
     "images": Scenario(_images, _read_images),
+    "files of systems": Scenario(_beside, _read_images),
+    "labels": Scenario(_labelled, _read_labels),
     "calibrations": Scenario(_calibrations, _read_calibrations),
     "panorama": Scenario(_panorama, lambda folder: storage.read_panorama(folder / "panorama")),
     "colmap": Scenario(_colmap, lambda folder: read_model(folder / "model", storage.read_capture(folder / "capture"))),
@@ -404,6 +449,7 @@ SCENARIOS: Mapping[str, Scenario] = {
     "design": Scenario(_demand, verb("design", "@brief.toml", *SEARCH, "--out", f"@{_OUT}")),
     "reproduce": Scenario(_results, verb("reproduce", "--results", "@results", "--no-run", "--out", f"@{_OUT}")),
     "evaluate": Scenario(_meshes, _evaluate),
+    "units": Scenario(_units, _compare_units),
     "measure": Scenario(_arch, verb("measure", "@jaw.ply", "--out", f"@{_OUT}")),
     "simulate": Scenario(_probe, verb("simulate", "@jaw.ply", *PROBE, *SCAN, "--out", f"@{_OUT}")),
     "precision": Scenario(_probe, verb("precision", "@jaw.ply", *PROBE, "--out", f"@{_OUT}")),

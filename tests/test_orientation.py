@@ -1,10 +1,13 @@
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from builders import any_pose, sphere
-from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, labels_from_colors
+from builders import any_pose, joined, moved, sphere
+from cuspid import storage
+from cuspid.anatomy.jaw_files import load_jaw
+from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, labels_from_colors, require_one_jaw
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
@@ -91,3 +94,25 @@ def test_colours_that_do_not_number_the_teeth_give_no_labels():
     assert labels_from_colors(noise, mesh, "lower") is None
     gap = np.where(np.isin(labels, (45, 44)), GUM, labels)
     assert labels_from_colors(painted(gap), mesh, "lower") is None
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("closed", [True, False])
+def test_two_jaws_that_bite_are_named(tmp_path: Path, closed: bool, seed: int):
+    lower = jaw().mesh if closed else without_base(jaw().mesh)
+    upper = Mesh(lower.vertices * [-0.95, 1.0, -1.05] + [0, 2, 13], lower.faces)
+    pair = joined(lower, upper).transformed(any_pose(seed, 100))
+    with pytest.raises(InputError, match=r"two jaws that bite, \d\d mm high; export each"):
+        require_one_jaw(pair)
+    storage.write_mesh(tmp_path / "pair.stl", pair)
+    with pytest.raises(InputError, match=r"pair\.stl: the mesh shows two jaws"):
+        load_jaw(tmp_path / "pair.stl")
+
+
+def test_a_jaw_of_several_pieces_is_one():
+    lower = jaw().mesh
+    base = Mesh(lower.vertices * [1.05, 1.05, 0.3] - [0, 0, 8], lower.faces)
+    crowns = joined(*(moved(sphere(4.0, 2), (9.0 * k, 0, 0)) for k in range(5)))
+    side_by_side = joined(lower, moved(lower, (70.0, 0, 0)))
+    for mesh in (lower, joined(lower, base), crowns, side_by_side):
+        require_one_jaw(mesh)

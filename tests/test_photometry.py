@@ -14,8 +14,16 @@ from cuspid import storage
 from cuspid.board import Board
 from cuspid.calibration.calibrate import RigCalibration, in_frame_of
 from cuspid.calibration.corners import BoardView
+from cuspid.calibration.noise import Noise
 from cuspid.calibration.patches import clear_places
-from cuspid.calibration.photometry import Photometry, PhotometryOptions, calibrate_light, look_at_patches
+from cuspid.calibration.photometry import (
+    Photometry,
+    PhotometryOptions,
+    _as_told,
+    _numbers,
+    calibrate_light,
+    look_at_patches,
+)
 from cuspid.calibration.shading import Given, Samples, _model, polynomials, prior
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
@@ -202,6 +210,19 @@ def test_where_there_is_no_falloff_none_is_found():
     in_sigmas = [each.corner_loss_pct / each.corner_loss_sigma_pct for each in found.cameras.values()]
     assert 0 < rms([np.array(in_sigmas)]) < 2
     assert max(each.corner_loss_sigma_pct for each in found.cameras.values()) < 2
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.8])
+def test_a_falloff_that_the_images_do_not_tell_is_neither_stored_nor_stated(sigma: float):
+    """It was stated as -89 ± 14 %."""
+    given = Sensor(falloff=(-0.2, -0.1))
+    found = replace(given, gain=1.1, falloff=(0.9, -0.3), covariance=np.diag([1e-4, sigma**2 / 8, sigma**2 / 8, 1e-3]))
+    noise = Noise(read_dn2=1.0, per_dn=0.1, noise_sigma_dn=0.1, levels_dn=np.zeros(0), variances_dn2=np.zeros(0))
+    numbers, stored, told = _numbers(found, noise), _as_told(found, given), sigma < 0.1
+    assert (numbers["corner_loss_pct"] is not None) == told
+    assert (numbers["corner_loss_sigma_pct"] is not None) == told
+    assert stored.falloff == (found.falloff if told else given.falloff)
+    assert stored.gain == found.gain
 
 
 def test_a_brightness_common_to_all_changes_nothing():

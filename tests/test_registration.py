@@ -142,3 +142,22 @@ def test_a_plate_that_slides_but_for_two_posts_finds_its_place():
     points, surface = noisy(plate, 0.0005).sample(20_000, np.random.default_rng(0))[0], SignedDistance(plate)
     found = fit(points, surface, Rigid3(np.eye(3), np.array([0.3, -0.15, 0])), FAST)
     assert error_um(found.reference_from_scan, Rigid3.identity(), plate.vertices) < 0.5
+
+
+def mirrored(mesh: Mesh) -> Mesh:
+    return Mesh(mesh.vertices * [1.0, 1.0, -1.0], mesh.faces[:, ::-1])
+
+
+def test_a_mirror_image_is_named():
+    """An arch that is nearly its own mirror image is laid onto the other side; a part of it is refused."""
+    scan = mirrored(jaw().mesh).transformed(any_pose(2, 100))
+    found = register(scan, surface(), FAST, rng=np.random.default_rng(0))
+    assert "the scan is a mirror image of the reference" in found.notes[0]
+    right = register(noisy(jaw().mesh, 0.12), surface(), FAST, rng=np.random.default_rng(0))
+    assert not any("mirror" in note for note in right.notes)
+
+
+def test_a_bad_scan_is_no_mirror_image():
+    bad = jaw().mesh.vertices + 0.3 * np.sin(jaw().mesh.vertices[:, [1, 2, 0]] / 2)
+    found = register(Mesh(bad, jaw().mesh.faces), surface(), FAST, rng=np.random.default_rng(0))
+    assert not any("mirror" in note for note in found.notes)

@@ -21,7 +21,7 @@ from cuspid.image_sequence import ImageSequence
 from cuspid.jaw import GUM, Jaw
 from cuspid.motion.single import SingleOptions, locate_single, mouth_share, normalise_contrast
 from cuspid.panorama import Panorama
-from cuspid.panorama_pipeline import StitchOptions, stitch
+from cuspid.panorama_pipeline import StitchOptions, stitch, that_show_something
 from cuspid.pipeline import RenderOptions, take_images
 from cuspid.reconstruction import Tracks
 from cuspid.simulation.path.free import FreePathOptions, plan_free_path
@@ -257,6 +257,24 @@ def test_two_films_are_stitched_as_two_parts(sequence: ImageSequence, tmp_path: 
     assert all(part.panorama.parts == 2 for part in parts)
     assert "broke into 2 parts" in parts[0].panorama.notes[0]
     assert any(frame.reason == "in part 2" for frame in parts[0].panorama.frames)
+
+
+def test_an_empty_picture_is_no_panorama(stitched: Stitched) -> None:
+    """Of frames that hardly overlap it was one of status 0 without a pixel."""
+    assert that_show_something([stitched]) == (stitched,)
+    nothing = np.zeros_like(stitched.panorama.covered)
+    empty = replace(stitched, panorama=replace(stitched.panorama, covered=nothing))
+    assert len(that_show_something([empty, stitched])) == 2
+    with pytest.raises(ReconstructionError, match=rf"the {FRAMES} frames that were placed give no picture; take them"):
+        that_show_something([empty])
+    assert stitched.motion is not None
+    tracks = stitched.motion.tracks
+    few = replace(tracks, **{name: getattr(tracks, name)[:40] for name in OF_OBSERVATIONS})
+    with pytest.raises(ReconstructionError, match=r"no picture, as neighbours share only \d+ points; take them"):
+        that_show_something([replace(empty, motion=replace(stitched.motion, tracks=few))])
+
+
+OF_OBSERVATIONS = ("point_index", "frame_index", "camera_index", "pixels")
 
 
 # --- parts -------------------------------------------------------------------------------------------------------

@@ -39,7 +39,9 @@ class BoardPattern(Options):
     marker_share: Annotated[float, Range(0.1, 0.95)] = 0.75
     """Side of a marker, as a share (0 to 1) of the side of its square."""
     dictionary: Dictionary = "4X4_1000"
-    """Family of markers; their ids begin at 0."""
+    """Family of markers."""
+    first_id: Annotated[int, Range(0, 999)] = 0
+    """Id of the first marker; the others follow."""
     legacy: bool = False
     """Layout of OpenCV before 4.6 for boards with an even number of rows: a marker in the first corner."""
     inverted: bool = False
@@ -61,7 +63,7 @@ class Board(BoardPattern):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        markers, needed = int(self.dictionary.split("_")[1]), self.columns * self.rows // 2
+        markers, needed = int(self.dictionary.split("_")[1]), self.first_id + self.markers
         if self.kind == "charuco" and markers < needed:
             raise InputError(f"board: {needed} markers are needed, but the dictionary {self.dictionary} has {markers}")
         if self.terraces > 1 and self.kind != "charuco":
@@ -72,6 +74,16 @@ class Board(BoardPattern):
             )
 
     @property
+    def markers(self) -> int:
+        """Number of markers that a board of this size has."""
+        return self.columns * self.rows // 2
+
+    @property
+    def family(self) -> str:
+        """The largest dictionary of its markers' kind, which begins with those of the smaller ones."""
+        return f"{self.dictionary.split('_')[0]}_1000"
+
+    @property
     def size_mm(self) -> tuple[float, float]:
         """Width and height of the squares, seen from straight above."""
         return self.columns * self.square_mm, self.rows * self.square_mm
@@ -80,7 +92,7 @@ class Board(BoardPattern):
     def corners(self) -> Float[np.ndarray, "n 3"]:
         """The points where four squares meet, mm."""
         column, row = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
-        places = self.square_mm * np.stack([column, row, 0 * row], axis=-1).reshape(-1, 3)
+        places = self.square_mm * np.stack([column, row, 0.0 * row], axis=-1).reshape(-1, 3)
         places[:, 2] -= self.step_mm * self._terrace_of(column.ravel())
         return places
 
@@ -122,7 +134,8 @@ class Board(BoardPattern):
             raise InputError("board: a chessboard has no markers")
         markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
         side = self.marker_share * self.square_mm
-        board = cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_mm, side, markers)
+        ids = self.first_id + np.arange(self.markers, dtype=np.int32)
+        board = cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_mm, side, markers, ids)
         board.setLegacyPattern(self.legacy)
         return board
 

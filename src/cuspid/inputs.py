@@ -20,6 +20,14 @@ LARGEST_MIB: Mapping[Kind, int] = MappingProxyType(
 """Largest size of each kind of file; ``file`` is any other, such as a video."""
 
 
+def is_there(path: Path) -> bool:
+    """Whether there is such a file; a name that is too long for any, or lies where nobody may look, is none."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
 def require_file(path: Path, kind: Kind) -> Path:
     """Return the path. Raises InputError where it is not a regular file, or is too large for its kind."""
     try:

@@ -27,13 +27,18 @@ _LONGEST_WAIT_S = 120.0
 
 
 def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """Decorator: compile a function when it is first called. ``options`` are those of ``numba.njit``."""
+    """Decorator: compile a function when it is first called; in each process anew where nothing can be kept on disk
+    (``NUMBA_CACHE_DIR`` names a place). ``options`` are those of ``numba.njit``."""
     if function is None:
         return partial(kernel, **options)
     compiled = njit(nogil=True, error_model="numpy", **options)(function)
     if isinstance(compiled, Dispatcher):  # otherwise numba is told not to compile
-        compiled._cache = _KernelCache(function)  # type: ignore[attr-defined]
-        compiled.compile = _one_at_a_time(compiled.compile, compiled._cache)  # type: ignore[attr-defined,method-assign]
+        try:
+            cache = _KernelCache(function)
+        except RuntimeError:  # nowhere to keep it: a read-only installation without a home
+            return compiled
+        compiled._cache = cache  # type: ignore[attr-defined]
+        compiled.compile = _one_at_a_time(compiled.compile, cache)  # type: ignore[method-assign]
     return compiled
 
 

@@ -8,8 +8,9 @@ views                = view_mesh(mesh, ...)                         the same vie
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -18,7 +19,7 @@ from jaxtyping import UInt8
 from cuspid.anatomy.orientation import find_occlusal_frame
 from cuspid.arch_curve import arch_curve
 from cuspid.capture import Capture
-from cuspid.errors import InputError
+from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.image_sequence import ImageSequence
 from cuspid.jaw import Jaw
@@ -62,11 +63,24 @@ from cuspid.stitching.thesis_method import ThesisOptions, stitch_as_thesis
 from cuspid.tolerances import NominalOptions
 from cuspid.workers import computed_once
 
-__all__ = ["FilmOptions", "MeshViewOptions", "StitchOptions", "film", "stitch", "stitch_rig", "view_mesh"]
+__all__ = [
+    "FilmOptions",
+    "MeshViewOptions",
+    "StitchOptions",
+    "film",
+    "stitch",
+    "stitch_rig",
+    "that_show_something",
+    "view_mesh",
+]
 
 
 _NOT_ON_SURFACE = "motion: the path is less accurate, for too few points are found again on the surface"
 
+_LEAST_COVERED = 0.01
+"""Share of a picture that shows something, at least; a narrow arch fills a tenth of it."""
+_ENOUGH_SHARED = 50
+"""Points that frames which overlap by half share many times over."""
 _SLIDING_PCT = 0.06
 """What the scale of a film of bare teeth is off by beside what its points tell, because light that goes along with the
 camera makes them slide (root mean square of nine simulated films, docs/panorama-evaluation.md)."""
@@ -95,21 +109,42 @@ class StitchOptions(OrthoOptions):
 def stitch(sequence: ImageSequence, options: StitchOptions, *, progress: Progress = silent) -> tuple[Stitched, ...]:
     """The panorama of an arch from the frames of one camera; several parts where the sequence broke, largest first.
 
-    Raises ReconstructionError, naming the frames, where nothing can be placed.
+    Raises ReconstructionError, naming the frames, where nothing can be placed, or nothing of it can be shown.
     """
     if options.method == "thesis":
         panoramas = stitch_as_thesis(sequence, options.thesis, examination=options.examination, progress=progress)
-        return tuple(Stitched(panorama=panorama, motion=None, strip=None) for panorama in panoramas)
+        return that_show_something(Stitched(panorama=panorama, motion=None, strip=None) for panorama in panoramas)
     motion = locate_single(sequence, options.motion, progress=progress)
     notes = (*sequence.notes, *motion.notes)
     stitched = [_stitched(sequence, motion, number, options, progress) for number in range(len(motion.parts))]
-    return tuple(
+    return that_show_something(
         replace(
             part,
             panorama=replace(part.panorama, part=number, parts=len(stitched), notes=(*notes, *part.panorama.notes)),
         )
         for number, part in enumerate(stitched, start=1)
     )
+
+
+def that_show_something(parts: Iterable[Stitched]) -> tuple[Stitched, ...]:
+    """The parts of a panorama. Raises ReconstructionError where the pictures of all of them are as good as empty."""
+    made = tuple(parts)
+    if any(part.panorama.covered.mean() > _LEAST_COVERED for part in made):
+        return made
+    shared = [_shared_points(part.motion) for part in made if part.motion is not None]
+    found = f", as neighbours share only {max(shared):.0f} points" if shared and max(shared) < _ENOUGH_SHARED else ""
+    placed = sum(frame.used for part in made for frame in part.panorama.frames)
+    raise ReconstructionError(
+        f"stitch: the {placed} frames that were placed give no picture{found}; take them so that each overlaps the one "
+        "before by at least half"
+    )
+
+
+def _shared_points(motion: SparseModel) -> float:
+    """How many points a frame has in common with the one before (median)."""
+    tracks = motion.tracks
+    seen = [set(tracks.point_index[tracks.frame_index == number].tolist()) for number in range(len(motion.frames))]
+    return float(np.median([len(before & after) for before, after in pairwise(seen)] or [0]))
 
 
 def _stitched(
@@ -160,7 +195,7 @@ def stitch_rig(capture: Capture, options: StitchOptions, *, progress: Progress =
     uses = _uses(capture, scene.found, scene.camera)
     made = orthophoto(shown, uses, scene.read, options, progress=progress)
     noted = (*_scale_notes(scene.found, scene.camera), *scene.found.notes, *notes)
-    return replace(made, panorama=replace(made.panorama, notes=noted))
+    return that_show_something([replace(made, panorama=replace(made.panorama, notes=noted))])[0]
 
 
 @dataclass(frozen=True, eq=False)

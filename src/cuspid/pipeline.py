@@ -22,10 +22,12 @@ from jaxtyping import Bool, Float
 
 from cuspid import storage
 from cuspid.anatomy.crowns import crowns_of
+from cuspid.anatomy.jaw_files import Labelling
 from cuspid.anatomy.orientation import find_occlusal_frame
 from cuspid.capture import Capture
 from cuspid.evaluation.crown import OpenCrown, open_parts, pieces
 from cuspid.evaluation.deviation import EvaluationOptions, evaluate
+from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Arch, Jaw
 from cuspid.memory import give_back
@@ -359,14 +361,25 @@ class Reference:
     """The open crown surface; None if nothing is crown or looks like it."""
     hashes: Mapping[str, str]
     """SHA-256 of the files, by what they contain."""
+    notes: tuple[str, ...] = ()
+    """How its files were understood."""
 
 
-def load_reference(path: Path, *, unit: storage.Unit = "mm", arch: Arch | None = None) -> Reference:
+def load_reference(
+    path: Path,
+    *,
+    unit: storage.Unit = "mm",
+    arch: Arch | None = None,
+    scan: storage.MeasuredFile | None = None,
+    labelling: Labelling = Labelling(),
+) -> Reference:
     """What a scan is compared with: a mesh file, or the ``truth`` folder of a simulation, which also knows which faces
-    could be seen."""
+    could be seen. Raises InputError where a mesh is too small or too large for teeth, or for the ``scan``."""
     if not path.is_dir():
-        return _loaded_reference(path, unit, arch)
+        return _loaded_reference(path, unit, arch, scan, labelling)
     truth = storage.read_truth(path)
+    if scan is not None and not _SMALLEST_SCAN_MM < scan.width_mm < _LARGEST_SCAN_MM:
+        storage.require_one_unit(scan, storage.MeasuredFile(path=path, mesh=truth.jaw.mesh, unit="mm"))
     seen = scannable(truth, VisibilityOptions())
     return Reference(
         jaw=truth.jaw,
@@ -376,15 +389,39 @@ def load_reference(path: Path, *, unit: storage.Unit = "mm", arch: Arch | None =
     )
 
 
-def _loaded_reference(path: Path, unit: storage.Unit, arch: Arch | None) -> Reference:
+def _loaded_reference(
+    path: Path, unit: storage.Unit, arch: Arch | None, scan: storage.MeasuredFile | None, labelling: Labelling
+) -> Reference:
     hashes = {"reference": storage.hash_file(path)}
     if storage.is_jaw(path):
         jaw = storage.read_jaw(path)
+        _require_sizes(storage.MeasuredFile(path=path, mesh=jaw.mesh, unit="mm", option=_REFERENCE_UNIT), scan)
         return Reference(jaw=jaw, scannable=None, crown=crown_surface(jaw), hashes=hashes)
     mesh, labels, _ = storage.read_labelled_mesh(path, unit)
+    _require_sizes(storage.MeasuredFile(path=path, mesh=mesh, unit=unit, option=_REFERENCE_UNIT), scan)
+    mesh, notes = facing_outwards(mesh)
+    occlusal = find_occlusal_frame(mesh)
+    if labels is not None:
+        upright = mesh.transformed(occlusal.occlusal_from_mesh)
+        numbered = labelling.fdi(path, labels, upright, arch=arch, sure=not occlusal.notes)
+        labels, notes = numbered.labels, (*notes, *numbered.notes)
     jaw = Jaw(mesh=mesh, face_labels=labels, arch=arch)
-    crown = crown_surface(jaw, find_occlusal_frame(mesh).occlusal_from_mesh)
-    return Reference(jaw=jaw, scannable=None, crown=crown, hashes=hashes)
+    crown = crown_surface(jaw, occlusal.occlusal_from_mesh)
+    return Reference(
+        jaw=jaw, scannable=None, crown=crown, hashes=hashes, notes=tuple(f"reference: {note}" for note in notes)
+    )
+
+
+_REFERENCE_UNIT = "--reference-unit"
+_SMALLEST_SCAN_MM, _LARGEST_SCAN_MM = 0.3, 300.0
+"""Extent of what a simulated handpiece scans, which may be a small part of a tooth."""
+
+
+def _require_sizes(reference: storage.MeasuredFile, scan: storage.MeasuredFile | None) -> None:
+    """Before anything is looked for that takes memory by the size."""
+    if scan is not None:
+        storage.require_one_unit(scan, reference)
+    storage.require_size(reference)
 
 
 def crown_surface(

@@ -2,55 +2,108 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int
 
 from cuspid.anatomy.landmarks.estimation import with_estimates
 from cuspid.anatomy.landmarks.scheme import in_frame, missing, validate
-from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, labels_from_colors
+from cuspid.anatomy.numbering import Numbered, Numbering, number_teeth
+from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, labels_from_colors, require_one_jaw
 from cuspid.errors import InputError
+from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
+from cuspid.inputs import is_there
 from cuspid.jaw import ARCHES, Arch, Jaw
-from cuspid.storage.jaws import is_jaw, read_jaw, read_labelled_mesh
+from cuspid.mesh import Mesh
+from cuspid.storage.files import finished, reading
+from cuspid.storage.jaws import is_jaw, read_jaw, read_label_map, read_labelled_mesh
 from cuspid.storage.landmarks import MARKUPS_SUFFIX, read_landmarks
-from cuspid.storage.meshes import MESH_SUFFIXES, Unit
+from cuspid.storage.meshes import MESH_SUFFIXES
+from cuspid.storage.units import Unit
 
 
-def load_jaw(path: Path, *, unit: Unit = "mm", arch: Arch | None = None) -> tuple[Jaw, tuple[str, ...]]:
+@dataclass(frozen=True, kw_only=True)
+class Labelling:
+    """How the tooth labels of a mesh file are understood."""
+
+    numbering: Numbering = "auto"
+    """Their numbers; found out from where the teeth stand unless given."""
+    label_map: Path | None = None
+    """A JSON file of each label and its FDI number."""
+
+    def fdi(
+        self, path: Path, labels: Int[np.ndarray, "f"], mesh: Mesh, *, arch: Arch | None = None, sure: bool = True
+    ) -> Numbered:
+        """The labels of a file in FDI numbers, for its mesh in the occlusal frame; see :func:`number_teeth`."""
+        table = None if self.label_map is None else read_label_map(self.label_map)
+        return number_teeth(
+            str(path), labels, mesh, arch=arch or named_arch(path), sure=sure, numbering=self.numbering, label_map=table
+        )
+
+
+def named_arch(path: Path) -> Arch | None:
+    """The arch that the name of a file says: ``lower`` or ``upper`` stands in it."""
+    named = [arch for arch in ARCHES if arch in path.stem.lower()]
+    return named[0] if len(named) == 1 else None
+
+
+def load_jaw(
+    path: Path, *, unit: Unit = "mm", arch: Arch | None = None, labelling: Labelling = Labelling()
+) -> tuple[Jaw, tuple[str, ...]]:
     """A user's jaw mesh, brought into the occlusal frame, and notes on what was found or is unsure; a jaw that cuspid
     wrote, as it is.
 
-    Raises InputError where the file is no mesh, or its width is not that of a jaw in the given unit.
+    Raises InputError where the file is no mesh, its width is not that of a jaw in the given unit, or its labels are not
+    understood.
     """
-    jaw, notes, _ = _load_oriented(path, unit, arch)
+    jaw, notes, _ = _load_oriented(path, unit, arch, labelling)
     return jaw, notes
 
 
-def _load_oriented(path: Path, unit: Unit, arch: Arch | None) -> tuple[Jaw, tuple[str, ...], Rigid3]:
+def _load_oriented(
+    path: Path, unit: Unit, arch: Arch | None, labelling: Labelling
+) -> tuple[Jaw, tuple[str, ...], Rigid3]:
     """As :func:`load_jaw`, with ``occlusal_from_mesh``."""
     if is_jaw(path):
         return read_jaw(path), (), Rigid3.identity()
     mesh, labels, colors = read_labelled_mesh(path, unit)
-    notes = check_scale(mesh, unit)
+    scale = check_scale(mesh, unit)
+    mesh, facing = facing_outwards(mesh)
+    with reading(path):
+        require_one_jaw(mesh)
     occlusal = find_occlusal_frame(mesh)
     moved = mesh.transformed(occlusal.occlusal_from_mesh)
-    if labels is None and colors is not None:
+    notes = (*scale, *facing, *occlusal.notes)
+    if labels is not None:
+        numbered = labelling.fdi(path, labels, moved, arch=arch, sure=not occlusal.notes)
+        labels, notes = numbered.labels, (*notes, *numbered.notes)
+    elif colors is not None:
         labels = labels_from_colors(colors, moved, arch)
-    return Jaw(mesh=moved, face_labels=labels, arch=arch), (*notes, *occlusal.notes), occlusal.occlusal_from_mesh
+    return Jaw(mesh=moved, face_labels=labels, arch=arch), notes, occlusal.occlusal_from_mesh
 
 
 def jaw_files(folder: Path) -> list[Path]:
     """The mesh files of a folder, or the one file that is given. Raises InputError where there is none."""
     if folder.is_file():
         return [folder]
-    found = sorted(path for path in folder.glob("*") if path.suffix.lower() in MESH_SUFFIXES)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such file or folder")
+    found = sorted(path for path in finished(folder) if path.suffix.lower() in MESH_SUFFIXES)
     if not found:
         raise InputError(f"{folder}: there are no jaw meshes in it; give a folder with STL, PLY or OBJ files")
     return found
 
 
 def load_landmarked_jaw(
-    path: Path, *, unit: Unit = "mm", arch: Arch | None = None, landmarks: Path | None = None
+    path: Path,
+    *,
+    unit: Unit = "mm",
+    arch: Arch | None = None,
+    landmarks: Path | None = None,
+    labelling: Labelling = Labelling(),
 ) -> tuple[Jaw, tuple[str, ...]]:
     """As :func:`load_jaw`, with landmarks: from a file, or those that the jaw came with; the rest is estimated from its
     labels, where it has any.
@@ -59,10 +112,9 @@ def load_landmarked_jaw(
     in the name of the mesh tells the arch where nothing else does. Raises InputError for a landmark that the scheme or
     the jaw does not know, and where there are neither landmarks nor labels.
     """
-    named: Arch | None = next((each for each in ARCHES if each in path.stem.lower()), None)
-    jaw, notes, occlusal_from_mesh = _load_oriented(path, unit, arch or named)
+    jaw, notes, occlusal_from_mesh = _load_oriented(path, unit, arch or named_arch(path), labelling)
     beside = (path.with_suffix(suffix) for suffix in (".landmarks.json", MARKUPS_SUFFIX))
-    file = landmarks or next((each for each in beside if each.exists()), None)
+    file = landmarks or next((each for each in beside if is_there(each)), None)
     if file is not None:
         given = read_landmarks(file)
         validate(given.landmarks, jaw.teeth, source=str(file))

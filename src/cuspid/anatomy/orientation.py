@@ -16,7 +16,8 @@ from jaxtyping import Float, Int, UInt8
 from scipy.spatial import ConvexHull, cKDTree
 
 from cuspid.errors import InputError
-from cuspid.geometry import Rigid3, axes_about, best_similarity
+from cuspid.facing import pieces_of
+from cuspid.geometry import Rigid3, axes_about, best_similarity, unit
 from cuspid.jaw import GUM, Arch
 from cuspid.mesh import Mesh
 from cuspid.occlusal_plane import crown_tips, crown_tops, levelled, upright
@@ -34,6 +35,10 @@ _PART_MM = 9.0
 """What is smaller is not a tooth, but may be a jaw in cm."""
 _NARROW_MM = 32.0
 """What is narrower across is part of an arch."""
+_SECOND_JAW = 0.4
+"""Least surface of one of two jaws, as a share of that of the other one."""
+_TOWARDS = 0.6
+"""Least cosine between where the crowns of a jaw point and where the other jaw lies."""
 _ENOUGH_FACES = 500_000
 """More say no more of how a jaw lies."""
 _TILT_SD_DEG = 30.0
@@ -75,6 +80,9 @@ def find_occlusal_frame(mesh: Mesh) -> OcclusalFrame:
     level = _level(mesh, start)
     relief = _relief(mesh, level)
     crowns = relief.crowns()
+    if len(crowns) == 0:
+        note = "occlusal frame: unsure, as nothing looks like a crown; check the picture"
+        return OcclusalFrame(occlusal_from_mesh=level, notes=(*notes_up, note))
     anterior, notes_front = _anterior(crowns[:, :2])
     centre = np.array([*crowns[:, :2].mean(axis=0), relief.tips()[:, 2].mean()])
     turn = np.array([[anterior[1], -anterior[0], 0], [anterior[0], anterior[1], 0], [0, 0, 1.0]])
@@ -224,6 +232,28 @@ def _laid(
     scale, rotation, _ = best_similarity(source, target, weights)
     from_centre, to_centre = (np.average(each, axis=0, weights=weights) for each in (source, target))
     return np.asarray(np.clip(scale, 0.75, 1.3) * (points - from_centre) @ rotation.T + to_centre)
+
+
+def require_one_jaw(mesh: Mesh) -> None:
+    """Raise InputError where a mesh shows two jaws that bite: two wide pieces, one over the other, whose crowns point
+    to each other."""
+    piece = pieces_of(mesh)
+    areas = np.bincount(piece, mesh.face_areas)
+    largest = np.argsort(areas)[::-1][:2]
+    if len(largest) < 2 or areas[largest[1]] < _SECOND_JAW * areas[largest[0]]:
+        return
+    jaws = [mesh.submesh(piece == each) for each in largest]
+    if min(float(np.sort(np.ptp(jaw.vertices, axis=0))[1]) for jaw in jaws) < _JAW_MM[0] / 2:
+        return
+    first, second = (jaw.thinned(_ENOUGH_FACES) for jaw in jaws)
+    (one, doubts), (other, more) = _upright(first), _upright(second)
+    between = unit(second.vertices.mean(axis=0) - first.vertices.mean(axis=0))
+    facing = one.rotation[2] @ between > _TOWARDS and other.rotation[2] @ between < -_TOWARDS
+    if facing and not doubts and not more:
+        height_mm = float(np.ptp(mesh.vertices @ unit(one.rotation[2] - other.rotation[2])))
+        raise InputError(
+            f"the mesh shows two jaws that bite, {height_mm:.0f} mm high; export each jaw into its own file"
+        )
 
 
 def check_scale(mesh: Mesh, unit: Unit = "mm") -> tuple[str, ...]:

@@ -39,6 +39,8 @@ _LESS = 0.9
 which they did not; and the share of the views that must then remain."""
 _RUN = 6
 """Number of successive instants that stay in the same half, where cameras do not expose together."""
+_ODD_SIZE = 0.02
+"""Cameras that are glued into a printed holder are nearer to where they were drawn, as a share of their distances."""
 _OPEN_SHARE = 0.01
 """Standard deviation of a focal length, as a share of it, beyond which a note is given."""
 
@@ -238,6 +240,25 @@ def in_frame_of(found: RigCalibration, drawn: Rig) -> RigCalibration:
     drawn_from_rig = found.rig.motion_onto(drawn)
     seen = {key: drawn_from_rig @ pose for key, pose in found.rig_from_view.items()}
     return replace(found, rig=found.rig.in_frame(drawn_from_rig), rig_from_view=seen)
+
+
+def size_notes(found: Rig, drawn: Rig, board: Board) -> tuple[str, ...]:
+    """Where the cameras lie farther apart, or closer together, than they were drawn, as all do if the squares of the
+    board are not as large as was said."""
+    if set(found.names) != set(drawn.names) or len(found.names) < 2:
+        return ()
+    sizes = []
+    for rig in (found, drawn):
+        places = np.stack([rig[name].cam_from_rig.inverse().translation for name in found.names])
+        sizes.append(float(np.linalg.norm(places - places.mean(axis=0))))
+    growth = sizes[0] / max(sizes[1], 1e-9) - 1
+    if abs(growth) < _ODD_SIZE:
+        return ()
+    how = "farther apart" if growth > 0 else "closer together"
+    return (
+        f"the cameras lie {abs(growth):.1%} {how} than drawn: was --square-mm {board.square_mm:g} measured on the "
+        f"print? With {board.square_mm / (1 + growth):.3g} they lie as drawn",
+    )
 
 
 # --- what it is worth --------------------------------------------------------------------------------------------

@@ -37,7 +37,8 @@ Views = Mapping[tuple[str, str], BoardView]
 def find_corners(gray: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | None:
     """The corners of the board in an image, to a fraction of a pixel; None if too few are found.
 
-    A plain chessboard must be seen completely (A. Duda, U. Frese, BMVC 2018); of a ChArUco board any part may be seen
+    A plain chessboard must be seen completely (A. Duda, U. Frese, BMVC 2018), and is searched for exhaustively where it
+    is not found at once; of a ChArUco board any part may be seen
     (S. Garrido-Jurado et al., Pattern Recognition 47, 2014). Each corner is searched for where the two markers beside
     it predict it, so that steps elsewhere do not matter.
     """
@@ -71,6 +72,8 @@ def _charuco(image: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | None:
 def _chessboard(image: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | None:
     size = (board.columns - 1, board.rows - 1)
     found, pixels = cv2.findChessboardCornersSB(image, size)
+    if not found:  # its further flags find boards where there are none
+        found, pixels = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_EXHAUSTIVE)
     if not found:
         return None
     return BoardView(np.arange(size[0] * size[1]), pixels.reshape(-1, 2) + OPENCV_PIXEL_OFFSET)

@@ -64,6 +64,8 @@ _FOREIGN = 0.1
 """Deviation of the light from that of the lamps (logarithm) beyond which it comes from elsewhere."""
 _OPEN_CORNER = 0.05
 """Standard deviation of the light in the corners beyond which a note is given."""
+_NO_CORNER = 0.1
+"""Standard deviation of the light in the corners beyond which no falloff is stated."""
 _TOLD = 0.7
 """The images have determined a parameter if its standard deviation is less than this share of what it was before."""
 
@@ -97,9 +99,9 @@ class CameraLight:
     """Gain relative to the geometric mean of the cameras, in linear light."""
     gain_sigma_pct: float
     """Standard deviation of the gain."""
-    corner_loss_pct: float
-    """Light that is lost in the corners of the image."""
-    corner_loss_sigma_pct: float
+    corner_loss_pct: float | None
+    """Light that is lost in the corners of the image; None where the images do not tell."""
+    corner_loss_sigma_pct: float | None
     """Standard deviation of the corner loss, in the same unit."""
     gamma: float
     """Encoding exponent."""
@@ -349,13 +351,13 @@ def _described(case: _Case, fit: Shading, clipped: Mapping[str, float], notes: l
     residuals = _residuals(case, fit)
     held_out = _held_out(case, halves)
     return Photometry(
-        sensors=sensors,
+        sensors={name: _as_told(sensor, case.sensor(name)) for name, sensor in sensors.items()},
         lights=lamps or dict(case.drawn.lights if case.drawn else {}),
         cameras={
             name: CameraLight(
                 patches=len(r),
                 clipped_pct=100 * clipped[name],
-                **_numbers(sensors[name], case.noise[name]),
+                **_numbers(sensors[name], case.noise[name]),  # type: ignore[arg-type]
                 before_pct=_rms(before),
                 after_pct=_rms(after),
                 held_out_pct=100 * _rms(held_out[name]) if halves else None,
@@ -382,14 +384,23 @@ def _residuals(
     }
 
 
-def _numbers(sensor: Sensor, noise: Noise) -> dict[str, float]:
-    covariance = known(sensor.covariance)
-    corner = float(covariance[1:3, 1:3].sum())
+def _corner_sigma(sensor: Sensor) -> float:
+    """Standard deviation of the light in the corners, as a share of that in the middle."""
+    return (1 - sensor.corner_loss) * float(np.sqrt(known(sensor.covariance)[1:3, 1:3].sum()))
+
+
+def _as_told(sensor: Sensor, given: Sensor) -> Sensor:
+    """With the falloff that was given where the images tell none."""
+    return sensor if _corner_sigma(sensor) <= _NO_CORNER else replace(sensor, falloff=given.falloff)
+
+
+def _numbers(sensor: Sensor, noise: Noise) -> dict[str, float | None]:
+    covariance, told = known(sensor.covariance), _corner_sigma(sensor) <= _NO_CORNER
     return {
         "gain": sensor.gain,
         "gain_sigma_pct": 100 * float(np.sqrt(covariance[0, 0])),
-        "corner_loss_pct": 100 * sensor.corner_loss,
-        "corner_loss_sigma_pct": 100 * (1 - sensor.corner_loss) * float(np.sqrt(corner)),
+        "corner_loss_pct": 100 * sensor.corner_loss if told else None,
+        "corner_loss_sigma_pct": 100 * _corner_sigma(sensor) if told else None,
         "gamma": sensor.gamma,
         "gamma_sigma_pct": 100 * float(np.sqrt(covariance[3, 3])),
         "noise_dn": noise.noise_dn,
@@ -467,11 +478,12 @@ def _doubts(case: _Case, fit: Shading, sensors: Mapping[str, Sensor]) -> Iterato
                 f"camera {name}: {outlying:.0%} of its patches are not as bright as they should be; "
                 "look for highlights or dirt"
             )
-        open_pct = _numbers(sensors[name], case.noise[name])["corner_loss_sigma_pct"]
-        if open_pct > 100 * _OPEN_CORNER:
+        sigma = _corner_sigma(sensors[name])
+        if sigma > _OPEN_CORNER:
+            known_to = f"known only to {100 * sigma:.0f} %" if sigma <= _NO_CORNER else "not known, and none is stated"
             yield (
-                f"camera {name}: the falloff in its corners is known only to {open_pct:.0f} %; show it the board in "
-                "the corners too, together with other cameras"
+                f"camera {name}: the falloff in its corners is {known_to}; show it the board in the corners too, "
+                "together with other cameras"
             )
     if _gamma_told(case, fit) > _TOLD:
         yield "gamma cannot be determined from these images; it stays close to the given value"

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import codecs
+import io
 import logging
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import wraps
 from importlib import import_module
 from inspect import signature
 from keyword import iskeyword
-from typing import Any, get_type_hints
+from pathlib import Path
+from typing import Any, NoReturn, get_type_hints
 
 import tyro
 
@@ -18,6 +22,7 @@ from cuspid import __version__
 from cuspid.cli.shared import console
 from cuspid.errors import CuspidError
 from cuspid.options import check
+from cuspid.values import one_line
 
 DESCRIPTION = (
     f"cuspid {__version__}: passive intra-oral 3D scanning: simulate, reconstruct, and prove the accuracy. "
@@ -107,20 +112,63 @@ class _Notes(logging.Handler):
 
 def main(arguments: list[str] | None = None) -> None:
     """Run a verb; a known error prints one line on stderr and exits with status 1."""
+    _require_streams()
+    warnings.filterwarnings("ignore", module="PIL")  # what is wrong with an image is told where it is read
     log = logging.getLogger("cuspid")
     log.setLevel(logging.INFO)
     log.handlers = [_Notes()]
     try:
         _run(sys.argv[1:] if arguments is None else arguments)
     except CuspidError as error:
-        console.print(f"cuspid: {error}", style="red", soft_wrap=True, highlight=False)
-        sys.exit(1)
+        _fail(str(error))
     except KeyboardInterrupt:
         console.print("cuspid: interrupted; run the same command again to continue")
         sys.exit(130)
     except BrokenPipeError:  # what reads us, as ``head`` does, has had enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _print_no_more()
         sys.exit(1)
+    except MemoryError as error:
+        _fail(f"there is not enough memory ({one_line(error) or 'for this size'}); give less, smaller or coarser input")
+    except OSError as error:
+        if error.filename is None:  # no file of ours: where we print to
+            _print_no_more()
+            _fail(f"what is printed cannot be written ({error.strerror or error}); print elsewhere")
+        _fail(f"{error.filename}: cannot be used ({error.strerror or error}); change its permissions, or give another")
+
+
+def _fail(message: str) -> NoReturn:
+    console.print(f"cuspid: {CuspidError(message)}", style="red", soft_wrap=True, highlight=False)
+    sys.exit(1)
+
+
+def _print_no_more() -> None:
+    """Let what is still to be printed go nowhere, which at the end would fail again."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _require_streams() -> None:
+    """Streams that take all that is printed: nowhere, if they are closed, and in other letters where a terminal does
+    not have those."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115
+        stream = getattr(sys, name)
+        if isinstance(stream, io.TextIOWrapper) and codecs.lookup(stream.encoding).name != "utf-8":
+            stream.reconfigure(errors=_IN_OTHER_LETTERS)
+
+
+_IN_OTHER_LETTERS = "cuspid.in_other_letters"
+_LETTERS = {"µ": "u", "μ": "u", "±": "+-", "°": " deg", "²": "2", "³": "3", "×": "x", "…": "...", "—": "-", "–": "-"}
+
+
+def _in_other_letters(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    wanted = error.object[error.start : error.end]
+    return "".join(_LETTERS.get(letter, "?") for letter in wanted), error.end
+
+
+codecs.register_error(_IN_OTHER_LETTERS, _in_other_letters)
 
 
 def _run(arguments: Sequence[str]) -> None:

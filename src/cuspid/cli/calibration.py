@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
@@ -15,13 +15,22 @@ from tyro.conf import Positional
 
 from cuspid import storage
 from cuspid.board import Board
-from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, calibrate_rig, in_frame_of
+from cuspid.calibration.calibrate import (
+    CalibrationOptions,
+    RigCalibration,
+    calibrate_rig,
+    in_frame_of,
+    size_notes,
+)
+from cuspid.calibration.causes import MOST_TRIED, cause_of_absence, is_part_of_a_larger_one
 from cuspid.calibration.corners import BoardView, Views, find_corners
 from cuspid.calibration.photometry import Photometry, PhotometryOptions, calibrate_light, look_at_patches
+from cuspid.calibration.start import LEAST_VIEWS
 from cuspid.calibration.target import PLATE_MM, target_body
 from cuspid.calibration.uncertainty import projection_sigma_px
 from cuspid.cli.report import report
-from cuspid.cli.shared import Flat, console, show_progress
+from cuspid.cli.shared import Flat, console, named, show_progress
+from cuspid.errors import ReconstructionError
 from cuspid.image_sequence import ImageSequence
 from cuspid.options import Range
 from cuspid.progress import Progress
@@ -115,10 +124,13 @@ def calibrate(
             for name, path in sources.items()
         }
         views = _views(sequences, board, progress)
+        _require_views(sequences, views, board)
         found = calibrate_rig(views, {name: each.size for name, each in sequences.items()}, board, options)
+        drawn_notes = () if given is None else size_notes(found.rig, given.rig, board)
         found = found if given is None else in_frame_of(found, given.rig)
         light = _light(found, sequences, board, given, photometry, progress) if photometry.photometry else None
-    notes = (*(note for each in sequences.values() for note in each.notes), *found.notes)
+    read = (note for each in sequences.values() for note in each.notes)
+    notes = (*read, *_unseen(sequences, views), *drawn_notes, *found.notes)
     found = replace(found, notes=notes)
     with storage.claimed_folder(out, "calibrate", settings, hashes | drawn_hash, replace=True):
         _write(found, light, _handpiece(found, light, given, working_distance_mm), board, out)
@@ -173,6 +185,38 @@ def _views(sequences: Mapping[str, ImageSequence], board: Board, progress: Progr
         for (camera, index), view in zip(images, found, strict=True)
         if view is not None
     }
+
+
+def _require_views(sequences: Mapping[str, ImageSequence], views: Views, board: Board) -> None:
+    """Raise ReconstructionError, which names the cause, where a camera hardly saw the board as it was described, or saw
+    a larger one."""
+    for name, sequence in sequences.items():
+        seen = [index for index, instant in enumerate(sequence.names) if (name, instant) in views]
+        unseen = [index for index in range(len(sequence)) if index not in set(seen)]
+        if len(seen) >= LEAST_VIEWS:
+            if is_part_of_a_larger_one(_some(sequence, seen), board):
+                raise ReconstructionError(
+                    f"calibration: the board in the images of camera {name} has a square more each way; the corners "
+                    f"were counted, not the squares: give --columns {board.columns + 1} --rows {board.rows + 1}"
+                )
+        elif (cause := cause_of_absence(_some(sequence, unseen), board)) is not None:
+            raise ReconstructionError(
+                f"calibration: the board is found in {len(seen)} of {len(sequence)} images of camera {name}; {cause}"
+            )
+
+
+def _some(sequence: ImageSequence, indices: Sequence[int]) -> list[UInt8[np.ndarray, "h w"]]:
+    """A few of some images, evenly, in grey."""
+    tried = [indices[k] for k in np.unique(np.linspace(0, len(indices) - 1, MOST_TRIED).astype(int))] if indices else []
+    return [cv2.cvtColor(sequence.image(index), cv2.COLOR_RGB2GRAY) for index in tried]
+
+
+def _unseen(sequences: Mapping[str, ImageSequence], views: Views) -> Iterator[str]:
+    """In which images the board was not found."""
+    for name, sequence in sequences.items():
+        unseen = [instant for instant in sequence.names if (name, instant) not in views]
+        if unseen:
+            yield f"camera {name}: the board was not found in {len(unseen)} of {len(sequence)} images: {named(unseen)}"
 
 
 def _handpiece(
@@ -258,7 +302,8 @@ def _print_light(light: Photometry) -> None:
         table.add_column(heading, justify="left" if heading == "camera" else "right", no_wrap=True)
     for name, each in light.cameras.items():
         gain = f"{each.gain:.3f} ±{each.gain_sigma_pct:.1f}"
-        corner = f"{-each.corner_loss_pct:.1f} ±{each.corner_loss_sigma_pct:.1f}"
+        loss, sigma = each.corner_loss_pct, each.corner_loss_sigma_pct
+        corner = "-" if loss is None or sigma is None else f"{-loss:.1f} ±{sigma:.1f}"
         gamma = f"{each.gamma:.2f} ±{each.gamma_sigma_pct:.1f}"
         left = [_shown(value) for value in (each.noise_dn, each.before_pct, each.held_out_pct)]
         table.add_row(name, gain, corner, gamma, *left)

@@ -49,6 +49,8 @@ def optics(
     """
     if not (distance_mm > 0 and blur_px > 0 and baseline_mm >= 0):
         raise InputError("optics: --distance-mm and --blur-px must be larger than 0, --baseline-mm at least 0")
+    if out is not None:
+        storage.require_suffix(out, ".csv")
     rows = [_optics_row(name, lens, distance_mm, blur_px, baseline_mm) for name, lens in PRESETS.items()]
     if out is not None:
         storage.write_table(out, rows)

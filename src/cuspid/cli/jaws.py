@@ -25,7 +25,7 @@ from cuspid.anatomy.preparation.prepare import (
 from cuspid.anatomy.preparation.prepare import prepare as prepare_teeth
 from cuspid.anatomy.shape.boxed import boxed
 from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
-from cuspid.errors import InputError
+from cuspid.errors import InputError, OutputError
 from cuspid.jaw import Jaw
 from cuspid.options import TOOTH, Range
 from cuspid.reporting.figures.drawing import save_picture
@@ -135,6 +135,8 @@ def _write_jaw(path: Path, make: Callable[[], Jaw], title: str) -> Jaw:
     """Write a jaw, what its mesh file cannot hold, and a picture of it; say what it has."""
     if path.suffix.lower() not in storage.MESH_SUFFIXES:
         raise InputError(f"{path}: give a file name that ends in .ply, .stl or .obj")
+    if path.exists() and not (path.is_file() and storage.is_jaw(path)):
+        raise OutputError(f"{path}: is there already, and no jaw that cuspid wrote; give another name as --out")
     jaw = make()
     storage.write_jaw(path, jaw)
     save_picture(path.with_suffix(".png"), jaw.mesh, title=title)

@@ -10,9 +10,11 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from cuspid import panorama_pipeline, storage
+from cuspid.anatomy.orientation import require_one_jaw
 from cuspid.cli.report import report
-from cuspid.cli.shared import Flat, console, show_progress
+from cuspid.cli.shared import Flat, console, named, show_progress
 from cuspid.errors import InputError
+from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
 from cuspid.image_sequence import ImageSequence
 from cuspid.motion.single import loosely_held
@@ -91,6 +93,10 @@ def _stitch_rig(folder: Path, out: Path, options: StitchOptions) -> None:
 
 def _view_mesh(path: Path, out: Path, unit: storage.Unit, options: MeshViewOptions) -> None:
     mesh, hashes = storage.read_mesh(path, unit), {"mesh": storage.hash_file(path)}
+    storage.require_size(storage.MeasuredFile(path=path, mesh=mesh, unit=unit))
+    mesh, facing = facing_outwards(mesh)
+    with storage.reading(path):
+        require_one_jaw(mesh)
     with show_progress() as progress, storage.claimed_folder(out, "stitch", {"view": options}, hashes, replace=True):
         views, occlusal_from_mesh = panorama_pipeline.view_mesh(mesh, options, progress=progress)
         clear(out)
@@ -101,7 +107,7 @@ def _view_mesh(path: Path, out: Path, unit: storage.Unit, options: MeshViewOptio
     width_mm, depth_mm = views.panorama.size_mm or (0.0, 0.0)
     strips = ", ".join(views.strips) or "none"
     console.print(f"{out / 'panorama.png'}: {width_mm:.1f} x {depth_mm:.1f} mm; strips: {strips}")
-    for note in views.panorama.notes:
+    for note in (*facing, *views.panorama.notes):
         console.print(f"note: {note}")
 
 
@@ -176,10 +182,3 @@ def left_out(frames: Iterable[FrameUse]) -> list[str]:
         if not frame.used and frame.reason is not None and not frame.reason.startswith("in part "):
             names.setdefault(frame.reason.split(":")[0], []).append(frame.name)
     return [f"{len(each)} frames, {reason}: {named(each)}" for reason, each in names.items()]
-
-
-def named(names: list[str], most: int = 6) -> str:
-    """Names on one line; if there are many, those in the middle are left out."""
-    if len(names) <= most:
-        return ", ".join(names)
-    return f"{', '.join(names[: most - 1])} ... {names[-1]}"

@@ -34,6 +34,7 @@ def report(
         unit: Length unit of the reference.
     """
     path = out or folder / "report.html"
+    storage.require_suffix(path, ".html", ".htm")
     with storage.reading(folder):
         page = report_page(storage.read_result(folder, reference, unit), options)
     storage.write_bytes(path, page.encode())

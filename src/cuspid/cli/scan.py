@@ -23,6 +23,7 @@ from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.evaluation.margin import MarginError, cut_margins, margin_error
 from cuspid.evaluation.spheres import SphereReport, evaluate_spheres
 from cuspid.evaluation.trajectory import trajectory_error
+from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
 from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
@@ -117,16 +118,18 @@ def evaluate(
     *,
     out: Path,
     source: Annotated[Source, Flat] = Source(),
+    reference_unit: storage.Unit | None = None,
     options: Annotated[EvaluationOptions, Flat] = EvaluationOptions(),
 ) -> None:
     """Measure the trueness of a mesh against a reference: trueness.json, and the colour map as PLY and PNG.
 
     Args:
-        mesh: The scan (STL, PLY, OBJ), in any pose.
+        mesh: The scan (STL, PLY, OBJ), in any pose, in --unit.
         reference: A mesh, or the folder truth/ of a simulation, which also tells what could be seen.
         out: Folder for the results.
+        reference_unit: Length unit of the reference, if it is another one than that of the scan.
     """
-    _evaluate(mesh, reference, out, source, options)
+    _evaluate(mesh, reference, out, source, options, reference_unit)
 
 
 def _simulate(mesh: Path | None, out: Path, source: Source, probe: Probe, options: SimulationOptions) -> None:
@@ -171,15 +174,30 @@ def reconstruct_capture(capture: Capture, out: Path, options: ReconstructionOpti
         _print_expected(found.expectation, sigma_um, found.told_by)
 
 
-def _evaluate(mesh: Path, reference: Path, out: Path, source: Source, options: EvaluationOptions) -> None:
-    _measure_trueness(mesh, reference, out, source, options)  # and let go of the surfaces, which the report reads again
-    report(out, reference=reference, unit=source.unit)
+def _evaluate(
+    mesh: Path,
+    reference: Path,
+    out: Path,
+    source: Source,
+    options: EvaluationOptions,
+    reference_unit: storage.Unit | None = None,
+) -> None:
+    unit = reference_unit or source.unit
+    _measure_trueness(mesh, reference, out, source, options, unit)  # lets go of the surfaces, which the report reads
+    report(out, reference=reference, unit=unit)
 
 
-def _measure_trueness(mesh: Path, reference: Path, out: Path, source: Source, options: EvaluationOptions) -> None:
+def _measure_trueness(
+    mesh: Path, reference: Path, out: Path, source: Source, options: EvaluationOptions, reference_unit: storage.Unit
+) -> None:
     file = storage.read_mesh_file(mesh, source.unit)
-    scan, sigma_um = file.mesh, file.vertex_values.get(storage.SIGMA)
-    against = pipeline.load_reference(reference, unit=source.unit, arch=source.arch)
+    (scan, facing), sigma_um = facing_outwards(file.mesh), file.vertex_values.get(storage.SIGMA)
+    measured = storage.MeasuredFile(path=mesh, mesh=scan, unit=source.unit)
+    against = pipeline.load_reference(
+        reference, unit=reference_unit, arch=source.arch, scan=measured, labelling=source.labelling
+    )
+    for note in (*(f"scan: {note}" for note in facing), *against.notes):
+        console.print(f"note: {note}")
     known, hashes = against.jaw, {**against.hashes, "mesh": storage.hash_file(mesh)}
     with storage.claimed_folder(out, "evaluate", {"evaluation": options}, hashes, replace=True):
         trueness = pipeline.evaluate(

@@ -8,15 +8,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 from tyro.conf import arg
 
 from cuspid import storage
-from cuspid.anatomy.jaw_files import load_jaw
+from cuspid.anatomy.jaw_files import Labelling, load_jaw
+from cuspid.anatomy.numbering import Numbering
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.errors import InputError
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.jaw import Arch, Jaw
 from cuspid.options import SEED, Options, Range
@@ -36,6 +39,7 @@ class _Messages(Console):
 
 console = _Messages(stderr=True, markup=False, emoji=False)
 
+_ONE_PLACE_MM = 1e-6
 Flat = arg(name="")
 """The fields of a nested options value appear without a prefix."""
 
@@ -48,8 +52,17 @@ class Source(Options):
     """Length unit of the mesh file."""
     arch: Arch | None = None
     """Which jaw the file contains, if its teeth are to be numbered; for the phantom, lower by default."""
+    labels: Numbering = "auto"
+    """Numbers of the tooth labels in the file; found out from where the teeth stand unless given."""
+    label_map: Path | None = None
+    """JSON file of each label in the mesh file and its FDI number, for other numbers: {"1": 47, "2": 46}."""
     jaw_seed: Annotated[int, SEED] = 0
     """Seed that selects the individual of the built-in phantom."""
+
+    @property
+    def labelling(self) -> Labelling:
+        """How the tooth labels of the file are understood."""
+        return Labelling(numbering=self.labels, label_map=self.label_map)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +101,7 @@ def load_source(mesh: Path | None, source: Source) -> Jaw:
     """The jaw of a file in the occlusal frame, or the phantom; prints notes on what was found or is uncertain."""
     if mesh is None:
         return build_phantom(PhantomOptions(arch=source.arch or "lower", seed=source.jaw_seed))
-    jaw, notes = load_jaw(mesh, unit=source.unit, arch=source.arch)
+    jaw, notes = load_jaw(mesh, unit=source.unit, arch=source.arch, labelling=source.labelling)
     for note in notes:
         console.print(f"note: {note}")
     return jaw
@@ -97,9 +110,18 @@ def load_source(mesh: Path | None, source: Source) -> Jaw:
 def load_probe(probe: Probe) -> Handpiece:
     """The handpiece of a file, or a built-in design."""
     if probe.handpiece is not None:
-        return storage.read_handpiece(probe.handpiece, probe.working_distance_mm)
+        device = storage.read_handpiece(probe.handpiece, probe.working_distance_mm)
+        _require_places(probe.handpiece, device)
+        return device
     distance_mm = probe.working_distance_mm or DesignOptions.working_distance_mm
     return DESIGNS[probe.design](DesignOptions(working_distance_mm=distance_mm, lights=probe.lights or "white"))
+
+
+def _require_places(path: Path, device: Handpiece) -> None:
+    """Raise InputError where all cameras are at one place: they see the same, and no depth."""
+    centres = np.stack([each.cam_from_rig.inverse().translation for each in device.rig.cameras.values()])
+    if len(centres) > 1 and np.ptp(centres, axis=0).max() < _ONE_PLACE_MM:
+        raise InputError(f"{path}: all {len(centres)} cameras are at one place, which shows no depth; give theirs")
 
 
 def suited(probe: Probe, texture: Preset) -> Probe:
@@ -110,3 +132,10 @@ def suited(probe: Probe, texture: Preset) -> Probe:
     if plain:
         console.print("note: plain enamel takes coloured lights and crossed polarisers (--lights white for others)")
     return replace(probe, lights="colour-coded" if plain else "white")
+
+
+def named(names: list[str], most: int = 6) -> str:
+    """Names on one line; if there are many, those in the middle are left out."""
+    if len(names) <= most:
+        return ", ".join(names)
+    return f"{', '.join(names[: most - 1])} ... {names[-1]}"

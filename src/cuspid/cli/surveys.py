@@ -13,7 +13,7 @@ from rich.table import Table
 from tyro.conf import Positional
 
 from cuspid import storage
-from cuspid.anatomy.jaw_files import jaw_files, load_landmarked_jaw
+from cuspid.anatomy.jaw_files import Labelling, jaw_files, load_landmarked_jaw
 from cuspid.anatomy.landmarks.dimensions import (
     DIMENSIONS,
     Dimension,
@@ -27,6 +27,7 @@ from cuspid.anatomy.landmarks.dimensions import (
     needed_landmarks,
     survey,
 )
+from cuspid.anatomy.numbering import Numbering
 from cuspid.anatomy.shape.mean import MeanShapeOptions, mean_shape
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
@@ -45,6 +46,8 @@ def measure(
     landmarks: Path | None = None,
     unit: storage.Unit = "mm",
     arch: Arch | None = None,
+    labels: Numbering = "auto",
+    label_map: Path | None = None,
 ) -> None:
     """Measure the arch dimensions a, b, c and f of a jaw or of a folder of jaws, and tabulate them by group.
 
@@ -56,17 +59,22 @@ def measure(
         landmarks: File with the landmarks, for a single jaw whose landmarks are not beside it.
         unit: Length unit of the mesh files.
         arch: Upper or lower, if neither the files nor their names say so.
+        labels: Numbers of the tooth labels in the files; found out from where the teeth stand unless given.
+        label_map: JSON file of each label in the mesh files and its FDI number, for other numbers: {"1": 47, "2": 46}.
     """
-    files = jaw_files(jaws)
+    files, labelling = jaw_files(jaws), Labelling(numbering=labels, label_map=label_map)
     if landmarks is not None and len(files) > 1:
         raise InputError(
             f"{landmarks}: a single file of landmarks for {len(files)} jaws; put one beside each mesh instead"
         )
     hashes = {path.name: storage.hash_file(path) for path in _of_different_names(files)}
-    with storage.claimed_folder(out, "measure", {"arch": arch}, hashes, replace=True), show_progress() as progress:
+    with (
+        storage.claimed_folder(out, "measure", {"arch": arch, "labels": labels}, hashes, replace=True),
+        show_progress() as progress,
+    ):
 
         def load(number: int, path: Path) -> tuple[Jaw, tuple[str, ...]]:
-            jaw, notes = load_landmarked_jaw(path, unit=unit, arch=arch, landmarks=landmarks)
+            jaw, notes = load_landmarked_jaw(path, unit=unit, arch=arch, landmarks=landmarks, labelling=labelling)
             storage.write_landmarks(out / f"{path.stem}.landmarks.json", jaw.landmarks, "occlusal")
             _save_pictures(out, path.stem, jaw)
             progress("jaws", number, len(files))
@@ -110,7 +118,7 @@ def _print_survey(found: Survey) -> None:
         groups.add_row(group, count, *(_spread(cells.get(name)) for name in DIMENSIONS))
     Console().print(groups)
     for jaw in found.jaws:
-        for flag in implausible(jaw):
+        for flag in (*jaw.notes, *implausible(jaw)):
             console.print(f"note: {jaw.name}: {flag}")
     for name, reason in found.failures.items():
         console.print(f"  not measured: {name}: {reason}")
@@ -134,6 +142,8 @@ def shape(
     out: Path,
     unit: storage.Unit = "mm",
     arch: Arch | None = None,
+    labels: Numbering = "auto",
+    label_map: Path | None = None,
     options: Annotated[MeanShapeOptions, Flat] = MeanShapeOptions(),
 ) -> None:
     """Find the mean jaw of a folder of labelled jaws, and the principal modes in which they vary.
@@ -142,12 +152,14 @@ def shape(
         jaws: Folder of jaw meshes. Landmarks are read from the JSON file beside a mesh, or estimated from its labels.
         out: Folder for mean.ply, modes.npz, shape.json and pictures.
         unit: Length unit of the mesh files.
-        arch: Upper or lower, if the files do not say so.
+        arch: Upper or lower, if neither the files nor their names say so.
+        labels: Numbers of the tooth labels in the files; found out from where the teeth stand unless given.
+        label_map: JSON file of each label in the mesh files and its FDI number, for other numbers: {"1": 47, "2": 46}.
     """
-    files = jaw_files(jaws)
+    files, labelling = jaw_files(jaws), Labelling(numbering=labels, label_map=label_map)
     hashes = {path.name: storage.hash_file(path) for path in _of_different_names(files)}
     with storage.claimed_folder(out, "shape", {"shape": options}, hashes, replace=True), show_progress() as progress:
-        samples = {path.stem: load_landmarked_jaw(path, unit=unit, arch=arch)[0] for path in files}
+        samples = {path.stem: _loaded(path, unit, arch, labelling) for path in files}
         model = mean_shape(samples, options, progress=progress)
         storage.write_shape_model(out, model)
         save_picture(out / "mean.png", model.mean.mesh, title=f"Mean of {len(samples)} jaws")
@@ -155,6 +167,13 @@ def shape(
         save_variance_picture(out / "variance.png", model)
     _print_model(model)
     report(out)
+
+
+def _loaded(path: Path, unit: storage.Unit, arch: Arch | None, labelling: Labelling) -> Jaw:
+    jaw, notes = load_landmarked_jaw(path, unit=unit, arch=arch, labelling=labelling)
+    for note in notes:
+        console.print(f"note: {path.stem}: {note}")
+    return jaw
 
 
 def _print_model(model: ShapeModel) -> None:

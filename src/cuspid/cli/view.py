@@ -12,6 +12,7 @@ from cuspid import storage
 from cuspid.cli.shared import console
 from cuspid.options import Range
 from cuspid.reporting.live_view import serve
+from cuspid.reporting.same_origin import address
 
 
 def view(
@@ -33,7 +34,7 @@ def view(
     """
     server = serve(storage.read_result(folder, reference, unit), host, port)
     console.print(
-        f"http://{host}:{server.get_port()} shows {folder}; press Ctrl-C to stop", highlight=False, soft_wrap=True
+        f"{address(host, server.get_port())} shows {folder}; press Ctrl-C to stop", highlight=False, soft_wrap=True
     )
     try:
         threading.Event().wait()

@@ -22,6 +22,10 @@ from cuspid.options import Options, Range
 _NARROWEST_MM, _WIDEST_MM = 1e-3, 2.0
 """Bounds of the distance at which a sample loses its weight."""
 _LEAST_OVERLAP = 0.25
+_POOR_MM = 0.06
+"""Mean distance above which it is asked whether the scan is mirrored."""
+_FAR_BETTER = 0.5
+"""Share of the mean distance that is left of a mirrored scan when it is mirrored back, at most."""
 _FEW = 2000
 """Number of samples that suffice to tell good poses from bad ones."""
 
@@ -73,20 +77,60 @@ def register(
 
 
 def _lay(scan: Mesh, surface: SignedDistance, options: RegistrationOptions, rng: np.random.Generator) -> Alignment:
+    found = _search(scan, surface, options, rng)
+    mirrored = _mirror_note(scan, surface, found, options)
+    if found.overlap < _LEAST_OVERLAP:
+        reason = mirrored or ("; check that both show the same teeth, in the same unit",)
+        raise InputError(
+            f"registration: at best {found.overlap:.0%} of the scan lies close to the reference{reason[0]}"
+        )
+    alignment = fit(scan.sample(options.samples, rng)[0], surface, found.best, options)
+    notes = tuple(f"alignment: doubtful{note}" for note in mirrored)
+    return replace(alignment, notes=(*notes, *_doubts(alignment), *_rivals(found.poses, found.misfits_mm, found.few)))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Search:
+    """Poses that were found, by a few points of the scan."""
+
+    few: Float[np.ndarray, "n 3"]
+    poses: list[Rigid3]
+    misfits_mm: Float[np.ndarray, "k"]
+    """Truncated mean distance of each pose."""
+    overlap: float
+    """Of the best one."""
+
+    @property
+    def best(self) -> Rigid3:
+        """The pose with the smallest misfit."""
+        return self.poses[int(np.argmin(self.misfits_mm))]
+
+
+def _search(scan: Mesh, surface: SignedDistance, options: RegistrationOptions, rng: np.random.Generator) -> _Search:
     few, _ = scan.sample(_FEW, rng)
     brief = replace(options, tolerance_um=1.0, iterations=25)
     starts = find_poses(scan, surface.mesh, options.search, rng=rng)
     poses = [refine(few, surface, start, brief) for start in starts]
-    misfits = np.array([_truncated_mean_mm(few, surface, pose) for pose in poses])
-    best = poses[int(np.argmin(misfits))]
+    misfits_mm = np.array([_truncated_mean_mm(few, surface, pose) for pose in poses])
+    best = poses[int(np.argmin(misfits_mm))]
     overlap = _overlap(surface.closest_points(best.apply(few)), options.outlier_mm)
-    if overlap < _LEAST_OVERLAP:
-        raise InputError(
-            f"registration: at best {overlap:.0%} of the scan lies close to the reference; "
-            "check that both show the same teeth, in the same unit"
-        )
-    alignment = fit(scan.sample(options.samples, rng)[0], surface, best, options)
-    return replace(alignment, notes=(*_doubts(alignment), *_rivals(poses, misfits, few)))
+    return _Search(few=few, poses=poses, misfits_mm=misfits_mm, overlap=overlap)
+
+
+def _mirror_note(scan: Mesh, surface: SignedDistance, found: _Search, options: RegistrationOptions) -> tuple[str, ...]:
+    """What is said where the mirror image of a scan that fits badly fits far better: no motion mends that."""
+    misfit_mm = float(found.misfits_mm.min())
+    if misfit_mm < _POOR_MM and found.overlap > _LEAST_OVERLAP:
+        return ()
+    image = Mesh(scan.vertices * [-1.0, 1.0, 1.0], scan.faces[:, ::-1])
+    mirrored = _search(image, surface, options, np.random.default_rng(0))
+    mirrored_mm = float(mirrored.misfits_mm.min())
+    if mirrored_mm > _FAR_BETTER * misfit_mm or mirrored.overlap < max(found.overlap, 2 * _LEAST_OVERLAP):
+        return ()
+    return (
+        f", the scan is a mirror image of the reference: mirrored it lies {1000 * mirrored_mm:.0f} instead of "
+        f"{1000 * misfit_mm:.0f} um from it (mean); mirror one of the two files",
+    )
 
 
 def fit(

@@ -8,6 +8,7 @@ from cuspid.capture import Dropped, Frame, ImageFolder, image_size
 from cuspid.errors import InputError
 from cuspid.rig import Handpiece
 from cuspid.storage.captures import IMAGE_SUFFIXES
+from cuspid.storage.files import is_meant
 
 _State = tuple[int, int]
 """Size and time of modification of a file."""
@@ -78,14 +79,14 @@ class Arrivals:
         return found
 
     def _look(self, now_s: float) -> None:
-        for folder in sorted(path for path in self._images.glob("*") if path.is_dir()):
+        for folder in sorted(path for path in self._images.glob("*") if path.is_dir() and is_meant(path)):
             if folder.name not in self._handpiece.rig.names:
                 raise InputError(
                     f"{folder}: the handpiece has no camera {folder.name}; its cameras are "
                     f"{', '.join(self._handpiece.rig.names)}"
                 )
             for path in folder.iterdir():
-                if path.suffix.lower() in IMAGE_SUFFIXES and path.stem not in self._given:
+                if is_meant(path) and path.suffix.lower() in IMAGE_SUFFIXES and path.stem not in self._given:
                     self._look_at(path, now_s)
 
     def _look_at(self, path: Path, now_s: float) -> None:

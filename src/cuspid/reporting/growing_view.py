@@ -16,6 +16,7 @@ from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.reporting.live_view import add, start
 from cuspid.reporting.pages.scene import camera_lines, camera_path
+from cuspid.reporting.same_origin import address
 from cuspid.rig import Handpiece, Rig
 
 _RIMS_EVERY_S = 3.0
@@ -54,7 +55,7 @@ class GrowingView:
     def __init__(self, host: str, port: int) -> None:
         """It takes the next free port. Raises MissingDependencyError without viser."""
         self._server = start(host, port)
-        self.address = f"http://{host}:{self._server.get_port()}"
+        self.address = address(host, int(self._server.get_port()))
         self._nodes = dict[int, Any]()
         self._words = self._server.gui.add_markdown("Waiting for the first frame.")
         self._toggles = {name: self._server.gui.add_checkbox(name, True) for name in ("Path", "Holes")}

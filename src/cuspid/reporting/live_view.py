@@ -25,7 +25,7 @@ from cuspid.reporting.pages.scene import (
     shown_frame,
     surface_maps,
 )
-from cuspid.reporting.same_origin import only_own_pages
+from cuspid.reporting.same_origin import only_own_pages, require_address
 from cuspid.shape_model import ShapeModel
 from cuspid.storage import Result, ScanResult, ShapeResult
 
@@ -59,6 +59,7 @@ def start(host: str, port: int) -> Server:
         import viser
     except ImportError as error:
         raise MissingDependencyError("the view needs viser: pip install 'cuspid[view]'") from error
+    require_address(host)
     with only_own_pages(host):
         server = viser.ViserServer(host=host, port=port, label="cuspid", verbose=False)
     server.scene.configure_environment_map(None)

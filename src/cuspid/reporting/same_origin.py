@@ -14,12 +14,30 @@ from http import HTTPStatus
 from typing import Any
 from urllib.parse import urlsplit
 
-from cuspid.errors import MissingDependencyError
+from cuspid.errors import InputError, MissingDependencyError
 
 Request = Any
 """``websockets.http11.Request``; it comes with viser, which may be missing."""
 Answer = Callable[[Any, Request], Any]
 """What websockets calls first for each request: None goes on, a response ends it."""
+
+
+def address(host: str, port: int) -> str:
+    """Where a browser finds a server; addresses of IPv6 are in brackets."""
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
+def require_address(host: str) -> None:
+    """Raise InputError where this machine cannot listen on an address."""
+    try:
+        family, kind, protocol, _, place = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as tried:
+            tried.bind(place)
+    except (OSError, UnicodeError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise InputError(
+            f"--host {host}: this machine cannot listen there ({why}); give one of its addresses"
+        ) from error
 
 
 def is_own(host: str | None, origin: str | None, bound: str) -> bool:

@@ -19,7 +19,7 @@ GRADIENT_NOISE_SD = 0.27 / 2
 
 def main(folder: Path) -> None:
     """Render every image that the scene file asks for."""
-    description = json.loads((folder / "scene.json").read_text())
+    description = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
     bpy.ops.wm.read_factory_settings(use_empty=True)
     set_up_cycles(description)
     materials = [build_material(each) for each in description["materials"]]

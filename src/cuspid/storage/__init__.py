@@ -19,20 +19,19 @@ from cuspid.storage.files import (
     hash_file,
     read_json,
     reading,
+    require_suffix,
     whole_file,
     write_bytes,
     write_json,
 )
 from cuspid.storage.frame_times import TIMES_FILES, read_frame_times
 from cuspid.storage.handpieces import read_handpiece, read_rig_config, write_handpiece, write_rig_config
-from cuspid.storage.jaws import is_jaw, read_jaw, read_labelled_mesh, write_jaw
+from cuspid.storage.jaws import is_jaw, read_jaw, read_label_map, read_labelled_mesh, write_jaw
 from cuspid.storage.landmarks import MARKUPS_SUFFIX, LandmarkFile, LandmarkFrame, read_landmarks, write_landmarks
 from cuspid.storage.meshes import (
     MESH_SUFFIXES,
-    MM_PER_UNIT,
     SIGMA,
     MeshFile,
-    Unit,
     read_mesh,
     read_mesh_file,
     write_mesh,
@@ -64,6 +63,7 @@ from cuspid.storage.shapes import read_shape_model, write_shape_model
 from cuspid.storage.tables import csv_table, write_table
 from cuspid.storage.trueness import trueness_summary, write_trueness
 from cuspid.storage.truths import read_truth, write_path, write_truth
+from cuspid.storage.units import MM_PER_UNIT, MeasuredFile, Unit, require_one_unit, require_size
 from cuspid.storage.videos import write_video
 
 __all__ = [
@@ -77,6 +77,7 @@ __all__ = [
     "CalibrationResult",
     "LandmarkFile",
     "LandmarkFrame",
+    "MeasuredFile",
     "MeshFile",
     "PanoramaResult",
     "Result",
@@ -102,6 +103,7 @@ __all__ = [
     "read_handpiece",
     "read_jaw",
     "read_json",
+    "read_label_map",
     "read_labelled_mesh",
     "read_landmarks",
     "read_mesh",
@@ -117,6 +119,9 @@ __all__ = [
     "read_shape_model",
     "read_truth",
     "reading",
+    "require_one_unit",
+    "require_size",
+    "require_suffix",
     "rig_sources",
     "trueness_summary",
     "whole_file",

@@ -51,7 +51,7 @@ def read_capture(folder: Path, handpiece: Path | None = None, working_distance_m
             "of photographs"
         )
     known = read_handpiece(handpiece or folder / "handpiece.json", working_distance_mm)
-    unknown = {path.name for path in images.iterdir() if path.is_dir()} - set(known.rig.names)
+    unknown = _folders_of_images(images) - set(known.rig.names)
     if unknown:
         raise InputError(
             f"{images}: no camera of the handpiece matches the folder {', '.join(sorted(unknown))}; the cameras "
@@ -67,6 +67,18 @@ def read_capture(folder: Path, handpiece: Path | None = None, working_distance_m
         for name in frame.cameras:
             capture.check_image(frame, name)
     return capture
+
+
+def _folders_of_images(images: Path) -> set[str]:
+    """The folders in which images lie, at any depth, as cameras are named: ``left``, ``rig/left``."""
+    found, left = set[str](), [path for path in finished(images) if path.is_dir()]
+    while left:
+        folder = left.pop()
+        inner = [path for path in finished(folder) if path.is_dir()]
+        if not inner or any(path.suffix.lower() in IMAGE_SUFFIXES for path in finished(folder)):
+            found.add(folder.relative_to(images).as_posix())
+        left += inner
+    return found
 
 
 def _listed(folder: Path, handpiece: Handpiece, stems: Mapping[str, set[str]]) -> list[Frame]:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import csv
 import dataclasses
 import errno
+import fcntl
 import hashlib
 import json
 import math
 import os
 import tempfile
+import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import UnionType
 from typing import Any, BinaryIO, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -32,9 +35,22 @@ PART = ".part-"
 """How the names of unfinished files begin; a killed run leaves them behind, and nothing reads them."""
 
 
+_NOT_FOR_US = ("@eaDir", "__MACOSX", "Thumbs.db", "desktop.ini", "lost+found")
+"""What systems put beside files, without a dot."""
+
+
 def finished(folder: Path) -> list[Path]:
-    """What is in a folder, without the unfinished files of a killed run."""
-    return [path for path in folder.iterdir() if not path.name.startswith(PART)]
+    """What is in a folder, without the unfinished files of a killed run and what is hidden, as systems put it beside
+    the files of people. Raises InputError where the folder may not be entered."""
+    try:
+        return [path for path in folder.iterdir() if is_meant(path)]
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be entered ({error.strerror or error}); change its permissions") from error
+
+
+def is_meant(path: Path) -> bool:
+    """Whether a file or folder is one that people put there."""
+    return not path.name.startswith(".") and path.name not in _NOT_FOR_US
 
 
 @contextmanager
@@ -90,6 +106,12 @@ def _describe(path: Path, error: OSError) -> str:
     if error.errno == errno.ENOSPC:
         return f"{path}: the disk is full; free some space and run the same command again to continue"
     return f"{path}: cannot be written ({error.strerror or error}); choose another --out"
+
+
+def require_suffix(path: Path, *suffixes: str) -> None:
+    """Raise OutputError where a file that is to be written has the name of another kind."""
+    if path.suffix.lower() not in suffixes:
+        raise OutputError(f"{path}: is no name of what is written; give one that ends in {' or '.join(suffixes)}")
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -246,17 +268,64 @@ def claimed_folder(
     results that are to be replaced stay those of the run that made them until the work is done."""
     existed = folder.exists()
     empty = not folder.is_dir() or not any(folder.iterdir())
-    entry = claim_folder(folder, stage, settings, inputs, replace=replace)
+    with _alone_in(folder):
+        try:
+            entry = claim_folder(folder, stage, settings, inputs, replace=replace)
+            yield
+        except (CuspidError, OSError, MemoryError):
+            if empty and folder.is_dir() and {path.name for path in folder.iterdir()} <= {"run.json"}:
+                (folder / "run.json").unlink(missing_ok=True)
+                if not existed:
+                    folder.rmdir()
+            raise
+        if read_manifest(folder).get(stage) != entry:
+            _enter(folder, stage, entry)
+
+
+_held: Counter[Path] = Counter()
+_holding = threading.Lock()
+"""The folders in which this process works, and how often it has claimed each."""
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """No other process works in a folder in the block, which is made if need be. Raises OutputError where one does.
+
+    The folder itself is locked (flock), so that no file is left, and the lock of a process that ends ends with it;
+    where folders cannot be locked, nothing is.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder}: is a file; give a folder as --out")
+    with _writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        place = folder.resolve()
+    with _holding:
+        _held[place] += 1
+        first = _held[place] == 1
     try:
-        yield
-    except CuspidError:
-        if empty and [path.name for path in folder.iterdir()] == ["run.json"]:
-            (folder / "run.json").unlink()
-            if not existed:
-                folder.rmdir()
-        raise
-    if read_manifest(folder).get(stage) != entry:
-        _enter(folder, stage, entry)
+        with ExitStack() as stack:
+            if first:
+                _lock(folder, stack)
+            yield
+    finally:
+        with _holding:
+            _held[place] -= 1
+
+
+def _lock(folder: Path, stack: ExitStack) -> None:
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return
+    stack.callback(os.close, descriptor)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise OutputError(
+            f"{folder}: another run of cuspid works there; wait until it has ended, or give another --out"
+        ) from error
+    except OSError:  # a file system without locks
+        return
 
 
 def _first_difference(old: Any, new: Any, name: str = "") -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from cuspid.body import Body, Box
 from cuspid.camera import Camera
@@ -21,6 +22,8 @@ from cuspid.values import LONGEST_MM, MOST_PX, checked_name, covariance, number,
 _MOST_DISTORTION = 1e3
 _BRIGHTEST, _NARROWEST_LOBE = 1e6, 1e4
 _SHORTEST_QUATERNION = 1e-6
+_ROUNDED = 1e-9
+"""Of a correlation; a covariance whose eigenvalues are less negative is read as it is."""
 _log = logging.getLogger("cuspid")
 _SET_BY = "a handpiece.json or, where the command has it, --working-distance-mm"
 
@@ -50,7 +53,7 @@ def camera_to_json(camera: Camera) -> dict[str, Any]:
         "focal_px": camera.focal_px,
         "principal_point_px": camera.principal_point_px,
         "distortion_k1_k2_p1_p2": camera.distortion,
-        "covariance_fx_fy_cx_cy_k1_k2_p1_p2": camera.covariance,
+        "covariance_fx_fy_cx_cy_k1_k2_p1_p2": _symmetric(camera.covariance),
     }
 
 
@@ -76,6 +79,20 @@ def camera_from_json(value: Mapping[str, Any], what: str = "camera") -> Camera:
     )
 
 
+def _symmetric(covariance: Float[np.ndarray, "n n"] | None) -> Float[np.ndarray, "n n"] | None:
+    """A covariance as readers take it: symmetric, and without a negative eigenvalue, however it was rounded."""
+    if covariance is None:
+        return None
+    even = (covariance + covariance.T) / 2
+    scale = np.sqrt(np.maximum(np.diag(even), 0))
+    scale = np.where(scale > 0, scale, 1)
+    values, axes = np.linalg.eigh(even / np.outer(scale, scale))
+    if values[0] > -_ROUNDED:
+        return even
+    clean = (axes * np.maximum(values, 0)) @ axes.T * np.outer(scale, scale)
+    return (clean + clean.T) / 2
+
+
 def handpiece_to_json(handpiece: Handpiece) -> dict[str, Any]:
     """All of a handpiece (docs/formats.md)."""
     known = {} if handpiece.body is None else {"body": _body_to_json(handpiece.body)}
@@ -88,7 +105,7 @@ def _optics_to_json(handpiece: Handpiece) -> dict[str, Any]:
         name: {
             **camera_to_json(mounted.camera),
             "cam_from_rig": rigid_to_json(mounted.cam_from_rig),
-            "covariance_rotation_rad_translation_mm": mounted.covariance,
+            "covariance_rotation_rad_translation_mm": _symmetric(mounted.covariance),
         }
         for name, mounted in handpiece.rig.cameras.items()
     }
@@ -112,7 +129,7 @@ def _light_to_json(light: Light) -> dict[str, Any]:
     plain = {name: getattr(light, name) for name in _LIGHT_FIELDS}
     if light.glare == 1:
         del plain["glare"]
-    return plain if light.covariance is None else {**plain, _LIGHT_COVARIANCE: light.covariance}
+    return plain if light.covariance is None else {**plain, _LIGHT_COVARIANCE: _symmetric(light.covariance)}
 
 
 def _sensor_to_json(sensor: Sensor) -> dict[str, Any]:
@@ -123,7 +140,7 @@ def _sensor_to_json(sensor: Sensor) -> dict[str, Any]:
     if any(sensor.falloff):
         value["falloff_r2_r4"] = sensor.falloff
     if sensor.covariance is not None:
-        value[_SENSOR_COVARIANCE] = sensor.covariance
+        value[_SENSOR_COVARIANCE] = _symmetric(sensor.covariance)
     return value
 
 

@@ -9,12 +9,13 @@ import numpy as np
 from jaxtyping import Int, UInt8
 
 from cuspid.errors import InputError
-from cuspid.inputs import require_file
-from cuspid.jaw import ARCHES, FDI_FROM_UNIVERSAL, Arch, Jaw, Landmark, Sphere
+from cuspid.inputs import is_there, require_file
+from cuspid.jaw import ARCHES, FDI_FROM_UNIVERSAL, GUM, Arch, Jaw, Landmark, Sphere
 from cuspid.mesh import Mesh
 from cuspid.storage.files import read_json, reading, write_json
-from cuspid.storage.meshes import MESH_SUFFIXES, MeshFile, Unit, read_mesh_file, write_mesh
-from cuspid.values import LONGEST_MM, number, numbers, one_line, shown
+from cuspid.storage.meshes import MESH_SUFFIXES, MeshFile, read_mesh_file, write_mesh
+from cuspid.storage.units import Unit
+from cuspid.values import LONGEST_MM, number, numbers, one_line, shown, whole
 
 _LARGEST_LABEL = 10_000
 OCCLUSAL = "occlusal"
@@ -24,22 +25,22 @@ OCCLUSAL = "occlusal"
 def read_labelled_mesh(
     path: Path, unit: Unit = "mm"
 ) -> tuple[Mesh, Int[np.ndarray, "f"] | None, UInt8[np.ndarray, "f 3"] | None]:
-    """As :func:`cuspid.storage.meshes.read_mesh`, with the FDI label and the colour of each face where the file has
-    them.
+    """As :func:`cuspid.storage.meshes.read_mesh`, with the label, in whatever numbers, and the colour of each face
+    where the file has them.
 
-    Labels are the PLY face property ``label``, or a file ``<name>_facelabels.npy`` beside it, in FDI or Universal
-    numbers (recognised by their range). Raises InputError where their number is not that of the faces.
+    Labels are the PLY face property ``label``, or a file ``<name>_facelabels.npy`` beside it. Raises InputError where
+    their number is not that of the faces.
     """
     file = read_mesh_file(path, unit)
     labels = _labels_of(path, file)
     if labels is not None and len(labels) != len(file.mesh.faces):
         raise InputError(f"{path}: {len(labels)} labels for {len(file.mesh.faces)} faces; each face needs exactly one")
-    return file.mesh, None if labels is None else _fdi_labels(labels, path), file.face_colors
+    return file.mesh, labels, file.face_colors
 
 
 def _labels_of(path: Path, file: MeshFile) -> Int[np.ndarray, "f"] | None:
     beside = path.with_name(f"{path.stem}_facelabels.npy")
-    if beside.exists():
+    if is_there(beside):
         return _whole(beside, _read_array(beside))
     return _whole(path, file.face_values["label"]) if "label" in file.face_values else None
 
@@ -59,18 +60,21 @@ def _whole(path: Path, labels: np.ndarray) -> Int[np.ndarray, "f"]:
     return labels.astype(np.int64).reshape(-1)
 
 
-def _fdi_labels(labels: Int[np.ndarray, "f"], path: Path) -> Int[np.ndarray, "f"]:
-    values = {int(value) for value in np.unique(labels)} - {0}
-    if values <= set(FDI_FROM_UNIVERSAL.values()) and (
-        values & set(range(33, 49)) or not values & {9, 10, 19, 20, 29, 30}
-    ):
-        return labels
-    if values <= set(FDI_FROM_UNIVERSAL):
-        table = np.zeros(33, dtype=np.int64)
-        for universal, fdi in FDI_FROM_UNIVERSAL.items():
-            table[universal] = fdi
-        return table[labels]
-    raise InputError(f"{path}: tooth labels {sorted(values)[:6]} are neither FDI nor Universal numbers")
+def read_label_map(path: Path) -> dict[int, int]:
+    """Which FDI number each label stands for, from a JSON file: ``{"1": 47, "2": 46}``; 0 is gum."""
+    found = read_json(path)
+    if not isinstance(found, dict) or not found:
+        raise InputError(f'{path}: must hold each label and its FDI number, as {{"1": 47, "2": 46}}')
+    try:
+        table = {int(label): int(whole(f"label {label}", fdi, 0, 48)) for label, fdi in found.items()}
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except ValueError as error:
+        raise InputError(f"{path}: labels are whole numbers ({one_line(error)})") from error
+    for label, fdi in table.items():
+        if fdi != GUM and fdi not in FDI_FROM_UNIVERSAL.values():
+            raise InputError(f"{path}: label {label} cannot be {fdi}, which is no FDI number")
+    return table
 
 
 def write_jaw(path: Path, jaw: Jaw) -> None:
@@ -94,7 +98,7 @@ def write_jaw(path: Path, jaw: Jaw) -> None:
 def is_jaw(path: Path) -> bool:
     """Whether :func:`write_jaw` wrote a mesh file, so that its frame is known and more than the mesh may be read."""
     beside = path.with_suffix(".json")
-    if path.suffix.lower() not in MESH_SUFFIXES or not beside.is_file():
+    if path.suffix.lower() not in MESH_SUFFIXES or not is_there(beside):
         return False
     extra = read_json(beside)
     return isinstance(extra, dict) and extra.get("frame") == OCCLUSAL
@@ -106,6 +110,8 @@ def read_jaw(path: Path) -> Jaw:
     Raises InputError where the JSON beside the mesh is missing or broken.
     """
     mesh, labels, _ = read_labelled_mesh(path)
+    if labels is not None and not set(np.unique(labels).tolist()) <= {GUM, *FDI_FROM_UNIVERSAL.values()}:
+        raise InputError(f"{path}: its tooth labels are not FDI numbers, which those of a jaw by cuspid are")
     beside = path.with_suffix(".json")
     extra = read_json(beside)
     with reading(beside):

@@ -20,11 +20,8 @@ from cuspid.geometry import distinct_rows, owned
 from cuspid.inputs import read_bytes
 from cuspid.mesh import Mesh
 from cuspid.storage.files import write_bytes
+from cuspid.storage.units import MM_PER_UNIT, Unit
 from cuspid.values import LONGEST_MM, one_line
-
-Unit = Literal["mm", "cm", "m", "in", "um"]
-MM_PER_UNIT: Mapping[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "um": 0.001}
-"""Length units that a mesh file may be in."""
 
 _PLACE_AND_COLOR = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"}
 _COLOR = ("red", "green", "blue")
@@ -74,7 +71,7 @@ def read_mesh_file(path: Path, unit: Unit = "mm") -> MeshFile:
     with _let_go(loaded, *parts):
         if not isinstance(loaded, trimesh.Trimesh) or len(loaded.vertices) == 0 or len(loaded.faces) == 0:
             raise InputError(f"{path}: the mesh is empty (no triangles); export the surface, not a point cloud")
-        return _checked(path, loaded, declared, MM_PER_UNIT[unit])
+        return _checked(path, loaded, declared, unit)
 
 
 @contextmanager
@@ -100,7 +97,8 @@ def _let_go(*meshes: trimesh.parent.Geometry) -> Iterator[None]:
             vars(mesh).clear()
 
 
-def _checked(path: Path, loaded: trimesh.Trimesh, declared: int, mm_per_unit: float) -> MeshFile:
+def _checked(path: Path, loaded: trimesh.Trimesh, declared: int, unit: Unit) -> MeshFile:
+    mm_per_unit = MM_PER_UNIT[unit]
     vertices, faces = np.asarray(loaded.vertices, dtype=np.float64), np.asarray(loaded.faces, dtype=np.int64)
     if len(faces) < declared:
         raise InputError(
@@ -111,7 +109,10 @@ def _checked(path: Path, loaded: trimesh.Trimesh, declared: int, mm_per_unit: fl
     if not np.isfinite(vertices).all():
         raise InputError(f"{path}: some coordinates are not finite numbers; repair the mesh and export it again")
     if np.abs(vertices).max() * mm_per_unit > LONGEST_MM:
-        raise InputError(f"{path}: coordinates beyond {LONGEST_MM / 1000:g} m; repair the mesh, or give its --unit")
+        raise InputError(
+            f"{path}: coordinates beyond {LONGEST_MM / 1000:g} m (read in {unit}); repair the mesh, or give its unit "
+            "(--unit; --reference-unit where it is what a scan is compared with)"
+        )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"{path}: faces refer to vertices that do not exist; export the mesh again")
     first, number = distinct_rows(vertices)

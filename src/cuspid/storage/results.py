@@ -17,9 +17,10 @@ from jaxtyping import Float
 
 from cuspid.capture import Capture
 from cuspid.errors import InputError
+from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
 from cuspid.inputs import read_text
-from cuspid.jaw import Jaw
+from cuspid.jaw import FDI_FROM_UNIVERSAL, GUM, Jaw
 from cuspid.mesh import Mesh
 from cuspid.panorama import Panorama
 from cuspid.reconstruction import Reconstruction
@@ -29,10 +30,11 @@ from cuspid.storage.captures import read_capture
 from cuspid.storage.files import hash_file, read_json, read_manifest, reading
 from cuspid.storage.handpieces import read_handpiece
 from cuspid.storage.jaws import is_jaw, read_jaw, read_labelled_mesh
-from cuspid.storage.meshes import SIGMA, MeshFile, Unit, read_mesh_file
+from cuspid.storage.meshes import SIGMA, MeshFile, read_mesh_file
 from cuspid.storage.panoramas import read_panorama
 from cuspid.storage.reconstructions import read_reconstruction
 from cuspid.storage.shapes import read_shape_model
+from cuspid.storage.units import Unit
 from cuspid.values import LONGEST_MM, numbers
 
 
@@ -179,7 +181,7 @@ def _read_scan(folder: Path, run: Mapping[str, Any], reference: Path | None, uni
     trueness = _optional_json(folder / "trueness.json")
     if trueness is None and scan is not None:
         missing.append("the trueness: run cuspid evaluate")
-    jaw = _reference(folder, run, reference, unit)
+    jaw = _reference(folder, run, reference, unit, _evaluated_teeth(trueness))
     if jaw is None and trueness is not None:
         missing.append("the reference: give it with cuspid report --reference")
     known = trueness is not None
@@ -232,7 +234,12 @@ def _sigma_um(given: Float[np.ndarray, "v"] | None) -> Float[np.ndarray, "v"] | 
     return None if given is None else np.where(np.isfinite(given) & (given >= 0), given, np.nan)
 
 
-def _reference(folder: Path, run: Mapping[str, Any], given: Path | None, unit: Unit) -> Jaw | None:
+def _evaluated_teeth(trueness: Any) -> set[str]:
+    found = trueness.get("per_tooth", {}) if isinstance(trueness, dict) else {}
+    return set(found) if isinstance(found, dict) else set()
+
+
+def _reference(folder: Path, run: Mapping[str, Any], given: Path | None, unit: Unit, teeth: set[str]) -> Jaw | None:
     path = folder / "truth" if given is None else given
     path = path / "jaw.ply" if given is None or path.is_dir() else path
     if given is None and not path.exists():
@@ -243,7 +250,12 @@ def _reference(folder: Path, run: Mapping[str, Any], given: Path | None, unit: U
     if is_jaw(path):
         return read_jaw(path)
     mesh, labels, _ = read_labelled_mesh(path, unit)
-    return Jaw(mesh=mesh, face_labels=labels)
+    # Labels of another numbering, which the evaluation understood, would name the wrong teeth.
+    fdi = labels is not None and teeth <= set(map(str, np.unique(labels))) <= _FDI
+    return Jaw(mesh=facing_outwards(mesh)[0], face_labels=labels if fdi else None)
+
+
+_FDI = {str(GUM), *map(str, FDI_FROM_UNIVERSAL.values())}
 
 
 def _alignment(path: Path, trueness: Mapping[str, Any]) -> Rigid3:

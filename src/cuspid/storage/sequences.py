@@ -13,7 +13,7 @@ import numpy as np
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.capture import ImageFolder, image_size
 from cuspid.errors import InputError
-from cuspid.image_sequence import ImageSequence
+from cuspid.image_sequence import ImageSequence, exif_orientation, recorded_size
 from cuspid.inputs import read_text
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, Rig
@@ -91,7 +91,16 @@ def name_order(name: str) -> list[tuple[str, int]]:
 
 def _of_folder(folder: Path) -> ImageSequence:
     paths = images_in(folder)
-    return ImageSequence(source=folder, paths=tuple(paths), size=_common_size(folder, paths))
+    orientations = tuple(map(exif_orientation, paths))
+    ways = set(orientations)
+    if len(ways) < 2:
+        return ImageSequence(source=folder, paths=tuple(paths), size=_common_size(folder, paths))
+    note = (
+        f"{folder.name}: EXIF says that the camera was held in {len(ways)} ways; its images are taken as "
+        "the sensor recorded them, none is turned upright"
+    )
+    size = _common_size(folder, paths, as_recorded=True)
+    return ImageSequence(source=folder, paths=tuple(paths), size=size, notes=(note,), orientations=orientations)
 
 
 def _of_capture(folder: Path) -> ImageSequence:
@@ -108,17 +117,19 @@ def _of_capture(folder: Path) -> ImageSequence:
     return _with_handpiece(found, capture.handpiece, folder / "handpiece.json")
 
 
-def _common_size(folder: Path, paths: list[Path]) -> tuple[int, int]:
-    """Raises InputError where there are fewer than two frames, or they are tiny or not of one size."""
+def _common_size(folder: Path, paths: list[Path], *, as_recorded: bool = False) -> tuple[int, int]:
+    """Of images that are turned upright, or not. Raises InputError where there are fewer than two frames, or they are
+    tiny or not of one size."""
     if len(paths) < 2:
         raise InputError(f"{folder}: {len(paths)} image(s); a sequence needs at least two")
     sizes = {path: image_size(path) for path in paths}
+    sizes = {path: recorded_size(path) for path in paths} if as_recorded else sizes
     usual = Counter(sizes.values()).most_common(1)[0][0]
     odd = [path for path, size in sizes.items() if size != usual]
     if odd:
         raise InputError(
             f"{odd[0]}: {sizes[odd[0]][0]} x {sizes[odd[0]][1]} px, but most frames have {usual[0]} x {usual[1]} px "
-            f"({len(odd)} of {len(paths)} differ); remove them, or stitch each size separately"
+            f"({len(odd)} of {len(paths)} differ); leave them out, or put each size into a folder of its own"
         )
     if min(usual) < LEAST_PX:
         raise InputError(

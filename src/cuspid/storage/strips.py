@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from cuspid.capture import read_rgba
 from cuspid.inputs import read_bytes, read_text
 from cuspid.storage.files import read_json, reading, write_bytes, write_json
 from cuspid.storage.tables import write_table
@@ -29,6 +30,7 @@ def read_scaled_strip(folder: Path, factor: float) -> ScaledStrip:
     pixels). Raises InputError where a file is missing or damaged."""
     value, text = read_json(folder / "strip.json"), read_text(folder / "strip.csv")
     picture = read_bytes(folder / "strip.png", "image")
+    read_rgba(folder / "strip.png")  # which is to be shown
     with reading(folder / "strip.json"):
         mm_per_px = factor * number("mm_per_px", value["mm_per_px"] or 1.0, 1e-6, LONGEST_MM)
         header = {**value, "mm_per_px": mm_per_px, "length_mm": value["width_px"] * mm_per_px}

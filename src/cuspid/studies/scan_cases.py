@@ -184,11 +184,11 @@ def measure_scan(
         ],
         "threads": usable_cores(),
         "images": len(list((folder / "capture" / "images").glob("*/*.png"))),
-        "options": json.loads((folder / "run.json").read_text()),
+        "options": json.loads((folder / "run.json").read_text(encoding="utf-8")),
         "images_to_mesh": reconstructed if whole else None,
-        "reconstruction": json.loads((folder / "motion" / "reconstruction.json").read_text())["log"],
+        "reconstruction": json.loads((folder / "motion" / "reconstruction.json").read_text(encoding="utf-8"))["log"],
         **{
-            part: json.loads((folder / f"{part}.json").read_text())
+            part: json.loads((folder / f"{part}.json").read_text(encoding="utf-8"))
             for part in ("trueness", "spheres", "margins")
             if (folder / f"{part}.json").exists()
         },

@@ -179,7 +179,7 @@ def sweep_arguments(surface: str, repeats: int) -> tuple[str, ...]:
 
 def sweep_result(out: Path, arguments: Sequence[str]) -> dict[str, object]:
     """What came of a finished sweep in a folder."""
-    with (out / "results.csv").open() as stream:
+    with (out / "results.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     return {
         "command": f"cuspid {' '.join(arguments)} --out {out.name}",

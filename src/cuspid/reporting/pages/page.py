@@ -56,7 +56,7 @@ def _environment() -> Environment:
 
 def asset(name: str) -> Markup:
     """A script or a style of the package, as it is."""
-    return Markup((resources.files("cuspid.reporting.pages") / "assets" / name).read_text())
+    return Markup((resources.files("cuspid.reporting.pages") / "assets" / name).read_text(encoding="utf-8"))
 
 
 def script_json(value: object) -> Markup:

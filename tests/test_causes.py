@@ -1,0 +1,140 @@
+"""Why a board is not found is told, and images count as what they are."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from boards import photographs, scene, undistorted
+from builders import rig_of, shifted
+from cuspid import storage
+from cuspid.board import Board
+from cuspid.calibration import corners
+from cuspid.calibration.calibrate import size_notes
+from cuspid.calibration.causes import cause_of_absence, is_part_of_a_larger_one
+from cuspid.calibration.corners import find_corners
+from cuspid.capture import read_image
+from cuspid.errors import InputError
+from cuspid.image_sequence import exif_orientation, recorded
+from cuspid.rig import Rig
+from verbs import refused, run
+
+BOARD = Board(columns=7, rows=6, square_mm=2.5)
+CHESSBOARD = Board(kind="chessboard", columns=7, rows=6, square_mm=2.5)
+
+
+def pictures(folder: Path, board: Board, instants: int = 3) -> list[np.ndarray]:
+    whole = scene(0, board, cameras=1, instants=instants)
+    photographs(folder, replace(whole, cameras={k: undistorted(each) for k, each in whole.cameras.items()}), board)
+    return [cv2.cvtColor(read_image(path), cv2.COLOR_RGB2GRAY) for path in sorted(folder.glob("cam0/*.png"))]
+
+
+@pytest.mark.parametrize(
+    ("shown", "described", "told"),
+    [
+        ({"legacy": True}, {}, "old layout of OpenCV: give --legacy"),
+        ({}, {"legacy": True}, "new layout of OpenCV: give --no-legacy"),
+        ({"first_id": 100}, {}, "ids of its markers begin at 100: give --first-id 100"),
+        ({}, {"first_id": 200}, "give --first-id 0"),
+        ({}, {"columns": 6, "rows": 5}, "corners were counted, not its squares: give --columns 7 --rows 6"),
+        ({}, {"columns": 6, "rows": 7}, "columns and rows are swapped: give --columns 7 --rows 6"),
+        ({"dictionary": "5X5_100"}, {}, "another family: give --dictionary 5X5_1000"),
+        ({"kind": "chessboard"}, {}, "no markers: give --kind chessboard"),
+    ],
+)
+def test_what_a_board_should_have_been_called(tmp_path: Path, shown: dict, described: dict, told: str) -> None:
+    images, asked = pictures(tmp_path, replace(BOARD, **shown)), replace(BOARD, **described)
+    assert not any(find_corners(image, asked) for image in images)
+    cause = cause_of_absence(images, asked)
+    assert cause is not None
+    assert told in cause
+
+
+def test_a_part_of_a_larger_chessboard_is_told(tmp_path: Path) -> None:
+    images = pictures(tmp_path, CHESSBOARD)
+    assert is_part_of_a_larger_one(images, replace(CHESSBOARD, columns=6, rows=5))
+    assert not is_part_of_a_larger_one(images, CHESSBOARD)
+
+
+def test_mirrored_images_are_told(tmp_path: Path) -> None:
+    images = [np.ascontiguousarray(image[:, ::-1]) for image in pictures(tmp_path, BOARD)]
+    assert "mirrored" in str(cause_of_absence(images, BOARD))
+
+
+def test_without_a_board_there_is_no_cause() -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (2, 120, 160), dtype=np.uint8)
+    assert cause_of_absence(list(noise), BOARD) is None
+
+
+def test_ids_may_begin_anywhere_in_the_dictionary(tmp_path: Path) -> None:
+    board = replace(BOARD, first_id=40)
+    assert all(find_corners(image, board) is not None for image in pictures(tmp_path, board))
+    with pytest.raises(InputError, match="needed, but the dictionary 4X4_50 has 50"):
+        replace(BOARD, first_id=40, dictionary="4X4_50")
+
+
+def test_a_chessboard_is_searched_for_exhaustively(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def find(image: np.ndarray, size: tuple[int, int], flags: int = 0) -> tuple[bool, np.ndarray | None]:
+        asked.append(flags)
+        places = np.stack(np.meshgrid(np.arange(6.0), np.arange(5.0)), axis=-1).reshape(-1, 1, 2)
+        return (True, 10 * places) if flags == cv2.CALIB_CB_EXHAUSTIVE else (False, None)
+
+    monkeypatch.setattr(corners.cv2, "findChessboardCornersSB", find)
+    assert find_corners(np.zeros((90, 90), np.uint8), CHESSBOARD) is not None
+    assert asked == [0, cv2.CALIB_CB_EXHAUSTIVE]
+
+
+def test_the_verb_names_the_cause_and_the_images_without_a_board(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pictures(tmp_path / "photos", BOARD, instants=6)
+    asked = ["calibrate", tmp_path / "photos", "--square-mm", 2.5, "--columns", 7, "--rows", 6, "--no-photometry"]
+    message = refused(capsys, *asked, "--legacy", "--out", tmp_path / "out")
+    assert "found in 0 of 6 images of camera cam0; the board has the new layout" in message
+    assert not (tmp_path / "out").exists()
+    (file,) = (tmp_path / "photos" / "cam0").glob("03.png")
+    storage.write_image(file, np.full((480, 640, 3), 90, np.uint8))
+    run(*asked, "--out", tmp_path / "out")
+    assert "the board was not found in 1 of 6 images: 03" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(("growth", "told"), [(0.96, "closer"), (1.0, None), (1.005, None), (1.05, "farther")])
+def test_a_print_of_another_size_is_asked_for(growth: float, told: str | None) -> None:
+    drawn, found = (rig_of(a=shifted(0), b=shifted(20 * size), c=shifted(9, 5 * size)) for size in (1.0, growth))
+    found = Rig({**found.cameras, "c": rig_of(c=shifted(9 * growth, 5 * growth))["c"]})
+    notes = size_notes(found, drawn, BOARD)
+    assert bool(notes) == (told is not None)
+    assert all(f"{told} " in note and f"With {2.5 / growth:.3g} they lie as drawn" in note for note in notes)
+    assert size_notes(rig_of(a=shifted(0)), rig_of(a=shifted(3)), BOARD) == ()
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_turned_image_is_turned_back_to_the_sensor(tmp_path: Path, orientation: int) -> None:
+    sensor = np.random.default_rng(0).integers(0, 255, (20, 30, 3), dtype=np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(sensor).save(tmp_path / "x.png", exif=exif)
+    assert exif_orientation(tmp_path / "x.png") == orientation
+    np.testing.assert_array_equal(recorded(read_image(tmp_path / "x.png"), orientation), sensor)
+
+
+@pytest.mark.parametrize("ways", [(1, 6), (3, 1), (8, 6), (6, 6)])
+def test_a_camera_that_was_held_in_several_ways_has_one_sensor(tmp_path: Path, ways: tuple[int, int]) -> None:
+    sensor = np.random.default_rng(0).integers(0, 255, (60, 90, 3), dtype=np.uint8)
+    for number, way in enumerate(2 * ways):
+        exif = Image.Exif()
+        exif[0x0112] = way
+        Image.fromarray(sensor).save(tmp_path / f"{number}.png", exif=exif)
+    sequence = storage.read_sequence(tmp_path, tmp_path / "out")
+    if len(set(ways)) == 1:
+        assert sequence.notes == ()
+        return
+    assert sequence.size == (90, 60)
+    assert "EXIF" in sequence.notes[0]
+    for index in range(len(sequence)):
+        np.testing.assert_array_equal(sequence.image(index), sensor)
