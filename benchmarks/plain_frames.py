@@ -31,7 +31,7 @@ from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.motion.surface_tracking import SurfaceTrackingOptions, adjusted
 from cuspid.motion.surfaces import Surface, surface_of
-from cuspid.pairing import camera_groups, stereo_pairs
+from cuspid.pairing import rank_sources
 from cuspid.pipeline import SimulationOptions
 from cuspid.progress import silent
 from cuspid.rig import Handpiece
@@ -95,10 +95,10 @@ def compared(
 
 
 def widest_pairs(handpiece: Handpiece) -> tuple[RectifiedPair, ...]:
-    """Of each group of cameras, at full resolution."""
+    """That each camera begins with, at full resolution."""
     rig, distance_mm = handpiece.rig, handpiece.working_distance_mm
-    possible = stereo_pairs(rig, distance_mm)
-    found = {pair for names in camera_groups(rig, distance_mm) for pair in initial_pairs(rig, names, possible)}
+    pairs = initial_pairs(rig, rank_sources(rig, distance_mm), distance_mm).values()
+    found = {tuple(sorted(pair)) for pair in pairs}
     return tuple(rectify((one, other), rig[one], rig[other], 1.0) for one, other in sorted(found))
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from cuspid.geometry import Rigid3
-from cuspid.rig import Handpiece, Rig, Sensor
 from cuspid.pairing import PairingOptions
+from cuspid.rig import Handpiece, Rig, Sensor
 from cuspid.stereo.across import AcrossOptions, measure_moving_cameras, moving_pair
 from cuspid.stereo.matching import StereoOptions
 from synthetic_scene import cast_depth, diamond, height_field, render

@@ -18,9 +18,9 @@ from cuspid.capture import Frame
 from cuspid.geometry import Rigid3
 from cuspid.reconstruction import DepthMap, Reconstruction, SurfacePoints, Tracks
 from cuspid.stereo import stage
+from cuspid.stereo.across import AcrossOptions
 from cuspid.stereo.holes import Sightings, Views, covering
 from cuspid.stereo.matching import StereoOptions
-from cuspid.stereo.across import AcrossOptions
 from synthetic_scene import diamond
 
 SETS = st.lists(st.sets(st.integers(0, 39), max_size=15), max_size=12)

@@ -132,14 +132,16 @@ def test_views_share_points_or_are_no_sources():
     sightings = [(v, p) for v, seen in enumerate((range(300), half, half + 150, half + 150, range(300))) for p in seen]
     ranked = rank_by_points(centres, points, np.array(sightings))
     assert ranked[0] == (1, 2, 3)
-    assert set(ranked[2]) == {0, 3} and set(ranked[1]) == {0}
+    assert set(ranked[2]) == {0, 3}
+    assert set(ranked[1]) == {0}
     assert ranked[4] == ()
 
 
 @given(st.floats(0.0, 180.0))
 def test_no_angle_is_a_wall(angle):
     at, beside = worth_of_angle(np.array([angle, angle + 0.01]))
-    assert 0 <= at <= 1 and abs(at - beside) < 0.002
+    assert 0 <= at <= 1
+    assert abs(at - beside) < 0.002
 
 
 @pytest.mark.parametrize("wrong", [{"minimum_overlap": 1.1}, {"maximum_angle_deg": -1.0}])

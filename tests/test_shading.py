@@ -17,7 +17,7 @@ from cuspid.stereo import shading
 from cuspid.stereo.matching import DepthEstimator, StereoOptions, gray
 from cuspid.stereo.refinement import RefinementOptions
 from cuspid.stereo.shading import ShadingOptions
-from cuspid.stereo.signal import detail_dn, choose_signal
+from cuspid.stereo.signal import choose_signal, detail_dn
 from plain_scene import HILLS, WAY, capture_of, lit, photographs, plain_scan
 from synthetic_scene import cast_depth
 from test_any_rig import times

@@ -50,8 +50,8 @@ from cuspid.stereo.stage import (
     measure_depth,
     measure_depth_across,
     measure_enough_depth,
-    measure_view_depth,
 )
+from cuspid.stereo.view_stage import measure_view_depth
 from cuspid.surface.cleaning import CleaningOptions
 from cuspid.surface.fusion import FusionOptions
 from cuspid.surface.sharp_edges import SharpEdgeOptions

@@ -61,8 +61,8 @@ class Funnel:
         """One line for the user."""
         begun, matched, agreed, kept = self.shares_pct.values()
         return (
-            f"of the pixels, {begun:.3g} % have an initial depth, {matched:.3g} % a matched one, {agreed:.3g} % one that "
-            f"other views agree with, {kept:.3g} % one in a large enough piece"
+            f"of the pixels, {begun:.3g} % have an initial depth, {matched:.3g} % a matched one, {agreed:.3g} % one "
+            f"that other views agree with, {kept:.3g} % one in a large enough piece"
         )
 
 

@@ -44,8 +44,8 @@ _LOOSE_SCALE_PPM, _LOOSE_SPAN_PPM = 1000.0, 300.0
 
 
 _HELD = (
-    "calibration: held as in the file, since the images of the one frame share too few points to refine it: its cameras "
-    "stand far apart, or the surface shows little detail"
+    "calibration: held as in the file, since the images of the one frame share too few points to refine it: its "
+    "cameras stand far apart, or the surface shows little detail"
 )
 
 

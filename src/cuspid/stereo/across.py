@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Int, UInt8
 
 from cuspid.capture import Frame
 from cuspid.geometry import Rigid3
@@ -98,7 +98,7 @@ def moving_pair(handpiece: Handpiece, name: str, next_from_rig: Rigid3, options:
     return rig if stereo_pairs(rig, handpiece.working_distance_mm, options) else None
 
 
-# --- Any views ---------------------------------------------------------------------------------------------------------
+# --- Any views ----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

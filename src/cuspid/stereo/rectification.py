@@ -57,7 +57,7 @@ class IdealView:
         return np.asarray(cv2.remap(image, *self.maps, cv2.INTER_CUBIC), dtype=np.uint8)
 
     def resample_mask(self, mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
-        """As :meth:`resample`, for the nearest pixel: what is masked out stays so, and so is what nothing was seen of."""
+        """As :meth:`resample`, for the nearest pixel; zero where the real camera saw nothing."""
         if self.maps is None:
             return mask
         return np.asarray(cv2.remap(mask, *self.maps, cv2.INTER_NEAREST), dtype=np.uint8)

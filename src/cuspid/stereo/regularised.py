@@ -2,8 +2,8 @@
 
 For each of a row of inverse depths the sources are warped onto the reference as if the surface stood there, parallel to
 its image, and compared with it in Gaussian windows (ZNCC, in which noise counts as uncorrelated). The depth of a pixel
-is then chosen together with those of its neighbours (H. Hirschmueller, IEEE Trans. PAMI 30, 2008). It is known to half a
-pixel of disparity: less exactly than a slanted window that has enough texture knows it, but in more places.
+is then chosen together with those of its neighbours (H. Hirschmueller, IEEE Trans. PAMI 30, 2008). It is known to half
+a pixel of disparity: less exactly than a slanted window that has enough texture knows it, but in more places.
 """
 
 from __future__ import annotations
@@ -53,16 +53,10 @@ def sweep(
     mean, variance = _moments(one)
     zncc = np.empty((*one.shape, len(labels)), dtype=np.float32)
     for number, q in enumerate(labels):
-        seen = [
-            _zncc(
-                one,
-                mean,
-                variance,
-                *_warped(other, np.linalg.inv(back) @ (a + q * _column(b)) @ to_full, one.shape),
-                noise_dn,
-            )
-            for (other, back), a, b in zip(others, geometry.infinite, geometry.parallax, strict=True)
-        ]
+        seen = []
+        for (other, to_other), a, b in zip(others, geometry.infinite, geometry.parallax, strict=True):
+            homography = np.linalg.inv(to_other) @ (a + q * _column(b)) @ to_full
+            seen.append(_zncc(one, mean, variance, *_warped(other, homography, one.shape), noise_dn))
         # Half of the sources may look past what is in front of the surface there.
         best = np.sort(np.stack(seen), axis=0)[len(seen) // 2 :]
         zncc[..., number] = best.mean(axis=0)
@@ -92,9 +86,9 @@ def _warped(
     image: Float[np.ndarray, "h w"], homography: Float[np.ndarray, "3 3"], shape: tuple[int, ...]
 ) -> tuple[Float[np.ndarray, "r c"], Float[np.ndarray, "r c"]]:
     """An image as seen through a homography from another one's pixels, and where it shows anything there."""
-    how = {"dsize": shape[::-1], "flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP}
-    shown = cv2.warpPerspective(np.ones_like(image), homography, **how)
-    return np.asarray(cv2.warpPerspective(image, homography, **how)), np.asarray(shown)
+    size, flags = shape[::-1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    shown = cv2.warpPerspective(np.ones_like(image), homography, size, flags=flags)
+    return np.asarray(cv2.warpPerspective(image, homography, size, flags=flags)), np.asarray(shown)
 
 
 def _blur(image: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

@@ -5,54 +5,36 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool
 
-from cuspid.camera import Camera
 from cuspid.capture import Capture, Frame
 from cuspid.geometry import Rigid3
 from cuspid.pairing import camera_groups
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import DepthMap, Reconstruction, SurfacePoints
-from cuspid.stereo.holes import Sightings, Views, covering
 from cuspid.stereo.across import (
     AcrossOptions,
-    LocatedView,
-    locate_views,
     measure_moving_cameras,
     moving_pair,
-    view_resolution,
 )
-from cuspid.stereo.confidence import Measured
+from cuspid.stereo.holes import Sightings, Views, covering
 from cuspid.stereo.matching import (
-    WIDENINGS,
     DepthEstimator,
-    Match,
     Signal,
     StereoOptions,
-    agreed_planes,
-    checked_depth_map,
-    coarser,
-    gray,
-    prepare_views,
 )
-from cuspid.stereo.rectification import IdealView
 from cuspid.storage.captures import hash_frame
-from cuspid.storage.files import digest_of, read_arrays, write_arrays
+from cuspid.storage.files import digest_of
 from cuspid.storage.handpieces import hash_handpiece
-from cuspid.rig import Rig
 from cuspid.storage.reconstructions import read_depth_maps, write_depth_maps
 from cuspid.storage.stages import Stage
 from cuspid.tolerances import held
 from cuspid.workers import map_ahead, map_in_threads
 
 _CODE = ("stereo",)
-_KEPT_IMAGES = 32
-"""Images that are kept in memory for the next views."""
 _LEFT_SHARE = 0.005
 """Share of the sparse points that matching across frames need not reach."""
 _LEAST_PLACES = 5
@@ -228,132 +210,6 @@ def measure_depth_across(
 
     stage = Stage("depth across frames", folder, [options, stereo], _CODE)
     return _measure_all(capture, [step.now for step in steps.values()], measure, inputs, stage, progress)
-
-
-def measure_view_depth(
-    capture: Capture,
-    found: Reconstruction,
-    folder: Path,
-    options: StereoOptions,
-    *,
-    progress: Progress = silent,
-) -> StoredDepthMaps:
-    """Depth maps of every image of the located frames, each from those images of any frame that suit it, kept in
-    ``folder``. This needs no rig: one camera is enough."""
-    views = locate_views(capture.handpiece, capture.frames, found, options.pairing)
-    ideal = {name: IdealView.of(name, mounted) for name, mounted in capture.handpiece.rig.cameras.items()}
-
-    @lru_cache(maxsize=_KEPT_IMAGES)
-    def read(k: int) -> UInt8[np.ndarray, "h w"]:
-        return ideal[views[k].camera].resample(gray(capture.image(views[k].frame, views[k].camera)))
-
-    def match(k: int) -> Match:
-        view, of = views[k], (k, *views[k].sources)
-        rig = Rig({_number(j): replace(views[j].mounted, camera=ideal[views[j].camera].camera) for j in of})
-        prepared = prepare_views(rig, {_number(k): [_number(j) for j in view.sources]}, view.distance_mm, options)
-        return Match(prepared, {_number(j): read(j) for j in of}, view.depth_range_mm, options, shaded=True)
-
-    def read_back(k: int) -> Measured:
-        grid = coarser(ideal[views[k].camera].camera, options.grid_px)
-        return _read_measured(matched[k].file, grid, views[k].mounted.cam_from_rig)
-
-    def first(k: int) -> _Matched:
-        of = [views[j] for j in (k, *views[k].sources)]
-        images = [capture.source.digest(view.frame.name, view.camera) for view in of]
-        inputs = {"images": digest_of(images), "views": digest_of([(each.mounted, each.depth_range_mm) for each in of])}
-        file = stage.folder / f"{views[k].frame.name}.{views[k].camera}.npz"
-        return _Matched(file, stage.make(inputs, [file], lambda: _write_measured(file, match(k).measure(0))))
-
-    def again(k: int) -> _Matched:
-        others = [j for j in views[k].sources if j in matched]
-        one = read_back(k)
-        agreed = agreed_planes(one, list(map(read_back, others)), view_resolution(views, k), options.confidence)
-        if agreed is None:
-            return matched[k]
-        file = stage.folder / matched[k].file.name
-        inputs = {"matched": digest_of([matched[j].key for j in (k, *others)])}
-        write = lambda: _write_measured(file, match(k).widen(0, one, agreed, widening))  # noqa: E731
-        return _Matched(file, stage.make(inputs, [file], write))
-
-    used = [k for k, view in enumerate(views) if view.sources]
-    stage = Stage("matching", folder / "matched", options, _CODE)
-    matched = dict(zip(used, map_in_threads(first, used, stage=stage.name, progress=progress), strict=True))
-    for widening in WIDENINGS:
-        stage = Stage(f"wider windows ({widening})", folder / f"matched-{widening}", options, _CODE)
-        matched = dict(zip(used, map_in_threads(again, used, stage=stage.name, progress=progress), strict=True))
-    return _check_views(capture, views, matched, folder, options, progress)
-
-
-def _grids(rig: Rig, options: StereoOptions) -> dict[str, Camera]:
-    """The camera of the depth maps of each camera."""
-    return {name: coarser(IdealView.of(name, mounted).camera, options.grid_px) for name, mounted in rig.cameras.items()}
-
-
-class _Matched(NamedTuple):
-    """Depth of a view before the checks, on disk."""
-
-    file: Path
-    key: str
-
-
-def _check_views(
-    capture: Capture,
-    views: Sequence[LocatedView],
-    ideal: Mapping[str, IdealView],
-    matched: Mapping[int, _Matched],
-    folder: Path,
-    options: StereoOptions,
-    progress: Progress,
-) -> StoredDepthMaps:
-    """The depth maps of views, frame by frame, from what was matched."""
-    grids = {name: coarser(view.camera, options.grid_px) for name, view in ideal.items()}
-    by_frame = dict[str, list[int]]()
-    for k in matched:
-        by_frame.setdefault(views[k].frame.name, []).append(k)
-
-    def measured(k: int) -> Measured:
-        return _read_measured(matched[k].file, grids[views[k].camera], views[k].mounted.cam_from_rig)
-
-    def check(k: int) -> DepthMap:
-        view = views[k]
-        checked = checked_depth_map(
-            measured(k),
-            [measured(j) for j in view.sources if j in matched],
-            capture.image(view.frame, view.camera),
-            capture.masks(view.frame).get(view.camera),
-            ideal[view.camera],
-            view.frame.name,
-            view_resolution(views, k),
-            options.confidence,
-            options.grid_px,
-        )
-        return replace(checked, cam_from_rig=ideal[view.camera].cam_from_rig)
-
-    stage = Stage("depth", folder, options, _CODE)
-
-    def keep(name: str) -> tuple[Path, str]:
-        file, of = folder / f"{name}.npz", by_frame[name]
-        keys = [matched[j].key for k in of for j in (k, *views[k].sources) if j in matched]
-        inputs = {"matched": digest_of(keys)}
-        return file, stage.make(inputs, [file], lambda: write_depth_maps(file, [check(k) for k in of]))
-
-    return StoredDepthMaps(dict(map_in_threads(keep, by_frame, stage=stage.name, progress=progress)))
-
-
-def _write_measured(file: Path, measured: Measured) -> None:
-    arrays = {name: getattr(measured, name).astype(np.float32) for name in ("depth_mm", "sigma_mm", "planes")}
-    write_arrays(file, arrays | {"begun": np.array(measured.begun)})
-
-
-def _read_measured(file: Path, grid: Camera, cam_from_world: Rigid3) -> Measured:
-    arrays = read_arrays(file, remedy="give the command again: it is made anew")
-    depth_mm, sigma_mm = (arrays[name].astype(np.float64) for name in ("depth_mm", "sigma_mm"))
-    return Measured(grid, cam_from_world, depth_mm, sigma_mm, int(arrays["begun"]), arrays["planes"])
-
-
-def _number(k: int) -> str:
-    """A name for a view."""
-    return f"{k:06}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import numpy as np
 
 from cuspid.capture import Dropped
 from cuspid.geometry import Rigid3
-from cuspid.reconstruction import DepthMap, Funnel, Expectation, Reconstruction, Refinement, SurfacePoints, Tracks
+from cuspid.reconstruction import DepthMap, Expectation, Funnel, Reconstruction, Refinement, SurfacePoints, Tracks
 from cuspid.rig import Handpiece
 from cuspid.storage.files import as_declared, read_arrays, read_json, reading, to_plain, write_arrays, write_json
 from cuspid.storage.handpieces import (

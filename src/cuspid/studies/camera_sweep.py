@@ -42,8 +42,8 @@ from cuspid.room import Room, check_clearance
 from cuspid.simulation.appearance import Preset
 from cuspid.simulation.path.overlap import image_overlap
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path, steady_poses
-from cuspid.stereo.matching import StereoOptions
 from cuspid.stereo.across import AcrossOptions
+from cuspid.stereo.matching import StereoOptions
 from cuspid.studies.camera_pair import Direction, baseline_axis, camera_pair, facing
 from cuspid.studies.grid import Case, Outcome, Value, run_grid
 from cuspid.studies.trial import Trial, TrialOptions, run_trial

@@ -217,7 +217,7 @@ def _slanted(
 ) -> Float[np.ndarray, "n 2"]:
     """Places in the second image, by the refinement of depth; NaN where it accepts none."""
     views = tuple(IdealView.of(str(k), mounted) for k, mounted in enumerate(cameras))
-    geometry = group_geometry(views, 0)
+    geometry = group_geometry(views, 0, (1,))
     grid: Camera = coarser(views[0].camera, options.spacing_px)
     seeds = np.full(points.known.shape, np.nan)
     true_mm = cameras[0].cam_from_rig.apply(points.in_rig)[:, 2]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -83,7 +84,7 @@ def fuse(
             raise ReconstructionError(f"no surface: {_what_took_it(funnel, len(raw.mesh.faces))}")
         sigma_um = _sigma_um(cleaned, raw, expected)
         mesh, moved = sharpened(cleaned, detail_mm, sharp_edges)
-        scale = "known" if has_scale else "unknown"
+        scale: Literal["known", "unknown"] = "known" if has_scale else "unknown"
         write_json(
             files[0],
             replace(
@@ -111,7 +112,8 @@ def _what_took_it(funnel: Funnel | None, faces: int) -> str:
         advice = {
             "begun": "the images overlap too little, are out of focus, or their depth lies outside the depth range of "
             "the calibration",
-            "matched": "the images need texture (spray, powder), sharper focus or more light, or the calibration is off",
+            "matched": "the images need texture (spray, powder), sharper focus or more light, or the calibration is "
+            "off",
             "agreed": "views contradict each other: check the calibration and the poses",
             "kept": "what agrees is scattered: the images need more texture or sharper focus",
         }
