@@ -22,7 +22,7 @@ FUNCTIONS = {
     "locate": "motion",
     "measure_enough_depth": "depth",
     "find_holes": "holes",
-    "measure_temporal_depth": "temporal depth",
+    "measure_depth_across": "depth across frames",
     "fuse": "fusion and cleaning",
 }
 """Of the pipeline, and the stages that they are."""

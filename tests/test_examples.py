@@ -47,7 +47,7 @@ def goes_on_where_it_stopped(folder: Path) -> bool:
     whole = (folder / "mesh.stl").read_bytes()
     for lost in ("mesh.ply", "mesh.stl", "mesh.json", "depth/00002.npz", "motion/reconstruction.json"):
         (folder / lost).unlink()
-    shutil.rmtree(folder / "depth-temporal")
+    shutil.rmtree(folder / "depth-across")
     kept = (folder / "depth" / "00004.npz").stat().st_mtime_ns
     pipeline.reconstruct(storage.read_capture(folder / "capture"), folder, pipeline.ReconstructionOptions())
     return (folder / "mesh.stl").read_bytes() == whole and (folder / "depth" / "00004.npz").stat().st_mtime_ns == kept

@@ -136,11 +136,11 @@ def test_maps_of_one_frame_count_as_one() -> None:
 def test_stored_maps_follow_each_other_frame_by_frame() -> None:
     within, across = (
         StoredDepthMaps({Path(kind) / f"{name}.npz": kind for name in names})
-        for kind, names in (("depth", ("b", "a", "c")), ("depth-temporal", ("a", "b")))
+        for kind, names in (("depth", ("b", "a", "c")), ("depth-across", ("a", "b")))
     )
     order = [(file.stem, file.parent.name) for file in (within | across).made]
     assert [name for name, _ in order] == ["b", "b", "a", "a", "c"]
-    assert [kind for _, kind in order] == ["depth", "depth-temporal"] * 2 + ["depth"]
+    assert [kind for _, kind in order] == ["depth", "depth-across"] * 2 + ["depth"]
 
 
 def test_every_seen_place_is_covered() -> None:

@@ -1,0 +1,226 @@
+"""Depth of any views: one camera that goes around, masks, weak texture, and what is said where nothing is left."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cuspid import storage
+from cuspid.capture import Capture, Frame, read_mask
+from cuspid.errors import InputError, ReconstructionError
+from cuspid.geometry import Rigid3
+from cuspid.pipeline import ReconstructionOptions, _hold_what_fits
+from cuspid.reconstruction import DepthMap, Funnel, Reconstruction, sum_funnels
+from cuspid.rig import Handpiece, MountedCamera, Rig
+from cuspid.stereo import DepthEstimator, StereoOptions
+from cuspid.stereo.matching import group_geometry
+from cuspid.stereo.rectification import IdealView
+from cuspid.stereo.refinement import image_noise
+from cuspid.stereo.regularised import even_out, sweep
+from cuspid.stereo.view_stage import measure_view_depth
+from cuspid.surface.cleaning import CleaningOptions
+from cuspid.surface.fusion import FusionOptions
+from cuspid.surface.sharp_edges import SharpEdgeOptions
+from cuspid.surface.stage import fuse
+from cuspid.tolerances import NominalOptions
+from synthetic_scene import cast_depth, diamond, height_field, render
+from test_any_rig import InMemory
+
+HILLS = height_field(lambda x, y: 5 + 0.25 * np.sin(1.8 * x) * np.cos(1.5 * y), half_width_mm=6.0)
+TURNS_DEG = (-24.0, -12.0, 0.0, 12.0, 24.0)
+
+
+class Masked(InMemory):
+    """Images of which the left half does not count."""
+
+    def mask(self, frame: str, camera: str) -> np.ndarray:
+        height, width = self.images[frame, camera].shape[:2]
+        return np.repeat((np.arange(width) >= width // 2)[None], height, axis=0).astype(np.uint8)
+
+
+def around() -> Mapping[str, Rigid3]:
+    """Places of one camera that goes around a point 5 mm before it."""
+    back = Rigid3(np.eye(3), np.array([0, 0, 5.0]))
+    turns = (Rigid3.from_rotation_vector(np.array([0.0, np.deg2rad(turn), 0]), np.zeros(3)) for turn in TURNS_DEG)
+    return {f"{k:02}": back @ turn @ back.inverse() for k, turn in enumerate(turns)}
+
+
+def one_camera() -> Handpiece:
+    camera = diamond().rig["west"].camera
+    return Handpiece(rig=Rig({"camera": MountedCamera(camera, Rigid3.identity())}), depth_range_mm=(3.5, 7.0))
+
+
+@cache
+def photographs() -> Mapping[tuple[str, str], np.ndarray]:
+    rng, mounted = np.random.default_rng(1), one_camera().rig["camera"]
+    return {(name, "camera"): render(HILLS, mounted, pose, rng) for name, pose in around().items()}
+
+
+def measured(folder: Path, names: list[str], source: type[InMemory] = InMemory) -> dict[str, DepthMap]:
+    frames = tuple(Frame(name=name, cameras=("camera",)) for name in names)
+    capture = Capture(handpiece=one_camera(), frames=frames, source=source(photographs()))
+    found = Reconstruction(rig=capture.handpiece.rig, rig_from_world={name: around()[name] for name in names})
+    maps = measure_view_depth(capture, found, folder, StereoOptions())
+    return {depth_map.frame: depth_map for depth_map in maps}
+
+
+def errors_um(depth_map: DepthMap) -> np.ndarray:
+    truth = cast_depth(HILLS, depth_map.camera, depth_map.cam_from_rig @ around()[depth_map.frame])
+    difference = 1000 * (depth_map.depth_mm - truth)
+    return difference[np.isfinite(difference)]
+
+
+def test_one_camera_that_goes_around_measures_depth_in_any_order(tmp_path: Path) -> None:
+    names = list(around())
+    one = measured(tmp_path / "one", names)
+    assert list(one) == names
+    for depth_map in one.values():
+        error = errors_um(depth_map)
+        assert error.size > 0.4 * depth_map.depth_mm.size
+        assert 0.1 < np.median(np.abs(error)) < 12
+        assert abs(np.median(error)) < 3
+    other = measured(tmp_path / "other", names[::-1])
+    for name, depth_map in one.items():
+        apart = np.abs(depth_map.depth_mm - other[name].depth_mm)
+        assert np.nanmedian(apart) < 1e-4
+        assert np.mean(depth_map.known != other[name].known) < 0.02
+
+
+def test_what_is_masked_out_has_no_depth(tmp_path: Path) -> None:
+    whole, masked = measured(tmp_path / "a", list(around())), measured(tmp_path / "b", list(around()), Masked)
+    for name, depth_map in masked.items():
+        middle = depth_map.depth_mm.shape[1] // 2
+        assert not depth_map.known[:, :middle].any()
+        assert depth_map.known[:, middle + 1 :].sum() > 0.9 * whole[name].known[:, middle + 1 :].sum()
+
+
+def test_views_that_were_measured_are_not_measured_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = measured(tmp_path, list(around()))
+    (tmp_path / "02.npz").unlink()  # as of a run that was killed
+    monkeypatch.setattr("cuspid.stereo.matching.refine", None)
+    again = measured(tmp_path, list(around()))
+    assert np.array_equal(first["02"].depth_mm, again["02"].depth_mm, equal_nan=True)
+
+
+@pytest.mark.parametrize(("mask", "told"), [(np.zeros((8, 9)), "leaves nothing"), (np.ones((9, 8)), "8 x 9 px, but")])
+def test_a_mask_that_is_empty_or_of_another_size_is_refused(tmp_path: Path, mask: np.ndarray, told: str) -> None:
+    image, file = tmp_path / "image.png", tmp_path / "mask.png"
+    storage.write_image(image, np.full((8, 9, 3), 90, np.uint8))
+    storage.write_image(file, np.repeat(255 * mask[..., None], 3, axis=2).astype(np.uint8))
+    assert read_mask(image, None) is None
+    with pytest.raises(InputError, match=told):
+        read_mask(image, file)
+
+
+def weak(seed: int) -> dict[str, np.ndarray]:
+    """Hardly more contrast than noise."""
+    rng = np.random.default_rng(seed)
+    rig = diamond().rig
+    return {
+        name: render(HILLS, mounted, Rigid3.identity(), rng, contrast=0.1, cell_mm=0.2)
+        for name, mounted in rig.cameras.items()
+    }
+
+
+def test_weak_texture_gives_depth_that_is_less_certain() -> None:
+    found = DepthEstimator(diamond()).measure(weak(0), "00000")
+    for depth_map in found:
+        truth = cast_depth(HILLS, depth_map.camera, depth_map.cam_from_rig)
+        error = np.abs(1000 * (depth_map.depth_mm - truth))
+        assert np.isfinite(error).mean() > 0.25
+        assert 5 < np.nanmedian(error) < 75  # a pixel of disparity of the widest pair
+        assert 0 < np.median(depth_map.confidence[depth_map.known]) < 0.7
+
+
+@given(st.floats(20.0, 40.0))
+def test_a_sweep_finds_a_plane_within_a_pixel_of_disparity(disparity: float) -> None:
+    camera = diamond().rig["west"].camera
+    rig = {"a": Rigid3.identity(), "b": Rigid3(np.eye(3), np.array([-1.0, 0, 0]))}
+    views = [IdealView(name, camera, pose, None) for name, pose in rig.items()]
+    geometry = group_geometry(views, 0, (1,))
+    scene = np.random.default_rng(0).normal(120, 10, (160, 320)).astype(np.float32)
+    columns = np.arange(160)
+    second = np.array([np.interp(columns + disparity, np.arange(320), row) for row in scene], dtype=np.float32)
+    q, sigma = sweep(
+        np.stack([scene[:, :160], second]), np.full((2, 2), 160), 0, geometry, (15.0, 45.0), 4, image_noise(second)
+    )
+    inside = q[4:-4, 12:-2]
+    assert np.isfinite(inside).mean() > 0.9
+    assert abs(np.nanmedian(inside) - disparity) < 2 * sigma == 1.0
+
+
+def test_noise_is_evened_out_and_steps_stay() -> None:
+    rng, sigma = np.random.default_rng(0), np.full((40, 40), 0.05)
+    step = np.where(np.arange(40) < 20, 5.0, 7.0) * np.ones((40, 1))
+    noisy = step + sigma * rng.normal(size=step.shape)
+    even = even_out(noisy, sigma, 30.0)
+    assert 0.1 < np.std(even - step) / np.std(noisy - step) < 0.5
+    assert np.array_equal(even_out(noisy, 1e-4 * sigma, 30.0), noisy)
+
+
+@pytest.mark.parametrize("level", [0, 255])
+def test_a_flat_background_takes_no_noise_from_an_image(level: int) -> None:
+    noisy = np.random.default_rng(0).normal(100, 3.0, (120, 160)).astype(np.float32)
+    alone = image_noise(noisy)
+    noisy[:, :80] = level
+    assert image_noise(noisy) == pytest.approx(alone, rel=0.25)
+    assert image_noise(np.full((50, 50), float(level), np.float32)) > 0
+
+
+COUNTS = st.integers(0, 1000)
+
+
+@given(COUNTS, COUNTS, COUNTS, COUNTS)
+def test_a_funnel_names_the_step_that_takes_most(a: int, b: int, c: int, d: int) -> None:
+    left = sorted((a, b, c, d), reverse=True)
+    funnel = Funnel(pixels=1000, begun=left[0], matched=left[1], agreed=left[2], kept=left[3])
+    assert funnel.narrowest in funnel.shares_pct
+    assert all(0 <= share <= 100 for share in funnel.shares_pct.values())
+    both = sum_funnels([funnel, None, funnel])
+    assert both is not None
+    assert both.shares_pct == funnel.shares_pct
+    assert sum_funnels([None]) is None
+
+
+def test_an_empty_surface_is_refused_with_what_took_it(tmp_path: Path) -> None:
+    camera = one_camera().rig["camera"].camera
+    empty = DepthMap(
+        frame="00",
+        camera_name="camera",
+        camera=camera,
+        cam_from_rig=Rigid3.identity(),
+        depth_mm=np.full((160, 160), np.nan, np.float32),
+        confidence=np.zeros((160, 160), np.float32),
+        funnel=Funnel(pixels=25600, begun=20000, matched=15000, agreed=100, kept=0),
+    )
+    options = FusionOptions(), CleaningOptions(), SharpEdgeOptions()
+    with pytest.raises(ReconstructionError, match=r"no surface: .* 0\.39 % one that other views agree with") as refusal:
+        fuse([empty], "a", {"00": Rigid3.identity()}, 0.03, tmp_path, *options)
+    assert "\n" not in str(refusal.value)
+    assert not (tmp_path / "mesh.ply").exists()
+
+
+@pytest.mark.parametrize(("off_px", "held"), [(0.0, True), (4.0, False)])
+def test_one_instant_refines_only_a_calibration_that_it_contradicts(tmp_path: Path, off_px: float, held: bool) -> None:
+    """One of the cameras looks so many pixels higher than its file says."""
+    handpiece, rng = diamond(320), np.random.default_rng(2)
+    turned = Rigid3.from_rotation_vector(
+        np.array([off_px / handpiece.rig["east"].camera.focal_px[0], 0, 0]), np.zeros(3)
+    )
+    built = {
+        name: replace(each, cam_from_rig=(turned if name == "east" else Rigid3.identity()) @ each.cam_from_rig)
+        for name, each in handpiece.rig.cameras.items()
+    }
+    images = {("0", name): render(HILLS, each, Rigid3.identity(), rng) for name, each in built.items()}
+    nominal = NominalOptions().of(handpiece).fill(handpiece)
+    capture = Capture(handpiece=nominal, frames=(Frame(name="0", cameras=nominal.rig.names),), source=InMemory(images))
+    known, notes = _hold_what_fits(capture, True, tmp_path, ReconstructionOptions(), lambda *_: None)
+    assert (known.handpiece.rig["east"].covariance is None) == held
+    assert bool(notes) == held
