@@ -281,7 +281,10 @@ def test_the_verb_writes_its_results_and_does_not_mix_them(jaw_file, tmp_path, c
     storage.claim_folder(
         out,
         "sweep",
-        {"options": options, "source": {"unit": "mm", "arch": None, "jaw_seed": 0}},
+        {
+            "options": options,
+            "source": {"unit": "mm", "arch": None, "labels": "auto", "label_map": None, "jaw_seed": 0},
+        },
         {"jaw": storage.hash_file(jaw_file)},
     )
     shutil.copytree(folder / "cases", out / "cases")

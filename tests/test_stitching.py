@@ -135,7 +135,10 @@ def test_overlaps_inliers_and_notes_are_told(stitched: Stitched) -> None:
     assert not any("found again on the surface" in note for note in stitched.panorama.notes)
 
 
-def test_a_path_that_the_surface_does_not_hold_stays_and_a_note_tells(sequence: ImageSequence) -> None:
+def test_a_path_that_the_surface_does_not_hold_stays_and_a_note_tells(
+    sequence: ImageSequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cuspid.panorama_pipeline.that_show_something", tuple)  # there is no picture without a surface
     options = StitchOptions(plane_sweep=PlaneSweepOptions(agreement=0.99))
     (made,) = stitch(sequence, options)
     assert all(frame.used for frame in made.panorama.frames)

@@ -36,6 +36,7 @@ from cuspid.progress import Progress, silent
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece
 from cuspid.stereo.matching import DepthEstimator
+from cuspid.stereo.signal import shows_detail
 from cuspid.stereo.stage import StoredDepthMaps, measure_depth
 from cuspid.surface.growing import GrowingSurface
 
@@ -167,7 +168,9 @@ class Session:
         return placed
 
     def _is_plain(self, frame: Frame) -> bool:
-        return pipeline.matched(replace(self._capture, frames=(frame,)), self._options) == "shading"
+        if self._options.signal != "auto":
+            return self._options.signal == "shading"
+        return not shows_detail(replace(self._capture, frames=(frame,)))
 
     def _features(self, frame: Frame) -> Mapping[tuple[str, str], Features]:
         one = replace(self._capture, frames=(frame,))

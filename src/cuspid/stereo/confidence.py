@@ -52,7 +52,8 @@ class ConfidenceOptions(Options):
     border_jump: Annotated[float, Range(0, 1000)] = 2.0
     """How far behind, in resolutions, the other surface must lie at least to count as another one."""
     speckle_px: Annotated[int, Range(0, 1_000_000)] = 100
-    """Connected pieces of fewer depth pixels are dropped."""
+    """Connected pieces of fewer depths are dropped, where every third pixel has one; of depths that are farther apart,
+    pieces that are as small in pixels of the image."""
     speckle_jump: Annotated[float, Range(0.01, 10_000)] = 5.0
     """Neighbours that differ by more resolutions (0.06 mm at 12 um), scaled with their depth, are not connected."""
 
@@ -83,8 +84,8 @@ class Measured:
     """NaN where unknown."""
     sigma_mm: Float[np.ndarray, "h w"]
     """Standard deviation estimated by the refinement."""
-    begun: int = 0
-    """Number of pixels that had an initial depth."""
+    begun: Bool[np.ndarray, "h w"] | None = None
+    """Where there was an initial depth, if that is known."""
     planes: Float[np.ndarray, "h w 6"] | None = None
     """The planes that the depths are of (:mod:`cuspid.stereo.refinement`), if they were measured by texture."""
     smooth: Bool[np.ndarray, "h w"] | None = None

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from cuspid.camera import Camera
 from cuspid.errors import InputError
@@ -362,7 +362,7 @@ class Match:
         """Depth of a reference view before the checks."""
         view, grid = self._views.views[index], self._views.grids[index]
         layers = np.stack([initial_layer(self._initial[pair], view, grid) for pair in self._views.layers[index]])
-        return self._refined(index, layers, begun=int(np.isfinite(layers).any(axis=0).sum()))
+        return self._refined(index, layers, begun=np.isfinite(layers).any(axis=0))
 
     def widen(self, index: int, one: Measured, agreed: Float[np.ndarray, "h w 6"], widening: int) -> Measured:
         """What was measured of a view where other views agree with it (planes), and what these planes, carried on to
@@ -375,7 +375,7 @@ class Match:
         index: int,
         layers: Float[np.ndarray, "l h w"],
         *,
-        begun: int,
+        begun: Bool[np.ndarray, "h w"] | None,
         known: Float[np.ndarray, "h w 6"] | None = None,
         widening: int = 1,
     ) -> Measured:
@@ -482,8 +482,9 @@ def agreed_planes(
     """The planes of a view that others agree with; None where these are ``enough`` (a share) of what it began with, so
     that it is not worth looking for more."""
     assert one.planes is not None
+    assert one.begun is not None
     agreed = (agreement(one, others, resolution, checks) > 0) & sure_enough(one, resolution, checks)
-    if agreed.sum() >= enough * one.begun:
+    if agreed.sum() >= enough * one.begun.sum():
         return None
     return np.asarray(one.planes * agreed[..., None], dtype=np.float64)
 
@@ -536,12 +537,15 @@ def checked_depth_map(
     agreed = counts & (agreement(one, others, resolution, checks) > 0) & sure_enough(one, resolution, checks)
     if len(others) == 1:
         agreed &= ~at_near_borders(one, others[0], -(-checks.border_px // grid_px), resolution, checks)
-    keep = without_speckle(np.where(agreed, one.depth_mm, np.nan), resolution, checks)
-    matched = int((counts & np.isfinite(one.depth_mm)).sum())
+    speckle = replace(
+        checks, speckle_px=min(checks.speckle_px, round(checks.speckle_px * (_SPACING_PX / grid_px) ** 2))
+    )
+    keep = without_speckle(np.where(agreed, one.depth_mm, np.nan), resolution, speckle)
+    matched = counts & np.isfinite(one.depth_mm)
     funnel = Funnel(
         pixels=int(counts.sum()),
-        begun=max(one.begun, matched),
-        matched=matched,
+        begun=int((matched if one.begun is None else counts & (matched | one.begun)).sum()),
+        matched=int(matched.sum()),
         agreed=int(agreed.sum()),
         kept=int(keep.sum()),
     )

@@ -35,7 +35,7 @@ def choose_signal(capture: Capture, options: StereoOptions) -> Signal:
     Shade tells something only where the lights are known. Where they are, and what is lit shows little detail, a few
     frames are matched both ways, and the way that gives more depth on which the views agree is taken.
     """
-    if not capture.handpiece.lights or _shows_detail(capture):
+    if not capture.handpiece.lights or shows_detail(capture):
         return "texture"
     frames = [capture.frames[k] for k in sorted({0, len(capture.frames) // 2})]
     by_texture = _agreed_share(capture, frames, options, "texture")
@@ -57,7 +57,7 @@ def _agreed_share(capture: Capture, frames: Sequence[Frame], options: StereoOpti
     return 0.0 if funnel is None else funnel.kept / max(funnel.pixels, 1)
 
 
-def _shows_detail(capture: Capture) -> bool:
+def shows_detail(capture: Capture) -> bool:
     """Whether even the smoothest tenth of what is lit shows the detail of a texture."""
     images = [(frame, camera) for frame in capture.frames for camera in frame.cameras]
     chosen = {images[k] for k in np.linspace(0, len(images) - 1, _LOOKED_AT).astype(int)} if images else set()

@@ -109,8 +109,7 @@ class _Views:
         arrays = read_arrays(matched[number].file, remedy="give the command again: it is made anew")
         grid = coarser(self._ideal[view.camera].camera, self.options.grid_px)
         depth_mm, sigma_mm = (arrays[name].astype(np.float64) for name in ("depth_mm", "sigma_mm"))
-        begun, planes = int(arrays["begun"]), arrays["planes"]
-        return Measured(grid, view.mounted.cam_from_rig, depth_mm, sigma_mm, begun, planes)
+        return Measured(grid, view.mounted.cam_from_rig, depth_mm, sigma_mm, arrays["begun"], arrays["planes"])
 
     def _others(self, number: int, matched: Mapping[int, _Matched]) -> list[int]:
         """Those sources of a view that were matched themselves."""
@@ -176,4 +175,4 @@ def _name(number: int) -> str:
 def _write_measured(file: Path, measured: Measured) -> None:
     assert measured.planes is not None
     arrays = {name: getattr(measured, name).astype(np.float32) for name in ("depth_mm", "sigma_mm", "planes")}
-    write_arrays(file, arrays | {"begun": np.array(measured.begun)})
+    write_arrays(file, arrays | {"begun": np.asarray(measured.begun)})
