@@ -17,6 +17,7 @@ from jaxtyping import Float32, UInt8
 
 from cuspid.capture import Capture
 from cuspid.geometry import Rigid3
+from cuspid.motion.colmap import quiet
 from cuspid.pairing import detail_mm
 from cuspid.reconstruction import DepthMap
 from cuspid.rig import Rig
@@ -121,9 +122,10 @@ def colmap(given: Path, out: Path) -> dict[str, Any]:
     out.mkdir(parents=True, exist_ok=True)
     begin, database = time.process_time(), out / "database.db"
     one = pycolmap.CameraMode.SINGLE
-    pycolmap.extract_features(database, given, camera_mode=one, device=pycolmap.Device.cpu)
-    pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
-    models = pycolmap.incremental_mapping(database, given, out / "sparse")
+    with quiet():
+        pycolmap.extract_features(database, given, camera_mode=one, device=pycolmap.Device.cpu)
+        pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
+        models = pycolmap.incremental_mapping(database, given, out / "sparse")
     best = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
     figures: dict[str, Any] = {"cpu_s": round(time.process_time() - begin, 1), "models": len(models)}
     if best is None:

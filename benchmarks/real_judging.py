@@ -87,13 +87,16 @@ def depth_maps(out: Path) -> Iterator[DepthMap]:
 
 def _share_known(depths: list[DepthMap], source: Path) -> float | None:
     """Share of the pixels of the images (%) that have a depth, over all that depth was measured for."""
-    if not depths or not (source / "handpiece.json").exists():
+    if not depths:
         return None
-    rig = read_handpiece(source / "handpiece.json").rig
+    file = source / "handpiece.json"
+    cameras = read_handpiece(file).rig.cameras if file.exists() else {}
     known = pixels = 0
     for depth in depths:
-        camera = rig[depth.camera_name].camera
-        shown = mask_at(depth, rig[depth.camera_name], np.ones((camera.height, camera.width), bool))
+        shown = np.ones(depth.depth_mm.shape, dtype=bool)
+        if depth.camera_name in cameras:  # else it is one that was found from photographs
+            mounted = cameras[depth.camera_name]
+            shown = mask_at(depth, mounted, np.ones((mounted.camera.height, mounted.camera.width), bool))
         known, pixels = known + int(depth.known[shown].sum()), pixels + int(shown.sum())
     return 100 * known / pixels if pixels else None
 

@@ -47,6 +47,8 @@ _WEAK_SIGMA_PX = 0.15
 """Standard deviation (px of disparity) that a depth from weak texture has at least: what looks alike need not be."""
 _OUTLYING_SIGMAS = 4.0
 """Planes that lie so far from a smooth surface, in its standard deviations, are outliers."""
+_MOST_DISPARITIES = 256
+"""Of the initial matching, px."""
 MOST_AGREED, WEAKLY_AGREED = 0.8, 0.6
 """Shares of the pixels with an initial depth that views should agree on: with less than the first they are matched in
 wider windows, with less than the second, after that, the rest is made smooth."""
@@ -108,11 +110,15 @@ class ViewSet:
 
 
 def prepare_views(
-    rig: Rig, sources: Mapping[str, Sequence[str]], distance_mm: float, options: StereoOptions
+    rig: Rig,
+    sources: Mapping[str, Sequence[str]],
+    distance_mm: float,
+    depth_range_mm: tuple[float, float],
+    options: StereoOptions,
 ) -> ViewSet:
     """Views, given as cameras in a common frame, those of which ``sources`` names others being references.
 
-    ``distance_mm`` is how far from them the surface lies, about.
+    ``distance_mm`` is how far from them the surface lies, about, ``depth_range_mm`` at least and at most.
     """
     names = list(rig.names)
     index = {name: k for k, name in enumerate(names)}
@@ -125,7 +131,10 @@ def prepare_views(
     return ViewSet(
         views=views,
         sources=others,
-        pairs=tuple(rectify(pair, rig[pair[0]], rig[pair[1]], options.initial_scale) for pair in chosen.values()),
+        pairs=tuple(
+            rectify(pair, rig[pair[0]], rig[pair[1]], _initial_scale(rig, pair, depth_range_mm, options))
+            for pair in chosen.values()
+        ),
         layers=tuple(
             tuple(k for k, pair in enumerate(pairs) if set(pair) <= {reference, *others[reference]})
             for reference in range(len(names))
@@ -136,6 +145,17 @@ def prepare_views(
         ),
         grids=tuple(coarser(view.camera, options.grid_px) for view in views),
     )
+
+
+def _initial_scale(
+    rig: Rig, pair: tuple[str, str], depth_range_mm: tuple[float, float], options: StereoOptions
+) -> float:
+    """Resolution of the initial matching of a pair relative to its images: less where there would be very many
+    disparities."""
+    near, far = depth_range_mm
+    baseline_mm = float(np.linalg.norm(rig[pair[0]].centre_in_rig - rig[pair[1]].centre_in_rig))
+    disparities = baseline_mm * float(rig[pair[0]].camera.focal_px.mean()) * (1 / near - 1 / far)
+    return min(options.initial_scale, _MOST_DISPARITIES / max(disparities, 1))
 
 
 def coarser(camera: Camera, spacing_px: int) -> Camera:
@@ -235,7 +255,7 @@ class DepthEstimator:
                 part = Rig({name: rig[name] for name in names})
                 if self.signal == "texture":
                     sources = rank_sources(part, distance_mm, self.options.pairing)
-                    sets.append(prepare_views(part, sources, distance_mm, self.options))
+                    sets.append(prepare_views(part, sources, distance_mm, self.handpiece.depth_range_mm, self.options))
                 else:
                     sets.append(self._prepare_shading(part, distance_mm))
         return tuple(sets)
@@ -243,7 +263,7 @@ class DepthEstimator:
     def _prepare_shading(self, part: Rig, distance_mm: float) -> ViewSet:
         """Every view with all others."""
         sources = {name: tuple(other for other in part.names if other != name) for name in part.names}
-        prepared = prepare_views(part, sources, distance_mm, self.options)
+        prepared = prepare_views(part, sources, distance_mm, self.handpiece.depth_range_mm, self.options)
         sensors = [self.handpiece.sensor_of(name) for name in part.names]
         return replace(
             prepared,

@@ -99,7 +99,8 @@ class _Views:
         cameras = {
             _name(k): replace(self.located[k].mounted, camera=self._ideal[self.located[k].camera].camera) for k in of
         }
-        views = prepare_views(Rig(cameras), {_name(of[0]): list(map(_name, of[1:]))}, view.distance_mm, self.options)
+        sources = {_name(of[0]): list(map(_name, of[1:]))}
+        views = prepare_views(Rig(cameras), sources, view.distance_mm, view.depth_range_mm, self.options)
         images = {_name(k): self._gray(k) for k in of}
         return Match(views, images, view.depth_range_mm, self.options, shaded=True)
 
