@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid import storage
+from cuspid import cli, storage
 from cuspid.capture import Capture, Frame, read_mask
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
@@ -224,3 +224,16 @@ def test_one_instant_refines_only_a_calibration_that_it_contradicts(tmp_path: Pa
     known, notes = _hold_what_fits(capture, True, tmp_path, ReconstructionOptions(), lambda *_: None)
     assert (known.handpiece.rig["east"].covariance is None) == held
     assert bool(notes) == held
+
+
+def test_a_mesh_without_scale_says_so_and_is_not_evaluated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, reference = tmp_path / "mesh.ply", tmp_path / "reference.ply"
+    storage.write_mesh(file, HILLS, comment=storage.NO_SCALE)
+    storage.write_mesh(reference, HILLS)
+    assert len(storage.read_mesh_file(file).mesh.faces) == len(HILLS.faces)
+    assert not storage.has_scale(file)
+    assert storage.has_scale(reference)
+    with pytest.raises(SystemExit, match="1"):
+        cli.main(["evaluate", str(file), str(reference), "--out", str(tmp_path / "out")])
+    assert "it has no scale" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

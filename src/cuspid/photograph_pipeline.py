@@ -174,7 +174,7 @@ def _write(folder: Path, located: LocatedPhotographs) -> None:
     assert isinstance(source, Photographs)
     write_model(folder / "sparse", found, capture, {name: source[name].path.name for name in found.frames})
     if found.tracks is not None:
-        comment = "lengths in mm" if found.has_scale else "scale unknown: lengths are not in mm"
+        comment = "lengths in mm" if found.has_scale else storage.NO_SCALE
         storage.write_points(folder / "points.ply", found.tracks.points, found.tracks.colors, comment)
     told = {"scale": "unknown"} if scale is None else {"scale": "known", **asdict(scale)}
     storage.write_json(folder / "scale.json", told)

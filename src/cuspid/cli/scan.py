@@ -190,6 +190,11 @@ def _evaluate(
 def _measure_trueness(
     mesh: Path, reference: Path, out: Path, source: Source, options: EvaluationOptions, reference_unit: storage.Unit
 ) -> None:
+    if not storage.has_scale(mesh):
+        raise InputError(
+            f"{mesh}: it has no scale, so its deviations are in no unit; reconstruct its photographs with --square-mm "
+            "(a board beside the object) or --distance"
+        )
     file = storage.read_mesh_file(mesh, source.unit)
     (scan, facing), sigma_um = facing_outwards(file.mesh), file.vertex_values.get(storage.SIGMA)
     measured = storage.MeasuredFile(path=mesh, mesh=scan, unit=source.unit)

@@ -30,8 +30,10 @@ from cuspid.storage.jaws import is_jaw, read_jaw, read_label_map, read_labelled_
 from cuspid.storage.landmarks import MARKUPS_SUFFIX, LandmarkFile, LandmarkFrame, read_landmarks, write_landmarks
 from cuspid.storage.meshes import (
     MESH_SUFFIXES,
+    NO_SCALE,
     SIGMA,
     MeshFile,
+    has_scale,
     read_mesh,
     read_mesh_file,
     write_mesh,
@@ -71,6 +73,7 @@ __all__ = [
     "MARKUPS_SUFFIX",
     "MESH_SUFFIXES",
     "MM_PER_UNIT",
+    "NO_SCALE",
     "PART",
     "SIGMA",
     "TIMES_FILES",
@@ -90,6 +93,7 @@ __all__ = [
     "claimed_folder",
     "csv_table",
     "digest_of",
+    "has_scale",
     "hash_capture",
     "hash_file",
     "hash_photographs",

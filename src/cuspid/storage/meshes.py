@@ -17,7 +17,7 @@ from jaxtyping import Float, Int, UInt8
 
 from cuspid.errors import InputError
 from cuspid.geometry import distinct_rows, owned
-from cuspid.inputs import read_bytes
+from cuspid.inputs import read_bytes, require_file
 from cuspid.mesh import Mesh
 from cuspid.storage.files import write_bytes
 from cuspid.storage.units import MM_PER_UNIT, Unit
@@ -184,6 +184,17 @@ def write_mesh(
     if comment is not None and data.startswith(b"ply\n"):
         data = data.replace(b"\nelement ", f"\ncomment {comment}\nelement ".encode(), 1)
     write_bytes(path, data)
+
+
+NO_SCALE = "scale unknown: lengths are not in mm"
+"""Comment of a PLY file of which nothing tells the scale."""
+
+
+def has_scale(path: Path) -> bool:
+    """Whether the lengths of a mesh file are in a known unit: not where a PLY file says :data:`NO_SCALE`."""
+    with require_file(path, "mesh").open("rb") as stream:
+        head = stream.read(4096)
+    return not (head.startswith(b"ply") and NO_SCALE.encode() in head.split(b"end_header")[0])
 
 
 def write_points(path: Path, points: Float[np.ndarray, "n 3"], colors: UInt8[np.ndarray, "n 3"], comment: str) -> None:

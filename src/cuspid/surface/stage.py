@@ -17,7 +17,7 @@ from cuspid.mesh import Mesh
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import DepthMap, Expectation, Funnel, SurfacePoints, sum_funnels
 from cuspid.storage.files import digest_of, write_json
-from cuspid.storage.meshes import SIGMA, read_mesh_file, write_mesh
+from cuspid.storage.meshes import NO_SCALE, SIGMA, read_mesh_file, write_mesh
 from cuspid.storage.reconstructions import read_surface_points, write_surface_points
 from cuspid.storage.stages import Stage
 from cuspid.surface.cleaning import CleaningOptions, clean
@@ -92,7 +92,7 @@ def fuse(
             ),
         )
         write_mesh(files[1], mesh)
-        comment = None if has_scale else "scale unknown: lengths are not in mm"
+        comment = None if has_scale else NO_SCALE
         write_mesh(files[2], mesh, values={SIGMA: sigma_um}, comment=comment)
 
     inputs = {
