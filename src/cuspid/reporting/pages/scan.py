@@ -67,6 +67,12 @@ class ReportOptions(Options):
     """Number of the worst places that are listed."""
 
 
+_NO_SCALE = (
+    "scale: nothing tells it, so all lengths and areas are in a unit of this surface's own, not in millimetres or "
+    "micrometres, whatever is written beside them"
+)
+
+
 def scan_page(result: ScanResult, options: ReportOptions = ReportOptions()) -> str:
     """The HTML of a scan. Raises InputError where there is no surface."""
     if result.scan is None:
@@ -90,7 +96,7 @@ def scan_page(result: ScanResult, options: ReportOptions = ReportOptions()) -> s
         views=[view["name"] for view in scene["views"]],
         shown=sizes,
         tiles=_tiles(result),
-        warnings=() if result.reconstruction is None else result.reconstruction.notes,
+        warnings=_warnings(result),
         trueness=result.trueness,
         rows=_table(result.trueness),
         histogram=None if result.deviation_um is None else histogram(scan, result.deviation_um, range_um),
@@ -140,8 +146,18 @@ def _scene(
         "scales": [scale.in_scene for scale, _ in maps],
         "views": standard_views(arch),
         "teeth": [asdict(place) for place in _teeth(result)],
+        "length_unit": "mm" if _has_scale(result) else "units of its own",
     }
     return scene, sizes
+
+
+def _has_scale(result: ScanResult) -> bool:
+    return result.reconstruction is None or result.reconstruction.has_scale
+
+
+def _warnings(result: ScanResult) -> tuple[str, ...]:
+    notes = () if result.reconstruction is None else result.reconstruction.notes
+    return notes if _has_scale(result) else (_NO_SCALE, *notes)
 
 
 def _size(name: str, full: int, shown: int, off_um: float) -> dict[str, Any]:

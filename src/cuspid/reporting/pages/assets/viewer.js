@@ -6,6 +6,7 @@
 "use strict";
 (async () => {
   const scene = JSON.parse(document.getElementById("scene").textContent);
+  const lengthUnit = scene.length_unit ?? "mm"; // Photographs alone tell no scale.
   const root = document.getElementById("viewer");
   const find = (selector) => root.querySelector(selector);
   const canvas = find("canvas");
@@ -256,7 +257,7 @@
     const steps = [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50];
     const length = steps.filter((each) => each * pixelsPerMm <= 0.28 * canvas.clientWidth).pop() ?? steps[0];
     find(".length span").style.width = `${length * pixelsPerMm}px`;
-    find(".length b").textContent = `${length} mm`;
+    find(".length b").textContent = `${length} ${lengthUnit}`;
   }
 
   function showTicks() {
@@ -288,7 +289,7 @@
     const amount = value * step;
     const where = hit.point.toArray().map((each) => each.toFixed(2)).join(", ");
     const text = value === UNKNOWN ? "not known" : `${signed && amount > 0 ? "+" : ""}${amount.toFixed(unit === "mm" ? 3 : 1)} ${unit}`;
-    readout.textContent = `${text}  at ${where} mm`.replace(/-/g, "−");
+    readout.textContent = `${text}  at ${where} ${lengthUnit}`.replace(/-/g, "−");
   }
 
   // --- buttons -------------------------------------------------------------------------------------------------------
