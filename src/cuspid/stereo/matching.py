@@ -47,7 +47,7 @@ _WEAK_SIGMA_PX = 0.15
 """Standard deviation (px of disparity) that a depth from weak texture has at least: what looks alike need not be."""
 _OUTLYING_SIGMAS = 4.0
 """Planes that lie so far from a smooth surface, in its standard deviations, are outliers."""
-_MOST_DISPARITIES = 256
+_MOST_DISPARITIES = 800
 """Of the initial matching, px."""
 MOST_AGREED, WEAKLY_AGREED = 0.8, 0.6
 """Shares of the pixels with an initial depth that views should agree on: with less than the first they are matched in
