@@ -28,8 +28,8 @@ from cuspid.workers import map_in_threads
 
 DESCRIPTOR_NORM = 512.0
 """Euclidean length of a descriptor before rounding."""
-_DARK_DN, _BRIGHT_PERCENTILE = 128.0, 99.5
-"""An image is dark if its brightest place is below this grey level; it is stretched until this percentile is white."""
+_DARK_DN, _BRIGHT_PERCENTILES = 128.0, (99.5, 99.9)
+"""An image is dark if the second percentile is below this grey level; it is stretched until the first one is white."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,8 +120,7 @@ def _colors_at(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "n 2
 
 def brighten(gray: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     """A dark image stretched to the whole range: the contrast of a keypoint is a share of it. Others as they are."""
-    brightest = float(cv2.blur(gray, (3, 3)).max())  # which a single hot pixel is not
-    bright = float(np.percentile(gray[::2, ::2], _BRIGHT_PERCENTILE))
+    bright, brightest = np.percentile(gray[::2, ::2], _BRIGHT_PERCENTILES).tolist()
     if not 0 < bright <= brightest < _DARK_DN:
         return gray
     return np.asarray(cv2.convertScaleAbs(gray, alpha=255 / bright), dtype=np.uint8)
