@@ -133,6 +133,47 @@ def test_maps_of_one_frame_count_as_one() -> None:
     assert np.median(twice) == pytest.approx(np.median(once), rel=0.05)
 
 
+def scattered(sigma_mm: float, *, stated: bool) -> list[DepthMap]:
+    """The depths of one frame with errors that are alike over a few pixels."""
+    rng = np.random.default_rng(0)
+    maps = []
+    for each in depth_maps(HILLS):
+        if each.frame != "00000":
+            continue
+        error = cv2.GaussianBlur(rng.normal(0, 1, each.depth_mm.shape), (0, 0), 2)
+        depth = each.depth_mm + (sigma_mm / error.std() * error).astype(np.float32)
+        weight = np.where(each.known, 1, 0).astype(np.float32)
+        maps.append(replace(each, depth_mm=depth, confidence=weight, best_mm=sigma_mm if stated else None))
+    return maps
+
+
+def test_one_frame_is_as_uncertain_as_its_maps_state() -> None:
+    maps = scattered(0.01, stated=True)
+    fused = fuse_depth_maps(maps, POSES, DETAIL_MM)
+    off = signed_um(fused.mesh, HILLS)
+    assert 0.5 < np.sqrt(np.mean(fused.sigma_mm**2)) * 1000 / np.sqrt(np.mean(off**2)) < 2
+    assert np.median(fuse_depth_maps(scattered(0.01, stated=False), POSES, DETAIL_MM).sigma_mm) < 0.005
+
+
+def test_depths_that_scatter_as_they_state_still_make_a_surface() -> None:
+    """Their slopes are those of their noise."""
+    told, untold = (
+        fuse_depth_maps(scattered(0.15, stated=stated), POSES, DETAIL_MM, FusionOptions(voxel_mm=0.1)).mesh.face_areas
+        for stated in (True, False)
+    )
+    assert told.sum() > 1.3 * untold.sum()
+    assert told.sum() > 0.7 * fuse(scattered(0.002, stated=True), POSES).face_areas.sum()
+
+
+@pytest.mark.parametrize("ratio", [1.0, 4.0])
+def test_the_grid_follows_the_footprint_half_way(ratio: float) -> None:
+    resolved = FusionOptions().resolved(ratio * 0.1, 0.1)
+    assert resolved.voxel_for(ratio * 0.1) == pytest.approx(np.sqrt(ratio) * FusionOptions().voxel_for(0.1))
+    blended = resolved.truncation_voxels * resolved.voxel_for(ratio * 0.1)
+    assert blended == pytest.approx(ratio * FusionOptions().truncation_voxels * FusionOptions().voxel_for(0.1))
+    assert FusionOptions(voxel_mm=0.3).resolved(ratio * 0.1, 0.1) == FusionOptions(voxel_mm=0.3)
+
+
 def test_stored_maps_follow_each_other_frame_by_frame() -> None:
     within, across = (
         StoredDepthMaps({Path(kind) / f"{name}.npz": kind for name in names})

@@ -351,6 +351,7 @@ def test_depth_maps_return(tmp_path):
         depth_mm=depth,
         confidence=rng.random((12, 16)).astype(np.float32),
         color=rng.integers(0, 255, (12, 16, 3), dtype=np.uint8),
+        best_mm=0.002,
     )
     storage.write_depth_maps(tmp_path / "d.npz", [original, dataclasses.replace(original, color=None)])
     first, second = storage.read_depth_maps(tmp_path / "d.npz")
@@ -358,6 +359,7 @@ def test_depth_maps_return(tmp_path):
     np.testing.assert_allclose(first.confidence, original.confidence, atol=1e-3)
     np.testing.assert_array_equal(first.color, original.color)
     assert second.color is None
+    assert first.best_mm == 0.002
     points, known = first.points_in_rig()
     assert len(points) == 12 * 16 - 1
     in_cam = original.cam_from_rig.apply(points)

@@ -210,7 +210,7 @@ def surface(
     else:
         depths = _textured_depth(of_size, found, detail, folder, options, progress)
     give_back()
-    how = _of_quality(options, detail), options.cleaning, options.sharp_edges
+    how = fusion_for(of_size.handpiece, options), options.cleaning, options.sharp_edges
     return fuse(
         *(depths, depths.digest, _poses(found, depths), detail, folder, *how),
         expected=found.expectation,
@@ -278,7 +278,7 @@ def _textured_depth(
     holes = None
     if found.tracks is not None and options.across.small_holes is not False and options.across.left_share != 0:
         located = depths, depths.digest, _poses(found, depths)
-        holes = find_holes(*located, detail, folder, _of_quality(options, detail), progress=progress)
+        holes = find_holes(*located, detail, folder, fusion_for(handpiece, options), progress=progress)
     return depths | measure_depth_across(
         *(capture, found, depths, folder / "depth-across", options.across, stereo),
         agreement_mm=agreement_mm,
@@ -293,10 +293,11 @@ def _poses(found: Reconstruction, depths: StoredDepthMaps) -> dict[str, Rigid3]:
     return {name: found.rig_from_world[name] for name in depths.frames if name in found.rig_from_world}
 
 
-def _of_quality(options: ReconstructionOptions, detail: float) -> FusionOptions:
-    """How depth maps are fused, for a handpiece that shows this detail (mm)."""
-    fusion = options.fusion
-    if options.quality != "fine" or fusion.voxel_mm is not None:
+def fusion_for(handpiece: Handpiece, options: ReconstructionOptions) -> FusionOptions:
+    """How the depth maps of a handpiece are fused."""
+    detail = detail_mm(handpiece)
+    fusion = options.fusion.resolved(detail, handpiece.footprint_mm)
+    if options.quality != "fine" or options.fusion.voxel_mm is not None:
         return fusion
     return replace(fusion, voxel_mm=_FINE_VOXELS * fusion.voxel_for(detail))
 

@@ -92,11 +92,19 @@ class DepthMap:
     """RGB seen at each pixel."""
     funnel: Funnel | None = None
     """How many of its pixels were left from step to step."""
+    best_mm: float | None = None
+    """Standard deviation of a depth that has confidence 1; None where none is stated."""
 
     @property
     def known(self) -> Bool[np.ndarray, "h w"]:
         """The pixels that have a depth."""
         return np.asarray(np.isfinite(self.depth_mm) & (self.confidence > 0))
+
+    @property
+    def sigma_mm(self) -> Float[np.ndarray, "h w"]:
+        """Standard deviation of each depth, 0 if none is stated; NaN where the depth is unknown. float32."""
+        best_mm = np.float32(self.best_mm or 0)
+        return np.where(self.known, best_mm / np.sqrt(np.where(self.known, self.confidence, 1)), np.float32(np.nan))
 
     def points_in_rig(self) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
         """Known points in the rig frame (mm) and their flat pixel indices."""
@@ -196,6 +204,11 @@ class Expectation:
     def __post_init__(self) -> None:
         for name in ("points", "covariance"):
             object.__setattr__(self, name, read_only(np.asarray(getattr(self, name), dtype=np.float64)))
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether neither poses nor calibration add anything."""
+        return not self.covariance.any()
 
     def sigma_mm(self, vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v"]:
         """Standard deviation of vertices nearby, along their normals: that of the nearest points (mean variance)."""

@@ -85,8 +85,8 @@ class Session:
         self._given = handpiece
         self._sized = pipeline.sized(self._capture, settled)
         self._estimator = DepthEstimator(self._sized.handpiece, settled.stereo)
-        self._surface = GrowingSurface(detail_mm(self._sized.handpiece), settled.fusion)
-        self._voxel_mm = settled.fusion.voxel_for(detail_mm(self._sized.handpiece))
+        detail, fusion = detail_mm(self._sized.handpiece), pipeline.fusion_for(self._sized.handpiece, settled)
+        self._surface, self._voxel_mm = GrowingSurface(detail, fusion), fusion.voxel_for(detail)
         self._tracker = Tracker(self._capture.handpiece, settled.tracking, self._recalled)
         self._ranks = Counter[str | None]()
         self._every_second = set[str]()

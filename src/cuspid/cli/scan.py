@@ -330,11 +330,14 @@ def _print_nominal(handpiece: Handpiece, options: NominalOptions) -> None:
 
 def _print_expected(expected: Expectation, sigma_um: Float[np.ndarray, "v"], told_by: str) -> None:
     middle, most = np.percentile(sigma_um, [50, 95])
-    console.print(
-        f"expected (one sigma): surface within {middle:.1f} µm (median; {most:.1f} for 95 % of it); by {told_by}, "
-        f"scale within {expected.scale_sigma_ppm:.0f} ppm and the {expected.span_mm:.0f} mm from end to end within "
-        f"{expected.span_sigma_um:.1f} µm"
-    )
+    if expected.is_exact:
+        told = "the calibration, which states no uncertainty, and the poses are taken as exact"
+    else:
+        told = (
+            f"by {told_by}, scale within {expected.scale_sigma_ppm:.0f} ppm and the {expected.span_mm:.0f} mm from end "
+            f"to end within {expected.span_sigma_um:.1f} µm"
+        )
+    console.print(f"expected (one sigma): surface within {middle:.1f} µm (median; {most:.1f} for 95 % of it); {told}")
 
 
 def _print_located(reconstruction: Reconstruction, capture: Capture) -> None:

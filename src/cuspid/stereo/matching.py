@@ -578,6 +578,7 @@ def checked_depth_map(
         confidence=confidence(one, keep, resolution, checks),
         color=_rgb(_grid_of(view.resample(image), grid_px)),
         funnel=funnel,
+        best_mm=resolution.mm * checks.best_sigma,
     )
 
 

@@ -133,6 +133,7 @@ def write_depth_maps(path: Path, depth_maps: Sequence[DepthMap]) -> None:
             "camera": camera_to_json(depth.camera),
             "cam_from_rig": depth.cam_from_rig.matrix,
             "funnel": depth.funnel,
+            "best_mm": depth.best_mm,
         }
         for depth in depth_maps
     ]
@@ -156,6 +157,7 @@ def read_depth_maps(path: Path) -> tuple[DepthMap, ...]:
                 confidence=arrays[f"{index}.confidence"].astype(np.float32),
                 color=arrays[f"{index}.color"] if f"{index}.color" in arrays else None,
                 funnel=None if entry.get("funnel") is None else as_declared(Funnel, **entry["funnel"]),
+                best_mm=entry.get("best_mm"),
             )
             for index, entry in enumerate(header)
         )

@@ -39,8 +39,9 @@ class Fused:
     mesh: Mesh
     """In the world frame, coloured."""
     sigma_mm: Float[np.ndarray, "v"]
-    """Standard deviation of each vertex along its normal, from the scatter of the depth maps about it. The maps of one
-    frame share its images, so they count as one. Errors common to all frames are not included."""
+    """Standard deviation of each vertex along its normal, from the scatter of the depth maps about it or, where no
+    surface is seen in several frames, from what the maps state. The maps of one frame share its images, so they count
+    as one. Errors common to all frames are not included."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,8 +56,9 @@ class FusionOptions(Options):
     largest_jump: Annotated[float, Range(0.01, 10_000)] = 12.5
     """Neighbouring depths that differ by more than this many times the detail (0.15 mm at 12 um) do not belong to the
     same surface."""
-    least_weight: Annotated[float, Range(0, 1_000_000)] = 0.01
-    """Minimum weight (sum of confidences) for a voxel to count as observed."""
+    least_weight: Annotated[float, Range(0, 1_000_000)] = 0.001
+    """Minimum weight (sum of confidences) for a voxel to count as observed: a thirtieth of what a pixel of a smooth
+    surface has that fills what could not be matched."""
     agreement: Annotated[float, Range(0.01, 10_000)] = 6.65
     """A depth map confirms a vertex within this many times the detail (0.08 mm at 12 um); nearer ones have more
     weight."""
@@ -69,6 +71,20 @@ class FusionOptions(Options):
     def voxel_for(self, detail_mm: float) -> float:
         """Spacing of the grid for a handpiece, mm."""
         return 4.16 * detail_mm if self.voxel_mm is None else self.voxel_mm
+
+    def resolved(self, detail_mm: float, footprint_mm: float) -> FusionOptions:
+        """With the grid for a handpiece whose pixels have a footprint that may be less than the detail.
+
+        Depths that scatter tell a slope to scatter / distance, averaged over (distance / footprint)**2 pixels: with a
+        spacing like the square root of both the mesh is not rougher than one whose detail is the footprint. They are
+        blended as far from the surface as they scatter.
+        """
+        if self.voxel_mm is not None or detail_mm <= footprint_mm:
+            return self
+        finer = float(np.sqrt(footprint_mm / detail_mm))
+        return replace(
+            self, voxel_mm=finer * self.voxel_for(detail_mm), truncation_voxels=self.truncation_voxels / finer
+        )
 
 
 def fuse(
@@ -179,6 +195,12 @@ _RINGS = 1
 _LEAST_FACING = 0.7
 """A depth map that sees a surface turned farther away than this from a vertex (cosine between their normals) sees
 another one, as beyond an edge."""
+_LEAST_TAN = float(np.sqrt(1 / _LEAST_FACING**2 - 1))
+_STEEP = 0.3
+"""Depths with a larger standard deviation, in distances of their pixels, have slopes by chance: they may be turned away
+by as much more."""
+_SIGMAS = 2.0
+"""Such depths confirm vertices within so many of their standard deviations."""
 _LEAST_FRONTAL = 0.02
 """Votes count as if the camera looked along the surface no more than this (cosine)."""
 CHUNK = 256
@@ -197,8 +219,8 @@ class Voter:
     """Numbers of the chunks of vertices in its view."""
     colors: UInt8[np.ndarray, "p 3"]
     """RGB by flat pixel index."""
-    known: Bool[np.ndarray, "p"]
-    """Whether it has a depth there itself, by flat pixel index."""
+    sigma_mm: Float[np.ndarray, "p"]
+    """Standard deviation of its depth, by flat pixel index; 0 if it states none, NaN where it has no depth itself."""
     frame: int
     """Number of its frame, starting from 1."""
 
@@ -223,6 +245,8 @@ class Votes:
     """The last frame that confirms it: the maps of a frame are consecutive."""
     frames: Float[np.ndarray, "v 2"]
     """Sum of the weights of that frame, and the sum of the squares of such sums of all frames."""
+    stated: Float[np.ndarray, "v"]
+    """Largest inverse variance (1/mm^2) that one of them states; 0 where none states any."""
 
     @staticmethod
     def on(rough: Mesh) -> Votes:
@@ -235,12 +259,12 @@ class Votes:
             ball[3] = np.linalg.norm(chunk - ball[:3], axis=1).max()
         moment, color, frames = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 2))
         maps, last = np.zeros((2, count), dtype=np.int64)
-        return Votes(rough, balls, moment, color, maps, np.zeros(count, dtype=bool), last, frames)
+        return Votes(rough, balls, moment, color, maps, np.zeros(count, dtype=bool), last, frames, np.zeros(count))
 
     def in_view(self, evidence: Evidence, depth_map: DepthMap, cam_from_world: Rigid3, frame: int) -> Voter:
         """A depth map with the vertices that it may see; ``frame`` is the number of its frame, starting from 1."""
         chunks = self._in_view(depth_map.camera, cam_from_world)
-        return Voter(evidence, cam_from_world, chunks, colors_of(depth_map), depth_map.known.ravel(), frame)
+        return Voter(evidence, cam_from_world, chunks, colors_of(depth_map), depth_map.sigma_mm.ravel(), frame)
 
     def collect(self, voters: Sequence[Voter], agreement_mm: float) -> None:
         """Let depth maps vote, one after the other, on the vertices that they see."""
@@ -257,7 +281,7 @@ class Votes:
                     voter.cam_from_world.translation,
                     *voter.evidence.arrays,
                     voter.colors,
-                    voter.known,
+                    voter.sigma_mm,
                     agreement_mm,
                     self.moment,
                     self.color,
@@ -266,6 +290,7 @@ class Votes:
                     self.last,
                     self.frames,
                     voter.frame,
+                    self.stated,
                 )
 
         in_shares(work)
@@ -297,7 +322,7 @@ class Votes:
         frames = np.maximum(self.moment[:, 0] ** 2 / np.maximum(self.frames[:, 1], 1e-24), 1)
         several = frames > _SEVERAL
         told = variance[several] * frames[several] / (frames[several] - 1)
-        usual = np.median(told) if len(told) else 0.0
+        usual = np.median(told) if len(told) else np.where(self.stated > 0, 1 / np.maximum(self.stated, 1e-24), 0)
         return np.asarray(np.sqrt((frames * variance + _USUAL * usual) / (frames - 1 + _USUAL) / frames))
 
 
@@ -315,7 +340,7 @@ def _vote(
     weights,
     intrinsics,
     colors,
-    known,
+    sigma,
     agreement,
     moment,
     color,
@@ -324,6 +349,7 @@ def _vote(
     last,
     frames,
     frame,
+    stated,
 ):
     """Each vertex of a share of the chunks that a depth map sees from its outer side and near its surface gets the
     map's vote."""
@@ -341,9 +367,14 @@ def _vote(
                 continue
             distance = seen[0]
             facing = normal[0] * seen[2] + normal[1] * seen[3] + normal[2] * seen[4]
-            if abs(distance) >= agreement or facing < _LEAST_FACING:
+            scatter, within, least_facing = sigma[int(seen[5])], agreement, _LEAST_FACING
+            steep = scatter * intrinsics[0] / (x[2] * _STEEP)
+            if steep > 1:  # false where it is not known
+                within = max(agreement, _SIGMAS * scatter)
+                least_facing = 1 / np.hypot(1.0, steep * _LEAST_TAN)
+            if abs(distance) >= within or facing < least_facing:
                 continue
-            closeness = 1 - (distance / agreement) ** 2
+            closeness = 1 - (distance / within) ** 2
             # Seen along the surface, the pixel of a vertex beside an edge shows mostly the other side of the edge.
             frontal = -(x[0] * normal[0] + x[1] * normal[1] + x[2] * normal[2])
             frontal = max(frontal / np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2]), _LEAST_FRONTAL)
@@ -355,7 +386,10 @@ def _vote(
             for channel in range(3):
                 color[n, channel] += weight * colors[int(seen[5]), channel]
             maps[n] += 1
-            measured[n] |= known[int(seen[5])]
+            if not np.isnan(scatter):
+                measured[n] = True
+                if scatter > 0:
+                    stated[n] = max(stated[n], 1 / (scatter * scatter))
             if last[n] != frame:
                 last[n], frames[n, 0] = frame, 0
             frames[n, 1] += (2 * frames[n, 0] + weight) * weight
