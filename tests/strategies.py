@@ -8,6 +8,7 @@ from hypothesis.extra import numpy as hnp
 
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
+from cuspid.geometry.cameras import MODELS
 
 
 def vectors(limit: float = 10.0, size: int = 3) -> st.SearchStrategy[np.ndarray]:
@@ -23,13 +24,34 @@ def rigid3s() -> st.SearchStrategy[Rigid3]:
     return st.builds(Rigid3.from_rotation_vector, vectors(3.0), vectors(100.0))
 
 
+LENS_LIMITS = {
+    "k1": 0.15,
+    "k2": 0.05,
+    "k3": 0.02,
+    "k4": 0.02,
+    "k5": 0.02,
+    "k6": 0.01,
+    "p1": 0.005,
+    "p2": 0.005,
+    "sx1": 0.005,
+    "sy1": 0.005,
+}
+"""Of what the strategies draw."""
+
+
 @st.composite
-def cameras(draw: st.DrawFn) -> Camera:
-    """Wide-angle cameras with an off-centre principal point and lens distortion as small lenses have it."""
+def lenses(draw: st.DrawFn, model: str) -> Camera:
+    """Wide-angle cameras with an off-centre principal point and a lens of a model, distorted as small lenses are."""
     return Camera(
         width=draw(st.integers(64, 800)),
         height=draw(st.integers(64, 800)),
         focal_px=draw(hnp.arrays(np.float64, 2, elements=st.floats(300, 900))),
         principal_point_px=draw(hnp.arrays(np.float64, 2, elements=st.floats(100, 400))),
-        distortion=np.array([draw(st.floats(-limit, limit)) for limit in (0.15, 0.05, 0.005, 0.005)]),
+        distortion=np.array([draw(st.floats(-LENS_LIMITS[name], LENS_LIMITS[name])) for name in MODELS[model].names]),
+        model=model,
     )
+
+
+def cameras() -> st.SearchStrategy[Camera]:
+    """Those of COLMAP's OPENCV model."""
+    return lenses("OPENCV")

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.motion import misfit
 from cuspid.motion.adjustment import AdjustmentOptions, adjust
@@ -158,7 +157,7 @@ def test_of_a_calibration_that_is_partly_held_that_part_is_tested() -> None:
 
 def test_what_is_refined_is_not_tested_as_held() -> None:
     wrong = held_wrongly("c1", {"lens": np.array([0, 0, 1.0, 0, 0, 0, 0, 0])})
-    camera = Camera(**{**vars(make_rig()["c1"].camera), "covariance": np.diag(PARAMETER_SIGMA**2)})
+    camera = replace(make_rig()["c1"].camera, covariance=np.diag(PARAMETER_SIGMA**2))
     cameras = {name: replace(each, camera=camera) for name, each in part_held(wrong).rig.cameras.items()}
     assert not notes_of(adjust(replace(wrong, rig=Rig(cameras))))
 

@@ -3,6 +3,7 @@ import dataclasses
 import errno
 import json
 import os
+import re
 
 import numpy as np
 import pytest
@@ -15,14 +16,15 @@ from cuspid.body import Body, Box
 from cuspid.capture import Dropped
 from cuspid.errors import CuspidError, InputError, OutputError
 from cuspid.geometry import Rigid3
+from cuspid.geometry.cameras import LENSES
 from cuspid.jaw import Jaw, Landmark, Sphere
 from cuspid.reconstruction import DepthMap, Expectation, Reconstruction, Refinement
 from cuspid.rig import MountedCamera, Rig, Sensor
 from cuspid.shape_model import MeanStep
 from cuspid.storage.files import as_declared, read_arrays, whole_files, write_arrays
-from cuspid.storage.handpieces import hash_handpiece
+from cuspid.storage.handpieces import camera_from_json, hash_handpiece
 from cuspid.trueness import ReferenceRender
-from strategies import cameras, rigid3s
+from strategies import lenses, rigid3s
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".ply", ".obj"])
@@ -124,9 +126,10 @@ def test_polarised_lights_return_and_plain_ones_are_written_as_before(tmp_path):
     assert storage.read_handpiece(file).lights["led"].glare == 1
 
 
-@given(camera=cameras(), transform=rigid3s(), other=rigid3s())
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25, deadline=None)
+@given(camera=st.sampled_from(LENSES).flatmap(lenses), transform=rigid3s(), other=rigid3s())
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40, deadline=None)
 def test_handpiece_and_rig_config_return(tmp_path, camera, transform, other):
+    camera = dataclasses.replace(camera, covariance=1e-3 * np.eye(len(camera.parameters)))
     rig = Rig({"o1": MountedCamera(camera, transform, 1e-4 * np.eye(6)), "o2": MountedCamera(camera, other)})
     original = dataclasses.replace(handpiece("x"), rig=rig, depth_range_mm=(2.0, 9.5))
     storage.write_handpiece(tmp_path / "handpiece.json", original)
@@ -143,7 +146,26 @@ def test_handpiece_and_rig_config_return(tmp_path, camera, transform, other):
         np.testing.assert_allclose(again.rig[name].cam_from_rig.matrix, rig[name].cam_from_rig.matrix, atol=1e-9)
         np.testing.assert_allclose(colmap[name].cam_from_rig.matrix, expected[name].cam_from_rig.matrix, atol=1e-8)
         np.testing.assert_allclose(colmap[name].camera.parameters, camera.parameters)
+        np.testing.assert_allclose(again.rig[name].camera.parameters, camera.parameters)
+        np.testing.assert_allclose(again.rig[name].camera.covariance, camera.covariance)
+        assert again.rig[name].camera.model == colmap[name].camera.model == camera.model
         assert (colmap[name].camera.width, colmap[name].camera.height) == (camera.width, camera.height)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"params": [500.0] * 8}, "params has 8 numbers; those of the model FULL_OPENCV are 12: fx, fy, cx, cy, k1"),
+        ({"model": "BROWN"}, "model 'BROWN' is not supported; use one of OPENCV, FULL_OPENCV"),
+        ({"focal_px": [500, 500]}, "it has both model and focal_px"),
+        ({"params": [500.0, 500, 250, 250, *[0.0] * 7, 1e9]}, "k6 of params"),
+    ],
+)
+def test_a_lens_of_a_named_model_has_its_parameters(change, told):
+    entry = {"width_px": 500, "height_px": 500, "model": "FULL_OPENCV", "params": [500.0, 500, 250, 250, *[0.0] * 8]}
+    assert camera_from_json(entry).model == "FULL_OPENCV"
+    with pytest.raises(InputError, match=re.escape(told)):
+        camera_from_json(entry | change)
 
 
 def test_a_rig_config_serves_as_a_handpiece(tmp_path, caplog):

@@ -1,57 +1,35 @@
-"""A pinhole camera with lens distortion, and the two projections of thesis 3.1 (Eq 3.1, 3.2 as corrected).
+"""A camera with its lens, and the two projections of thesis 3.1 (Eq 3.1, 3.2 as corrected).
 
 Frame: the camera looks along +Z, +X is right, +Y is down. Pixels are COLMAP's: the centre of the first pixel is
-(0.5, 0.5). Distortion is COLMAP's OPENCV model (k1, k2, p1, p2) on normalised coordinates.
+(0.5, 0.5). Lenses are COLMAP's models (:mod:`cuspid.geometry.cameras`): OPENCV unless another one is named.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from cuspid.errors import InputError
-from cuspid.geometry import read_only
+from cuspid.geometry import read_only, unit
+from cuspid.geometry.cameras import (
+    MODELS,
+    LensModel,
+    directions_through,
+    fold_radius,
+    project_points,
+    projection_derivatives,
+)
 from cuspid.values import shown
 
+_MOST_SLOPE = float(np.tan(np.deg2rad(70.0)))
+"""Of the rays at the border of an image without distortion."""
+_LEAST_AHEAD = 0.05
 OPENCV_PIXEL_OFFSET = 0.5
 """COLMAP's pixel coordinate minus OpenCV's for the same place in an image."""
-
-
-def distort(normalized: Float[np.ndarray, "*n 2"], distortion: Float[np.ndarray, "4 ..."]) -> Float[np.ndarray, "*n 2"]:
-    """Ideal normalised coordinates to distorted ones: COLMAP's OPENCV model (k1, k2, p1, p2), with one lens for all
-    points or one for each."""
-    k1, k2, p1, p2 = distortion
-    x, y = normalized[..., 0], normalized[..., 1]
-    r2 = x * x + y * y
-    radial = 1 + k1 * r2 + k2 * r2 * r2
-    return np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
-        ],
-        axis=-1,
-    )
-
-
-def undistort(
-    distorted: Float[np.ndarray, "*n 2"], distortion: Float[np.ndarray, "4"], iterations: int = 12
-) -> Float[np.ndarray, "*n 2"]:
-    """Inverse of :func:`distort` by Newton's method with a numeric Jacobian (exact to rounding for real lenses)."""
-    if not np.any(distortion):
-        return distorted.copy()
-    ideal = distorted.astype(np.float64)
-    step = 1e-7
-    for _ in range(iterations):
-        residual = distort(ideal, distortion) - distorted
-        if np.abs(residual).max(initial=0.0) < 1e-13:
-            break
-        along_x = (distort(ideal + [step, 0], distortion) - distort(ideal - [step, 0], distortion)) / (2 * step)
-        along_y = (distort(ideal + [0, step], distortion) - distort(ideal - [0, step], distortion)) / (2 * step)
-        jacobian = np.stack([along_x, along_y], axis=-1)
-        ideal = ideal - np.linalg.solve(jacobian, residual[..., None])[..., 0]
-    return ideal
 
 
 def project_orthographic(points: Float[np.ndarray, "*n 3"], scale_px_per_mm: float = 1.0) -> Float[np.ndarray, "*n 2"]:
@@ -71,21 +49,30 @@ class Camera:
     """Focal lengths (fx, fy) in px."""
     principal_point_px: Float[np.ndarray, "2"]
     """Principal point (cx, cy) in px; (width/2, height/2) is the image centre."""
-    distortion: Float[np.ndarray, "4"] = field(default_factory=lambda: np.zeros(4))
-    """(k1, k2, p1, p2) of COLMAP's OPENCV model."""
-    covariance: Float[np.ndarray, "8 8"] | None = None
-    """Covariance of (fx, fy, cx, cy, k1, k2, p1, p2); zero for an exact calibration, None if its uncertainty is not
-    stated (an adjustment then holds it fixed)."""
+    distortion: Float[np.ndarray, "k"] = field(default_factory=lambda: np.zeros(4))
+    """Parameters of the lens, as :attr:`lens` names them: (k1, k2, p1, p2) of COLMAP's OPENCV model."""
+    covariance: Float[np.ndarray, "n n"] | None = None
+    """Covariance of :attr:`parameters`; zero for an exact calibration, None if its uncertainty is not stated (an
+    adjustment then holds it fixed)."""
+    model: str = "OPENCV"
+    """The model of the lens: one of :data:`cuspid.geometry.cameras.MODELS`."""
 
     def __post_init__(self) -> None:
         for name in ("focal_px", "principal_point_px", "distortion"):
             object.__setattr__(self, name, read_only(np.asarray(getattr(self, name), dtype=np.float64)))
         if self.covariance is not None:
             object.__setattr__(self, "covariance", read_only(np.asarray(self.covariance, dtype=np.float64)))
+        if self.model not in MODELS:
+            raise InputError(f"camera: there is no model {self.model!r}; it must be one of {', '.join(MODELS)}")
         if self.width <= 0 or self.height <= 0 or not np.all(self.focal_px > 0):
             raise InputError(
                 f"camera: width, height and focal length must be positive, not {self.width} x {self.height} px and "
                 f"{self.focal_px} px"
+            )
+        if len(self.distortion) != len(self.lens.names):
+            raise InputError(
+                f"camera: a lens of the model {self.model} has the parameters {', '.join(self.lens.names)}, not "
+                f"{len(self.distortion)} numbers"
             )
         if not np.isfinite(self.parameters).all():
             raise InputError(f"camera: its parameters are not finite: {shown(self.parameters)}")
@@ -115,11 +102,51 @@ class Camera:
         return matrix
 
     @property
-    def parameters(self) -> Float[np.ndarray, "8"]:
-        """(fx, fy, cx, cy, k1, k2, p1, p2): COLMAP's parameter order of the OPENCV model."""
-        return np.concatenate([self.focal_px, self.principal_point_px, self.distortion])
+    def lens(self) -> LensModel:
+        """The model of its lens."""
+        return MODELS[self.model]
 
-    def with_parameters(self, parameters: Float[np.ndarray, "8"]) -> Camera:
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Of :attr:`parameters`."""
+        return "fx", "fy", "cx", "cy", *self.lens.names
+
+    @cached_property
+    def parameters(self) -> Float[np.ndarray, "n"]:
+        """(fx, fy, cx, cy) and those of the lens: COLMAP's order."""
+        return read_only(np.concatenate([self.focal_px, self.principal_point_px, self.distortion]))
+
+    @cached_property
+    def fold_radius(self) -> float:
+        """See :func:`cuspid.geometry.cameras.fold_radius`."""
+        return fold_radius(self.lens, self.distortion)
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether it shows straight lines straight."""
+        return not self.lens.is_equidistant and not np.any(self.distortion)
+
+    def as_pinhole(self) -> Camera:
+        """A pinhole camera with the same image size, focal length and principal point, taken as exact."""
+        return replace(self, model="OPENCV", distortion=np.zeros(4), covariance=None)
+
+    def straightened(self) -> Camera:
+        """The pinhole camera that its images are resampled to: :meth:`as_pinhole`, or for an equidistant lens one of
+        the same scale on the axis whose image is large enough for what is seen up to 70 degrees from it, each way."""
+        if not self.lens.is_equidistant:
+            return self.as_pinhole()
+        ticks = np.linspace(0, 1, 33)
+        border = np.array([[t, s] for t in ticks for s in ticks if t in (0, 1) or s in (0, 1)])
+        seen = self.directions(border * [self.width, self.height])
+        slopes = np.nan_to_num(seen[:, :2] / np.maximum(seen[:, 2:], _LEAST_AHEAD), nan=0.0)
+        low, high = np.clip([slopes.min(axis=0), slopes.max(axis=0)], -_MOST_SLOPE, _MOST_SLOPE) * self.focal_px
+        if np.isnan(seen).any():  # the image is round, and its rim lies within the border
+            high = _MOST_SLOPE * self.focal_px
+            low = -high
+        width, height = np.ceil(high - low).astype(int).tolist()
+        return replace(self.as_pinhole(), width=width, height=height, principal_point_px=-low)
+
+    def with_parameters(self, parameters: Float[np.ndarray, "n"]) -> Camera:
         """The same sensor with other intrinsic parameters, in the order of :attr:`parameters`."""
         return replace(
             self,
@@ -131,22 +158,34 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """The camera whose images are those of this one, resized."""
         by = np.array([width / self.width, height / self.height])
-        factors = np.concatenate([by, by, np.ones(4)])
+        factors = np.concatenate([by, by, np.ones(len(self.distortion))])
         covariance = None if self.covariance is None else factors[:, None] * self.covariance * factors
         fewer = replace(self, width=width, height=height, covariance=covariance)
         return fewer.with_parameters(factors * self.parameters)
 
     def project(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
-        """Perspective projection of points in the camera frame (mm) to px. NaN where Z <= 0."""
-        depth = points[..., 2:]
-        normalized = points[..., :2] / np.where(depth > 0, depth, np.nan)
-        distorted = distort(normalized, self.distortion) if np.any(self.distortion) else normalized
-        return distorted * self.focal_px + self.principal_point_px
+        """Projection of points in the camera frame (mm) to px. NaN where the lens shows nothing: behind a perspective
+        camera, and so far from the axis that the model folds back."""
+        return project_points(self.lens.code, self.parameters, self.fold_radius, points)
+
+    def projection_derivatives(
+        self, points: Float[np.ndarray, "*n 3"]
+    ) -> tuple[Float[np.ndarray, "*n 2 3"], Float[np.ndarray, "*n 2 k"]]:
+        """Derivatives of :meth:`project` by the points (px / mm), and by :attr:`parameters`."""
+        return projection_derivatives(self.lens.code, self.parameters, points)
+
+    def directions(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 3"]:
+        """Unit vectors in the camera frame through pixels, the inverse of :meth:`project`; NaN where it has none."""
+        return unit(directions_through(self.lens.code, self.parameters, self.fold_radius, pixels))
 
     def rays(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 3"]:
-        """Directions with Z = 1 in the camera frame through pixels, the inverse of :meth:`project`."""
-        normalized = undistort((pixels - self.principal_point_px) / self.focal_px, self.distortion)
-        return np.concatenate([normalized, np.ones((*normalized.shape[:-1], 1))], axis=-1)
+        """Directions with Z = 1 in the camera frame through pixels, the inverse of :meth:`project`; NaN where it has
+        none, and for what lies 90 degrees from the axis or farther."""
+        found = directions_through(self.lens.code, self.parameters, self.fold_radius, pixels)
+        if not self.lens.is_equidistant:
+            return found
+        ahead = found[..., 2:]
+        return found / np.where(ahead > 0, ahead, np.nan)
 
     def pixel_centres(self) -> Float[np.ndarray, "h w 2"]:
         """Coordinates of every pixel centre."""
@@ -159,12 +198,21 @@ class Camera:
         return np.all((pixels >= margin_px) & (pixels <= upper), axis=-1)
 
 
-def undistortion_maps(camera: Camera) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]] | None:
-    """For each pixel of the same camera without distortion, its place in the image, as float32 maps for ``cv2.remap``
-    (far outside where the image does not show it); None if the camera has no distortion."""
-    if not np.any(camera.distortion):
+def stack_lenses(cameras: Sequence[Camera]) -> tuple[Int[np.ndarray, "c"], Float[np.ndarray, "c n"]]:
+    """Codes of the models of some cameras, and their parameters, with zeros after those of models that have fewer."""
+    most = max(len(camera.parameters) for camera in cameras)
+    rows = [np.pad(camera.parameters, (0, most - len(camera.parameters))) for camera in cameras]
+    return np.array([camera.lens.code for camera in cameras], dtype=np.int64), np.stack(rows)
+
+
+def undistortion_maps(
+    camera: Camera, ideal: Camera | None = None
+) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]] | None:
+    """For each pixel of an ideal camera at the same place (by default the camera as a pinhole), its place in the image,
+    as float32 maps for ``cv2.remap`` (far outside where the image does not show it); None if they are the same."""
+    ideal = ideal or camera.as_pinhole()
+    if camera.is_pinhole and np.array_equal(camera.parameters, ideal.parameters):
         return None
-    ideal = replace(camera, distortion=np.zeros(4), covariance=None)
     pixels = camera.project(ideal.rays(ideal.pixel_centres())) - OPENCV_PIXEL_OFFSET
     pixels = np.nan_to_num(pixels, nan=-1e4).astype(np.float32)
     return np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])

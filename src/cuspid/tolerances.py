@@ -38,9 +38,9 @@ class Tolerances:
         """Standard deviations of a small motion on the left of ``cam_from_rig``: rad, mm."""
         return np.repeat([np.deg2rad(self.turn_deg), self.place_mm], 3)
 
-    def lens_factor(self, camera: Camera) -> Float[np.ndarray, "8 4"]:
+    def lens_factor(self, camera: Camera) -> Float[np.ndarray, "n 4"]:
         """Change of the camera parameters for a unit deviation of (focal length, cx, cy, k1)."""
-        factor = np.zeros((8, 4))
+        factor = np.zeros((len(camera.parameters), 4))
         factor[:2, 0] = self.focal_share * camera.focal_px
         factor[2, 1] = factor[3, 2] = self.centre_px
         factor[4, 3] = self.k1

@@ -1,7 +1,7 @@
 """One adjustment of the cameras, the poses of the board, and its bending.
 
 A corner X of the board is seen by camera c at instant i at ``project(c, cam_from_rig[c] @ rig_from_board[i] @ X)``.
-Unknowns and how a step changes them: for each camera, (fx, fy, cx, cy, k1, k2, p1, p2) by addition, and its pose by a
+Unknowns and how a step changes them: for each camera, the parameters of its lens by addition, and its pose by a
 small motion (rotation vector rad, translation mm) on the left of ``cam_from_rig``; the pose of the board at each
 instant, by one on the left of ``rig_from_board``; and three parameters of a board that is not quite flat: out of its
 plane by b1 u^2 + b2 u v + b3 v^2 mm at the distances u and v, in units of half its diagonal, from its middle. A board
@@ -28,18 +28,18 @@ from scipy.sparse import csr_array
 
 from cuspid.board import Board
 from cuspid.calibration.corners import BoardView, Views
-from cuspid.camera import Camera, distort
+from cuspid.camera import Camera
 from cuspid.epipolar import skew
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.rig import MountedCamera
 
-_INTRINSICS, _PLACE, _BENDING = 8, 6, 3
+_PLACE, _BENDING = 6, 3
 _LENSES, _CAMERAS, _BOARDS, _BENDINGS, _CAMERA_DELAYS, _VIEW_DELAYS = range(6)
 """Kinds of unknowns, in order."""
-_DISTORTION_SIGMA = np.array([0.5, 0.5, 0.01, 0.01])
-"""Standard deviation of (k1, k2, p1, p2) about 0, for lenses as they are made: it matters only where the images do not
-decide."""
+_RADIAL_SIGMA, _SIDEWAYS_SIGMA = 0.5, 0.01
+"""Standard deviation of radial, and of tangential and prism parameters about 0, for lenses as they are made: it matters
+only where the images do not decide. Radial terms beyond the second may do as much at the corner of the image."""
 _CENTRE_SHARE = 0.05
 """Standard deviation of the principal point about the image centre, as a share of the image width."""
 _BENDING_SHARE = 0.01
@@ -228,10 +228,9 @@ def _project(scene: BoardScene, seen: _Observations) -> tuple[Float[np.ndarray, 
     points = _bent(scene, seen)
     in_rig = np.einsum("nk,nkj->nj", seen.weights(scene)[0][seen.view], _at_instants(scene, seen, points))
     in_cam = _moved(list(scene.cam_from_rig.values()), seen.camera, in_rig)
-    parameters = np.stack([camera.parameters for camera in scene.cameras.values()])[seen.camera]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ideal = np.where(in_cam[:, 2:] > 0, in_cam[:, :2] / in_cam[:, 2:], np.nan)
-    image = distort(ideal, parameters[:, 4:].T) * parameters[:, :2] + parameters[:, 2:4]
+    image = np.empty_like(seen.pixels)
+    for number, camera in enumerate(scene.cameras.values()):
+        image[seen.camera == number] = camera.project(in_cam[seen.camera == number])
     return in_cam, seen.pixels - image
 
 
@@ -257,16 +256,14 @@ def _moved(
 
 def _jacobian(scene: BoardScene, seen: _Observations, in_cam: Float[np.ndarray, "n 3"]) -> csr_array:
     """Derivative of the projections by all unknowns, in the order of :func:`_sizes`."""
-    parameters = np.stack([camera.parameters for camera in scene.cameras.values()])[seen.camera]
-    ideal = in_cam[:, :2] / in_cam[:, 2:]
-    by_point = _by_point(ideal, in_cam[:, 2], parameters)
+    by_point, by_parameters = _by_cameras(scene, seen, in_cam)
     turn = np.stack([place.rotation for place in scene.cam_from_rig.values()])[seen.camera]
     by_rig = by_point @ turn
     weights, slopes = (each[seen.view] for each in seen.weights(scene))
     places = _at_instants(scene, seen, _bent(scene, seen))
     normals = np.stack([pose.rotation[:, 2] for pose in scene.rig_from_board.values()])[seen.near[seen.view]]
     by_bending = np.einsum("nij,nk,nkj->ni", by_rig, weights, normals)[:, :, None] * seen.basis[:, None]
-    blocks = [_by_parameters(ideal, parameters), _by_motion(by_point, in_cam), by_bending]
+    blocks = [by_parameters, _by_motion(by_point, in_cam), by_bending]
     which = [(_LENSES, seen.camera), (_CAMERAS, seen.camera), (_BENDINGS, 0 * seen.camera)]
     for k, instant in enumerate(seen.near[seen.view].T):
         blocks.append(weights[:, k, None, None] * _by_motion(by_rig, places[:, k]))
@@ -283,8 +280,8 @@ def _jacobian(scene: BoardScene, seen: _Observations, in_cam: Float[np.ndarray, 
     values, column = np.concatenate(blocks, axis=2), np.concatenate(columns, axis=1)
     width = values.shape[2]
     jacobian = csr_array(
-        (values.ravel(), np.repeat(column, 2, axis=0).ravel(), width * np.arange(2 * len(ideal) + 1)),
-        shape=(2 * len(ideal), first[-1]),
+        (values.ravel(), np.repeat(column, 2, axis=0).ravel(), width * np.arange(2 * len(in_cam) + 1)),
+        shape=(2 * len(in_cam), first[-1]),
     )
     jacobian.sum_duplicates()
     return jacobian
@@ -294,41 +291,24 @@ def _sizes(scene: BoardScene) -> tuple[int, ...]:
     """How many numbers there are of each kind of unknowns."""
     cameras, instants = len(scene.cameras), len(scene.rig_from_board)
     delays = (0, 0) if scene.timing is None else (cameras, len(scene.timing.by_view))
-    return _INTRINSICS * cameras, _PLACE * cameras, _PLACE * instants, _BENDING, *delays
+    return _numbers(scene) * cameras, _PLACE * cameras, _PLACE * instants, _BENDING, *delays
 
 
-def _by_point(
-    ideal: Float[np.ndarray, "n 2"], depth: Float[np.ndarray, "n"], parameters: Float[np.ndarray, "n 8"]
-) -> Float[np.ndarray, "n 2 3"]:
-    """Derivative of the pixel by the point in the camera."""
-    (x, y), (k1, k2, p1, p2) = ideal.T, parameters[:, 4:].T
-    r2 = x * x + y * y
-    radial, slope = 1 + k1 * r2 + k2 * r2 * r2, 2 * k1 + 4 * k2 * r2
-    mixed = x * y * slope + 2 * p1 * x + 2 * p2 * y
-    by_ideal = np.stack(
-        [
-            np.stack([radial + x * x * slope + 2 * p1 * y + 6 * p2 * x, mixed], axis=-1),
-            np.stack([mixed, radial + y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=-1),
-        ],
-        axis=-2,
-    )
-    one, none = np.ones_like(x), np.zeros_like(x)
-    ideal_by_point = np.stack([np.stack([one, none, -x], axis=-1), np.stack([none, one, -y], axis=-1)], axis=-2)
-    return np.asarray(parameters[:, :2, None] * (by_ideal @ ideal_by_point) / depth[:, None, None])
+def _numbers(scene: BoardScene) -> int:
+    """How many parameters a camera has, at most: those of a smaller model are followed by some that mean nothing."""
+    return max(len(camera.parameters) for camera in scene.cameras.values())
 
 
-def _by_parameters(ideal: Float[np.ndarray, "n 2"], parameters: Float[np.ndarray, "n 8"]) -> Float[np.ndarray, "n 2 8"]:
-    """Derivative of the pixel by (fx, fy, cx, cy, k1, k2, p1, p2)."""
-    (x, y), focal = ideal.T, parameters[:, :2]
-    r2 = x * x + y * y
-    out = np.zeros((len(x), 2, _INTRINSICS))
-    out[:, [0, 1], [0, 1]] = distort(ideal, parameters[:, 4:].T)
-    out[:, [0, 1], [2, 3]] = 1
-    out[:, :, 4] = focal * ideal * r2[:, None]
-    out[:, :, 5] = focal * ideal * (r2 * r2)[:, None]
-    out[:, :, 6] = focal * np.stack([2 * x * y, r2 + 2 * y * y], axis=1)
-    out[:, :, 7] = focal * np.stack([r2 + 2 * x * x, 2 * x * y], axis=1)
-    return out
+def _by_cameras(
+    scene: BoardScene, seen: _Observations, in_cam: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n 2 3"], Float[np.ndarray, "n 2 k"]]:
+    """Derivatives of the pixels by the points in the cameras, and by the parameters of these."""
+    by_point = np.empty((len(in_cam), 2, 3))
+    by_parameters = np.zeros((len(in_cam), 2, _numbers(scene)))
+    for number, camera in enumerate(scene.cameras.values()):
+        own, count = seen.camera == number, len(camera.parameters)
+        by_point[own], by_parameters[own, :, :count] = camera.projection_derivatives(in_cam[own])
+    return by_point, by_parameters
 
 
 def _by_motion(by_point: Float[np.ndarray, "n 2 3"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 6"]:
@@ -354,7 +334,7 @@ class _Free:
         lenses, places, boards, bending, cameras, views = _sizes(scene)
         precision = np.concatenate(
             [
-                *(_lens_precision(camera) for camera in scene.cameras.values()),
+                *(_lens_precision(camera, _numbers(scene)) for camera in scene.cameras.values()),
                 np.zeros(places + boards),
                 np.full(bending, _bending_sigma_mm(board) ** -2.0),
                 np.full(cameras, _CAMERA_DELAY_SIGMA**-2.0),
@@ -452,16 +432,27 @@ def _cost(scene: BoardScene, residuals: Float[np.ndarray, "n 2"], sigma_px: floa
     return float(loss.sum() + (free.precision * _held(scene)[free.columns] ** 2).sum())
 
 
-def _lens_precision(camera: Camera) -> Float[np.ndarray, "8"]:
-    """Of the prior of a camera's parameters."""
+def _lens_precision(camera: Camera, numbers: int) -> Float[np.ndarray, "n"]:
+    """Of the prior of so many parameters of a camera."""
     centre = np.full(2, _CENTRE_SHARE * camera.width)
-    return np.concatenate([[0.0, 0.0], centre**-2.0, _DISTORTION_SIGMA**-2.0])
+    corner = min(float(np.linalg.norm([camera.width, camera.height]) / 2 / camera.focal_px.mean()), 1.0)
+    sigma = np.full(len(camera.distortion), _SIDEWAYS_SIGMA)
+    for terms in (camera.lens.numerator, camera.lens.denominator):
+        for order, place in enumerate(terms):
+            sigma[place] = _RADIAL_SIGMA / corner ** (2 * max(order - 1, 0))
+    known = np.concatenate([[0.0, 0.0], centre**-2.0, sigma**-2.0])
+    return np.pad(known, (0, numbers - len(known)), constant_values=1.0)
 
 
 def _held(scene: BoardScene) -> Float[np.ndarray, "k"]:
     """How far all unknowns are from where the prior holds them; 0 where it does not."""
     lenses = [
-        np.concatenate([[0, 0], camera.principal_point_px - [camera.width / 2, camera.height / 2], camera.distortion])
+        np.pad(
+            np.concatenate(
+                [[0, 0], camera.principal_point_px - [camera.width / 2, camera.height / 2], camera.distortion]
+            ),
+            (0, _numbers(scene) - len(camera.parameters)),
+        )
         for camera in scene.cameras.values()
     ]
     places = np.zeros(_PLACE * (len(scene.cameras) + len(scene.rig_from_board)))
@@ -507,10 +498,10 @@ def _stepped(scene: BoardScene, free: _Free, step: Float[np.ndarray, "k"]) -> Bo
     whole[free.columns] = step
     lenses, places, boards, bending, cameras, views = np.split(whole, np.cumsum(sizes)[:-1])
     parameters = [
-        camera.parameters + shift
-        for camera, shift in zip(scene.cameras.values(), lenses.reshape(-1, _INTRINSICS), strict=True)
+        camera.parameters + shift[: len(camera.parameters)]
+        for camera, shift in zip(scene.cameras.values(), lenses.reshape(-1, _numbers(scene)), strict=True)
     ]
-    if not np.all(np.array(parameters)[:, :2] > 0):
+    if not all(np.all(each[:2] > 0) for each in parameters):
         return None
     return BoardScene(
         cameras={
@@ -536,13 +527,13 @@ def _all_moved(poses: Mapping[str, Rigid3], motions: Float[np.ndarray, "k"]) -> 
 
 def _camera_covariance(matrix: Float[np.ndarray, "k k"], scene: BoardScene, free: _Free) -> Float[np.ndarray, "m m"]:
     """Of the parameters and the motions of all cameras, in the frame in which these sum up to nothing."""
-    size = (_INTRINSICS + _PLACE) * len(scene.cameras)
+    size = (_numbers(scene) + _PLACE) * len(scene.cameras)
     known = free.columns < size
     inverse = _solved(matrix, np.eye(len(matrix))[:, known])[known]
     whole = np.zeros((size, size))
     whole[np.ix_(free.columns[known], free.columns[known])] = inverse
     project = np.eye(size)
-    places = _INTRINSICS * len(scene.cameras)
+    places = _numbers(scene) * len(scene.cameras)
     project[places:, places:] = _without_common_motion(scene)
     return np.asarray(project @ whole @ project.T)
 
@@ -569,10 +560,10 @@ def _adjoint(target_from_source: Rigid3) -> Float[np.ndarray, "6 6"]:
 
 def mounted_cameras(found: Adjusted) -> dict[str, MountedCamera]:
     """The cameras with their covariances."""
-    count, mounted = len(found.scene.cameras), {}
+    count, numbers, mounted = len(found.scene.cameras), _numbers(found.scene), {}
     for index, (name, camera) in enumerate(found.scene.cameras.items()):
-        lens = slice(_INTRINSICS * index, _INTRINSICS * (index + 1))
-        first = _INTRINSICS * count + _PLACE * index
+        lens = slice(numbers * index, numbers * index + len(camera.parameters))
+        first = numbers * count + _PLACE * index
         place = slice(first, first + _PLACE)
         mounted[name] = MountedCamera(
             replace(camera, covariance=_symmetric(found.covariance[lens, lens])),

@@ -22,7 +22,8 @@ from cuspid.calibration.bundle import (
     of_instants,
 )
 from cuspid.calibration.corners import Views
-from cuspid.calibration.start import LEAST_VIEWS, calibrated_alone, groups, joined, require_one_group
+from cuspid.calibration.lenses import LensChoice, LensName, choose_lens
+from cuspid.calibration.start import LEAST_VIEWS, groups, joined, require_one_group
 from cuspid.calibration.timing import adjust_scene, numbered, untied
 from cuspid.camera import Camera
 from cuspid.errors import InputError, ReconstructionError
@@ -47,7 +48,11 @@ _OPEN_SHARE = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrationOptions(Options):
-    """Which views are left out."""
+    """The model of the lenses, and which views are left out."""
+
+    lens: LensName = "auto"
+    """COLMAP's name of the model of the lenses. auto: for each camera the simplest one that no richer one beats, by
+    more than chance, in views that it was not made from."""
 
     outlier_sigmas: Annotated[float, Range(2, 1000)] = 4.0
     """A view is left out if the RMS of its residuals is beyond this, in standard deviations of all residuals or of its
@@ -90,6 +95,8 @@ class RigCalibration:
 
     rig: Rig
     """The rig with covariances, in the frame of its first camera."""
+    lenses: Mapping[str, LensChoice]
+    """The model of the lens of each camera, and how well others did."""
     sigma_px: float
     """Standard deviation of one coordinate of a corner."""
     bending_mm: Float[np.ndarray, "3"]
@@ -124,17 +131,19 @@ def calibrate_rig(
             f"calibration: {', '.join(few)} saw the board at fewer than {LEAST_VIEWS} instants; check that the "
             "columns, rows, dictionary and kind of the board match the images"
         )
-    alone = {name: _alone(name, views, board, size) for name, size in sizes.items()}
+    lenses = {name: _alone(name, views, board, size, options.lens) for name, size in sizes.items()}
+    choices = {name: choice for name, (choice, _) in lenses.items()}
+    alone = {name: each for name, (_, each) in lenses.items()}
     cameras = {name: each.scene.cameras[""] for name, each in alone.items()}
     start, chosen = joined(views, board, cameras, sorted({instant for _, instant in views}))
     found, notes = _without_outliers(start, chosen, board, options)
-    together = _described(found, chosen, board, alone, notes)
+    together = _described(found, chosen, board, alone, choices, notes)
     frame = numbered(start.rig_from_board)
     if frame is None or not any(_is_doubtful_together(check) for check in together.cameras.values()):
         return together
     try:
         found, notes = _without_outliers(untied(start, frame, chosen), chosen, board, options)
-        apart = _described(found, chosen, board, alone, notes)
+        apart = _described(found, chosen, board, alone, choices, notes)
     except ReconstructionError:  # the images do not tell delays as well
         return together
     return apart if _is_better(apart, together) else together
@@ -162,9 +171,9 @@ def _held_out_px(found: RigCalibration) -> float:
     return _rms(np.array([np.inf if check.held_out_px is None else check.held_out_px for check in checks]))
 
 
-def _alone(name: str, views: Views, board: Board, size: tuple[int, int]) -> Adjusted:
+def _alone(name: str, views: Views, board: Board, size: tuple[int, int], lens: LensName) -> tuple[LensChoice, Adjusted]:
     try:
-        return calibrated_alone([view for (camera, _), view in views.items() if camera == name], board, size)
+        return choose_lens([view for (camera, _), view in views.items() if camera == name], board, size, lens)
     except ReconstructionError as error:
         raise ReconstructionError(
             f"calibration: camera {name}: {str(error).removeprefix('calibration: ')}; check the columns, rows, kind "
@@ -265,7 +274,12 @@ def size_notes(found: Rig, drawn: Rig, board: Board) -> tuple[str, ...]:
 
 
 def _described(
-    found: Adjusted, chosen: Views, board: Board, alone: Mapping[str, Adjusted], notes: tuple[str, ...]
+    found: Adjusted,
+    chosen: Views,
+    board: Board,
+    alone: Mapping[str, Adjusted],
+    lenses: Mapping[str, LensChoice],
+    notes: tuple[str, ...],
 ) -> RigCalibration:
     names, views = list(found.scene.cameras), {key: chosen[key] for key in found.residuals}
     of = {name: [key for key in views if key[0] == name] for name in names}
@@ -293,6 +307,7 @@ def _described(
     rig = Rig({name: _widened(mounted, checks[name]) for name, mounted in mounted_cameras(found).items()})
     return RigCalibration(
         rig=rig,
+        lenses=lenses,
         sigma_px=found.sigma_px,
         bending_mm=found.scene.bending_mm,
         cameras=checks,

@@ -32,13 +32,29 @@ _NO_FIT_SHARE = 0.01
 """Residuals of a single camera, as a share of its image width, beyond which no camera model fits."""
 
 
-def calibrated_alone(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> Adjusted:
+def calibrated_alone(
+    views: Sequence[BoardView], board: Board, size: tuple[int, int], starts: Sequence[Camera] = ()
+) -> Adjusted:
     """One camera from its own views; the poses of the board relative to other cameras play no part.
 
-    Raises ReconstructionError where the views fit no camera, or do not determine its focal length.
+    The search begins from each of some cameras (whose model the result has, the best of them), or from OpenCV's. Raises
+    ReconstructionError where the views fit no camera, or do not determine its focal length.
     """
+    found = [each for each in (_calibrated_from(start, views, board, size) for start in starts or (None,)) if each]
+    if not found:
+        raise ReconstructionError("no camera model fits its views of the board")
+    best = min(found, key=lambda each: each.sigma_px)
+    if best.sigma_px > _NO_FIT_SHARE * size[0]:
+        raise ReconstructionError(f"no camera model fits its views of the board (error {best.sigma_px:.0f} px)")
+    return best
+
+
+def _calibrated_from(
+    camera: Camera | None, views: Sequence[BoardView], board: Board, size: tuple[int, int]
+) -> Adjusted | None:
+    """None where the views do not fit."""
     try:
-        camera = first_camera(views, board, size)
+        camera = camera or first_camera(views, board, size)
         poses = [board_pose(view, board, camera) for view in views]
         named = {str(k): pose for k, pose in enumerate(poses)}
         start = BoardScene(
@@ -46,13 +62,10 @@ def calibrated_alone(views: Sequence[BoardView], board: Board, size: tuple[int, 
         )
         sound = in_front(start, {("", str(k)): view for k, view in enumerate(views)}, board)
         if len(sound) < LEAST_VIEWS:
-            raise ReconstructionError("no camera model fits its views of the board")
-        found = adjust_board(of_instants(start, {instant for _, instant in sound}), sound, board)
-    except (cv2.error, InputError) as error:  # such as a focal length that is no number
-        raise ReconstructionError("no camera model fits its views of the board") from error
-    if found.sigma_px > _NO_FIT_SHARE * size[0]:
-        raise ReconstructionError(f"no camera model fits its views of the board (error {found.sigma_px:.0f} px)")
-    return found
+            return None
+        return adjust_board(of_instants(start, {instant for _, instant in sound}), sound, board)
+    except (cv2.error, InputError):  # such as a focal length that is no number
+        return None
 
 
 def first_camera(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> Camera:
@@ -86,6 +99,8 @@ def board_pose(view: BoardView, board: Board, camera: Camera) -> Rigid3:
     Raises InputError where there is none.
     """
     points, ideal = board.corners[view.corner], np.ascontiguousarray(camera.rays(view.pixels)[:, None, :2])
+    if not np.isfinite(ideal).all():
+        raise InputError("calibration: a corner of the board lies where the lens shows nothing")
     for method in [cv2.SOLVEPNP_IPPE] * (board.terraces == 1) + [cv2.SOLVEPNP_SQPNP]:
         _, turns, shifts, _ = cv2.solvePnPGeneric(points, ideal, np.eye(3), None, flags=method)
         if turns:

@@ -28,7 +28,8 @@ def projection_sigma_px(camera: Camera, columns: int = 32) -> Float[np.ndarray, 
     across, down = np.meshgrid((np.arange(columns) + 0.5) * cell, (np.arange(rows) + 0.5) * camera.height / rows)
     pixels = np.stack([across, down], axis=-1).reshape(-1, 2)
     rays = camera.rays(pixels)
-    steps = np.array([*[_STEP_PX] * 4, *[_STEP] * 4])
+    steps = np.array([*[_STEP_PX] * 4, *[_STEP] * len(camera.distortion)])
+    numbers = len(steps)
     by_lens = [
         (camera.with_parameters(camera.parameters + step).project(rays) - camera.project(rays)) / step.sum()
         for step in np.diag(steps)
@@ -39,21 +40,21 @@ def projection_sigma_px(camera: Camera, columns: int = 32) -> Float[np.ndarray, 
     ]
     lens, turn = (np.stack(each, axis=-1).reshape(-1, len(each)) for each in (by_lens, by_turn))
     known = np.linalg.norm(camera.project(rays) - pixels, axis=1) < _BACK_PX
-    covariance = np.zeros((8, 8)) if camera.covariance is None else camera.covariance
+    covariance = np.zeros((numbers, numbers)) if camera.covariance is None else camera.covariance
     sigma = np.full(len(known), np.nan)
-    sigma[known] = _without_turn(lens.reshape(-1, 2, 8)[known], turn.reshape(-1, 2, 3)[known], covariance)
+    sigma[known] = _without_turn(lens.reshape(-1, 2, numbers)[known], turn.reshape(-1, 2, 3)[known], covariance)
     return sigma.reshape(rows, columns)
 
 
 def _without_turn(
-    lens: Float[np.ndarray, "n 2 8"], turn: Float[np.ndarray, "n 2 3"], covariance: Float[np.ndarray, "8 8"]
+    lens: Float[np.ndarray, "n 2 k"], turn: Float[np.ndarray, "n 2 3"], covariance: Float[np.ndarray, "k k"]
 ) -> Float[np.ndarray, "n"]:
     """Standard deviations, from derivatives of the projections by the intrinsics and by a turn, each place weighted by
     what is left of it."""
     sigma = np.ones(len(lens))
     for _ in range(_ROUNDS):
         weighted = (turn / np.maximum(sigma, _LEAST_PX)[:, None, None] ** 2).reshape(-1, 3)
-        away = np.linalg.pinv(weighted.T @ turn.reshape(-1, 3)) @ weighted.T @ lens.reshape(-1, 8)
+        away = np.linalg.pinv(weighted.T @ turn.reshape(-1, 3)) @ weighted.T @ lens.reshape(-1, lens.shape[2])
         left = lens - turn @ away
         spread = np.einsum("nik,kl,njl->nij", left, covariance, left)
         sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(spread)[:, -1], 0))

@@ -51,27 +51,8 @@ def projection_jacobian(
     camera: Camera, cam_from_world: Rigid3, points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 2 3"]:
     """Derivative of the image points (px) by the points in the world (mm); NaN behind the camera."""
-    in_cam = cam_from_world.apply(points)
-    depth = np.where(in_cam[:, 2] > 0, in_cam[:, 2], np.nan)
-    x, y = in_cam[:, 0] / depth, in_cam[:, 1] / depth
-    ideal = np.zeros((len(points), 2, 3))
-    ideal[:, 0, 0] = ideal[:, 1, 1] = 1 / depth
-    ideal[:, 0, 2], ideal[:, 1, 2] = -x / depth, -y / depth
-    lens = camera.focal_px[:, None] * _distortion_jacobian(x, y, camera.distortion)
-    return np.einsum("nij,njk,kl->nil", lens, ideal, cam_from_world.rotation)
-
-
-def _distortion_jacobian(
-    x: Float[np.ndarray, "n"], y: Float[np.ndarray, "n"], distortion: Float[np.ndarray, "4"]
-) -> Float[np.ndarray, "n 2 2"]:
-    """Derivative of the distorted by the ideal normalised coordinates."""
-    k1, k2, p1, p2 = distortion
-    r2 = x * x + y * y
-    radial, slope = 1 + k1 * r2 + k2 * r2 * r2, 2 * (k1 + 2 * k2 * r2)
-    xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-    yy = radial + slope * y * y + 2 * p2 * x + 6 * p1 * y
-    xy = slope * x * y + 2 * p1 * x + 2 * p2 * y
-    return np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-2)
+    by_point, _ = camera.projection_derivatives(cam_from_world.apply(points))
+    return np.asarray(by_point @ cam_from_world.rotation)
 
 
 def noise_px(

@@ -5,15 +5,15 @@ Unknowns and how a step changes them:
 
 - a pose, by a small motion on the left (rotation vector rad, translation mm); the first frame stays: it is the world;
 - a point, by a displacement (mm);
-- the calibration of a camera, by 14 whitened parameters z with prior N(0, 1): cam_from_rig = exp(L_e z_e) prior and
+- the calibration of a camera, by its whitened parameters z with prior N(0, 1): cam_from_rig = exp(L_e z_e) prior and
   parameters = prior + L_i z_i, where L L^T is the covariance of the prior. Without one L = 0: the calibration is fixed.
 
 Levenberg-Marquardt on the Huber loss of the residuals in units of their standard deviation. The points are eliminated
-(Schur complement); what remains is a dense system of 6 unknowns a frame and 14 a camera. After each step the points
-are put where their rays then meet (variable projection, Golub and Pereyra 1973), because as an arch bends they move far
-and not in a straight line; and the similarity of the whole rig, which no image determines, is set by the prior alone
-(:mod:`cuspid.motion.gauge`). The sums run over a fixed number of parts in a fixed order, so the result does not depend
-on the number of threads.
+(Schur complement); what remains is a dense system of 6 unknowns a frame and 14 to 18 a camera. After each step the
+points are put where their rays then meet (variable projection, Golub and Pereyra 1973), because as an arch bends they
+move far and not in a straight line; and the similarity of the whole rig, which no image determines, is set by the prior
+alone (:mod:`cuspid.motion.gauge`). The sums run over a fixed number of parts in a fixed order, so the result does not
+depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.special import chdtri
 
+from cuspid.camera import stack_lenses
 from cuspid.epipolar import skew
 from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
@@ -34,7 +35,6 @@ from cuspid.motion.expectation import MOST_POINTS, covariance_factor, expectatio
 from cuspid.motion.gauge import PLACE, best_gauge, gauge_basis, moved_places, moved_world
 from cuspid.motion.misfit import CHANCE, held_misfit
 from cuspid.motion.normal_equations import (
-    CALIBRATION,
     POSE,
     Observations,
     State,
@@ -101,17 +101,22 @@ class _Prior:
 
     rig: Rig
     extrinsic_factor: Float[np.ndarray, "c 6 6"]
-    parameter_factor: Float[np.ndarray, "c 8 8"]
+    parameter_factor: Float[np.ndarray, "c n n"]
 
     @staticmethod
     def of(rig: Rig) -> _Prior:
         """From the covariances that the rig carries."""
         mounted = rig.cameras.values()
-        return _Prior(
-            rig,
-            np.stack([covariance_factor(m.covariance, 6) for m in mounted]),
-            np.stack([covariance_factor(m.camera.covariance, 8) for m in mounted]),
-        )
+        lenses = np.zeros((len(mounted), *2 * (max(len(m.camera.parameters) for m in mounted),)))
+        for factor, m in zip(lenses, mounted, strict=True):
+            count = len(m.camera.parameters)
+            factor[:count, :count] = covariance_factor(m.camera.covariance, count)
+        return _Prior(rig, np.stack([covariance_factor(m.covariance, 6) for m in mounted]), lenses)
+
+    @property
+    def numbers(self) -> int:
+        """Unknowns of each camera: of its place, and of its lens."""
+        return POSE + self.parameter_factor.shape[1]
 
     @property
     def is_free(self) -> bool:
@@ -124,13 +129,14 @@ class _Prior:
         factors = zip(self.extrinsic_factor, self.parameter_factor, strict=True)
         return np.array([np.linalg.matrix_rank(place) + np.linalg.matrix_rank(lens) for place, lens in factors])
 
-    def camera_at(self, index: int, whitened: Float[np.ndarray, "14"]) -> MountedCamera:
+    def camera_at(self, index: int, whitened: Float[np.ndarray, "n"]) -> MountedCamera:
         """A camera whose calibration is ``whitened`` standard deviations from the given one."""
         mounted = self.rig.cameras[self.rig.names[index]]
         motion = self.extrinsic_factor[index] @ whitened[:6]
         shift = self.parameter_factor[index] @ whitened[6:]
         moved = Rigid3.from_rotation_vector(motion[:3], motion[3:]) @ mounted.cam_from_rig
-        camera = mounted.camera.with_parameters(mounted.camera.parameters + shift)
+        parameters = mounted.camera.parameters
+        camera = mounted.camera.with_parameters(parameters + shift[: len(parameters)])
         return replace(mounted, camera=camera, cam_from_rig=moved)
 
     def whitened_places(
@@ -145,24 +151,26 @@ class _Prior:
             numbers.append(np.linalg.pinv(factor) @ [*motion.rotation_vector, *motion.translation])
         return np.array(numbers)
 
-    def basis_at(self, index: int, whitened: Float[np.ndarray, "14"]) -> Float[np.ndarray, "14 14"]:
+    def basis_at(self, index: int, whitened: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n n"]:
         """Derivative of (motion on the left of cam_from_rig, parameters) with respect to ``whitened``."""
         motion = self.extrinsic_factor[index] @ whitened[:6]
         turn = left_jacobian(motion[:3])
         on_the_left = np.block([[turn, np.zeros((3, 3))], [skew(motion[3:]) @ turn, np.eye(3)]])
-        basis = np.zeros((CALIBRATION, CALIBRATION))
+        basis = np.zeros((self.numbers, self.numbers))
         basis[:6, :6] = on_the_left @ self.extrinsic_factor[index]
         basis[6:, 6:] = self.parameter_factor[index]
         return basis
 
 
-def _with_calibration(state: State, prior: _Prior, whitened: Float[np.ndarray, "c 14"]) -> State:
+def _with_calibration(state: State, prior: _Prior, whitened: Float[np.ndarray, "c n"]) -> State:
     """The state with another calibration."""
     cameras = [prior.camera_at(index, z) for index, z in enumerate(whitened)]
+    models, intrinsics = stack_lenses([m.camera for m in cameras])
     return state._replace(
         camera_rotation=np.stack([m.cam_from_rig.rotation for m in cameras]),
         camera_translation=np.stack([m.cam_from_rig.translation for m in cameras]),
-        intrinsics=np.stack([m.camera.parameters for m in cameras]),
+        models=models,
+        intrinsics=intrinsics,
         whitened=whitened,
         basis=np.stack([prior.basis_at(index, z) for index, z in enumerate(whitened)]),
     )
@@ -176,12 +184,13 @@ def _initial_state(poses: Sequence[Rigid3], points: Float[np.ndarray, "p 3"], pr
         frame_translation=np.stack([pose.translation for pose in poses]),
         camera_rotation=empty,
         camera_translation=empty,
+        models=empty,
         intrinsics=empty,
         points=np.ascontiguousarray(points),
         whitened=empty,
         basis=empty,
     )
-    return _with_calibration(state, prior, np.zeros((len(prior.rig.names), CALIBRATION)))
+    return _with_calibration(state, prior, np.zeros((len(prior.rig.names), prior.numbers)))
 
 
 def _moved(state: State, observations: Observations, weighting: Weighting, prior: _Prior, step: Any) -> State:
@@ -366,7 +375,7 @@ def calibration_sigma_px(rig: Rig, distance_mm: float) -> float:
     for index, mounted in enumerate(rig.cameras.values()):
         corners = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]]) * [mounted.camera.width, mounted.camera.height]
         in_rig = mounted.cam_from_rig.inverse().apply(distance_mm * mounted.camera.rays(corners))
-        moved = [prior.camera_at(index, unit) for unit in np.eye(CALIBRATION)]
+        moved = [prior.camera_at(index, unit) for unit in np.eye(prior.numbers)]
         shifts = np.stack([m.camera.project(m.cam_from_rig.apply(in_rig)) - corners for m in moved])
         sigma = max(sigma, float(np.sqrt(np.sum(shifts**2, axis=(0, 2)).max())))
     return sigma
@@ -392,7 +401,7 @@ class _Posterior(NamedTuple):
     """Covariances of what was found."""
 
     poses: Float[np.ndarray, "f 6 6"]
-    calibration: Float[np.ndarray, "c 14 14"] | None
+    calibration: Float[np.ndarray, "c n n"] | None
     """Of each camera (motion on the left, parameters); None where it is held."""
     expectation: Expectation
 
@@ -416,8 +425,9 @@ def _posterior(state: State, observations: Observations, weighting: Weighting) -
     expectation = _expectation(state, observations, weighting, inverse)
     if not weighting.calibrated:
         return _Posterior(poses, None, expectation)
-    starts = range(start, len(inverse), CALIBRATION)
-    whitened = np.stack([inverse[at : at + CALIBRATION, at : at + CALIBRATION] for at in starts])
+    numbers = state.basis.shape[1]
+    starts = range(start, len(inverse), numbers)
+    whitened = np.stack([inverse[at : at + numbers, at : at + numbers] for at in starts])
     calibration = state.basis @ whitened @ np.swapaxes(state.basis, 1, 2)
     return _Posterior(poses, calibration, expectation)
 
@@ -462,7 +472,7 @@ def _known_posterior(state: State, observations: Observations, weighting: Weight
         raise ReconstructionError("adjustment: the tracks do not connect all frames; more overlap is needed") from error
 
 
-def _adjusted_rig(state: State, prior: _Prior, covariance: Float[np.ndarray, "c 14 14"] | None) -> Rig:
+def _adjusted_rig(state: State, prior: _Prior, covariance: Float[np.ndarray, "c n n"] | None) -> Rig:
     """The rig with the refined calibration and what is still uncertain of it; what was held stays as given."""
     if not prior.is_free:
         return prior.rig
@@ -473,7 +483,8 @@ def _adjusted_rig(state: State, prior: _Prior, covariance: Float[np.ndarray, "c 
             cameras[name] = mounted
             continue
         if mounted.camera.covariance is not None:
-            camera = replace(mounted.camera, covariance=covariance[index, 6:, 6:])
+            lens = slice(POSE, POSE + len(mounted.camera.parameters))
+            camera = replace(mounted.camera, covariance=covariance[index, lens, lens])
             mounted = replace(mounted, camera=camera)
         if mounted.covariance is not None:
             mounted = replace(mounted, covariance=covariance[index, :6, :6])

@@ -40,10 +40,10 @@ SCALE_SPREAD = 0.02
 
 
 def colmap_camera(camera: Camera, camera_id: int = 0) -> pycolmap.Camera:
-    """The same camera as COLMAP's OPENCV camera, which has the same parameters and pixel origin."""
+    """The same camera as COLMAP's, which has the same models, parameters and pixel origin."""
     return pycolmap.Camera(
         camera_id=camera_id,
-        model="OPENCV",
+        model=camera.model,
         width=camera.width,
         height=camera.height,
         params=camera.parameters.tolist(),

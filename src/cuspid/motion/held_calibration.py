@@ -17,7 +17,7 @@ from cuspid.motion.expectation import covariance_factor
 from cuspid.pairing import PairingOptions, stereo_pairs
 from cuspid.rig import Handpiece, MountedCamera
 
-_LENS, _MOTION = 8, 6
+_MOTION = 6
 _STEP = 1e-6
 """Of finite differences."""
 
@@ -45,21 +45,23 @@ def _moved(place: Float[np.ndarray, "3"], cameras: list[MountedCamera]) -> Float
         def seen(step: Float[np.ndarray, "k"], mounted: MountedCamera = mounted) -> Float[np.ndarray, "2"]:
             return _seen(mounted, place + step[:3], step[3:])
 
-        by_all = _jacobian(seen, 3 + _LENS + _MOTION)
+        numbers = len(mounted.camera.parameters)
+        by_all = _jacobian(seen, 3 + numbers + _MOTION)
         by_place, by_camera = by_all[:, :3], by_all[:, 3:]
-        lens = covariance_factor(mounted.camera.covariance, _LENS)
+        lens = covariance_factor(mounted.camera.covariance, numbers)
         motion = covariance_factor(mounted.covariance, _MOTION)
         square += by_place.T @ by_place
-        factors.append(by_place.T @ np.hstack([by_camera[:, :_LENS] @ lens, by_camera[:, _LENS:] @ motion]))
+        factors.append(by_place.T @ np.hstack([by_camera[:, :numbers] @ lens, by_camera[:, numbers:] @ motion]))
     return np.asarray(np.linalg.pinv(square) @ np.hstack(factors))
 
 
 def _seen(
-    mounted: MountedCamera, place: Float[np.ndarray, "3"], step: Float[np.ndarray, "14"]
+    mounted: MountedCamera, place: Float[np.ndarray, "3"], step: Float[np.ndarray, "k"]
 ) -> Float[np.ndarray, "2"]:
     """The pixel at which a camera with other parameters, turned and shifted, sees a place of the rig frame."""
-    camera = mounted.camera.with_parameters(mounted.camera.parameters + step[:_LENS])
-    moved = Rigid3.from_rotation_vector(step[_LENS : _LENS + 3], step[_LENS + 3 :])
+    lens, turn, shift = np.split(step, [-_MOTION, 3 - _MOTION])
+    camera = mounted.camera.with_parameters(mounted.camera.parameters + lens)
+    moved = Rigid3.from_rotation_vector(turn, shift)
     return np.asarray(camera.project((moved @ mounted.cam_from_rig).apply(place)))
 
 

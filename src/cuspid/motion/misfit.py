@@ -25,7 +25,6 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from cuspid.motion.normal_equations import (
-    CALIBRATION,
     POSE,
     Observations,
     State,
@@ -126,7 +125,7 @@ def held_misfit(
     if not held.any():
         return ()
     raw, free = (
-        state._replace(basis=np.tile(np.eye(CALIBRATION), (len(names), 1, 1))),
+        state._replace(basis=np.tile(np.eye(state.basis.shape[1]), (len(names), 1, 1))),
         weighting._replace(calibrated=True),
     )
     numbers = _numbers(state, _curvature(raw, observations, free), observations, weighting, held)
@@ -144,10 +143,10 @@ def held_misfit(
     )
 
 
-def _held(state: State) -> Bool[np.ndarray, "c 14"]:
+def _held(state: State) -> Bool[np.ndarray, "c n"]:
     """Which numbers of each camera are held: all of its place, or all of its lens."""
     place, lens = (~state.basis[:, :, part].any(axis=(1, 2)) for part in (slice(POSE), slice(POSE, None)))
-    return np.repeat(np.stack([place, lens], axis=1), [POSE, CALIBRATION - POSE], axis=1)
+    return np.repeat(np.stack([place, lens], axis=1), [POSE, state.basis.shape[1] - POSE], axis=1)
 
 
 def _curvature(raw: State, observations: Observations, weighting: Weighting) -> System:
@@ -163,7 +162,7 @@ def _curvature(raw: State, observations: Observations, weighting: Weighting) -> 
 
 
 def _numbers(
-    state: State, told: System, observations: Observations, weighting: Weighting, held: Bool[np.ndarray, "c 14"]
+    state: State, told: System, observations: Observations, weighting: Weighting, held: Bool[np.ndarray, "c n"]
 ) -> _Numbers:
     """What is free of the calibration is counted in standard deviations of its prior, what is held in what is allowed:
     units that move the images by so much."""
@@ -182,7 +181,7 @@ def _numbers(
     )
 
 
-def _farthest(wanted: Float[np.ndarray, "k"], held: Bool[np.ndarray, "c 14"], names: Sequence[str]) -> str:
+def _farthest(wanted: Float[np.ndarray, "k"], held: Bool[np.ndarray, "c n"], names: Sequence[str]) -> str:
     """The camera whose numbers have the largest sum of squares."""
     squares = np.zeros(held.shape)
     squares[held] = wanted**2

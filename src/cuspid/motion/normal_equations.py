@@ -13,20 +13,21 @@ from jaxtyping import Float
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
+from cuspid.geometry.cameras import MODELS, camera_jacobian
 from cuspid.kernels import kernel
 from cuspid.workers import map_slices
 
 POSE = 6
 """Unknowns of a frame."""
-CALIBRATION = 14
-"""Unknowns of a camera: 6 of its pose in the rig, 8 of its lens."""
-_COLUMNS = 3 + POSE + CALIBRATION
 _PARTS = 4
 """Fixed, because the order of a sum shows in its last bits: the result must not depend on the number of cores."""
 _FEW = 1000
 """Number of points below which threads are not worthwhile."""
 _FLATTEST = 1e-3
 """Depth of a point, as a share of its distance from the axis, above which it counts as in front of the camera."""
+_FARTHEST_BACK = 2.0
+"""The same for an equidistant lens, behind the camera."""
+_LAST_PERSPECTIVE = MODELS["FULL_OPENCV"].code
 _SETTLING = 4
 """Maximum number of steps of a point after the rest has moved."""
 
@@ -38,12 +39,15 @@ class State(NamedTuple):
     frame_translation: np.ndarray
     camera_rotation: np.ndarray
     camera_translation: np.ndarray
+    models: np.ndarray
+    """Code of the model of each camera's lens."""
     intrinsics: np.ndarray
+    """(cameras, n): parameters, with zeros after those of models that have fewer."""
     points: np.ndarray
     whitened: np.ndarray
-    """(cameras, 14): z of each camera, zero at the prior."""
+    """(cameras, 6 + n): z of each camera, zero at the prior."""
     basis: np.ndarray
-    """(cameras, 14, 14): derivative of (motion on the left of cam_from_rig, parameters) with respect to z."""
+    """(cameras, 6 + n, 6 + n): derivative of (motion on the left of cam_from_rig, parameters) with respect to z."""
 
 
 class Observations(NamedTuple):
@@ -77,33 +81,6 @@ class System(NamedTuple):
 
 @kernel
 @no_type_check
-def _camera_jacobian(k, x, y, z, pixel, by_point, by_parameters):
-    """Projection of a point in the camera frame, and its derivatives (2x3 and 2x8)."""
-    fx, fy, k1, k2, p1, p2 = k[0], k[1], k[4], k[5], k[6], k[7]
-    u, v = x / z, y / z
-    r2 = u * u + v * v
-    radial, slope = 1 + k1 * r2 + k2 * r2 * r2, k1 + 2 * k2 * r2
-    xd = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
-    yd = v * radial + 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
-    pixel[0], pixel[1] = fx * xd + k[2], fy * yd + k[3]
-    cross = 2 * u * v * slope + 2 * p1 * u + 2 * p2 * v
-    xu = radial + 2 * u * u * slope + 2 * p1 * v + 6 * p2 * u
-    yv = radial + 2 * v * v * slope + 2 * p2 * u + 6 * p1 * v
-    by_point[0, 0], by_point[0, 1] = fx * xu / z, fx * cross / z
-    by_point[1, 0], by_point[1, 1] = fy * cross / z, fy * yv / z
-    by_point[0, 2] = -(by_point[0, 0] * u + by_point[0, 1] * v)
-    by_point[1, 2] = -(by_point[1, 0] * u + by_point[1, 1] * v)
-    by_parameters[:] = 0
-    by_parameters[0, 0], by_parameters[1, 1] = xd, yd
-    by_parameters[0, 2], by_parameters[1, 3] = 1, 1
-    by_parameters[0, 4], by_parameters[1, 4] = fx * u * r2, fy * v * r2
-    by_parameters[0, 5], by_parameters[1, 5] = fx * u * r2 * r2, fy * v * r2 * r2
-    by_parameters[0, 6], by_parameters[1, 6] = fx * 2 * u * v, fy * (r2 + 2 * v * v)
-    by_parameters[0, 7], by_parameters[1, 7] = fx * (r2 + 2 * u * u), fy * 2 * u * v
-
-
-@kernel
-@no_type_check
 def _move(rotation, translation, x, out):
     """out = rotation @ x + translation."""
     for i in range(3):
@@ -112,9 +89,11 @@ def _move(rotation, translation, x, out):
 
 @kernel
 @no_type_check
-def _is_before(x_in_cam):
-    """Whether a point lies before its camera, and not almost beside it."""
-    return x_in_cam[2] > _FLATTEST * (abs(x_in_cam[0]) + abs(x_in_cam[1]))
+def _is_before(model, x_in_cam):
+    """Whether a point lies where a lens may show it: before a perspective one, and not almost beside it; not right
+    behind an equidistant one."""
+    least = _FLATTEST if model <= _LAST_PERSPECTIVE else -_FARTHEST_BACK
+    return x_in_cam[2] > least * (abs(x_in_cam[0]) + abs(x_in_cam[1]))
 
 
 @kernel
@@ -140,23 +119,24 @@ def _times_motion(a, x, out):
 @kernel
 @no_type_check
 def linearise(state, point, frame, camera, calibrated, scratch, pixel, jacobian):
-    """Projected pixel and its derivatives (2x23) by point, pose and whitened calibration. False behind the camera."""
+    """Projected pixel and its derivatives (2xn) by point, pose and whitened calibration. False behind the camera."""
     x_in_rig, x_in_cam, by_cam, by_rig, raw = scratch
     _move(state.frame_rotation[frame], state.frame_translation[frame], state.points[point], x_in_rig)
     _move(state.camera_rotation[camera], state.camera_translation[camera], x_in_rig, x_in_cam)
-    if not _is_before(x_in_cam):
+    model = state.models[camera]
+    if not _is_before(model, x_in_cam):
         return False
     x, y, z = x_in_cam
-    _camera_jacobian(state.intrinsics[camera], x, y, z, pixel, by_cam, raw[:, POSE:])
+    camera_jacobian(model, state.intrinsics[camera], x, y, z, pixel, by_cam, raw[:, POSE:])
     _times(by_cam, state.camera_rotation[camera], by_rig)
     _times(by_rig, state.frame_rotation[frame], jacobian[:, :3])
     _times_motion(by_rig, x_in_rig, jacobian[:, 3 : 3 + POSE])
     if calibrated:
         _times_motion(by_cam, x_in_cam, raw[:, :POSE])
         for i in range(2):
-            for j in range(CALIBRATION):
+            for j in range(raw.shape[1]):
                 total = 0.0
-                for k in range(CALIBRATION):
+                for k in range(raw.shape[1]):
                     total += raw[i, k] * state.basis[camera, k, j]
                 jacobian[i, 3 + POSE + j] = total
     return True
@@ -164,7 +144,7 @@ def linearise(state, point, frame, camera, calibrated, scratch, pixel, jacobian)
 
 @kernel
 @no_type_check
-def pose_equations(lenses, rotations, translations, pose, points, pixels, cameras, limit_px):
+def pose_equations(models, lenses, rotations, translations, pose, points, pixels, cameras, limit_px):
     """Normal equations of the pose of one frame alone, and the number of observations within ``limit_px``; the step is
     a small motion on its left.
 
@@ -173,14 +153,15 @@ def pose_equations(lenses, rotations, translations, pose, points, pixels, camera
     """
     matrix, gradient, within = np.zeros((POSE, POSE)), np.zeros(POSE), 0
     x_in_rig, x_in_cam, by_cam, by_rig = np.zeros(3), np.zeros(3), np.zeros((2, 3)), np.zeros((2, 3))
-    pixel, by_lens, by_pose = np.zeros(2), np.zeros((2, 8)), np.zeros((2, POSE))
+    pixel, by_lens, by_pose = np.zeros(2), np.zeros((2, lenses.shape[1])), np.zeros((2, POSE))
     for o in range(len(points)):
         camera = cameras[o]
         _move(pose[0], pose[1], points[o], x_in_rig)
         _move(rotations[camera], translations[camera], x_in_rig, x_in_cam)
-        if not _is_before(x_in_cam):
+        if not _is_before(models[camera], x_in_cam):
             continue
-        _camera_jacobian(lenses[camera], x_in_cam[0], x_in_cam[1], x_in_cam[2], pixel, by_cam, by_lens)
+        x, y, z = x_in_cam
+        camera_jacobian(models[camera], lenses[camera], x, y, z, pixel, by_cam, by_lens)
         x, y = pixel[0] - pixels[o, 0], pixel[1] - pixels[o, 1]
         left = 1 - (x * x + y * y) / limit_px**2
         if not left > 0:
@@ -198,25 +179,33 @@ def pose_equations(lenses, rotations, translations, pose, points, pixels, camera
 
 @kernel
 @no_type_check
-def make_scratch():
+def make_scratch(state):
     """Working memory of :func:`linearise`."""
-    return np.zeros(3), np.zeros(3), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, CALIBRATION))
+    return np.zeros(3), np.zeros(3), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, state.basis.shape[1]))
+
+
+@kernel
+@no_type_check
+def _columns(state):
+    """Number of unknowns that an observation depends on."""
+    return 3 + POSE + state.basis.shape[1]
 
 
 @kernel
 @no_type_check
 def _residuals(state, observations, out):
     """Projected minus observed pixel for each observation; NaN behind the camera."""
-    x_in_rig, x_in_cam, by_cam, _, raw = make_scratch()
+    x_in_rig, x_in_cam, by_cam, _, raw = make_scratch(state)
     for point in range(observations.start.shape[0] - 1):
         for o in range(observations.start[point], observations.start[point + 1]):
             frame, camera = observations.frame[o], observations.camera[o]
             _move(state.frame_rotation[frame], state.frame_translation[frame], state.points[point], x_in_rig)
             _move(state.camera_rotation[camera], state.camera_translation[camera], x_in_rig, x_in_cam)
             out[o] = np.nan
-            if _is_before(x_in_cam):
+            model = state.models[camera]
+            if _is_before(model, x_in_cam):
                 x, y, z = x_in_cam
-                _camera_jacobian(state.intrinsics[camera], x, y, z, out[o], by_cam, raw[:, POSE:])
+                camera_jacobian(model, state.intrinsics[camera], x, y, z, out[o], by_cam, raw[:, POSE:])
                 out[o] -= observations.pixels[o]
 
 
@@ -287,7 +276,7 @@ def _add_observation(system, blocks, jacobian, residual, pose_at, camera_at):
         _add_block(system.matrix, camera_at, camera_at, by_calibration, by_calibration)
         _add_gradient(system, camera_at, by_calibration, residual)
         slot, count = _slot(offsets, count, camera_at, coupling)
-        widths[slot] = CALIBRATION
+        widths[slot] = by_calibration.shape[1]
         _add_block(coupling[slot], 0, 0, by_calibration, by_point)
         if pose_at >= 0:
             _add_block(system.matrix, camera_at, pose_at, by_calibration, by_pose)
@@ -334,10 +323,10 @@ def _point_inverse(hessian, inverse):
 
 @kernel
 @no_type_check
-def _offsets_of(observations, weighting, o, frames):
+def _offsets_of(state, observations, weighting, o):
     """Where the pose and the calibration of an observation stand in the system; -1 where they are held."""
     frame, camera = observations.frame[o], observations.camera[o]
-    calibration_at = POSE * (frames - 1) + CALIBRATION * camera
+    calibration_at = POSE * (state.frame_rotation.shape[0] - 1) + state.basis.shape[1] * camera
     return POSE * (frame - 1) if frame > 0 else -1, calibration_at if weighting.calibrated else -1
 
 
@@ -345,17 +334,17 @@ def _offsets_of(observations, weighting, o, frames):
 @no_type_check
 def _accumulate(state, observations, weighting, first, last, system):
     """Add the points ``first`` to ``last`` to the reduced normal equations."""
-    frames, longest = state.frame_rotation.shape[0], np.diff(observations.start).max()
-    scratch, residual, jacobian = make_scratch(), np.zeros(2), np.zeros((2, _COLUMNS))
+    longest, calibration = np.diff(observations.start).max(), state.basis.shape[1]
+    scratch, residual, jacobian = make_scratch(state), np.zeros(2), np.zeros((2, _columns(state)))
     offsets, widths = np.zeros(2 * longest, np.int64), np.zeros(2 * longest, np.int64)
-    coupling = np.zeros((2 * longest, CALIBRATION, 3))
+    coupling = np.zeros((2 * longest, max(calibration, POSE), 3))
     hessian, gradient, inverse = np.zeros((3, 3)), np.zeros((3, 1)), np.zeros((3, 3))
     for point in range(first, last):
         hessian[:], gradient[:] = 0, 0
         count = 0
         for o in range(observations.start[point], observations.start[point + 1]):
             if _weigh(state, observations, weighting, point, o, scratch, residual, jacobian):
-                pose_at, camera_at = _offsets_of(observations, weighting, o, frames)
+                pose_at, camera_at = _offsets_of(state, observations, weighting, o)
                 _add_block(hessian, 0, 0, jacobian[:, :3], jacobian[:, :3])
                 _add_block(gradient, 0, 0, jacobian[:, :3], residual.reshape(2, 1))
                 blocks = (offsets, widths, coupling, count)
@@ -368,11 +357,11 @@ def _accumulate(state, observations, weighting, first, last, system):
 @no_type_check
 def _scores(state, observations, weighting, first, last, out):
     """J^T r of each observation of the points ``first`` to ``last``, by its pose and its calibration."""
-    scratch, residual, jacobian = make_scratch(), np.zeros(2), np.zeros((2, _COLUMNS))
+    scratch, residual, jacobian = make_scratch(state), np.zeros(2), np.zeros((2, _columns(state)))
     for point in range(first, last):
         for o in range(observations.start[point], observations.start[point + 1]):
             if _weigh(state, observations, weighting, point, o, scratch, residual, jacobian):
-                for i in range(POSE + CALIBRATION):
+                for i in range(out.shape[1]):
                     out[o, i] = jacobian[0, 3 + i] * residual[0] + jacobian[1, 3 + i] * residual[1]
 
 
@@ -380,8 +369,8 @@ def _scores(state, observations, weighting, first, last, out):
 @no_type_check
 def _substitute(state, observations, weighting, steps, first, last, moved):
     """Back-substitution: the points ``first`` to ``last`` after the reduced unknowns have made each of some steps."""
-    frames, count = state.frame_rotation.shape[0], steps.shape[1]
-    scratch, residual, jacobian = make_scratch(), np.zeros(2), np.zeros((2, _COLUMNS))
+    count, calibration = steps.shape[1], state.basis.shape[1]
+    scratch, residual, jacobian = make_scratch(state), np.zeros(2), np.zeros((2, _columns(state)))
     hessian, inverse = np.zeros((3, 3)), np.zeros((3, 3))
     ahead, gradient = np.zeros((2, count)), np.zeros((3, count))
     for point in range(first, last):
@@ -389,13 +378,13 @@ def _substitute(state, observations, weighting, steps, first, last, moved):
         for o in range(observations.start[point], observations.start[point + 1]):
             if not _weigh(state, observations, weighting, point, o, scratch, residual, jacobian):
                 continue
-            pose_at, camera_at = _offsets_of(observations, weighting, o, frames)
+            pose_at, camera_at = _offsets_of(state, observations, weighting, o)
             for i in range(2):
                 ahead[i] = residual[i]
                 if pose_at >= 0:
                     _add_products(jacobian[i, 3 : 3 + POSE], steps[pose_at : pose_at + POSE], ahead[i])
                 if camera_at >= 0:
-                    _add_products(jacobian[i, 3 + POSE :], steps[camera_at : camera_at + CALIBRATION], ahead[i])
+                    _add_products(jacobian[i, 3 + POSE :], steps[camera_at : camera_at + calibration], ahead[i])
             _add_block(hessian, 0, 0, jacobian[:, :3], jacobian[:, :3])
             _add_block(gradient, 0, 0, jacobian[:, :3], ahead)
         _point_inverse(hessian, inverse)
@@ -425,10 +414,11 @@ def _loss(state, observations, weighting, point, scratch, residual):
         frame, camera = observations.frame[o], observations.camera[o]
         _move(state.frame_rotation[frame], state.frame_translation[frame], state.points[point], x_in_rig)
         _move(state.camera_rotation[camera], state.camera_translation[camera], x_in_rig, x_in_cam)
-        if not _is_before(x_in_cam):
+        model = state.models[camera]
+        if not _is_before(model, x_in_cam):
             return np.inf
         x, y, z = x_in_cam
-        _camera_jacobian(state.intrinsics[camera], x, y, z, residual, by_cam, raw[:, POSE:])
+        camera_jacobian(model, state.intrinsics[camera], x, y, z, residual, by_cam, raw[:, POSE:])
         residual -= observations.pixels[o]
         length, knee = np.hypot(residual[0], residual[1]) / weighting.sigma_px, weighting.huber_sigmas
         total += length * length if length <= knee else 2 * knee * length - knee * knee
@@ -439,7 +429,7 @@ def _loss(state, observations, weighting, point, scratch, residual):
 @no_type_check
 def _settle(state, observations, weighting, first, last):
     """Move the points ``first`` to ``last`` to where their rays meet, the rest being held (Gauss-Newton)."""
-    scratch, residual, jacobian = make_scratch(), np.zeros(2), np.zeros((2, _COLUMNS))
+    scratch, residual, jacobian = make_scratch(state), np.zeros(2), np.zeros((2, _columns(state)))
     hessian, gradient, inverse = np.zeros((3, 3)), np.zeros((3, 1)), np.zeros((3, 3))
     before = np.zeros(3)
     for point in range(first, last):
@@ -489,7 +479,8 @@ def scatter_of_tracks(state: State, observations: Observations, weighting: Weigh
     independent tracks, however the errors within a track are correlated (Liang and Zeger, Biometrika 73, 1986)."""
     size = POSE * (len(state.frame_rotation) - 1)
     total = size + (state.whitened.size if weighting.calibrated else 0)
-    blocks = np.zeros((len(observations.frame), POSE + CALIBRATION))
+    calibration = state.basis.shape[1]
+    blocks = np.zeros((len(observations.frame), POSE + calibration))
     map_slices(
         lambda points: _scores(state, observations, weighting, points.start, points.stop, blocks),
         len(state.points),
@@ -499,7 +490,7 @@ def scatter_of_tracks(state: State, observations: Observations, weighting: Weigh
     columns = np.concatenate(
         [
             POSE * (observations.frame - 1)[:, None] + np.arange(POSE),
-            size + CALIBRATION * observations.camera[:, None] + np.arange(CALIBRATION),
+            size + calibration * observations.camera[:, None] + np.arange(calibration),
         ],
         axis=1,
     )

@@ -16,6 +16,7 @@ import pycolmap
 from jaxtyping import Float, Int
 from scipy.sparse.csgraph import breadth_first_order
 
+from cuspid.camera import stack_lenses
 from cuspid.capture import Dropped
 from cuspid.geometry import Rigid3
 from cuspid.graph import graph_of, parts_of
@@ -215,13 +216,14 @@ def polish(
     unit_mm = float(np.linalg.norm(points, axis=1).mean())
     scale = np.array([1.0, 1.0, 1.0, unit_mm, unit_mm, unit_mm])
     mounted = list(rig.cameras.values())
-    lenses = np.array([each.camera.parameters for each in mounted])
+    models, lenses = stack_lenses([each.camera for each in mounted])
     rotations = np.array([each.cam_from_rig.rotation for each in mounted])
     translations = np.array([each.cam_from_rig.translation for each in mounted])
     pose, within = rig_from_world, 0
     for _ in range(_POLISHING_ROUNDS):
+        at = pose.rotation, pose.translation
         matrix, gradient, within = pose_equations(
-            lenses, rotations, translations, (pose.rotation, pose.translation), points, pixels, cameras, limit_px
+            models, lenses, rotations, translations, at, points, pixels, cameras, limit_px
         )
         step = np.linalg.lstsq(scale[:, None] * matrix * scale, -scale * gradient, rcond=None)[0]
         pose = Rigid3.from_rotation_vector(step[:3], unit_mm * step[3:]) @ pose

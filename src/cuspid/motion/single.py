@@ -208,7 +208,7 @@ def _colmap_camera(camera: Camera | None, size: tuple[int, int], options: Single
         return pycolmap.Camera(camera_id=1, model="SIMPLE_PINHOLE", width=width, height=height, params=parameters)
     parameters = camera.parameters.tolist()
     return pycolmap.Camera(
-        camera_id=1, model="OPENCV", width=width, height=height, params=parameters, has_prior_focal_length=True
+        camera_id=1, model=camera.model, width=width, height=height, params=parameters, has_prior_focal_length=True
     )
 
 

@@ -85,7 +85,7 @@ def check_blender(handpiece: Handpiece, appearance: Appearance, optics: Optics) 
     if appearance.marked:
         raise InputError("texture: Blender renders no stains, fillings, vessels and stippling; use the renderer embree")
     for name in handpiece.rig.names:
-        if np.any(handpiece.rig[name].camera.distortion):
+        if not handpiece.rig[name].camera.is_pinhole:
             raise InputError(f"camera {name}: Blender cannot render this lens distortion; use the renderer embree")
     for name, light in handpiece.lights.items():
         if light.lobe_exponent != 1:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from multiprocessing import get_context
 from operator import itemgetter
@@ -618,12 +618,12 @@ def metered_gains(scene: Scene, frames: Sequence[Frame], poses: Mapping[str, Rig
 
 
 def _coarser(camera: Camera, stride: int) -> Camera:
-    return Camera(
+    return replace(
+        camera,
         width=-(-camera.width // stride),
         height=-(-camera.height // stride),
         focal_px=camera.focal_px / stride,
         principal_point_px=camera.principal_point_px / stride,
-        distortion=camera.distortion,
     )
 
 

@@ -38,7 +38,7 @@ class IdealView:
     name: str
     """Name in the rig."""
     camera: Camera
-    """Same matrix and size as the real camera, without distortion."""
+    """The real camera without its distortion (:meth:`cuspid.camera.Camera.straightened`)."""
     cam_from_rig: Rigid3
     """As for the real camera."""
     maps: tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]] | None
@@ -47,8 +47,8 @@ class IdealView:
     @staticmethod
     def of(name: str, mounted: MountedCamera) -> IdealView:
         """The ideal view of a mounted camera."""
-        ideal = replace(mounted.camera, distortion=np.zeros(4), covariance=None)
-        return IdealView(name, ideal, mounted.cam_from_rig, undistortion_maps(mounted.camera))
+        ideal = mounted.camera.straightened()
+        return IdealView(name, ideal, mounted.cam_from_rig, undistortion_maps(mounted.camera, ideal))
 
     def resample(self, image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w *c"]:
         """The image as the ideal camera would have taken it; black where the real one saw nothing."""
@@ -134,6 +134,9 @@ def _field_of_view(mounted: MountedCamera, rect_from_rig: Float[np.ndarray, "3 3
     width, height = mounted.camera.width, mounted.camera.height
     along_x, along_y = np.linspace(0, width, 9), np.linspace(0, height, 9)
     edge = [(x, y) for x in along_x for y in (0, height)] + [(x, y) for x in (0, width) for y in along_y]
+    if mounted.camera.lens.is_equidistant:  # the border may lie behind the camera
+        ideal = mounted.camera.straightened()
+        return _field_of_view(replace(mounted, camera=ideal), rect_from_rig)
     rays = mounted.camera.rays(np.array(edge, dtype=np.float64)) @ mounted.cam_from_rig.rotation @ rect_from_rig.T
     normalized = rays[:, :2] / np.maximum(rays[:, 2:], 0.2)
     return np.stack([normalized.min(axis=0), normalized.max(axis=0)])

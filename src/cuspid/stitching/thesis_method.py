@@ -12,14 +12,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int16, UInt8
 
-from cuspid.camera import Camera
+from cuspid.camera import Camera, undistortion_maps
 from cuspid.errors import ReconstructionError
 from cuspid.image_sequence import ImageSequence
 from cuspid.options import Options, Range
@@ -102,9 +102,8 @@ def calibration(sequence: ImageSequence, options: ThesisOptions) -> tuple[Camera
 
 def without_distortion(image: UInt8[np.ndarray, "h w 3"], camera: Camera) -> UInt8[np.ndarray, "h w 3"]:
     """The image as a lens without distortion would have taken it."""
-    if not np.any(camera.distortion):
-        return image
-    return np.asarray(cv2.undistort(image, camera.opencv_matrix, camera.distortion), dtype=np.uint8)
+    maps = undistortion_maps(camera)
+    return image if maps is None else np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), dtype=np.uint8)
 
 
 def look(image: UInt8[np.ndarray, "h w 3"], camera: Camera, options: ThesisOptions) -> Look:
@@ -116,7 +115,7 @@ def look(image: UInt8[np.ndarray, "h w 3"], camera: Camera, options: ThesisOptio
 
 def look_at_all(sequence: ImageSequence, camera: Camera, options: ThesisOptions, progress: Progress) -> list[Look]:
     """Every frame; the images are read one by one."""
-    ideal = replace(camera, distortion=np.zeros(4))
+    ideal = camera.as_pinhole()
 
     def one(index: int) -> Look:
         return look(without_distortion(sequence.image(index), camera), ideal, options)
@@ -257,9 +256,9 @@ def _lay(sequence: ImageSequence, camera: Camera, chain: Chain, part: int, progr
     for done, placed in enumerate(chain.placed, start=1):
         blend.add(placed, without_distortion(sequence.image(placed.index), camera))
         progress(f"mosaic, part {part}", done, len(chain.placed))
-    if np.any(camera.distortion):
+    if not camera.is_pinhole:
         seen = blend.frame >= 0
-        ideal = replace(camera, distortion=np.zeros(4))
+        ideal = camera.as_pinhole()
         blend.pixel[seen] = camera.project(ideal.rays(blend.pixel[seen].astype(np.float64)))
     return blend
 

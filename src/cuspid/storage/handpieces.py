@@ -14,6 +14,7 @@ from cuspid.body import Body, Box
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.geometry.cameras import MODELS
 from cuspid.pairing import guess_working_distance_mm
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor, depth_of_field_mm
 from cuspid.storage.files import digest_of, read_json, reading, write_json
@@ -46,7 +47,15 @@ def rigid_from_json(value: Mapping[str, Any], what: str = "pose") -> Rigid3:
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
-    """Intrinsic calibration of a camera."""
+    """Intrinsic calibration of a camera; a model that is not OPENCV is named, with its parameters in COLMAP's order."""
+    if camera.model != "OPENCV":
+        return {
+            "width_px": camera.width,
+            "height_px": camera.height,
+            "model": camera.model,
+            "params": camera.parameters,
+            "covariance_of_params": _symmetric(camera.covariance),
+        }
     return {
         "width_px": camera.width,
         "height_px": camera.height,
@@ -60,6 +69,8 @@ def camera_to_json(camera: Camera) -> dict[str, Any]:
 def camera_from_json(value: Mapping[str, Any], what: str = "camera") -> Camera:
     """Inverse of :func:`camera_to_json`. Raises InputError for what no camera can have."""
     width, height = (whole(f"{what}: {side}_px", value[f"{side}_px"], 1, MOST_PX) for side in ("width", "height"))
+    if "model" in value:
+        return _camera_of_model(value, width, height, what)
     matrix = value.get("covariance_fx_fy_cx_cy_k1_k2_p1_p2")
     return Camera(
         width=width,
@@ -76,6 +87,35 @@ def camera_from_json(value: Mapping[str, Any], what: str = "camera") -> Camera:
             _MOST_DISTORTION,
         ),
         covariance=None if matrix is None else covariance(f"{what}: covariance_fx_fy_cx_cy_k1_k2_p1_p2", matrix, 8),
+    )
+
+
+def _camera_of_model(value: Mapping[str, Any], width: int, height: int, what: str) -> Camera:
+    """A camera whose model is named."""
+    name = value["model"]
+    if name not in MODELS:
+        raise InputError(f"{what}: model {shown(name)} is not supported; use one of {', '.join(MODELS)}")
+    also = [key for key in ("focal_px", "principal_point_px", "distortion_k1_k2_p1_p2") if key in value]
+    if also:
+        raise InputError(f"{what}: it has both model and {also[0]}; give the parameters of {name} in params alone")
+    names = ("fx", "fy", "cx", "cy", *MODELS[name].names)
+    given = np.array(value["params"], dtype=np.float64).ravel()
+    if len(given) != len(names):
+        raise InputError(
+            f"{what}: params has {len(given)} numbers; those of the model {name} are {len(names)}: {', '.join(names)}"
+        )
+    limits = np.array([100.0 * MOST_PX] * 2 + [2.0 * MOST_PX] * 2 + [_MOST_DISTORTION] * (len(names) - 4))
+    for value_of, each, limit in zip(given.tolist(), names, limits.tolist(), strict=True):
+        numbers(f"{what}: {each} of params", [value_of], (1,), 1.0 if each in ("fx", "fy") else -limit, limit)
+    matrix = value.get("covariance_of_params")
+    return Camera(
+        width=width,
+        height=height,
+        focal_px=given[:2],
+        principal_point_px=given[2:4],
+        distortion=given[4:],
+        covariance=None if matrix is None else covariance(f"{what}: covariance_of_params", matrix, len(names)),
+        model=name,
     )
 
 
@@ -306,7 +346,7 @@ def write_rig_config(path: Path, rig: Rig) -> None:
     for index, (name, mounted) in enumerate(rebased.cameras.items()):
         entry: dict[str, Any] = {
             "image_prefix": f"{name}/",
-            "camera_model_name": "OPENCV",
+            "camera_model_name": mounted.camera.model,
             "camera_params": mounted.camera.parameters,
             "camera_size": [mounted.camera.width, mounted.camera.height],
         }
@@ -320,7 +360,7 @@ def write_rig_config(path: Path, rig: Rig) -> None:
 
 
 def read_rig_config(path: Path, image_size_px: tuple[int, int] | None = None) -> Rig:
-    """Read COLMAP's ``rig_config.json`` (one rig, calibrated cameras of a PINHOLE or OPENCV family).
+    """Read COLMAP's ``rig_config.json`` (one rig, calibrated cameras of any model that cuspid has or contains).
 
     The format has no image size: it is taken from cuspid's own extra field ``camera_size``, else from the argument,
     else twice the principal point.
@@ -348,28 +388,27 @@ _COLMAP_PARAMETERS: Mapping[str, Sequence[int]] = {
     "PINHOLE": (0, 1, 2, 3),
     "SIMPLE_RADIAL": (0, 0, 1, 2, 3),
     "RADIAL": (0, 0, 1, 2, 3, 4),
-    "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
+    "SIMPLE_RADIAL_FISHEYE": (0, 0, 1, 2, 3),
+    "RADIAL_FISHEYE": (0, 0, 1, 2, 3, 4),
 }
-"""Where (fx, fy, cx, cy, k1, k2, p1, p2) stand among a COLMAP model's parameters."""
+"""Of smaller models of COLMAP's: where the first parameters of the one that contains them stand among theirs."""
+_CONTAINED = {
+    **dict.fromkeys(_COLMAP_PARAMETERS, "OPENCV"),
+    "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "RADIAL_FISHEYE": "OPENCV_FISHEYE",
+}
 
 
 def camera_from_colmap(entry: Mapping[str, Any], image_size_px: tuple[int, int] | None, what: str = "camera") -> Camera:
     """A camera of ``rig_config.json``; see :func:`read_rig_config`. Raises InputError for what no camera can have."""
     model = entry["camera_model_name"]
-    if model not in _COLMAP_PARAMETERS:
-        raise InputError(f"{what}: model {shown(model)} is not supported; use one of {', '.join(_COLMAP_PARAMETERS)}")
-    given = np.array(entry["camera_params"], dtype=np.float64)
-    parameters = np.zeros(8)
-    chosen = given[list(_COLMAP_PARAMETERS[model])]
-    parameters[: len(chosen)] = chosen
+    if model not in _COLMAP_PARAMETERS and model not in MODELS:
+        known = ", ".join([*_COLMAP_PARAMETERS, *MODELS])
+        raise InputError(f"{what}: model {shown(model)} is not supported; use one of {known}")
+    parameters = np.array(entry["camera_params"], dtype=np.float64)
+    if model in _COLMAP_PARAMETERS:
+        chosen = parameters[list(_COLMAP_PARAMETERS[model])]
+        model = _CONTAINED[model]
+        parameters = np.pad(chosen, (0, 4 + len(MODELS[model].names) - len(chosen)))
     width, height = entry.get("camera_size") or image_size_px or np.rint(2 * parameters[2:4]).tolist()
-    return camera_from_json(
-        {
-            "width_px": width,
-            "height_px": height,
-            "focal_px": parameters[:2],
-            "principal_point_px": parameters[2:4],
-            "distortion_k1_k2_p1_p2": parameters[4:],
-        },
-        what,
-    )
+    return camera_from_json({"width_px": width, "height_px": height, "model": model, "params": parameters}, what)

@@ -56,9 +56,9 @@ class FusionOptions(Options):
     largest_jump: Annotated[float, Range(0.01, 10_000)] = 12.5
     """Neighbouring depths that differ by more than this many times the detail (0.15 mm at 12 um) do not belong to the
     same surface."""
-    least_weight: Annotated[float, Range(0, 1_000_000)] = 0.001
-    """Minimum weight (sum of confidences) for a voxel to count as observed: a thirtieth of what a pixel of a smooth
-    surface has that fills what could not be matched."""
+    least_weight: Annotated[float | None, Range(0, 1_000_000)] = None
+    """Minimum weight (sum of confidences) for a voxel to count as observed. Default: 0.001 for each frame, at most
+    0.01: what many frames see is seen well by some of them."""
     agreement: Annotated[float, Range(0.01, 10_000)] = 6.65
     """A depth map confirms a vertex within this many times the detail (0.08 mm at 12 um); nearer ones have more
     weight."""
@@ -71,6 +71,10 @@ class FusionOptions(Options):
     def voxel_for(self, detail_mm: float) -> float:
         """Spacing of the grid for a handpiece, mm."""
         return 4.16 * detail_mm if self.voxel_mm is None else self.voxel_mm
+
+    def least_weight_for(self, frames: int) -> float:
+        """Minimum weight of a voxel where there are so many frames."""
+        return min(0.001 * frames, 0.01) if self.least_weight is None else self.least_weight
 
     def resolved(self, detail_mm: float, footprint_mm: float) -> FusionOptions:
         """With the grid for a handpiece whose pixels have a footprint that may be less than the detail.
@@ -145,7 +149,7 @@ def _votes(
     for batch in map_batches(reached, _located(depth_maps, rig_from_world)):
         volume.integrate([where for _, where in batch])
         progress(stage, batch[-1][0], 2 * half)
-    rough = extract(volume, options.least_weight)
+    rough = extract(volume, options.least_weight_for(half))
     votes = Votes.on(halved(rough, bent(rough, _RINGS)) if options.finer_bends is not False else rough)
     del volume
 

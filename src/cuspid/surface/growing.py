@@ -23,6 +23,8 @@ from cuspid.surface.meshing import extract, extract_parts, part_of
 from cuspid.surface.volume import BLOCK, SparseVolume, around, find, pack
 
 _GREY = 128
+_MANY = 100
+"""Frames that a surface is expected to get."""
 
 
 class GrowingSurface:
@@ -33,7 +35,7 @@ class GrowingSurface:
         options = options or FusionOptions()
         voxel_mm = options.voxel_for(detail_mm)
         self._volume = SparseVolume(voxel_mm, options.truncation_voxels * voxel_mm)
-        self._jump_mm, self._least_weight = options.largest_jump * detail_mm, options.least_weight
+        self._jump_mm, self._least_weight = options.largest_jump * detail_mm, options.least_weight_for(_MANY)
         self._colors = np.zeros((0, BLOCK**3, 4), dtype=np.float32)
         self._changed = set[int]()
 

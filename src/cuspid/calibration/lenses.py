@@ -1,0 +1,167 @@
+"""Which camera model the views of a board call for.
+
+Each model is calibrated from a part of the views and looks at the others, whose poses alone are then found (k-fold
+cross-validation). A model with more parameters, or another one with as many, is taken only where it explains the views
+that it did not see better than chance: by the mean of the logarithms of how much smaller their residuals are, in its
+standard errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from cuspid.board import Board
+from cuspid.calibration.bundle import Adjusted, adjust_board, of_instants
+from cuspid.calibration.corners import BoardView
+from cuspid.calibration.start import LEAST_VIEWS, calibrated_alone
+from cuspid.camera import Camera
+from cuspid.errors import ReconstructionError
+from cuspid.geometry.cameras import MODELS
+
+LensName = Literal["auto", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"]
+"""A model, or the one that the images call for."""
+_LADDER = ("OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "THIN_PRISM_FISHEYE")
+"""The models, simplest first. The last one is tried only where one of those before it is better than the first."""
+_FOLDS, _MOST_VIEWS = 4, 24
+_CHANCE = 3.0
+"""Standard errors beyond which one model is better than another."""
+_HALF_VIEWS_DEG = (20.0, 35.0, 50.0, 65.0, 80.0)
+"""Half the angle of view across the image, from which the search for an equidistant lens begins."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensChoice:
+    """The model of a lens, and what others did."""
+
+    model: str
+    """The one that was taken."""
+    held_out_px: Mapping[str, float]
+    """RMS of the residuals in views that a calibration by a model was not made from; empty where there were too few
+    views to tell."""
+
+    @property
+    def summary(self) -> str:
+        """In words, with the figures."""
+        told = ", ".join(f"{model} {px:.3f}" for model, px in self.held_out_px.items())
+        return f"{self.model}" + (f" (px in views held out: {told})" if told else "")
+
+
+def choose_lens(
+    views: Sequence[BoardView], board: Board, size: tuple[int, int], asked: LensName = "auto"
+) -> tuple[LensChoice, Adjusted]:
+    """The model that is asked for or that the views call for, and the camera by it, calibrated alone.
+
+    Raises ReconstructionError where no camera fits the views.
+    """
+    if asked != "auto":
+        return LensChoice(model=asked, held_out_px={}), calibrated_as(asked, views, board, size)
+    if len(views) < 2 * LEAST_VIEWS:
+        return LensChoice(model="OPENCV", held_out_px={}), calibrated_as("OPENCV", views, board, size)
+    spread = np.unique(np.linspace(0, len(views) - 1, _MOST_VIEWS).astype(int))
+    some = [views[k] for k in spread]
+    found, squares, failure = dict[str, Adjusted](), dict[str, Float[np.ndarray, "v"]](), None
+    for model in _LADDER:
+        if model == _LADDER[-1] and not any(
+            _is_better(each, next(iter(squares.values()))) for each in squares.values()
+        ):
+            break
+        try:
+            found[model] = calibrated_as(model, some, board, size, found.get("OPENCV"))
+            squares[model] = _held_out(found[model], some, board)
+        except ReconstructionError as error:
+            failure = failure or error
+    if not squares:
+        assert failure is not None
+        raise failure
+    chosen = next(iter(squares))
+    for model in list(squares)[1:]:
+        if _is_better(squares[model], squares[chosen]):
+            chosen = model
+    rms = {model: float(np.sqrt(np.nanmean(each))) for model, each in squares.items()}
+    start = found[chosen].scene.cameras[""]
+    alone = found[chosen] if len(some) == len(views) else calibrated_alone(views, board, size, [start])
+    return LensChoice(model=chosen, held_out_px=rms), alone
+
+
+def calibrated_as(
+    model: str, views: Sequence[BoardView], board: Board, size: tuple[int, int], simple: Adjusted | None = None
+) -> Adjusted:
+    """One camera of a model from its own views; ``simple``, if it is known, is the same by OPENCV.
+
+    Raises ReconstructionError where the views fit no such camera.
+    """
+    if model == "OPENCV":
+        return calibrated_alone(views, board, size)
+    starts = []
+    try:
+        simple = simple or calibrated_alone(views, board, size)
+        starts.append(as_model(simple.scene.cameras[""], model, np.concatenate([view.pixels for view in views])))
+    except ReconstructionError:
+        if not MODELS[model].is_equidistant:
+            raise
+    if MODELS[model].is_equidistant and not starts:
+        starts += [_equidistant(model, size, half_deg) for half_deg in _HALF_VIEWS_DEG]
+    return calibrated_alone(views, board, size, starts)
+
+
+def as_model(camera: Camera, model: str, pixels: Float[np.ndarray, "n 2"]) -> Camera:
+    """The camera of another model that is most like a perspective one at some pixels, with the first radial term
+    alone where the ideal lens is another one."""
+    lens = MODELS[model]
+    if not lens.is_equidistant:
+        more = np.pad(camera.distortion, (0, len(lens.names) - len(camera.distortion)))
+        return replace(camera, model=model, distortion=more, covariance=None)
+    rays = camera.rays(pixels)
+    angle, out = np.arctan(np.linalg.norm(rays[:, :2], axis=1)), (pixels - camera.principal_point_px) / camera.focal_px
+    known = np.isfinite(angle)
+    # Least squares of |out| = share (angle + k1 angle^3).
+    powers = np.stack([angle, angle**3], axis=1)[known]
+    share, cubic = np.linalg.lstsq(powers, np.linalg.norm(out, axis=1)[known], rcond=None)[0]
+    distortion = np.zeros(len(lens.names))
+    distortion[lens.numerator[0]] = cubic / share
+    return replace(camera, model=model, focal_px=share * camera.focal_px, distortion=distortion, covariance=None)
+
+
+def _equidistant(model: str, size: tuple[int, int], half_deg: float) -> Camera:
+    """An ideal one, with half the angle of view across the image."""
+    width, height = size
+    return Camera(
+        width=width,
+        height=height,
+        focal_px=np.full(2, width / 2 / np.deg2rad(half_deg)),
+        principal_point_px=np.array([width / 2, height / 2]),
+        distortion=np.zeros(len(MODELS[model].names)),
+        model=model,
+    )
+
+
+def _held_out(found: Adjusted, views: Sequence[BoardView], board: Board) -> Float[np.ndarray, "v"]:
+    """Mean square of the residuals of each view by cameras that were calibrated without it; NaN where the view fits no
+    camera. Raises ReconstructionError where too few views are left."""
+    scene, count = found.scene, len(views)
+    named = {("", instant): views[int(instant)] for instant in scene.rig_from_board}
+    squares = np.full(count, np.nan)
+    for fold in range(_FOLDS):
+        out = {key: view for key, view in named.items() if int(key[1]) % _FOLDS == fold}
+        rest = {key: view for key, view in named.items() if key not in out}
+        if not out:
+            continue
+        seen = adjust_board(of_instants(scene, {instant for _, instant in rest}), rest, board)
+        held = replace(seen.scene, rig_from_board=of_instants(scene, {key[1] for key in out}).rig_from_board)
+        for (_, instant), residuals in adjust_board(held, out, board, only_boards=True).residuals.items():
+            squares[int(instant)] = np.mean(residuals**2)
+    return squares
+
+
+def _is_better(one: Float[np.ndarray, "v"], other: Float[np.ndarray, "v"]) -> bool:
+    """Whether the residuals of the same views are smaller, by more than chance."""
+    gain = np.log(other / one)
+    gain = gain[np.isfinite(gain)]
+    if len(gain) < LEAST_VIEWS:
+        return False
+    return float(gain.mean()) > _CHANCE * float(gain.std(ddof=1)) / np.sqrt(len(gain))

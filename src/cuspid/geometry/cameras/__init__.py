@@ -1,0 +1,23 @@
+"""Camera models, under COLMAP's names: how a lens maps directions to the image, with derivatives and inverse."""
+
+from cuspid.geometry.cameras.models import LENSES, LONGEST, MODELS, LensModel, fold_radius
+from cuspid.geometry.cameras.projection import (
+    camera_jacobian,
+    directions_through,
+    distorted,
+    project_points,
+    projection_derivatives,
+)
+
+__all__ = [
+    "LENSES",
+    "LONGEST",
+    "MODELS",
+    "LensModel",
+    "camera_jacobian",
+    "directions_through",
+    "distorted",
+    "fold_radius",
+    "project_points",
+    "projection_derivatives",
+]

@@ -1,0 +1,64 @@
+"""The camera models, and where they hold.
+
+Parameters are (fx, fy, cx, cy) and those of the lens, in COLMAP's order. A model takes the direction of a point to a
+place (u, v) of an *ideal* lens: (x / z, y / z) of a perspective one, or the angle from the axis, in rad, times the unit
+vector sideways of an equidistant one. The lens then distorts that place: radially by a factor that is a polynomial of
+r^2 = u^2 + v^2 (or a ratio of two), tangentially by p1 and p2 (D. C. Brown, Photogramm. Eng. 32, 1966), and by thin
+prisms (s1, s2) (J. Weng et al., IEEE Trans. PAMI 14, 1992).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy.polynomial import Polynomial
+
+
+@dataclass(frozen=True)
+class LensModel:
+    """How a lens maps directions to the image."""
+
+    code: int
+    """What the compiled kernels call it."""
+    names: tuple[str, ...]
+    """Of the parameters of its distortion, in COLMAP's order."""
+    numerator: tuple[int, ...]
+    """Which of these are the coefficients of r^2, r^4, ... of the radial factor."""
+    denominator: tuple[int, ...] = ()
+    """Which are those of what it is divided by."""
+    is_equidistant: bool = False
+    """Whether the ideal lens is equidistant instead of perspective."""
+
+
+MODELS: Mapping[str, LensModel] = {
+    "OPENCV": LensModel(0, ("k1", "k2", "p1", "p2"), (0, 1)),
+    "FULL_OPENCV": LensModel(1, ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), (0, 1, 4), (5, 6, 7)),
+    "OPENCV_FISHEYE": LensModel(2, ("k1", "k2", "k3", "k4"), (0, 1, 2, 3), is_equidistant=True),
+    "THIN_PRISM_FISHEYE": LensModel(
+        3, ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"), (0, 1, 4, 5), is_equidistant=True
+    ),
+}
+LENSES = tuple(MODELS)
+LONGEST = max(len(model.names) for model in MODELS.values())
+"""Most parameters of a distortion."""
+
+
+_NOTHING = 1e-12
+"""Coefficients of a polynomial of r^2 that are smaller show only where no lens does."""
+
+
+def fold_radius(model: LensModel, distortion: Float[np.ndarray, "k"]) -> float:
+    """Ideal radius up to which the distorted one grows with it: from there on the model folds the image back onto
+    itself, and means nothing. Infinite for a perspective lens that never folds; at most pi for an equidistant one."""
+    numerator = Polynomial([1.0, *distortion[list(model.numerator)]])  # of r^2
+    denominator = Polynomial([1.0, *distortion[list(model.denominator)]])
+    square = Polynomial([0.0, 1.0])
+    # d(r N / D) / dr = (D (N + 2 r^2 N') - 2 r^2 N D') / D^2
+    slope = denominator * (numerator + 2 * square * numerator.deriv()) - 2 * square * numerator * denominator.deriv()
+    roots = np.concatenate([each.trim(_NOTHING).roots() for each in (slope, denominator)])
+    real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
+    first = float(np.sqrt(real.min())) if len(real) else np.inf
+    return min(first, np.pi) if model.is_equidistant else first

@@ -1,0 +1,254 @@
+"""Projection of points, its derivatives, and its inverse, compiled: the only place that knows the formulas of the
+models (:mod:`cuspid.geometry.cameras.models`)."""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float
+
+from cuspid.kernels import kernel
+
+_OPENCV, _FULL_OPENCV, _OPENCV_FISHEYE = 0, 1, 2
+_STEPS, _SETTLED = 30, 1e-14
+"""Of Newton's method for the inverse; and the step, in units of the ideal image, below which it ends."""
+_WRONG = 1e-9
+"""Where what was found projects farther from the pixel than this, in the same units, there is no inverse."""
+_INSIDE = 0.99
+"""Share of the radius at which the model folds that the search goes back to."""
+_ON_AXIS = 1e-6
+"""Tangent of an angle from the axis below which an equidistant lens is expanded about it."""
+
+
+@kernel
+@no_type_check
+def _radial(model, k, r2):
+    """Radial factor, its derivative by r^2, and what its numerator is divided by."""
+    if model == _OPENCV:
+        return 1 + k[4] * r2 + k[5] * r2 * r2, k[4] + 2 * k[5] * r2, 1.0
+    if model == _FULL_OPENCV:
+        numerator = 1 + r2 * (k[4] + r2 * (k[5] + r2 * k[8]))
+        denominator = 1 + r2 * (k[9] + r2 * (k[10] + r2 * k[11]))
+        radial = numerator / denominator
+        by_r2 = k[4] + r2 * (2 * k[5] + r2 * 3 * k[8])
+        return radial, (by_r2 - radial * (k[9] + r2 * (2 * k[10] + r2 * 3 * k[11]))) / denominator, denominator
+    third, fourth = (k[6], k[7]) if model == _OPENCV_FISHEYE else (k[8], k[9])
+    factor = 1 + r2 * (k[4] + r2 * (k[5] + r2 * (third + r2 * fourth)))
+    return factor, k[4] + r2 * (2 * k[5] + r2 * (3 * third + r2 * 4 * fourth)), 1.0
+
+
+@kernel
+@no_type_check
+def _sideways(model, k):
+    """p1, p2, s1, s2."""
+    if model == _OPENCV_FISHEYE:
+        return 0.0, 0.0, 0.0, 0.0
+    if model <= _FULL_OPENCV:
+        return k[6], k[7], 0.0, 0.0
+    return k[6], k[7], k[10], k[11]
+
+
+@kernel
+@no_type_check
+def _ideal(model, x, y, z):
+    """Where an ideal lens shows a point; of a perspective one only with z > 0."""
+    if model <= _FULL_OPENCV:
+        return x / z, y / z
+    side = np.hypot(x, y)
+    if side <= _ON_AXIS * z:
+        return x / z, y / z
+    share = np.arctan2(side, z) / side
+    return share * x, share * y
+
+
+@kernel
+@no_type_check
+def distorted(model, k, u, v):
+    """Where a lens shows a place of the ideal one, before focal length and principal point."""
+    r2 = u * u + v * v
+    radial, _, _ = _radial(model, k, r2)
+    p1, p2, s1, s2 = _sideways(model, k)
+    return (
+        u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u) + s1 * r2,
+        v * radial + 2 * p2 * u * v + p1 * (r2 + 2 * v * v) + s2 * r2,
+    )
+
+
+@kernel
+@no_type_check
+def _by_ideal(model, k, u, v):
+    """Derivatives of :func:`distorted` by u and v: of the first by both, then of the second."""
+    r2 = u * u + v * v
+    radial, slope, _ = _radial(model, k, r2)
+    p1, p2, s1, s2 = _sideways(model, k)
+    cross = 2 * u * v * slope + 2 * p1 * u + 2 * p2 * v
+    return (
+        radial + 2 * u * u * slope + 2 * p1 * v + 6 * p2 * u + 2 * s1 * u,
+        cross + 2 * s1 * v,
+        cross + 2 * s2 * u,
+        radial + 2 * v * v * slope + 2 * p2 * u + 6 * p1 * v + 2 * s2 * v,
+    )
+
+
+@kernel
+@no_type_check
+def camera_jacobian(model, k, x, y, z, pixel, by_point, by_parameters):
+    """Projection of a point in the camera frame, and its derivatives by the point (2x3) and by the parameters (2xn);
+    columns of the latter beyond those of the model are zero.
+
+    ``k`` is (fx, fy, cx, cy, ...); before a perspective camera z must be positive.
+    """
+    fx, fy = k[0], k[1]
+    u, v = _ideal(model, x, y, z)
+    xd, yd = distorted(model, k, u, v)
+    pixel[0], pixel[1] = fx * xd + k[2], fy * yd + k[3]
+    xu, xv, yu, yv = _by_ideal(model, k, u, v)
+    if model <= _FULL_OPENCV:
+        by_point[0, 0], by_point[0, 1] = fx * xu / z, fx * xv / z
+        by_point[1, 0], by_point[1, 1] = fy * yu / z, fy * yv / z
+        by_point[0, 2] = -(by_point[0, 0] * u + by_point[0, 1] * v)
+        by_point[1, 2] = -(by_point[1, 0] * u + by_point[1, 1] * v)
+    else:
+        # (u, v) = s (x, y) with s the angle from the axis over the distance from it.
+        side2 = x * x + y * y
+        away2 = side2 + z * z
+        if side2 <= (_ON_AXIS * z) ** 2:
+            s, c = 1 / z, -2 / (3 * z * z * z)
+        else:
+            side = np.sqrt(side2)
+            s = np.arctan2(side, z) / side
+            c = (z / away2 - s) / side2
+        ux, uy, vy = s + c * x * x, c * x * y, s + c * y * y
+        by_point[0, 0], by_point[0, 1] = fx * (xu * ux + xv * uy), fx * (xu * uy + xv * vy)
+        by_point[1, 0], by_point[1, 1] = fy * (yu * ux + yv * uy), fy * (yu * uy + yv * vy)
+        by_point[0, 2] = -fx * (xu * x + xv * y) / away2
+        by_point[1, 2] = -fy * (yu * x + yv * y) / away2
+    by_parameters[:] = 0
+    by_parameters[0, 0], by_parameters[1, 1] = xd, yd
+    by_parameters[0, 2], by_parameters[1, 3] = 1, 1
+    r2 = u * u + v * v
+    radial, _, divided = _radial(model, k, r2)
+    a, b = fx * u * r2 / divided, fy * v * r2 / divided
+    by_parameters[0, 4], by_parameters[1, 4] = a, b
+    by_parameters[0, 5], by_parameters[1, 5] = a * r2, b * r2
+    if model == _OPENCV_FISHEYE:
+        by_parameters[0, 6], by_parameters[1, 6] = a * r2 * r2, b * r2 * r2
+        by_parameters[0, 7], by_parameters[1, 7] = a * r2 * r2 * r2, b * r2 * r2 * r2
+        return
+    by_parameters[0, 6], by_parameters[1, 6] = fx * 2 * u * v, fy * (r2 + 2 * v * v)
+    by_parameters[0, 7], by_parameters[1, 7] = fx * (r2 + 2 * u * u), fy * 2 * u * v
+    if model == _OPENCV:
+        return
+    by_parameters[0, 8], by_parameters[1, 8] = a * r2 * r2, b * r2 * r2
+    if model == _FULL_OPENCV:
+        for power in range(3):
+            by_parameters[0, 9 + power], by_parameters[1, 9 + power] = -radial * a, -radial * b
+            a, b = a * r2, b * r2
+        return
+    by_parameters[0, 9], by_parameters[1, 9] = a * r2 * r2 * r2, b * r2 * r2 * r2
+    by_parameters[0, 10], by_parameters[1, 11] = fx * r2, fy * r2
+
+
+@kernel
+@no_type_check
+def _project_points(model, k, limit, points, out):
+    for n in range(points.shape[0]):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        out[n, 0] = out[n, 1] = np.nan
+        if model <= _FULL_OPENCV and not z > 0:
+            continue
+        u, v = _ideal(model, x, y, z)
+        if u * u + v * v <= limit * limit:
+            xd, yd = distorted(model, k, u, v)
+            out[n, 0], out[n, 1] = xd * k[0] + k[2], yd * k[1] + k[3]
+
+
+@kernel
+@no_type_check
+def _derivatives(model, k, points, by_point, by_parameters):
+    pixel = np.zeros(2)
+    for n in range(points.shape[0]):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        if model <= _FULL_OPENCV and not z > 0:
+            by_point[n], by_parameters[n] = np.nan, np.nan
+        else:
+            camera_jacobian(model, k, x, y, z, pixel, by_point[n], by_parameters[n])
+
+
+@kernel
+@no_type_check
+def _undistorted(model, k, limit, a, b):
+    """The place of the ideal lens that is shown at (a, b), by Newton's method; NaN where there is none."""
+    u, v = a, b
+    for _ in range(_STEPS):
+        # What lies beyond the fold would lead to a place on the wrong side of it.
+        length = np.hypot(u, v)
+        if length > limit:
+            u, v = _INSIDE * u * limit / length, _INSIDE * v * limit / length
+        xd, yd = distorted(model, k, u, v)
+        xu, xv, yu, yv = _by_ideal(model, k, u, v)
+        determinant = xu * yv - xv * yu
+        step_u, step_v = (yv * (xd - a) - xv * (yd - b)) / determinant, (xu * (yd - b) - yu * (xd - a)) / determinant
+        if not np.isfinite(step_u + step_v):
+            break
+        u, v = u - step_u, v - step_v
+        if abs(step_u) + abs(step_v) < _SETTLED:
+            break
+    xd, yd = distorted(model, k, u, v)
+    if not abs(xd - a) + abs(yd - b) < _WRONG or np.hypot(u, v) > limit:
+        return np.nan, np.nan
+    return u, v
+
+
+@kernel
+@no_type_check
+def _directions(model, k, limit, pixels, out):
+    straight = not np.any(k[4:])
+    for n in range(pixels.shape[0]):
+        u, v = (pixels[n, 0] - k[2]) / k[0], (pixels[n, 1] - k[3]) / k[1]
+        if not straight:
+            u, v = _undistorted(model, k, limit, u, v)
+        if model <= _FULL_OPENCV:
+            out[n, 0], out[n, 1], out[n, 2] = u, v, 1.0
+            continue
+        angle = np.hypot(u, v)
+        if not angle <= limit:
+            out[n] = np.nan
+            continue
+        share = np.sin(angle) / angle if angle > 0 else 1.0
+        out[n, 0], out[n, 1], out[n, 2] = share * u, share * v, np.cos(angle)
+
+
+def _flat(values: Float[np.ndarray, "*n d"]) -> Float[np.ndarray, "m d"]:
+    return np.ascontiguousarray(values, dtype=np.float64).reshape(-1, values.shape[-1])
+
+
+def project_points(
+    model: int, parameters: Float[np.ndarray, "k"], limit: float, points: Float[np.ndarray, "*n 3"]
+) -> Float[np.ndarray, "*n 2"]:
+    """Pixels of points in the camera frame; NaN behind a perspective camera, and beyond the ideal radius ``limit``."""
+    out = np.empty((*points.shape[:-1], 2))
+    _project_points(model, parameters, limit, _flat(points), out.reshape(-1, 2))
+    return out
+
+
+def projection_derivatives(
+    model: int, parameters: Float[np.ndarray, "k"], points: Float[np.ndarray, "*n 3"]
+) -> tuple[Float[np.ndarray, "*n 2 3"], Float[np.ndarray, "*n 2 k"]]:
+    """Derivatives of the pixels by points in the camera frame, and by the parameters; NaN behind a perspective
+    camera."""
+    count = len(parameters)
+    by_point, by_parameters = np.empty((*points.shape[:-1], 2, 3)), np.empty((*points.shape[:-1], 2, count))
+    _derivatives(model, parameters, _flat(points), by_point.reshape(-1, 2, 3), by_parameters.reshape(-1, 2, count))
+    return by_point, by_parameters
+
+
+def directions_through(
+    model: int, parameters: Float[np.ndarray, "k"], limit: float, pixels: Float[np.ndarray, "*n 2"]
+) -> Float[np.ndarray, "*n 3"]:
+    """Directions in the camera frame through pixels: with Z = 1 of a perspective lens, of unit length of an equidistant
+    one; NaN where the lens shows nothing."""
+    out = np.empty((*pixels.shape[:-1], 3))
+    _directions(model, parameters, limit, _flat(pixels), out.reshape(-1, 3))
+    return out
