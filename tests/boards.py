@@ -59,6 +59,41 @@ def scene(seed: int, board: Board = BOARD, cameras: int = 3, instants: int = 16,
     )
 
 
+LENSES_OF = {
+    "OPENCV": (520.0, (-0.1, 0.03, 1e-3, -1e-3)),
+    "FULL_OPENCV": (340.0, (-0.3, 0.14, 1e-3, -1e-3, -0.05, 0.0, 0.0, 0.0)),
+    "OPENCV_FISHEYE": (300.0, (-0.03, 0.01, -0.004, 5e-4)),
+    "THIN_PRISM_FISHEYE": (300.0, (-0.03, 0.01, 2e-3, -2e-3, -0.004, 5e-4, 0.02, -0.015)),
+}
+"""Focal length in px and distortion of a lens of each model, the last ones of 120 degrees across the image."""
+
+
+def before_lens(model: str, seed: int, instants: int = 16) -> BoardScene:
+    """One camera with a lens of a model, and a board that is held all over its image."""
+    rng = np.random.default_rng(seed)
+    focal, distortion = LENSES_OF[model]
+    camera = Camera(
+        width=SIZE[0],
+        height=SIZE[1],
+        focal_px=np.array([focal, 1.003 * focal]),
+        principal_point_px=np.array([325.0, 236.0]),
+        distortion=np.array(distortion),
+        model=model,
+    )
+    poses = {}
+    for i in range(instants):
+        turn = Rotation.from_euler("xyz", rng.uniform(-40, 40, 3), degrees=True).as_matrix()
+        away = rng.uniform(9, 20)
+        middle = away * np.array([*rng.uniform(-1, 1, 2) * [264, 192] / focal, 1.0])
+        poses[f"{i:02d}"] = Rigid3(turn, middle - turn @ np.array([*BOARD.size_mm, 0]) / 2)
+    return BoardScene(
+        cameras={"cam": camera},
+        cam_from_rig={"cam": Rigid3.identity()},
+        rig_from_board=poses,
+        bending_mm=np.zeros(3),
+    )
+
+
 def moving(seed: int, instants: int = 28) -> BoardScene:
     """Cameras over a board that is moved by hand, filmed."""
     still = scene(seed, instants=1)

@@ -102,6 +102,7 @@ def located(true: Handpiece, poses: Mapping[str, Rigid3]) -> RigCalibration:
             seen = np.flatnonzero(mounted.camera.contains(pixels))
             views |= {(camera, instant): BoardView(seen, pixels[seen])} if len(seen) >= 6 else {}
     return RigCalibration(
+        lenses={},
         rig=true.rig,
         sigma_px=0.1,
         bending_mm=np.zeros(3),

@@ -61,14 +61,12 @@ def choose_lens(
     if asked != "auto":
         return LensChoice(model=asked, held_out_px={}), calibrated_as(asked, views, board, size)
     if len(views) < 2 * LEAST_VIEWS:
-        return LensChoice(model="OPENCV", held_out_px={}), calibrated_as("OPENCV", views, board, size)
+        return _first_that_fits(views, board, size)
     spread = np.unique(np.linspace(0, len(views) - 1, _MOST_VIEWS).astype(int))
     some = [views[k] for k in spread]
     found, squares, failure = dict[str, Adjusted](), dict[str, Float[np.ndarray, "v"]](), None
     for model in _LADDER:
-        if model == _LADDER[-1] and not any(
-            _is_better(each, next(iter(squares.values()))) for each in squares.values()
-        ):
+        if model == _LADDER[-1] and not _is_worth_more(squares):
             break
         try:
             found[model] = calibrated_as(model, some, board, size, found.get("OPENCV"))
@@ -86,6 +84,24 @@ def choose_lens(
     start = found[chosen].scene.cameras[""]
     alone = found[chosen] if len(some) == len(views) else calibrated_alone(views, board, size, [start])
     return LensChoice(model=chosen, held_out_px=rms), alone
+
+
+def _first_that_fits(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> tuple[LensChoice, Adjusted]:
+    """One of the two simplest models: of few views more cannot be told."""
+    try:
+        return LensChoice(model="OPENCV", held_out_px={}), calibrated_as("OPENCV", views, board, size)
+    except ReconstructionError as error:
+        try:
+            found = calibrated_as("OPENCV_FISHEYE", views, board, size)
+        except ReconstructionError:
+            raise error from None
+        return LensChoice(model="OPENCV_FISHEYE", held_out_px={}), found
+
+
+def _is_worth_more(squares: Mapping[str, Float[np.ndarray, "v"]]) -> bool:
+    """Whether another model than the simplest one was better, or the only one that fits."""
+    first = squares.get(_LADDER[0])
+    return first is None or any(_is_better(each, first) for each in squares.values())
 
 
 def calibrated_as(
@@ -164,4 +180,4 @@ def _is_better(one: Float[np.ndarray, "v"], other: Float[np.ndarray, "v"]) -> bo
     gain = gain[np.isfinite(gain)]
     if len(gain) < LEAST_VIEWS:
         return False
-    return float(gain.mean()) > _CHANCE * float(gain.std(ddof=1)) / np.sqrt(len(gain))
+    return float(gain.mean()) > _CHANCE * float(gain.std(ddof=1)) / float(np.sqrt(len(gain)))

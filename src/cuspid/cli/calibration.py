@@ -242,7 +242,7 @@ def _figures(found: RigCalibration, board: Board) -> dict[str, object]:
         "sigma_px": found.sigma_px,
         **(bent if board.terraces == 1 else {"board_step_mm": board.step_mm + found.bending_mm[0]}),
         "board_distance_mm": found.distance_mm,
-        "cameras": {name: asdict(each) for name, each in found.cameras.items()},
+        "cameras": {name: {**asdict(each), "lens": asdict(found.lenses[name])} for name, each in found.cameras.items()},
         "notes": found.notes,
     }
 
@@ -278,6 +278,7 @@ def _print(found: RigCalibration, out: Path) -> None:
     table = Table(title="Calibration")
     for heading in (
         "camera",
+        "lens",
         "views",
         "corners",
         "RMS px",
@@ -285,12 +286,16 @@ def _print(found: RigCalibration, out: Path) -> None:
         "held out px",
         "halves apart: lens, place",
     ):
-        table.add_column(heading, justify="left" if heading == "camera" else "right")
+        table.add_column(heading, justify="left" if heading in ("camera", "lens") else "right")
     for name, each in found.cameras.items():
         apart = [_shown(value, 1) for value in (each.parameters_apart, each.place_apart)]
         pixels = [_shown(value) for value in (each.rms_px, each.alone_px, each.held_out_px)]
-        table.add_row(name, str(each.views), str(each.corners), *pixels, ", ".join(apart))
+        model = found.lenses[name].model
+        table.add_row(name, model, str(each.views), str(each.corners), *pixels, ", ".join(apart))
     console.print(table)
+    for name, choice in found.lenses.items():
+        if choice.model != "OPENCV" and choice.held_out_px:
+            console.print(f"  lens of {name}: {choice.summary}")
     console.print(f"{out / 'handpiece.json'}: {len(found.cameras)} cameras, corners to {found.sigma_px:.2f} px")
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.reporting.pages.page import number, picture_uri, provenance, render_page
-from cuspid.rig import MountedCamera
+from cuspid.rig import MountedCamera, Rig
 from cuspid.storage import CalibrationResult
 
 
@@ -31,6 +31,7 @@ def calibration_page(result: CalibrationResult) -> str:
         cameras=cameras,
         timed=any(each.get("delay_frames") is not None for each in cameras.values()),
         lenses={} if result.rig is None else {name: _lens(each) for name, each in result.rig.cameras.items()},
+        parameter_names=[] if result.rig is None else _parameter_names(result.rig),
         places={} if result.rig is None else {name: _place(each) for name, each in result.rig.cameras.items()},
         light=light,
         notes=[*found["notes"], *([] if light is None else light["notes"])],
@@ -39,17 +40,24 @@ def calibration_page(result: CalibrationResult) -> str:
     )
 
 
-_DIGITS = (1, 1, 1, 1, 4, 4, 5, 5)
-"""Of fx, fy, cx, cy, k1, k2, p1, p2."""
+_DIGITS = {"f": 1, "c": 1, "k": 4, "p": 5, "s": 5}
+"""Of parameters, by the first letters of their names."""
 
 
-def _lens(mounted: MountedCamera) -> list[str]:
-    """Each parameter with its standard deviation."""
-    sigma = _sigmas(mounted.camera.covariance, 8)
-    return [
-        f"{number(value, digits)} ± {number(_known(each), digits)}"
-        for value, each, digits in zip(mounted.camera.parameters, sigma, _DIGITS, strict=True)
-    ]
+def _parameter_names(rig: Rig) -> list[str]:
+    """Of all models of its lenses."""
+    return list(dict.fromkeys(name for each in rig.cameras.values() for name in each.camera.parameter_names))
+
+
+def _lens(mounted: MountedCamera) -> dict[str, Any]:
+    """Its model, and each parameter with its standard deviation."""
+    camera = mounted.camera
+    sigma = _sigmas(camera.covariance, len(camera.parameters))
+    values = {
+        name: f"{number(value, _DIGITS[name[0]])} ± {number(_known(each), _DIGITS[name[0]])}"
+        for name, value, each in zip(camera.parameter_names, camera.parameters, sigma, strict=True)
+    }
+    return {"model": camera.model, "values": values}
 
 
 def _place(mounted: MountedCamera) -> dict[str, Any]:
