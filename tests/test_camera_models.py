@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 
 from cuspid.camera import Camera, undistortion_maps
 from cuspid.errors import InputError
+from cuspid.geometry import Rigid3
 from cuspid.geometry.cameras import LENSES, MODELS, fold_radius, projection_derivatives
+from cuspid.rig import MountedCamera, Rig
 from strategies import LENS_LIMITS, lenses
 
 
@@ -150,3 +152,25 @@ def test_wide_lenses_are_straightened_into_a_given_pinhole() -> None:
 
 def test_the_limits_of_the_lenses_cover_every_parameter() -> None:
     assert {name for model in MODELS.values() for name in model.names} == set(LENS_LIMITS)
+
+
+def test_a_lens_that_folds_within_its_image_is_used_where_it_shows_something() -> None:
+    """As that of a laparoscope whose calibration has a third radial term of -4 (real ones have -15)."""
+    lens = np.array([-0.7, 2.9, 0, 0, -4.0, 0, 0, 0])
+    camera = replace(Camera.from_field_of_view(360, 288, 80.0), model="FULL_OPENCV", distortion=lens)
+    assert camera.shown is not None
+    assert 0.3 < camera.shown.mean() < 0.95
+    assert camera.shown[144, 180]
+    assert not camera.shown[0, 0]
+    assert Camera.from_field_of_view(360, 288, 80.0).shown is None
+    border = np.array([[0.0, 0.0], [360.0, 0.0], [360.0, 288.0]])
+    rays = camera.rim_rays(border)
+    assert np.isfinite(rays).all()
+    assert np.linalg.norm(rays[:, :2], axis=1).max() < camera.fold_radius
+    rig = Rig(
+        {
+            name: MountedCamera(camera, Rigid3(np.eye(3), np.array([x, 0.0, 0.0])))
+            for name, x in (("left", 0.0), ("right", -1.0))
+        }
+    )
+    assert rig.overlap("left", "right", 20.0) > 0.8

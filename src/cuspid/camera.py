@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from cuspid.errors import InputError
 from cuspid.geometry import read_only, unit
@@ -28,6 +28,8 @@ from cuspid.values import shown
 _MOST_SLOPE = float(np.tan(np.deg2rad(70.0)))
 """Of the rays at the border of an image without distortion."""
 _LEAST_AHEAD = 0.05
+_RIM_TICKS = 50
+"""Pixels along each side of an image that stand for all."""
 OPENCV_PIXEL_OFFSET = 0.5
 """COLMAP's pixel coordinate minus OpenCV's for the same place in an image."""
 
@@ -186,6 +188,24 @@ class Camera:
             return found
         ahead = found[..., 2:]
         return found / np.where(ahead > 0, ahead, np.nan)
+
+    def rim_rays(self, border: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 3"]:
+        """Rays through pixels of the border of the image or, where the lens shows nothing at some of them, through a
+        grid of those at which it does."""
+        rays = self.rays(border)
+        if np.isfinite(rays).all():
+            return rays
+        inner = self.rays(self.pixel_centres()[:: -(-self.height // _RIM_TICKS), :: -(-self.width // _RIM_TICKS)])
+        return inner[np.isfinite(inner).all(axis=-1)]
+
+    @cached_property
+    def shown(self) -> Bool[np.ndarray, "h w"] | None:
+        """Where in the image the lens shows something, by its model; None where it does so everywhere."""
+        edge = np.linspace(0, 1, _RIM_TICKS)[:, None] * [self.width, self.height]
+        corners = np.array([[0.0, 0.0], [1, 0], [0, 1], [1, 1]]) * [self.width, self.height]
+        if np.isfinite(self.directions(np.concatenate([edge, corners]))).all():
+            return None
+        return np.isfinite(self.directions(self.pixel_centres())).all(axis=-1)
 
     def pixel_centres(self) -> Float[np.ndarray, "h w 2"]:
         """Coordinates of every pixel centre."""

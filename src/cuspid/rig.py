@@ -125,7 +125,7 @@ class Rig:
             pixels = shares * [mounted.camera.width, mounted.camera.height]
             in_rig = mounted.cam_from_rig.inverse().apply(mounted.camera.rays(pixels) * distance_mm)
             there = other[name].camera.project(other[name].cam_from_rig.apply(in_rig))
-            largest = max(largest, float(np.abs(there - pixels).max()))
+            largest = max(largest, float(np.nanmax(np.abs(there - pixels), initial=0.0)))
         return largest
 
     def overlap(self, first: str, second: str, distance_mm: float) -> float:
@@ -136,7 +136,8 @@ class Rig:
         grid = np.stack(np.meshgrid(cells * one.camera.width, cells * one.camera.height), -1)
         plane = one.camera.rays(grid.reshape(-1, 2)) * distance_mm
         in_other = (other.cam_from_rig @ one.cam_from_rig.inverse()).apply(plane)
-        return float(np.mean(other.camera.contains(other.camera.project(in_other))))
+        shown = np.isfinite(plane).all(axis=1)
+        return float(np.mean(other.camera.contains(other.camera.project(in_other[shown])))) if shown.any() else 0.0
 
     def angle_deg(self, first: str, second: str) -> float:
         """Angle between the optical axes of two cameras."""

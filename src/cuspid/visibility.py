@@ -224,8 +224,8 @@ def slope_bounds(camera: Camera) -> tuple[Float[np.ndarray, "2"], Float[np.ndarr
     ticks = np.linspace(0, 1, 20)
     border = np.array([[t, s] for t in ticks for s in ticks if t in (0, 1) or s in (0, 1)])
     camera = camera.straightened() if camera.lens.is_equidistant else camera
-    rays = camera.rays(border * [camera.width, camera.height])[:, :2]
-    return np.nanmin(rays, axis=0), np.nanmax(rays, axis=0)
+    rays = camera.rim_rays(border * [camera.width, camera.height])[:, :2]
+    return rays.min(axis=0), rays.max(axis=0)
 
 
 def _at_each_pose(

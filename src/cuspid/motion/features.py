@@ -16,13 +16,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from cuspid.camera import OPENCV_PIXEL_OFFSET
+from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.capture import Frame, halved_size
 from cuspid.geometry import distinct_rows
 from cuspid.motion.pictures import Pictures
 from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
-from cuspid.storage.files import write_arrays
+from cuspid.storage.files import digest_of, write_arrays
 from cuspid.storage.stages import Stage
 from cuspid.workers import map_in_threads
 
@@ -163,15 +163,27 @@ def _load(path: Path) -> Features:
         return Features(pixels=kept["pixels"], descriptors=kept["descriptors"], colors=kept["colors"])
 
 
+def _where_shown(mask: UInt8[np.ndarray, "h w"] | None, lens: Camera) -> UInt8[np.ndarray, "h w"] | None:
+    """The mask without what the model of the lens has no direction for."""
+    if lens.shown is None:
+        return mask
+    whole = np.full(lens.shown.shape, 255, dtype=np.uint8) if mask is None else mask
+    return np.where(lens.shown, whole, np.uint8(0))
+
+
 def _detect_kept(
     pictures: Pictures, frame: Frame, camera: str, options: FeatureOptions, stage: Stage | None
 ) -> Features:
     """Features of one image of a capture, from the results of an earlier run where they are there."""
-    mask = pictures.capture.source.mask(frame.name, camera)
+    lens = pictures.capture.handpiece.rig[camera].camera
+    mask = _where_shown(pictures.capture.source.mask(frame.name, camera), lens)
     if stage is None:
         return detect(pictures.image(frame, camera), options, mask)
     path = stage.folder / camera / f"{frame.name}.npz"
-    key = stage.key({"image": pictures.capture.source.digest(frame.name, camera)})
+    made_from = {"image": pictures.capture.source.digest(frame.name, camera)}
+    if lens.shown is not None:
+        made_from["lens"] = digest_of([lens.model, lens.parameters])
+    key = stage.key(made_from)
     if stage.has(key, [path]):
         return _load(path)
     features = detect(pictures.image(frame, camera), options, mask)

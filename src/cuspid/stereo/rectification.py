@@ -137,7 +137,7 @@ def _field_of_view(mounted: MountedCamera, rect_from_rig: Float[np.ndarray, "3 3
     if mounted.camera.lens.is_equidistant:  # the border may lie behind the camera
         ideal = mounted.camera.straightened()
         return _field_of_view(replace(mounted, camera=ideal), rect_from_rig)
-    rays = mounted.camera.rays(np.array(edge, dtype=np.float64)) @ mounted.cam_from_rig.rotation @ rect_from_rig.T
+    rays = mounted.camera.rim_rays(np.array(edge, dtype=np.float64)) @ mounted.cam_from_rig.rotation @ rect_from_rig.T
     normalized = rays[:, :2] / np.maximum(rays[:, 2:], 0.2)
     return np.stack([normalized.min(axis=0), normalized.max(axis=0)])
 
