@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -11,6 +12,7 @@ from jaxtyping import UInt8
 
 from cuspid.board import Board
 from cuspid.calibration.corners import find_corners
+from cuspid.calibration.lattice import find_lattice
 from cuspid.errors import InputError
 
 MOST_TRIED = 6
@@ -63,7 +65,7 @@ def _others(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, 
                 yield f"the ids of its markers begin at {first}: give --first-id {first}", with_id, False
     light = "--no-inverted" if board.inverted else "--inverted"
     yield f"light and dark are swapped: give {light}", replace(board, inverted=not board.inverted), False
-    for columns, rows, why in _sizes(board):
+    for columns, rows, why in (*_seen_sizes(board, images), *_sizes(board)):
         sized = _possible(board, columns=columns, rows=rows)
         if sized is not None:
             yield f"{why}: give --columns {columns} --rows {rows}", sized, False
@@ -76,6 +78,20 @@ def _others(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, 
         yield "it has no markers: give --kind chessboard", replace(board, kind="chessboard", terraces=1), False
     else:
         yield "it has markers: give --kind charuco", replace(board, kind="charuco"), False
+
+
+def _seen_sizes(board: Board, images: Sequence[Gray]) -> Iterator[tuple[int, int, str]]:
+    """Numbers of squares of the chessboard that most images show, whatever it is said to be."""
+    if board.kind != "chessboard":
+        return
+    found = [each.size for each in (find_lattice(image) for image in images) if each is not None]
+    if not found:
+        return
+    (columns, rows), count = Counter(found).most_common(1)[0]
+    if count <= len(images) / 2 or (columns, rows) == (board.columns - 1, board.rows - 1):
+        return
+    why = f"the images show a chessboard of {columns + 1} x {rows + 1} squares"
+    yield (columns + 1, rows + 1, why) if board.columns >= board.rows else (rows + 1, columns + 1, why)
 
 
 def _sizes(board: Board) -> Iterator[tuple[int, int, str]]:

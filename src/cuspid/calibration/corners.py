@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from cuspid.board import Board
+from cuspid.calibration.lattice import find_lattice, is_as_large, is_larger
 from cuspid.camera import OPENCV_PIXEL_OFFSET
 
 LEAST_CORNERS = 6
@@ -37,8 +38,8 @@ Views = Mapping[tuple[str, str], BoardView]
 def find_corners(gray: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | None:
     """The corners of the board in an image, to a fraction of a pixel; None if too few are found.
 
-    A plain chessboard must be seen completely (A. Duda, U. Frese, BMVC 2018), and is searched for exhaustively where it
-    is not found at once; of a ChArUco board any part may be seen
+    A plain chessboard must be seen from border to border (A. Duda, U. Frese, BMVC 2018; where it is bent by a strong
+    lens or partly hidden by glare, :mod:`cuspid.calibration.lattice`); of a ChArUco board any part may be seen
     (S. Garrido-Jurado et al., Pattern Recognition 47, 2014). Each corner is searched for where the two markers beside
     it predict it, so that steps elsewhere do not matter.
     """
@@ -72,11 +73,20 @@ def _charuco(image: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | None:
 def _chessboard(image: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | None:
     size = (board.columns - 1, board.rows - 1)
     found, pixels = cv2.findChessboardCornersSB(image, size)
-    if not found:  # its further flags find boards where there are none
-        found, pixels = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_EXHAUSTIVE)
-    if not found:
-        return None
-    return BoardView(np.arange(size[0] * size[1]), pixels.reshape(-1, 2) + OPENCV_PIXEL_OFFSET)
+    if found:
+        return BoardView(np.arange(size[0] * size[1]), pixels.reshape(-1, 2) + OPENCV_PIXEL_OFFSET)
+    lattice = find_lattice(image)
+    if lattice is None or not is_as_large(lattice, board):
+        # Of a larger chessboard it would find a part.
+        return None if lattice is not None and is_larger(lattice, board) else _exhaustively(image, size)
+    numbered = lattice.numbered(board)
+    return None if numbered is None else BoardView(numbered[0], numbered[1] + OPENCV_PIXEL_OFFSET)
+
+
+def _exhaustively(image: UInt8[np.ndarray, "h w"], size: tuple[int, int]) -> BoardView | None:
+    """With the one flag of OpenCV's that does not find boards where there are none."""
+    found, pixels = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_EXHAUSTIVE)
+    return BoardView(np.arange(size[0] * size[1]), pixels.reshape(-1, 2) + OPENCV_PIXEL_OFFSET) if found else None
 
 
 def _on_a_line(points: Float[np.ndarray, "n 2"]) -> bool:

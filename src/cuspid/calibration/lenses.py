@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.board import Board
-from cuspid.calibration.bundle import Adjusted, adjust_board, of_instants
+from cuspid.calibration.bundle import Adjusted, adjust_board, in_front, of_instants
 from cuspid.calibration.corners import BoardView
 from cuspid.calibration.start import LEAST_VIEWS, calibrated_alone
 from cuspid.camera import Camera
@@ -28,10 +28,11 @@ LensName = Literal["auto", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRIS
 _LADDER = ("OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "THIN_PRISM_FISHEYE")
 """The models, simplest first. The last one is tried only where one of those before it is better than the first."""
 _FOLDS, _MOST_VIEWS = 4, 24
-_CHANCE = 3.0
-"""Standard errors beyond which one model is better than another."""
+_CHANCE, _CHANCE_ALIKE = 2.0, 1.0
+"""Standard errors beyond which a model with more parameters is better than another (L. Breiman et al., Classification
+and Regression Trees, 1984, take one), and one with as many."""
 _HALF_VIEWS_DEG = (20.0, 35.0, 50.0, 65.0, 80.0)
-"""Half the angle of view across the image, from which the search for an equidistant lens begins."""
+"""Half the angle of view across the image, from which the search begins where OpenCV's finds no camera."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,9 +79,10 @@ def choose_lens(
         raise failure
     chosen = next(iter(squares))
     for model in list(squares)[1:]:
-        if _is_better(squares[model], squares[chosen]):
+        as_many = len(MODELS[model].names) == len(MODELS[chosen].names)
+        if _is_better(squares[model], squares[chosen], _CHANCE_ALIKE if as_many else _CHANCE):
             chosen = model
-    rms = {model: float(np.sqrt(np.nanmean(each))) for model, each in squares.items()}
+    rms = {model: float(np.sqrt(np.mean(each[np.isfinite(each)]))) for model, each in squares.items()}
     start = found[chosen].scene.cameras[""]
     alone = found[chosen] if len(some) == len(views) else calibrated_alone(views, board, size, [start])
     return LensChoice(model=chosen, held_out_px=rms), alone
@@ -101,7 +103,7 @@ def _first_that_fits(views: Sequence[BoardView], board: Board, size: tuple[int, 
 def _is_worth_more(squares: Mapping[str, Float[np.ndarray, "v"]]) -> bool:
     """Whether another model than the simplest one was better, or the only one that fits."""
     first = squares.get(_LADDER[0])
-    return first is None or any(_is_better(each, first) for each in squares.values())
+    return first is None or any(_is_better(each, first, _CHANCE_ALIKE) for each in squares.values())
 
 
 def calibrated_as(
@@ -113,15 +115,12 @@ def calibrated_as(
     """
     if model == "OPENCV":
         return calibrated_alone(views, board, size)
-    starts = []
     try:
         simple = simple or calibrated_alone(views, board, size)
-        starts.append(as_model(simple.scene.cameras[""], model, np.concatenate([view.pixels for view in views])))
-    except ReconstructionError:
-        if not MODELS[model].is_equidistant:
-            raise
-    if MODELS[model].is_equidistant and not starts:
-        starts += [_equidistant(model, size, half_deg) for half_deg in _HALF_VIEWS_DEG]
+        pixels = np.concatenate([view.pixels for view in views])
+        starts = [as_model(simple.scene.cameras[""], model, pixels)]
+    except ReconstructionError:  # too far from such a lens
+        starts = [_ideal(model, size, half_deg) for half_deg in _HALF_VIEWS_DEG]
     return calibrated_alone(views, board, size, starts)
 
 
@@ -143,13 +142,14 @@ def as_model(camera: Camera, model: str, pixels: Float[np.ndarray, "n 2"]) -> Ca
     return replace(camera, model=model, focal_px=share * camera.focal_px, distortion=distortion, covariance=None)
 
 
-def _equidistant(model: str, size: tuple[int, int], half_deg: float) -> Camera:
-    """An ideal one, with half the angle of view across the image."""
-    width, height = size
+def _ideal(model: str, size: tuple[int, int], half_deg: float) -> Camera:
+    """A lens without distortion, with half the angle of view across the image."""
+    (width, height), half = size, np.deg2rad(half_deg)
+    reach = half if MODELS[model].is_equidistant else np.tan(half)
     return Camera(
         width=width,
         height=height,
-        focal_px=np.full(2, width / 2 / np.deg2rad(half_deg)),
+        focal_px=np.full(2, width / 2 / reach),
         principal_point_px=np.array([width / 2, height / 2]),
         distortion=np.zeros(len(MODELS[model].names)),
         model=model,
@@ -158,7 +158,8 @@ def _equidistant(model: str, size: tuple[int, int], half_deg: float) -> Camera:
 
 def _held_out(found: Adjusted, views: Sequence[BoardView], board: Board) -> Float[np.ndarray, "v"]:
     """Mean square of the residuals of each view by cameras that were calibrated without it; NaN where the view fits no
-    camera. Raises ReconstructionError where too few views are left."""
+    camera, infinite where such a camera does not show all of it. Raises ReconstructionError where too few views are
+    left."""
     scene, count = found.scene, len(views)
     named = {("", instant): views[int(instant)] for instant in scene.rig_from_board}
     squares = np.full(count, np.nan)
@@ -169,15 +170,20 @@ def _held_out(found: Adjusted, views: Sequence[BoardView], board: Board) -> Floa
             continue
         seen = adjust_board(of_instants(scene, {instant for _, instant in rest}), rest, board)
         held = replace(seen.scene, rig_from_board=of_instants(scene, {key[1] for key in out}).rig_from_board)
-        for (_, instant), residuals in adjust_board(held, out, board, only_boards=True).residuals.items():
+        shown = in_front(held, out, board)
+        squares[[int(instant) for _, instant in out if ("", instant) not in shown]] = np.inf
+        if not shown:
+            continue
+        held = of_instants(held, {instant for _, instant in shown})
+        for (_, instant), residuals in adjust_board(held, shown, board, only_boards=True).residuals.items():
             squares[int(instant)] = np.mean(residuals**2)
     return squares
 
 
-def _is_better(one: Float[np.ndarray, "v"], other: Float[np.ndarray, "v"]) -> bool:
-    """Whether the residuals of the same views are smaller, by more than chance."""
-    gain = np.log(other / one)
-    gain = gain[np.isfinite(gain)]
-    if len(gain) < LEAST_VIEWS:
+def _is_better(one: Float[np.ndarray, "v"], other: Float[np.ndarray, "v"], sigmas: float) -> bool:
+    """Whether the residuals of the same views are smaller, by more than so many standard errors."""
+    both = np.isfinite(one + other)
+    if both.sum() < LEAST_VIEWS or np.isinf(one).sum() > np.isinf(other).sum():
         return False
-    return float(gain.mean()) > _CHANCE * float(gain.std(ddof=1)) / float(np.sqrt(len(gain)))
+    gain = np.log(other[both] / one[both])
+    return float(gain.mean()) > sigmas * float(gain.std(ddof=1)) / float(np.sqrt(len(gain)))
