@@ -125,7 +125,7 @@ def _fine() -> _Candidates:
     return _Candidates.of(np.concatenate([fine, _coarse().changes]))
 
 
-_Choice = tuple[Float[np.ndarray, "k 6"], Float[np.ndarray, "k"]]
+_Choice = tuple[Float[np.ndarray, "_ 6"], Float[np.ndarray, "_"]]
 """Some candidates of a station, and what each costs by itself."""
 
 
