@@ -122,6 +122,8 @@ class ScanPath:
     """Travel at each frame."""
     steady: SteadyPath = field(repr=False)
     """The trajectory of a steady hand."""
+    further_frames: int = 0
+    """About how many of the frames further passes take."""
     seen: Mapping[int, float] = field(default_factory=dict)
     """Approximate share (0 to 1) of the open surface of each crown along the path that two cameras see at once, by FDI
     number; under 0, that of all crowns together."""
@@ -177,7 +179,8 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
             f"scan path: with the handpiece {options.clearance_mm:g} mm from the jaw, no camera sees it in focus; "
             "use a narrower handpiece, a larger depth of field or a smaller --clearance-mm"
         )
-    path = replace(path, seen=_seen(crowns, handpiece, path, options.tooth))
+    seen, further = _seen(crowns, handpiece, path, options.tooth), _further_frames(first, path)
+    path = replace(path, seen=seen, further_frames=further)
     notes = (_gap_notes(steady), _detour_notes(jaw, steady, detour), _further_pass_notes(steady, first, path))
     across = _crossing_notes(jaw, path) if options.cross_sweep else ()
     for note in chain(*notes, across, _blind_notes(path), _unseen_notes(path)):
@@ -367,16 +370,23 @@ def _near_teeth(jaw: Jaw, places: Float[np.ndarray, "n 3"]) -> str:
     return " (near " + ", ".join(str(jaw.teeth[index]) for index in np.unique(nearest)) + ")"
 
 
+def _further_frames(first: SteadyPath, path: ScanPath) -> int:
+    """By the length of the passes; ``first`` is the path without further ones."""
+    passes_mm = path.steady.legs_end_mm - path.steady.span_mm[0]
+    return round((len(path.rig_from_world) - len(path.cross_sweep)) * (1 - float(np.ptp(first.span_mm)) / passes_mm))
+
+
 def _further_pass_notes(steady: SteadyPath, first: SteadyPath, path: ScanPath) -> tuple[str, ...]:
     """What further passes cost."""
     rolls = {leg.roll_deg for leg in first.legs}
     further = [leg for leg in steady.legs if leg.roll_deg not in rolls]
     if not further:
         return ()
-    frames, passes_mm = len(path.rig_from_world), steady.legs_end_mm - steady.span_mm[0]
-    more = round((frames - len(path.cross_sweep)) * (1 - np.ptp(first.span_mm) / passes_mm))
     what = ", ".join(f"{leg.roll_deg:+.0f} deg over {leg.length_mm:.0f} mm" for leg in further)
-    return (f"scan path: further passes, rolled towards the cheek by {what}, take about {more} of {frames} frames",)
+    return (
+        f"scan path: further passes, rolled towards the cheek by {what}, take about {path.further_frames} of "
+        f"{len(path.rig_from_world)} frames",
+    )
 
 
 def _crossing_notes(jaw: Jaw, path: ScanPath) -> tuple[str, ...]:
