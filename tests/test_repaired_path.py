@@ -51,6 +51,18 @@ def test_a_frame_that_nearly_fits_is_lifted_a_little_and_its_neighbours_with_it(
     assert not moves[15:].any()
 
 
+def test_a_large_repair_begins_before_it_is_needed() -> None:
+    heights = np.full(21, 1.6)
+    heights[10] = -1.4
+    poses = over_the_ball(heights)
+    found = repaired(BALL, poses)
+    assert min(BALL.clearance(pose)[0] for pose in found) >= 0.5
+    moves = np.array([away_mm(*pair) for pair in zip(found, poses, strict=True)])
+    assert 2.5 < moves[10] < 4.5
+    assert (np.diff(moves[5:11]) > 0).sum() >= 4
+    assert np.abs(np.diff(moves)).max() < 0.5 * moves[10]
+
+
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10**6))
 def test_whatever_the_frames_all_fit_afterwards(seed: int) -> None:

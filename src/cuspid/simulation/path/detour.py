@@ -45,6 +45,8 @@ _KEPT = 150
 """Number of candidates per station from which the shortest path chooses."""
 _AT_ONCE = 256
 """Candidates that are looked at together, those nearest to the steady pose first."""
+_SHARES, _NEEDED = np.arange(0.1, 1.0, 0.1), 20
+"""Parts of what a frame needs of which its neighbours have the choice, and for how many frames at most."""
 _OUT = 12
 """Number of heights at which a handpiece that fits nowhere else is tried, up to where it fits."""
 _STATION_MM = 1.0
@@ -149,7 +151,9 @@ def repaired(room: Room, rig_from_world: Sequence[Rigid3]) -> list[Rigid3]:
     if not blocked.any():
         return list(rig_from_world)
     roomy = replace(room, clearance_mm=room.clearance_mm + _MARGIN_MM)
-    changes = _changes(rig_from_world, blocked, partial(_least, roomy))
+    needed = np.array([_least(roomy, rig_from_world[index])[0][0] for index in np.flatnonzero(blocked).tolist()])
+    parts = np.multiply.outer(_SHARES, needed[np.linspace(0, len(needed) - 1, min(len(needed), _NEEDED)).astype(int)])
+    changes = _changes(rig_from_world, blocked, partial(_eased_least, roomy, parts.reshape(-1, 6)))
     return [
         _changed(change) @ pose if change.any() else pose for change, pose in zip(changes, rig_from_world, strict=True)
     ]
@@ -179,6 +183,13 @@ def _fitting(room: Room, crowns: CrownPoints, handpiece: Handpiece, pose: Rigid3
 def _least(room: Room, pose: Rigid3) -> _Choice:
     """Those that change a frame least."""
     return _best(room, pose, _fine(), lambda motions: np.zeros(len(motions)))
+
+
+def _eased_least(room: Room, parts: Float[np.ndarray, "k 6"], pose: Rigid3) -> _Choice:
+    """Those, and parts of what frames nearby need, so that there is a smooth way to it."""
+    changes, costs = _least(room, pose)
+    fits = room.fits(pose, [_changed(part) for part in parts])
+    return np.concatenate([changes, parts[fits]]), np.concatenate([costs, _off(parts[fits])])
 
 
 def _best(
