@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,33 +14,46 @@ from cuspid.handpiece.designs import DesignOptions, essential_four
 from cuspid.jaw import Jaw
 from cuspid.simulation import stage
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
+from cuspid.workers import usable_cores
 
 
-def rendered(images: int, total: int, seconds: float, before: int = 0) -> Iterator[tuple[int, int]]:
-    """As if each image took so long; some were there before."""
-    for done in range(before + 1, before + images + 1):
-        time.sleep(seconds)
-        yield done, total
+class Clock:
+    """Goes on only while something is rendered."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.seconds = 0.0
+        monkeypatch.setattr(stage, "time", SimpleNamespace(perf_counter=lambda: self.seconds))
+
+    def rendered(self, images: int, total: int, each_s: float, before: int = 0) -> Iterator[tuple[int, int]]:
+        """Each image takes so long, the very first ones longer; some were there before."""
+        for done in range(before + 1, before + images + 1):
+            self.seconds += each_s if done > before + usable_cores() else 100.0
+            yield done, total
 
 
-def test_the_time_is_that_of_the_first_images(caplog: pytest.LogCaptureFixture) -> None:
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    return Clock(monkeypatch)
+
+
+def test_the_time_is_that_of_the_first_images(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
+    timed = 4 * usable_cores()
     with caplog.at_level("INFO", logger="cuspid"):
-        steps = list(stage._foretold(rendered(20, 40_020, 0.005, before=20), ["one", "two"]))
-    assert steps == [(done, 40_020) for done in range(21, 41)]
-    (told,) = caplog.messages
-    minutes = float(told.split("about ")[1].split(" min")[0])
-    assert 40_000 * 0.005 / 60 - 1 < minutes < 3 * 40_000 * 0.005 / 60
-    assert "of 40,020 images are to come" in told
-    assert told.endswith("; for less: one, two")
+        steps = list(stage._foretold(clock.rendered(timed + 9, 1220, 0.5, before=20), ["one", "two"]))
+    assert steps == [(done, 1220) for done in range(21, timed + 30)]
+    left = 1200 - timed
+    assert caplog.messages == [
+        f"simulation: {left:,} of 1,220 images are to come, about {left / 120:.0f} min here; for less: one, two"
+    ]
 
 
-def test_short_work_offers_nothing_shorter(caplog: pytest.LogCaptureFixture) -> None:
+def test_short_work_offers_nothing_shorter(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
+    images = 40 * usable_cores()
     with caplog.at_level("INFO", logger="cuspid"):
-        list(stage._foretold(rendered(60, 60, 0.0), ["one"]))
-        list(stage._foretold(rendered(1, 1, 0.0), ["one"]))
+        list(stage._foretold(clock.rendered(images, images, 0.01), ["one"]))
+        list(stage._foretold(clock.rendered(1, 1, 0.01), ["one"]))
     (told,) = caplog.messages
-    assert "of 60 images are to come, about 0 s here" in told
-    assert "for less" not in told
+    assert told.endswith(f"of {images} images are to come, about {0.01 * 36 * usable_cores():.0f} s here")
 
 
 def test_the_forecast_of_fewer_passes_is_about_right(coarse_phantom: Jaw) -> None:
