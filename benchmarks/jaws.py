@@ -1,14 +1,14 @@
 """Scan real jaws and parts of them, each without options of its own.
 
     python benchmarks/jaws.py FOLDER [--work build/jaws] [--size half] [--passes auto] [--only 001 quadrant] [--plan]
-                              [--add]
+                              [--seeds 1] [--add]
 
 FOLDER holds meshes of jaws, ``lower`` or ``upper`` in their names; those of fewer than 30,000 faces are also scanned
 after two Loop subdivisions, for their facets are larger than teeth are smooth. Quadrants, single teeth and jaws with
 gaps are cut from labelled ones, with 3 mm of what is around them, turned at random and without their labels; where
-teeth are taken out of an arch the gum around them stays, as in a mouth. ``--plan`` only plans the paths. Finished scans
-are kept in the work folder and not run again; ``--add`` keeps those of the result file, too, each with the commit that
-it is of.
+teeth are taken out of an arch the gum around them stays, as in a mouth. ``--plan`` only plans the paths, for so many
+seeds of the hand, and tells how near the body comes to the jaw. Finished scans are kept in the work folder and not run
+again; ``--add`` keeps those of the result file, too, each with the commit that it is of.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from cuspid.jaw import ARCHES, GUM, Arch, Jaw
 from cuspid.mesh import Mesh, edges_of
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.rig import Handpiece
+from cuspid.room import Room
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 from cuspid.storage import read_json, read_poses, write_json
 from cuspid.studies.grid import Case, Value, Work, run_grid
@@ -127,7 +128,7 @@ def cut_out(jaw: Jaw, teeth: tuple[int, ...], *, gaps: bool) -> Mesh:
 
 
 def judge(
-    *, file: str, part: str, smooth: bool, pixels: int, passes: str, plan_only: bool, scans: Path
+    *, file: str, part: str, smooth: bool, pixels: int, passes: str, plan_only: bool, seeds: int, scans: Path
 ) -> dict[str, Value]:
     """The figures of one jaw. A scan that was cut short goes on where it stopped; a finished one is not kept."""
     jaw = jaw_of(file, part, smooth)
@@ -135,12 +136,21 @@ def judge(
     path_options = ScanPathOptions(passes="auto" if passes == "auto" else "turns")
     begin, begin_cpu = time.perf_counter(), time.process_time()
     path = plan_scan_path(jaw, handpiece, path_options, np.random.default_rng([0, 1]))
+    took, took_cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
+    others = (
+        plan_scan_path(jaw, handpiece, path_options, np.random.default_rng([seed, 1])) for seed in range(1, seeds)
+    )
+    room = Room(jaw.mesh, handpiece.solid, path_options.clearance_mm)
     planned: dict[str, Value] = {
         "commit": commit(),
         "faces": len(jaw.mesh.faces),
         "frames": len(path.rig_from_world),
-        "plan_s": time.perf_counter() - begin,
-        "plan_cpu_s": time.process_time() - begin_cpu,
+        "plan_s": took,
+        "plan_cpu_s": took_cpu,
+        "clearance_mm": min(
+            room.clearance(pose)[0] for each in (path, *others) for pose in each.rig_from_world.values()
+        ),
+        "seeds": seeds,
         "minimum_overlap_pct": 100 * path.minimum_overlap,
         "seen_pct": 100 * path.seen[GUM],
     }
@@ -230,13 +240,22 @@ def main() -> None:
     parser.add_argument("--size", choices=("half", "full"), default="half", help="of the images: 250 or 500 px")
     parser.add_argument("--passes", choices=("turns", "auto"), default="turns")
     parser.add_argument("--plan", action="store_true", help="only plan the paths")
+    parser.add_argument("--seeds", type=int, default=1, help="of the hand, for --plan")
     arguments = parser.parse_args()
     auto = ["auto"] if arguments.passes == "auto" else []
     kind = "_".join(["plan" if arguments.plan else arguments.size, *auto])
     pixels = 500 if arguments.size == "full" else 250
     known = list(cases({path.stem: path for path in sorted(arguments.folder.rglob("*.ply"))}))
     work, out = arguments.work / kind, arguments.out or HERE / "results" / f"jaws_{kind}.json"
-    how = partial(judge, pixels=pixels, passes=arguments.passes, plan_only=arguments.plan, scans=work / "unfinished")
+    seeds = arguments.seeds if arguments.plan else 1
+    how = partial(
+        judge,
+        pixels=pixels,
+        passes=arguments.passes,
+        plan_only=arguments.plan,
+        seeds=seeds,
+        scans=work / "unfinished",
+    )
     scans = figures_of(known, how, work, out, arguments)
     write_json(out, {"kind": kind, "cases": len(known), "scans": scans, **conditions()})
 

@@ -50,11 +50,11 @@ def part_of(jaw: Jaw, teeth: tuple[int, ...]) -> Jaw:
 @pytest.mark.parametrize("anchored", list(product((False, True), repeat=2)))
 def test_the_chain_is_the_cheapest_of_all(anchored: tuple[bool, bool]) -> None:
     rng = np.random.default_rng(4)
-    stations = [(rng.normal(0, 1, (4, 5)) * _UNITS, rng.uniform(0, 3, 4)) for _ in range(4)]
+    stations = [(rng.normal(0, 1, (4, 6)) * _UNITS, rng.uniform(0, 3, 4)) for _ in range(4)]
 
     def cost(choice: tuple[int, ...]) -> float:
         rows = [station[0][index] for station, index in zip(stations, choice, strict=True)]
-        rows = [np.zeros(5)] * anchored[0] + rows + [np.zeros(5)] * anchored[1]
+        rows = [np.zeros(6)] * anchored[0] + rows + [np.zeros(6)] * anchored[1]
         steps = sum(np.sum(((b - a) / _UNITS) ** 2) for a, b in pairwise(rows))
         return _APART * steps + sum(station[1][index] for station, index in zip(stations, choice, strict=True))
 
@@ -258,7 +258,7 @@ def test_frames_are_evaluated_by_all_their_cameras() -> None:
 def test_a_detour_is_about_what_is_looked_at() -> None:
     from cuspid.simulation.path.detour import _changed
 
-    change = _changed(np.array([0.5, 2.0, *np.deg2rad([10.0, 0, 0])])).inverse()
-    np.testing.assert_allclose(change.translation, [0, 0.5, 2.0], atol=1e-12)
+    change = _changed(np.array([0.1, 0.5, 2.0, *np.deg2rad([10.0, 0, 0])])).inverse()
+    np.testing.assert_allclose(change.translation, [0.1, 0.5, 2.0], atol=1e-12)
     assert np.rad2deg(np.linalg.norm(change.rotation_vector)) == pytest.approx(10)
     assert isinstance(change, Rigid3)

@@ -11,8 +11,9 @@ from scipy.ndimage import maximum_filter
 from scipy.spatial import KDTree
 
 from cuspid.errors import InputError
-from cuspid.geometry import Rigid3, lengths_along, read_only
+from cuspid.geometry import Rigid3, lengths_along, owned, read_only
 from cuspid.jaw import GUM, Jaw
+from cuspid.workers import computed_once
 
 _GRID_MM = 0.25
 """Spacing of the height map in which the arch is found."""
@@ -44,10 +45,14 @@ class ArchCurve:
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", read_only(self.points))
 
-    @property
+    @computed_once
     def lengths_mm(self) -> Float[np.ndarray, "n"]:
         """Length of the curve up to each sample."""
-        return lengths_along(self.points)
+        return owned(lengths_along(self.points))
+
+    @computed_once
+    def _tangents(self) -> Float[np.ndarray, "n 3"]:
+        return owned(np.gradient(self.points, self.lengths_mm, axis=0))
 
     def span_of(self, points: Float[np.ndarray, "m 3"]) -> tuple[float, float]:
         """The stretch of the curve (mm from its start) beside which most of the points lie."""
@@ -62,9 +67,8 @@ class ArchCurve:
     def rig_from_world(self, length_mm: float) -> Rigid3:
         """A handpiece held upright over a point of the curve; straight on beyond its ends."""
         lengths = self.lengths_mm
-        tangents = np.gradient(self.points, lengths, axis=0)
         at = np.clip(length_mm, 0, lengths[-1])
-        tangent = np.array([np.interp(at, lengths, tangents[:, axis]) for axis in range(3)])
+        tangent = np.array([np.interp(at, lengths, self._tangents[:, axis]) for axis in range(3)])
         tangent /= np.linalg.norm(tangent)
         place = np.array([np.interp(at, lengths, self.points[:, axis]) for axis in range(3)])
         buccal = np.cross([0, 0, 1.0], tangent)

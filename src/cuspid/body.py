@@ -77,7 +77,7 @@ class Body:
         that part."""
         boxes = self.parts.values()
         distance, part = np.empty(len(points)), np.empty(len(points), dtype=np.int64)
-        _distances(
+        box_distances(
             np.ascontiguousarray(points, dtype=np.float64),
             np.stack([box.box_from_rig.rotation for box in boxes]),
             np.stack([box.box_from_rig.translation for box in boxes]),
@@ -90,7 +90,8 @@ class Body:
 
 @kernel
 @no_type_check
-def _distances(points, rotations, translations, halves, distance, part):
+def box_distances(points, rotations, translations, halves, distance, part):
+    """Fill in the signed distance from points to the nearest of several boxes, and its index."""
     for n in range(len(points)):
         distance[n], part[n] = np.inf, -1
         for b in range(len(halves)):

@@ -12,16 +12,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import igl
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import map_coordinates
 
-from cuspid.body import CAMERA_MM, LED_MM, Body
+from cuspid.body import CAMERA_MM, LED_MM, Body, box_distances
 from cuspid.errors import InputError
-from cuspid.geometry import Rigid3
+from cuspid.geometry import Rigid3, composed
 from cuspid.kernels import kernel
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
@@ -31,12 +30,15 @@ _LOG = logging.getLogger("cuspid")
 
 _APART_MM = 0.3
 """Largest distance between points on the surface along an edge."""
-_PITCH_MM = 0.15
-"""Spacing of the grid of distances to the body: their errors stay below a hundredth of a millimetre away from its
-edges."""
+_PITCH_MM = 0.25
+"""Spacing of the grid of distances to the body. It decides where it can, and the exact distance elsewhere."""
+_OFF_MM = _PITCH_MM * float(np.sqrt(3) / 2)
+"""How far it may be from that at the nearest node of the grid: it changes nowhere faster than one's place."""
 _INSIDE_PITCH_MM = 1.0
 """Spacing of the grid of winding numbers; nearer to the surface than this, the distance decides."""
 _INSIDE = 0.5
+_LEAF = 8
+"""Least number of points in the smallest balls of the tree."""
 FAR_MM = 3.0
 """Distances are computed up to this far beyond the clearance."""
 
@@ -58,6 +60,48 @@ class _Grid:
 
 
 @dataclass(frozen=True, eq=False)
+class _Balls:
+    """Points in a balanced binary tree of balls: the two halves of ball ``k`` are ``2 k + 1`` and ``2 k + 2``."""
+
+    points: Float[np.ndarray, "n 3"]
+    """Those of a smallest ball are consecutive, in the order of these balls; some occur twice."""
+    centres: Float[np.ndarray, "b 3"]
+    radii: Float[np.ndarray, "b"]
+
+    @staticmethod
+    def around(points: Float[np.ndarray, "n 3"]) -> _Balls:
+        """Halved across the longest side of the box around them, again and again."""
+        levels = max(0, int(np.log2(len(points) / _LEAF)))
+        leaf = -(-len(points) // 2**levels)
+        points = points[np.arange(leaf * 2**levels) % len(points)]
+        centres, radii = np.empty((2 ** (levels + 1) - 1, 3)), np.empty(2 ** (levels + 1) - 1)
+        _halve(points, centres, radii)
+        return _Balls(points, centres, radii)
+
+
+class _Surface(NamedTuple):
+    """A jaw as arrays for the compiled search."""
+
+    points: np.ndarray
+    centres: np.ndarray
+    radii: np.ndarray
+    winding: np.ndarray
+    winding_origin: np.ndarray
+
+
+class _Solid(NamedTuple):
+    """A body likewise."""
+
+    rotations: np.ndarray
+    translations: np.ndarray
+    halves: np.ndarray
+    middles: np.ndarray
+    bounds: np.ndarray
+    distances: np.ndarray
+    origin: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class Room:
     """A jaw, and the body of a handpiece that moves around it."""
 
@@ -70,19 +114,14 @@ class Room:
 
     def fits(self, rig_from_world: Rigid3, pose_from_rig: Sequence[Rigid3]) -> Bool[np.ndarray, "n"]:
         """Whether the body fits at each of several poses, given relative to one pose."""
-        rotations = np.stack([each.rotation for each in pose_from_rig])
-        translations = np.stack([each.translation for each in pose_from_rig])
-        swept = np.einsum("nji,nkj->nki", rotations, self._corners - translations[:, None]).reshape(-1, 3)
-        points = self._within(
-            rig_from_world, swept.min(axis=0) - self.clearance_mm, swept.max(axis=0) + self.clearance_mm
-        )
-        # What is nearest to the body meets most poses first.
-        points = points[np.argsort(np.sum((points - self._corners.mean(axis=0)) ** 2, axis=1))]
-        grid = self._distances
-        free = _clear(points, rotations, translations, grid.values, grid.origin, grid.pitch_mm, self.clearance_mm)
-        which = np.flatnonzero(free)
-        free[which] = ~self._inside([pose_from_rig[index] @ rig_from_world for index in which.tolist()]).any(axis=1)
+        free = np.empty(len(pose_from_rig), dtype=np.bool_)
+        poses = composed(pose_from_rig, rig_from_world)
+        _fits(*poses, self._surface, self._solid, self.clearance_mm, free)
         return free
+
+    def fits_at(self, rig_from_world: Sequence[Rigid3]) -> Bool[np.ndarray, "n"]:
+        """Whether the body fits at each of several poses."""
+        return self.fits(Rigid3.identity(), rig_from_world)
 
     def clearance(self, rig_from_world: Rigid3) -> tuple[float, str]:
         """Distance in mm between body and surface, minus infinity if a part lies inside the jaw, and the name of that
@@ -90,7 +129,7 @@ class Room:
 
         Infinite if they are some millimetres apart.
         """
-        inside = self._inside([rig_from_world])[0]
+        inside = self._inside(rig_from_world)
         if inside.any():
             return -np.inf, self.body.names[int(np.argmax(inside))]
         reach = self.clearance_mm + FAR_MM
@@ -109,7 +148,12 @@ class Room:
 
     @property
     def _points(self) -> Float[np.ndarray, "n 3"]:
-        return _points_of(self.mesh)
+        return _balls_of(self.mesh).points
+
+    @property
+    def _surface(self) -> _Surface:
+        balls, winding = _balls_of(self.mesh), _winding_of(self.mesh)
+        return _Surface(balls.points, balls.centres, balls.radii, winding.values, winding.origin)
 
     @computed_once
     def _corners(self) -> Float[np.ndarray, "8 3"]:
@@ -117,24 +161,31 @@ class Room:
         return np.array(list(product(*self.body.bounds.T)))
 
     @computed_once
-    def _distances(self) -> _Grid:
-        """Signed distance to the body, in the rig frame."""
-        reach = self.clearance_mm + 2 * _PITCH_MM
+    def _solid(self) -> _Solid:
+        """With the signed distances to the body around it."""
+        boxes, reach = self.body.parts.values(), self.clearance_mm + 2 * _PITCH_MM
         low, high = self.body.bounds + [[-reach], [reach]]
         places = _Grid.places(low, high, _PITCH_MM)
-        return _Grid(self.body.distances(places.reshape(-1, 3))[0].reshape(places.shape[:3]), low, _PITCH_MM)
+        return _Solid(
+            np.stack([box.box_from_rig.rotation for box in boxes]),
+            np.stack([box.box_from_rig.translation for box in boxes]),
+            np.stack([box.half_mm for box in boxes]),
+            self._middles,
+            self.body.bounds,
+            self.body.distances(places.reshape(-1, 3))[0].reshape(places.shape[:3]),
+            low,
+        )
 
     @property
     def _winding(self) -> _Grid:
         """Winding number of the jaw, in the world."""
         return _winding_of(self.mesh)
 
-    def _inside(self, rig_from_world: Sequence[Rigid3]) -> Bool[np.ndarray, "n p"]:
-        """At each pose, which parts have their middle inside the jaw."""
-        middles = np.array([pose.inverse().apply(self._middles) for pose in rig_from_world]).reshape(-1, 3)
-        at = ((middles - self._winding.origin) / self._winding.pitch_mm).T
-        numbers = map_coordinates(self._winding.values, at, order=1, cval=0.0)
-        return np.asarray(numbers.reshape(len(rig_from_world), len(self._middles)) > _INSIDE)
+    def _inside(self, rig_from_world: Rigid3) -> Bool[np.ndarray, "p"]:
+        """Which parts have their middle inside the jaw."""
+        winding = self._winding
+        middles = rig_from_world.inverse().apply(self._middles)
+        return np.asarray([_winding_at(place, winding.values, winding.origin) > _INSIDE for place in middles])
 
     @computed_once
     def _middles(self) -> Float[np.ndarray, "p 3"]:
@@ -143,8 +194,8 @@ class Room:
 
 # A search for a handpiece asks many bodies about few meshes.
 @lru_cache(maxsize=8)
-def _points_of(mesh: Mesh) -> Float[np.ndarray, "n 3"]:
-    return surface_points(mesh, _APART_MM)
+def _balls_of(mesh: Mesh) -> _Balls:
+    return _Balls.around(surface_points(mesh, _APART_MM))
 
 
 @lru_cache(maxsize=8)
@@ -182,14 +233,15 @@ def room_about(mesh: Mesh, handpiece: Handpiece, clearance_mm: float) -> Room:
 
 def check_clearance(room: Room, poses: Mapping[str, Rigid3]) -> None:
     """Raise InputError where a part of the handpiece comes too near to the jaw or lies inside it."""
-    for frame, rig_from_world in poses.items():
-        distance, part = room.clearance(rig_from_world)
-        if distance < room.clearance_mm:
-            where = "lies inside the jaw" if distance == -np.inf else f"comes within {distance:.2f} mm of the jaw"
-            raise InputError(
-                f"scan path: at frame {frame} the {part} of the handpiece {where}, "
-                f"but must keep {room.clearance_mm:g} mm away"
-            )
+    fits = room.fits_at(list(poses.values()))
+    if fits.all():
+        return
+    frame = list(poses)[int(np.argmin(fits))]
+    distance, part = room.clearance(poses[frame])
+    where = "lies inside the jaw" if distance == -np.inf else f"comes within {distance:.2f} mm of the jaw"
+    raise InputError(
+        f"scan path: at frame {frame} the {part} of the handpiece {where}, but must keep {room.clearance_mm:g} mm away"
+    )
 
 
 @kernel
@@ -215,28 +267,151 @@ def _in_box(points, r, t, low, high):
 
 @kernel
 @no_type_check
-def _clear(points, rotations, translations, grid, origin, pitch, limit):
-    """For each pose, whether the distances that the grid has at all points, moved by the pose, reach the limit."""
-    free = np.ones(len(rotations), dtype=np.bool_)
-    nx, ny, nz = grid.shape
+def _halve(points, centres, radii):
+    """Sort points into balls, in place, and fill in the balls."""
+    for ball in range(len(radii)):
+        level = int(np.log2(ball + 1.0))
+        size = len(points) >> level
+        some = points[(ball + 1 - (1 << level)) * size :][:size]
+        low, high = some[0].copy(), some[0].copy()
+        for p in some:
+            for i in range(3):
+                low[i], high[i] = min(low[i], p[i]), max(high[i], p[i])
+        x, y, z = (low + high) / 2
+        centres[ball], squared = (low + high) / 2, 0.0
+        for p in some:
+            squared = max(squared, (p[0] - x) ** 2 + (p[1] - y) ** 2 + (p[2] - z) ** 2)
+        radii[ball] = np.sqrt(squared)
+        if 2 * ball + 1 < len(radii):
+            _part(some, np.argmax(high - low))
+
+
+@kernel
+@no_type_check
+def _part(points, axis):
+    """Move the lower half of some points along an axis to the front (C. A. R. Hoare's selection)."""
+    first, last, middle = 0, len(points) - 1, len(points) // 2
+    while first < last:
+        pivot = points[(first + last) // 2, axis]
+        i, j = first, last
+        while i <= j:
+            while points[i, axis] < pivot:
+                i += 1
+            while points[j, axis] > pivot:
+                j -= 1
+            if i <= j:
+                for c in range(3):
+                    points[i, c], points[j, c] = points[j, c], points[i, c]
+                i, j = i + 1, j - 1
+        if middle <= j:
+            last = j
+        elif middle >= i:
+            first = i
+        else:
+            return
+
+
+@kernel
+@no_type_check
+def _winding_at(place, winding, origin):
+    """The winding number of the jaw at a place, interpolated linearly; zero far from it."""
+    u = (place[0] - origin[0]) / _INSIDE_PITCH_MM
+    v = (place[1] - origin[1]) / _INSIDE_PITCH_MM
+    w = (place[2] - origin[2]) / _INSIDE_PITCH_MM
+    nx, ny, nz = winding.shape
+    if not (0 <= u < nx - 1 and 0 <= v < ny - 1 and 0 <= w < nz - 1):
+        return 0.0
+    i, j, l = int(u), int(v), int(w)
+    a, b, c = u - i, v - j, w - l
+    low = (winding[i, j, l] * (1 - a) + winding[i + 1, j, l] * a) * (1 - b) + (
+        winding[i, j + 1, l] * (1 - a) + winding[i + 1, j + 1, l] * a
+    ) * b
+    high = (winding[i, j, l + 1] * (1 - a) + winding[i + 1, j, l + 1] * a) * (1 - b) + (
+        winding[i, j + 1, l + 1] * (1 - a) + winding[i + 1, j + 1, l + 1] * a
+    ) * b
+    return low * (1 - c) + high * c
+
+
+@kernel
+@no_type_check
+def _box_distance(x, y, z, bounds):
+    """From a place to a box along the axes, zero inside."""
+    a = max(bounds[0, 0] - x, 0.0, x - bounds[1, 0])
+    b = max(bounds[0, 1] - y, 0.0, y - bounds[1, 1])
+    c = max(bounds[0, 2] - z, 0.0, z - bounds[1, 2])
+    return np.sqrt(a * a + b * b + c * c)
+
+
+@kernel
+@no_type_check
+def _at_least(x, y, z, solid):
+    """A lower bound of the distance from a place in the rig frame to the body: near to it twice `_OFF_MM` below an
+    upper bound."""
+    nx, ny, nz = solid.distances.shape
+    u = (x - solid.origin[0]) * (1 / _PITCH_MM) + 0.5
+    v = (y - solid.origin[1]) * (1 / _PITCH_MM) + 0.5
+    w = (z - solid.origin[2]) * (1 / _PITCH_MM) + 0.5
+    if 0 <= u < nx and 0 <= v < ny and 0 <= w < nz:
+        return solid.distances[int(u), int(v), int(w)] - _OFF_MM
+    return _box_distance(x, y, z, solid.bounds)
+
+
+@kernel
+@no_type_check
+def _is_free(rotation, translation, surface, solid, limit, stack):
+    """Whether a body at a pose keeps its distance from all points."""
+    leaves = (len(surface.radii) + 1) // 2
+    leaf, point, one, part = len(surface.points) // leaves, np.empty((1, 3)), np.empty(1), np.empty(1, np.int64)
+    stack[0], count = 0, 1
+    while count > 0:
+        count -= 1
+        ball = stack[count]
+        x, y, z = _moved(rotation, translation, surface.centres[ball])
+        if _at_least(x, y, z, solid) - surface.radii[ball] >= limit:
+            continue
+        if ball < leaves - 1:
+            stack[count], stack[count + 1] = 2 * ball + 1, 2 * ball + 2
+            count += 2
+            continue
+        first = (ball - leaves + 1) * leaf
+        for n in range(first, first + leaf):
+            x, y, z = _moved(rotation, translation, surface.points[n])
+            least = _at_least(x, y, z, solid)
+            if least >= limit:
+                continue
+            if least + 2 * _OFF_MM >= limit:
+                point[0, 0], point[0, 1], point[0, 2] = x, y, z
+                box_distances(point, solid.rotations, solid.translations, solid.halves, one, part)
+                if one[0] >= limit:
+                    continue
+            return False
+    return True
+
+
+@kernel
+@no_type_check
+def _moved(rotation, translation, p):
+    return (
+        rotation[0, 0] * p[0] + rotation[0, 1] * p[1] + rotation[0, 2] * p[2] + translation[0],
+        rotation[1, 0] * p[0] + rotation[1, 1] * p[1] + rotation[1, 2] * p[2] + translation[1],
+        rotation[2, 0] * p[0] + rotation[2, 1] * p[1] + rotation[2, 2] * p[2] + translation[2],
+    )
+
+
+@kernel
+@no_type_check
+def _fits(rotations, translations, surface, solid, limit, free):
+    """For each pose, whether the body keeps its distance and no part has its middle inside the jaw."""
+    stack, place = np.empty(128, np.int64), np.empty(3)
     for k in range(len(rotations)):
         r, t = rotations[k], translations[k]
-        for n in range(len(points)):
-            x, y, z = points[n, 0], points[n, 1], points[n, 2]
-            u = (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0] - origin[0]) / pitch
-            v = (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1] - origin[1]) / pitch
-            w = (r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2] - origin[2]) / pitch
-            if not (0 <= u < nx - 1 and 0 <= v < ny - 1 and 0 <= w < nz - 1):
-                continue
-            i, j, l = int(u), int(v), int(w)
-            a, b, c = u - i, v - j, w - l
-            low = (grid[i, j, l] * (1 - a) + grid[i + 1, j, l] * a) * (1 - b) + (
-                grid[i, j + 1, l] * (1 - a) + grid[i + 1, j + 1, l] * a
-            ) * b
-            high = (grid[i, j, l + 1] * (1 - a) + grid[i + 1, j, l + 1] * a) * (1 - b) + (
-                grid[i, j + 1, l + 1] * (1 - a) + grid[i + 1, j + 1, l + 1] * a
-            ) * b
-            if low * (1 - c) + high * c < limit:
+        free[k] = True
+        for middle in solid.middles:
+            for i in range(3):
+                place[i] = 0.0
+                for j in range(3):
+                    place[i] += r[j, i] * (middle[j] - t[j])
+            if _winding_at(place, surface.winding, surface.winding_origin) > _INSIDE:
                 free[k] = False
                 break
-    return free
+        free[k] = free[k] and _is_free(r, t, surface, solid, limit, stack)

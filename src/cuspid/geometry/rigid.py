@@ -7,6 +7,7 @@ camera, jaws of different size), :func:`best_similarity` returns the scale separ
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
 from typing import TypeVar
@@ -154,6 +155,13 @@ class Rigid3:
     def rotate(self, directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Rotate directions, without translation."""
         return directions @ self.rotation.T
+
+
+def composed(motions: Sequence[Rigid3], first: Rigid3) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
+    """Rotations and translations of ``motion @ first`` for each of the motions: fast, for thousands of them."""
+    rotations = np.stack([each.rotation for each in motions])
+    translations = np.stack([each.translation for each in motions])
+    return rotations @ first.rotation, rotations @ first.translation + translations
 
 
 def best_similarity(

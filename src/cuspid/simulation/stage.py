@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -21,7 +22,7 @@ from cuspid.simulation.blender import check_blender, render_with_blender
 from cuspid.simulation.lights import lit
 from cuspid.simulation.manufacturing import ManufacturingOptions, built, told
 from cuspid.simulation.optics import OpticsOptions
-from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
+from cuspid.simulation.path.scan import ScanPath, ScanPathOptions, plan_scan_path
 from cuspid.simulation.raycast import Scene, lit_frames, render_capture
 from cuspid.storage.captures import write_capture, write_image
 from cuspid.storage.files import digest_of, hash_file
@@ -77,7 +78,16 @@ def simulate(
     path = plan_scan_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
     overlaps = path.minimum_overlap, path.mean_overlap
     write_path(folder / "truth" / "path.json", *overlaps, path.seen, path.cross_sweep)
-    return take_images(jaw, true, path.rig_from_world, folder, options, known=known, progress=progress)
+    return take_images(
+        jaw,
+        true,
+        path.rig_from_world,
+        folder,
+        options,
+        known=known,
+        less=_less(path),
+        progress=progress,
+    )
 
 
 def take_images(
@@ -88,10 +98,11 @@ def take_images(
     options: RenderOptions,
     *,
     known: Handpiece | None = None,
+    less: Sequence[str] = (),
     progress: Progress = silent,
 ) -> tuple[Capture, GroundTruth]:
     """As :func:`simulate`, from given poses of the handpiece by frame name. The capture has the handpiece ``known``; by
-    default the true one, as exact."""
+    default the true one, as exact. ``less``: what takes less time, for those who are told that it takes long."""
     if options.optics.scattering and not any(APPEARANCES[options.texture].enamel.scattering_mm):
         _LOG.info(f"optics: --scattering changes nothing, for light does not go below the texture {options.texture}")
     handpiece = lit(handpiece)
@@ -101,7 +112,7 @@ def take_images(
     write_truth(folder / "truth", truth)
     capture = Capture(handpiece=known or EXACT.fill(handpiece), frames=frames, source=ImageFolder(folder / "capture"))
     write_capture(folder / "capture", capture)
-    for done, total in _render(folder, capture, truth, options):
+    for done, total in _foretold(_render(folder, capture, truth, options), less):
         progress("images", done, total)
     # As it will be read: a rotation may differ in its last bit once it was written, and results go by that.
     return replace(capture, handpiece=read_handpiece(folder / "capture" / "handpiece.json")), truth
@@ -137,6 +148,33 @@ def _render(folder: Path, capture: Capture, truth: GroundTruth, options: RenderO
         yield done, len(there)
 
 
+def _less(path: ScanPath) -> tuple[str, ...]:
+    share = 1 - path.further_frames / len(path.rig_from_world)
+    passes = f"--passes turns takes about {share:.0%} of the images"
+    pixels = "--handpiece takes one with fewer pixels (cuspid handpiece --width-px 250 --height-px 250)"
+    return (passes, pixels) if path.further_frames else (pixels,)
+
+
+def _foretold(rendered: Iterator[tuple[int, int]], less: Sequence[str]) -> Iterator[tuple[int, int]]:
+    """What is rendered; after the first images it is logged how many are to come, how long they take here, and, if that
+    is long, what takes less."""
+    warm = usable_cores()  # the first image of each process is not timed
+    begin = time.perf_counter()
+    for number, (done, total) in enumerate(rendered, start=1):
+        if number == warm:
+            begin = time.perf_counter()
+        elif number == (1 + _TIMED) * warm and total > done:
+            seconds = (total - done) * (time.perf_counter() - begin) / (number - warm)
+            duration = f"{seconds / 60:.0f} min" if seconds >= 90 else f"{seconds:.0f} s"
+            shorter = f"; for less: {', '.join(less)}" if less and seconds > _LONG_S else ""
+            _LOG.info(f"simulation: {total - done:,} of {total:,} images are to come, about {duration} here{shorter}")
+        yield done, total
+
+
+_TIMED = 3
+"""Images of each process that are timed for the forecast."""
+_LONG_S = 60.0
+"""Nobody minds waiting so long."""
 CODE = ("simulation",)
 """What images are made by: their key has the version of this code."""
 _RENDERERS = {"embree": render_capture, "blender": render_with_blender}

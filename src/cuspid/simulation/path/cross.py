@@ -20,12 +20,11 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation
 
 from cuspid.arch_curve import ArchCurve
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
 from cuspid.room import Room
-from cuspid.simulation.path.detour import lifts_needed, up
+from cuspid.simulation.path.detour import eased, least_lifts, up
 from cuspid.simulation.path.overlap import image_overlap
 
 _STEP_MM = 1.0
@@ -109,11 +108,10 @@ def _crossing(mesh: Mesh, room: Room, curve: ArchCurve, start_mm: float, end_mm:
     if not np.isfinite(heights).all():
         return None
     poses = list(_following(ends[0], ends[1], heights, length))
-    try:
-        lifts = lifts_needed(room, poses, _SLOPE)
-    except InputError:
+    lifts = least_lifts(room, poses)
+    if not np.isfinite(lifts).all():
         return None
-    lifted = tuple(up(float(lift)) @ pose for lift, pose in zip(lifts, poses, strict=True))
+    lifted = tuple(up(float(lift)) @ pose for lift, pose in zip(eased(lifts, _SLOPE), poses, strict=True))
     return Crossing(start_mm, end_mm, length, lifted)
 
 

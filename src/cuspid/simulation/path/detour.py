@@ -5,39 +5,50 @@ station has candidates: the handpiece is lifted, shifted towards the cheek or th
 axis across the arch) and yawed, all about the place that it looks at. Of those that fit, the cheapest chain is chosen:
 the cost of a candidate is how far it is off the steady pose and what two cameras then miss of the crowns nearby, and
 that of a step is how far apart its candidates are (Viterbi's shortest path). Elsewhere the path is unchanged, to the
-last bit. Where the drift of the hand would still make it touch, it is lifted.
+last bit. Where none of the candidates fits, the handpiece goes straight out of the gum, where it fits in the end.
+
+Where the drift of the hand would still make it touch, it is lifted. Frames that do not fit all the same, as between
+stations, are repaired: the least changes, as smooth as those of a detour.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from itertools import pairwise, product
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import binary_dilation, gaussian_filter1d, label, maximum_filter1d
 
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.rig import Handpiece
-from cuspid.room import Room
+from cuspid.room import FAR_MM, Room
 from cuspid.simulation.path.coverage import CrownPoints
+from cuspid.workers import map_in_threads
 
 PoseAt = Callable[[float], Rigid3]
 """``rig_from_world`` at a given travel."""
 
 _SHIFTS_MM, _LIFTS_MM = (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0), (0.0, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 13.0)
-_ROLLS_DEG = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0)
-_TILTS_DEG = ((0.0, 0.0), (12.0, 0.0), (-12.0, 0.0), (0.0, 12.0), (0.0, -12.0))
-"""Pitch and yaw of the candidates."""
-_UNITS = np.array([1.0, 1.0, *np.deg2rad([12.0, 12.0, 12.0])])
+_ROLLS_DEG, _TILT_DEG = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0), 12.0
+"""Of the candidates; those that are tilted are pitched or yawed by the same angle."""
+_FINE_SHIFTS_MM, _FINE_LIFTS_MM = (-0.4, -0.2, -0.1, 0.0, 0.1, 0.2, 0.4), (0.0, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8)
+_FINE_ROLLS_DEG, _FINE_TILT_DEG = (-5.0, -2.0, 0.0, 2.0, 5.0), 3.0
+"""Of those that a repair has besides."""
+_UNITS = np.array([1.0, 1.0, 1.0, *np.deg2rad([12.0, 12.0, 12.0])])
 """A shift, a lift and a rotation of equal cost."""
 _OFF, _MISSED, _APART = 0.05, 10.0, 0.5
 """Cost of being off by one unit, of missing all that there is to see, and of one unit between neighbours (squares)."""
 _KEPT = 150
 """Number of candidates per station from which the shortest path chooses."""
+_AT_ONCE = 256
+"""Candidates that are looked at together, those nearest to the steady pose first."""
+_SHARES, _NEEDED = np.arange(0.1, 1.0, 0.1), 20
+"""Parts of what a frame needs of which its neighbours have the choice, and for how many frames at most."""
+_OUT = 12
+"""Number of heights at which a handpiece that fits nowhere else is tried, up to where it fits."""
 _STATION_MM = 1.0
 _EASE = 4
 """Number of stations before and after those where the steady handpiece does not fit that may also be changed."""
@@ -45,22 +56,24 @@ _BESIDE_MM = 3.0
 """What a station must see lies this near to it along the arch ..."""
 _REACH_MM = 9.0
 """... and this near to it in space."""
-_HIGHEST_MM, _RISE_MM, _SPARE_MM = 30.0, 0.1, 0.05
-"""Maximum height to which a hand lifts, the step, and the margin beyond what is needed."""
+_HEIGHTS_MM, _SPARE_MM = np.arange(0.1, 30.0, 0.1), 0.05
+"""Heights to which a hand lifts, and the margin beyond what is needed."""
 _SLOPE_MM = 4.0
 """Length of travel over which it lifts."""
+_MARGIN_MM = 0.01
+"""What is changed keeps this much more distance than it must."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Detour:
-    """Changes to a path: shift towards the cheek and lift in mm; roll, pitch and yaw in rad, about what is looked
-    at."""
+    """Changes to a path: shift along the arch, towards the cheek and lift in mm; roll, pitch and yaw in rad, about what
+    is looked at."""
 
     travel_mm: Float[np.ndarray, "n"]
-    changes: Float[np.ndarray, "n 5"]
+    changes: Float[np.ndarray, "n 6"]
 
     @property
-    def largest(self) -> Float[np.ndarray, "5"]:
+    def largest(self) -> Float[np.ndarray, "6"]:
         """Largest amount of each."""
         return np.abs(self.changes).max(axis=0)
 
@@ -69,16 +82,53 @@ class Detour:
         return _changed(np.array([np.interp(travel_mm, self.travel_mm, column) for column in self.changes.T]))
 
 
-def _changed(change: Float[np.ndarray, "5"]) -> Rigid3:
-    return Rigid3.from_rotation_vector(change[2:], np.array([0.0, *change[:2]])).inverse()
+def _changed(change: Float[np.ndarray, "6"]) -> Rigid3:
+    return Rigid3.from_rotation_vector(change[3:], change[:3]).inverse()
 
 
-_CANDIDATES = np.array(
-    [
-        (shift, lift, *np.deg2rad([roll, pitch, yaw]))
-        for shift, lift, roll, (pitch, yaw) in product(_SHIFTS_MM, _LIFTS_MM, _ROLLS_DEG, _TILTS_DEG)
-    ]
-)
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    """Changes from which a station chooses."""
+
+    changes: Float[np.ndarray, "k 6"]
+    """Those nearest to no change first."""
+    motions: Sequence[Rigid3]
+
+    @staticmethod
+    def of(changes: Float[np.ndarray, "k 6"]) -> _Candidates:
+        """Sorted."""
+        ordered = changes[np.argsort(_off(changes), kind="stable")]
+        return _Candidates(ordered, [_changed(change) for change in ordered])
+
+
+def _off(changes: Float[np.ndarray, "k 6"]) -> Float[np.ndarray, "k"]:
+    """What it costs to be off the steady pose."""
+    return np.asarray(_OFF * np.sum((changes / _UNITS) ** 2, axis=1))
+
+
+def _grid(
+    shifts_mm: Sequence[float], lifts_mm: Sequence[float], rolls_deg: Sequence[float], tilt_deg: float
+) -> Float[np.ndarray, "k 6"]:
+    tilts = ((0.0, 0.0), (tilt_deg, 0.0), (-tilt_deg, 0.0), (0.0, tilt_deg), (0.0, -tilt_deg))
+    every = product(shifts_mm, lifts_mm, rolls_deg, tilts)
+    return np.array([(0.0, shift, lift, *np.deg2rad([roll, *tilt])) for shift, lift, roll, tilt in every])
+
+
+@cache
+def _coarse() -> _Candidates:
+    """2,000 motions take a while to make, and few paths need them."""
+    return _Candidates.of(_grid(_SHIFTS_MM, _LIFTS_MM, _ROLLS_DEG, _TILT_DEG))
+
+
+@cache
+def _fine() -> _Candidates:
+    """Those of a repair."""
+    fine = _grid(_FINE_SHIFTS_MM, _FINE_LIFTS_MM, _FINE_ROLLS_DEG, _FINE_TILT_DEG)
+    return _Candidates.of(np.concatenate([fine, _coarse().changes]))
+
+
+_Choice = tuple[Float[np.ndarray, "_ 6"], Float[np.ndarray, "_"]]
+"""Some candidates of a station, and what each costs by itself."""
 
 
 def plan_detour(
@@ -91,55 +141,105 @@ def plan_detour(
     """The changes that make a steady handpiece fit everywhere."""
     travel = np.linspace(*span_mm, max(2, 1 + round((span_mm[1] - span_mm[0]) / _STATION_MM)))
     poses = [steady(float(at)) for at in travel]
-    blocked = np.array([not room.fits(pose, [Rigid3.identity()])[0] for pose in poses])
-    changes = np.zeros((len(travel), 5))
+    blocked, choose = ~room.fits_at(poses), partial(_fitting, room, crowns, handpiece)
+    return Detour(travel_mm=travel, changes=_changes(poses, blocked, choose))
+
+
+def repaired(room: Room, rig_from_world: Sequence[Rigid3]) -> list[Rigid3]:
+    """Consecutive frames, those that do not fit and some before and after them changed by as little as is needed."""
+    blocked = ~room.fits_at(rig_from_world)
+    if not blocked.any():
+        return list(rig_from_world)
+    roomy = replace(room, clearance_mm=room.clearance_mm + _MARGIN_MM)
+    needed = np.array([_least(roomy, rig_from_world[index])[0][0] for index in np.flatnonzero(blocked).tolist()])
+    parts = np.multiply.outer(_SHARES, needed[np.linspace(0, len(needed) - 1, min(len(needed), _NEEDED)).astype(int)])
+    changes = _changes(rig_from_world, blocked, partial(_eased_least, roomy, parts.reshape(-1, 6)))
+    return [
+        _changed(change) @ pose if change.any() else pose for change, pose in zip(changes, rig_from_world, strict=True)
+    ]
+
+
+def _changes(
+    poses: Sequence[Rigid3], blocked: Bool[np.ndarray, "n"], choose: Callable[[Rigid3], _Choice]
+) -> Float[np.ndarray, "n 6"]:
+    """Smooth changes to the poses that are blocked and those near to them; none to the others."""
+    changes = np.zeros((len(poses), 6))
     stretches, count = label(binary_dilation(blocked, iterations=_EASE))
     for number in range(1, count + 1):
         inside = np.flatnonzero(stretches == number)
-        fitting = [_fitting(room, crowns, handpiece, poses[index]) for index in inside]
-        anchored = bool(inside[0] > 0), bool(inside[-1] < len(travel) - 1)
-        changes[inside] = _shortest(fitting, anchored)
-    return Detour(travel_mm=travel, changes=changes)
+        choices = map_in_threads(choose, [poses[index] for index in inside.tolist()])
+        anchored = bool(inside[0] > 0), bool(inside[-1] < len(poses) - 1)
+        changes[inside] = _shortest(choices, anchored)
+    return changes
 
 
-def _fitting(
-    room: Room, crowns: CrownPoints, handpiece: Handpiece, pose: Rigid3
-) -> tuple[Float[np.ndarray, "k 5"], Float[np.ndarray, "k"]]:
-    """The best candidates at a station that fit, and what each costs by itself."""
-    fits = room.fits(pose, _motions())
-    if not fits.any():
-        raise InputError(
-            f"scan path: the handpiece does not fit over the jaw even when lifted by {max(_LIFTS_MM):g} mm; check that "
-            "the jaw is in its occlusal frame and that the body of the handpiece is not too large"
-        )
-    candidates = _CANDIDATES[fits]
-    motions = [motion for motion, fit in zip(_motions(), fits, strict=True) if fit]
-    costs = _OFF * np.sum((candidates / _UNITS) ** 2, axis=1) + _MISSED * _missed(crowns, handpiece, pose, motions)
-    best = np.argsort(costs, kind="stable")[:_KEPT]
-    return candidates[best], costs[best]
-
-
-@cache
-def _motions() -> list[Rigid3]:
-    """Those of the candidates; 2,000 take a while to make, and few paths need them."""
-    return [_changed(candidate) for candidate in _CANDIDATES]
-
-
-def _missed(crowns: CrownPoints, handpiece: Handpiece, pose: Rigid3, motions: list[Rigid3]) -> Float[np.ndarray, "k"]:
-    """Share of the crowns beside a station that no two cameras see, from each of several poses about it."""
+def _fitting(room: Room, crowns: CrownPoints, handpiece: Handpiece, pose: Rigid3) -> _Choice:
+    """The best candidates at a station that fit."""
     near = crowns.within(pose.inverse().translation[None], _REACH_MM)
     near = near[np.abs(pose.apply(crowns.points[near])[:, 0]) < _BESIDE_MM]
+    return _best(room, pose, _coarse(), partial(_missed, crowns, near, handpiece, pose))
+
+
+def _least(room: Room, pose: Rigid3) -> _Choice:
+    """Those that change a frame least."""
+    return _best(room, pose, _fine(), lambda motions: np.zeros(len(motions)))
+
+
+def _eased_least(room: Room, parts: Float[np.ndarray, "k 6"], pose: Rigid3) -> _Choice:
+    """Those, and parts of what frames nearby need, so that there is a smooth way to it."""
+    changes, costs = _least(room, pose)
+    fits = room.fits(pose, [_changed(part) for part in parts])
+    return np.concatenate([changes, parts[fits]]), np.concatenate([costs, _off(parts[fits])])
+
+
+def _best(
+    room: Room,
+    pose: Rigid3,
+    candidates: _Candidates,
+    missed: Callable[[Sequence[Rigid3]], Float[np.ndarray, "k"]],
+) -> _Choice:
+    """Of the candidates that fit those that cost least. They are looked at in the order of what it costs to be off the
+    pose, until that alone is too much."""
+    off = _off(candidates.changes)
+    found, costs = np.empty(0, dtype=int), np.empty(0)
+    for first in range(0, len(off), _AT_ONCE):
+        if len(costs) >= _KEPT and off[first] > np.partition(costs, _KEPT - 1)[_KEPT - 1]:
+            break
+        some = slice(first, first + _AT_ONCE)
+        fitting = first + np.flatnonzero(room.fits(pose, candidates.motions[some]))
+        if len(fitting):
+            found = np.concatenate([found, fitting])
+            motions = [candidates.motions[index] for index in fitting.tolist()]
+            costs = np.concatenate([costs, off[fitting] + missed(motions)])
+    if not len(found):
+        return _outwards(room, pose)
+    best = np.argsort(costs, kind="stable")[:_KEPT]
+    return candidates.changes[found[best]], costs[best]
+
+
+def _outwards(room: Room, pose: Rigid3) -> _Choice:
+    """Straight out of the gum, up to where nothing of the jaw is."""
+    world_from_rig = pose.inverse()
+    corners = np.concatenate([world_from_rig.apply(box.corners) for box in room.body.parts.values()])
+    out_mm = room.mesh.bounds[1, 2] + room.clearance_mm + 2 * FAR_MM - corners[:, 2].min()
+    heights = np.linspace(0, out_mm, _OUT + 1)[1:, None]
+    changes = np.concatenate([heights * pose.rotation[:, 2], np.zeros((_OUT, 3))], axis=1)
+    fits = room.fits(pose, [_changed(change) for change in changes])
+    return changes[fits], _off(changes[fits])
+
+
+def _missed(
+    crowns: CrownPoints, near: Int[np.ndarray, "n"], handpiece: Handpiece, pose: Rigid3, motions: Sequence[Rigid3]
+) -> Float[np.ndarray, "k"]:
+    """What it costs that two cameras do not see some points of the crowns, from each of several poses about a pose."""
     if len(near) == 0:
         return np.zeros(len(motions))
-    seen = crowns.cameras_at(near, handpiece, [motion @ pose for motion in motions]) >= 2
-    return np.asarray(1 - seen.mean(axis=1))
+    return np.asarray(_MISSED * (1 - crowns.seen_by_two(near, handpiece, pose, motions).mean(axis=1)))
 
 
-def _shortest(
-    stations: list[tuple[Float[np.ndarray, "_ 5"], Float[np.ndarray, "_"]]], anchored: tuple[bool, bool]
-) -> Float[np.ndarray, "n 5"]:
+def _shortest(stations: Sequence[_Choice], anchored: tuple[bool, bool]) -> Float[np.ndarray, "n 6"]:
     """One candidate of each station, the cheapest chain; it begins and ends unchanged where it is anchored."""
-    unchanged = (np.zeros((1, 5)), np.zeros(1))
+    unchanged = (np.zeros((1, 6)), np.zeros(1))
     chain = [*[unchanged] * anchored[0], *stations, *[unchanged] * anchored[1]]
     total, came_from = chain[0][1], []
     for (before, _), (after, cost) in pairwise(chain):
@@ -156,10 +256,10 @@ def _shortest(
 
 
 def lifted(room: Room, pose_at: PoseAt, span_mm: tuple[float, float]) -> PoseAt:
-    """The path of a hand that lifts the handpiece where it would touch. Raises InputError where that does not help."""
+    """The path of a hand that lifts the handpiece where it would touch, as far as that helps."""
     travel = np.linspace(*span_mm, max(2, 1 + round(2 * (span_mm[1] - span_mm[0]) / _STATION_MM)))
     reach = round(_SLOPE_MM / (travel[1] - travel[0]))
-    lifts = lifts_needed(room, [pose_at(float(at)) for at in travel], reach)
+    lifts = eased(least_lifts(room, [pose_at(float(at)) for at in travel]), reach)
     if not lifts.any():
         return pose_at
     return lambda at: up(float(np.interp(at, travel, lifts))) @ pose_at(at)
@@ -170,23 +270,18 @@ def up(lift_mm: float) -> Rigid3:
     return Rigid3(np.eye(3), np.array([0, 0, -lift_mm]))
 
 
-def lifts_needed(room: Room, rig_from_world: Sequence[Rigid3], reach: int) -> Float[np.ndarray, "n"]:
-    """How much each of consecutive poses must be lifted to fit, mm, rising and falling over ``reach`` poses.
-
-    Raises InputError where lifting does not help.
-    """
-    needed = np.array([_lift(room, pose) for pose in rig_from_world])
-    if not needed.any():
-        return needed
-    return np.asarray(gaussian_filter1d(maximum_filter1d(needed, 2 * reach + 1), reach / 3, mode="nearest"))
+def least_lifts(room: Room, rig_from_world: Sequence[Rigid3]) -> Float[np.ndarray, "n"]:
+    """How much each pose must be lifted to fit, mm; infinite where that does not help."""
+    lifts = np.zeros(len(rig_from_world))
+    for index in np.flatnonzero(~room.fits_at(rig_from_world)).tolist():
+        fits = room.fits(rig_from_world[index], [up(float(height)) for height in _HEIGHTS_MM])
+        lifts[index] = _HEIGHTS_MM[np.argmax(fits)] + _SPARE_MM if fits.any() else np.inf
+    return lifts
 
 
-def _lift(room: Room, pose: Rigid3) -> float:
-    """By how much a handpiece must be lifted to fit, mm."""
-    if room.fits(pose, [Rigid3.identity()])[0]:
-        return 0.0
-    heights = np.arange(_RISE_MM, _HIGHEST_MM, _RISE_MM)
-    fits = room.fits(pose, [up(float(height)) for height in heights])
-    if not fits.any():
-        raise InputError(f"scan path: the handpiece does not fit over the jaw even when lifted by {_HIGHEST_MM:g} mm")
-    return float(heights[np.argmax(fits)]) + _SPARE_MM
+def eased(lifts_mm: Float[np.ndarray, "n"], reach: int) -> Float[np.ndarray, "n"]:
+    """Lifts of consecutive poses, rising and falling over ``reach`` poses; none for those that do not help."""
+    helpful = np.where(np.isfinite(lifts_mm), lifts_mm, 0.0)
+    if not helpful.any():
+        return helpful
+    return np.asarray(gaussian_filter1d(maximum_filter1d(helpful, 2 * reach + 1), reach / 3, mode="nearest"))

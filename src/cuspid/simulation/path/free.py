@@ -27,7 +27,7 @@ from cuspid.options import SHARE, Options, Range
 from cuspid.rig import Handpiece
 from cuspid.room import Room, room_about
 from cuspid.simulation.path.cross import plan_crossing
-from cuspid.simulation.path.detour import lifts_needed, up
+from cuspid.simulation.path.detour import eased, least_lifts, repaired, up
 
 _LOG = logging.getLogger("cuspid")
 
@@ -76,9 +76,10 @@ class FreePathOptions(Options):
 def plan_free_path(
     jaw: Jaw, handpiece: Handpiece, options: FreePathOptions, rng: np.random.Generator
 ) -> Mapping[str, Rigid3]:
-    """``rig_from_world`` by frame name. Where the camera would come too near to the jaw, the hand lifts it.
+    """``rig_from_world`` by frame name. Where the camera would come too near to the jaw, the hand lifts it, or goes
+    around where that does not help.
 
-    Raises InputError where that does not help, or where nothing lies between the sides that it is to cross.
+    Raises InputError where nothing lies between the sides that it is to cross.
     """
     if options.clearance_mm >= handpiece.depth_range_mm[1]:
         raise InputError(
@@ -100,12 +101,11 @@ def plan_free_path(
         Rigid3.from_rotation_vector(motion[:3], motion[3:]) @ steady(float(travel))
         for motion, travel in zip(motions, along / along[-1] * length_mm, strict=True)
     ]
-    lifts = lifts_needed(room, poses, reach)
+    lifts = eased(least_lifts(room, poses), reach)
     if lifts.any():
         _LOG.info(f"free path: the hand lifts the camera by up to {lifts.max():.1f} mm where it would come too close")
-    return {
-        f"{index:05d}": up(lift) @ pose for index, (lift, pose) in enumerate(zip(lifts.tolist(), poses, strict=True))
-    }
+    poses = repaired(room, [up(lift) @ pose for lift, pose in zip(lifts.tolist(), poses, strict=True)])
+    return {f"{index:05d}": pose for index, pose in enumerate(poses)}
 
 
 def _steady(jaw: Jaw, room: Room, handpiece: Handpiece, shape: PathShape) -> tuple[float, Steady]:

@@ -176,5 +176,4 @@ def _least_lifted(room: Room, pose: Rigid3) -> Rigid3 | None:
 
 def seen_from(crowns: CrownPoints, handpiece: Handpiece, poses: Sequence[Rigid3]) -> Bool[np.ndarray, "p n"]:
     """Whether two cameras see each point of the crowns from each pose."""
-    every = np.arange(len(crowns.points))
-    return np.asarray(crowns.cameras_at(every, handpiece, poses) >= 2)
+    return crowns.seen_by_two(np.arange(len(crowns.points)), handpiece, Rigid3.identity(), poses)

@@ -27,10 +27,10 @@ from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
 from cuspid.options import TOOTH, Options, Range
 from cuspid.rig import Handpiece
-from cuspid.room import Room, check_clearance, room_about
+from cuspid.room import Room, room_about
 from cuspid.simulation.path.coverage import CrownPoints, crown_points
 from cuspid.simulation.path.cross import plan_crossing
-from cuspid.simulation.path.detour import Detour, PoseAt, lifted, plan_detour
+from cuspid.simulation.path.detour import Detour, PoseAt, lifted, plan_detour, repaired
 from cuspid.simulation.path.further import further_legs, seen_from
 from cuspid.simulation.path.hand import HandMotion, hand_motion
 from cuspid.simulation.path.legs import Leg, SteadyPath, steady_path, there_and_back
@@ -122,6 +122,8 @@ class ScanPath:
     """Travel at each frame."""
     steady: SteadyPath = field(repr=False)
     """The trajectory of a steady hand."""
+    further_frames: int = 0
+    """About how many of the frames further passes take."""
     seen: Mapping[int, float] = field(default_factory=dict)
     """Approximate share (0 to 1) of the open surface of each crown along the path that two cameras see at once, by FDI
     number; under 0, that of all crowns together."""
@@ -152,8 +154,8 @@ class ScanPath:
 def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng: np.random.Generator) -> ScanPath:
     """A path over the arch or one tooth on which the handpiece fits and consecutive images overlap enough.
 
-    What a user should know about it is logged. Raises InputError where the jaw has no such tooth, the handpiece does
-    not fit even when lifted, or the given number of frames is too small for the overlap.
+    What a user should know about it is logged. Raises InputError where the jaw has no such tooth, nothing can
+    be seen from where the handpiece fits, or the given number of frames is too small for the overlap.
     """
     curve, room = arch_curve(jaw), room_about(jaw.mesh, handpiece, options.clearance_mm)
     crowns = crown_points(jaw, curve, _reach_mm(handpiece))
@@ -171,14 +173,14 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
         jitter_length_mm=options.jitter_length_mm,
     )
     pose_at = lifted(room, _held(steady, detour, hand), steady.span_mm)
-    path = _with_frames(jaw.mesh, handpiece, first, steady, pose_at, options)
-    check_clearance(room, path.rig_from_world)
+    path = _with_frames(room, handpiece, first, steady, pose_at, options)
     if not np.isfinite(path.overlap).any():
         raise InputError(
             f"scan path: with the handpiece {options.clearance_mm:g} mm from the jaw, no camera sees it in focus; "
             "use a narrower handpiece, a larger depth of field or a smaller --clearance-mm"
         )
-    path = replace(path, seen=_seen(crowns, handpiece, path, options.tooth))
+    seen, further = _seen(crowns, handpiece, path, options.tooth), _further_frames(first, path)
+    path = replace(path, seen=seen, further_frames=further)
     notes = (_gap_notes(steady), _detour_notes(jaw, steady, detour), _further_pass_notes(steady, first, path))
     across = _crossing_notes(jaw, path) if options.cross_sweep else ()
     for note in chain(*notes, across, _blind_notes(path), _unseen_notes(path)):
@@ -264,7 +266,7 @@ def _held(steady: SteadyPath, detour: Detour, hand: HandMotion) -> PoseAt:
 
 
 def _with_frames(
-    mesh: Mesh,
+    room: Room,
     handpiece: Handpiece,
     first: SteadyPath,
     steady: SteadyPath,
@@ -275,7 +277,7 @@ def _with_frames(
     usual = options.frames or _usual_frames(steady, first, options)
     frames = usual
     while True:
-        path = _even_path(mesh, handpiece, steady, pose_at, frames)
+        path = _even_path(room, handpiece, steady, pose_at, frames)
         if path.minimum_overlap >= options.minimum_overlap:
             return path
         needed = _needed(frames, path, options)
@@ -307,14 +309,16 @@ def _needed(frames: int, path: ScanPath, options: ScanPathOptions) -> int:
     return max(frames + 1, int(np.ceil(1 + (frames - 1) * growth)))
 
 
-def _even_path(mesh: Mesh, handpiece: Handpiece, steady: SteadyPath, pose_at: PoseAt, frames: int) -> ScanPath:
-    """The path on which the hand goes slower where the images change faster, so that the overlap is about even."""
+def _even_path(room: Room, handpiece: Handpiece, steady: SteadyPath, pose_at: PoseAt, frames: int) -> ScanPath:
+    """The path on which the hand goes slower where the images change faster, so that the overlap is about even. All its
+    frames fit."""
+    mesh = room.mesh
     travel = np.linspace(*steady.span_mm, frames)
     for _ in range(2):
         lost = 1 - frame_overlap(image_overlap(mesh, handpiece, [pose_at(float(at)) for at in travel], _COARSE))
         change = np.concatenate([[0], np.cumsum(np.maximum(lost, 0.25 * lost.max()))])
         travel = np.interp(np.linspace(0, change[-1], frames), change, travel)
-    poses = [pose_at(float(at)) for at in travel]
+    poses = repaired(room, [pose_at(float(at)) for at in travel])
     return ScanPath(
         rig_from_world={f"{index:05d}": pose for index, pose in enumerate(poses)},
         overlap=image_overlap(mesh, handpiece, poses),
@@ -350,7 +354,7 @@ def _detour_notes(jaw: Jaw, steady: SteadyPath, detour: Detour) -> tuple[str, ..
     changed = np.any(detour.changes != 0, axis=1) & (detour.travel_mm <= steady.legs_end_mm)
     if not changed.any():
         return ()
-    shift, lift, *turns = detour.largest
+    _, shift, lift, *turns = detour.largest
     places = np.array([steady.curve.place(steady.place(float(at))[0]) for at in detour.travel_mm[changed]])
     return (
         f"scan path: the handpiece does not fit everywhere{_near_teeth(jaw, places)}; there it is lifted by up to "
@@ -366,16 +370,23 @@ def _near_teeth(jaw: Jaw, places: Float[np.ndarray, "n 3"]) -> str:
     return " (near " + ", ".join(str(jaw.teeth[index]) for index in np.unique(nearest)) + ")"
 
 
+def _further_frames(first: SteadyPath, path: ScanPath) -> int:
+    """By the length of the passes; ``first`` is the path without further ones."""
+    passes_mm = path.steady.legs_end_mm - path.steady.span_mm[0]
+    return round((len(path.rig_from_world) - len(path.cross_sweep)) * (1 - float(np.ptp(first.span_mm)) / passes_mm))
+
+
 def _further_pass_notes(steady: SteadyPath, first: SteadyPath, path: ScanPath) -> tuple[str, ...]:
     """What further passes cost."""
     rolls = {leg.roll_deg for leg in first.legs}
     further = [leg for leg in steady.legs if leg.roll_deg not in rolls]
     if not further:
         return ()
-    frames, passes_mm = len(path.rig_from_world), steady.legs_end_mm - steady.span_mm[0]
-    more = round((frames - len(path.cross_sweep)) * (1 - np.ptp(first.span_mm) / passes_mm))
     what = ", ".join(f"{leg.roll_deg:+.0f} deg over {leg.length_mm:.0f} mm" for leg in further)
-    return (f"scan path: further passes, rolled towards the cheek by {what}, take about {more} of {frames} frames",)
+    return (
+        f"scan path: further passes, rolled towards the cheek by {what}, take about {path.further_frames} of "
+        f"{len(path.rig_from_world)} frames",
+    )
 
 
 def _crossing_notes(jaw: Jaw, path: ScanPath) -> tuple[str, ...]:
