@@ -33,13 +33,13 @@ from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.arch_curve import arch_curve
 from cuspid.board import Board
-from cuspid.capture import read_image
 from cuspid.errors import CuspidError
 from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.facing import facing_outwards
 from cuspid.handpiece.brief import read_brief
 from cuspid.handpiece.designs import DESIGNS
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
+from cuspid.image_files import read_image
 from cuspid.jaw import Jaw, Landmark
 from cuspid.motion.colmap import read_model
 from cuspid.pipeline import RenderOptions, take_images

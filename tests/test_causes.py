@@ -16,9 +16,8 @@ from cuspid.calibration import corners
 from cuspid.calibration.calibrate import size_notes
 from cuspid.calibration.causes import cause_of_absence, is_part_of_a_larger_one
 from cuspid.calibration.corners import find_corners
-from cuspid.capture import read_image
 from cuspid.errors import InputError
-from cuspid.image_sequence import exif_orientation, recorded
+from cuspid.image_files import exif_orientation, read_image, recorded
 from cuspid.rig import Rig
 from verbs import refused, run
 

@@ -14,9 +14,9 @@ from PIL import Image
 
 from builders import sphere, write_frames
 from cuspid import storage
-from cuspid.capture import image_size, read_image
 from cuspid.errors import InputError, OutputError
 from cuspid.handpiece.designs import DESIGNS
+from cuspid.image_files import image_size, read_image
 from cuspid.inputs import LARGEST_MIB, read_text, require_file
 from verbs import refused
 

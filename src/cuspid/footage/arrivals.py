@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cuspid.capture import Dropped, Frame, ImageFolder, read_image
+from cuspid.capture import Dropped, Frame, ImageFolder
 from cuspid.errors import InputError
+from cuspid.image_files import read_image
 from cuspid.rig import Handpiece
 from cuspid.storage.captures import IMAGE_SUFFIXES, folders_of_images
 from cuspid.storage.files import finished

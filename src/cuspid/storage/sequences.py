@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
-from cuspid.capture import ImageFolder, image_size
+from cuspid.capture import ImageFolder
 from cuspid.errors import InputError
-from cuspid.image_sequence import ImageSequence, exif_orientation, recorded_size
+from cuspid.image_files import exif_orientation, image_size, recorded_size
+from cuspid.image_sequence import ImageSequence
 from cuspid.inputs import read_text
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, Rig
