@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import map_coordinates
 
-from cuspid.body import CAMERA_MM, LED_MM, Body
+from cuspid.body import CAMERA_MM, LED_MM, Body, nearest_box
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.kernels import kernel
@@ -31,9 +31,9 @@ _LOG = logging.getLogger("cuspid")
 
 _APART_MM = 0.3
 """Largest distance between points on the surface along an edge."""
-_PITCH_MM = 0.15
-"""Spacing of the grid of distances to the body: their errors stay below a hundredth of a millimetre away from its
-edges."""
+_PITCH_MM, _MOST_NODES = 0.5, 2_000_000
+"""Spacing of the grid of distances to the body, wider for a body that would need more nodes than that: only points that
+it does not decide are looked at exactly."""
 _INSIDE_PITCH_MM = 1.0
 """Spacing of the grid of winding numbers; nearer to the surface than this, the distance decides."""
 _INSIDE = 0.5
@@ -79,7 +79,8 @@ class Room:
         # What is nearest to the body meets most poses first.
         points = points[np.argsort(np.sum((points - self._corners.mean(axis=0)) ** 2, axis=1))]
         grid = self._distances
-        free = _clear(points, rotations, translations, grid.values, grid.origin, grid.pitch_mm, self.clearance_mm)
+        coarse = grid.values, grid.origin, grid.pitch_mm
+        free = _clear(points, rotations, translations, coarse, self.body.boxes, self.clearance_mm)
         which = np.flatnonzero(free)
         free[which] = ~self._inside([pose_from_rig[index] @ rig_from_world for index in which.tolist()]).any(axis=1)
         return free
@@ -119,10 +120,10 @@ class Room:
     @computed_once
     def _distances(self) -> _Grid:
         """Signed distance to the body, in the rig frame."""
-        reach = self.clearance_mm + 2 * _PITCH_MM
-        low, high = self.body.bounds + [[-reach], [reach]]
-        places = _Grid.places(low, high, _PITCH_MM)
-        return _Grid(self.body.distances(places.reshape(-1, 3))[0].reshape(places.shape[:3]), low, _PITCH_MM)
+        low, high = self.body.bounds + [[-self.clearance_mm], [self.clearance_mm]]
+        pitch_mm = max(_PITCH_MM, float(np.cbrt(np.prod(high - low) / _MOST_NODES)))
+        places = _Grid.places(low, high, pitch_mm)
+        return _Grid(self.body.distances(places.reshape(-1, 3))[0].reshape(places.shape[:3]), low, pitch_mm)
 
     @property
     def _winding(self) -> _Grid:
@@ -215,28 +216,29 @@ def _in_box(points, r, t, low, high):
 
 @kernel
 @no_type_check
-def _clear(points, rotations, translations, grid, origin, pitch, limit):
-    """For each pose, whether the distances that the grid has at all points, moved by the pose, reach the limit."""
+def _clear(points, rotations, translations, coarse, boxes, limit):
+    """For each pose, whether the distances of all points, moved by the pose, from the boxes reach the limit.
+
+    ``coarse`` is a grid of them, about the boxes as far as the limit: (values, origin, pitch).
+    """
     free = np.ones(len(rotations), dtype=np.bool_)
+    grid, origin, pitch = coarse
     nx, ny, nz = grid.shape
+    slack = pitch * np.sqrt(3.0) / 2  # of a point from the node nearest to it, and so of their distances
     for k in range(len(rotations)):
         r, t = rotations[k], translations[k]
         for n in range(len(points)):
             x, y, z = points[n, 0], points[n, 1], points[n, 2]
-            u = (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0] - origin[0]) / pitch
-            v = (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1] - origin[1]) / pitch
-            w = (r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2] - origin[2]) / pitch
-            if not (0 <= u < nx - 1 and 0 <= v < ny - 1 and 0 <= w < nz - 1):
+            u = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0]
+            v = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]
+            w = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]
+            i, j, l = (u - origin[0]) / pitch + 0.5, (v - origin[1]) / pitch + 0.5, (w - origin[2]) / pitch + 0.5
+            if not (0 <= i < nx and 0 <= j < ny and 0 <= l < nz):
                 continue
-            i, j, l = int(u), int(v), int(w)
-            a, b, c = u - i, v - j, w - l
-            low = (grid[i, j, l] * (1 - a) + grid[i + 1, j, l] * a) * (1 - b) + (
-                grid[i, j + 1, l] * (1 - a) + grid[i + 1, j + 1, l] * a
-            ) * b
-            high = (grid[i, j, l + 1] * (1 - a) + grid[i + 1, j, l + 1] * a) * (1 - b) + (
-                grid[i, j + 1, l + 1] * (1 - a) + grid[i + 1, j + 1, l + 1] * a
-            ) * b
-            if low * (1 - c) + high * c < limit:
+            near = grid[int(i), int(j), int(l)]
+            if near >= limit + slack:
+                continue
+            if near < limit - slack or nearest_box(u, v, w, boxes[0], boxes[1], boxes[2])[0] < limit:
                 free[k] = False
                 break
     return free
