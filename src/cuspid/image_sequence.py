@@ -33,10 +33,13 @@ class ImageSequence:
     """EXIF orientation of each frame, where the camera was held in different ways: images then are taken as its sensor
     recorded them, not turned upright."""
 
+    instants: tuple[str, ...] = ()
+    """Names of the frames, where they are others than those of the files."""
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the frames."""
-        return tuple(path.stem for path in self.paths)
+        return self.instants or tuple(path.stem for path in self.paths)
 
     def __len__(self) -> int:
         return len(self.paths)
