@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 from pathlib import Path
 
 import cv2
@@ -54,6 +55,12 @@ def test_fewer_bits_in_16_are_told_by_the_brightest_image_of_a_folder(
     assert np.array_equal(read_image(bright), expected)
     assert np.abs(read_image(dark).astype(int) - expected // 4).max() <= 1
     assert np.array_equal(read_deep(bright), deep)
+
+
+def test_nothing_waits_for_a_pipe(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "1.png")
+    assert exif_orientation(tmp_path / "1.png") == 1
+    assert read_image(write(tmp_path / "0.png", SHADES.astype(np.uint16))).any()
 
 
 def test_black_images_stay_black(tmp_path: Path) -> None:

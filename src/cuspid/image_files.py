@@ -115,7 +115,7 @@ def has_opacity(path: Path) -> bool:
 def exif_orientation(path: Path) -> int:
     """How an image was held when it was taken, as EXIF has it: 1 (upright) to 8; 1 where the file does not say."""
     try:
-        with warnings.catch_warnings(action="ignore"), path.open("rb") as stream:
+        with warnings.catch_warnings(action="ignore"), require_file(path, "image").open("rb") as stream:
             return _orientation(Image.open(stream), stream)
     except Exception:  # what is wrong with the file is told where it is read
         return 1
@@ -255,8 +255,8 @@ def _bits_used_then(folder: Path, suffix: str, modified_ns: int) -> int:
     most = 0
     for path in sorted(folder.iterdir()):
         if path.suffix == suffix and not path.name.startswith("."):
-            with suppress(OSError):
-                state = path.stat()
+            with suppress(OSError, InputError):
+                state = require_file(path, "image").stat()
                 most = max(most, _peak(path, state.st_size, state.st_mtime_ns))
         if most >> max(_FEWER_BITS):
             return _FULL
