@@ -209,6 +209,7 @@ def _read_opencv(path: Path) -> Camera:
         raise InputError(f"{path}: not an OpenCV calibration (nested more than {_DEEPEST} deep)")
     try:
         file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        file.getNode("camera_matrix")  # OpenCV asserts where the file is a list, or one number
     except (cv2.error, SystemError) as error:
         raise InputError(f"{path}: not an OpenCV calibration") from error
     with reading(path):
