@@ -17,7 +17,7 @@ from pathlib import Path
 
 from cuspid import cli, storage
 from cuspid.cli.calibration import photograph  # noqa: F401 - imported once, not in each run
-from cuspid.handpiece.designs import DESIGNS
+from cuspid.handpiece.designs import DESIGNS, DesignOptions
 
 INSTANTS = (1, 2)
 BOARD = ("--columns", "6", "--rows", "5", "--square-mm", "1", "--supersampling", "1")
@@ -50,7 +50,7 @@ def main() -> None:
     pairs, ends = parser.parse_args().pairs, Counter[str]()
     with tempfile.TemporaryDirectory(prefix="cuspid-at-once-") as made:
         handpiece = Path(made) / "handpiece.json"
-        storage.write_handpiece(handpiece, DESIGNS["two"]())
+        storage.write_handpiece(handpiece, DESIGNS["two"](DesignOptions()))
         alone, said = {}, {instants: Path(made) / f"said-{instants}.txt" for instants in INSTANTS}
         for instants in INSTANTS:
             begun(handpiece, Path(made) / str(instants), instants, said[instants]).join()
