@@ -28,11 +28,11 @@ from real_measures import (
 from real_sets import Set, cameras_of, image_file, mask_file
 from scipy.spatial.transform import Rotation
 
-from cuspid.capture import read_image
 from cuspid.errors import CuspidError
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions, refine
 from cuspid.geometry import Rigid3
+from cuspid.image_files import read_image
 from cuspid.mesh import Mesh
 from cuspid.reconstruction import DepthMap
 from cuspid.reporting.figures.drawing import render

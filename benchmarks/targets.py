@@ -24,8 +24,8 @@ from run import conditions
 from cuspid.board import Board
 from cuspid.calibration.calibrate import RigCalibration, calibrate_rig
 from cuspid.calibration.corners import Views, find_corners
-from cuspid.capture import read_image
 from cuspid.handpiece.designs import DesignOptions, six_cameras
+from cuspid.image_files import read_image
 from cuspid.rig import Handpiece, Rig
 from cuspid.simulation.board_images import PhotographOptions, take_photographs
 from cuspid.simulation.manufacturing import ManufacturingOptions, built

@@ -7,6 +7,7 @@ line what is wrong: no traceback, no hang, no gigabytes, no noise of libraries, 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import os
 import re
@@ -24,6 +25,7 @@ from typing import Any
 import cv2
 import numpy as np
 import trimesh
+from PIL import Image
 
 from boards import photographs, scene, undistorted
 from builders import image_path, write_frames
@@ -33,16 +35,19 @@ from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.arch_curve import arch_curve
 from cuspid.board import Board
-from cuspid.capture import read_image
 from cuspid.errors import CuspidError
 from cuspid.evaluation.deviation import EvaluationOptions
+from cuspid.evaluation.registration import RegistrationOptions
+from cuspid.evaluation.search import SearchOptions
 from cuspid.facing import facing_outwards
 from cuspid.handpiece.brief import read_brief
 from cuspid.handpiece.designs import DESIGNS
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
+from cuspid.image_files import image_size, read_image
 from cuspid.jaw import Jaw, Landmark
 from cuspid.motion.colmap import read_model
 from cuspid.pipeline import RenderOptions, take_images
+from cuspid.rig import Rig
 from report_folders import (
     TOOTH,
     write_calibrated,
@@ -78,6 +83,8 @@ class Scenario:
     """Writes good files into a folder."""
     use: Callable[[Path], object]
     """Reads them; what it writes goes to ``out`` in the folder."""
+    is_good: bool | None = True
+    """Whether the undamaged files are taken; False if they, too, must be refused, None if either will do."""
 
 
 # --- scenarios ----------------------------------------------------------------------------------------------------
@@ -389,6 +396,174 @@ def _beside(folder: Path) -> None:
         (folder / each / "@eaDir").mkdir()
 
 
+def _facing(folder: Path) -> None:
+    """An arch with every other face turned, and one that is inside out."""
+    mesh = arch(1.6).mesh
+    faces = mesh.faces.copy()
+    faces[::2] = faces[::2, ::-1]
+    for name, turned in (("half.ply", faces), ("inside.ply", mesh.faces[:, ::-1])):
+        loaded = trimesh.Trimesh(mesh.vertices, turned, process=False)
+        (folder / name).write_bytes(loaded.export(file_type="ply", encoding="ascii"))
+
+
+def _read_facing(folder: Path) -> None:
+    for name in ("half.ply", "inside.ply"):
+        with contextlib.suppress(CuspidError):
+            load_jaw(folder / name)
+
+
+def _tiny(folder: Path) -> None:
+    """Scans and a reference of next to nothing."""
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    for name, size, times in (("one", 4.0, 1), ("again", 4.0, 10), ("speck", 1e-30, 1), ("reference", 5.0, 1)):
+        loaded = trimesh.Trimesh(size * corners, np.tile(faces, (times, 1)), process=False)
+        (folder / f"{name}.ply").write_bytes(loaded.export(file_type="ply", encoding="ascii"))
+
+
+def _evaluate_tiny(folder: Path) -> None:
+    for name in ("one", "again", "speck"):
+        with contextlib.suppress(CuspidError):
+            scan, against = storage.read_mesh(folder / f"{name}.ply"), pipeline.load_reference(folder / "reference.ply")
+            search = SearchOptions(anchors=2, targets=50, candidates=20, turn_step_deg=45.0)
+            options = EvaluationOptions(samples=500, registration=RegistrationOptions(search=search, samples=200))
+            pipeline.evaluate(scan, against.jaw, options)
+
+
+def _image_types(folder: Path) -> None:
+    """Images of every kind, some of them under the name of another."""
+    rng = np.random.default_rng(0)
+    grey, colours = (
+        rng.integers(0, 1024, (40, 60), dtype=np.uint16),
+        rng.integers(0, 1024, (40, 60, 3), dtype=np.uint16),
+    )
+    shown = (colours >> 2).astype(np.uint8)
+    for suffix in ("png", "tiff"):
+        cv2.imwrite(str(folder / f"grey.{suffix}"), grey)
+        cv2.imwrite(str(folder / f"colours.{suffix}"), colours)
+    cv2.imwrite(str(folder / "decimals.tiff"), grey.astype(np.float32) / 1023)
+    cv2.imwrite(str(folder / "whole.tiff"), grey.astype(np.int32))
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    for name, kind in (("jpeg.png", "JPEG"), ("png.jpg", "PNG"), ("bmp.tiff", "BMP"), ("lying.png", "PNG")):
+        Image.fromarray(shown).save(folder / name, format=kind, **({"exif": exif} if kind != "BMP" else {}))
+
+
+def _read_image_types(folder: Path) -> None:
+    for path in sorted(folder.iterdir()):
+        with contextlib.suppress(CuspidError):
+            size, image = image_size(path), read_image(path)
+            if image.shape[1::-1] != size:
+                raise AssertionError(f"{path.name} is {image.shape}, and was said to be {size}")
+
+
+def _in_folders(folder: Path) -> None:
+    """A capture whose cameras are named with a folder."""
+    two = DESIGNS["two"]()
+    cameras = {f"rig/{name}": mounted for name, mounted in two.rig.cameras.items()}
+    handpiece = replace(two, rig=Rig(cameras), sensors={f"rig/{name}": each for name, each in two.sensors.items()})
+    storage.write_handpiece(folder / "handpiece.json", handpiece)
+    for name, mounted in cameras.items():
+        size = (mounted.camera.height, mounted.camera.width, 3)
+        storage.write_image(folder / "images" / name / "00000.png", np.zeros(size, np.uint8))
+
+
+def _at_one_place(folder: Path) -> None:
+    """Cameras that all stand where the first one does."""
+    storage.write_jaw(folder / "jaw.ply", small_jaw())
+    four = DESIGNS["four"]()
+    first = next(iter(four.rig.cameras.values()))
+    rig = Rig({name: replace(each, cam_from_rig=first.cam_from_rig) for name, each in four.rig.cameras.items()})
+    storage.write_handpiece(folder / "handpiece.json", replace(four, rig=rig))
+
+
+def _exchanged(folder: Path) -> None:
+    """A scan of which the folders of two cameras are exchanged."""
+    _textured_capture(folder)
+    images = folder / "capture" / "images"
+    one, other = sorted(images.iterdir())[:2]
+    one.rename(images / "x")
+    other.rename(one)
+    (images / "x").rename(other)
+
+
+def _strange_beside(folder: Path) -> None:
+    """A scan into whose folders systems and cuspid itself have put something."""
+    _textured_capture(folder)
+    for camera in sorted((folder / "capture" / "images").iterdir()):
+        (camera / ".part-x.png").write_bytes(b"unfinished")
+        (camera / "._00000.png").write_bytes(b"Mac OS X")
+        (camera / "@eaDir").mkdir()
+        (camera / "loop").symlink_to(camera / "loop")
+    (folder / "capture" / "images" / ".git").mkdir()
+
+
+def _written_over(folder: Path) -> None:
+    """Files of others, and a scan whose page might be written over them."""
+    _scan(folder)
+    storage.write_jaw(folder / "jaw.ply", small_jaw())
+    (folder / "notes.txt").write_text("of mine")
+
+
+def _write_over(folder: Path) -> None:
+    for name in ("jaw.ply", "notes.txt"):
+        before = (folder / name).read_bytes() if (folder / name).is_file() else None
+        with contextlib.suppress(SystemExit, CuspidError):
+            verb("report", "@scan", "--out", f"@{name}")(folder)
+        if before is not None and (folder / name).read_bytes() != before:
+            raise AssertionError(f"{name} was written over")
+
+
+def _in_use(folder: Path) -> None:
+    """Another run works in the folder: the verb says so, and writes nothing there."""
+    (folder / _OUT).mkdir()
+    descriptor = os.open(folder / _OUT, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        before = sorted(folder.rglob("*"))
+        verb("photograph", "@handpiece.json", *BOARD, "--out", f"@{_OUT}")(folder)
+    finally:
+        os.close(descriptor)
+        if sorted(folder.rglob("*")) != before:
+            raise AssertionError("something was written where another run works")
+
+
+def _in_little_memory(folder: Path) -> None:
+    held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (held + (4 << 20), hard))
+    try:
+        verb("measure", "@jaw.ply", "--out", f"@{_OUT}")(folder)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def on_terminal(encoding: str, use: Callable[[Path], object]) -> Callable[[Path], None]:
+    """With what is printed going to a terminal of other letters."""
+
+    def used(folder: Path) -> None:
+        with (
+            open(1, "w", encoding=encoding, closefd=False) as out,
+            open(2, "w", encoding=encoding, closefd=False) as err,
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+        ):
+            use(folder)
+
+    return used
+
+
+def _into_a_full_output(folder: Path) -> None:
+    """A full output is told, whatever was to be printed."""
+    full = Path("/dev/full").open("w")  # noqa: SIM115 - what cannot be written cannot be closed either
+    try:
+        with contextlib.redirect_stdout(full):
+            verb("visibility", "@jaw.ply", *PROBE, *SCAN[:4], "--out", f"@{_OUT}")(folder)
+    finally:
+        with contextlib.suppress(OSError):
+            full.close()
+
+
 def _footage(folder: Path) -> None:
     """Films of two cameras in two kinds of videos, images of a third one, and when they were taken."""
     verb("handpiece", "--design", "four", "--width-px", "96", "--height-px", "96", "--out", "@.")(folder)
@@ -449,6 +624,28 @@ SCENARIOS: Mapping[str, Scenario] = {
     "design": Scenario(_demand, verb("design", "@brief.toml", *SEARCH, "--out", f"@{_OUT}")),
     "reproduce": Scenario(_results, verb("reproduce", "--results", "@results", "--no-run", "--out", f"@{_OUT}")),
     "evaluate": Scenario(_meshes, _evaluate),
+    "face directions": Scenario(_facing, _read_facing),
+    "tiny scans": Scenario(_tiny, _evaluate_tiny),
+    "image types": Scenario(_image_types, _read_image_types),
+    "cameras in folders": Scenario(_in_folders, storage.read_capture),
+    "cameras at one place": Scenario(
+        _at_one_place, verb("visibility", "@jaw.ply", *PROBE, *SCAN[:4], "--out", f"@{_OUT}"), is_good=False
+    ),
+    "exchanged cameras": Scenario(_exchanged, verb("reconstruct", "@capture", "--out", f"@{_OUT}"), is_good=False),
+    "strange files beside": Scenario(_strange_beside, verb("live", "@capture", *WATCHED, "--out", f"@{_OUT}")),
+    "files of others": Scenario(_written_over, _write_over),
+    "folder in use": Scenario(_four_cameras, _in_use, is_good=False),
+    "little memory": Scenario(_arch, _in_little_memory, is_good=False),
+    "full output": Scenario(_probe, _into_a_full_output, is_good=False),
+    "long names": Scenario(
+        _four_cameras, verb("photograph", "@handpiece.json", *BOARD, "--out", f"@{'long' * 60}"), is_good=None
+    ),
+    **{
+        f"terminal of {encoding}": Scenario(
+            _arch, on_terminal(encoding, verb("measure", "@jaw.ply", "--out", f"@{_OUT}"))
+        )
+        for encoding in ("ascii", "cp437", "latin-1")
+    },
     "units": Scenario(_units, _compare_units),
     "measure": Scenario(_arch, verb("measure", "@jaw.ply", "--out", f"@{_OUT}")),
     "simulate": Scenario(_probe, verb("simulate", "@jaw.ply", *PROBE, *SCAN, "--out", f"@{_OUT}")),
@@ -660,6 +857,18 @@ def wrong_with(use: Callable[[], object], said: Path) -> str | None:
     return None
 
 
+def _use_good(scenario: Scenario, folder: Path) -> None:
+    refused = False
+    try:
+        scenario.use(folder)
+    except (CuspidError, SystemExit):
+        if scenario.is_good:
+            raise
+        refused = True
+    if scenario.is_good is False and not refused:
+        raise AssertionError("what must be refused is taken")
+
+
 class Fuzzer:
     """Makes the good folders once, and a damaged copy for each case."""
 
@@ -677,8 +886,8 @@ class Fuzzer:
             ):
                 SCENARIOS[name].make(there)
                 first = Path(made) / name
-                shutil.copytree(there, first)
-                SCENARIOS[name].use(first)
+                shutil.copytree(there, first, symlinks=True)
+                _use_good(SCENARIOS[name], first)
         return there
 
     def case(self, name: str, seed: int) -> tuple[str, str | None]:
@@ -686,7 +895,7 @@ class Fuzzer:
         good = self.good(name)
         with tempfile.TemporaryDirectory(dir=self.folder, prefix="case-") as made:
             inner = Path(made) / "a" / "b"
-            shutil.copytree(good, inner)
+            shutil.copytree(good, inner, symlinks=True)
             what = damage(inner, np.random.default_rng([seed, *name.encode()]))
             before = set(Path(made).rglob("*"))
             wrong = wrong_with(lambda: SCENARIOS[name].use(inner), Path(made) / "said.txt")

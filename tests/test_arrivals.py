@@ -114,3 +114,44 @@ def test_mixed_types_are_refused(tmp_path: Path) -> None:
     arrivals.news(0.0)
     with pytest.raises(InputError, match="write all images in one type"):
         arrivals.news(0.1)
+
+
+def test_a_running_scan_passes_over_what_does_not_belong_to_it(tmp_path: Path) -> None:
+    arrivals = Arrivals(tmp_path, handpiece("a", "b"), late_s=2.0)
+    assert arrivals.news(0.0) == [], "there is no folder yet"
+    for camera in "ab":
+        write(tmp_path, camera, "00000")
+        (tmp_path / "images" / camera / ".part-x.png").write_bytes(b"unfinished")
+        (tmp_path / "images" / camera / "._00000.png").write_bytes(b"Mac OS X")
+        write(tmp_path, f"{camera}/@eaDir", "00000")
+    write(tmp_path, ".git", "00000")
+    (tmp_path / "images" / "notes").mkdir()
+    arrivals.news(0.1)
+    assert names(arrivals.news(0.2)) == ["00000"]
+    for camera in "ab":
+        write(tmp_path, camera, "00001")
+    write(tmp_path, "x", "00001")
+    write(tmp_path, "b", "00002", suffix=".jpg")
+    arrivals.news(0.3)
+    assert names(arrivals.news(0.4)) == ["00001"]
+    told = [(Path(each.what).name, each.reason.partition(";")[0]) for each in arrivals.left_out]
+    assert told == [("x", "the handpiece has no camera x"), ("00002.jpg", "the images before are .png files")]
+
+
+def test_an_image_that_is_not_whole_is_waited_for_whatever_its_type(tmp_path: Path) -> None:
+    arrivals = Arrivals(tmp_path, handpiece("a"), late_s=2.0)
+    half = write(tmp_path, "a", "00000", share=0.7, suffix=".bmp")
+    assert arrivals.news(0.0) == arrivals.news(0.1) == arrivals.news(5.0) == []
+    half.unlink()
+    write(tmp_path, "a", "00000", suffix=".bmp")
+    assert arrivals.news(6.0) == []
+    assert names(arrivals.news(6.1)) == ["00000"]
+
+
+def test_cameras_may_be_named_with_a_folder(tmp_path: Path) -> None:
+    arrivals = Arrivals(tmp_path, handpiece("rig/a", "rig/b"), late_s=2.0)
+    for camera in "ab":
+        write(tmp_path, f"rig/{camera}", "00000")
+    arrivals.news(0.0)
+    (frame,) = arrivals.news(0.1)
+    assert frame.cameras == ("rig/a", "rig/b")

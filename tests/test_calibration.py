@@ -344,6 +344,13 @@ def test_cameras_that_expose_together_have_no_delays():
     assert all(check.delay_frames is None and check.alone_apart < 1.5 for check in found.cameras.values())
 
 
+def test_a_few_views_judge_no_calibration():
+    truth = scene(2, BOARD, cameras=2, instants=5)
+    found = calibrated(truth, views_of(truth, BOARD, 0.1, np.random.default_rng(2)))
+    assert all(check.alone_apart is None and check.parameters_apart is None for check in found.cameras.values())
+    assert not any("standard deviations" in note for note in found.notes)
+
+
 @pytest.mark.parametrize("worse", ["undetermined", "no better", "few views", "no halves"])
 def test_delays_that_explain_nothing_are_not_taken(monkeypatch, worse):
     """Doubtful views are tried with delays; the calibration without stays where these fail, or leave much out."""

@@ -16,9 +16,11 @@ from cuspid.calibration import corners
 from cuspid.calibration.calibrate import size_notes
 from cuspid.calibration.causes import cause_of_absence, is_part_of_a_larger_one
 from cuspid.calibration.corners import find_corners
-from cuspid.capture import read_image
+from cuspid.calibration.instants import common_instants
+from cuspid.cli.calibration import _matched
 from cuspid.errors import InputError
-from cuspid.image_sequence import exif_orientation, recorded
+from cuspid.image_files import exif_orientation, read_image, recorded
+from cuspid.image_sequence import ImageSequence
 from cuspid.rig import Rig
 from verbs import refused, run
 
@@ -81,12 +83,59 @@ def test_a_chessboard_is_searched_for_exhaustively(monkeypatch: pytest.MonkeyPat
 
     def find(image: np.ndarray, size: tuple[int, int], flags: int = 0) -> tuple[bool, np.ndarray | None]:
         asked.append(flags)
-        places = np.stack(np.meshgrid(np.arange(6.0), np.arange(5.0)), axis=-1).reshape(-1, 1, 2)
-        return (True, 10 * places) if flags == cv2.CALIB_CB_EXHAUSTIVE else (False, None)
+        places = np.stack(np.meshgrid(np.arange(1, 7), np.arange(1, 6)), axis=-1).reshape(-1, 1, 2)
+        return (True, 10 * places.astype(np.float32) - 0.5) if flags == cv2.CALIB_CB_EXHAUSTIVE else (False, None)
 
     monkeypatch.setattr(corners.cv2, "findChessboardCornersSB", find)
-    assert find_corners(np.zeros((90, 90), np.uint8), CHESSBOARD) is not None
+    squares = np.indices((6, 7)).sum(axis=0) % 2 * 200
+    assert find_corners(np.kron(squares, np.ones((10, 10))).astype(np.uint8), CHESSBOARD) is not None
     assert asked == [0, cv2.CALIB_CB_EXHAUSTIVE]
+
+
+@pytest.mark.parametrize("gone", [np.s_[-1], np.s_[:, 0]])
+def test_the_ends_of_outer_squares_are_no_corners(monkeypatch: pytest.MonkeyPatch, gone: object) -> None:
+    """A board whose other end is out of the picture: a row of corners is found where its border is white."""
+    places = np.stack(np.meshgrid(np.arange(1, 7), np.arange(1, 6)), axis=-1).reshape(-1, 1, 2)
+    found = (True, 10 * places.astype(np.float32) - 0.5)
+    monkeypatch.setattr(corners.cv2, "findChessboardCornersSB", lambda *_, **__: found)
+    squares = np.indices((6, 7)).sum(axis=0) % 2 * 200
+    squares[gone] = 200
+    assert find_corners(np.kron(squares, np.ones((10, 10))).astype(np.uint8), CHESSBOARD) is None
+
+
+@pytest.mark.parametrize(
+    ("names", "instants"),
+    [
+        ({"cam1": ["cam1_0001", "cam1_0002"], "cam2": ["cam2_0001", "cam2_0002"]}, ("1", "2")),
+        ({"left": ["left_0009", "left_0010"], "right": ["right_0009", "right_0010"]}, ("09", "10")),
+        ({"l": ["l1_t3", "l1_t4"], "r": ["r2-004", "r2-005"]}, ("3", "4")),
+    ],
+)
+def test_names_with_a_prefix_are_matched_by_their_number(names: dict, instants: tuple[str, str]) -> None:
+    found = common_instants(names)
+    assert found is not None
+    assert found[next(iter(names))] == instants
+
+
+def test_common_names_are_the_instants_and_others_are_told() -> None:
+    assert common_instants({"a": ["01", "02"], "b": ["02", "03"]}) is None
+    assert common_instants({"a": ["x", "y"]}) is None
+    with pytest.raises(InputError, match="no two cameras have an image of the same name, or with the same number"):
+        common_instants({"a": ["one", "two"], "b": ["three", "four"]})
+    with pytest.raises(InputError, match=r"\(a: x1, b: y8\)"):
+        common_instants({"a": ["x1", "x2"], "b": ["y8", "y9"]})
+
+
+def test_prefixed_images_are_matched_and_it_is_told() -> None:
+    sequences = {
+        camera: ImageSequence(
+            source=Path(camera), paths=tuple(Path(f"{camera}_{number:04d}.png") for number in (1, 2)), size=(64, 64)
+        )
+        for camera in ("left", "right")
+    }
+    matched, (note,) = _matched(sequences)
+    assert [each.names for each in matched.values()] == [("1", "2"), ("1", "2")]
+    assert "left: left_0001 is 1, right: right_0001 is 1" in note
 
 
 def test_the_verb_names_the_cause_and_the_images_without_a_board(

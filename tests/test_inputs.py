@@ -14,9 +14,9 @@ from PIL import Image
 
 from builders import sphere, write_frames
 from cuspid import storage
-from cuspid.capture import image_size, read_image
 from cuspid.errors import InputError, OutputError
 from cuspid.handpiece.designs import DESIGNS
+from cuspid.image_files import image_size, read_image
 from cuspid.inputs import LARGEST_MIB, read_text, require_file
 from verbs import refused
 
@@ -194,3 +194,13 @@ def test_a_calibration_that_is_nested_without_end_is_refused(tmp_path, opening):
     (tmp_path / "camera.yml").write_text(f"%YAML:1.0\n---\ncamera_matrix: {100_000 * opening}")
     with pytest.raises(InputError, match="nested more than"):
         storage.read_sequence(tmp_path / "frames", tmp_path / "out", calibration=tmp_path / "camera.yml")
+
+
+@pytest.mark.parametrize("text", ["- 1\n- 2\n", "3\n"])
+def test_a_calibration_of_opencv_that_is_a_list_or_a_number_is_told(tmp_path: Path, text: str) -> None:
+    file, image = tmp_path / "camera.yml", np.zeros((40, 60, 3), np.uint8)
+    file.write_text(f"%YAML:1.0\n---\n{text}")
+    for name in ("0", "1"):
+        storage.write_image(tmp_path / "frames" / f"{name}.png", image)
+    with pytest.raises(InputError, match="not an OpenCV calibration"):
+        storage.read_sequence(tmp_path / "frames", tmp_path / "out", calibration=file)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -15,13 +16,14 @@ import numpy as np
 import pytest
 
 from cuspid import storage
-from cuspid.capture import Frame
-from cuspid.cli.live import _paced
+from cuspid.capture import Capture, Frame
+from cuspid.cli.live import _Feed, _followed, _paced
+from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.reporting import live_view
 from cuspid.reporting.growing_view import GrowingView
-from test_session import scan, smooth
+from test_session import FIXED, scan, smooth, with_frame
 from verbs import refused, run
 
 STANDARD = ("--quality", "standard", "--calibration", "fixed")
@@ -83,6 +85,38 @@ def test_plain_teeth_are_refused_and_nothing_is_left(tmp_path: Path, capsys: pyt
         storage.write_image(tmp_path / "capture" / "images" / camera / "00000.png", smooth())
     assert "it shows no texture" in refused(capsys, "live", tmp_path / "capture", "--out", tmp_path / "scan")
     assert not (tmp_path / "scan").exists()
+
+
+def feed(*frames: Frame | None, error: InputError | None = None, capture: Capture | None = None) -> _Feed:
+    """Frames, of which None is a pause, and what ends them."""
+    taken = capture or scan()
+
+    def coming() -> Iterator[Frame | None]:
+        yield from frames
+        if error is not None:
+            raise error
+
+    return _Feed(handpiece=taken.handpiece, source=lambda: taken.source, frames=coming(), left_out=lambda: ())
+
+
+def test_pauses_and_incomplete_frames_before_the_first_whole_one_do_no_harm(tmp_path: Path) -> None:
+    torn, alone, whole = scan().frames[:3]
+    alone = replace(alone, cameras=alone.cameras[:1])
+    capture = with_frame(scan(), torn.name, np.zeros((8, 160, 3), np.uint8))
+    taken = _followed(feed(None, torn, None, alone, None, whole, capture=capture), tmp_path, FIXED, None)
+    assert [frame.name for frame in taken.frames] == [alone.name, whole.name]
+    assert [each.what for each in taken.left_out] == [f"frame {torn.name}"]
+
+
+def test_what_was_taken_is_reconstructed_whatever_ends_the_scan(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = InputError("folder: closed")
+    taken = _followed(feed(scan().frames[0], error=error), tmp_path, FIXED, None)
+    assert len(taken.frames) == 1
+    assert "note: folder: closed; the scan is ended" in capsys.readouterr().err
+    with pytest.raises(InputError, match="closed"):
+        _followed(feed(error=error), tmp_path, FIXED, None)
 
 
 def test_a_replay_keeps_its_pace() -> None:

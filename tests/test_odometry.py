@@ -341,12 +341,12 @@ def test_a_frame_is_triangulated_in_the_rig_frame() -> None:
 def test_chain_follows_edges_in_both_directions() -> None:
     """Poses come from the edges whatever frame they start at; the first located frame is the world."""
     step = Rigid3.from_rotation_vector(np.array([0, 0, 0.1]), np.array([1.0, 0, 0]))
-    none = Edge(target_from_source=None, matches=3)
+    none = Edge(target_from_source=None, matches=3, sought=3)
     edges = {
         (0, 1): none,
-        (1, 2): Edge(target_from_source=step, matches=90),
+        (1, 2): Edge(target_from_source=step, matches=90, sought=90),
         (0, 2): none,
-        (1, 3): Edge(target_from_source=step @ step, matches=80),
+        (1, 3): Edge(target_from_source=step @ step, matches=80, sought=80),
         (2, 3): none,
     }
     path = chain(edges, ["p", "q", "r", "s"], OdometryOptions())

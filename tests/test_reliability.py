@@ -70,6 +70,8 @@ def test_a_folder_that_may_not_be_entered_is_told(tmp_path: Path, capsys: pytest
         (OSError(36, "File name too long", "/x/long"), "/x/long: cannot be used (File name too long)"),
         (MemoryError("Unable to allocate 309. GiB for an array"), "not enough memory (Unable to allocate 309. GiB"),
         (MemoryError(), "not enough memory (for this size)"),
+        (ImportError("a.so: failed to map segment from shared object"), "not enough memory (a.so: failed to map"),
+        (RuntimeError("can't start new thread"), "not enough memory (can't start new thread)"),
     ],
 )
 def test_what_the_system_refuses_is_one_line(

@@ -71,6 +71,17 @@ def test_the_clearance_over_a_plate_is_the_closed_form(height_mm: float) -> None
     assert room.clearance(turned)[0] == pytest.approx(height_mm + 1 - np.sqrt(2), abs=0.04)
 
 
+def test_a_long_handle_held_obliquely_takes_little_memory_and_is_exact() -> None:
+    turn = Rotation.from_euler("x", 30, degrees=True).as_matrix()
+    handle = Box(Rigid3(turn, turn @ np.array([0.0, -80.0, 0.0])), np.array([9.0, 90.0, 9.0]))
+    room = Room(plate(0.0, 20.0), Body({"cube": CUBE.parts["cube"], "handle": handle}), 0.5)
+    poses = [at(0, 0, height_mm) for height_mm in np.arange(0.3, 60.0, 1.7)]
+    exact = [room.clearance(pose)[0] >= 0.5 for pose in poses]
+    assert room.fits(Rigid3.identity(), poses).tolist() == exact
+    assert 0 < np.count_nonzero(exact) < len(exact)
+    assert room._distances.values.nbytes < 50e6
+
+
 @pytest.mark.parametrize("height_mm", [0.5, 1.3, 1.7, 2.4])
 def test_what_fits_has_its_clearance(height_mm: float) -> None:
     """The grid of distances and the exact distance agree."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import resource
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -116,6 +117,21 @@ def test_a_record_that_is_no_file_is_told_and_nothing_waits_for_it_or_goes_elsew
             Stage("cut", folder, Options()).record("key", [])
     assert elsewhere.read_bytes() == b""
     assert not (tmp_path / "nowhere").exists()
+
+
+def test_a_record_that_cannot_be_written_leaves_no_empty_file(tmp_path: Path) -> None:
+    file = tmp_path / "result.txt"
+    file.touch()
+    stage, (soft, hard) = Stage("cut", tmp_path, Options()), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
+    try:
+        with pytest.raises(OutputError, match="cannot be written"):
+            stage.record("key", [file])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert [path.name for path in tmp_path.iterdir()] == ["result.txt"]
+    stage.record("key", [file])
+    assert stage.has("key", [file])
 
 
 def test_the_version_of_the_code_tells_its_parts_apart() -> None:

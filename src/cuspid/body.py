@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, read_only
 from cuspid.kernels import kernel
+from cuspid.workers import computed_once
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,35 +76,42 @@ class Body:
     def distances(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"]]:
         """Signed distance in mm from points in the rig frame to the nearest part, negative inside, and the index of
         that part."""
-        boxes = self.parts.values()
         distance, part = np.empty(len(points)), np.empty(len(points), dtype=np.int64)
-        box_distances(
-            np.ascontiguousarray(points, dtype=np.float64),
+        _distances(np.ascontiguousarray(points, dtype=np.float64), *self.boxes, distance, part)
+        return distance, part
+
+    @computed_once
+    def boxes(self) -> tuple[Float[np.ndarray, "p 3 3"], Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
+        """Rotations and translations into the boxes, and half their sides, as :func:`nearest_box` takes them."""
+        boxes = self.parts.values()
+        return (
             np.stack([box.box_from_rig.rotation for box in boxes]),
             np.stack([box.box_from_rig.translation for box in boxes]),
             np.stack([box.half_mm for box in boxes]),
-            distance,
-            part,
         )
-        return distance, part
 
 
 @kernel
 @no_type_check
-def box_distances(points, rotations, translations, halves, distance, part):
-    """Fill in the signed distance from points to the nearest of several boxes, and its index."""
+def nearest_box(x, y, z, rotations, translations, halves):
+    """Signed distance from a point to the nearest box, and its index."""
+    nearest, which = np.inf, -1
+    for b in range(len(halves)):
+        outside, inside = 0.0, -np.inf
+        for i in range(3):
+            along = rotations[b, i, 0] * x + rotations[b, i, 1] * y + rotations[b, i, 2] * z + translations[b, i]
+            over = abs(along) - halves[b, i]
+            inside = max(inside, over)
+            if over > 0:
+                outside += over * over
+        signed = np.sqrt(outside) if inside > 0 else inside
+        if signed < nearest:
+            nearest, which = signed, b
+    return nearest, which
+
+
+@kernel
+@no_type_check
+def _distances(points, rotations, translations, halves, distance, part):
     for n in range(len(points)):
-        distance[n], part[n] = np.inf, -1
-        for b in range(len(halves)):
-            outside, inside = 0.0, -np.inf
-            for i in range(3):
-                x = translations[b, i]
-                for j in range(3):
-                    x += rotations[b, i, j] * points[n, j]
-                over = abs(x) - halves[b, i]
-                inside = max(inside, over)
-                if over > 0:
-                    outside += over * over
-            signed = np.sqrt(outside) if inside > 0 else inside
-            if signed < distance[n]:
-                distance[n], part[n] = signed, b
+        distance[n], part[n] = nearest_box(points[n, 0], points[n, 1], points[n, 2], rotations, translations, halves)

@@ -3,98 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-import warnings
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8, UInt16
-from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
+from jaxtyping import UInt8
 
 from cuspid.errors import InputError
-from cuspid.inputs import require_file
+from cuspid.image_files import has_opacity, image_size, read_image, read_rgba
 from cuspid.rig import Handpiece, Rig
-from cuspid.values import checked_name, one_line
-
-# What is too large or damaged is refused; short of that nothing need be said.
-warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-warnings.filterwarnings("ignore", module=r"PIL\.")
-
-PNG_END = b"IEND\xaeB`\x82"
-"""The last bytes of a whole PNG file."""
-
-
-def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    """An 8-bit RGB image, upright. Raises InputError where the file is missing or cannot be decoded whole."""
-    return _decoded(path, "RGB")
-
-
-def read_rgba(path: Path) -> UInt8[np.ndarray, "h w 4"]:
-    """As :func:`read_image`, with the opacity of each pixel; 255 where the file has none."""
-    return _decoded(path, "RGBA")
-
-
-def read_deep(path: Path) -> UInt8[np.ndarray, "h w *c"] | UInt16[np.ndarray, "h w *c"]:
-    """As :func:`read_image`, but as stored, with 8 or 16 bits; grey as (h, w)."""
-    return _decoded(path, None)
-
-
-def read_as_stored(path: Path) -> UInt8[np.ndarray, "h w 4"]:
-    """As :func:`read_rgba`, but in the grid of the sensor, whichever way the camera was held."""
-    return _decoded(path, "RGBA", upright=False)
-
-
-def _decoded(
-    path: Path, mode: Literal["RGB", "RGBA"] | None, *, upright: bool = True
-) -> UInt8[np.ndarray, "h w *c"] | UInt16[np.ndarray, "h w"]:
-    image_size(path)
-    try:
-        with Image.open(path) as image:
-            if upright:
-                ImageOps.exif_transpose(image, in_place=True)
-            if mode is None and (image.mode == "L" or image.mode.startswith("I;16")):
-                return np.asarray(image).astype(np.uint8 if image.mode == "L" else np.uint16)
-            deep = image.mode.startswith("I;16")
-            shown = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8)) if deep else image
-            wanted = mode or "RGB"
-            return np.asarray(shown if shown.mode == wanted else shown.convert(wanted))
-    except Exception as error:  # as in image_size
-        raise InputError(f"{path}: cannot be decoded ({one_line(error)}); copy the image again") from error
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height in px, from the header. Raises InputError where the file is missing, truncated or not an
-    image."""
-    try:
-        with require_file(path, "image").open("rb") as stream:
-            width, height = _upright_size(Image.open(stream))
-            stream.seek(max(0, path.stat().st_size - len(PNG_END)))
-            end = stream.read()
-    except Image.DecompressionBombError as error:
-        raise InputError(
-            f"{path}: too many pixels; at most {2 * (Image.MAX_IMAGE_PIXELS or 0):,} can be read"
-        ) from error
-    except UnidentifiedImageError as error:
-        raise InputError(f"{path}: not an image, or truncated; copy the image again") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); put the image back") from error
-    except InputError:
-        raise
-    except Exception as error:  # a reader of Pillow raises whatever its format makes of the header
-        raise InputError(f"{path}: damaged ({one_line(error)}); copy the image again") from error
-    if path.suffix.lower() == ".png" and end != PNG_END:
-        raise InputError(f"{path}: truncated PNG; copy the image again")
-    return width, height
-
-
-def _upright_size(image: Image.Image) -> tuple[int, int]:
-    """A camera that is held on its side keeps its image lying and says so; PNG would be decoded to be asked, and Pillow
-    turns TIFF by itself."""
-    lying = image.format not in ("PNG", "TIFF") and image.getexif().get(ExifTags.Base.Orientation) in (5, 6, 7, 8)
-    return (image.height, image.width) if lying else image.size
+from cuspid.values import checked_name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,13 +102,6 @@ def read_mask(image: Path, mask: Path | None) -> UInt8[np.ndarray, "h w"] | None
     if not counts.any():
         raise InputError(f"{mask or image}: the mask leaves nothing of the image; white is what counts")
     return counts
-
-
-def has_opacity(path: Path) -> bool:
-    """Whether an image file states the opacity of its pixels."""
-    image_size(path)
-    with Image.open(path) as image:
-        return image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
 
 
 @cache

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image
 
 from cuspid.camera import Camera
-from cuspid.capture import read_image
 from cuspid.errors import InputError
+from cuspid.image_files import read_image, recorded
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -35,10 +33,13 @@ class ImageSequence:
     """EXIF orientation of each frame, where the camera was held in different ways: images then are taken as its sensor
     recorded them, not turned upright."""
 
+    instants: tuple[str, ...] = ()
+    """Names of the frames, where they are others than those of the files."""
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the frames."""
-        return tuple(path.stem for path in self.paths)
+        return self.instants or tuple(path.stem for path in self.paths)
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -51,38 +52,3 @@ class ImageSequence:
         if image.shape[1::-1] != self.size:
             raise InputError(f"{self.paths[index]}: its size changed while it was in use; start again")
         return image
-
-
-def exif_orientation(path: Path) -> int:
-    """How an image was held when it was taken, as EXIF has it: 1 (upright) to 8; 1 where the file does not say."""
-    try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
-            found = image.getexif().get(_ORIENTATION, 1)
-    except Exception:  # what is wrong with the file is told where it is read
-        return 1
-    return found if isinstance(found, int) and 1 <= found <= 8 else 1
-
-
-def recorded_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image as the sensor recorded it, px, of a file that was found to be an image."""
-    with Image.open(path) as image:
-        width, height = image.size
-    return width, height
-
-
-def recorded(upright: UInt8[np.ndarray, "h w c"], orientation: int) -> UInt8[np.ndarray, "h2 w2 c"]:
-    """An image that was turned upright by its EXIF orientation, as the sensor recorded it."""
-    across = upright.swapaxes(0, 1)
-    return {
-        1: upright,
-        2: upright[:, ::-1],
-        3: upright[::-1, ::-1],
-        4: upright[::-1],
-        5: across,
-        6: np.rot90(upright, 1),
-        7: across[::-1, ::-1],
-        8: np.rot90(upright, -1),
-    }[orientation]
-
-
-_ORIENTATION = 0x0112

@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from cuspid.camera import Camera
-from cuspid.capture import Dropped, file_digest, image_size, read_as_stored, read_deep
+from cuspid.capture import Dropped, file_digest
 from cuspid.errors import InputError
+from cuspid.image_files import image_size, read_as_stored, read_deep
 from cuspid.values import checked_name
 
 UPRIGHT, _LYING = 1, (5, 6, 7, 8)

@@ -33,6 +33,7 @@ from cuspid.jaw import GUM, Arch, Jaw
 from cuspid.memory import give_back
 from cuspid.mesh import Mesh
 from cuspid.motion.epipolar_check import epipolar_offset_px
+from cuspid.motion.exchanged import require_own_images
 from cuspid.motion.location import MotionOptions
 from cuspid.motion.stage import MotionMethod, locate, locate_by_surfaces, take_poses
 from cuspid.motion.surface_tracking import SurfaceTrackingOptions
@@ -118,6 +119,8 @@ class ReconstructionOptions(Options):
     signal: Literal["auto", "texture", "shading"] = "auto"
     """What is matched: texture, or the light and shade of plain surfaces, where the frames are then located by their
     surfaces. auto: texture if the images hold any."""
+    own_images: bool = True
+    """Look first whether the images of each camera are its own, or those of another one."""
     stereo: StereoOptions = field(default_factory=StereoOptions)
     """Depth of a view from those that it is matched with."""
     across: AcrossOptions = field(default_factory=AcrossOptions)
@@ -167,9 +170,13 @@ def find_poses(
         depths = _shaded_depth(capture, folder, options, progress)
         made_from, how = depths.digest, options.surfaces
         return locate_by_surfaces(capture, depths, made_from, folder / "motion", how, progress=progress)
+    doubts: tuple[str, ...] = ()
+    if options.own_images:
+        cache = folder / "motion" / "cache"
+        doubts = require_own_images(capture, options.tracking, cache=cache, progress=progress)
     capture, notes = _hold_what_fits(capture, nominal, folder / "motion", options, progress)
     found = locate(capture, folder / "motion", options.tracking, options.motion, progress=progress)
-    return replace(found, notes=(*notes, *found.notes))
+    return replace(found, notes=(*doubts, *notes, *found.notes))
 
 
 def _hold_what_fits(

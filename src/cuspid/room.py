@@ -18,7 +18,7 @@ import igl
 import numpy as np
 from jaxtyping import Bool, Float
 
-from cuspid.body import CAMERA_MM, LED_MM, Body, box_distances
+from cuspid.body import CAMERA_MM, LED_MM, Body, nearest_box
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, composed
 from cuspid.kernels import kernel
@@ -30,10 +30,12 @@ _LOG = logging.getLogger("cuspid")
 
 _APART_MM = 0.3
 """Largest distance between points on the surface along an edge."""
-_PITCH_MM = 0.25
-"""Spacing of the grid of distances to the body. It decides where it can, and the exact distance elsewhere."""
-_OFF_MM = _PITCH_MM * float(np.sqrt(3) / 2)
-"""How far it may be from that at the nearest node of the grid: it changes nowhere faster than one's place."""
+_PITCH_MM, _MOST_NODES = 0.25, 2_000_000
+"""Spacing of the grid of distances to the body, wider for a body that would need more nodes than that. It decides where
+it can, and the exact distance elsewhere."""
+_OFF = float(np.sqrt(3) / 2)
+"""How far a distance may be from that at the nearest node of the grid, in spacings: it changes nowhere faster than a
+place does."""
 _INSIDE_PITCH_MM = 1.0
 """Spacing of the grid of winding numbers; nearer to the surface than this, the distance decides."""
 _INSIDE = 0.5
@@ -99,6 +101,7 @@ class _Solid(NamedTuple):
     bounds: np.ndarray
     distances: np.ndarray
     origin: np.ndarray
+    pitch: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,17 +166,18 @@ class Room:
     @computed_once
     def _solid(self) -> _Solid:
         """With the signed distances to the body around it."""
-        boxes, reach = self.body.parts.values(), self.clearance_mm + 2 * _PITCH_MM
+        size = np.ptp(self.body.bounds, axis=0) + 2 * self.clearance_mm
+        pitch_mm = max(_PITCH_MM, float(np.cbrt(np.prod(size) / _MOST_NODES)))
+        reach = self.clearance_mm + 2 * pitch_mm
         low, high = self.body.bounds + [[-reach], [reach]]
-        places = _Grid.places(low, high, _PITCH_MM)
+        places = _Grid.places(low, high, pitch_mm)
         return _Solid(
-            np.stack([box.box_from_rig.rotation for box in boxes]),
-            np.stack([box.box_from_rig.translation for box in boxes]),
-            np.stack([box.half_mm for box in boxes]),
+            *self.body.boxes,
             self._middles,
             self.body.bounds,
             self.body.distances(places.reshape(-1, 3))[0].reshape(places.shape[:3]),
             low,
+            pitch_mm,
         )
 
     @property
@@ -345,14 +349,15 @@ def _box_distance(x, y, z, bounds):
 @kernel
 @no_type_check
 def _at_least(x, y, z, solid):
-    """A lower bound of the distance from a place in the rig frame to the body: near to it twice `_OFF_MM` below an
-    upper bound."""
+    """A lower bound of the distance from a place in the rig frame to the body: near to it twice `_OFF` spacings below
+    an upper bound."""
     nx, ny, nz = solid.distances.shape
-    u = (x - solid.origin[0]) * (1 / _PITCH_MM) + 0.5
-    v = (y - solid.origin[1]) * (1 / _PITCH_MM) + 0.5
-    w = (z - solid.origin[2]) * (1 / _PITCH_MM) + 0.5
+    scale = 1 / solid.pitch
+    u = (x - solid.origin[0]) * scale + 0.5
+    v = (y - solid.origin[1]) * scale + 0.5
+    w = (z - solid.origin[2]) * scale + 0.5
     if 0 <= u < nx and 0 <= v < ny and 0 <= w < nz:
-        return solid.distances[int(u), int(v), int(w)] - _OFF_MM
+        return solid.distances[int(u), int(v), int(w)] - _OFF * solid.pitch
     return _box_distance(x, y, z, solid.bounds)
 
 
@@ -361,7 +366,7 @@ def _at_least(x, y, z, solid):
 def _is_free(rotation, translation, surface, solid, limit, stack):
     """Whether a body at a pose keeps its distance from all points."""
     leaves = (len(surface.radii) + 1) // 2
-    leaf, point, one, part = len(surface.points) // leaves, np.empty((1, 3)), np.empty(1), np.empty(1, np.int64)
+    leaf = len(surface.points) // leaves
     stack[0], count = 0, 1
     while count > 0:
         count -= 1
@@ -379,11 +384,9 @@ def _is_free(rotation, translation, surface, solid, limit, stack):
             least = _at_least(x, y, z, solid)
             if least >= limit:
                 continue
-            if least + 2 * _OFF_MM >= limit:
-                point[0, 0], point[0, 1], point[0, 2] = x, y, z
-                box_distances(point, solid.rotations, solid.translations, solid.halves, one, part)
-                if one[0] >= limit:
-                    continue
+            undecided = least + 2 * _OFF * solid.pitch >= limit
+            if undecided and nearest_box(x, y, z, solid.rotations, solid.translations, solid.halves)[0] >= limit:
+                continue
             return False
     return True
 

@@ -142,6 +142,8 @@ class Session:
 
         Raises ReconstructionError where too few of them can be placed; nothing is changed then.
         """
+        if not self.frames:
+            return {}
         found = pipeline.find_poses(self.capture, self._folder, self._options, progress=progress)
         self._tracker.correct(found.rig_from_world)
         for frame in self.frames:

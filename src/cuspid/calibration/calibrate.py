@@ -33,6 +33,8 @@ from cuspid.rig import MountedCamera, Rig
 
 _DOUBTFUL = 2.0
 """Difference between two halves, in standard deviations, that chance hardly explains."""
+_TELLING = 6
+"""Views from which on a calibration states how far it may be off well enough for others to be judged by it."""
 _MUCH_MORE = 3.0
 """Ratio of the residuals together with other cameras to those alone, beyond which a note is given."""
 _LESS = 0.9
@@ -80,9 +82,9 @@ class CameraCheck:
     about 1 if these are right."""
     place_apart: float | None
     """The same for the pose in the rig."""
-    alone_apart: float
+    alone_apart: float | None
     """Difference between the parameters and those from its own views alone, in the standard deviations that the latter
-    state; below 1 if these are right."""
+    state; below 1 if these are right; None if there were too few views to tell."""
     delay_frames: float | None
     """How many frames after the others it saw the board, in the mean; None if all cameras exposed together."""
     delay_spread_frames: float | None
@@ -162,7 +164,7 @@ def _is_worse_together(check: CameraCheck) -> bool:
 
 def _is_doubtful_together(check: CameraCheck) -> bool:
     """Whether a camera may have exposed at other moments than the others."""
-    return _is_worse_together(check) or check.alone_apart > _DOUBTFUL
+    return _is_worse_together(check) or (check.alone_apart or 0.0) > _DOUBTFUL
 
 
 def _held_out_px(found: RigCalibration) -> float:
@@ -298,7 +300,7 @@ def _described(
             held_out_px=held_out.get(name),
             parameters_apart=apart[name][0] if name in apart else None,
             place_apart=apart[name][1] if name in apart else None,
-            alone_apart=_lens_apart(found.scene.cameras[name], alone[name]),
+            alone_apart=_lens_apart(found.scene.cameras[name], alone[name]) if len(of[name]) >= _TELLING else None,
             delay_frames=delays[name][0],
             delay_spread_frames=delays[name][1],
         )
@@ -345,7 +347,7 @@ def _lens_apart(camera: Camera, alone: Adjusted) -> float:
 def _widened(mounted: MountedCamera, check: CameraCheck) -> MountedCamera:
     """With covariances that account for how far two halves of the images are apart, and the lens from that of its own
     views alone."""
-    lens = max(1.0, check.parameters_apart or 0.0, check.alone_apart) ** 2
+    lens = max(1.0, check.parameters_apart or 0.0, check.alone_apart or 0.0) ** 2
     place = max(1.0, check.place_apart or 0.0) ** 2
     camera = replace(mounted.camera, covariance=lens * known(mounted.camera.covariance))
     return replace(mounted, camera=camera, covariance=place * known(mounted.covariance))
@@ -373,7 +375,7 @@ def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Itera
                 f"camera {name}: calibrations from two halves of the images differ by {worst:.1f} of their standard "
                 "deviations; its covariance is widened accordingly; look for a pattern in residuals.png"
             )
-        if check.alone_apart > _DOUBTFUL:
+        if check.alone_apart is not None and check.alone_apart > _DOUBTFUL:
             yield (
                 f"camera {name}: its own views alone give a lens {check.alone_apart:.1f} of their standard deviations "
                 "away; its covariance is widened accordingly; the board may be bent, or the cameras not triggered "
@@ -394,7 +396,8 @@ def _cross_validated(
     found: Adjusted, views: Views, board: Board
 ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
     """Of two halves of the instants, each calibrated for itself: the residuals in the other one, and how far they are
-    from each other. Nothing where a half is too small, or its cameras fall into groups."""
+    from each other, where each has views enough to tell. Nothing where a half is too small, or its cameras fall into
+    groups."""
     halves = _halves(views, found.scene.timing)
     counts = [Counter(camera for camera, _ in half) for half in halves]
     cameras = list(found.scene.cameras)
@@ -408,7 +411,8 @@ def _cross_validated(
         start = replace(part.scene, rig_from_board=other.scene.rig_from_board)
         for (camera, _), residuals in adjust_scene(start, other_views, board, only_boards=True).residuals.items():
             squares[camera].append(residuals)
-    return {name: _rms(np.concatenate(each)) for name, each in squares.items()}, _apart(*parts)
+    tell = all(count[name] >= _TELLING for count in counts for name in cameras)
+    return {name: _rms(np.concatenate(each)) for name, each in squares.items()}, _apart(*parts) if tell else {}
 
 
 def _halves(views: Views, timing: Timing | None) -> list[Views]:

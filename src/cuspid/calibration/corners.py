@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 
 from cuspid.board import Board
 from cuspid.calibration.lattice import find_lattice, is_as_large, is_larger
@@ -15,6 +15,10 @@ from cuspid.camera import OPENCV_PIXEL_OFFSET
 
 LEAST_CORNERS = 6
 """Minimum number of corners in a usable view."""
+
+
+_LEAST_SQUARES, _ALIKE = 3, 0.3
+"""Squares of which a line shows whether they alternate, and the contrast of a line as a share of that of all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +78,7 @@ def _chessboard(image: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | No
     size = (board.columns - 1, board.rows - 1)
     found, pixels = cv2.findChessboardCornersSB(image, size)
     if found:
-        return BoardView(np.arange(size[0] * size[1]), pixels.reshape(-1, 2) + OPENCV_PIXEL_OFFSET)
+        return _whole(image, pixels, size)
     lattice = find_lattice(image)
     if lattice is None or not is_as_large(lattice, board):
         # Of a larger chessboard it would find a part.
@@ -86,7 +90,42 @@ def _chessboard(image: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | No
 def _exhaustively(image: UInt8[np.ndarray, "h w"], size: tuple[int, int]) -> BoardView | None:
     """With the one flag of OpenCV's that does not find boards where there are none."""
     found, pixels = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_EXHAUSTIVE)
-    return BoardView(np.arange(size[0] * size[1]), pixels.reshape(-1, 2) + OPENCV_PIXEL_OFFSET) if found else None
+    return _whole(image, pixels, size) if found else None
+
+
+def _whole(
+    image: UInt8[np.ndarray, "h w"], pixels: Float32[np.ndarray, "n 1 2"], size: tuple[int, int]
+) -> BoardView | None:
+    """What OpenCV has found; None where it is not a board."""
+    if not _alternates_beyond(image, pixels.reshape(size[1], size[0], 2)):
+        return None
+    return BoardView(np.arange(size[0] * size[1]), pixels.reshape(-1, 2) + OPENCV_PIXEL_OFFSET)
+
+
+def _alternates_beyond(image: UInt8[np.ndarray, "h w"], grid: Float32[np.ndarray, "r c 2"]) -> bool:
+    """Whether the squares around the corners alternate as those between them do. Of a board that is cut off, OpenCV
+    takes the ends of the outer squares for a row of corners, beyond which all is white."""
+    for axis in (0, 1):  # places where the corners around them would be
+        ends = [2 * grid.take([k], axis) - grid.take([k + step], axis) for k, step in ((0, 1), (-1, -1))]
+        grid = np.concatenate([ends[0], grid, ends[1]], axis=axis)
+    middles = ((grid[1:, 1:] + grid[:-1, 1:] + grid[1:, :-1] + grid[:-1, :-1]) / 4).astype(np.float32)
+    smooth = cv2.blur(image, (3, 3)).astype(np.float32)
+    level = cv2.remap(smooth, middles, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=-1.0)
+    height, width = image.shape
+    seen = ((middles >= 0) & (middles <= [width - 1, height - 1])).all(axis=2)
+    rows, columns = np.indices(seen.shape)
+    sign = np.where((rows + columns) % 2, 1.0, -1.0)
+
+    def contrast(line: tuple[int | slice, int | slice]) -> float | None:
+        there = seen[line]
+        if there.sum() < _LEAST_SQUARES:
+            return None
+        values = level[line][there]
+        return float(np.mean((values - values.mean()) * sign[line][there]))
+
+    within = contrast((slice(1, -1), slice(1, -1)))
+    around = [contrast(line) for line in ((0, slice(None)), (-1, slice(None)), (slice(None), 0), (slice(None), -1))]
+    return within is None or all(each is None or each * np.sign(within) > _ALIKE * abs(within) for each in around)
 
 
 def _on_a_line(points: Float[np.ndarray, "n 2"]) -> bool:

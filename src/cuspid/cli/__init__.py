@@ -127,13 +127,24 @@ def main(arguments: list[str] | None = None) -> None:
     except BrokenPipeError:  # what reads us, as ``head`` does, has had enough
         _print_no_more()
         sys.exit(1)
-    except MemoryError as error:
-        _fail(f"there is not enough memory ({one_line(error) or 'for this size'}); give less, smaller or coarser input")
-    except OSError as error:
+    except (MemoryError, ImportError, RuntimeError, OSError) as error:
+        if _lacks_memory(error):
+            size = one_line(error) or "for this size"
+            _fail(f"there is not enough memory ({size}); give less, smaller or coarser input")
+        if not isinstance(error, OSError):
+            raise
         if error.filename is None:  # no file of ours: where we print to
             _print_no_more()
             _fail(f"what is printed cannot be written ({error.strerror or error}); print elsewhere")
         _fail(f"{error.filename}: cannot be used ({error.strerror or error}); change its permissions, or give another")
+
+
+def _lacks_memory(error: Exception) -> bool:
+    """Whether it is for want of memory that something failed: loading a library and beginning a thread need some."""
+    return isinstance(error, MemoryError) or any(words in str(error) for words in _NO_MEMORY)
+
+
+_NO_MEMORY = ("failed to map segment", "annot allocate memory", "can't start new thread")
 
 
 def _fail(message: str) -> NoReturn:

@@ -24,6 +24,7 @@ from cuspid.calibration.calibrate import (
 )
 from cuspid.calibration.causes import MOST_TRIED, cause_of_absence, is_part_of_a_larger_one
 from cuspid.calibration.corners import BoardView, Views, find_corners
+from cuspid.calibration.instants import common_instants
 from cuspid.calibration.photometry import Photometry, PhotometryOptions, calibrate_light, look_at_patches
 from cuspid.calibration.start import LEAST_VIEWS
 from cuspid.calibration.target import PLATE_MM, target_body
@@ -123,6 +124,7 @@ def calibrate(
             name: storage.read_sequence(path, out / "frames" / name, progress=progress)
             for name, path in sources.items()
         }
+        sequences, named_notes = _matched(sequences)
         views = _views(sequences, board, progress)
         _require_views(sequences, views, board)
         found = calibrate_rig(views, {name: each.size for name, each in sequences.items()}, board, options)
@@ -130,7 +132,7 @@ def calibrate(
         found = found if given is None else in_frame_of(found, given.rig)
         light = _light(found, sequences, board, given, photometry, progress) if photometry.photometry else None
     read = (note for each in sequences.values() for note in each.notes)
-    notes = (*read, *_unseen(sequences, views), *drawn_notes, *found.notes)
+    notes = (*read, *named_notes, *_unseen(sequences, views), *drawn_notes, *found.notes)
     found = replace(found, notes=notes)
     with storage.claimed_folder(out, "calibrate", settings, hashes | drawn_hash, replace=True):
         _write(found, light, _handpiece(found, light, given, working_distance_mm), board, out)
@@ -169,6 +171,20 @@ def _write(found: RigCalibration, light: Photometry | None, handpiece: Handpiece
     if light is not None and light.sensors:
         shown = {name: (each.levels_dn, each.variances_dn2) for name, each in light.noise.items()}
         save_photometry_picture(out / "photometry.png", light.sensors, shown, light.residuals_pct)
+
+
+def _matched(sequences: Mapping[str, ImageSequence]) -> tuple[dict[str, ImageSequence], tuple[str, ...]]:
+    """With frames that have one name where they were taken at one instant, and how they were matched if not by theirs.
+    Raises InputError where nothing tells."""
+    instants = common_instants({camera: each.names for camera, each in sequences.items()})
+    if instants is None:
+        return dict(sequences), ()
+    (one, first), (other, second) = [(camera, each.names[0]) for camera, each in sequences.items()][:2]
+    note = (
+        f"images are matched by the numbers in their names ({one}: {first} is {instants[one][0]}, {other}: {second} is "
+        f"{instants[other][0]})"
+    )
+    return {camera: replace(each, instants=instants[camera]) for camera, each in sequences.items()}, (note,)
 
 
 def _views(sequences: Mapping[str, ImageSequence], board: Board, progress: Progress) -> Views:

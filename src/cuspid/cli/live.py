@@ -14,7 +14,7 @@ from cuspid import storage
 from cuspid.capture import Capture, Dropped, Frame, ImageSource
 from cuspid.cli.scan import reconstruct_capture
 from cuspid.cli.shared import Flat, console
-from cuspid.errors import InputError, ReconstructionError
+from cuspid.errors import CuspidError, InputError, ReconstructionError
 from cuspid.footage.arrivals import Arrivals
 from cuspid.mesh import Mesh
 from cuspid.options import Options, Range
@@ -159,12 +159,19 @@ def _followed(feed: _Feed, out: Path, options: ReconstructionOptions, view: Grow
     words, begin = _Words(), time.monotonic()
     try:
         for frame in feed.frames:
-            session = session or Session(feed.handpiece, feed.source(), out, options)
-            changed = _corrected(session) if frame is None else words.of(session.push(frame))
-            if view is not None:
+            if frame is None:
+                changed = {} if session is None else _corrected(session)
+            else:
+                session = session or Session(feed.handpiece, feed.source(), out, options)
+                changed = words.of(session.push(frame))
+            if view is not None and session is not None:
                 view.show(session, changed, words.lost)
     except KeyboardInterrupt:
         console.print("the scan is ended; what came in is reconstructed")
+    except CuspidError as error:
+        if session is None or not session.rig_from_world:
+            raise
+        console.print(f"note: {error}; the scan is ended, and what came in is reconstructed", soft_wrap=True)
     left_out = feed.left_out()
     if session is None or not session.frames:
         why = next((f" ({each.what}: {each.reason})" for each in left_out), "")

@@ -11,7 +11,6 @@ from rich.table import Table
 from tyro.conf import Positional
 
 from cuspid import storage
-from cuspid.capture import read_rgba
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console
 from cuspid.errors import InputError
@@ -22,6 +21,7 @@ from cuspid.evaluation.panorama import (
     PanoramaScore,
     evaluate_panorama,
 )
+from cuspid.image_files import read_rgba
 from cuspid.panorama import FrameUse, Panorama
 from cuspid.reporting.figures.panorama_evaluation import save_panorama_evaluation
 from cuspid.trueness import ReferenceRender

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cuspid.capture import Dropped, Frame, ImageFolder, image_size
+from cuspid.capture import Dropped, Frame, ImageFolder
 from cuspid.errors import InputError
+from cuspid.image_files import read_image
 from cuspid.rig import Handpiece
-from cuspid.storage.captures import IMAGE_SUFFIXES
-from cuspid.storage.files import is_meant
+from cuspid.storage.captures import IMAGE_SUFFIXES, folders_of_images
+from cuspid.storage.files import finished
 
 _State = tuple[int, int]
 """Size and time of modification of a file."""
@@ -17,9 +18,9 @@ _State = tuple[int, int]
 class Arrivals:
     """Gives each frame once, when its images are whole, in the order of their names.
 
-    An image is whole when it did not change between two looks and its header can be read. A frame of which images are
-    missing is waited for as long as ``late_s`` after the first image of a later one, and then given with those that
-    it has.
+    An image is whole when it did not change between two looks and can be decoded. A frame of which images are missing
+    is waited for as long as ``late_s`` after the first image of a later one, and then given with those that it has.
+    What does not belong to the capture is refused before the first frame, and passed over once there is one.
     """
 
     def __init__(self, folder: Path, handpiece: Handpiece, *, late_s: float) -> None:
@@ -29,6 +30,7 @@ class Arrivals:
         self._since = dict[str, float]()
         self._given = set[str]()
         self._refused = dict[Path, str]()
+        self._strange = dict[str, str]()
         self._suffix: str | None = None
 
     @property
@@ -40,23 +42,27 @@ class Arrivals:
     def left_out(self) -> tuple[Dropped, ...]:
         """The images that the frames so far do not have, and why."""
         idle, late = self._idle(), "its image came too late"
-        why = {(path.stem, path.parent.name): reason for path, reason in self._refused.items()}
+        why = {(path.stem, self._camera_of(path)): reason for path, reason in self._refused.items()}
         missing = [
             Dropped(what=f"camera {camera} of frame {name}", reason=why.get((name, camera), late))
             for name in sorted(self._given | {path.stem for path in self._refused})
             for camera in self._handpiece.rig.names
             if camera not in idle and camera not in self._whole.get(name, ())
         ]
-        return (*(Dropped(what=f"camera {camera}", reason="it has no images") for camera in idle), *missing)
+        return (
+            *(Dropped(what=what, reason=reason) for what, reason in self._strange.items()),
+            *(Dropped(what=f"camera {camera}", reason="it has no images") for camera in idle),
+            *missing,
+        )
 
     def _idle(self) -> list[str]:
         """Cameras without a whole image so far."""
-        seen = set[str]().union(*self._whole.values(), {path.parent.name for path in self._refused})
+        seen = set[str]().union(*self._whole.values(), map(self._camera_of, self._refused))
         return [camera for camera in self._handpiece.rig.names if camera not in seen]
 
     def news(self, now_s: float) -> list[Frame]:
-        """The frames that are whole by now and were not given before. Raises InputError where images are of a camera
-        that the handpiece does not have, or of different types."""
+        """The frames that are whole by now and were not given before. Raises InputError where, before the first one,
+        images are of a camera that the handpiece does not have, or of different types."""
         self._look(now_s)
         return self._take(now_s, self._late_s)
 
@@ -79,18 +85,32 @@ class Arrivals:
         return found
 
     def _look(self, now_s: float) -> None:
-        for folder in sorted(path for path in self._images.glob("*") if path.is_dir() and is_meant(path)):
-            if folder.name not in self._handpiece.rig.names:
-                raise InputError(
-                    f"{folder}: the handpiece has no camera {folder.name}; its cameras are "
-                    f"{', '.join(self._handpiece.rig.names)}"
-                )
-            for path in folder.iterdir():
-                if is_meant(path) and path.suffix.lower() in IMAGE_SUFFIXES and path.stem not in self._given:
-                    self._look_at(path, now_s)
+        try:
+            folders = folders_of_images(self._images) if self._images.is_dir() else set[str]()
+            there = {camera: finished(self._images / camera) for camera in sorted(folders)}
+        except InputError as error:  # a folder that is moved meanwhile, or closed to others
+            self._pass_over(self._images, "not all of it can be entered", error)
+            return
+        for camera, paths in there.items():
+            images = [path for path in paths if path.suffix.lower() in IMAGE_SUFFIXES]
+            if camera in self._handpiece.rig.names:
+                for path in images:
+                    if path.stem not in self._given:
+                        self._look_at(path, camera, now_s)
+            elif images:
+                names = ", ".join(self._handpiece.rig.names)
+                self._pass_over(self._images / camera, f"the handpiece has no camera {camera}; its cameras are {names}")
 
-    def _look_at(self, path: Path, now_s: float) -> None:
-        camera, stem = path.parent.name, path.stem
+    def _pass_over(self, path: Path, reason: str, error: InputError | None = None) -> None:
+        if not self._given:
+            raise error or InputError(f"{path}: {reason}")
+        self._strange[str(path)] = reason
+
+    def _camera_of(self, path: Path) -> str:
+        return path.parent.relative_to(self._images).as_posix()
+
+    def _look_at(self, path: Path, camera: str, now_s: float) -> None:
+        stem = path.stem
         if camera in self._whole.get(stem, ()):
             return
         try:
@@ -98,7 +118,7 @@ class Arrivals:
             before, self._states[path] = self._states.get(path), (state.st_size, state.st_mtime_ns)
             if before != self._states[path]:
                 return
-            image_size(path)
+            read_image(path)
         except OSError:  # moved to its place meanwhile
             return
         except InputError as error:  # still being written, or damaged
@@ -106,7 +126,8 @@ class Arrivals:
             return
         self._refused.pop(path, None)
         if self._suffix not in (None, path.suffix):
-            raise InputError(f"{path}: the images before are {self._suffix} files; write all images in one type")
+            self._pass_over(path, f"the images before are {self._suffix} files; write all images in one type")
+            return
         self._suffix = path.suffix
         self._whole.setdefault(stem, set()).add(camera)
         self._since.setdefault(stem, now_s)

@@ -88,6 +88,8 @@ class Edge:
     """Pose of the later frame relative to the earlier one, None if it could not be found."""
     matches: int
     """Number of consistent matches."""
+    sought: int
+    """Number of matches of which these are."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -239,7 +241,7 @@ def relative_pose(
     """Pose of the target frame relative to the frame of the point cloud."""
     points, pixels, cameras = _sightings(rig, cloud, source, target, options)
     if len(points) < options.minimum_matches:
-        return Edge(target_from_source=None, matches=len(points))
+        return Edge(target_from_source=None, matches=len(points), sought=len(points))
     ransac = pycolmap.RANSACOptions(
         max_error=options.error_px, random_seed=seed, num_threads=1, min_num_trials=50, max_num_trials=3000
     )
@@ -252,10 +254,10 @@ def relative_pose(
         ransac,
     )
     if found is None:
-        return Edge(target_from_source=None, matches=0)
+        return Edge(target_from_source=None, matches=0, sought=len(points))
     pose, inliers = polish(rig, rigid_from_colmap(found["rig_from_world"]), points, pixels, cameras, options.error_px)
     enough = inliers >= max(options.minimum_matches, options.minimum_share * len(points))
-    return Edge(target_from_source=pose if enough else None, matches=inliers)
+    return Edge(target_from_source=pose if enough else None, matches=inliers, sought=len(points))
 
 
 def _parts(edges: Mapping[tuple[int, int], Edge], count: int) -> Int[np.ndarray, "f"]:

@@ -51,7 +51,7 @@ def read_capture(folder: Path, handpiece: Path | None = None, working_distance_m
             "of photographs"
         )
     known = read_handpiece(handpiece or folder / "handpiece.json", working_distance_mm)
-    unknown = _folders_of_images(images) - set(known.rig.names)
+    unknown = folders_of_images(images) - set(known.rig.names)
     if unknown:
         raise InputError(
             f"{images}: no camera of the handpiece matches the folder {', '.join(sorted(unknown))}; the cameras "
@@ -69,7 +69,7 @@ def read_capture(folder: Path, handpiece: Path | None = None, working_distance_m
     return capture
 
 
-def _folders_of_images(images: Path) -> set[str]:
+def folders_of_images(images: Path) -> set[str]:
     """The folders in which images lie, at any depth, as cameras are named: ``left``, ``rig/left``."""
     found, left = set[str](), [path for path in finished(images) if path.is_dir()]
     while left:

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from cuspid.capture import read_rgba
 from cuspid.errors import InputError, OutputError
+from cuspid.image_files import read_rgba
 from cuspid.inputs import read_text
 from cuspid.panorama import ZONES, FrameUse, Panorama, Strip
 from cuspid.storage.files import as_declared, read_arrays, read_json, reading, write_arrays, write_bytes, write_json

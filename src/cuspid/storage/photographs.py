@@ -10,8 +10,9 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from cuspid.camera import Camera
-from cuspid.capture import Dropped, image_size
+from cuspid.capture import Dropped
 from cuspid.errors import InputError
+from cuspid.image_files import exif_orientation, image_size
 from cuspid.photographs import UPRIGHT, PhotoCamera, Photograph, Photographs
 from cuspid.progress import Progress, silent
 from cuspid.storage.captures import IMAGE_SUFFIXES
@@ -201,8 +202,10 @@ class _Exif:
         """Of a file; what cannot be understood counts as not told."""
         try:
             with Image.open(path) as image:
-                if image.format == "TIFF" or (image.format == "PNG" and "exif" not in image.info):
-                    return _Exif()  # TIFF is turned by Pillow itself, and of PNG all would be decoded to be asked
+                if image.format == "TIFF":  # turned by Pillow itself
+                    return _Exif()
+                if image.format == "PNG" and "exif" not in image.info:  # all of it would be decoded to be asked
+                    return _Exif(exif_orientation(path))
                 exif = image.getexif()
                 inner = exif.get_ifd(ExifTags.IFD.Exif)
             orientation = int(exif.get(ExifTags.Base.Orientation, UPRIGHT))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cuspid.capture import read_image
 from cuspid.errors import InputError
+from cuspid.image_files import read_image
 from cuspid.storage.captures import write_image
 from cuspid.storage.files import as_declared, read_arrays, read_json, reading, write_arrays, write_json
 from cuspid.trueness import ReferenceRender

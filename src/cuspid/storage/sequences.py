@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
-from cuspid.capture import ImageFolder, image_size
+from cuspid.capture import ImageFolder
 from cuspid.errors import InputError
-from cuspid.image_sequence import ImageSequence, exif_orientation, recorded_size
+from cuspid.image_files import exif_orientation, image_size, recorded_size
+from cuspid.image_sequence import ImageSequence
 from cuspid.inputs import read_text
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, Rig
@@ -208,6 +209,7 @@ def _read_opencv(path: Path) -> Camera:
         raise InputError(f"{path}: not an OpenCV calibration (nested more than {_DEEPEST} deep)")
     try:
         file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        file.getNode("camera_matrix")  # OpenCV asserts where the file is a list, or one number
     except (cv2.error, SystemError) as error:
         raise InputError(f"{path}: not an OpenCV calibration") from error
     with reading(path):

@@ -12,6 +12,7 @@ import json
 import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files as package_files
@@ -94,6 +95,7 @@ class Stage:
             with self._lock, open_to_append(self.folder / RECORD) as stream:
                 stream.write(lines.encode())
         except OSError as error:
+            _remove_empty(self.folder / RECORD)
             raise OutputError(f"{self.folder / RECORD}: cannot be written ({error.strerror})") from error
         self._made.update(entries)
 
@@ -113,6 +115,12 @@ def _digest(file: Path) -> str:
         return hash_file(file)
     except InputError:
         return ""
+
+
+def _remove_empty(file: Path) -> None:
+    with suppress(OSError):
+        if file.stat().st_size == 0:
+            file.unlink()
 
 
 def _read_record(path: Path) -> dict[str, tuple[str, str]]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cuspid.capture import read_rgba
+from cuspid.image_files import read_rgba
 from cuspid.inputs import read_bytes, read_text
 from cuspid.storage.files import read_json, reading, write_bytes, write_json
 from cuspid.storage.tables import write_table

@@ -21,8 +21,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, UndefinedError
 from markupsafe import Markup
 
 import cuspid
-from cuspid.capture import read_image
 from cuspid.errors import InputError
+from cuspid.image_files import read_image
 from cuspid.inputs import read_bytes
 from cuspid.storage.files import to_plain
 from cuspid.values import one_line
