@@ -133,6 +133,48 @@ def measured(result: Result) -> str:
     )
 
 
+def landmarks(result: Result) -> str:
+    """Estimated landmarks against those that phantoms know and that people set."""
+    real, phantoms = result["real"], result["phantoms"]
+    kinds = [
+        (kind, found["count"], *(f"{found[f'{name}_mm']:.2f}" for name in ("median", "p90")), found["over_stated"])
+        for kind, found in phantoms["kinds"].items()
+    ]
+    arches = [
+        (
+            name,
+            found["count"],
+            *(f"{found[f'{figure}_mm']:.2f}" for figure in ("median", "p90")),
+            f"{found['beyond_1_mm_pct']:.0f}",
+            *(f"{found['widths'][width]:+.2f}" for width in real["widths"]),
+        )
+        for name, found in real["arches"].items()
+    ]
+    total, held = real["all"], real["looked_at_only_at_the_end"]
+    widths = ", ".join(
+        f"{name.replace('_', '-')} {found['median_abs_mm']:.2f} (largest {found['max_abs_mm']:.2f})"
+        for name, found in real["widths"].items()
+    )
+    return "\n".join(
+        [
+            f"Six real arches with landmarks that people set: {total['count']} are the same points as ours. Median "
+            f"{mark(total['median_mm'], 0.35)} mm (bar 0.35), P90 {mark(total['p90_mm'], 1.0)} mm (bar 1.0), "
+            f"{total['beyond_1_mm_pct']:.0f} % beyond 1 mm; error over stated uncertainty {total['over_stated']:.1f}. "
+            f"On the three that were looked at only at the end: {held['median_mm']:.2f} and {held['p90_mm']:.2f} mm. "
+            "Widths, median error in mm (bars 0.5, largest 1.2): "
+            f"{widths}. Not counted, as they do not lie on their tooth: "
+            f"{', '.join(real['not_on_their_tooth']) or 'none'}.",
+            "",
+            markdown_table(("arch", "points", "median mm", "P90 mm", "> 1 mm, %", *real["widths"]), arches),
+            "",
+            f"{2 * phantoms['seeds']} phantoms with edges of {' and '.join(map(str, phantoms['edges_mm']))} mm; over "
+            f"all points the error is {phantoms['all']['over_stated']:.2f} times the stated uncertainty:",
+            "",
+            markdown_table(("point", "count", "median mm", "P90 mm", "error / stated"), kinds),
+        ]
+    )
+
+
 def _spread(mean: float | None, sd: float | None) -> str:
     if mean is None:
         return "-"

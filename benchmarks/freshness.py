@@ -62,6 +62,7 @@ MAKERS: Mapping[str, Maker] = {
     "live": Maker("live", _SCAN),
     "mouth": Maker("mouth"),
     "measure": Maker("measure_jaws"),
+    "landmarks": Maker("landmarks"),
     "populations": Maker("populations"),
     "mean_shape": Maker("mean_shape", ("jaws", "surveys")),
     "visibility": Maker("visibility"),

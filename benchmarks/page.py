@@ -161,6 +161,7 @@ def motion_table(rows: list[Result]) -> str:
 SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
     "mouth": ("The mouth", anatomy_sections.mouth),
     "measure": ("Arch dimensions", anatomy_sections.measured),
+    "landmarks": ("Estimated landmarks", anatomy_sections.landmarks),
     "populations": ("Phantom populations", anatomy_sections.populations),
     "mean_shape": ("Mean shape", anatomy_sections.mean_shape),
     "visibility": ("Visibility", handpiece_sections.visibility),

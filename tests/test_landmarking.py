@@ -17,7 +17,7 @@ from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Jaw, Landmark
 from cuspid.reporting.figures.landmark import save_landmark_picture, save_measure_picture
 
-# The uncertainties are from the phantoms of seeds 100 to 103, which no test uses.
+# The uncertainties are from the phantoms of seeds 100 to 113, which no test uses.
 
 
 @cache
@@ -83,6 +83,32 @@ def test_a_tilted_jaw_gives_nearly_the_same_dimensions(coarse_phantom: Jaw):
         assert one is not None
         assert other is not None
         assert abs(one.value_mm - other.value_mm) < 0.4
+
+
+def test_cusps_are_found_along_the_teeth_however_the_jaw_lies(phantom: Jaw):
+    tilt = Rigid3(Rotation.from_euler("xyz", [8.0, 6.0, 0.0], degrees=True).as_matrix(), np.zeros(3))
+    straight = estimated(phantom)
+    found = estimate_landmarks(replace(phantom, mesh=phantom.mesh.transformed(tilt), landmarks={}))
+    moved = [
+        np.linalg.norm(found[label].position - tilt.apply(point.position))
+        for label, point in straight.items()
+        if "cusp" in label
+    ]
+    assert 0 < np.median(moved) < 0.15
+
+
+def test_specks_of_a_label_elsewhere_do_not_count(phantom: Jaw):
+    labels = phantom.face_labels
+    assert labels is not None
+    tooth = phantom.teeth[-2]
+    away = np.linalg.norm(phantom.mesh.face_centres - phantom.mesh.centroid(phantom.tooth_faces(tooth)), axis=1)
+    speck = np.argmax(np.where(labels == GUM, away, 0.0))
+    found = estimate_landmarks(
+        replace(phantom, face_labels=np.where(np.arange(len(labels)) == speck, tooth, labels), landmarks={})
+    )
+    for name in TOOTH_LANDMARKS["molar"]:
+        apart = found[f"{tooth}.{name}"].position - estimated(phantom)[f"{tooth}.{name}"].position
+        assert np.linalg.norm(apart) < 0.01
 
 
 def test_a_tooth_that_is_missing_is_left_out_and_the_others_stay(coarse_phantom: Jaw):

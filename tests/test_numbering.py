@@ -13,6 +13,7 @@ from cuspid.anatomy.numbering import Numbering, number_teeth
 from cuspid.cli import main
 from cuspid.errors import InputError
 from cuspid.jaw import GUM, UNIVERSAL_FROM_FDI, Arch, Jaw
+from cuspid.mesh import Mesh
 from horseshoe import horseshoe
 
 LOWER = horseshoe(150, 40)
@@ -56,6 +57,12 @@ def test_each_numbering_is_told_from_where_the_teeth_stand(name: str, arch: Arch
     found = number_teeth("jaw.ply", labels, truth.mesh, arch=arch, numbering=along)
     assert np.mean(found.labels != truth.face_labels) < (0.006 if name == "Palmer" else 1e-9)
     assert found.notes == () if universal and arch == "upper" else "overrules" in found.notes[0]
+
+
+def test_labels_along_a_small_arch_are_not_taken_for_those_of_the_other_jaw() -> None:
+    mesh = Mesh(LOWER.mesh.vertices * [0.9, 0.9, 1] - [2, 0, 0], LOWER.mesh.faces)
+    found = number_teeth("jaw.ply", replaced(LOWER.face_labels, ALONG), mesh, arch="lower")
+    assert np.array_equal(found.labels, LOWER.face_labels)
 
 
 @pytest.mark.parametrize("missing", [(), (36,), (41, 31), (37, 47), (34, 44)])

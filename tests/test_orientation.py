@@ -7,9 +7,9 @@ import pytest
 from builders import any_pose, joined, moved, sphere
 from cuspid import storage
 from cuspid.anatomy.jaw_files import load_jaw
-from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, labels_from_colors, require_one_jaw
+from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, require_one_jaw
 from cuspid.errors import InputError
-from cuspid.jaw import GUM, Jaw
+from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.storage import Unit
 from horseshoe import horseshoe, without_base
@@ -40,6 +40,15 @@ def test_where_there_is_no_arch_the_frame_is_unsure():
     assert any("anterior" in note for note in find_occlusal_frame(quadrant).notes)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_quadrant_with_its_base_lies_crowns_up_and_is_doubted(seed: int):
+    quadrant = jaw().mesh.submesh(jaw().mesh.face_centres[:, 0] > 1)
+    found = find_occlusal_frame(quadrant.transformed(any_pose(seed, 300)))
+    up = (found.occlusal_from_mesh @ any_pose(seed, 300)).rotation[2, 2]
+    assert np.degrees(np.arccos(up)) < 12
+    assert any("which way is up" in note for note in found.notes)
+
+
 def in_unit(mm_per_unit_read: float) -> Mesh:
     mesh = jaw().mesh.transformed(any_pose(0, 300))
     return Mesh(mesh.vertices * mm_per_unit_read, mesh.faces)
@@ -66,34 +75,6 @@ def test_an_unlikely_width_is_told_and_an_impossible_one_refused():
     assert "a jaw is 40-90 mm wide" in note
     with pytest.raises(InputError, match="rescale it"):
         check_scale(in_unit(3.0))
-
-
-def painted(labels: np.ndarray) -> np.ndarray:
-    """White gum and a colour for each tooth."""
-    palette = np.random.default_rng(0).integers(0, 250, (50, 3)).astype(np.uint8)
-    palette[GUM] = 255
-    return palette[labels]
-
-
-def test_colours_of_teeth_become_their_numbers():
-    labels, mesh = jaw().face_labels, jaw().mesh
-    assert labels is not None
-    np.testing.assert_array_equal(labels_from_colors(painted(labels), mesh, "lower"), labels)
-    upper = labels_from_colors(painted(labels), mesh, "upper")
-    assert upper is not None
-    np.testing.assert_array_equal(upper[labels == 41], 21)
-    np.testing.assert_array_equal(upper[labels == 37], 17)
-
-
-def test_colours_that_do_not_number_the_teeth_give_no_labels():
-    labels, mesh = jaw().face_labels, jaw().mesh
-    assert labels is not None
-    assert labels_from_colors(painted(labels), mesh, None) is None
-    assert labels_from_colors(np.full((len(mesh.faces), 3), 255, dtype=np.uint8), mesh, "lower") is None
-    noise = np.random.default_rng(0).integers(0, 255, (len(mesh.faces), 3)).astype(np.uint8)
-    assert labels_from_colors(noise, mesh, "lower") is None
-    gap = np.where(np.isin(labels, (45, 44)), GUM, labels)
-    assert labels_from_colors(painted(gap), mesh, "lower") is None
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -11,7 +11,8 @@ from jaxtyping import Int
 from cuspid.anatomy.landmarks.estimation import with_estimates
 from cuspid.anatomy.landmarks.scheme import in_frame, missing, validate
 from cuspid.anatomy.numbering import Numbered, Numbering, number_teeth
-from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, labels_from_colors, require_one_jaw
+from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, require_one_jaw
+from cuspid.anatomy.tooth_colors import face_colors_of, number_regions, tooth_regions
 from cuspid.errors import InputError
 from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
@@ -23,6 +24,8 @@ from cuspid.storage.jaws import is_jaw, read_jaw, read_label_map, read_labelled_
 from cuspid.storage.landmarks import MARKUPS_SUFFIX, read_landmarks
 from cuspid.storage.meshes import MESH_SUFFIXES
 from cuspid.storage.units import Unit
+
+_GIVE_LABELS = "give a landmark file or a labelled mesh"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,12 +67,17 @@ def load_jaw(
 
 
 def _load_oriented(
-    path: Path, unit: Unit, arch: Arch | None, labelling: Labelling
+    path: Path, unit: Unit, arch: Arch | None, labelling: Labelling, *, needs_teeth: bool = False
 ) -> tuple[Jaw, tuple[str, ...], Rigid3]:
-    """As :func:`load_jaw`, with ``occlusal_from_mesh``."""
+    """As :func:`load_jaw`, with ``occlusal_from_mesh``; where teeth are needed, what does not tell them is refused
+    before it takes time."""
     if is_jaw(path):
         return read_jaw(path), (), Rigid3.identity()
     mesh, labels, colors = read_labelled_mesh(path, unit)
+    colors = face_colors_of(mesh, colors)
+    regions = tooth_regions(colors, mesh) if labels is None and colors is not None else None
+    if needs_teeth:
+        _require_teeth(path, labels is not None, colors is not None, regions, arch)
     scale = check_scale(mesh, unit)
     mesh, facing = facing_outwards(mesh)
     with reading(path):
@@ -80,9 +88,29 @@ def _load_oriented(
     if labels is not None:
         numbered = labelling.fdi(path, labels, moved, arch=arch, sure=not occlusal.notes)
         labels, notes = numbered.labels, (*notes, *numbered.notes)
-    elif colors is not None:
-        labels = labels_from_colors(colors, moved, arch)
+    elif regions is not None and arch is not None:
+        labels = number_regions(regions, moved, arch)
+        if labels is None and needs_teeth:
+            raise InputError(
+                f"{path}: its colours tell {regions.max()} teeth, but these are not one row without a gap, so they "
+                f"cannot be numbered; {_GIVE_LABELS}"
+            )
     return Jaw(mesh=moved, face_labels=labels, arch=arch), notes, occlusal.occlusal_from_mesh
+
+
+def _require_teeth(
+    path: Path, labelled: bool, colored: bool, regions: Int[np.ndarray, "f"] | None, arch: Arch | None
+) -> None:
+    """Raise InputError where neither labels nor colours tell the teeth."""
+    if labelled:
+        return
+    if regions is None:
+        colors = "; its colours are not those of gum and teeth, one each" if colored else ""
+        raise InputError(f"{path}: it has neither landmarks nor tooth labels{colors}; {_GIVE_LABELS}")
+    if arch is None:
+        raise InputError(
+            f"{path}: its colours tell {regions.max()} teeth, but not whether they are lower or upper ones; give --arch"
+        )
 
 
 def jaw_files(folder: Path) -> list[Path]:
@@ -112,9 +140,11 @@ def load_landmarked_jaw(
     in the name of the mesh tells the arch where nothing else does. Raises InputError for a landmark that the scheme or
     the jaw does not know, and where there are neither landmarks nor labels.
     """
-    jaw, notes, occlusal_from_mesh = _load_oriented(path, unit, arch or named_arch(path), labelling)
     beside = (path.with_suffix(suffix) for suffix in (".landmarks.json", MARKUPS_SUFFIX))
     file = landmarks or next((each for each in beside if is_there(each)), None)
+    jaw, notes, occlusal_from_mesh = _load_oriented(
+        path, unit, arch or named_arch(path), labelling, needs_teeth=file is None
+    )
     if file is not None:
         given = read_landmarks(file)
         validate(given.landmarks, jaw.teeth, source=str(file))
@@ -123,5 +153,5 @@ def load_landmarked_jaw(
     if jaw.face_labels is not None and missing(jaw.landmarks, jaw.teeth):
         jaw = with_estimates(jaw)
     if not jaw.landmarks:
-        raise InputError(f"{path}: it has neither landmarks nor tooth labels; give a landmark file or a labelled mesh")
+        raise InputError(f"{path}: it has neither landmarks nor tooth labels; {_GIVE_LABELS}")
     return jaw, notes

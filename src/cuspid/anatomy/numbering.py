@@ -258,7 +258,9 @@ def _read_in_place(
     if plainly is not None and numbering == "auto" and plainly.misfit_mm < _DOUBTFUL_MM:
         if arch in (None, plainly.arch) and not any(_is_better(each, plainly) for each in others):
             return Numbered(labels=_mapped(labels, plainly.fdi()))
-        if arch not in (None, plainly.arch) and plainly.misfit_mm < _FITS_MM:
+        fitting = [each for each in others if each.arch == arch]
+        against = arch not in (None, plainly.arch) and plainly.misfit_mm < _FITS_MM
+        if against and not any(_is_better(each, plainly) for each in fitting):
             raise InputError(f"{source}: {_against(teeth.values, plainly, arch, others)}")
     best = _only([each for each in others if each.arch == arch])
     if best is None:

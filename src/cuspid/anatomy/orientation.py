@@ -12,21 +12,25 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float
+from scipy.ndimage import uniform_filter
 from scipy.spatial import ConvexHull, cKDTree
 
 from cuspid.errors import InputError
 from cuspid.facing import pieces_of
 from cuspid.geometry import Rigid3, axes_about, best_similarity, unit
-from cuspid.jaw import GUM, Arch
 from cuspid.mesh import Mesh
 from cuspid.occlusal_plane import crown_tips, crown_tops, levelled, upright
 from cuspid.storage import MM_PER_UNIT, Unit
 
 _GRID_MM = 0.5
 """Spacing of the height map."""
-_ARCH_HALF_WIDTH_MM, _ARCH_DEPTH_MM = 25.0, 42.0
-"""Of the mean arch, at the middle of the second molars."""
+_ARCHES_MM = ((25.0, 42.0), (20.5, 46.0))
+"""Half the width, and the depth, of a mean arch and of a narrow one, at the middle of the second molars."""
+_BEND_MM, _SMOOTH = 3.5, 0.05
+"""In a square of this side that is smooth, the mean of the normals is shorter than one by no more than this."""
+_ON_ARCH = 0.85
+"""Share of the crowns that an arch is laid on: the rest may be flaps of gum and cheek."""
 _ARCH_MISFIT_MM = 2.0
 """A whole arch lies closer than this to the mean arch, as crowns are up to 11 mm wide."""
 _JAW_MM = (40.0, 90.0)
@@ -35,6 +39,14 @@ _PART_MM = 9.0
 """What is smaller is not a tooth, but may be a jaw in cm."""
 _NARROW_MM = 32.0
 """What is narrower across is part of an arch."""
+_NARROW_ARCH_MM = 36.0
+"""Crowns that are narrower across are those of a part of an arch; whole ones are 45 mm and more."""
+_LEANS_DEG = (25.0, 50.0, 75.0)
+"""How far from where a part of an arch seems to look its crowns are looked for."""
+_PART_NOTE = (
+    "occlusal frame: unsure which way is up and which anterior, as this does not look like a whole arch; check the "
+    "picture"
+)
 _SECOND_JAW = 0.4
 """Least surface of one of two jaws, as a share of that of the other one."""
 _TOWARDS = 0.6
@@ -65,8 +77,20 @@ class _Relief:
     """Normal there."""
 
     def crowns(self) -> Float[np.ndarray, "n 3"]:
-        """Points of the tops of the crowns."""
-        return np.asarray(self.points[crown_tops(self.points[..., 2], _GRID_MM)])
+        """Points of the tops of the crowns. What else stands as high, a trimmed base or the gum behind the last tooth,
+        is smooth."""
+        tops = crown_tops(self.points[..., 2], _GRID_MM)
+        rough = tops & self.rough()
+        return np.asarray(self.points[rough if rough.any() else tops])
+
+    def rough(self) -> Bool[np.ndarray, "h w"]:
+        """Where the normals of the surroundings point apart, which shortens their mean."""
+        seen = np.isfinite(self.normals[..., 2])
+        size = (round(_BEND_MM / _GRID_MM),) * 2
+        share = np.maximum(uniform_filter(seen.astype(float), size), 1e-6)
+        known = np.where(seen[..., None], self.normals, 0.0)
+        mean = uniform_filter(known, (*size, 1)) / share[..., None]
+        return np.asarray(seen & (1 - np.linalg.norm(mean, axis=-1) > _SMOOTH))
 
     def tips(self) -> Float[np.ndarray, "n 3"]:
         """Points that are the highest of their surroundings."""
@@ -76,17 +100,21 @@ class _Relief:
 def find_occlusal_frame(mesh: Mesh) -> OcclusalFrame:
     """The occlusal frame of a jaw in any orientation, in mm; says so where it is unsure."""
     mesh = mesh.thinned(_ENOUGH_FACES)
-    start, notes_up = _upright(mesh)
-    level = _level(mesh, start)
-    relief = _relief(mesh, level)
+    start, notes = _upright(mesh)
+    rests = not _is_part(mesh, start.rotation[2])
+    relief, level = _levelled(mesh, _resting(_relief(mesh, start), start) if rests else start)
     crowns = relief.crowns()
     if len(crowns) == 0:
         note = "occlusal frame: unsure, as nothing looks like a crown; check the picture"
-        return OcclusalFrame(occlusal_from_mesh=level, notes=(*notes_up, note))
-    anterior, notes_front = _anterior(crowns[:, :2])
+        return OcclusalFrame(occlusal_from_mesh=level, notes=(*notes, note))
+    anterior, whole = _anterior(crowns[:, :2])
+    if not whole:
+        relief, level = _levelled(mesh, _roughest(mesh, start))
+        crowns, notes = relief.crowns(), (*notes, _PART_NOTE)
+        anterior, _ = _anterior(crowns[:, :2])
     centre = np.array([*crowns[:, :2].mean(axis=0), relief.tips()[:, 2].mean()])
     turn = np.array([[anterior[1], -anterior[0], 0], [anterior[0], anterior[1], 0], [0, 0, 1.0]])
-    return OcclusalFrame(occlusal_from_mesh=Rigid3(turn, -turn @ centre) @ level, notes=(*notes_up, *notes_front))
+    return OcclusalFrame(occlusal_from_mesh=Rigid3(turn, -turn @ centre) @ level, notes=notes)
 
 
 def _frame(up: Float[np.ndarray, "3"], centre: Float[np.ndarray, "3"]) -> Rigid3:
@@ -119,11 +147,29 @@ def _upright(mesh: Mesh) -> tuple[Rigid3, tuple[str, ...]]:
     return sides[best], notes
 
 
+def _roughest(mesh: Mesh, start: Rigid3) -> Rigid3:
+    """Of frames that lean from ``start``, that from which most of what is seen is rough: of a quadrant with its base or
+    palate, the labial or the inner side may be the larger one, but both are smooth."""
+    centre = start.inverse().apply(np.zeros((1, 3)))[0]
+    around = np.deg2rad(np.arange(0, 360, 30.0))
+    leans = [
+        start.rotation.T @ [np.sin(lean) * np.cos(turn), np.sin(lean) * np.sin(turn), np.cos(lean)]
+        for lean in np.deg2rad(_LEANS_DEG)
+        for turn in around
+    ]
+    frames = [start, *(_frame(up, centre) for up in leans)]
+    return max(frames, key=lambda frame: _relief(mesh, frame).rough().sum())
+
+
 def _is_part(mesh: Mesh, up: Float[np.ndarray, "3"]) -> bool:
     """Whether this is a quadrant or less, seen from above."""
-    seen = mesh.vertices @ axes_about(up)[:2].T
-    axes = np.linalg.svd(seen - seen.mean(axis=0), full_matrices=False)[2]
-    return bool(np.ptp(seen @ axes.T, axis=0).min() < _NARROW_MM)
+    return _width_mm(mesh.vertices @ axes_about(up)[:2].T) < _NARROW_MM
+
+
+def _width_mm(places: Float[np.ndarray, "n 2"]) -> float:
+    """The lesser extent of places seen from above."""
+    axes = np.linalg.svd(places - places.mean(axis=0), full_matrices=False)[2]
+    return float(np.ptp(places @ axes.T, axis=0).min())
 
 
 def _relief(mesh: Mesh, frame: Rigid3) -> _Relief:
@@ -149,10 +195,10 @@ def _roughness(relief: _Relief) -> float:
     return float(np.arccos(np.clip(cosines[known], -1, 1)).mean()) if known.any() else 0.0
 
 
-def _level(mesh: Mesh, start: Rigid3) -> Rigid3:
-    """Turn a frame so that the tips of the crowns lie in the plane XY on average."""
-    frame = start if _is_part(mesh, start.rotation[2]) else _resting(_relief(mesh, start), start)
-    return levelled(lambda turn: _relief(mesh, turn @ frame).points, _GRID_MM, _TILT_SD_DEG) @ frame
+def _levelled(mesh: Mesh, start: Rigid3) -> tuple[_Relief, Rigid3]:
+    """A frame turned so that the tips of the crowns lie in the plane XY on average, and what is seen from there."""
+    frame = levelled(lambda turn: _relief(mesh, turn @ start).points, _GRID_MM, _TILT_SD_DEG) @ start
+    return _relief(mesh, frame), frame
 
 
 def _resting(relief: _Relief, frame: Rigid3) -> Rigid3:
@@ -171,17 +217,18 @@ def _resting(relief: _Relief, frame: Rigid3) -> Rigid3:
     return upright(normals[int(np.argmin(exits))]) @ frame
 
 
-def _anterior(crowns: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "2"], tuple[str, ...]]:
-    """Unit vector towards anterior, from the places of the crowns seen from above: how an arch fits them best."""
+def _anterior(crowns: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "2"], bool]:
+    """Unit vector towards anterior, from the places of the crowns seen from above: how an arch fits them best. And
+    whether they are those of a whole arch, which fits one way only."""
     places = crowns[:: max(1, len(crowns) // 1000)]
-    fits = [_fit_arch(places, angle) for angle in np.deg2rad(np.arange(0, 360, 15.0))]
+    angles = np.deg2rad(np.arange(0, 360, 20.0))
+    fits = [_fit_arch(places, angle, *size_mm) for size_mm in _ARCHES_MM for angle in angles]
     misfits = np.array([misfit for misfit, _ in fits])
     directions = np.array([direction for _, direction in fits])
     best = int(np.argmin(misfits))
     rivals = misfits[directions @ directions[best] < np.cos(np.deg2rad(60))]
-    sure = misfits[best] < _ARCH_MISFIT_MM and (len(rivals) == 0 or misfits[best] < 0.85 * rivals.min())
-    note = "occlusal frame: unsure which way is anterior, as this does not look like a whole arch; check the picture"
-    return _midline(places, directions[best]), () if sure else (note,)
+    one_way = misfits[best] < _ARCH_MISFIT_MM and (len(rivals) == 0 or misfits[best] < 0.85 * rivals.min())
+    return _midline(places, directions[best]), bool(one_way and _width_mm(crowns) > _NARROW_ARCH_MM)
 
 
 def _midline(places: Float[np.ndarray, "n 2"], front: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
@@ -199,23 +246,26 @@ def _midline(places: Float[np.ndarray, "n 2"], front: Float[np.ndarray, "2"]) ->
     return np.array([np.cos(best), np.sin(best)])
 
 
-def _fit_arch(places: Float[np.ndarray, "n 2"], angle: float) -> tuple[float, Float[np.ndarray, "2"]]:
-    """Lay the mean arch on the crowns from a start ``angle``: misfit in mm (0 to 4), and where its front points."""
+def _fit_arch(
+    places: Float[np.ndarray, "n 2"], angle: float, half_width_mm: float, depth_mm: float
+) -> tuple[float, Float[np.ndarray, "2"]]:
+    """Lay an arch on the crowns from a start ``angle``: misfit in mm (0 to 4), and where its front points."""
     x = np.linspace(-1, 1, 61)
-    arch = np.stack([_ARCH_HALF_WIDTH_MM * x, -_ARCH_DEPTH_MM * np.abs(x) ** 2.3], axis=1)
+    arch = np.stack([half_width_mm * x, -depth_mm * np.abs(x) ** 2.3], axis=1)
     arch -= arch.mean(axis=0)
     c, s = np.cos(angle), np.sin(angle)
     laid = arch @ np.array([[c, s], [-s, c]]) + places.mean(axis=0)
     tree = cKDTree(places)
     for _ in range(20):
-        _, from_places = cKDTree(laid).query(places)
+        beside, from_places = cKDTree(laid).query(places)
         far, to_places = tree.query(laid)
-        near = far < 6.0
-        source = np.concatenate([arch[from_places], arch[near]])
-        target = np.concatenate([places, places[to_places[near]]])
-        weights = np.concatenate([np.full(len(places), 1 / len(places)), np.full(near.sum(), 1 / len(arch))])
+        on, near = beside <= np.quantile(beside, _ON_ARCH), far < 6.0
+        source = np.concatenate([arch[from_places[on]], arch[near]])
+        target = np.concatenate([places[on], places[to_places[near]]])
+        weights = np.concatenate([np.full(on.sum(), 1 / on.sum()), np.full(near.sum(), 1 / len(arch))])
         laid = _laid(source, target, weights, arch)
     there, _ = cKDTree(laid).query(places)
+    there = there[there <= np.quantile(there, _ON_ARCH)]
     back, _ = tree.query(laid)
     front = laid[30] - laid[[0, -1]].mean(axis=0)
     misfit = np.minimum(there, 4.0).mean() + np.minimum(back, 4.0).mean()
@@ -272,42 +322,3 @@ def check_scale(mesh: Mesh, unit: Unit = "mm") -> tuple[str, ...]:
     likely = [other for other, factor in MM_PER_UNIT.items() if lower <= raw * factor <= upper]
     advice = f"give --unit {likely[0]}" if likely else "rescale it, or give the correct --unit"
     raise InputError(f"{measured}; {advice}")
-
-
-def labels_from_colors(
-    face_colors: UInt8[np.ndarray, "f 3"], mesh: Mesh, arch: Arch | None
-) -> Int[np.ndarray, "f"] | None:
-    """FDI number for each face of a mesh in the occlusal frame whose teeth have a colour each and whose gum is white.
-
-    The teeth are numbered from the midline backwards on each side as if none were missing. None where the arch is not
-    known, the colours are not those of teeth (too few, too many, scattered), or a gap shows that a tooth is missing.
-    """
-    if arch is None:
-        return None
-    colors, region = np.unique(face_colors, axis=0, return_inverse=True)
-    teeth = np.flatnonzero(~np.all(colors == 255, axis=1))
-    if not 10 <= len(teeth) <= 16:
-        return None
-    areas = np.bincount(region, mesh.face_areas, minlength=len(colors))
-    summed = [np.bincount(region, mesh.face_areas * mesh.face_centres[:, k], minlength=len(colors)) for k in range(3)]
-    centroids = (np.stack(summed, axis=1) / areas[:, None])[:, :2]
-    numbers = _number_teeth(centroids[teeth], arch)
-    if numbers is None:
-        return None
-    table = np.full(len(colors), GUM)
-    table[teeth] = numbers
-    return np.asarray(table[region])
-
-
-def _number_teeth(centroids: Float[np.ndarray, "n 2"], arch: Arch) -> Int[np.ndarray, "n"] | None:
-    """FDI numbers by place along the arch, or None where they are not those of a row without gaps."""
-    numbers = np.zeros(len(centroids), dtype=np.int64)
-    around = np.arctan2(centroids[:, 0], centroids[:, 1] - centroids[:, 1].min() + 1.0)
-    for side, quadrant in ((1, 4), (-1, 3)) if arch == "lower" else ((1, 2), (-1, 1)):
-        members = np.flatnonzero(side * centroids[:, 0] > 0)
-        ordered = members[np.argsort(np.abs(around[members]))]
-        steps = np.linalg.norm(np.diff(centroids[ordered], axis=0), axis=1)
-        if not 5 <= len(ordered) <= 8 or np.any(steps > 14) or np.any(steps < 2):
-            return None
-        numbers[ordered] = 10 * quadrant + 1 + np.arange(len(ordered))
-    return numbers

@@ -1,14 +1,17 @@
 """Landmarks of a jaw whose teeth are labelled, estimated from its surface.
 
-Each tooth is looked at in its own view (`cuspid.anatomy.landmarks.tooth_view`: u distal, v buccal, z occlusal). What is
-looked for, by the definitions of `cuspid.anatomy.landmarks.scheme`:
+Each tooth is looked at in its own view (`cuspid.anatomy.landmarks.tooth_view`: z along the tooth, u distal, v buccal).
+What is looked for, by the definitions of `cuspid.anatomy.landmarks.scheme`:
 
 - the angle of an incisal edge is the point farthest half-way between up and sideways (on a canine, whose edge slopes,
-  60 degrees from up); the middle of the edge lies half-way between its angles;
-- cusps are summits, told apart by where the cusps of that tooth normally lie (`cuspid.anatomy.teeth.dentition`);
+  60 degrees from up); the middle of the edge lies half-way between its angles, in the middle of what wear made flat;
+- cusps are summits, told apart by where the cusps of that tooth normally lie (`cuspid.anatomy.teeth.dentition`), after
+  the shift that the row of summits shows; a cusp without a summit is a shoulder, the farthest point outwards and up;
+- the tip of a molar's cusp is the point farthest in a direction that leans outwards a little: of a top that is worn
+  flat, the corner where its ridges met; that of a canine is the mean over such directions all around;
 - the buccal groove is where the rim is deepest below the line through the tips of the two buccal cusps; the rim bows
   out from that line a little (`RIM_BOW`);
-- the central groove is the lowest point between buccal and lingual cusps, half-way between mesial and distal;
+- the central groove is the deepest point below the plane of the cusps, half-way between mesial and distal;
 - a cervix is the bottom of a parabola laid through the margin of the gum.
 
 The uncertainty of a point joins three parts: what phantoms with known landmarks show for that kind of point, a share of
@@ -21,14 +24,24 @@ from types import MappingProxyType
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
 from cuspid.anatomy.landmarks.dimensions import arch_of
-from cuspid.anatomy.landmarks.scheme import TOOTH_LANDMARKS, ToothKind, kind_of, labels_of
+from cuspid.anatomy.landmarks.scheme import (
+    ANGLE_DEG,
+    PIT_REACH,
+    TIP_LEAN_DEG,
+    TOOTH_LANDMARKS,
+    ToothKind,
+    below_cusps,
+    kind_of,
+    labels_of,
+)
 from cuspid.anatomy.landmarks.tooth_view import Place, ToothView, view_teeth
 from cuspid.anatomy.teeth.dentition import QUADRANTS
 from cuspid.errors import InputError
+from cuspid.geometry import unit
 from cuspid.jaw import GUM, Arch, Jaw, Landmark
 from cuspid.mesh import Mesh, edges_of
 from cuspid.options import Options, Range
@@ -38,17 +51,25 @@ Points = Float[np.ndarray, "n 3"]
 
 _NO_POINTS = np.zeros((0, 3))
 _UP = np.array([0.0, 0.0, 1.0])
-_ANGLE_DEG: Mapping[ToothKind, float] = MappingProxyType({"incisor": 45.0, "canine": 60.0})
-"""Direction in which the angle of an edge is the farthest point, from up to sideways."""
 _CUSPS_APART_MM = 0.8
 """No two cusps of a tooth are nearer."""
 _CUSP_SPREAD_MM = 1.5
 """How far a cusp usually lies from where it is expected."""
 _FARTHEST_CUSP_MM = 3.0
 """No cusp is this far from where it is expected."""
-_RELIEF_MM = 0.8
-"""A cusp without a summit is what stands out most from the surface smoothed by this."""
-RIM_BOW: Mapping[Arch, tuple[float, float]] = MappingProxyType({"lower": (0.122, 0.145), "upper": (0.081, 0.095)})
+_SHOULDER_DEG, _SHOULDER_MM = 45.0, 1.2
+"""A cusp without a summit is the farthest point in this direction, from up to outwards, so near to where it is
+expected."""
+_TIP_REACH_MM = 0.8
+"""Half the side of the square about a summit that its tip is looked for in."""
+_WORN_EDGE_DEG, _WORN_TIP_DEG = 25.0, 15.0
+"""The middle of an edge, or the tip of a canine, is the mean of the farthest points in directions this far from up."""
+_BUCCAL_CUSPS = ("buccal_cusp", "mesiobuccal_cusp", "distobuccal_cusp")
+_LINGUAL_CUSPS = ("lingual_cusp", "second_lingual_cusp", "mesiolingual_cusp", "distolingual_cusp")
+"""Between these lies the central groove."""
+_PIT_SMOOTHING_MM = 0.4
+"""Standard deviation of the smoothing before the search for a pit, where scans see least and faces are large."""
+RIM_BOW: Mapping[Arch, tuple[float, float]] = MappingProxyType({"lower": (0.094, 0.110), "upper": (0.063, 0.072)})
 """How far buccally of the line through the tips of the buccal cusps the rim of first and of other molars is crossed, as
 a fraction of half the depth of the tooth, seen from above; from the phantoms that `SIGMA_MM` is from."""
 _GROOVE_CAP_MM = 0.02
@@ -63,35 +84,35 @@ _PAPILLA_BELOW_MM = 1.0
 
 SIGMA_MM: Mapping[str, tuple[float, float]] = MappingProxyType(
     {
-        "canine.cusp_tip": (0.03, 0.03),
-        "canine.distal_angle": (0.03, 0.93),
-        "canine.labial_cervix": (0.05, 0.05),
-        "canine.lingual_cervix": (0.18, 0.00),
-        "canine.mesial_angle": (0.12, 0.39),
-        "incisor.distal_angle": (0.08, 0.31),
-        "incisor.incisal_edge": (0.07, 0.12),
-        "incisor.labial_cervix": (0.07, 0.08),
-        "incisor.lingual_cervix": (0.13, 0.05),
-        "incisor.mesial_angle": (0.04, 0.27),
-        "midline": (0.03, 0.34),
-        "molar.buccal_groove": (0.01, 0.08),
-        "molar.central_groove": (0.26, 0.23),
-        "molar.distobuccal_cusp": (0.10, 0.04),
-        "molar.mesiobuccal_cusp": (0.10, 0.08),
+        "canine.cusp_tip": (0.08, 0.07),
+        "canine.distal_angle": (0.31, 0.67),
+        "canine.labial_cervix": (0.12, 0.06),
+        "canine.lingual_cervix": (0.13, 0.00),
+        "canine.mesial_angle": (0.21, 0.37),
+        "incisor.distal_angle": (0.22, 0.26),
+        "incisor.incisal_edge": (0.08, 0.16),
+        "incisor.labial_cervix": (0.10, 0.08),
+        "incisor.lingual_cervix": (0.11, 0.06),
+        "incisor.mesial_angle": (0.13, 0.21),
+        "midline": (0.00, 0.23),
+        "molar.buccal_groove": (0.04, 0.07),
+        "molar.central_groove": (0.21, 0.00),
+        "molar.distobuccal_cusp": (0.15, 0.04),
+        "molar.mesiobuccal_cusp": (0.14, 0.05),
         "molar.mesiolingual_cusp": (0.13, 0.05),
-        "papilla": (0.00, 0.37),
-        "premolar.buccal_cervix": (0.06, 0.04),
-        "premolar.buccal_cusp": (0.03, 0.06),
-        "premolar.central_groove": (0.29, 0.00),
-        "premolar.lingual_cervix": (0.07, 0.08),
-        "premolar.lingual_cusp": (0.13, 0.05),
+        "papilla": (0.00, 0.24),
+        "premolar.buccal_cervix": (0.08, 0.06),
+        "premolar.buccal_cusp": (0.03, 0.04),
+        "premolar.central_groove": (0.16, 0.06),
+        "premolar.lingual_cervix": (0.10, 0.06),
+        "premolar.lingual_cusp": (0.35, 0.00),
     }
 )
 """Standard uncertainty (one axis) of each kind of point: a constant in mm, and a share of the edge length of the mesh.
 
-From the errors on phantoms of seeds 100 to 103, both arches, with edges of 0.47 and 0.84 mm: what the spread under
-tilts and smoothing does not explain. They hold for teeth formed like the phantom's; worn or restored ones are worse,
-and that shows in the spread alone."""
+From the errors on phantoms of seeds 100 to 113, both arches, with edges of 0.5 and 0.9 mm: what the spread under tilts
+and smoothing does not explain (`python benchmarks/landmarks.py --calibrate`). They hold for teeth formed like the
+phantom's; worn or restored ones are worse, and that shows in the spread alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,7 +187,7 @@ def _tooth_points(view: ToothView, arch: Arch) -> dict[str, Point]:
         places = _edge_places(view, kind)
     else:
         places = _cusp_places(view, arch)
-        places["central_groove"] = _central_groove(view, places, 0.15 if kind == "molar" else 0.0)
+        places["central_groove"] = _central_groove(view, places, PIT_REACH[kind])
         if kind == "molar":
             places["buccal_groove"] = _buccal_groove(view, RIM_BOW[arch][view.fdi % 10 > 6], places)
     return {name: view.lift(place) for name, place in places.items()}
@@ -175,15 +196,22 @@ def _tooth_points(view: ToothView, arch: Arch) -> dict[str, Point]:
 # Edges
 
 
+def _leaning(deg: float, aside: Place) -> Point:
+    """A direction (u, v, z), not of length one, that leans from up by an angle along each coordinate of ``aside``."""
+    return np.array([*np.tan(np.radians(deg)) * np.asarray(aside), 1.0])
+
+
 def _edge_places(view: ToothView, kind: ToothKind) -> dict[str, Place]:
     """Corners and middle of an incisal edge, or corners and tip of a canine."""
-    lean = np.radians(_ANGLE_DEG[kind])
-    mesial, distal = (view.farthest(np.array([side * np.sin(lean), 0.0, np.cos(lean)])) for side in (-1, 1))
+    mesial, distal = (view.farthest(_leaning(ANGLE_DEG[kind], np.array([side, 0.0]))) for side in (-1, 1))
     if kind == "canine":
-        return {"mesial_angle": mesial, "cusp_tip": view.farthest(_UP), "distal_angle": distal}
-    middle = (mesial[0] + distal[0]) / 2
-    strip = np.abs(view.places[..., 0] - middle) < 0.6 * view.grid_mm
-    return {"mesial_angle": mesial, "incisal_edge": view.farthest(_UP, strip), "distal_angle": distal}
+        turns = np.arange(8) * np.pi / 4
+        around = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+        tip = np.mean([view.farthest(_leaning(_WORN_TIP_DEG, aside)) for aside in around], axis=0)
+        return {"mesial_angle": mesial, "cusp_tip": tip, "distal_angle": distal}
+    strip = np.abs(view.places[..., 0] - (mesial[0] + distal[0]) / 2) < 0.6 * view.grid_mm
+    sides = [view.farthest(_leaning(_WORN_EDGE_DEG, np.array([0.0, side])), strip) for side in (-1, 1)]
+    return {"mesial_angle": mesial, "incisal_edge": np.mean(sides, axis=0), "distal_angle": distal}
 
 
 # Cusps and grooves
@@ -200,29 +228,49 @@ def _expected_cusps(fdi: int, arch: Arch) -> dict[str, tuple[float, float]]:
     }
 
 
+def _outwards(name: str) -> Place:
+    """Where a cusp lies from the middle of its tooth, as signs of u and v."""
+    along = -1.0 if "mesio" in name else 1.0 if "dist" in name else 0.0
+    return np.array([along, 1.0 if "buccal" in name else -1.0])
+
+
 def _cusp_places(view: ToothView, arch: Arch) -> dict[str, Place]:
-    """The summits that suit the cusps of the tooth best; where none does, the highest place near the expected one."""
+    """The tips at the summits that suit the cusps of the tooth best; where none does, a shoulder near the expected
+    place."""
     expected = _expected_cusps(view.fdi, arch)
+    kind = kind_of(view.fdi)
+    named = np.isin(list(expected), TOOTH_LANDMARKS[kind])
     places = np.array(list(expected.values())) * [view.half_width_mm, view.half_depth_mm]
     summits = view.summits(_CUSPS_APART_MM)
+    shift = np.zeros(2)
+    for _ in range(2):
+        chosen = _suiting(view, places + shift, summits, named)
+        known = named & (chosen < len(summits))
+        if known.any():
+            shift = (summits[chosen[known]] - places[known]).mean(axis=0)
+    found = {}
+    for name, place, summit in zip(expected, places + shift, chosen, strict=True):
+        if summit < len(summits):
+            tip, centre = TIP_LEAN_DEG if kind == "molar" else 0.0, summits[summit]
+            near = view.within(centre - _TIP_REACH_MM, centre + _TIP_REACH_MM)
+            found[name] = view.farthest(_leaning(tip, _outwards(name)), near)
+        else:
+            near = view.within(place - _SHOULDER_MM, place + _SHOULDER_MM)
+            found[name] = view.farthest(_leaning(_SHOULDER_DEG, _outwards(name)), near)
+    return found
+
+
+def _suiting(
+    view: ToothView, places: Float[np.ndarray, "c 2"], summits: Float[np.ndarray, "k 2"], named: Bool[np.ndarray, "c"]
+) -> Int[np.ndarray, "c"]:
+    """The summit of each cusp that is expected at a place; the number of the summits or more where it has none."""
     apart = np.linalg.norm(places[:, None] - summits[None], axis=-1)
     heights = view.surface(summits)
     lower = heights.max(initial=-np.inf) - heights
     suits = np.where(apart < _FARTHEST_CUSP_MM, (apart / _CUSP_SPREAD_MM) ** 2 + lower, 1e3)
     # A cusp may go without a summit; one that is no landmark does so first.
-    named = np.isin(list(expected), TOOTH_LANDMARKS[kind_of(view.fdi)])
-    without = np.broadcast_to(np.where(named, 20.0, 8.0)[:, None], (len(expected), len(expected)))
-    _, chosen = linear_sum_assignment(np.hstack([suits, without]))
-    inside = np.isfinite(view.heights)
-    relief = np.subtract(view.heights, view.smoothed(_RELIEF_MM).heights, out=view.heights.copy(), where=inside)
-    found = {}
-    for k, name in enumerate(expected):
-        if chosen[k] < len(summits):
-            centre = summits[chosen[k]]
-            found[name] = view.farthest(_UP, view.within(centre - 0.5, centre + 0.5))
-        else:
-            found[name] = view.top(relief, view.within(places[k] - 1.0, places[k] + 1.0))
-    return found
+    without = np.broadcast_to(np.where(named, 20.0, 8.0)[:, None], (len(places), len(places)))
+    return np.asarray(linear_sum_assignment(np.hstack([suits, without]))[1])
 
 
 def _buccal_groove(view: ToothView, bow: float, cusps: Mapping[str, Place]) -> Place:
@@ -238,12 +286,15 @@ def _buccal_groove(view: ToothView, bow: float, cusps: Mapping[str, Place]) -> P
 
 
 def _central_groove(view: ToothView, cusps: Mapping[str, Place], wide: float) -> Place:
-    """The lowest place between buccal and lingual cusps, within a fraction of half the width about the middle."""
-    low = max(place[1] for name, place in cusps.items() if "lingual" in name)
-    high = min(place[1] for name, place in cusps.items() if "buccal" in name)
-    reach, middle, half = max(wide * view.half_width_mm, 0.6 * view.grid_mm), (low + high) / 2, 0.4 * abs(high - low)
+    """The deepest place below the plane of the cusps, within a fraction of half the width about the middle."""
+    rows = [[place for name, place in cusps.items() if name in row] for row in (_BUCCAL_CUSPS, _LINGUAL_CUSPS)]
+    buccal, lingual = (np.column_stack([row, view.surface(np.array(row))]) for row in rows)
+    down = below_cusps(buccal, lingual)
+    sides = buccal[:, 1].mean(), lingual[:, 1].mean()
+    middle, half = np.mean(sides), 0.3 * abs(sides[0] - sides[1])
+    reach = max(wide * view.half_width_mm, 0.6 * view.grid_mm)
     among = view.within(np.array([-reach, middle - half]), np.array([reach, middle + half]))
-    return view.farthest(-_UP, among)
+    return view.smoothed(_PIT_SMOOTHING_MM).farthest(down, among)
 
 
 # The gum
@@ -298,9 +349,8 @@ def _midline_points(
     if jaw.face_labels is None or not all(label in points for label in labels):
         return {}
     middle = (points[labels[0]] + points[labels[1]]) / 2
-    midpoint = (views[right].origin + views[left].origin) / 2
-    inwards = -(views[right].axes[1] + views[left].axes[1])
-    inwards /= np.linalg.norm(inwards)
+    midpoint = jaw.mesh.centroid(jaw.tooth_faces(right) | jaw.tooth_faces(left))
+    inwards = unit(-(views[right].axes[1] + views[left].axes[1]) * [1.0, 1.0, 0.0])
     found = {"midline": _surface_below(jaw, middle)}
     if arch == "lower":
         papilla = _lingual_papilla(jaw.mesh, jaw.face_labels, middle, inwards)
@@ -337,7 +387,7 @@ def _incisive_papilla(jaw: Jaw, midpoint: Point, inwards: Point, cervices: Seque
     """The palatal gum behind the central incisors, `_PAPILLA_BELOW_MM` apical of their palatal margin."""
     if not cervices:
         return None
-    depth = np.arange(0.0, 10.0, 0.05)
+    depth = np.arange(0.0, 12.0, 0.05)
     over = midpoint * [1, 1, 0] + depth[:, None] * inwards + 20.0 * _UP
     hits = jaw.mesh.cast(over, np.broadcast_to(-_UP, over.shape))
     heights = 20.0 - hits.distances

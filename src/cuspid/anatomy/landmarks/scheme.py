@@ -15,6 +15,9 @@ from difflib import get_close_matches
 from types import MappingProxyType
 from typing import Literal
 
+import numpy as np
+from jaxtyping import Float
+
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.jaw import UNIVERSAL_FROM_FDI, Landmark
@@ -35,11 +38,19 @@ TOOTH_LANDMARKS: Mapping[ToothKind, tuple[str, ...]] = MappingProxyType(
 """Points of a tooth of each kind.
 
 ``*_angle``: corner of the incisal edge; on a canine, the shoulder where the edge meets the proximal side.
-``incisal_edge``: its middle. ``*_cusp``, ``cusp_tip``: highest point of the cusp; of several lingual cusps of a
-premolar, the mesial one. ``central_groove``: deepest point of the central groove or fossa. ``buccal_groove``: where the
-(mesio)buccal groove crosses the occlusal rim. ``*_cervix``: lowest (most apical) point of the gum's margin on that
-side.
+``incisal_edge``: its middle. ``*_cusp``, ``cusp_tip``: the point of the cusp that is highest along the tooth, on a
+molar in a direction that leans outwards by `TIP_LEAN_DEG`; of several lingual cusps of a premolar, the mesial one.
+``central_groove``: deepest point of the central groove or fossa below the plane of the cusps, within `PIT_REACH` of the
+middle. ``buccal_groove``: where the (mesio)buccal groove crosses the occlusal rim. ``*_cervix``: lowest (most apical)
+point of the gum's margin on that side.
 """
+ANGLE_DEG: Mapping[ToothKind, float] = MappingProxyType({"incisor": 45.0, "canine": 60.0})
+"""Direction in which the angle of an edge is the farthest point, from up to sideways; the edge of a canine slopes."""
+TIP_LEAN_DEG = 10.0
+"""Lean outwards, both along the arch and across it, of the direction in which the tip of a molar's cusp is the farthest
+point: of a top that is worn flat, the corner where its ridges met."""
+PIT_REACH: Mapping[ToothKind, float] = MappingProxyType({"premolar": 0.0, "molar": 0.1})
+"""How far from the middle between mesial and distal a central groove is looked for, as a fraction of half the width."""
 
 MIDLINE_LANDMARKS = ("papilla", "midline")
 """``papilla``: centre of the incisive papilla (upper), tip of the lingual papilla between the central incisors (lower).
@@ -55,6 +66,17 @@ def labels_of(teeth: Iterable[int]) -> tuple[str, ...]:
     """Labels of all landmarks of a jaw with the given teeth (FDI), tooth by tooth in the given order, midline last."""
     points = [f"{fdi}.{point}" for fdi in teeth for point in TOOTH_LANDMARKS[kind_of(fdi)]]
     return (*points, *MIDLINE_LANDMARKS)
+
+
+def below_cusps(buccal: Float[np.ndarray, "b 3"], lingual: Float[np.ndarray, "l 3"]) -> Float[np.ndarray, "3"]:
+    """Direction (u, v, z) down from the plane through the tips (u, v, z) of cusps; of fewer than four, from the plane
+    through the means of both rows that holds the direction u."""
+    tips = np.concatenate([buccal, lingual])
+    if len(tips) < 4:
+        across = buccal.mean(axis=0) - lingual.mean(axis=0)
+        return np.array([0.0, across[2] / across[1], -1.0])
+    centred = tips - tips.mean(axis=0)
+    return np.array([*np.linalg.lstsq(centred[:, :2], centred[:, 2], rcond=None)[0], -1.0])
 
 
 def teeth_named(labels: Iterable[str]) -> tuple[int, ...]:

@@ -1,7 +1,12 @@
 """A labelled tooth seen from the occlusal side: its own directions, and its surface as a height field.
 
-Frame of a view: u distal along the arch, v buccal across it, z occlusal, mm; origin in the middle of the outline of the
-tooth, at the jaw's Z = 0. It is left-handed on one side of the jaw, where the teeth are mirror images.
+Frame of a view: z out of the crown along the tooth, u distal along the arch, v buccal across it, mm; origin in the
+middle of the outline of the tooth, as high as its highest point. It is left-handed on one side of the jaw, where the
+teeth are mirror images.
+
+Teeth lean: seen along the jaw's Z, the highest point of a worn cusp lies far down its slope. How a tooth leans is told
+by the vector area of its crown, which the border of its label alone fixes. That border is ragged: the mean with the
+neighbours, which lean alike, is drawn towards the jaw's Z as far as the border errs.
 
 The height field z(u, v) goes through the vertices that look upwards (Clough-Tocher, C1), so that a point of it does not
 stick to a vertex; it stays as near to the triangles as the surface that they were cut from can be.
@@ -11,11 +16,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.interpolate import CloughTocher2DInterpolator, RegularGridInterpolator
-from scipy.ndimage import distance_transform_edt, gaussian_filter, maximum_filter
+from scipy.ndimage import correlate1d, distance_transform_edt, gaussian_filter, maximum_filter
 
+from cuspid.facing import pieces_of
+from cuspid.geometry import unit
 from cuspid.jaw import Jaw
+from cuspid.mesh import Mesh
 
 Grid = Float[np.ndarray, "p q"]
 Place = Float[np.ndarray, "2"]
@@ -26,6 +34,12 @@ _ARCH_ORDER = (*range(48, 40, -1), *range(31, 39), *range(18, 10, -1), *range(21
 """FDI numbers along the lower and the upper arch."""
 _UPWARD = 0.15
 """Least z of the normal of a vertex that counts for the height field."""
+_NEIGHBOURS = (0.25, 0.5, 0.25)
+"""Share of a tooth, and of those beside it, in how it leans."""
+_LEAN_SHARE = 0.7
+"""Of the lean that borders tell: they err by some 10 degrees, where teeth lean by some 15."""
+_STEEPEST_LEAN = 0.3
+"""Least cosine of a lean that is taken for one."""
 _LEAST_VERTICES = 12
 """Fewer vertices that look upwards make no height field."""
 _SAG = 0.15
@@ -127,14 +141,31 @@ class ToothView:
 def view_teeth(jaw: Jaw, grid_mm: float) -> Mapping[int, ToothView]:
     """Each tooth that has enough surface, in the order along the arch."""
     order = [fdi for fdi in _ARCH_ORDER if fdi in jaw.teeth]
-    centroids = np.array([jaw.mesh.centroid(jaw.tooth_faces(fdi))[:2] for fdi in order])
-    directions = _along(centroids)
+    crowns = [_crown(jaw, fdi) for fdi in order]
+    centroids = np.array([crown.face_areas @ crown.face_centres / crown.face_areas.sum() for crown in crowns])[:, :2]
     views = {}
-    for fdi, direction in zip(order, directions, strict=True):
-        view = _view(jaw, fdi, direction, grid_mm)
+    for fdi, crown, centroid, tangent, up in zip(
+        order, crowns, centroids, _along(centroids), _leans(crowns), strict=True
+    ):
+        view = _view(fdi, crown, _axes(fdi, tangent, centroid, up), grid_mm)
         if view is not None:
             views[fdi] = view
     return views
+
+
+def _crown(jaw: Jaw, fdi: int) -> Mesh:
+    """The surface of a tooth without specks of its label that lie elsewhere."""
+    crown = jaw.mesh.submesh(jaw.tooth_faces(fdi))
+    piece = pieces_of(crown)
+    return crown.submesh(piece == np.argmax(np.bincount(piece, crown.face_areas)))
+
+
+def _leans(crowns: list[Mesh]) -> Float[np.ndarray, "t 3"]:
+    """The direction out of each crown along its tooth, for teeth in the order along the arch."""
+    outwards = np.array([unit(crown.face_areas @ crown.face_normals) for crown in crowns])
+    slopes = outwards[:, :2] / np.maximum(outwards[:, 2:], _STEEPEST_LEAN)
+    mean = _LEAN_SHARE * correlate1d(slopes, _NEIGHBOURS, axis=0, mode="nearest")
+    return unit(np.column_stack([mean, np.ones(len(mean))]))
 
 
 def _along(centroids: Float[np.ndarray, "t 2"]) -> Float[np.ndarray, "t 2"]:
@@ -145,29 +176,28 @@ def _along(centroids: Float[np.ndarray, "t 2"]) -> Float[np.ndarray, "t 2"]:
     return tangents / np.linalg.norm(tangents, axis=1, keepdims=True)
 
 
-def _axes(fdi: int, direction: Float[np.ndarray, "2"], centroid: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3 3"]:
-    """Distal, buccal and occlusal direction as rows; ``direction`` runs along `_ARCH_ORDER`."""
+def _axes(
+    fdi: int, tangent: Float[np.ndarray, "2"], centroid: Float[np.ndarray, "2"], up: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3 3"]:
+    """Distal, buccal and occlusal direction as rows; ``tangent`` runs along `_ARCH_ORDER`."""
     # The order begins at the patient's right, whose teeth are walked towards the midline.
-    distal = direction if fdi // 10 in (2, 3) else -direction
-    across = np.array([-distal[1], distal[0]])
-    buccal = across if across @ centroid > 0 else -across
-    return np.array([[*distal, 0.0], [*buccal, 0.0], [0.0, 0.0, 1.0]])
+    along = np.array([*(tangent if fdi // 10 in (2, 3) else -tangent), 0.0])
+    distal = unit(along - (along @ up) * up)
+    across = np.cross(up, distal)
+    return np.array([distal, across if across[:2] @ centroid > 0 else -across, up])
 
 
-def _view(jaw: Jaw, fdi: int, direction: Float[np.ndarray, "2"], grid_mm: float) -> ToothView | None:
-    faces = jaw.mesh.faces[jaw.tooth_faces(fdi)]
-    vertices: Int[np.ndarray, "k"] = np.unique(faces)
-    axes = _axes(fdi, direction, jaw.mesh.centroid(jaw.tooth_faces(fdi))[:2])
-    local = jaw.mesh.vertices[vertices] @ axes.T
+def _view(fdi: int, crown: Mesh, axes: Float[np.ndarray, "3 3"], grid_mm: float) -> ToothView | None:
+    local = crown.vertices @ axes.T
     low, high = local[:, :2].min(axis=0), local[:, :2].max(axis=0)
-    middle = np.array([*(low + high) / 2, 0.0])
-    upward = (local - middle)[jaw.mesh.vertex_normals[vertices, 2] > _UPWARD]
+    middle = np.array([*(low + high) / 2, local[:, 2].max()])
+    upward = (local - middle)[crown.vertex_normals @ axes[2] > _UPWARD]
     if len(upward) < _LEAST_VERTICES:
         return None
     half = (high - low) / 2
     u, v = (np.arange(-reach, reach + grid_mm, grid_mm) for reach in half)
     places = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1)
-    heights = _heights(jaw, fdi, places, middle, axes, upward)
+    heights = _heights(crown, places, middle, axes, upward)
     return ToothView(
         fdi=fdi,
         axes=axes,
@@ -181,19 +211,16 @@ def _view(jaw: Jaw, fdi: int, direction: Float[np.ndarray, "2"], grid_mm: float)
 
 
 def _heights(
-    jaw: Jaw,
-    fdi: int,
+    crown: Mesh,
     places: Float[np.ndarray, "p q 2"],
     middle: Float[np.ndarray, "3"],
     axes: Float[np.ndarray, "3 3"],
     upward: Points,
 ) -> Grid:
     """Height of the tooth over each place, mm; NaN beside it."""
-    crown = jaw.mesh.submesh(jaw.tooth_faces(fdi))
-    eye_z = crown.bounds[1, 2] + 1.0
-    eyes = np.concatenate([places.reshape(-1, 2), np.full((places[..., 0].size, 1), eye_z)], axis=1) + middle
-    hits = crown.cast(eyes @ axes, np.tile([0.0, 0.0, -1.0], (len(eyes), 1)))
-    flat = np.where(hits.faces >= 0, eye_z - hits.distances, np.nan)
+    eyes = np.concatenate([places.reshape(-1, 2), np.ones((places[..., 0].size, 1))], axis=1) + middle
+    hits = crown.cast(eyes @ axes, np.tile(-axes[2], (len(eyes), 1)))
+    flat = np.where(hits.faces >= 0, 1.0 - hits.distances, np.nan)
     smooth = CloughTocher2DInterpolator(upward[:, :2], upward[:, 2])(places.reshape(-1, 2))
     sag = _SAG * np.sqrt(np.median(crown.face_areas) * 4 / np.sqrt(3))
     bounded = np.clip(np.where(np.isnan(smooth), flat, smooth), flat - sag, flat + sag)
