@@ -30,7 +30,7 @@ def test_the_model_of_a_lens_is_found(model: str) -> None:
     choice, alone = choose_lens(views, BOARD, SIZE)
     assert choice.model == model
     assert 0.07 < choice.held_out_px[model] < 0.14
-    assert choice.held_out_px[model] <= 1.02 * min(choice.held_out_px.values())
+    assert choice.held_out_px[model] <= 1.05 * min(choice.held_out_px.values())
     assert 0.2 < error_sigmas(mounted_cameras(alone)[""].camera, truth.cameras["cam"]) < 2
     assert f"{model} 0." in choice.summary
 

@@ -28,6 +28,8 @@ LensName = Literal["auto", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRIS
 _LADDER = ("OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "THIN_PRISM_FISHEYE")
 """The models, simplest first. The last one is tried only where one of those before it is better than the first."""
 _FOLDS, _MOST_VIEWS = 4, 24
+_ODD = 10.0
+"""Residuals of a view, in usual ones, beyond which it shows something else."""
 _CHANCE, _CHANCE_ALIKE = 2.0, 1.0
 """Standard errors beyond which a model with more parameters is better than another (L. Breiman et al., Classification
 and Regression Trees, 1984, take one), and one with as many."""
@@ -61,31 +63,40 @@ def choose_lens(
     """
     if asked != "auto":
         return LensChoice(model=asked, held_out_px={}), calibrated_as(asked, views, board, size)
-    if len(views) < 2 * LEAST_VIEWS:
-        return _first_that_fits(views, board, size)
-    spread = np.unique(np.linspace(0, len(views) - 1, _MOST_VIEWS).astype(int))
-    some = [views[k] for k in spread]
-    found, squares, failure = dict[str, Adjusted](), dict[str, Float[np.ndarray, "v"]](), None
+    choice, simple = _first_that_fits(views, board, size)
+    some = _sound(views, simple)
+    if len(some) < 2 * LEAST_VIEWS:
+        return choice, simple
+    found, squares = dict[str, Adjusted](), dict[str, Float[np.ndarray, "v"]]()
     for model in _LADDER:
         if model == _LADDER[-1] and not _is_worth_more(squares):
             break
         try:
-            found[model] = calibrated_as(model, some, board, size, found.get("OPENCV"))
+            found[model] = calibrated_as(model, some, board, size, found.get(_LADDER[0]))
             squares[model] = _held_out(found[model], some, board)
-        except ReconstructionError as error:
-            failure = failure or error
+        except ReconstructionError:  # not such a lens
+            continue
     if not squares:
-        assert failure is not None
-        raise failure
+        return choice, simple
     chosen = next(iter(squares))
     for model in list(squares)[1:]:
         as_many = len(MODELS[model].names) == len(MODELS[chosen].names)
         if _is_better(squares[model], squares[chosen], _CHANCE_ALIKE if as_many else _CHANCE):
             chosen = model
     rms = {model: float(np.sqrt(np.mean(each[np.isfinite(each)]))) for model, each in squares.items()}
-    start = found[chosen].scene.cameras[""]
-    alone = found[chosen] if len(some) == len(views) else calibrated_alone(views, board, size, [start])
+    if chosen == choice.model:
+        return LensChoice(model=chosen, held_out_px=rms), simple
+    alone = calibrated_alone(views, board, size, [found[chosen].scene.cameras[""]])
     return LensChoice(model=chosen, held_out_px=rms), alone
+
+
+def _sound(views: Sequence[BoardView], found: Adjusted) -> list[BoardView]:
+    """Some of the views, without those that fit much worse than is usual, as views of something else do."""
+    rms = {int(key[1]): float(np.sqrt(np.mean(each**2))) for key, each in found.residuals.items()}
+    usual = float(np.median(list(rms.values())))
+    sound = [view for k, view in enumerate(views) if rms.get(k, np.inf) <= _ODD * usual]
+    spread = np.unique(np.linspace(0, len(sound) - 1, _MOST_VIEWS).astype(int))
+    return [sound[k] for k in spread]
 
 
 def _first_that_fits(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> tuple[LensChoice, Adjusted]:
