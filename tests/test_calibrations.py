@@ -7,9 +7,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from cuspid import storage
 from cuspid.camera import Camera
@@ -104,6 +106,376 @@ def test_a_fisheye_lens_of_opencv(tmp_path: Path) -> None:
     file.release()
     theirs = cv2.fisheye.projectPoints(POINTS[:, None], np.zeros(3), np.zeros(3), K1, lens)[0].reshape(-1, 2) + 0.5
     require_close(projected(read_calibration(tmp_path / "camera.yml").rig)[0], theirs)
+
+
+# --- Kalibr --------------------------------------------------------------------------------------------------------
+
+CAMCHAIN = """cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.2834, 0.0739, 0.00019, 1.76e-05]
+  distortion_model: radtan
+  intrinsics: [458.654, 457.296, 367.215, 248.375]
+  resolution: [752, 480]
+  rostopic: /cam0/image_raw
+cam1:
+  T_cn_cnm1:
+  - [0.9999972564, 0.0023171355, 0.0003433931, -0.1100737]
+  - [-0.0023122015, 0.9998980487, -0.0140910475, 0.0003991215]
+  - [-0.0003760088, 0.0140902375, 0.9999006564, -0.0008537025]
+  - [0.0, 0.0, 0.0, 1.0]
+  cam_overlaps: [0]
+  camera_model: pinhole
+  distortion_coeffs: [0.0034, 0.0007, -0.0020, 0.0002]
+  distortion_model: equidistant
+  intrinsics: [190.978, 190.973, 254.931, 256.897]
+  resolution: [512, 512]
+  rostopic: /cam1/image_raw
+"""
+"""As Kalibr writes it (wiki, yaml formats): metres."""
+
+
+def test_a_chain_of_kalibr(tmp_path: Path) -> None:
+    read = read_calibration(write(tmp_path, "any.yaml", CAMCHAIN))
+    assert (read.format, read.losses, read.notes) == ("kalibr", {}, ())
+    points = POINTS * 10
+    matrix = np.array([[458.654, 0, 367.215], [0, 457.296, 248.375], [0, 0, 1]])
+    lens = np.array([-0.2834, 0.0739, 0.00019, 1.76e-05])
+    second = np.array([[0.9999972564, 0.0023171355, 0.0003433931], [-0.0023122015, 0.9998980487, -0.0140910475],
+                       [-0.0003760088, 0.0140902375, 0.9999006564]])  # fmt: skip
+    moved = points @ second.T + np.array([-110.0737, 0.3991215, -0.8537025])
+    fisheye = np.array([[190.978, 0, 254.931], [0, 190.973, 256.897], [0, 0, 1]])
+    theirs = cv2.fisheye.projectPoints(
+        moved[:, None], np.zeros(3), np.zeros(3), fisheye, np.array([0.0034, 0.0007, -0.0020, 0.0002])
+    )[0]
+    first, other = projected(read.rig, points)
+    require_close(first, by_opencv(points, np.zeros(3), np.zeros(3), matrix, lens))
+    require_close(other, theirs.reshape(-1, 2) + 0.5)
+
+
+def _double_sphere_ray(plane: np.ndarray, xi: float, alpha: float) -> np.ndarray:
+    """Usenko et al. 2018, Eq. 46 to 50."""
+    square = (plane**2).sum(axis=1)
+    z = (1 - alpha**2 * square) / (alpha * np.sqrt(1 - (2 * alpha - 1) * square) + 1 - alpha)
+    share = (z * xi + np.sqrt(z**2 + (1 - xi**2) * square)) / (z**2 + square)
+    return np.column_stack([share[:, None] * plane, share * z - xi])
+
+
+def _unified_ray(plane: np.ndarray, alpha: float, beta: float) -> np.ndarray:
+    """Khomutenko et al. 2016, Eq. 10."""
+    square = (plane**2).sum(axis=1)
+    z = (1 - beta * alpha**2 * square) / (alpha * np.sqrt(1 - (2 * alpha - 1) * beta * square) + 1 - alpha)
+    return np.column_stack([plane, z])
+
+
+def _omni_ray(plane: np.ndarray, xi: float) -> np.ndarray:
+    """Mei and Rives 2007, Eq. 4."""
+    square = (plane**2).sum(axis=1)
+    share = (xi + np.sqrt(1 + (1 - xi**2) * square)) / (1 + square)
+    return np.column_stack([share[:, None] * plane, share - xi])
+
+
+@pytest.mark.parametrize(
+    ("model", "own", "ray"),
+    [
+        ("ds", (-0.18, 0.59), _double_sphere_ray),
+        ("eucm", (0.6, 1.1), _unified_ray),
+        ("omni", (1.2,), _omni_ray),
+    ],
+)
+def test_other_models_of_kalibr_lie_as_near_as_is_told(tmp_path: Path, model: str, own: tuple, ray) -> None:
+    """Against the inverse of each model that its authors print."""
+    focal = {"ds": 190.0, "eucm": 240.0, "omni": 560.0}[model]
+    text = json.dumps({"cam0": {"camera_model": model, "distortion_model": "none", "distortion_coeffs": [],
+                                "intrinsics": [*own, focal, focal + 1, 322.5, 238.0],
+                                "resolution": [640, 480]}})  # fmt: skip
+    read = read_calibration(write(tmp_path, "camchain.yaml", text))
+    loss = read.losses["cam0"]
+    assert 0 < loss.rms_px <= loss.largest_px < 0.5
+    pixels = np.stack(np.meshgrid(np.linspace(5, 635, 13), np.linspace(5, 475, 9)), -1).reshape(-1, 2)
+    rays = ray((pixels - 0.5 - [322.5, 238.0]) / [focal, focal + 1], *own)
+    off = np.linalg.norm(read.rig["cam0"].camera.project(rays) - pixels, axis=1)
+    assert off.max() < 1.1 * loss.largest_px + 0.001
+
+
+def test_the_fov_distortion_of_kalibr(tmp_path: Path) -> None:
+    """Its inverse is r_u = tan(r_d w) / (2 tan(w / 2))."""
+    text = json.dumps({"cam0": {"camera_model": "pinhole", "distortion_model": "fov", "distortion_coeffs": [0.9],
+                                "intrinsics": [300.0, 300.0, 320.0, 240.0], "resolution": [640, 480]}})  # fmt: skip
+    read = read_calibration(write(tmp_path, "camchain.yaml", text))
+    pixels = np.stack(np.meshgrid(np.linspace(20, 620, 9), np.linspace(20, 460, 7)), -1).reshape(-1, 2)
+    bent = (pixels - 0.5 - [320, 240]) / 300
+    radius = np.linalg.norm(bent, axis=1, keepdims=True)
+    rays = np.column_stack([bent * np.tan(radius * 0.9) / (2 * np.tan(0.45)) / radius, np.ones(len(bent))])
+    off = np.linalg.norm(projected(read.rig, rays)[0] - pixels, axis=1)
+    assert off.max() < 1.1 * read.losses["cam0"].largest_px + 0.001
+
+
+# --- ROS -----------------------------------------------------------------------------------------------------------
+
+
+def camera_info(name: str, matrix: np.ndarray, lens: np.ndarray, turn: np.ndarray, projection: np.ndarray) -> str:
+    """As camera_calibration writes it."""
+
+    def rows(values: np.ndarray, count: int, columns: int) -> str:
+        return f"  rows: {count}\n  cols: {columns}\n  data: [{', '.join(f'{each:.8f}' for each in values.ravel())}]\n"
+
+    return (
+        f"image_width: 1280\nimage_height: 720\ncamera_name: {name}\ncamera_matrix:\n{rows(matrix, 3, 3)}"
+        f"distortion_model: plumb_bob\ndistortion_coefficients:\n{rows(lens, 1, 5)}"
+        f"rectification_matrix:\n{rows(turn, 3, 3)}projection_matrix:\n{rows(projection, 3, 4)}"
+    )
+
+
+def test_a_pair_of_ros(tmp_path: Path) -> None:
+    turn = cv2.Rodrigues(TURN)[0]
+    found = cv2.stereoRectify(K1, D1, K2, D2, (1280, 720), turn, SHIFT / 1000, flags=cv2.CALIB_ZERO_DISPARITY)
+    write(tmp_path, "left.yaml", camera_info("left", K1, D1, found[0], found[2]))
+    write(tmp_path, "right.yaml", camera_info("right", K2, D2, found[1], found[3]))
+    read = read_calibration(tmp_path)
+    assert (read.format, read.notes) == ("ros", ())
+    assert read.rig["right"].camera.width == 1280
+    left = read.rig["left"].cam_from_rig
+    rig = read.rig.in_frame(left)
+    ours = projected(rig)
+    require_close(ours[0], by_opencv(POINTS, np.zeros(3), np.zeros(3), K1, D1))
+    require_close(ours[1], by_opencv(POINTS, TURN, SHIFT, K2, D2))
+
+
+def test_a_message_of_ros(tmp_path: Path) -> None:
+    """As ``ros2 topic echo`` prints it."""
+    lens = [-0.2, 0.05, 0.001, -0.002, 0.01, 0.02, 0.003, 0.001]
+    text = (
+        "header:\n  frame_id: camera\nheight: 720\nwidth: 1280\ndistortion_model: rational_polynomial\nd:\n"
+        + "".join(f"- {each}\n" for each in lens)
+        + f"k: {K1.ravel().tolist()}\nr: {np.eye(3).ravel().tolist()}\n"
+        + f"p: {np.hstack([K1, np.zeros((3, 1))]).ravel().tolist()}\n"
+    )
+    read = read_calibration(write(tmp_path, "info.yaml", text))
+    assert read.format == "ros"
+    require_close(projected(read.rig)[0], by_opencv(POINTS, np.zeros(3), np.zeros(3), K1, np.array(lens)))
+
+
+# --- anipose and caliscope -----------------------------------------------------------------------------------------
+
+ANIPOSE = """[cam_0]
+name = "A"
+size = [ 1280, 720,]
+matrix = [ [ 903.5, 0.0, 618.3,], [ 0.0, 907.9, 394.2,], [ 0.0, 0.0, 1.0,],]
+distortions = [ -0.33, 0.046, -0.0043, 0.0041, 0.0666,]
+rotation = [ 0.1, -0.2, 0.05,]
+translation = [ 12.5, -3.0, 4.0,]
+
+[cam_1]
+name = "B"
+size = [ 1280, 720,]
+matrix = [ [ 450.0, 0.0, 640.0,], [ 0.0, 452.0, 360.0,], [ 0.0, 0.0, 1.0,],]
+distortions = [ 0.05, -0.01, 0.003, -0.001,]
+rotation = [ 0.3, 0.4, -0.1,]
+translation = [ -40.0, 6.0, 9.0,]
+fisheye = true
+
+[metadata]
+adjusted = true
+error = 0.31
+"""
+"""Written by aniposelib 0.8.0."""
+
+
+def test_cameras_of_anipose(tmp_path: Path) -> None:
+    """Against what aniposelib projects, in OpenCV's pixels."""
+    read = read_calibration(write(tmp_path, "calibration.toml", ANIPOSE))
+    assert (read.format, read.rig.names) == ("anipose", ("A", "B"))
+    assert "mm is assumed" in read.notes[0]
+    first, second = projected(read.rig, np.array([[3.0, -4, 120], [20, 15, 150], [-10, 12, 90]]))
+    theirs = [[560.67168661, 250.4774812], [628.85994004, 377.18640075], [464.82745499, 385.7833627]]
+    require_close(first, np.array(theirs) + 0.5)
+    theirs = [[664.69256972, 223.69168364], [754.73104491, 274.9464412], [573.59054603, 313.77581295]]
+    require_close(second, np.array(theirs) + 0.5)
+
+
+CALISCOPE = """[cameras.0]
+cam_id = 0
+rotation_count = 0
+fisheye = false
+size = [1280, 720]
+matrix = [[900.0, 0.0, 620.0], [0.0, 905.0, 390.0], [0.0, 0.0, 1.0]]
+distortions = [-0.3, 0.04, -0.004, 0.004, 0.06]
+translation = [0.12, -0.2, 0.66]
+rotation = [0.09999999999999984, -0.19999999999999968, 0.049999999999999926]
+
+[cameras.1]
+cam_id = 1
+rotation_count = 0
+fisheye = false
+size = [1280, 720]
+matrix = [[901.0, 0.0, 620.0], [0.0, 905.0, 390.0], [0.0, 0.0, 1.0]]
+distortions = [-0.3, 0.04, -0.004, 0.004, 0.06]
+translation = [-0.18, -0.2, 0.66]
+rotation = ROTATION
+
+[cameras.2]
+cam_id = 2
+fisheye = false
+size = [1280, 720]
+matrix = [[901.0, 0.0, 620.0], [0.0, 905.0, 390.0], [0.0, 0.0, 1.0]]
+distortions = [-0.3, 0.04, -0.004, 0.004, 0.06]
+"""
+"""Written by caliscope 0.11.8; the third camera has no place yet."""
+
+
+@pytest.mark.parametrize("is_matrix", [False, True])
+def test_cameras_of_caliscope(tmp_path: Path, is_matrix: bool) -> None:
+    """Metres; older versions wrote the rotation as a matrix."""
+    turn = np.array([0.1, 0.1, 0.05])
+    written = cv2.Rodrigues(turn)[0].tolist() if is_matrix else turn.tolist()
+    read = read_calibration(write(tmp_path, "camera_array.toml", CALISCOPE.replace("ROTATION", str(written))))
+    assert (read.format, read.rig.names) == ("caliscope", ("cam_0", "cam_1"))
+    assert "camera cam_2 has no place" in read.notes[0]
+    points = POINTS * 8
+    matrix = np.array([[901.0, 0, 620.0], [0, 905.0, 390], [0, 0, 1]])
+    lens = np.array([-0.3, 0.04, -0.004, 0.004, 0.06])
+    theirs = by_opencv(points, turn, np.array([-180.0, -200, 660]), matrix, lens)
+    require_close(projected(read.rig, points)[1], theirs)
+
+
+# --- Nerfstudio ----------------------------------------------------------------------------------------------------
+
+
+def test_transforms_of_nerfstudio(tmp_path: Path) -> None:
+    """As its page on data conventions has it: OpenGL's axes, the middle of the first pixel at 0.5."""
+    shared = {"camera_model": "OPENCV", "fl_x": 1072.0, "fl_y": 1068.0, "cx": 1504.0, "cy": 1000.0, "w": 3008,
+              "h": 2000, "k1": 0.0312, "k2": 0.0051, "p1": 0.0006, "p2": -0.0013}  # fmt: skip
+    frames, seen = [], []
+    for index, turn in enumerate(([0.1, 0.2, 0.0], [0.0, -0.3, 0.1])):
+        world_from_camera = np.eye(4)
+        world_from_camera[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+        world_from_camera[:3, 3] = [0.3 * index, 0.1, 1.5]
+        frames.append({"file_path": f"images/frame_0000{index}.jpeg", "transform_matrix": world_from_camera.tolist()})
+        x, y, z = ((np.column_stack([POINTS / 1000, np.ones(len(POINTS))])) @ np.linalg.inv(world_from_camera).T)[
+            :, :3
+        ].T
+        right, down = x / -z, -y / -z
+        r2 = right**2 + down**2
+        radial = 1 + 0.0312 * r2 + 0.0051 * r2**2
+        u = right * radial + 2 * 0.0006 * right * down - 0.0013 * (r2 + 2 * right**2)
+        v = down * radial + 0.0006 * (r2 + 2 * down**2) - 2 * 0.0013 * right * down
+        seen.append(np.stack([1072.0 * u + 1504.0, 1068.0 * v + 1000.0], axis=1))
+    read = read_calibration(write(tmp_path, "t.json", json.dumps({**shared, "frames": frames})))
+    assert (read.format, read.rig.names) == ("nerfstudio", ("frame_00000", "frame_00001"))
+    assert "m is assumed" in read.notes[0]
+    for ours, theirs in zip(projected(read.rig), seen, strict=True):
+        require_close(ours, theirs)
+
+
+# --- COLMAP --------------------------------------------------------------------------------------------------------
+
+
+def test_a_text_model_of_colmap(tmp_path: Path) -> None:
+    """Written by pycolmap, and projected by it."""
+    model = pycolmap.Reconstruction()
+    lens = pycolmap.Camera(
+        camera_id=1, model="RADIAL_FISHEYE", width=640, height=480, params=[300, 321, 239, 0.05, -0.01]
+    )
+    model.add_camera_with_trivial_rig(lens)
+    poses = []
+    for index, turn in enumerate(([0.1, 0.2, 0.0], [0.0, -0.3, 0.1]), start=1):
+        pose = pycolmap.Rigid3d(
+            pycolmap.Rotation3d(Rotation.from_rotvec(turn).as_matrix()), np.array([index, 2.0, 3.0])
+        )
+        model.add_image_with_trivial_frame(pycolmap.Image(name=f"a/{index}.png", camera_id=1, image_id=index), pose)
+        poses.append(pose)
+    model.write_text(tmp_path)
+    read = read_calibration(tmp_path)
+    assert (read.format, read.rig.names) == ("colmap", ("a/1", "a/2"))
+    for ours, pose in zip(projected(read.rig), poses, strict=True):
+        require_close(ours, np.array([lens.img_from_cam(pose * point) for point in POINTS]).reshape(-1, 2))
+
+
+# --- Metashape -----------------------------------------------------------------------------------------------------
+
+METASHAPE = """<?xml version="1.0" encoding="UTF-8"?>
+<document version="2.0.0">
+  <chunk label="Chunk 1" enabled="true">
+    <sensors next_id="1">
+      <sensor id="0" label="M3M (12.29mm)" type="frame">
+        <resolution width="5280" height="3956"/>
+        <property name="layer_index" value="0"/>
+        <calibration type="frame" class="initial"><f>3700</f></calibration>
+        <calibration type="frame" class="adjusted">
+          <resolution width="5280" height="3956"/>
+          <f>3705.4728</f><cx>11.67385</cx><cy>-27.7498</cy><b1>2.5262</b1><b2>{b2}</b2>
+          <k1>-0.0919</k1><k2>-0.0763</k2><k3>0.1163</k3><k4>{k4}</k4><p1>-0.000313</p1><p2>0.000116</p2>
+        </calibration>
+      </sensor>
+    </sensors>
+    <components next_id="1" active_id="0">
+      <component id="0" label="Component 1">
+        <transform><scale locked="true">2.5</scale></transform>
+      </component>
+    </components>
+    <cameras next_id="3" next_group_id="0">
+      <camera id="0" sensor_id="0" component_id="0" label="IMG_1.JPG"><transform>{first}</transform></camera>
+      <camera id="1" sensor_id="0" component_id="0" label="IMG_2.JPG"><transform>{second}</transform></camera>
+      <camera id="2" sensor_id="0" label="IMG_3.JPG"/>
+    </cameras>
+  </chunk>
+</document>
+"""
+
+
+@pytest.mark.parametrize(("b2", "k4"), [(0.0, 0.0), (-3.1, -0.0761)])
+def test_cameras_of_metashape(tmp_path: Path, b2: float, k4: float) -> None:
+    """By the formulas of its manual (appendix C); a unit of the chunk is 2.5 m."""
+    matrices, seen = [], []
+    for turn in ([0.1, 0.2, 0.0], [0.0, -0.3, 0.1]):
+        matrices.append(np.eye(4))
+        matrices[-1][:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+        matrices[-1][:3, 3] = [0.01 * len(matrices), 0.002, -0.03]
+        in_chunk = np.column_stack([POINTS / 2500, np.ones(len(POINTS))])
+        points = (in_chunk @ np.linalg.inv(matrices[-1]).T)[:, :3]
+        x, y = (points[:, :2] / points[:, 2:]).T
+        r2 = x**2 + y**2
+        radial = 1 - 0.0919 * r2 - 0.0763 * r2**2 + 0.1163 * r2**3 + k4 * r2**4
+        bent_x = x * radial + (-0.000313 * (r2 + 2 * x**2) + 2 * 0.000116 * x * y)
+        bent_y = y * radial + (0.000116 * (r2 + 2 * y**2) + 2 * -0.000313 * x * y)
+        u = 5280 * 0.5 + 11.67385 + bent_x * 3705.4728 + bent_x * 2.5262 + bent_y * b2
+        seen.append(np.stack([u, 3956 * 0.5 - 27.7498 + bent_y * 3705.4728], axis=1))
+    first, second = (" ".join(f"{each:.16e}" for each in matrix.ravel()) for matrix in matrices)
+    read = read_calibration(write(tmp_path, "cameras.xml", METASHAPE.format(b2=b2, k4=k4, first=first, second=second)))
+    assert (read.format, read.rig.names) == ("metashape", ("IMG_1", "IMG_2"))
+    assert read.notes == ("1 cameras are not aligned, and are left out",)
+    assert bool(read.losses) == bool(k4)
+    lost = max((loss.largest_px for loss in read.losses.values()), default=0.0)
+    assert lost < 2
+    for ours, theirs in zip(projected(read.rig), seen, strict=True):
+        require_close(ours, theirs, 1.05 * lost + CLOSE_PX)
+
+
+# --- MATLAB --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("is_new", [False, True])
+def test_a_pair_of_matlab(tmp_path: Path, is_new: bool) -> None:
+    """``[x y z] R + t``, ``[u v 1] ~ [x y z] IntrinsicMatrix``, the first pixel at (1, 1); newer versions have K and
+    PoseCamera2, whose vectors are columns."""
+    turn = cv2.Rodrigues(TURN)[0]
+
+    def struct(matrix: np.ndarray, lens: np.ndarray) -> dict[str, object]:
+        own = matrix + np.array([[0, 0, 1.0], [0, 0, 1], [0, 0, 0]])
+        return {"RadialDistortion": lens[[0, 1, 4]].tolist(), "TangentialDistortion": lens[2:4].tolist(),
+                "ImageSize": [720, 1280], "WorldPoints": [[0, 0], [0, 25]], "WorldUnits": "centimeters",
+                **({"K": own.tolist()} if is_new else {"IntrinsicMatrix": own.T.tolist()})}  # fmt: skip
+
+    pose = {"RotationOfCamera2": turn.T.tolist(), "TranslationOfCamera2": (SHIFT / 10).tolist()}
+    if is_new:
+        pose = {"PoseCamera2": {"Dimensionality": 3, "R": turn.tolist(), "Translation": (SHIFT / 10).tolist()}}
+    values = {"CameraParameters1": struct(K1, D1), "CameraParameters2": struct(K2, D2), **pose}
+    read = read_calibration(write(tmp_path, "m.json", json.dumps(values)))
+    assert (read.format, read.notes) == ("matlab", ())
+    first, second = projected(read.rig)
+    require_close(first, by_opencv(POINTS, np.zeros(3), np.zeros(3), K1, D1))
+    require_close(second, by_opencv(POINTS, TURN, SHIFT, K2, D2))
 
 
 # --- what is written is read again ---------------------------------------------------------------------------------

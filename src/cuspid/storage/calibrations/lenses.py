@@ -22,6 +22,8 @@ _FARTHEST_RAD = np.deg2rad(110.0)
 _AHEAD = 0.02
 """Cosine of the angle from the axis up to which a perspective lens is fitted."""
 _SMALL_RAD = 1e-4
+_ROUGH_PX = 10.0
+"""A lens that is farther off is not told more exactly."""
 MOST_LOST_PX = 1.0
 """A lens that is carried over with more is not the same any more."""
 
@@ -88,12 +90,17 @@ def carried(camera: Camera, lenses: Sequence[Lens]) -> tuple[Camera, Loss | None
     for lens in lenses:
         if lens.holds(camera):
             return lens.of(camera), None
-    x, y = np.meshgrid(np.linspace(0.5, camera.width - 0.5, _ACROSS), np.linspace(0.5, camera.height - 0.5, _DOWN))
-    pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
+    pixels = _grid(camera)
     directions = camera.directions(pixels)
     seen = np.isfinite(directions).all(axis=1)
     return _nearest(directions[seen], pixels[seen], camera.parameters[:4], (camera.width, camera.height), lenses,
                     camera.model)  # fmt: skip
+
+
+def _grid(camera: Camera) -> Float[np.ndarray, "n 2"]:
+    """Pixels all over an image, up to its borders."""
+    x, y = np.meshgrid(np.linspace(0, camera.width, _ACROSS), np.linspace(0, camera.height, _DOWN))
+    return np.stack([x, y], axis=-1).reshape(-1, 2)
 
 
 def of_projection(
@@ -115,7 +122,15 @@ def of_projection(
     if np.count_nonzero(inside) < _ROUND or not np.all(focal >= 1):
         raise InputError(f"its lens ({said}) shows hardly anything in an image of {size_px[0]} x {size_px[1]} px")
     start = np.concatenate([focal, middle])
-    return _nearest(rays[inside], pixels[inside], start, size_px, lenses, said)
+    first, loss = _nearest(rays[inside], pixels[inside], start, size_px, lenses, said)
+    if loss.largest_px > _ROUGH_PX:
+        return first, loss
+    # Its rays cover the image evenly, and reach into the corners.
+    rays = first.directions(_grid(first))
+    rays = rays[np.isfinite(rays).all(axis=1)]
+    pixels = project(rays)
+    seen = np.isfinite(pixels).all(axis=1)
+    return _nearest(rays[seen], pixels[seen], start, size_px, lenses, said)
 
 
 def _nearest(
