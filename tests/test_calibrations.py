@@ -478,6 +478,68 @@ def test_a_pair_of_matlab(tmp_path: Path, is_new: bool) -> None:
     require_close(second, by_opencv(POINTS, TURN, SHIFT, K2, D2))
 
 
+# --- HALCON --------------------------------------------------------------------------------------------------------
+
+
+def campar(lens: dict[str, float]) -> str:
+    """As ``write_cam_par`` writes it (reference manual, read_cam_par)."""
+    values = {"Focus": 0.00806039, **lens, "Sx": 1.0629e-05, "Sy": 1.1e-05, "Cx": 378.236, "Cy": 297.587}
+    fields = (f'{name}:{name.lower()}: {value:.17g};\n  DOUBLE::;\n  "[meter]";\n\n' for name, value in values.items())
+    size = 'ImageWidth:imgw: 768;\n  INT:1:32767;\n  "[pixel]";\n\nImageHeight:imgh: 576;\n  INT:1:32767;\n'
+    head = '# INTERNAL CAMERA PARAMETERS\n\nParGroup: Camera: Parameter;\n  "Internal camera parameters";\n\n'
+    return head + "".join(fields) + size
+
+
+def undistorted_by_halcon(lens: dict[str, float], pixels: np.ndarray) -> np.ndarray:
+    """Directions through pixels whose first centre is (0, 0)."""
+    u, v = (pixels[:, 0] - 378.236) * 1.0629e-05, (pixels[:, 1] - 297.587) * 1.1e-05
+    r2 = u**2 + v**2
+    if "Kappa" in lens:
+        x, y = u / (1 + lens["Kappa"] * r2), v / (1 + lens["Kappa"] * r2)
+    else:
+        k1, k2, k3, p1, p2 = lens.values()
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        x = u * radial + p1 * (r2 + 2 * u**2) + 2 * p2 * u * v
+        y = v * radial + 2 * p1 * u * v + p2 * (r2 + 2 * v**2)
+    return np.stack([x / 0.00806039, y / 0.00806039, np.ones(len(x))], axis=1)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"Kappa": -2253.5},
+        {"Kappa": 0.0},
+        {"Poly1": 2100.0, "Poly2": 3e6, "Poly3": 1e10, "Poly4": 0.02, "Poly5": -0.03},
+    ],
+)
+def test_camera_parameters_of_halcon(tmp_path: Path, lens: dict[str, float]) -> None:
+    read = read_calibration(write(tmp_path, "campar.dat", campar(lens)))
+    assert read.format == "halcon"
+    pixels = np.stack(np.meshgrid(np.linspace(0, 767, 9), np.linspace(0, 575, 7)), -1).reshape(-1, 2)
+    require_close(projected(read.rig, undistorted_by_halcon(lens, pixels))[0], pixels + 0.5)
+    assert all(loss.largest_px < CLOSE_PX for loss in read.losses.values())
+
+
+def test_a_pair_of_halcon(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The pose is that of the second camera in the frame of the first: R_x(a) R_y(b) R_z(c), metres."""
+    for side in ("left", "right"):
+        write(tmp_path, f"cam_{side}.dat", campar({"Kappa": 0.0}))
+    pose = "# Used representation type:\nf 0\n\n# Rotation angles [deg] or Rodriguez vector:\nr 2 {} 5\n\n"
+    write(tmp_path, "relpose.dat", pose.format(350) + "# Translation vector (x y z [m]):\nt 0.0046 0.0001 -0.0002\n")
+    read = read_calibration(tmp_path)
+    assert (read.format, read.rig.names) == ("halcon", ("cam_left", "cam_right"))
+    (a, b, c), place = np.deg2rad([2, 350, 5]), read.rig["cam_right"].cam_from_rig.inverse()
+    about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+    about_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+    about_z = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
+    np.testing.assert_allclose(place.rotation, about_x @ about_y @ about_z, atol=1e-12)
+    np.testing.assert_allclose(place.translation, [4.6, 0.1, -0.2], atol=1e-9)
+    assert "only read" in refused(capsys, "convert", tmp_path, tmp_path / "x.dat", "--to", "halcon")
+    (tmp_path / "relpose.dat").unlink()
+    with pytest.raises(InputError, match="two and a pose"):
+        read_calibration(tmp_path)
+
+
 # --- what is written is read again ---------------------------------------------------------------------------------
 
 LENSES = {
@@ -612,7 +674,7 @@ def _places(value: object) -> list[tuple[object, object]]:
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     folder = tmp_path_factory.mktemp("written")
-    texts = {}
+    texts = {"halcon": campar({"Poly1": 2100.0, "Poly2": 3e6, "Poly3": 1e10, "Poly4": 0.02, "Poly5": -0.03})}
     for kind in (name for name, each in FORMATS.items() if each.write is not None):
         path = folder / f"{kind}{'.json' if kind == 'opencv' else SUFFIXES.get(kind, '.json')}"
         write_calibration(path, rig_of(1 if kind == "ros" else 2), kind)

@@ -25,6 +25,9 @@ _DASHES = re.compile(rf"(?:-[ \t]+){{{_DEEPEST}}}|^[ \t]{{{10 * _DEEPEST}}}", re
 """Lists of lists in a line of YAML, or a line that stands far to the right."""
 _HEAD = re.compile(r"\A%YAML[: ]\d\.\d\s*\n")
 """OpenCV's, which no YAML parser takes."""
+_KEY = re.compile(r"^[\w/-]+\s*:", re.MULTILINE)
+_NO_YAML = re.compile(r"^\s*ParGroup:", re.MULTILINE)
+"""HALCON's parameters only look like it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +88,7 @@ def _parsed(text: str) -> Document:
             continue
         if found:
             return Document("values", found)
-    if not _HEAD.match(text) and not re.search(r"^[\w/-]+\s*:", text, re.MULTILINE):
+    if not _HEAD.match(text) and (_NO_YAML.search(text) or not _KEY.search(text)):
         return Document("text", text)
     found = yaml.load(_HEAD.sub("", text), Loader=_Loader)
     return Document("text", text) if isinstance(found, str) or found is None else Document("values", found)

@@ -13,7 +13,7 @@ import numpy as np
 from cuspid.errors import InputError, OutputError
 from cuspid.inputs import read_text
 from cuspid.rig import MountedCamera, Rig
-from cuspid.storage.calibrations import colmap, kalibr, matlab, metashape, nerfstudio, opencv, ros, tables
+from cuspid.storage.calibrations import colmap, halcon, kalibr, matlab, metashape, nerfstudio, opencv, ros, tables
 from cuspid.storage.calibrations.documents import Document, parse
 from cuspid.storage.calibrations.fields import Calibration, Hints, scaled
 from cuspid.storage.calibrations.lenses import Lens, Loss, carried
@@ -23,7 +23,7 @@ from cuspid.storage.units import MM_PER_UNIT, Unit
 
 Name = Literal[
     "opencv", "kalibr", "ros", "caliscope", "anipose", "nerfstudio", "colmap-rig", "colmap", "handpiece", "metashape",
-    "matlab",
+    "matlab", "halcon",
 ]  # fmt: skip
 _SUFFIXES = (".yml", ".yaml", ".json", ".toml", ".xml", ".txt", ".dat", ".cal")
 _MOST_FILES = 64
@@ -91,6 +91,10 @@ FORMATS: Mapping[Name, Format] = {
     "anipose": Format(
         title="anipose's calibration.toml", unit="mm", lenses=tables.LENSES, recognises=tables.recognises_anipose,
         read=tables.read, write=tables.write_anipose,
+    ),
+    "halcon": Format(
+        title="HALCON's camera parameters", unit="m", tells_unit=True, lenses=halcon.LENSES,
+        recognises=halcon.recognises, read=halcon.read, write=None,
     ),
     "opencv": Format(
         title="OpenCV's FileStorage", unit="mm", lenses=opencv.LENSES, recognises=opencv.recognises, read=opencv.read,
@@ -197,6 +201,8 @@ class CarriedOver:
 def carried_over(rig: Rig, kind: Name) -> CarriedOver:
     """What a format can hold of a rig. Raises OutputError where that is too little."""
     format = FORMATS[kind]
+    if format.write is None and kind != "handpiece":
+        raise OutputError(f"{format.title} is only read; give another --to")
     count = len(rig.names)
     if format.most_cameras is not None and count > format.most_cameras:
         raise OutputError(f"{format.title} holds {format.most_cameras} cameras at most, not {count}; give another --to")
@@ -226,7 +232,7 @@ def write_calibration(path: Path, rig: Rig, kind: Name, working_distance_mm: flo
         return
     format = FORMATS[kind]
     if format.write is None:
-        raise OutputError(f"{path}: {format.title} is only read; give another --to")
+        raise OutputError(f"{path}: {format.title} is only read; give another format")
     cameras = {name: scaled(each, 1 / MM_PER_UNIT[format.unit or "mm"]) for name, each in rig.cameras.items()}
     text = format.write(cameras, path.suffix.lower())
     if isinstance(text, str):
