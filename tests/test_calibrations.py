@@ -97,6 +97,20 @@ def test_coefficients_of_opencv(tmp_path: Path, count: int) -> None:
     require_close(projected(read.rig)[0], by_opencv(POINTS, np.zeros(3), np.zeros(3), K1, lens), max(loss, CLOSE_PX))
 
 
+def test_the_same_reader_serves_stitch(tmp_path: Path) -> None:
+    """With k3, which was refused, and with the size of the frames where the file has none."""
+    for index in range(2):
+        storage.write_image(tmp_path / "frames" / f"{index}.png", np.full((48, 64, 3), 90 + index, dtype=np.uint8))
+    file = cv2.FileStorage(str(tmp_path / "camera.yml"), cv2.FILE_STORAGE_WRITE)
+    file.write("camera_matrix", np.array([[60.0, 0, 31.5], [0, 61, 23.5], [0, 0, 1]]))
+    file.write("distortion_coefficients", D1[None])
+    file.release()
+    read = storage.read_sequence(tmp_path / "frames", tmp_path / "d", calibration=tmp_path / "camera.yml")
+    assert read.camera is not None
+    assert (read.camera.model, read.camera.width, read.camera.height) == ("FULL_OPENCV", 64, 48)
+    np.testing.assert_allclose(read.camera.distortion[[0, 1, 2, 3, 4]], D1)
+
+
 def test_a_fisheye_lens_of_opencv(tmp_path: Path) -> None:
     lens = np.array([0.05, -0.01, 0.003, -0.001])
     file = cv2.FileStorage(str(tmp_path / "camera.yml"), cv2.FILE_STORAGE_WRITE)
@@ -682,7 +696,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return texts
 
 
-@settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damaged_files_are_refused_in_one_line(data: st.DataObject, written: dict[str, str], tmp_path: Path) -> None:
     """Cut, or with a value of another kind anywhere."""

@@ -59,7 +59,8 @@ def convert(
     _tell(target, carried.losses, carried.notes, most_px)
     write_calibration(target, carried.rig, kind, working_distance_mm)
     names = list(read.rig.names)
-    console.print(f"{target}: {kind}, {len(names)} camera(s) ({named(names)}), from {read.format}")
+    said = f"{target}: {kind}, {len(names)} camera(s) ({named(names)}), from {read.format}"
+    console.print(said, soft_wrap=True, highlight=False)
 
 
 def _tell(path: Path, losses: Mapping[str, Loss], notes: tuple[str, ...], most_px: float) -> None:
