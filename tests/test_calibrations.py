@@ -598,6 +598,7 @@ def test_what_is_written_is_read_again(tmp_path: Path, kind: str, model: str) ->
     read = read_calibration(path)
     assert read.format == kind
     assert not read.losses
+    assert FORMATS[kind].keeps_names == (read.rig.names == rig.names)
     seen = [projected(each.in_frame(next(iter(each.cameras.values())).cam_from_rig)) for each in (rig, read.rig)]
     lost = max((loss.largest_px for loss in carried.losses.values()), default=0.0)
     for ours, again in zip(*seen, strict=True):
@@ -650,9 +651,7 @@ def test_metres_are_noticed(tmp_path: Path) -> None:
     assert apart[0] == pytest.approx(apart[1])
     told = read_calibration(tmp_path / "pair.yml", unit="mm")
     assert not told.notes
-    assert told.rig["right"].cam_from_rig.translation == pytest.approx(
-        read.rig["right"].cam_from_rig.translation / 1000
-    )
+    assert told.rig["c1"].cam_from_rig.translation == pytest.approx(read.rig["c1"].cam_from_rig.translation / 1000)
 
 
 # --- the verb ------------------------------------------------------------------------------------------------------
@@ -663,7 +662,7 @@ def test_convert_writes_a_handpiece(tmp_path: Path, capsys: pytest.CaptureFixtur
     run("convert", tmp_path / "pair.yml", tmp_path / "handpiece.json", "--working-distance-mm", 30)
     handpiece = storage.read_handpiece(tmp_path / "handpiece.json")
     assert handpiece.working_distance_mm == 30
-    assert handpiece.rig.names == ("left", "right")
+    assert handpiece.rig.names == ("c0", "c1")
     assert "2 camera(s)" in capsys.readouterr().err
     assert "give --to" in refused(capsys, "convert", tmp_path / "pair.yml", tmp_path / "x.abc")
     assert "is the file that is read" in refused(capsys, "convert", tmp_path / "pair.yml", tmp_path / "pair.yml")

@@ -44,6 +44,7 @@ _MEANINGS = {
     "height": ("imageheight", "height"),
     "size": ("imagesize", "size", "resolution"),
     "fisheye": ("fisheyemodel", "fisheye", "isfisheye"),
+    "name": ("cameraname",),
 }
 _OF_PAIR = {"rotation": ("r", "rotation", "rotationmatrix", "rot"), "shift": ("t", "translation", "trans", "tvec")}
 _SIDES = {"1": 0, "2": 1, "0": 0, "left": 0, "right": 1, "l": 0, "r": 1}
@@ -83,15 +84,25 @@ def read(files: Mapping[str, Document], hints: Hints) -> Calibration:
     elif all("matrix" in each for each in _sides(values)):
         sides = _sides(values)
         shared = {key: value for key, value in _single(values).items() if key in ("width", "height", "size", "fisheye")}
-        left, right = (camera_of(name, shared | side) for name, side in zip(("left", "right"), sides, strict=True))
+        first, second = (_name(side, usual) for side, usual in zip(sides, ("left", "right"), strict=True))
+        if first == second:
+            raise InputError(f"both of its cameras are named {first}")
         between = _named(values, _OF_PAIR)
         if len(between) < 2:
             raise InputError("it has two cameras but no R and T between them; give both files in one folder")
         second_from_first = pose("R and T", between["rotation"], between["shift"])
-        cameras = {"left": MountedCamera(left, Rigid3.identity()), "right": MountedCamera(right, second_from_first)}
+        cameras = {
+            first: MountedCamera(camera_of(first, shared | sides[0]), Rigid3.identity()),
+            second: MountedCamera(camera_of(second, shared | sides[1]), second_from_first),
+        }
     else:
-        cameras = {"camera": MountedCamera(camera_of("camera", _single(values)), Rigid3.identity())}
+        name = _name(_single(values), "camera")
+        cameras = {name: MountedCamera(camera_of(name, _single(values)), Rigid3.identity())}
     return Calibration(cameras=cameras, losses=losses, notes=tuple(notes))
+
+
+def _name(found: Mapping[str, Any], usual: str) -> str:
+    return checked_name("camera_name", found.get("name", usual))
 
 
 def _merged(files: Mapping[str, Document]) -> Mapping[str, Any]:
@@ -137,7 +148,7 @@ def _single(values: Mapping[str, Any]) -> dict[str, Any]:
 def _sides(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """What is told of each camera of a pair. Where sides count from 0, 1 is the second."""
     pattern = re.compile(rf"^(?:{_SIDE}(?P<a>[a-z]+)|(?P<b>[a-z]+?){_SIDE})$")
-    matrices = {key: value for key, value in values.items() if isinstance(value, list | Mapping)}
+    matrices = {key: value for key, value in values.items() if isinstance(value, list | Mapping | str)}
     hits = [(found, value) for key, value in matrices.items() if (found := pattern.match(_plain(str(key))))]
     from_zero = any("0" in (found[1], found[4]) for found, _ in hits)
     sides: tuple[dict[str, Any], dict[str, Any]] = ({}, {})
@@ -206,8 +217,11 @@ def write(cameras: Mapping[str, MountedCamera], suffix: str) -> str:
     sizes = {(each.camera.width, each.camera.height) for each in mounted}
     kinds = {each.camera.lens.is_equidistant for each in mounted}
     if len(mounted) == 1:
+        file.write("camera_name", next(iter(cameras)))
         _write_camera(file, mounted[0].camera, "camera_matrix", "distortion_coefficients")
     elif len(mounted) == 2 and len(sizes) == 1 and len(kinds) == 1:
+        for index, name in enumerate(cameras, start=1):
+            file.write(f"camera_name{index}", name)
         _write_camera(file, mounted[0].camera, "M1", "D1")
         second_from_first = mounted[1].cam_from_rig @ mounted[0].cam_from_rig.inverse()
         file.write("M2", mounted[1].camera.opencv_matrix)
