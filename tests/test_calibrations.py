@@ -406,6 +406,15 @@ def test_a_text_model_of_colmap(tmp_path: Path) -> None:
         require_close(ours, np.array([lens.img_from_cam(pose * point) for point in POINTS]).reshape(-1, 2))
 
 
+def test_cameras_of_colmap_alone(tmp_path: Path) -> None:
+    path = write(tmp_path, "endoscope.txt", "# comment\n1 SIMPLE_RADIAL 640 480 500.0 320.5 240.5 -0.1\n")
+    read = read_calibration(path)
+    assert (read.format, read.rig.names) == ("colmap", ("camera",))
+    np.testing.assert_allclose(read.rig["camera"].camera.parameters, [500, 500, 320.5, 240.5, -0.1, 0, 0, 0])
+    with pytest.raises(InputError, match="folder of both"):
+        read_calibration(write(tmp_path, "two.txt", path.read_text() + path.read_text().replace("\n1 ", "\n2 ")))
+
+
 # --- Metashape -----------------------------------------------------------------------------------------------------
 
 METASHAPE = """<?xml version="1.0" encoding="UTF-8"?>
