@@ -61,6 +61,7 @@ COMMANDS: Mapping[str, Callable[..., Any]] = _Verbs(
         "target": "calibration",
         "photograph": "calibration",
         "calibrate": "calibration",
+        "convert": "conversion",
         "import": "footage",
         "optics": "forecasts",
         "visibility": "forecasts",

@@ -258,21 +258,15 @@ def read_handpiece(path: Path, working_distance_mm: float | None = None) -> Hand
     """
     value = read_json(path)
     if isinstance(value, list):
-        return _of_rig(path, read_rig_config(path), working_distance_mm)
+        return handpiece_of_rig(path, read_rig_config(path), working_distance_mm)
     if working_distance_mm is not None:
         raise InputError(f"{path}: it already has a working distance; change it there instead of giving another")
     with reading(path):
-        strange = sorted(set(value) - _FIELDS)
-        if strange:
-            raise InputError(f"{path}: unknown field {shown(strange[0])}; choose from {', '.join(sorted(_FIELDS))}")
-        cameras = {
-            checked_name(f"{path}: cameras", key): _mounted_from_json(camera, f"{path}: camera {shown(key)}")
-            for key, camera in value["cameras"].items()
-        }
+        rig = rig_from_handpiece(value, f"{path}: ")
         distance_mm = number(f"{path}: working_distance_mm", value["working_distance_mm"], 0.0, LONGEST_MM)
         near, far = numbers(f"{path}: depth_range_mm", value["depth_range_mm"], (2,), 0.0, LONGEST_MM).tolist()
         return Handpiece(
-            rig=Rig(cameras),
+            rig=rig,
             lights={
                 checked_name(f"{path}: lights", key): _light_from_json(light, f"{path}: light {shown(key)}")
                 for key, light in value.get("lights", {}).items()
@@ -293,6 +287,19 @@ def read_handpiece(path: Path, working_distance_mm: float | None = None) -> Hand
         )
 
 
+def rig_from_handpiece(value: Mapping[str, Any], where: str = "") -> Rig:
+    """The cameras of ``handpiece.json``. Raises InputError that begins with ``where``."""
+    strange = sorted(set(value) - _FIELDS)
+    if strange:
+        raise InputError(f"{where}unknown field {shown(strange[0])}; choose from {', '.join(sorted(_FIELDS))}")
+    return Rig(
+        {
+            checked_name(f"{where}cameras", key): _mounted_from_json(camera, f"{where}camera {shown(key)}")
+            for key, camera in value["cameras"].items()
+        }
+    )
+
+
 def _body_from_json(path: Path, value: Any) -> Body:
     if not (isinstance(value, dict) and value):
         raise InputError(f"{path}: body must map names to boxes, at least one; leave it out if it is unknown")
@@ -311,7 +318,8 @@ def _box_from_json(where: str, value: Any) -> Box:
     return Box(rigid_from_json(pose, f"{where}: box_from_rig"), size / 2)
 
 
-def _of_rig(path: Path, rig: Rig, working_distance_mm: float | None) -> Handpiece:
+def handpiece_of_rig(path: Path, rig: Rig, working_distance_mm: float | None) -> Handpiece:
+    """A handpiece of nothing but the cameras of a file: see :func:`read_handpiece`."""
     distance_mm = _guessed_mm(path, rig) if working_distance_mm is None else working_distance_mm
     return Handpiece(
         rig=rig.over_surface(distance_mm),
@@ -341,22 +349,27 @@ def hash_handpiece(handpiece: Handpiece) -> str:
 
 def write_rig_config(path: Path, rig: Rig) -> None:
     """Write COLMAP's ``rig_config.json``; the reference sensor is the first camera."""
+    write_json(path, rig_to_config(rig))
+
+
+def rig_to_config(rig: Rig) -> list[dict[str, Any]]:
+    """See :func:`write_rig_config`."""
     rebased, _ = rig.rebased()
     cameras: list[dict[str, Any]] = []
     for index, (name, mounted) in enumerate(rebased.cameras.items()):
         entry: dict[str, Any] = {
             "image_prefix": f"{name}/",
             "camera_model_name": mounted.camera.model,
-            "camera_params": mounted.camera.parameters,
+            "camera_params": mounted.camera.parameters.tolist(),
             "camera_size": [mounted.camera.width, mounted.camera.height],
         }
         if index == 0:
             entry["ref_sensor"] = True
         else:
-            entry["cam_from_rig_rotation"] = mounted.cam_from_rig.quaternion
-            entry["cam_from_rig_translation"] = mounted.cam_from_rig.translation
+            entry["cam_from_rig_rotation"] = mounted.cam_from_rig.quaternion.tolist()
+            entry["cam_from_rig_translation"] = mounted.cam_from_rig.translation.tolist()
         cameras.append(entry)
-    write_json(path, [{"cameras": cameras}])
+    return [{"cameras": cameras}]
 
 
 def read_rig_config(path: Path, image_size_px: tuple[int, int] | None = None) -> Rig:
@@ -367,15 +380,20 @@ def read_rig_config(path: Path, image_size_px: tuple[int, int] | None = None) ->
     """
     value = read_json(path)
     with reading(path):
-        if len(value) != 1:
-            raise InputError(f"{path}: it holds {len(value)} rigs; cuspid supports only one")
-        cameras: dict[str, MountedCamera] = {}
-        for entry in value[0]["cameras"]:
-            key = checked_name(f"{path}: image_prefix", str(entry["image_prefix"]).rstrip("/"))
-            what = f"{path}: camera {shown(key)}"
-            cam_from_rig = Rigid3.identity() if entry.get("ref_sensor") else _place_in_rig(entry, what)
-            cameras[key] = MountedCamera(camera_from_colmap(entry, image_size_px, what), cam_from_rig)
-        return Rig(cameras)
+        return rig_from_config(value, image_size_px)
+
+
+def rig_from_config(value: Any, image_size_px: tuple[int, int] | None = None) -> Rig:
+    """See :func:`read_rig_config`."""
+    if len(value) != 1:
+        raise InputError(f"it holds {len(value)} rigs; cuspid supports only one")
+    cameras: dict[str, MountedCamera] = {}
+    for entry in value[0]["cameras"]:
+        key = checked_name("image_prefix", str(entry["image_prefix"]).rstrip("/"))
+        what = f"camera {shown(key)}"
+        cam_from_rig = Rigid3.identity() if entry.get("ref_sensor") else _place_in_rig(entry, what)
+        cameras[key] = MountedCamera(camera_from_colmap(entry, image_size_px, what), cam_from_rig)
+    return Rig(cameras)
 
 
 def _place_in_rig(entry: Mapping[str, Any], what: str) -> Rigid3:

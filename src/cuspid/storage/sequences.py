@@ -7,20 +7,17 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
-import numpy as np
-
-from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
+from cuspid.camera import Camera
 from cuspid.capture import ImageFolder
 from cuspid.errors import InputError
 from cuspid.image_files import exif_orientation, image_size, recorded_size
 from cuspid.image_sequence import ImageSequence
-from cuspid.inputs import read_text
 from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, Rig
+from cuspid.storage.calibrations import MOST_LOST_PX, read_calibration
 from cuspid.storage.captures import IMAGE_SUFFIXES, read_capture, write_image
-from cuspid.storage.files import digest_of, finished, hash_file, read_json, reading
-from cuspid.storage.handpieces import camera_from_colmap, camera_from_json, read_handpiece, read_rig_config
+from cuspid.storage.files import digest_of, finished, hash_file, read_json
+from cuspid.storage.handpieces import read_handpiece
 from cuspid.storage.videos import VIDEO_SUFFIXES, read_video, video_length
 from cuspid.values import checked_name
 
@@ -30,10 +27,6 @@ MOST_FRAMES = 300
 """A longer video is thinned evenly to about as many frames."""
 
 _NUMBERS = re.compile(r"(\D*)(\d*)")
-_DEEPEST = 32
-_STEPS = re.compile(r"</|<(?=\w)|[\[\]{}]")
-_DASHES = re.compile(rf"(?:-[ \t]+){{{_DEEPEST}}}|^[ \t]{{{10 * _DEEPEST}}}", re.MULTILINE)
-"""Lists of lists in a line of YAML, or a line that stands far to the right."""
 
 
 def read_sequence(
@@ -167,19 +160,16 @@ def _of_video(video: Path, decoded: Path, progress: Progress) -> ImageSequence:
 
 
 def _calibrated(sequence: ImageSequence, path: Path) -> ImageSequence:
-    """With the calibration of a file: handpiece.json or rig_config.json of one camera, a camera alone as JSON, COLMAP's
-    cameras.txt, or OpenCV's YAML."""
-    if path.suffix.lower() in (".yml", ".yaml", ".xml"):
-        return _with_camera(sequence, _read_opencv(path), path)
-    if path.suffix.lower() == ".txt":
-        return _with_camera(sequence, _read_cameras_txt(path), path)
+    """With the calibration of one camera, of any program; the working distance is told by handpiece.json alone."""
+    found = read_calibration(path, image_size_px=sequence.size)
+    for loss in found.losses.values():
+        if loss.largest_px > MOST_LOST_PX:
+            raise InputError(f"{path}: {loss}; calibrate with a lens model that cuspid has")
+    calibrated = _with_rig(sequence, found.rig, path)
+    if found.format != "handpiece" or len(found.rig.names) > 1:
+        return calibrated
     value = read_json(path)
-    if isinstance(value, dict) and "focal_px" in value:
-        with reading(path):
-            return _with_camera(sequence, camera_from_json(value), path)
-    if isinstance(value, list):
-        return _with_rig(sequence, read_rig_config(path), path)
-    return _with_handpiece(sequence, read_handpiece(path), path)
+    return calibrated if "cameras" not in value else _with_handpiece(sequence, read_handpiece(path), path)
 
 
 def _with_handpiece(sequence: ImageSequence, handpiece: Handpiece, path: Path) -> ImageSequence:
@@ -201,61 +191,3 @@ def _with_camera(sequence: ImageSequence, camera: Camera, path: Path) -> ImageSe
             f"{sequence.size[0]} x {sequence.size[1]} px; give the matching calibration, or none"
         )
     return replace(sequence, camera=camera)
-
-
-def _read_opencv(path: Path) -> Camera:
-    """OpenCV's calibration: camera_matrix, distortion_coefficients (k1 k2 p1 p2 [k3 = 0]), image_width and _height."""
-    if _is_nested_deeply(read_text(path)):
-        raise InputError(f"{path}: not an OpenCV calibration (nested more than {_DEEPEST} deep)")
-    try:
-        file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-        file.getNode("camera_matrix")  # OpenCV asserts where the file is a list, or one number
-    except (cv2.error, SystemError) as error:
-        raise InputError(f"{path}: not an OpenCV calibration") from error
-    with reading(path):
-        matrix, distortion = (
-            _small_matrix(file.getNode(name)) for name in ("camera_matrix", "distortion_coefficients")
-        )
-        width, height = (int(file.getNode(name).real()) for name in ("image_width", "image_height"))
-    if matrix is None or matrix.shape != (3, 3) or not width or not height:
-        raise InputError(f"{path}: needs camera_matrix, image_width and image_height, as in OpenCV's calibration files")
-    coefficients = np.zeros(5) if distortion is None else np.pad(distortion.ravel().astype(np.float64), (0, 5))
-    if np.any(coefficients[4:]):
-        raise InputError(f"{path}: more than four distortion coefficients; calibrate with only k1, k2, p1, p2")
-    return Camera(
-        width=width,
-        height=height,
-        focal_px=np.array([matrix[0, 0], matrix[1, 1]]),
-        principal_point_px=matrix[:2, 2] + OPENCV_PIXEL_OFFSET,
-        distortion=coefficients[:4],
-    )
-
-
-def _is_nested_deeply(text: str) -> bool:
-    """Whether OpenCV's readers of YAML, JSON and XML, which call themselves for each level, would end the program."""
-    steps = [1 if step[0] in "[{<" and step[1:] != "/" else -1 for step in _STEPS.findall(text)]
-    return bool(np.cumsum([0, *steps]).max() > _DEEPEST or _DASHES.search(text))
-
-
-def _small_matrix(node: cv2.FileNode) -> np.ndarray | None:
-    """Raises ValueError for what is no matrix or, as it says itself, a large one."""
-    if not node.isMap():
-        return None
-    if not 0 < node.getNode("rows").real() * node.getNode("cols").real() < 100:
-        raise ValueError("a matrix is empty or too large")
-    try:
-        return np.asarray(node.mat())
-    except cv2.error as error:
-        raise ValueError("a matrix cannot be read") from error
-
-
-def _read_cameras_txt(path: Path) -> Camera:
-    """COLMAP's cameras.txt with one camera: id, model, width, height, parameters."""
-    text = read_text(path)
-    with reading(path):
-        rows = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
-        if len(rows) != 1:
-            raise InputError(f"{path}: it holds {len(rows)} cameras; give the calibration of a single one")
-        _, model, width, height, *parameters = rows[0]
-        entry = {"camera_model_name": model, "camera_params": [float(value) for value in parameters]}
-        return camera_from_colmap(entry, (int(width), int(height)))

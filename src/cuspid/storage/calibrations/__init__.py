@@ -1,0 +1,26 @@
+"""Calibrations of other programs, read and written: a module for each format, and what they have in common."""
+
+from cuspid.storage.calibrations.lenses import MOST_LOST_PX, Loss
+from cuspid.storage.calibrations.registry import (
+    FORMATS,
+    CarriedOver,
+    Name,
+    ReadCalibration,
+    carried_over,
+    format_of_name,
+    read_calibration,
+    write_calibration,
+)
+
+__all__ = [
+    "FORMATS",
+    "MOST_LOST_PX",
+    "CarriedOver",
+    "Loss",
+    "Name",
+    "ReadCalibration",
+    "carried_over",
+    "format_of_name",
+    "read_calibration",
+    "write_calibration",
+]
