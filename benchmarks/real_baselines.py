@@ -42,8 +42,9 @@ def sgbm(given: Path, out: Path) -> dict[str, Any]:
         if other is not None:
             maps.append(_pair_depth(capture, name, other))
     write_depth_maps(out / "depth" / f"{FRAME}.npz", maps)
-    options = FusionOptions(least_maps=min(2, len(maps) - 1))
-    fused = fuse(maps, {FRAME: Rigid3.identity()}, detail_mm(capture.handpiece), options)
+    detail = detail_mm(capture.handpiece)
+    options = FusionOptions(least_maps=min(2, len(maps) - 1)).resolved(detail, capture.handpiece.footprint_mm)
+    fused = fuse(maps, {FRAME: Rigid3.identity()}, detail, options)
     if len(fused.mesh.faces):
         write_mesh(out / "mesh.ply", fused.mesh)
     return {"cpu_s": round(time.process_time() - begin, 1), "pairs": len(maps)}
