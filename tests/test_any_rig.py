@@ -370,8 +370,10 @@ def test_what_was_asked_for_goes_before_the_quality() -> None:
     assert pipeline.settled(fine).stereo.grid_px < pipeline.settled(ReconstructionOptions()).stereo.grid_px
     assert pipeline.settled(replace(fine, stereo=StereoOptions(spacing_px=5))).stereo.grid_px == 5
     assert (pipeline.settled(fine).left_share, pipeline.settled(replace(fine, left_share=0.3)).left_share) == (0, 0.3)
-    assert pipeline._of_quality(fine, 0.012).voxel_mm == ReconstructionOptions().fusion.voxel_for(0.012) / 2
-    assert pipeline._of_quality(replace(fine, fusion=FusionOptions(voxel_mm=0.2)), 0.012).voxel_mm == 0.2
+    handpiece = diamond(SIZE_PX)
+    usual = ReconstructionOptions().fusion.voxel_for(detail_mm(handpiece))
+    assert pipeline.fusion_for(handpiece, fine).voxel_mm == usual / 2
+    assert pipeline.fusion_for(handpiece, replace(fine, fusion=FusionOptions(voxel_mm=0.2))).voxel_mm == 0.2
     standard = ReconstructionOptions()
     assert pipeline.settled(standard).tracking.features.size_for(640, 480) == (320, 240)
     assert pipeline.settled(standard) == replace(standard, left_share=pipeline._LEFT_SHARE)

@@ -30,9 +30,9 @@ _LADDER = ("OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "THIN_PRISM_FISHEYE")
 _FOLDS, _MOST_VIEWS = 4, 24
 _ODD = 10.0
 """Residuals of a view, in usual ones, beyond which it shows something else."""
-_CHANCE, _CHANCE_ALIKE = 2.0, 1.0
-"""Standard errors beyond which a model with more parameters is better than another (L. Breiman et al., Classification
-and Regression Trees, 1984, take one), and one with as many."""
+_CHANCE, _LEAST_GAIN = 2.0, 0.02
+"""Standard errors beyond which one model is better than another, and the share by which its residuals must be smaller
+to matter."""
 _HALF_VIEWS_DEG = (20.0, 35.0, 50.0, 65.0, 80.0)
 """Half the angle of view across the image, from which the search begins where OpenCV's finds no camera."""
 
@@ -80,8 +80,7 @@ def choose_lens(
         return choice, simple
     chosen = next(iter(squares))
     for model in list(squares)[1:]:
-        as_many = len(MODELS[model].names) == len(MODELS[chosen].names)
-        if _is_better(squares[model], squares[chosen], _CHANCE_ALIKE if as_many else _CHANCE):
+        if _is_better(squares[model], squares[chosen]):
             chosen = model
     rms = {model: float(np.sqrt(np.mean(each[np.isfinite(each)]))) for model, each in squares.items()}
     if chosen == choice.model:
@@ -114,7 +113,7 @@ def _first_that_fits(views: Sequence[BoardView], board: Board, size: tuple[int, 
 def _is_worth_more(squares: Mapping[str, Float[np.ndarray, "v"]]) -> bool:
     """Whether another model than the simplest one was better, or the only one that fits."""
     first = squares.get(_LADDER[0])
-    return first is None or any(_is_better(each, first, _CHANCE_ALIKE) for each in squares.values())
+    return first is None or any(_is_better(each, first) for each in squares.values())
 
 
 def calibrated_as(
@@ -191,10 +190,11 @@ def _held_out(found: Adjusted, views: Sequence[BoardView], board: Board) -> Floa
     return squares
 
 
-def _is_better(one: Float[np.ndarray, "v"], other: Float[np.ndarray, "v"], sigmas: float) -> bool:
-    """Whether the residuals of the same views are smaller, by more than so many standard errors."""
+def _is_better(one: Float[np.ndarray, "v"], other: Float[np.ndarray, "v"]) -> bool:
+    """Whether the residuals of the same views are smaller, by more than chance and enough to matter."""
     both = np.isfinite(one + other)
     if both.sum() < LEAST_VIEWS or np.isinf(one).sum() > np.isinf(other).sum():
         return False
-    gain = np.log(other[both] / one[both])
-    return float(gain.mean()) > sigmas * float(gain.std(ddof=1)) / float(np.sqrt(len(gain)))
+    gain = np.log(other[both] / one[both]) / 2  # of residuals, not of their squares
+    least = max(_CHANCE * float(gain.std(ddof=1)) / float(np.sqrt(len(gain))), _LEAST_GAIN)
+    return float(gain.mean()) > least
