@@ -676,7 +676,8 @@ def test_convert_writes_a_handpiece(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "give --to" in refused(capsys, "convert", tmp_path / "pair.yml", tmp_path / "x.abc")
     assert "is the file that is read" in refused(capsys, "convert", tmp_path / "pair.yml", tmp_path / "pair.yml")
     write(tmp_path, "other.yml", "a: 1\n")
-    assert "cuspid convert takes it with --from" in refused(capsys, "convert", tmp_path / "other.yml", tmp_path / "x.json")
+    told = refused(capsys, "convert", tmp_path / "other.yml", tmp_path / "x.json")
+    assert "cuspid convert takes it with --from" in told
 
 
 _JUNK = st.recursive(
