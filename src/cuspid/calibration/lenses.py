@@ -85,7 +85,10 @@ def choose_lens(
     rms = {model: float(np.sqrt(np.mean(each[np.isfinite(each)]))) for model, each in squares.items()}
     if chosen == choice.model:
         return LensChoice(model=chosen, held_out_px=rms), simple
-    alone = calibrated_alone(views, board, size, [found[chosen].scene.cameras[""]])
+    try:
+        alone = calibrated_alone(views, board, size, [found[chosen].scene.cameras[""]])
+    except ReconstructionError:  # the others lie where such a lens shows nothing
+        return choice, simple
     return LensChoice(model=chosen, held_out_px=rms), alone
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from cuspid.board import Board
 from cuspid.calibration.bundle import Adjusted, BoardScene, adjust_board, in_front, of_instants
-from cuspid.calibration.corners import BoardView, Views, pieces
+from cuspid.calibration.corners import LEAST_CORNERS, BoardView, Views, pieces
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
@@ -98,9 +98,11 @@ def board_pose(view: BoardView, board: Board, camera: Camera) -> Rigid3:
 
     Raises InputError where there is none.
     """
-    points, ideal = board.corners[view.corner], np.ascontiguousarray(camera.rays(view.pixels)[:, None, :2])
-    if not np.isfinite(ideal).all():
-        raise InputError("calibration: a corner of the board lies where the lens shows nothing")
+    rays = camera.rays(view.pixels)
+    shown = np.isfinite(rays).all(axis=1)
+    if shown.sum() < LEAST_CORNERS:
+        raise InputError("calibration: a view of the board lies where the lens shows nothing")
+    points, ideal = board.corners[view.corner[shown]], np.ascontiguousarray(rays[shown, None, :2])
     for method in [cv2.SOLVEPNP_IPPE] * (board.terraces == 1) + [cv2.SOLVEPNP_SQPNP]:
         _, turns, shifts, _ = cv2.solvePnPGeneric(points, ideal, np.eye(3), None, flags=method)
         if turns:
