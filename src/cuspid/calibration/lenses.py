@@ -62,11 +62,17 @@ def choose_lens(
     Raises ReconstructionError where no camera fits the views.
     """
     if asked != "auto":
-        return LensChoice(model=asked, held_out_px={}), calibrated_as(asked, views, board, size)
+        alone = calibrated_as(asked, views, board, size)
+        sound = _sound(views, alone)
+        if len(sound) < len(views):
+            alone = calibrated_as(asked, sound, board, size)
+        return LensChoice(model=asked, held_out_px={}), alone
     choice, simple = _first_that_fits(views, board, size)
-    some = _sound(views, simple)
-    if len(some) < 2 * LEAST_VIEWS:
+    sound = _sound(views, simple)
+    if len(sound) < 2 * LEAST_VIEWS:
         return choice, simple
+    spread = np.unique(np.linspace(0, len(sound) - 1, _MOST_VIEWS).astype(int))
+    some = [sound[k] for k in spread]
     found, squares = dict[str, Adjusted](), dict[str, Float[np.ndarray, "v"]]()
     for model in _LADDER:
         if model == _LADDER[-1] and not _is_worth_more(squares):
@@ -83,22 +89,20 @@ def choose_lens(
         if _is_better(squares[model], squares[chosen]):
             chosen = model
     rms = {model: float(np.sqrt(np.mean(each[np.isfinite(each)]))) for model, each in squares.items()}
-    if chosen == choice.model:
-        return LensChoice(model=chosen, held_out_px=rms), simple
+    if len(some) == len(sound):
+        return LensChoice(model=chosen, held_out_px=rms), found[chosen]
     try:
-        alone = calibrated_alone(views, board, size, [found[chosen].scene.cameras[""]])
+        alone = calibrated_alone(sound, board, size, [found[chosen].scene.cameras[""]])
     except ReconstructionError:  # the others lie where such a lens shows nothing
         return choice, simple
     return LensChoice(model=chosen, held_out_px=rms), alone
 
 
 def _sound(views: Sequence[BoardView], found: Adjusted) -> list[BoardView]:
-    """Some of the views, without those that fit much worse than is usual, as views of something else do."""
+    """The views without those that fit much worse than is usual, as views of something else do."""
     rms = {int(key[1]): float(np.sqrt(np.mean(each**2))) for key, each in found.residuals.items()}
     usual = float(np.median(list(rms.values())))
-    sound = [view for k, view in enumerate(views) if rms.get(k, np.inf) <= _ODD * usual]
-    spread = np.unique(np.linspace(0, len(sound) - 1, _MOST_VIEWS).astype(int))
-    return [sound[k] for k in spread]
+    return [view for k, view in enumerate(views) if rms.get(k, np.inf) <= _ODD * usual]
 
 
 def _first_that_fits(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> tuple[LensChoice, Adjusted]:
