@@ -259,6 +259,16 @@ def test_what_no_standard_deviation_can_be_is_not_known(scan_folder):
     assert (found[3:] == 2.0).all()
 
 
+def test_a_scan_without_a_scale_is_shown_in_its_own_unit(scan_folder):
+    result = replace(storage.read_result(scan_folder), trueness=None, deviation_um=None, reference=None)
+    assert result.reconstruction is not None
+    without = replace(result, reconstruction=replace(result.reconstruction, has_scale=False))
+    assert "thousandths of its unit" not in report_page(result)
+    page = report_page(without)
+    assert "Expected error along the normal in thousandths of its unit" in page
+    assert "µm" not in re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+
+
 @example([0.0, 501.0], 0)
 @example([0.0] * 19 + [501.0], 0)
 @given(st.lists(st.floats(0, 1e4), min_size=1), st.integers(0, 5))

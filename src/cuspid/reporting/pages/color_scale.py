@@ -86,17 +86,23 @@ def deviation_scale(end_um: float) -> ColorScale:
     )
 
 
-def sigma_scale(sigma_um: Float[np.ndarray, "v"]) -> ColorScale:
-    """Of standard deviations, most of which it holds."""
+def sigma_scale(sigma_um: Float[np.ndarray, "v"], *, has_scale: bool = True) -> ColorScale:
+    """Of standard deviations, most of which it holds; of a scan without a scale, in thousandths of its unit."""
     return ColorScale(
         name="sigma",
         label="Expected",
-        meaning="Expected error along the normal in µm, one standard deviation. Grey: not known.",
+        meaning=f"Expected error along the normal in {small_unit(has_scale)}, one standard deviation. Grey: not known.",
         colors=matplotlib.colormaps[SIGMA_COLORS],
         end=fitting_sigma_um(sigma_um),
         ends=RANGES_UM,
         signed=False,
+        unit=small_unit(has_scale),
     )
+
+
+def small_unit(has_scale: bool) -> str:
+    """Of small lengths on a surface, for people."""
+    return "µm" if has_scale else "thousandths of its unit"
 
 
 def css_color(rgb: UInt8[np.ndarray, "3"]) -> str:

@@ -26,13 +26,14 @@ from cuspid.reporting.figures.drawing import (
     deviation_map,
     render,
 )
-from cuspid.reporting.pages.color_scale import ColorScale, css_color
+from cuspid.reporting.pages.color_scale import ColorScale, css_color, small_unit
 from cuspid.reporting.pages.page import jpeg_uri, picture_uri, provenance, render_page, script_json
 from cuspid.reporting.pages.scene import (
     REFERENCE_COLOR,
     Place,
     camera_layer,
     deviation_range_um,
+    has_scale,
     mesh_layer,
     path_layer,
     poses_from,
@@ -95,6 +96,7 @@ def scan_page(result: ScanResult, options: ReportOptions = ReportOptions()) -> s
         toggles=[(layer["name"], layer["label"], layer["visible"]) for layer in scene["layers"]],
         views=[view["name"] for view in scene["views"]],
         shown=sizes,
+        small_unit=small_unit(has_scale(result)),
         tiles=_tiles(result),
         warnings=_warnings(result),
         trueness=result.trueness,
@@ -146,18 +148,14 @@ def _scene(
         "scales": [scale.in_scene for scale, _ in maps],
         "views": standard_views(arch),
         "teeth": [asdict(place) for place in _teeth(result)],
-        "length_unit": "mm" if _has_scale(result) else "units of its own",
+        "length_unit": "mm" if has_scale(result) else "units of its own",
     }
     return scene, sizes
 
 
-def _has_scale(result: ScanResult) -> bool:
-    return result.reconstruction is None or result.reconstruction.has_scale
-
-
 def _warnings(result: ScanResult) -> tuple[str, ...]:
     notes = () if result.reconstruction is None else result.reconstruction.notes
-    return notes if _has_scale(result) else (_NO_SCALE, *notes)
+    return notes if has_scale(result) else (_NO_SCALE, *notes)
 
 
 def _size(name: str, full: int, shown: int, off_um: float) -> dict[str, Any]:

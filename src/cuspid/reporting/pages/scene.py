@@ -70,6 +70,11 @@ def deviation_range_um(result: ScanResult) -> float:
     return fitting_range_um(float(result.trueness["p95_um"])) if result.trueness else 100.0
 
 
+def has_scale(result: ScanResult) -> bool:
+    """Whether lengths of a scan are millimetres: photographs alone tell no scale."""
+    return result.reconstruction is None or result.reconstruction.has_scale
+
+
 def surface_maps(result: ScanResult, range_um: float) -> list[tuple[ColorScale, Float[np.ndarray, "v"]]]:
     """What the surface of a scan can be coloured by, with the values of its vertices: its deviations, with this range,
     and what was expected of them; those of them that the folder has."""
@@ -77,7 +82,7 @@ def surface_maps(result: ScanResult, range_um: float) -> list[tuple[ColorScale, 
     if result.deviation_um is not None:
         maps.append((deviation_scale(range_um), result.deviation_um))
     if result.sigma_um is not None:
-        maps.append((sigma_scale(result.sigma_um), result.sigma_um))
+        maps.append((sigma_scale(result.sigma_um, has_scale=has_scale(result)), result.sigma_um))
     return maps
 
 
