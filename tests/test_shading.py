@@ -9,17 +9,18 @@ import cv2
 import numpy as np
 import pytest
 
+from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.reconstruction import DepthMap
-from cuspid.rig import Handpiece, Lighting, Rig, Sensor
+from cuspid.rig import Handpiece, Lighting, MountedCamera, Rig, Sensor
 from cuspid.stereo import shading
 from cuspid.stereo.matching import DepthEstimator, StereoOptions, gray
 from cuspid.stereo.refinement import RefinementOptions
 from cuspid.stereo.shading import ShadingOptions
 from cuspid.stereo.signal import choose_signal, detail_dn
 from plain_scene import HILLS, WAY, capture_of, lit, photographs, plain_scan
-from synthetic_scene import cast_depth
+from synthetic_scene import cast_depth, textured
 from test_any_rig import times
 
 FRAME = {"00000": Rigid3.identity()}
@@ -178,6 +179,56 @@ def test_plain_images_are_told_from_textured_ones() -> None:
             speckle = np.kron(rng.normal(0, 12, (40, 40, 1)), np.ones((4, 4, 1)))
             speckled[frame, name] = np.clip(image + speckle, 0, 255).astype(np.uint8)
     assert choose_signal(capture_of(capture.handpiece, speckled), OPTIONS) == "texture"
+
+
+def sprayed_to_the_right(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The images of the first frame, with bold texture where x > 0."""
+    return {name: sprayed(image, lit().rig[name]) for name, image in images.items()}
+
+
+def sprayed(image: np.ndarray, mounted: MountedCamera) -> np.ndarray:
+    points = surface_points(mounted.camera, mounted.cam_from_rig)
+    grain = textured(points.reshape(-1, 3), cell_mm=0.12).reshape(points.shape[:2]) / 255
+    factor = np.where(points[..., 0] > 0, np.clip(grain, 0.1, 1.0), 1.0)
+    return np.clip(image * factor[..., None], 0, 255).astype(np.uint8)
+
+
+def surface_points(camera: Camera, cam_from_rig: Rigid3) -> np.ndarray:
+    """Of the hills at each pixel, in the rig."""
+    depth = np.nan_to_num(cast_depth(HILLS, camera, cam_from_rig), nan=1e3)
+    in_cam = camera.rays(camera.pixel_centres().reshape(-1, 2)) * depth.reshape(-1, 1)
+    return cam_from_rig.inverse().apply(in_cam).reshape(camera.height, camera.width, 3)
+
+
+def test_bold_texture_beside_a_plain_surface_is_matched_as_such(images: dict[str, np.ndarray]) -> None:
+    handpiece, sprayed_images = lit(), sprayed_to_the_right(images)
+    estimators = [DepthEstimator(handpiece, OPTIONS, signal=signal) for signal in ("texture", "shading")]
+    by_texture, both = (estimator.measure(sprayed_images, "00000") for estimator in estimators)
+    plain = measured(handpiece, images)
+    for one, mixed, other in zip(by_texture, both, plain, strict=True):
+        middle = surface_points(one.camera, one.cam_from_rig)[..., 0]
+        right, left = (middle > 0.7) & (middle < 2.0), middle < -0.3
+        assert other.known[left].mean() > 0.5
+        assert one.known[left].mean() < 0.3
+        assert mixed.known[left].mean() > 0.9 * other.known[left].mean()
+        assert mixed.known[right].mean() > 0.9 * one.known[right].mean()
+    right_um, left_um = errors_right_and_left(both)
+    assert 0.2 < np.median(np.abs(right_um)) < 5
+    assert 2 < np.median(np.abs(left_um)) < 40
+
+
+def errors_right_and_left(maps: Sequence[DepthMap]) -> tuple[np.ndarray, np.ndarray]:
+    off, across = errors_um(maps), []
+    for each in maps:
+        across.append(surface_points(each.camera, each.cam_from_rig)[..., 0][each.known])
+    x = np.concatenate(across)
+    return off[(x > 0.7) & (x < 2.0)], off[x < -0.3]
+
+
+def test_what_is_plain_beside_texture_is_measured_by_its_shade(images: dict[str, np.ndarray]) -> None:
+    capture = plain_scan()
+    one = capture_of(capture.handpiece, {("00000", name): each for name, each in sprayed_to_the_right(images).items()})
+    assert choose_signal(one, OPTIONS) == "shading"
 
 
 @pytest.mark.parametrize(("grain_dn", "signal"), [(0.0, "shading"), (3.0, "texture")])

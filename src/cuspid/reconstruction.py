@@ -43,6 +43,11 @@ class Funnel:
     def __add__(self, other: Funnel) -> Funnel:
         return Funnel(**{each.name: getattr(self, each.name) + getattr(other, each.name) for each in fields(Funnel)})
 
+    def with_kept(self, kept: int) -> Funnel:
+        """Where so many have a depth in the end, some of them from elsewhere."""
+        at_least = {name: max(getattr(self, name), kept) for name in ("begun", "matched", "agreed")}
+        return replace(self, **at_least, kept=kept)
+
     @property
     def shares_pct(self) -> dict[str, float]:
         """What is left at each step, % of the pixels."""

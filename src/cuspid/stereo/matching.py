@@ -31,6 +31,7 @@ from cuspid.stereo.confidence import (
     sure_enough,
     without_speckle,
 )
+from cuspid.stereo.detail import find_bold_texture
 from cuspid.stereo.initial_depth import initial_pairs, initial_points, semi_global
 from cuspid.stereo.rectification import IdealView, RectifiedPair, rectify
 from cuspid.stereo.refinement import SCORE, VARIANCE, GroupGeometry, Q, RefinementOptions, image_noise, refine
@@ -47,6 +48,8 @@ _WEAK_SIGMA_PX = 0.15
 """Standard deviation (px of disparity) that a depth from weak texture has at least: what looks alike need not be."""
 _OUTLYING_SIGMAS = 4.0
 """Planes that lie so far from a smooth surface, in its standard deviations, are outliers."""
+_LEAST_BOLD = 0.02
+"""Share of a view with bold texture that makes it worth matching where shade is measured."""
 _MOST_DISPARITIES = 800
 """Of the initial matching, px."""
 MOST_AGREED, WEAKLY_AGREED = 0.8, 0.6
@@ -307,10 +310,42 @@ class DepthEstimator:
                     *(views, images, self.handpiece.depth_range_mm, self.resolution, self.options, work),
                     widenings=() if self.handpiece.lights else WIDENINGS,
                 )
-            found += depth_maps_of(
+            maps = depth_maps_of(
                 views, measured, images, masks or {}, frame, self.resolution, self.checks, self.options.grid_px
             )
+            if self.signal == "shading":
+                maps = self._add_bold_texture(views, maps, images, masks or {}, frame)
+            found += maps
         return tuple(sorted(found, key=lambda depth_map: names.index(depth_map.camera_name)))
+
+    def _add_bold_texture(
+        self,
+        views: ViewSet,
+        shaded: Sequence[DepthMap],
+        images: Mapping[str, UInt8[np.ndarray, "h w *c"]],
+        masks: Mapping[str, UInt8[np.ndarray, "h w"]],
+        frame: str,
+    ) -> list[DepthMap]:
+        """What shade tells of some views, with what texture tells where it is bold: several times as exact."""
+        bold = {view.name: self._bold_on_grid(view, images[view.name]) for view in views.views}
+        if max(where.mean() for where in bold.values()) < _LEAST_BOLD:
+            return list(shaded)
+        found = self._by_texture.measure({name: images[name] for name in bold}, frame, masks=masks)
+        textured = {each.camera_name: each for each in found}
+        return [
+            merge_depths(each, textured[each.camera_name], bold[each.camera_name])
+            if each.camera_name in textured
+            else each
+            for each in shaded
+        ]
+
+    def _bold_on_grid(self, view: IdealView, image: UInt8[np.ndarray, "h w *c"]) -> Bool[np.ndarray, "r s"]:
+        bold = view.resample_mask(find_bold_texture(gray(image)).astype(np.uint8))
+        return np.asarray(_grid_of(bold, self.options.grid_px) > 0)
+
+    @computed_once
+    def _by_texture(self) -> DepthEstimator:
+        return DepthEstimator(self.handpiece, self.options, resolution_mm=self.resolution.mm)
 
     def _by_shading(
         self, views: ViewSet, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], lighting: str | None
@@ -579,6 +614,21 @@ def checked_depth_map(
         color=_rgb(_grid_of(view.resample(image), grid_px)),
         funnel=funnel,
         best_mm=resolution.mm * checks.best_sigma,
+    )
+
+
+def merge_depths(one: DepthMap, other: DepthMap, where: Bool[np.ndarray, "h w"]) -> DepthMap:
+    """A depth map with the depths that another one of the same view has in some places."""
+    assert one.best_mm is not None
+    taken = where & other.known
+    sigma_mm = np.where(taken, other.sigma_mm, one.sigma_mm)
+    weight = np.minimum((one.best_mm / sigma_mm) ** 2, 1)
+    kept = int(np.isfinite(sigma_mm).sum())
+    return replace(
+        one,
+        depth_mm=np.where(taken, other.depth_mm, one.depth_mm),
+        confidence=np.nan_to_num(weight).astype(np.float32),
+        funnel=None if one.funnel is None else one.funnel.with_kept(kept),
     )
 
 

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 
 from cuspid.capture import Capture, Frame
 from cuspid.reconstruction import sum_funnels
+from cuspid.stereo.detail import detail_power
 from cuspid.stereo.matching import DepthEstimator, Signal, StereoOptions, gray
 
 _MOST_OF_IT = 0.4
 """Share of the pixels with a depth by texture from which on shade need not be tried."""
 _LOOKED_AT = 24
 """Images that are looked at, spread over the capture."""
-_FINE_PX, _COARSE_PX, _WINDOW_PX = 1.5, 3.0, 15
-"""Detail is what a Gaussian filter keeps and a wider one removes: noise of one pixel hardly has any."""
+_PLAIN, _LEAST_PLAIN = 0.5, 0.2
+"""A window with less than this share of the detail of texture is plain; with so much of what is lit plain, shade is
+tried although there is depth by texture."""
 _USUAL_DN, _LEAST_LIT = (30, 250), 0.03
 """Grey levels of lit surface, and the share of the pixels that tells something."""
 _SMOOTHEST = 10
@@ -33,13 +34,14 @@ def choose_signal(capture: Capture, options: StereoOptions) -> Signal:
     """What depth is best measured from.
 
     Shade tells something only where the lights are known. Where they are, and what is lit shows little detail, a few
-    frames are matched both ways, and the way that gives more depth on which the views agree is taken.
+    frames are matched both ways, and the way that gives more depth on which the views agree is taken; where both are
+    there, as with plain teeth beside sprayed gums, that is by shade, for there bold texture is matched as such.
     """
     if not capture.handpiece.lights or shows_detail(capture):
         return "texture"
     frames = [capture.frames[k] for k in sorted({0, len(capture.frames) // 2})]
     by_texture = _agreed_share(capture, frames, options, "texture")
-    if by_texture >= _MOST_OF_IT:
+    if by_texture >= _MOST_OF_IT and _plain_share(capture, frames) < _LEAST_PLAIN:
         return "texture"
     return "texture" if by_texture >= _agreed_share(capture, frames, options, "shading") else "shading"
 
@@ -73,10 +75,23 @@ def _least_dn(image: UInt8[np.ndarray, "h w"]) -> float:
 
 def detail_dn(image: UInt8[np.ndarray, "h w"]) -> float | None:
     """RMS detail in windows of lit surface, in the smoothest tenth of them; None where there is hardly any."""
-    lit = (image > _USUAL_DN[0]) & (image < _USUAL_DN[1])
+    lit = _lit(image)
     if lit.mean() < _LEAST_LIT:
         return None
-    level = image.astype(np.float32)
-    band = cv2.GaussianBlur(level, (0, 0), _FINE_PX) - cv2.GaussianBlur(level, (0, 0), _COARSE_PX)
-    power = cv2.boxFilter(band * band, -1, (_WINDOW_PX, _WINDOW_PX))
-    return float(np.sqrt(np.percentile(power[lit], _SMOOTHEST)))
+    return float(np.sqrt(np.percentile(detail_power(image)[lit], _SMOOTHEST)))
+
+
+def _plain_share(capture: Capture, frames: Sequence[Frame]) -> float:
+    """Share of what is lit in some frames that is plain."""
+    grays = [gray(capture.image(frame, camera)) for frame in frames for camera in frame.cameras]
+    lit = [_lit(image) for image in grays]
+    plain = sum(int((_is_plain(image) & where).sum()) for image, where in zip(grays, lit, strict=True))
+    return plain / max(sum(int(where.sum()) for where in lit), 1)
+
+
+def _is_plain(image: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    return np.asarray(detail_power(image) < (_PLAIN * _least_dn(image)) ** 2)
+
+
+def _lit(image: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    return (image > _USUAL_DN[0]) & (image < _USUAL_DN[1])
