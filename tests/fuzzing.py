@@ -43,7 +43,7 @@ from cuspid.facing import facing_outwards
 from cuspid.handpiece.brief import read_brief
 from cuspid.handpiece.designs import DESIGNS
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
-from cuspid.image_files import image_size, read_image
+from cuspid.image_files import image_size, read_fine, read_image
 from cuspid.jaw import Jaw, Landmark
 from cuspid.motion.colmap import read_model
 from cuspid.pipeline import RenderOptions, take_images
@@ -224,7 +224,7 @@ def _read_images(folder: Path) -> None:
     for name in ("frames", "jpg", "bmp", "tiff"):
         sequence = storage.read_sequence(folder / name, folder / _OUT)
         for path in sequence.paths:
-            read_image(path)
+            read_fine(path)
 
 
 def _panorama(folder: Path) -> None:

@@ -167,8 +167,8 @@ def test_all_images_are_read_once(capture: Capture, tmp_path: Path, monkeypatch:
     assert seen == [("features", k, 4) for k in (1, 2, 3, 4)]
     assert set(first) == {(f"{k:05d}", c) for k in (0, 1) for c in "ab"}
     reads: list[object] = []
-    original = Capture.image
-    monkeypatch.setattr(Capture, "image", lambda self, *which: reads.append(which) or original(self, *which))
+    original = Capture.fine_image
+    monkeypatch.setattr(Capture, "fine_image", lambda self, *which: reads.append(which) or original(self, *which))
     again = detect_all(Pictures(capture), cache=cache)
     assert not reads
     np.testing.assert_array_equal(again["00001", "b"].descriptors, first["00001", "b"].descriptors)
@@ -182,8 +182,8 @@ def test_all_images_are_read_once(capture: Capture, tmp_path: Path, monkeypatch:
 def test_grey_pictures_are_read_once_as_far_as_memory_goes(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those that were kept and those that are read again are the same."""
     reads: list[tuple[object, ...]] = []
-    original = Capture.image
-    monkeypatch.setattr(Capture, "image", lambda self, *which: reads.append(which) or original(self, *which))
+    original = Capture.fine_image
+    monkeypatch.setattr(Capture, "fine_image", lambda self, *which: reads.append(which) or original(self, *which))
     every = [(frame, camera) for frame in capture.frames for camera in frame.cameras]
     height, width = original(capture, *every[0]).shape[:2]
     greys, counts = [], []

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial import KDTree
 
 from cuspid import cli, storage
-from cuspid.capture import Capture, Frame, read_mask
+from cuspid.capture import Capture, Frame, ImageFolder, read_mask
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
+from cuspid.motion.features import detect
 from cuspid.pipeline import ReconstructionOptions, _hold_what_fits
 from cuspid.reconstruction import DepthMap, Funnel, Reconstruction, sum_funnels
 from cuspid.rig import Handpiece, MountedCamera, Rig
@@ -31,7 +34,7 @@ from cuspid.surface.sharp_edges import SharpEdgeOptions
 from cuspid.surface.stage import fuse
 from cuspid.tolerances import NominalOptions
 from synthetic_scene import cast_depth, diamond, height_field, render
-from test_any_rig import InMemory
+from test_any_rig import InMemory, scan
 
 HILLS = height_field(lambda x, y: 5 + 0.25 * np.sin(1.8 * x) * np.cos(1.5 * y), half_width_mm=6.0)
 TURNS_DEG = (-24.0, -12.0, 0.0, 12.0, 24.0)
@@ -237,3 +240,51 @@ def test_a_mesh_without_scale_says_so_and_is_not_evaluated(tmp_path: Path, capsy
         cli.main(["evaluate", str(file), str(reference), "--out", str(tmp_path / "out")])
     assert "it has no scale" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+# --- bits -------------------------------------------------------------------------------------------------------------
+
+
+def write_images(folder: Path, capture: Capture, of: Callable[[np.ndarray], np.ndarray]) -> Capture:
+    """The capture with images in files, each made of its own."""
+    for frame in capture.frames:
+        for camera in frame.cameras:
+            path = folder / "images" / camera / f"{frame.name}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path), of(capture.image(frame, camera))[..., ::-1])
+    return replace(capture, source=ImageFolder(folder))
+
+
+def twelve_bits_of_a_dark_image(image: np.ndarray) -> np.ndarray:
+    """A sixteenth as bright, beside a reflection that is not."""
+    dark = image.astype(np.uint16)
+    dark[:2, :2] = 4095
+    return dark
+
+
+def test_what_more_bits_show_of_dark_images_is_measured(tmp_path: Path) -> None:
+    bright = scan()
+    frame = bright.frames[0]
+    dark = write_images(tmp_path / "deep", replace(bright, frames=(frame,)), twelve_bits_of_a_dark_image)
+    eight = write_images(tmp_path / "eight", replace(bright, frames=(frame,)), lambda image: image // 16)
+    fine = dark.fine_image(frame, frame.cameras[0])
+    assert fine.dtype == np.float32
+    assert np.array_equal(16 * fine[2:, 2:], bright.image(frame, frame.cameras[0])[2:, 2:])
+    assert np.array_equal(dark.image(frame, frame.cameras[0])[2:, 2:], eight.image(frame, frame.cameras[0])[2:, 2:])
+    expected, found, lost = (
+        DepthEstimator(bright.handpiece).measure(each.fine_images(frame), frame.name) for each in (bright, dark, eight)
+    )
+    off_mm = [np.abs(one.depth_mm - other.depth_mm) for one, other in zip(found, expected, strict=True)]
+    assert np.nanmedian(off_mm) < 1e-3
+    shares = [sum(one.known.sum() for one in maps) for maps in (expected, found, lost)]
+    assert shares[1] > 0.95 * shares[0]
+    assert shares[2] < 0.5 * shares[0]
+
+
+def test_keypoints_of_dark_images_are_those_of_bright_ones(tmp_path: Path) -> None:
+    bright = scan()
+    frame = bright.frames[0]
+    dark = write_images(tmp_path, replace(bright, frames=(frame,)), twelve_bits_of_a_dark_image)
+    expected, found = (detect(each.fine_image(frame, frame.cameras[0])) for each in (bright, dark))
+    near, _ = KDTree(found.pixels).query(expected.pixels)
+    assert np.mean(near < 0.1) > 0.7

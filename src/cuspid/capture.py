@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from cuspid.errors import InputError
-from cuspid.image_files import has_opacity, image_size, read_image, read_rgba
+from cuspid.image_files import Pixels, as_8_bits, has_opacity, image_size, read_fine, read_image, read_rgba
 from cuspid.rig import Handpiece, Rig
 from cuspid.values import checked_name
 
@@ -54,8 +54,9 @@ class ImageSource(Protocol):
         """Suffix of the image names."""
         ...
 
-    def read(self, frame: str, camera: str) -> UInt8[np.ndarray, "h w 3"]:
-        """RGB image. Raises InputError where it is missing or cannot be decoded whole."""
+    def read(self, frame: str, camera: str) -> Pixels:
+        """RGB image, with fractions of its digital numbers (float32) where more than 8 bits are stored. Raises
+        InputError where it is missing or cannot be decoded whole."""
         ...
 
     def size(self, frame: str, camera: str) -> tuple[int, int]:
@@ -133,9 +134,9 @@ class ImageFolder:
         """Path of an image."""
         return self.folder / "images" / image_name(frame, camera, self.suffix)
 
-    def read(self, frame: str, camera: str) -> UInt8[np.ndarray, "h w 3"]:
+    def read(self, frame: str, camera: str) -> Pixels:
         """As :meth:`ImageSource.read`."""
-        return read_image(self.path(frame, camera))
+        return read_fine(self.path(frame, camera))
 
     def size(self, frame: str, camera: str) -> tuple[int, int]:
         """As :meth:`ImageSource.size`."""
@@ -173,11 +174,11 @@ class HalvedImages:
         """As :attr:`ImageSource.suffix`."""
         return self.whole.suffix
 
-    def read(self, frame: str, camera: str) -> UInt8[np.ndarray, "h w 3"]:
+    def read(self, frame: str, camera: str) -> Pixels:
         """As :meth:`ImageSource.read`."""
         image = self.whole.read(frame, camera)
         size = halved_size(image.shape[1], image.shape[0])
-        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
     def size(self, frame: str, camera: str) -> tuple[int, int]:
         """As :meth:`ImageSource.size`."""
@@ -230,12 +231,20 @@ class Capture:
 
     def image(self, frame: Frame, camera: str) -> UInt8[np.ndarray, "h w 3"]:
         """RGB image. Raises InputError where it is missing, damaged, or not of the camera's size."""
-        self.check_image(frame, camera)
-        return self.source.read(frame.name, camera)
+        return as_8_bits(self.fine_image(frame, camera))
 
     def images(self, frame: Frame) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
         """The images of all cameras that have one of a frame, as :meth:`image`."""
         return {name: self.image(frame, name) for name in frame.cameras}
+
+    def fine_image(self, frame: Frame, camera: str) -> Pixels:
+        """As :meth:`image`, with fractions of digital numbers (float32) where more than 8 bits are stored."""
+        self.check_image(frame, camera)
+        return self.source.read(frame.name, camera)
+
+    def fine_images(self, frame: Frame) -> dict[str, Pixels]:
+        """The images of all cameras that have one of a frame, as :meth:`fine_image`."""
+        return {name: self.fine_image(frame, name) for name in frame.cameras}
 
     def masks(self, frame: Frame) -> dict[str, UInt8[np.ndarray, "h w"]]:
         """The masks of those cameras that have one of a frame, as :meth:`ImageSource.mask`."""

@@ -17,7 +17,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Shaped, UInt8, UInt16
+from jaxtyping import Float32, Shaped, UInt8, UInt16
 from PIL import ExifTags, Image, ImageFile, ImageOps, UnidentifiedImageError
 
 from cuspid.errors import InputError
@@ -28,6 +28,9 @@ from cuspid.values import one_line
 warnings.simplefilter("ignore", Image.DecompressionBombWarning)
 warnings.filterwarnings("ignore", module=r"PIL\.")
 
+Pixels = UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"]
+"""An RGB image of 8 bits, or one with fractions of digital numbers of 255."""
+
 PNG_END = b"IEND\xaeB`\x82"
 """The last bytes of a whole PNG file."""
 LYING = (5, 6, 7, 8)
@@ -37,6 +40,8 @@ _TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _TEXTS, _TURNING_TEXTS = (b"tEXt", b"zTXt", b"iTXt"), (b"Raw profile type", b"XML:com.adobe.xmp")
 _PIXELS = (b"IHDR", b"IDAT", b"IEND")
 _LARGEST = 65535
+_DARK_DN, _BRIGHT_PERCENTILES = 128.0, (99.5, 99.9)
+"""An image is dark if the second percentile is below this grey level; it is stretched until the first one is white."""
 _FULL, _FEWER_BITS = 16, (8, 10, 12)
 """Bits of what is stored in 16: with more than twelve, the upper eight show what there is."""
 
@@ -45,6 +50,36 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     """An 8-bit RGB image, upright. Raises InputError where the file is missing or cannot be decoded whole, or holds
     numbers that are no grey values."""
     return _decoded(path, "RGB")
+
+
+def read_fine(path: Path) -> Pixels:
+    """As :func:`read_image`, but with fractions of its digital numbers (float32, below 256) where the file stores more
+    than 8 bits."""
+    image_size(path)
+    with _reading(path), Image.open(path) as image:
+        levels = _levels(path, image)
+        if levels is not None:
+            fine = (levels / np.float32(1 << (_bits_of(path, image) - 8))).astype(np.float32)
+            return np.ascontiguousarray(fine[..., :3] if fine.ndim == 3 else np.repeat(fine[..., None], 3, axis=2))
+        return _shown(image, "RGB")
+
+
+def as_8_bits(image: UInt8[np.ndarray, "*s"] | Float32[np.ndarray, "*s"]) -> UInt8[np.ndarray, "*s"]:
+    """The upper 8 bits of what :func:`read_fine` reads."""
+    return image if image.dtype == np.uint8 else image.astype(np.uint8)
+
+
+def visible_in_8_bits(grey: UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    """An image of 8 bits as it is; of more bits those that show most of it, where it is dark."""
+    return grey if grey.dtype == np.uint8 else brighten(grey)
+
+
+def brighten(grey: UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    """A dark image stretched to the whole range: the contrast of a keypoint is a share of it. Others as they are."""
+    bright, brightest = np.percentile(grey[::2, ::2], _BRIGHT_PERCENTILES).tolist()
+    if not 0 < bright <= brightest < _DARK_DN:
+        return as_8_bits(grey)
+    return np.asarray(cv2.convertScaleAbs(grey, alpha=255 / bright), dtype=np.uint8)
 
 
 def read_rgba(path: Path) -> UInt8[np.ndarray, "h w 4"]:
@@ -181,12 +216,16 @@ def _decoded(path: Path, mode: Literal["RGB", "RGBA"], *, upright: bool = True) 
     with _reading(path), Image.open(path) as image:
         levels = _levels(path, image, upright=upright)
         if levels is not None:
-            used = _FULL if image.mode == "F" else _bits_used(path.parent, path.suffix)
-            shown = Image.fromarray((levels >> (used - 8)).astype(np.uint8))
+            shown = Image.fromarray((levels >> (_bits_of(path, image) - 8)).astype(np.uint8))
             return np.asarray(shown.convert(mode))
-        if upright:
-            ImageOps.exif_transpose(image, in_place=True)
-        return np.asarray(image if image.mode == mode else image.convert(mode))
+        return _shown(image, mode, upright=upright)
+
+
+def _shown(image: Image.Image, mode: Literal["RGB", "RGBA"], *, upright: bool = True) -> UInt8[np.ndarray, "h w *c"]:
+    """Of an image of 8 bits."""
+    if upright:
+        ImageOps.exif_transpose(image, in_place=True)
+    return np.asarray(image if image.mode == mode else image.convert(mode))
 
 
 @contextmanager
@@ -242,6 +281,11 @@ def _bare_png(path: Path) -> bytes:
 
 
 _lock = Lock()
+
+
+def _bits_of(path: Path, image: Image.Image) -> int:
+    """Bits that an image of more than 8 uses."""
+    return _FULL if image.mode == "F" else _bits_used(path.parent, path.suffix)
 
 
 def _bits_used(folder: Path, suffix: str) -> int:

@@ -19,6 +19,7 @@ from jaxtyping import Float, Int, UInt8
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.capture import Frame, halved_size
 from cuspid.geometry import distinct_rows
+from cuspid.image_files import Pixels, as_8_bits, brighten
 from cuspid.motion.pictures import Pictures
 from cuspid.options import Options, Range
 from cuspid.progress import Progress, silent
@@ -28,8 +29,6 @@ from cuspid.workers import map_in_threads
 
 DESCRIPTOR_NORM = 512.0
 """Euclidean length of a descriptor before rounding."""
-_DARK_DN, _BRIGHT_PERCENTILES = 128.0, (99.5, 99.9)
-"""An image is dark if the second percentile is below this grey level; it is stretched until the first one is white."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,23 +117,15 @@ def _colors_at(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "n 2
     return image[row, column]
 
 
-def brighten(gray: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
-    """A dark image stretched to the whole range: the contrast of a keypoint is a share of it. Others as they are."""
-    bright, brightest = np.percentile(gray[::2, ::2], _BRIGHT_PERCENTILES).tolist()
-    if not 0 < bright <= brightest < _DARK_DN:
-        return gray
-    return np.asarray(cv2.convertScaleAbs(gray, alpha=255 / bright), dtype=np.uint8)
-
-
 def detect(
-    image: UInt8[np.ndarray, "h w 3"],
+    image: Pixels,
     options: FeatureOptions | None = None,
     mask: UInt8[np.ndarray, "h w"] | None = None,
 ) -> Features:
     """Keypoints of an RGB image, evenly distributed; with a mask, only where it is not zero."""
     options = options or FeatureOptions()
     height, width = image.shape[:2]
-    gray = brighten(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8))
+    gray = brighten(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)))
     searched = options.size_for(width, height)
     if searched != (width, height):
         gray = cv2.resize(gray, searched, interpolation=cv2.INTER_AREA)
@@ -154,7 +145,7 @@ def detect(
     if descriptors is None:
         descriptors = np.zeros((0, 128), np.float32)
     pixels = px * (_places(described) + OPENCV_PIXEL_OFFSET)
-    return Features(pixels=pixels, descriptors=_root_sift(descriptors), colors=_colors_at(image, pixels))
+    return Features(pixels=pixels, descriptors=_root_sift(descriptors), colors=_colors_at(as_8_bits(image), pixels))
 
 
 def _load(path: Path) -> Features:

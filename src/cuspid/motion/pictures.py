@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from cuspid.capture import Capture, Frame
+from cuspid.image_files import Pixels, visible_in_8_bits
 
 _BYTES = 400_000_000
 """Memory for the images that are kept."""
@@ -24,9 +25,9 @@ class Pictures:
     """Memory for the images that are kept, in bytes."""
     _kept: dict[tuple[str, str], UInt8[np.ndarray, "h w"]] = field(default_factory=dict, init=False, repr=False)
 
-    def image(self, frame: Frame, camera: str) -> UInt8[np.ndarray, "h w 3"]:
-        """As :meth:`cuspid.capture.Capture.image`, with the same errors."""
-        image = self.capture.image(frame, camera)
+    def image(self, frame: Frame, camera: str) -> Pixels:
+        """As :meth:`cuspid.capture.Capture.fine_image`, with the same errors."""
+        image = self.capture.fine_image(frame, camera)
         if (len(self._kept) + 1) * image.shape[0] * image.shape[1] <= self.most_bytes:
             self._kept[frame.name, camera] = _grey(image)
         return image
@@ -37,5 +38,5 @@ class Pictures:
         return _grey(self.image(frame, camera)) if kept is None else kept
 
 
-def _grey(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w"]:
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+def _grey(image: Pixels) -> UInt8[np.ndarray, "h w"]:
+    return visible_in_8_bits(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)))

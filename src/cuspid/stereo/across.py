@@ -22,7 +22,7 @@ from cuspid.pairing import PairingOptions, rank_by_points, rank_sources, resolve
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece, MountedCamera, Rig
 from cuspid.stereo.confidence import Resolution
-from cuspid.stereo.matching import StereoOptions, depth_maps_of, measure_views, prepare_views
+from cuspid.stereo.matching import Levels, StereoOptions, depth_maps_of, measure_views, prepare_views
 
 _LEAST_BASELINE = 0.08
 """Smallest movement of a camera relative to the distance of the surface."""
@@ -53,8 +53,8 @@ class AcrossOptions(Options):
 
 def measure_moving_cameras(
     handpiece: Handpiece,
-    images: Mapping[str, UInt8[np.ndarray, "h w *c"]],
-    next_images: Mapping[str, UInt8[np.ndarray, "h w *c"]],
+    images: Mapping[str, Levels],
+    next_images: Mapping[str, Levels],
     masks: Mapping[str, UInt8[np.ndarray, "h w"]],
     next_from_rig: Rigid3,
     frame: str,

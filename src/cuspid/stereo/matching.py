@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from cuspid.camera import Camera
 from cuspid.errors import InputError
+from cuspid.image_files import Pixels, as_8_bits, visible_in_8_bits
 from cuspid.options import Options, Range
 from cuspid.pairing import PairingOptions, camera_groups, rank_sources, require_stereo, resolved_mm
 from cuspid.reconstruction import DepthMap, Funnel
@@ -38,6 +39,9 @@ from cuspid.stereo.refinement import SCORE, VARIANCE, GroupGeometry, Q, Refineme
 from cuspid.stereo.regularised import even_out, sweep
 from cuspid.stereo.shading import ShadedView, ShadingOptions, brightness, correction, shaded_depths
 from cuspid.workers import computed_once, map_in_threads
+
+Levels = UInt8[np.ndarray, "h w *c"] | Float32[np.ndarray, "h w *c"]
+"""An RGB or grey image, with fractions of digital numbers where more than 8 bits are stored."""
 
 _SPACING_PX = 3
 _BLUR_SHARE = 0.5
@@ -199,7 +203,7 @@ def initial_layer(points_in_rig: Float[np.ndarray, "n 3"], view: IdealView, grid
 
 
 def stack_images(
-    images: Sequence[UInt8[np.ndarray, "_ _"]],
+    images: Sequence[UInt8[np.ndarray, "_ _"] | Float32[np.ndarray, "_ _"]],
 ) -> tuple[Float[np.ndarray, "c h w"], Int[np.ndarray, "c 2"]]:
     """Grey images as one float32 array, padded to the largest, and their true sizes."""
     sizes = np.array([image.shape for image in images])
@@ -277,7 +281,7 @@ class DepthEstimator:
 
     def measure(
         self,
-        images: Mapping[str, UInt8[np.ndarray, "h w *c"]],
+        images: Mapping[str, Levels],
         frame: str,
         lighting: str | None = None,
         *,
@@ -322,7 +326,7 @@ class DepthEstimator:
         self,
         views: ViewSet,
         shaded: Sequence[DepthMap],
-        images: Mapping[str, UInt8[np.ndarray, "h w *c"]],
+        images: Mapping[str, Levels],
         masks: Mapping[str, UInt8[np.ndarray, "h w"]],
         frame: str,
     ) -> list[DepthMap]:
@@ -339,17 +343,15 @@ class DepthEstimator:
             for each in shaded
         ]
 
-    def _bold_on_grid(self, view: IdealView, image: UInt8[np.ndarray, "h w *c"]) -> Bool[np.ndarray, "r s"]:
-        bold = view.resample_mask(find_bold_texture(gray(image)).astype(np.uint8))
+    def _bold_on_grid(self, view: IdealView, image: Levels) -> Bool[np.ndarray, "r s"]:
+        bold = view.resample_mask(find_bold_texture(as_8_bits(gray(image))).astype(np.uint8))
         return np.asarray(_grid_of(bold, self.options.grid_px) > 0)
 
     @computed_once
     def _by_texture(self) -> DepthEstimator:
         return DepthEstimator(self.handpiece, self.options, resolution_mm=self.resolution.mm)
 
-    def _by_shading(
-        self, views: ViewSet, images: Mapping[str, UInt8[np.ndarray, "h w *c"]], lighting: str | None
-    ) -> Mapping[int, Measured]:
+    def _by_shading(self, views: ViewSet, images: Mapping[str, Levels], lighting: str | None) -> Mapping[int, Measured]:
         stack = brightness(views.views, [_rgb(images[view.name]) for view in views.views], views.corrections)
         shaded = [
             ShadedView(
@@ -376,7 +378,7 @@ class Match:
     def __init__(
         self,
         views: ViewSet,
-        images: Mapping[str, UInt8[np.ndarray, "h w *c"]],
+        images: Mapping[str, Levels],
         depth_range_mm: tuple[float, float],
         options: StereoOptions,
         work: _Map = _one_by_one,
@@ -388,7 +390,7 @@ class Match:
         self._shaded, self._blurred = shaded, dict[int, Float[np.ndarray, "c h w"]]()
         grays = {view.name: gray(images[view.name]) for view in views.views}
         self._views, self._range_mm, self._options = views, depth_range_mm, options
-        self._grays, self._work = grays, work
+        self._grays, self._work = {name: visible_in_8_bits(image) for name, image in grays.items()}, work
         self._stack, self._sizes = stack_images([view.resample(grays[view.name]) for view in views.views])
 
     @computed_once
@@ -484,7 +486,7 @@ class Match:
 
 def measure_views(
     views: ViewSet,
-    images: Mapping[str, UInt8[np.ndarray, "h w *c"]],
+    images: Mapping[str, Levels],
     depth_range_mm: tuple[float, float],
     resolution: Resolution,
     options: StereoOptions,
@@ -547,7 +549,7 @@ def agreed_planes(
 def depth_maps_of(
     views: ViewSet,
     measured: Mapping[int, Measured],
-    images: Mapping[str, UInt8[np.ndarray, "h w *c"]],
+    images: Mapping[str, Levels],
     masks: Mapping[str, UInt8[np.ndarray, "h w"]],
     frame: str,
     resolution: Resolution,
@@ -574,7 +576,7 @@ def depth_maps_of(
 def checked_depth_map(
     one: Measured,
     others: Sequence[Measured],
-    image: UInt8[np.ndarray, "h w *c"],
+    image: Levels,
     mask: UInt8[np.ndarray, "h w"] | None,
     view: IdealView,
     frame: str,
@@ -611,7 +613,7 @@ def checked_depth_map(
         cam_from_rig=one.cam_from_rig,
         depth_mm=np.where(keep, one.depth_mm, np.nan).astype(np.float32),
         confidence=confidence(one, keep, resolution, checks),
-        color=_rgb(_grid_of(view.resample(image), grid_px)),
+        color=_rgb(_grid_of(view.resample(as_8_bits(image)), grid_px)),
         funnel=funnel,
         best_mm=resolution.mm * checks.best_sigma,
     )
@@ -632,26 +634,24 @@ def merge_depths(one: DepthMap, other: DepthMap, where: Bool[np.ndarray, "h w"])
     )
 
 
-def gray(image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w"]:
+def gray(image: Levels) -> UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]:
     """Grey levels of an RGB or grey image."""
-    if image.ndim == 2:
-        return image
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
 
 
-def _rgb(image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w 3"]:
+def _rgb(image: Levels) -> Pixels:
     return np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
 
 
 _BLANK_DN = 2.0
 
 
-def _is_blank(image: UInt8[np.ndarray, "h w *c"]) -> bool:
+def _is_blank(image: Levels) -> bool:
     """Whether an image shows no more than noise."""
     return bool(cv2.meanStdDev(image)[1].max() < _BLANK_DN)
 
 
-def _grid_of(image: UInt8[np.ndarray, "h w *c"], spacing_px: int) -> UInt8[np.ndarray, "r s *c"]:
+def _grid_of(image: Levels, spacing_px: int) -> UInt8[np.ndarray, "r s *c"]:
     """The pixels of the grid."""
     start = spacing_px // 2
     return np.ascontiguousarray(image[start::spacing_px, start::spacing_px])

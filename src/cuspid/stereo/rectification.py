@@ -50,11 +50,11 @@ class IdealView:
         ideal = mounted.camera.straightened()
         return IdealView(name, ideal, mounted.cam_from_rig, undistortion_maps(mounted.camera, ideal))
 
-    def resample(self, image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w *c"]:
+    def resample(
+        self, image: UInt8[np.ndarray, "h w *c"] | Float32[np.ndarray, "h w *c"]
+    ) -> UInt8[np.ndarray, "h w *c"] | Float32[np.ndarray, "h w *c"]:
         """The image as the ideal camera would have taken it; black where the real one saw nothing."""
-        if self.maps is None:
-            return image
-        return np.asarray(cv2.remap(image, *self.maps, cv2.INTER_CUBIC), dtype=np.uint8)
+        return image if self.maps is None else np.asarray(cv2.remap(image, *self.maps, cv2.INTER_CUBIC))
 
     def resample_mask(self, mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
         """As :meth:`resample`, for the nearest pixel; zero where the real camera saw nothing."""

@@ -159,7 +159,7 @@ def correction(camera: Camera, sensor: Sensor) -> Float32[np.ndarray, "h w 1"]:
 
 def brightness(
     views: Sequence[IdealView],
-    images: Sequence[UInt8[np.ndarray, "_ _ 3"]],
+    images: Sequence[UInt8[np.ndarray, "_ _ 3"] | Float32[np.ndarray, "_ _ 3"]],
     corrections: Sequence[Float32[np.ndarray, "_ _ 1"]],
 ) -> Float32[np.ndarray, "c h w 3"]:
     """What the cameras of a group are compared by, in digital numbers; `_UNUSABLE` where a channel burnt out, where it

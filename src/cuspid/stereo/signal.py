@@ -53,7 +53,7 @@ def _agreed_share(capture: Capture, frames: Sequence[Frame], options: StereoOpti
         depth_map.funnel
         for frame in frames
         for depth_map in estimator.measure(
-            capture.images(frame), frame.name, frame.lighting, masks=capture.masks(frame), alone=True
+            capture.fine_images(frame), frame.name, frame.lighting, masks=capture.masks(frame), alone=True
         )
     )
     return 0.0 if funnel is None else funnel.kept / max(funnel.pixels, 1)

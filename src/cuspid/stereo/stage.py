@@ -90,7 +90,7 @@ def measure_depth(
 
     def measure(frame: Frame) -> tuple[DepthMap, ...]:
         return estimator.measure(
-            capture.images(frame),
+            capture.fine_images(frame),
             frame.name,
             frame.lighting,
             masks=capture.masks(frame),
@@ -199,7 +199,7 @@ def measure_depth_across(
 
     def measure(frame: Frame) -> tuple[DepthMap, ...]:
         step = steps[frame.name]
-        now, after = capture.images(step.now), capture.images(step.after)
+        now, after = capture.fine_images(step.now), capture.fine_images(step.after)
         masks = capture.masks(step.now) | {f"{name}+": mask for name, mask in capture.masks(step.after).items()}
         return measure_moving_cameras(capture.handpiece, now, after, masks, step.motion, frame.name, options, stereo)
 

@@ -12,7 +12,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from cuspid.capture import Capture
 from cuspid.progress import Progress, silent
@@ -85,10 +85,10 @@ class _Views:
         self._ideal = {name: IdealView.of(name, mounted) for name, mounted in rig.cameras.items()}
         self._gray = lru_cache(maxsize=_KEPT_IMAGES)(self._read)
 
-    def _read(self, number: int) -> UInt8[np.ndarray, "h w"]:
+    def _read(self, number: int) -> UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]:
         """The grey image of a view, without distortion."""
         view = self.located[number]
-        return self._ideal[view.camera].resample(gray(self.capture.image(view.frame, view.camera)))
+        return self._ideal[view.camera].resample(gray(self.capture.fine_image(view.frame, view.camera)))
 
     def _with_sources(self, number: int) -> tuple[int, ...]:
         return number, *self.located[number].sources
