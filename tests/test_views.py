@@ -281,6 +281,18 @@ def test_what_more_bits_show_of_dark_images_is_measured(tmp_path: Path) -> None:
     assert shares[2] < 0.5 * shares[0]
 
 
+@pytest.mark.parametrize("factor", [1 / 3, 1 / 50])
+def test_how_dark_an_image_of_more_bits_is_decides_nothing(factor: float) -> None:
+    capture = scan()
+    frame = capture.frames[0]
+    fine = {name: image.astype(np.float32) for name, image in capture.images(frame).items()}
+    dark = {name: image * np.float32(factor) for name, image in fine.items()}
+    expected, found = (DepthEstimator(capture.handpiece).measure(each, frame.name) for each in (fine, dark))
+    for one, other in zip(found, expected, strict=True):
+        assert np.mean(one.known == other.known) > 0.98
+        assert np.nanquantile(np.abs(one.depth_mm - other.depth_mm), 0.95) < 2e-3
+
+
 def test_keypoints_of_dark_images_are_those_of_bright_ones(tmp_path: Path) -> None:
     bright = scan()
     frame = bright.frames[0]

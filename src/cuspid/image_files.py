@@ -76,10 +76,22 @@ def visible_in_8_bits(grey: UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"
 
 def brighten(grey: UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     """A dark image stretched to the whole range: the contrast of a keypoint is a share of it. Others as they are."""
+    factor = _brightening(grey)
+    return as_8_bits(grey) if factor == 1 else np.asarray(cv2.convertScaleAbs(grey, alpha=factor), dtype=np.uint8)
+
+
+def stretch_fine(
+    grey: UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"],
+) -> UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]:
+    """A dark image of more than 8 bits as bright as :func:`brighten` makes it, unrounded and unclipped; others as they
+    are."""
+    return grey if grey.dtype == np.uint8 else grey * np.float32(_brightening(grey))
+
+
+def _brightening(grey: UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]) -> float:
+    """How many times brighter a dark image can be; 1 for others."""
     bright, brightest = np.percentile(grey[::2, ::2], _BRIGHT_PERCENTILES).tolist()
-    if not 0 < bright <= brightest < _DARK_DN:
-        return as_8_bits(grey)
-    return np.asarray(cv2.convertScaleAbs(grey, alpha=255 / bright), dtype=np.uint8)
+    return 255 / bright if 0 < bright <= brightest < _DARK_DN else 1.0
 
 
 def read_rgba(path: Path) -> UInt8[np.ndarray, "h w 4"]:

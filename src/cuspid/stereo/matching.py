@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from cuspid.camera import Camera
 from cuspid.errors import InputError
-from cuspid.image_files import Pixels, as_8_bits, visible_in_8_bits
+from cuspid.image_files import Pixels, as_8_bits, stretch_fine, visible_in_8_bits
 from cuspid.options import Options, Range
 from cuspid.pairing import PairingOptions, camera_groups, rank_sources, require_stereo, resolved_mm
 from cuspid.reconstruction import DepthMap, Funnel
@@ -388,7 +388,7 @@ class Match:
         """RGB or grey images by the names of the views. ``shaded``: their brightness may be shade that does not stay
         on the surface, since lights move with the camera, or stand close by: wide windows must not gather it."""
         self._shaded, self._blurred = shaded, dict[int, Float[np.ndarray, "c h w"]]()
-        grays = {view.name: gray(images[view.name]) for view in views.views}
+        grays = {view.name: stretch_fine(gray(images[view.name])) for view in views.views}
         self._views, self._range_mm, self._options = views, depth_range_mm, options
         self._grays, self._work = {name: visible_in_8_bits(image) for name, image in grays.items()}, work
         self._stack, self._sizes = stack_images([view.resample(grays[view.name]) for view in views.views])
@@ -643,12 +643,13 @@ def _rgb(image: Levels) -> Pixels:
     return np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
 
 
-_BLANK_DN = 2.0
+_BLANK_DN, _BLANK_FINE_DN = 2.0, 0.1
+"""RMS contrast of images of 8 and of more bits."""
 
 
 def _is_blank(image: Levels) -> bool:
     """Whether an image shows no more than noise."""
-    return bool(cv2.meanStdDev(image)[1].max() < _BLANK_DN)
+    return bool(cv2.meanStdDev(image)[1].max() < (_BLANK_DN if image.dtype == np.uint8 else _BLANK_FINE_DN))
 
 
 def _grid_of(image: Levels, spacing_px: int) -> UInt8[np.ndarray, "r s *c"]:

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from cuspid.capture import Capture
+from cuspid.image_files import stretch_fine
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Rig
@@ -88,7 +89,7 @@ class _Views:
     def _read(self, number: int) -> UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]:
         """The grey image of a view, without distortion."""
         view = self.located[number]
-        return self._ideal[view.camera].resample(gray(self.capture.fine_image(view.frame, view.camera)))
+        return self._ideal[view.camera].resample(stretch_fine(gray(self.capture.fine_image(view.frame, view.camera))))
 
     def _with_sources(self, number: int) -> tuple[int, ...]:
         return number, *self.located[number].sources
