@@ -137,12 +137,23 @@ def test_evaluate_works_on_meshes_that_cuspid_never_saw(tmp_path, capsys, jaw_li
     assert "Trueness" in capsys.readouterr().out
 
 
-def test_every_verb_is_in_the_help(capsys):
-    with pytest.raises(SystemExit) as caught:
-        run("--help")
-    assert caught.value.code == 0
+@pytest.mark.parametrize("asked", [(), ("--help",), ("-h",)])
+def test_every_verb_is_in_the_overview(capsys, asked):
+    run(*asked)
     printed = capsys.readouterr().out
-    assert all(verb in printed for verb in cli.COMMANDS)
+    first = [line.split()[0] for line in printed.splitlines() if line.startswith("  ")]
+    assert first == list(cli.COMMANDS)
+    assert max(map(len, printed.splitlines())) < 120
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"), [("evalute", "did you mean evaluate?"), ("xyz", "no verb xyz; cuspid --help")]
+)
+def test_an_unknown_verb_is_answered_with_the_nearest_one(capsys, asked, said):
+    with pytest.raises(SystemExit) as caught:
+        run(asked)
+    assert caught.value.code == 2
+    assert said in capsys.readouterr().err
 
 
 def test_the_module_runs():
@@ -155,12 +166,13 @@ def test_the_version(capsys):
     assert capsys.readouterr().out == f"cuspid {__version__}\n"
 
 
-@pytest.mark.parametrize(("asked", "modules"), [(["view"], {"shared", "view"}), (["--version"], {"shared"})])
+@pytest.mark.parametrize(("asked", "modules"), [(["view"], {"shared", "verbs", "view"}), (["--help"], {"verbs"})])
 def test_only_what_is_asked_for_is_loaded(asked, modules):
     """To load everything takes seconds."""
-    code = f"import sys; from cuspid import cli; cli.commands({asked}); print(*sys.modules)"
+    code = f"import sys; from cuspid import cli; cli.load({asked}); print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert {name.split(".")[2] for name in loaded if name.startswith("cuspid.cli.")} == modules
+    assert ("numpy" in loaded) == ("view" in asked)
 
 
 def test_an_evaluation_keeps_nothing_of_another_one(tmp_path, monkeypatch):

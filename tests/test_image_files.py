@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -136,3 +138,10 @@ def test_deep_colours_are_turned_as_others_are(tmp_path: Path, orientation: int)
     deep.write_bytes(data[:33] + chunk + data[33:])
     assert np.array_equal(read_image(deep), read_image(shallow))
     assert read_deep(deep).dtype == np.uint16
+
+
+def test_to_import_cuspid_leaves_the_filters_of_warnings_alone() -> None:
+    code = "import warnings, numpy, PIL.Image, cv2, scipy.spatial, trimesh; before = list(warnings.filters);"
+    code += "import cuspid.image_files, cuspid.capture, cuspid.storage; print(warnings.filters == before)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "True\n"

@@ -36,7 +36,7 @@ def main() -> None:
         with _ended_by_interrupts():
             from cuspid import cli
 
-            cli.commands(sys.argv[1:])
+            cli.load(sys.argv[1:])
     from cuspid import cli
 
     cli.main()

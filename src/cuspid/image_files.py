@@ -24,10 +24,6 @@ from cuspid.errors import InputError
 from cuspid.inputs import read_bytes, require_file
 from cuspid.values import one_line
 
-# What is too large or damaged is refused; short of that nothing need be said.
-warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-warnings.filterwarnings("ignore", module=r"PIL\.")
-
 Pixels = UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"]
 """An RGB image of 8 bits, or one with fractions of digital numbers of 255."""
 

@@ -1,4 +1,7 @@
-"""The command line: each verb loads its inputs, makes one call and saves the results."""
+"""The command line: each verb loads its inputs, makes one call and saves the results.
+
+What takes long to load is loaded where it is needed: the overview of the verbs should come at once.
+"""
 
 from __future__ import annotations
 
@@ -14,93 +17,54 @@ from importlib import import_module
 from inspect import signature
 from keyword import iskeyword
 from pathlib import Path
-from typing import Any, NoReturn, get_type_hints
-
-import tyro
+from typing import TYPE_CHECKING, Any, NoReturn, get_type_hints
 
 from cuspid import __version__
-from cuspid.cli.shared import console
+from cuspid.cli.verbs import VERBS, overview, reject_unknown
 from cuspid.errors import CuspidError
-from cuspid.options import check
-from cuspid.values import one_line
 
-DESCRIPTION = (
-    f"cuspid {__version__}: passive intra-oral 3D scanning: simulate, reconstruct, and prove the accuracy. "
-    "What a verb does and takes: cuspid VERB --help."
-)
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
-class _Verbs(Mapping[str, Callable[..., Any]]):
+class _Commands(Mapping[str, Callable[..., Any]]):
     """The function of each verb. Its module is loaded when it is asked for: to load them all takes seconds."""
-
-    def __init__(self, modules: Mapping[str, str]) -> None:
-        self._modules = modules
 
     def __getitem__(self, verb: str) -> Callable[..., Any]:
         name = verb.replace("-", "_")
-        return getattr(import_module(f"cuspid.cli.{self._modules[verb]}"), f"{name}_" if iskeyword(name) else name)
+        return getattr(import_module(f"cuspid.cli.{VERBS[verb].module}"), f"{name}_" if iskeyword(name) else name)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._modules)
+        return iter(VERBS)
 
     def __len__(self) -> int:
-        return len(self._modules)
+        return len(VERBS)
 
 
-COMMANDS: Mapping[str, Callable[..., Any]] = _Verbs(
-    {
-        "run": "scan",
-        "phantom": "jaws",
-        "measure": "surveys",
-        "shape": "surveys",
-        "prepare": "jaws",
-        "box": "jaws",
-        "mouth": "mouth",
-        "handpiece": "handpieces",
-        "design": "handpieces",
-        "target": "calibration",
-        "photograph": "calibration",
-        "calibrate": "calibration",
-        "convert": "conversion",
-        "import": "footage",
-        "optics": "forecasts",
-        "visibility": "forecasts",
-        "precision": "forecasts",
-        "compare": "comparison",
-        "sweep": "studies",
-        "simulate": "scan",
-        "film": "film",
-        "stitch-eval": "panorama_evaluation",
-        "reconstruct": "scan",
-        "live": "live",
-        "evaluate": "scan",
-        "stitch": "panorama",
-        "rescale": "rescaling",
-        "reproduce": "reproduction",
-        "repeat": "repeat",
-        "report": "report",
-        "view": "view",
-    }
-)
+COMMANDS: Mapping[str, Callable[..., Any]] = _Commands()
 
 
-def commands(arguments: Sequence[str]) -> dict[str, Callable[..., None]]:
-    """The verb that the arguments begin with, none for ``--version``, otherwise all verbs; their modules are loaded."""
-    first = arguments[0] if arguments else ""
-    named = [first] if first in COMMANDS else [] if first == "--version" else COMMANDS
-    return {verb: _checked(verb, COMMANDS[verb]) for verb in named}
+def load(arguments: Sequence[str]) -> None:
+    """Load what the verb that the arguments begin with needs."""
+    if arguments and arguments[0] in COMMANDS:
+        import_module("tyro")
+        COMMANDS[arguments[0]]
 
 
-def _checked(name: str, verb: Callable[..., None]) -> Callable[..., None]:
-    """A verb that checks its own numbers before it begins."""
+def checked(verb: str) -> Callable[..., None]:
+    """The function of a verb, which checks its own numbers before it begins."""
+    from cuspid.options import check
 
-    @wraps(verb)
-    def checked(*given: object, **options: object) -> None:
-        check(name, verb, signature(verb).bind(*given, **options).arguments)
-        verb(*given, **options)
+    command = COMMANDS[verb]
 
-    checked.__annotations__ = get_type_hints(verb, include_extras=True)  # as text they would be looked up here
-    return checked
+    @wraps(command)
+    def first_checked(*given: object, **options: object) -> None:
+        check(verb, command, signature(command).bind(*given, **options).arguments)
+        command(*given, **options)
+
+    # As text they would be looked up here.
+    first_checked.__annotations__ = get_type_hints(command, include_extras=True)
+    return first_checked
 
 
 class _Notes(logging.Handler):
@@ -108,7 +72,13 @@ class _Notes(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print it."""
-        console.print(f"note: {record.getMessage()}", soft_wrap=True, highlight=False)
+        _console().print(f"note: {record.getMessage()}", soft_wrap=True, highlight=False)
+
+
+def _console() -> Console:
+    from cuspid.cli.shared import console
+
+    return console
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -123,14 +93,14 @@ def main(arguments: list[str] | None = None) -> None:
     except CuspidError as error:
         _fail(str(error))
     except KeyboardInterrupt:
-        console.print("cuspid: interrupted; run the same command again to continue")
+        _console().print("cuspid: interrupted; run the same command again to continue")
         sys.exit(130)
     except BrokenPipeError:  # what reads us, as ``head`` does, has had enough
         _print_no_more()
         sys.exit(1)
     except (MemoryError, ImportError, RuntimeError, OSError) as error:
         if _lacks_memory(error):
-            size = one_line(error) or "for this size"
+            size = str(error) or "for this size"
             _fail(f"there is not enough memory ({size}); give less, smaller or coarser input")
         if not isinstance(error, OSError):
             raise
@@ -149,7 +119,10 @@ _NO_MEMORY = ("failed to map segment", "annot allocate memory", "can't start new
 
 
 def _fail(message: str) -> NoReturn:
-    console.print(f"cuspid: {CuspidError(message)}", style="red", soft_wrap=True, highlight=False)
+    try:
+        _console().print(f"cuspid: {CuspidError(message)}", style="red", soft_wrap=True, highlight=False)
+    except (ImportError, MemoryError):  # there may be no memory for what prints, either
+        print(f"cuspid: {CuspidError(message)}", file=sys.stderr)
     sys.exit(1)
 
 
@@ -184,14 +157,18 @@ codecs.register_error(_IN_OTHER_LETTERS, _in_other_letters)
 
 
 def _run(arguments: Sequence[str]) -> None:
-    verbs = commands(arguments)
+    verb, *given = arguments or ["--help"]
     try:
-        if not verbs:
+        if verb in ("--help", "-h"):
+            print(overview())
+        elif verb == "--version":
             print(f"cuspid {__version__}")
-        elif len(verbs) == 1:
-            ((name, verb),) = verbs.items()
-            tyro.cli(verb, prog=f"cuspid {name}", args=arguments[1:])
+        elif verb not in COMMANDS:
+            print(f"cuspid: {CuspidError(reject_unknown(verb))}", file=sys.stderr)
+            sys.exit(2)
         else:
-            tyro.extras.subcommand_cli_from_dict(verbs, prog="cuspid", description=DESCRIPTION, args=arguments)
+            import tyro
+
+            tyro.cli(checked(verb), prog=f"cuspid {verb}", args=given)
     finally:
         sys.stdout.flush()
