@@ -137,7 +137,8 @@ def views_of(
 
 def options(board: Board) -> list[object]:
     given = ["--kind", board.kind, "--columns", board.columns, "--rows", board.rows, "--square-mm", board.square_mm]
-    return given + ["--inverted"] * board.inverted
+    shares = ["--first-id", board.first_id, "--circle-share", board.circle_share]
+    return given + shares + ["--inverted"] * board.inverted
 
 
 def photographs(folder: Path, truth: BoardScene, board: Board) -> None:

@@ -21,9 +21,10 @@ from cuspid.calibration.bundle import (
     mounted_cameras,
     of_instants,
 )
+from cuspid.calibration.circle_centres import centre_shifts
 from cuspid.calibration.corners import Views
 from cuspid.calibration.lenses import LensChoice, LensName, choose_lens
-from cuspid.calibration.start import LEAST_VIEWS, groups, joined, require_one_group
+from cuspid.calibration.start import LEAST_VIEWS, board_pose, groups, joined, require_one_group
 from cuspid.calibration.timing import adjust_scene, numbered, untied
 from cuspid.camera import Camera
 from cuspid.errors import InputError, ReconstructionError
@@ -127,6 +128,29 @@ def calibrate_rig(
     Raises ReconstructionError for cameras with too few views, whose views fit no camera, that never saw the board
     together, or that do not agree on how it was held.
     """
+    found = _calibrated(views, sizes, board, options)
+    return _calibrated(_centred(views, found, board), sizes, board, options) if board.has_circles else found
+
+
+def _centred(views: Views, found: RigCalibration, board: Board) -> Views:
+    """Views of circles, with the places of their centres instead of the middles of what is seen of them."""
+    centred = {}
+    for (name, instant), view in views.items():
+        camera = found.rig[name].camera
+        try:
+            cam_from_board = board_pose(view, board, camera)
+        except InputError:  # it is left out in any case
+            continue
+        centred[name, instant] = view.moved(-centre_shifts(camera, cam_from_board, board, view.corner))
+    return centred
+
+
+def _calibrated(
+    views: Views,
+    sizes: Mapping[str, tuple[int, int]],
+    board: Board,
+    options: CalibrationOptions,
+) -> RigCalibration:
     few = [name for name in sizes if sum(camera == name for camera, _ in views) < LEAST_VIEWS]
     if few:
         raise ReconstructionError(

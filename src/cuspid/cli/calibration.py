@@ -48,7 +48,7 @@ from cuspid.workers import map_in_threads
 
 
 def target(*, out: Path, board: Annotated[Board, Flat] = Board()) -> None:
-    """Draw a ChArUco board or a chessboard at true size for printing, or make the body that the print is mounted on.
+    """Draw a board at true size for printing, or make the body that the print is mounted on.
 
     Args:
         out: PDF, SVG or PNG file for the pattern (with terraces, a strip to be folded over them), or STL file for the
@@ -62,7 +62,7 @@ def target(*, out: Path, board: Annotated[Board, Flat] = Board()) -> None:
         return
     save_board(out, board)
     size = f"{width + board.height_mm:g} x {height:g} mm"
-    console.print(f"{out}: {size}; measure the ruler on the print, and give its length over squares")
+    console.print(f"{out}: {size}; measure the ruler on the print, and give the length of one of its parts")
 
 
 def photograph(

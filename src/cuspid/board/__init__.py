@@ -1,0 +1,5 @@
+"""Boards that cameras are calibrated from: what is printed on them, and where."""
+
+from cuspid.board.boards import Board, BoardKind, BoardPattern, Dictionary
+
+__all__ = ["Board", "BoardKind", "BoardPattern", "Dictionary"]

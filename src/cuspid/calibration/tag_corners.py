@@ -1,0 +1,155 @@
+"""Where the corners of the tags of an AprilGrid lie in an image."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+from scipy.spatial import cKDTree
+
+from cuspid.board import Board
+from cuspid.board.tags import TagGrid, tag_dictionary
+
+_WINDOWS_PX = (3, 43, 4)
+"""Sides of the windows in which brightness is compared: the smallest, the largest, and the step between them."""
+_LEAST_APART = 0.02
+"""Distance of two outlines that are not the same, as a share of their length: the dark squares touch the tags."""
+_WINDOW_SHARE, _WINDOW_PX = 0.15, (2, 10)
+"""Half the side of the window in which a corner is refined: as a share of the shortest side of its tag, less than its
+border is wide; and its limits."""
+_REACH = 0.1
+"""How far a corner may move when it is refined, as a share of the side of its tag, or else two windows."""
+_AROUND, _FAR = 16, 2.0
+"""Corners around a tag from which it is foretold where it is, and how far away they may be, in distances of tags."""
+_CELL_PX, _WRONG = 6, 3
+"""Side of a bit of a tag that is looked at, and bits of it that may be wrong."""
+_LEAST_CONTRAST_DN = 10.0
+_NEIGHBOURS, _OFF_USUAL, _OFF_PX = 15, 4.0, 0.2
+"""Corners around one that tell where it is; a corner that is farther from there than some times the usual, and some
+pixels, is left out."""
+_BORDER_PX = 2.0
+"""A corner nearer to the border of the image is not used."""
+
+Outline = Float[np.ndarray, "4 2"]
+
+
+def find_tag_corners(
+    image: UInt8[np.ndarray, "h w"], board: Board
+) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 2"]] | None:
+    """Numbers of the corners of the tags of a board that an image shows, and where they lie to a fraction of a pixel
+    (OpenCV's coordinates); None without any. Tags of other ids, and those that are seen twice, are left out.
+
+    The detector is OpenCV's (S. Garrido-Jurado et al., Pattern Recognition 47, 2014, for the tags of E. Olson, ICRA
+    2011). What it misses, as the outline of a tag touches the dark squares, is looked for where tags next to it foretell
+    it.
+    """
+    grid = board.tags
+    outlines = _detected(image, grid)
+    if not outlines:
+        return None
+    found = {tag: each for tag, outline in outlines.items() if (each := _refined(image, outline)) is not None}
+    new = found
+    while new:
+        new = dict(_foretold(image, board, found, new))
+        found |= new
+    if not found:
+        return None
+    corner = grid.corners_of(np.array(list(found))).ravel()
+    pixels = np.concatenate(list(found.values()))
+    near = _fits_neighbours(grid.corners[corner], pixels)
+    size = np.array(image.shape[::-1]) - 1
+    kept = near & ((pixels > _BORDER_PX) & (pixels < size - _BORDER_PX)).all(axis=1)
+    return corner[kept], pixels[kept]
+
+
+def _detected(image: UInt8[np.ndarray, "h w"], grid: TagGrid) -> dict[int, Outline]:
+    """The tags of a grid that are seen once, by id."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.markerBorderBits = grid.border_bits
+    parameters.minMarkerDistanceRate = _LEAST_APART
+    parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax, parameters.adaptiveThreshWinSizeStep = (
+        _WINDOWS_PX
+    )
+    found, ids, _ = cv2.aruco.ArucoDetector(tag_dictionary(), parameters).detectMarkers(image)
+    if ids is None:
+        return {}
+    numbers, times = np.unique(ids, return_counts=True)
+    own = set(numbers[times == 1].tolist()) & set(grid.ids.ravel().tolist())
+    return {
+        tag: outline[0].astype(np.float64)
+        for tag, outline in zip(ids.ravel().tolist(), found, strict=True)
+        if tag in own
+    }
+
+
+def _refined(image: UInt8[np.ndarray, "h w"], outline: Outline) -> Outline | None:
+    """The corners of a tag, each where the edges around it meet; None where one of them goes astray."""
+    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
+    side = float(np.linalg.norm(outline - np.roll(outline, 1, axis=0), axis=1).min())
+    half = int(np.clip(_WINDOW_SHARE * side, *_WINDOW_PX))
+    start = outline.astype(np.float32)[:, None]
+    found = cv2.cornerSubPix(image, start.copy(), (half, half), (-1, -1), stop)[:, 0].astype(np.float64)
+    moved = np.linalg.norm(found - outline, axis=1)
+    return found if (moved < max(2.0 * half, _REACH * side)).all() else None
+
+
+def _foretold(
+    image: UInt8[np.ndarray, "h w"], board: Board, found: dict[int, Outline], new: dict[int, Outline]
+) -> Iterator[tuple[int, Outline]]:
+    """Tags beside some new ones, by what has been found around them, if the image shows their bits there."""
+    grid = board.tags
+    places = grid.corners[grid.corners_of(np.array(list(found))).ravel()]
+    pixels, tree = np.concatenate(list(found.values())), cKDTree(places)
+    beside = {int(each) for tag in new for each in grid.beside(tag)} - set(found)
+    for tag in sorted(beside):
+        own = grid.corners[grid.corners_of(np.array([tag]))[0]]
+        far, near = tree.query(own.mean(axis=0), k=min(_AROUND, len(places)))
+        near = near[far < _FAR * grid.pitch_mm]
+        if len(near) < 4:
+            continue
+        homography, _ = cv2.findHomography(places[near], pixels[near])
+        if homography is None:
+            continue
+        there = cv2.perspectiveTransform(own[None], homography)[0]
+        if not _inside(there, image):
+            continue
+        exact = _refined(image, there)
+        if exact is not None and _inside(exact, image) and _shows(image, exact, board.tag_bits(tag)):
+            yield tag, exact
+
+
+def _inside(outline: Outline, image: UInt8[np.ndarray, "h w"]) -> bool:
+    size = np.array(image.shape[::-1]) - 1
+    return bool(((outline > _BORDER_PX) & (outline < size - _BORDER_PX)).all())
+
+
+def _shows(image: UInt8[np.ndarray, "h w"], outline: Outline, light_bits: Bool[np.ndarray, "b b"]) -> bool:
+    """Whether a tag has its bits where its outline says, but for a few."""
+    count = len(light_bits)
+    side = _CELL_PX * count
+    # Clockwise from the bottom right: as the corners of a tag are numbered.
+    square = np.array([[side, side], [0, side], [0, 0], [side, 0]], dtype=np.float32) - 0.5
+    upright = cv2.getPerspectiveTransform(outline.astype(np.float32), square)
+    seen = cv2.warpPerspective(image, upright, (side, side), flags=cv2.INTER_LINEAR)
+    level = seen.reshape(count, _CELL_PX, count, _CELL_PX)[:, 1:-1, :, 1:-1].mean(axis=(1, 3))
+    dark, light = level[~light_bits].mean(), level[light_bits].mean()
+    wrong = ((level > (dark + light) / 2) != light_bits).sum()
+    return bool(light - dark > _LEAST_CONTRAST_DN and wrong <= _WRONG)
+
+
+def _fits_neighbours(places: Float[np.ndarray, "n 2"], pixels: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
+    """Whether each corner lies where the homography of those next to it on the board has it, to some times what is
+    usual: at the border of an image, or of a shadow, some do not."""
+    if len(places) < _NEIGHBOURS + 1:
+        return np.ones(len(places), dtype=bool)
+    off = np.empty(len(places))
+    for k, near in enumerate(cKDTree(places).query(places, k=_NEIGHBOURS + 1)[1][:, 1:]):
+        homography, _ = cv2.findHomography(places[near], pixels[near], cv2.LMEDS)
+        if homography is None:
+            off[k] = np.inf
+            continue
+        there = cv2.perspectiveTransform(places[k].reshape(1, 1, 2), homography)
+        off[k] = np.linalg.norm(there - pixels[k])
+    return np.asarray(off <= _OFF_USUAL * np.median(off) + _OFF_PX)
