@@ -115,6 +115,25 @@ class Board(BoardPattern):
         return self.columns * self.rows // 2 if self.kind == "charuco" else 0
 
     @property
+    def ids(self) -> range:
+        """Ids of its markers."""
+        return range(self.first_id, self.first_id + self.markers)
+
+    @property
+    def ids_told(self) -> str:
+        """The first and the last of them, in words."""
+        return f"{self.ids[0]}-{self.ids[-1]}" if self.ids else "none"
+
+    @property
+    def boards(self) -> tuple[Board, ...]:
+        """Itself: one board, as :class:`cuspid.board.BoardSet` has several."""
+        return (self,)
+
+    def board_of(self, corner: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+        """The board that each corner is on: this one."""
+        return np.zeros_like(corner)
+
+    @property
     def family(self) -> str:
         """The largest dictionary of its markers' kind, which begins with those of the smaller ones."""
         return FAMILY if self.kind == "aprilgrid" else f"{self.dictionary.split('_')[0]}_1000"

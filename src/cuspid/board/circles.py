@@ -1,7 +1,7 @@
 """Grids of circles: square ones, and those whose rows are shifted by half a step, as OpenCV has them.
 
-Frame: as in :mod:`cuspid.board.boards`; around the outer circles there is as much paper as from the middle of one to the
-next.
+Frame: as in :mod:`cuspid.board.boards`; around the outer circles there is as much paper as from the middle of one to
+the next.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from scipy.spatial import cKDTree
 
-from cuspid.board import Board
+from cuspid.board import Board, BoardKind
 from cuspid.calibration.lattice import Cell, openings
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
@@ -75,6 +75,26 @@ def find_circles(
     )
     known = np.isfinite(exact).all(axis=1)
     return numbers[known], exact[known]
+
+
+def seen_grid(image: UInt8[np.ndarray, "h w"]) -> tuple[BoardKind, int, int] | None:
+    """The kind of grid of circles that an image shows, its columns and its rows, the greater number first where it has
+    both; None where it shows none."""
+    cells = _largest_lattice(_find_blobs(image))
+    best: tuple[float, BoardKind, int, int] = (0.0, "circles", 0, 0)
+    for turn in _TURNS:
+        place = np.array(list(cells)).reshape(-1, 2) @ turn.T
+        if not len(place):
+            return None
+        columns, rows = (np.ptp(place, axis=0) + 1).tolist()
+        best = max(best, (len(place) / (columns * rows), "circles", max(columns, rows), min(columns, rows)))
+        x, y = place[:, 0] - place[:, 1], place[:, 0] + place[:, 1]
+        x, y = x - x.min(), y - y.min()
+        columns, rows = int(np.ptp(x[y % 2 == 0]) // 2 + 1), int(y.max() + 1)
+        if np.ptp(x) + 1 == 2 * columns and ((x + y) % 2 == 0).all():
+            best = max(best, (len(place) / (columns * rows), "asymmetric-circles", columns, rows))
+    share, kind, columns, rows = best
+    return (kind, columns, rows) if share > 1 - _STRAY and min(columns, rows) > 2 else None
 
 
 # --- which circle is which ---------------------------------------------------------------------------------------
@@ -206,7 +226,7 @@ def _numbered(cells: dict[Cell, int], board: Board) -> tuple[Int[np.ndarray, "n"
 
 
 def _cells_of(board: Board) -> list[Cell]:
-    """Of the circles of a board, in order, along its rows and columns, or along the diagonals where rows are shifted."""
+    """Of the circles of a board, in order, along its rows and columns, or the diagonals where rows are shifted."""
     places = np.rint(board.corners[:, :2] / board.square_mm).astype(np.int64)
     if board.kind == "asymmetric-circles":
         x, y = places.T

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
-from cuspid.board import Board, BoardKind
+from cuspid.board import Board, BoardKind, BoardSet, Target
 from cuspid.calibration.circle_centres import find_circles
 from cuspid.calibration.lattice import find_lattice, is_as_large, is_larger
 from cuspid.calibration.tag_corners import find_tag_corners
@@ -45,8 +45,9 @@ Views = Mapping[tuple[str, str], BoardView]
 """Views of the board, by camera and instant."""
 
 
-def find_corners(gray: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | None:
-    """The corners of the board in an image, to a fraction of a pixel; None if too few are found.
+def find_corners(gray: UInt8[np.ndarray, "h w"], target: Target) -> BoardView | None:
+    """The corners of the board, or of all boards of a set, in an image, to a fraction of a pixel; None if too few are
+    found.
 
     A plain chessboard must be seen from border to border (A. Duda, U. Frese, BMVC 2018; where it is bent by a strong
     lens or partly hidden by glare, :mod:`cuspid.calibration.lattice`); of a ChArUco board any part may be seen
@@ -54,13 +55,36 @@ def find_corners(gray: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | No
     it predict it, so that steps elsewhere do not matter. Tags are those of :mod:`cuspid.calibration.tag_corners`,
     circles those of :mod:`cuspid.calibration.circle_centres`.
     """
+    if isinstance(target, BoardSet):
+        found = [find_corners(gray, each) for each in target.boards]
+        shown = [(view, start) for view, start in zip(found, target.starts, strict=False) if view is not None]
+        return _united([BoardView(view.corner + start, view.pixels) for view, start in shown])
+    return _found_alone(gray, target)
+
+
+def _united(views: list[BoardView]) -> BoardView | None:
+    """The corners of several boards in one image."""
+    if not views:
+        return None
+    return BoardView(np.concatenate([view.corner for view in views]), np.concatenate([view.pixels for view in views]))
+
+
+def split_by_board(view: BoardView, target: Target) -> list[BoardView]:
+    """The parts of a view that show a board each."""
+    number = target.board_of(view.corner)
+    return [BoardView(view.corner[number == k], view.pixels[number == k]) for k in np.unique(number)]
+
+
+def _found_alone(gray: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | None:
     image = 255 - gray if board.inverted else gray
     found = _FINDERS[board.kind](image, board)
     return found if found is not None and _tells(found, board) else None
 
 
-def pieces(view: BoardView, board: Board) -> list[BoardView]:
-    """The flat parts of a view, terrace by terrace, of which each tells something by itself."""
+def pieces(view: BoardView, board: Target) -> list[BoardView]:
+    """The flat parts of a view, terrace by terrace or board by board, of which each tells something by itself."""
+    if isinstance(board, BoardSet):
+        return split_by_board(view, board)
     terrace = board.terrace_at(board.corners[view.corner, 0])
     parts = [BoardView(view.corner[terrace == k], view.pixels[terrace == k]) for k in range(board.terraces)]
     return [part for part in parts if _tells(part, board)]

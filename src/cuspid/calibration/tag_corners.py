@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import cv2
 import numpy as np
@@ -25,6 +25,8 @@ _AROUND, _FAR = 16, 2.0
 """Corners around a tag from which it is foretold where it is, and how far away they may be, in distances of tags."""
 _CELL_PX, _WRONG = 6, 3
 """Side of a bit of a tag that is looked at, and bits of it that may be wrong."""
+_NEAR, _SO_MANY = 0.4, 0.6
+"""Distance of a tag from where it would be, in sides of one; and the share of the tags that must be there."""
 _LEAST_CONTRAST_DN = 10.0
 _NEIGHBOURS, _OFF_USUAL, _OFF_PX = 15, 4.0, 0.2
 """Corners around one that tell where it is; a corner that is farther from there than some times the usual, and some
@@ -42,12 +44,12 @@ def find_tag_corners(
     (OpenCV's coordinates); None without any. Tags of other ids, and those that are seen twice, are left out.
 
     The detector is OpenCV's (S. Garrido-Jurado et al., Pattern Recognition 47, 2014, for the tags of E. Olson, ICRA
-    2011). What it misses, as the outline of a tag touches the dark squares, is looked for where tags next to it foretell
-    it.
+    2011). What it misses, as the outline of a tag touches the dark squares, is looked for where tags next to it
+    foretell it.
     """
     grid = board.tags
-    outlines = _detected(image, grid)
-    if not outlines:
+    outlines = {tag: each for tag, each in detect_tags(image, grid.border_bits).items() if tag in set(grid.ids.flat)}
+    if not outlines or not _lie_so(outlines, grid):
         return None
     found = {tag: each for tag, outline in outlines.items() if (each := _refined(image, outline)) is not None}
     new = found
@@ -64,10 +66,10 @@ def find_tag_corners(
     return corner[kept], pixels[kept]
 
 
-def _detected(image: UInt8[np.ndarray, "h w"], grid: TagGrid) -> dict[int, Outline]:
-    """The tags of a grid that are seen once, by id."""
+def detect_tags(image: UInt8[np.ndarray, "h w"], border_bits: int) -> dict[int, Outline]:
+    """The outlines of all tags of the family that are seen once, by id: clockwise from the bottom right corner."""
     parameters = cv2.aruco.DetectorParameters()
-    parameters.markerBorderBits = grid.border_bits
+    parameters.markerBorderBits = border_bits
     parameters.minMarkerDistanceRate = _LEAST_APART
     parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax, parameters.adaptiveThreshWinSizeStep = (
         _WINDOWS_PX
@@ -76,12 +78,32 @@ def _detected(image: UInt8[np.ndarray, "h w"], grid: TagGrid) -> dict[int, Outli
     if ids is None:
         return {}
     numbers, times = np.unique(ids, return_counts=True)
-    own = set(numbers[times == 1].tolist()) & set(grid.ids.ravel().tolist())
+    once = set(numbers[times == 1].tolist())
     return {
         tag: outline[0].astype(np.float64)
         for tag, outline in zip(ids.ravel().tolist(), found, strict=True)
-        if tag in own
+        if tag in once
     }
+
+
+def _lie_so(outlines: Mapping[int, Outline], grid: TagGrid) -> bool:
+    """Whether most tags that are above others on a grid are so in an image: they are not where it has other columns."""
+    above = [(tag, tag + grid.columns) for tag in outlines if tag + grid.columns in outlines]
+    agree = sum(tag_above(outlines, tag, grid.pitch_mm / grid.tag_mm) == other for tag, other in above)
+    return agree >= _SO_MANY * len(above)
+
+
+def tag_above(outlines: Mapping[int, Outline], tag: int, pitch: float) -> int | None:
+    """The tag whose middle is seen where, by its outline, the next one above a tag is; None where none is. ``pitch``:
+    distance of tags, in sides of one."""
+    square = np.array([[1, 1], [0, 1], [0, 0], [1, 0]], dtype=np.float32)
+    in_tag = cv2.getPerspectiveTransform(outlines[tag].astype(np.float32), square)
+    others = [each for each in outlines if each != tag]
+    if not others:
+        return None
+    middles = np.stack([outlines[each].mean(axis=0) for each in others])
+    away = np.linalg.norm(cv2.perspectiveTransform(middles[None], in_tag)[0] - [0.5, 0.5 - pitch], axis=1)
+    return others[int(np.argmin(away))] if away.min() < _NEAR else None
 
 
 def _refined(image: UInt8[np.ndarray, "h w"], outline: Outline) -> Outline | None:

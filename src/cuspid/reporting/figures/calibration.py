@@ -130,7 +130,7 @@ def _named(board: Board) -> str:
     if board.has_circles:
         told += f", circles of {board.circle_mm:g} mm"
     if board.has_markers:
-        told += f", ids {board.first_id}-{board.first_id + board.markers - 1}"
+        told += f", ids {board.ids_told}"
     return told + (f"\n{board.terraces} terraces, steps of {board.step_mm:g} mm" if board.terraces > 1 else "")
 
 
