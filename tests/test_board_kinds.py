@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from boards import SIZE, looking_at, options, scene, undistorted
+from boards import SIZE, options, photograph, pose_before, scene, undistorted
 from cuspid import storage
 from cuspid.board import Board
 from cuspid.board.circles import turned_orders
@@ -21,8 +21,6 @@ from cuspid.calibration.corners import BoardView, find_corners
 from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.simulation.board_images import board_light
-from cuspid.simulation.raycast import pixel_rays
 from verbs import run
 
 TAGS = Board(kind="aprilgrid", columns=4, rows=3, square_mm=3.0, first_id=20)
@@ -38,21 +36,6 @@ WIDE = Camera(
     distortion=np.array([-0.03, 0.01, -0.004, 5e-4]),
     model="OPENCV_FISHEYE",
 )
-
-
-def pose_before(board: Board, away_mm: float, tilt_deg: float, *, roll_deg: float = 20.0) -> Rigid3:
-    """``cam_from_board`` of a board whose middle lies on the axis of a camera."""
-    tilt = np.deg2rad(tilt_deg)
-    centre = away_mm * np.array([np.sin(tilt), 0.3 * np.sin(tilt), -np.cos(tilt)])
-    middle = np.array([*board.size_mm, 0.0]) / 2
-    return looking_at(middle, middle + centre, roll_deg)
-
-
-def photograph(board: Board, camera: Camera, cam_from_board: Rigid3, times: int = 4, seed: int = 0) -> np.ndarray:
-    """Blurred a little, with noise."""
-    light = board_light(board, camera, pixel_rays(camera, times), cam_from_board)[..., 0]
-    blurred = cv2.GaussianBlur(20.0 + 250.0 * light, (0, 0), 0.6)
-    return np.clip(blurred + np.random.default_rng(seed).normal(0, 2, blurred.shape), 0, 255).astype(np.uint8)
 
 
 def errors_px(view: BoardView, board: Board, camera: Camera, cam_from_board: Rigid3) -> np.ndarray:

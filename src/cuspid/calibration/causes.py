@@ -14,7 +14,7 @@ from cuspid.board import Board, BoardSet, Target
 from cuspid.calibration.circle_centres import seen_grid
 from cuspid.calibration.corners import find_corners
 from cuspid.calibration.lattice import find_lattice
-from cuspid.calibration.tag_corners import detect_tags, tag_above
+from cuspid.calibration.tag_corners import ABOVE, detect_tags, layout_agreement, tag_beside
 from cuspid.errors import InputError
 
 MOST_TRIED = 6
@@ -63,11 +63,7 @@ def _others(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, 
     if board.kind != "circles":
         yield "the images are mirrored: turn them over (or the print is: print it anew)", board, True
     if board.has_markers:
-        ids = _ids_seen(images, board)
-        with_id = _possible(board, first_id=ids[0]) if ids and ids[-1] - ids[0] < board.markers else None
-        if with_id is not None and ids[0] != board.first_id:
-            found = f"{ids[0]}-{ids[-1]} found, this board has {board.ids_told}"
-            yield f"the ids of its markers begin at {ids[0]}: give --first-id {ids[0]} ({found})", with_id, False
+        yield from _other_first_ids(board, images)
     if board.kind == "aprilgrid":
         yield from _other_tags(board, images)
     light = "--no-inverted" if board.inverted else "--inverted"
@@ -88,6 +84,7 @@ def _others(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, 
         yield "it has no markers: give --kind chessboard", replace(board, kind="chessboard", terraces=1), False
     else:
         yield "it has markers: give --kind charuco", replace(board, kind="charuco"), False
+    yield from _other_grids(board, images)
 
 
 def _seen_sizes(board: Board, images: Sequence[Gray]) -> Iterator[tuple[int, int, str]]:
@@ -121,6 +118,23 @@ def _possible(board: Board, **changes: object) -> Board | None:
         return replace(board, **changes)  # type: ignore[arg-type]
     except InputError:
         return None
+
+
+def _other_first_ids(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, bool]]:
+    """The first id with which the board has all that are seen. Those at its beginning may be hidden: of tags it is the
+    one with which they lie best beside each other, of other markers the least that is seen."""
+    ids = _ids_seen(images, board)
+    if not ids:
+        return
+    others = [_possible(board, first_id=first) for first in range(ids[0], max(ids[-1] - board.markers, -1), -1)]
+    able = [each for each in others if each is not None]
+    if board.kind == "aprilgrid":
+        seen = [detect_tags(_as_printed(image, board), board.border_bits) for image in images]
+        able.sort(key=lambda each: -sum(layout_agreement(outlines, each.tags) for outlines in seen))
+    if able and able[0] != board:
+        first = able[0].first_id
+        found = f"{ids[0]}-{ids[-1]} found, this board has {board.ids_told}"
+        yield f"the ids of its markers begin at {first}: give --first-id {first} ({found})", able[0], False
 
 
 def _ids_seen(images: Sequence[Gray], board: Board) -> list[int]:
@@ -184,7 +198,7 @@ def _other_tags(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Boa
     ids = set[int]()
     for image in images:
         outlines = detect_tags(_as_printed(image, board), board.border_bits)
-        above = {tag: tag_above(outlines, tag, pitch) for tag in outlines}
+        above = {tag: tag_beside(outlines, tag, ABOVE, pitch) for tag in outlines}
         steps += [other - tag for tag, other in above.items() if other is not None]
         ids |= set(outlines)
     if not steps or not ids:
@@ -202,8 +216,6 @@ def _other_grids(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Bo
     grids = Counter(each for each in map(seen_grid, shown) if each is not None)
     squares = Counter(each.size for each in map(find_lattice, images) if each is not None)
     for (kind, columns, rows), count in grids.most_common(1):
-        if kind == "circles" and board.columns < board.rows:
-            columns, rows = rows, columns
         other = _possible(board, kind=kind, columns=columns, rows=rows)
         if other is not None and other != board and count > len(images) / 2:
             yield (

@@ -27,8 +27,9 @@ _CONTRAST_DN = 4.0
 """What is dark is darker by this than the mean around it."""
 _LEAST_PX2, _LARGEST = 16.0, 0.05
 """Area of a blob: at least, and at most as a share of the image."""
-_ROUND = 0.12
-"""Difference of the area of a blob from that of the ellipse with the same moments, as a share, at most."""
+_ROUND, _COARSE = 0.025, 1.5
+"""Difference of the area of a blob from that of the ellipse with the same moments, as a share, at most (a square has
+0.045), and how much that grows with one over its area in px."""
 _LEAST_AXIS = 0.2
 """Lesser axis of a blob, as a share of the greater, at least."""
 _MOST, _FEWEST = 2000, 9
@@ -250,11 +251,16 @@ def _find_blobs(image: UInt8[np.ndarray, "h w"]) -> _Blobs:
         dark = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, side, _CONTRAST_DN)
         contours, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         found = [each for each in map(_ellipse, contours) if each is not None]
-        found = [each for each in found if each[2] < _LARGEST * image.size][:_MOST]
+        found = [each for each in found if each[2] < _LARGEST * image.size and _is_at(dark, each[0])][:_MOST]
         for middle, moments, area in sorted(found, key=lambda each: -each[2]):
             if not len(pixels) or np.linalg.norm(pixels - middle, axis=1).min() > np.sqrt(area / np.pi) / 2:
                 pixels, spread = np.vstack([pixels, middle]), np.concatenate([spread, moments[None]])
     return _Blobs(pixels, spread)
+
+
+def _is_at(mask: UInt8[np.ndarray, "h w"], place: Float[np.ndarray, "2"]) -> bool:
+    column, row = np.rint(place).astype(int)
+    return bool(mask[row, column])
 
 
 def _ellipse(
@@ -269,7 +275,7 @@ def _ellipse(
         return None
     spread = np.array([[moments["mu20"], moments["mu11"]], [moments["mu11"], moments["mu02"]]]) / area
     least, most = np.linalg.eigvalsh(spread)
-    if least < _LEAST_AXIS**2 * most or abs(area / (4 * np.pi * np.sqrt(least * most)) - 1) > _ROUND:
+    if least < _LEAST_AXIS**2 * most or abs(area / (4 * np.pi * np.sqrt(least * most)) - 1) > _ROUND + _COARSE / area:
         return None
     return np.array([moments["m10"], moments["m01"]]) / area, spread, float(area)
 

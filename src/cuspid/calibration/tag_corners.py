@@ -25,7 +25,9 @@ _AROUND, _FAR = 16, 2.0
 """Corners around a tag from which it is foretold where it is, and how far away they may be, in distances of tags."""
 _CELL_PX, _WRONG = 6, 3
 """Side of a bit of a tag that is looked at, and bits of it that may be wrong."""
-_NEAR, _SO_MANY = 0.4, 0.6
+RIGHT, ABOVE = (1, 0), (0, -1)
+"""Directions on the board."""
+_NEAR, _SO_MANY = 0.4, 0.9
 """Distance of a tag from where it would be, in sides of one; and the share of the tags that must be there."""
 _LEAST_CONTRAST_DN = 10.0
 _NEIGHBOURS, _OFF_USUAL, _OFF_PX = 15, 4.0, 0.2
@@ -49,7 +51,7 @@ def find_tag_corners(
     """
     grid = board.tags
     outlines = {tag: each for tag, each in detect_tags(image, grid.border_bits).items() if tag in set(grid.ids.flat)}
-    if not outlines or not _lie_so(outlines, grid):
+    if not outlines or layout_agreement(outlines, grid) < _SO_MANY:
         return None
     found = {tag: each for tag, outline in outlines.items() if (each := _refined(image, outline)) is not None}
     new = found
@@ -86,23 +88,29 @@ def detect_tags(image: UInt8[np.ndarray, "h w"], border_bits: int) -> dict[int, 
     }
 
 
-def _lie_so(outlines: Mapping[int, Outline], grid: TagGrid) -> bool:
-    """Whether most tags that are above others on a grid are so in an image: they are not where it has other columns."""
-    above = [(tag, tag + grid.columns) for tag in outlines if tag + grid.columns in outlines]
-    agree = sum(tag_above(outlines, tag, grid.pitch_mm / grid.tag_mm) == other for tag, other in above)
-    return agree >= _SO_MANY * len(above)
+def layout_agreement(outlines: Mapping[int, Outline], grid: TagGrid) -> float:
+    """Share of the tags beside and above others in an image that are so on the grid, which fewer are where it has other
+    columns or begins with another id; 1 where none are."""
+    pitch, agree = grid.pitch_mm / grid.tag_mm, list[bool]()
+    for tag in outlines:
+        right, above = (tag_beside(outlines, tag, step, pitch) for step in (RIGHT, ABOVE))
+        if right is not None:
+            agree.append(right == tag + 1 and (right - grid.first_id) % grid.columns != 0)
+        if above is not None:
+            agree.append(above == tag + grid.columns)
+    return sum(agree) / len(agree) if agree else 1.0
 
 
-def tag_above(outlines: Mapping[int, Outline], tag: int, pitch: float) -> int | None:
-    """The tag whose middle is seen where, by its outline, the next one above a tag is; None where none is. ``pitch``:
-    distance of tags, in sides of one."""
+def tag_beside(outlines: Mapping[int, Outline], tag: int, step: tuple[int, int], pitch: float) -> int | None:
+    """The tag whose middle is seen where, by its outline, the next one after a tag is, in a direction on the board
+    (across, down); None where none is. ``pitch``: distance of tags, in sides of one."""
     square = np.array([[1, 1], [0, 1], [0, 0], [1, 0]], dtype=np.float32)
     in_tag = cv2.getPerspectiveTransform(outlines[tag].astype(np.float32), square)
     others = [each for each in outlines if each != tag]
     if not others:
         return None
     middles = np.stack([outlines[each].mean(axis=0) for each in others])
-    away = np.linalg.norm(cv2.perspectiveTransform(middles[None], in_tag)[0] - [0.5, 0.5 - pitch], axis=1)
+    away = np.linalg.norm(cv2.perspectiveTransform(middles[None], in_tag)[0] - 0.5 - pitch * np.array(step), axis=1)
     return others[int(np.argmin(away))] if away.min() < _NEAR else None
 
 
