@@ -16,7 +16,7 @@ from cuspid.board import Board
 from cuspid.board.circles import turned_orders
 from cuspid.calibration.bundle import BoardScene
 from cuspid.calibration.calibrate import CalibrationOptions, _calibrated, calibrate_rig
-from cuspid.calibration.circle_centres import centre_shifts
+from cuspid.calibration.circle_centres import centre_shifts, measured_share
 from cuspid.calibration.corners import BoardView, find_corners
 from cuspid.camera import Camera
 from cuspid.errors import InputError
@@ -221,6 +221,20 @@ def test_photographs_become_a_handpiece(tmp_path: Path, board: Board) -> None:
     found = storage.read_handpiece(tmp_path / "rig" / "handpiece.json").rig["cam"].camera
     assert np.abs(found.focal_px / camera.focal_px - 1).max() < 0.01
     assert storage.read_json(tmp_path / "rig" / "calibration.json")["sigma_px"] < 0.1
+
+
+@pytest.mark.parametrize("board", [CIRCLES, SHIFTED])
+def test_circles_of_another_size_are_told(tmp_path: Path, board: Board) -> None:
+    camera = undistorted(scene(0).cameras["cam0"]).resized(320, 240)
+    for k, (tilt, roll) in enumerate([(0, 10), (35, 20), (-35, 90)]):
+        image = photograph(board, camera, pose_before(board, 18.0, tilt, roll_deg=roll), 3, seed=k)
+        storage.write_image(tmp_path / "images" / "cam" / f"{k}.png", np.repeat(image[..., None], 3, axis=2))
+        assert measured_share(image, board) == pytest.approx(board.circle_share, rel=0.04)
+    given = [*options(replace(board, circle_share=0.8)), "--lens", "OPENCV", "--no-photometry"]
+    run("calibrate", tmp_path / "images", "--out", tmp_path / "rig", *given)
+    told = " ".join(storage.read_json(tmp_path / "rig" / "calibration.json")["notes"])
+    assert f"the circles are {board.circle_share:.1f}" in told
+    assert "not 0.8: give --circle-share 0." in told
 
 
 # --- files -------------------------------------------------------------------------------------------------------

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from boards import SIZE, scene
+from boards import SIZE, photograph, scene
+from cuspid import storage
 from cuspid.board import Board, BoardSet
 from cuspid.calibration import bundle
 from cuspid.calibration.bundle import BoardScene, adjust_board
 from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, calibrate_rig
 from cuspid.calibration.corners import BoardView, Views
 from cuspid.calibration.joining import hand_eye, second_turn_deg
+from cuspid.camera import Camera
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
+from verbs import refused, run
 
 ONE = Board(columns=6, rows=5, square_mm=2.0)
 TWO = replace(ONE, first_id=40)
@@ -241,3 +245,56 @@ def test_boards_alone_are_placed_with_known_places_of_boards() -> None:
     assert all(np.array_equal(found.scene.body_from_board[k].matrix, MOUNTS[k].matrix) for k in MOUNTS)
     off = [(found.scene.rig_from_board[name] @ pose.inverse()).angle_deg for name, pose in truth.rig_from_board.items()]
     assert max(off) < 0.1
+
+
+# --- from the command line ---------------------------------------------------------------------------------------
+
+ALIKE = ("--columns", ONE.columns, "--rows", ONE.rows, "--square-mm", ONE.square_mm)
+
+
+def test_photographs_of_two_boards_by_cameras_that_look_elsewhere(tmp_path: Path) -> None:
+    """Each camera sees a board of its own, and the two move as one."""
+    rng = np.random.default_rng(0)
+    camera = Camera(width=320, height=240, focal_px=np.full(2, 300.0), principal_point_px=np.array([160.0, 120.0]))
+    other_from_one = Rigid3.from_rotation_vector(np.array([0.1, 2.5, 0.0]), np.array([2.0, 1.0, 3.0]))
+    middle = np.array([*ONE.size_mm, 0.0]) / 2
+    places = [
+        pose @ Rigid3(np.eye(3), np.array([0, 0, 22.0]) - middle)
+        for pose in (Rigid3.identity(), other_from_one.inverse())
+    ]
+    boards = (ONE, replace(ONE, first_id=ONE.markers))
+    for i in range(7):
+        turn = Rotation.from_rotvec(rng.uniform(-0.35, 0.35, 3)).as_matrix()
+        moved = Rigid3(turn, rng.normal(0, 0.3, 3))
+        for name, board, rig_from_board, cam_from_rig in zip(
+            ("left", "right"), boards, places, (Rigid3.identity(), other_from_one), strict=True
+        ):
+            image = photograph(board, camera, cam_from_rig @ moved @ rig_from_board, 2, seed=i)
+            storage.write_image(tmp_path / "images" / name / f"{i}.png", np.repeat(image[..., None], 3, axis=2))
+    run("calibrate", tmp_path / "images", "--out", tmp_path / "rig", *ALIKE, "--copies", 2, "--lens", "OPENCV")
+    figures = storage.read_json(tmp_path / "rig" / "calibration.json")
+    assert [each["ids"] for each in figures["boards"]] == [[0, 14], [15, 29]]
+    assert [each["body_from_board"] is None for each in figures["boards"]] == [True, False]
+    assert any(note.startswith("left and right never saw a board together") for note in figures["notes"])
+    rig = storage.read_handpiece(tmp_path / "rig" / "handpiece.json").rig
+    off = rig["right"].cam_from_rig @ rig["left"].cam_from_rig.inverse() @ other_from_one.inverse()
+    assert 1e-3 < off.angle_deg < 1.5
+    assert 1e-3 < np.linalg.norm(off.translation) < 0.6
+
+
+def test_boards_are_said_once_and_drawn_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, out = tmp_path / "boards.yaml", tmp_path / "board.svg"
+    file.write_text(
+        "boards:\n- {columns: 5, rows: 4, square_mm: 3}\n- {kind: aprilgrid, columns: 2, rows: 2, square_mm: 8}\n"
+    )
+    run("target", "--board", file, "--out", out)
+    assert sorted(path.name for path in tmp_path.glob("*.svg")) == ["board-1.svg", "board-2.svg"]
+    assert "--board describes the board; leave out its other options" in refused(
+        capsys, "target", "--board", file, "--columns", 4, "--out", out
+    )
+    (tmp_path / "images" / "left").mkdir(parents=True)
+    storage.write_image(tmp_path / "images" / "left" / "0.png", np.zeros((32, 32, 3), np.uint8))
+    calibrate = ("calibrate", tmp_path / "images", "--out", tmp_path / "rig")
+    assert "the files describe 2 boards already" in refused(capsys, *calibrate, "--board", file, "--copies", 2)
+    assert "nothing tells from the others" in refused(capsys, *calibrate, "--kind", "chessboard", "--copies", 2)
+    assert "no such file" in refused(capsys, *calibrate, "--board", tmp_path / "none.yaml")

@@ -48,6 +48,10 @@ _FROM_BORDER_PX = 1.5
 _OUTLINE = 72
 """Places on the outline of a circle."""
 _ROUNDS = 3
+_CORE, _LARGE_PX = 0.5, 4.0
+"""Share of a radius within which it is as dark as the ink, in circles of this radius and more."""
+_CROSS = 5
+"""Circles that tell how large the grid is about one of them: itself and its neighbours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +69,30 @@ def find_circles(
 ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 2"]] | None:
     """Numbers of the circles of a board that is seen from border to border, and the centroids of what is seen of them
     (OpenCV's coordinates); None where there is no such board. Some circles may be hidden."""
+    found = _measured(image, board)
+    return None if found is None else found[:2]
+
+
+def measured_share(image: UInt8[np.ndarray, "h w"], board: Board) -> float | None:
+    """Diameter of the circles that an image shows, as a share of the distance to the nearest one, by the area of each
+    and how large the grid is there; None where it does not show the board, or they are small."""
+    found = _measured(image, board)
+    if found is None or np.isnan(found[2]).all():
+        return None
+    numbers, pixels, areas = found
+    places = board.corners[numbers, :2]
+    shares = []
+    for near, area in zip(cKDTree(places).query(places, k=_CROSS)[1], areas, strict=True):
+        design = np.pad(places[near], ((0, 0), (0, 1)), constant_values=1.0)
+        linear = np.linalg.lstsq(design, pixels[near], rcond=None)[0][:2]
+        shares.append(np.sqrt(area / (np.pi / 4 * board.circle_mm**2 * abs(np.linalg.det(linear)))))
+    return float(board.circle_share * np.nanmedian(shares))
+
+
+def _measured(
+    image: UInt8[np.ndarray, "h w"], board: Board
+) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]] | None:
+    """Numbers, centroids and areas (px) of circles."""
     blobs = _find_blobs(image)
     found = _numbered(_largest_lattice(blobs), board)
     if found is None:
@@ -74,8 +102,8 @@ def find_circles(
     exact = np.stack(
         [_centroid(image, blobs.pixels[k], blobs.spread[k], far) for k, far in zip(chosen, gap, strict=True)]
     )
-    known = np.isfinite(exact).all(axis=1)
-    return numbers[known], exact[known]
+    known = np.isfinite(exact[:, :2]).all(axis=1)
+    return numbers[known], exact[known, :2], exact[known, 2]
 
 
 def seen_grid(image: UInt8[np.ndarray, "h w"]) -> tuple[BoardKind, int, int] | None:
@@ -282,11 +310,12 @@ def _ellipse(
 
 def _centroid(
     image: UInt8[np.ndarray, "h w"], middle: Float[np.ndarray, "2"], spread: Float[np.ndarray, "2 2"], gap_px: float
-) -> Float[np.ndarray, "2"]:
-    """NaN where not all of it is seen, or too little paper around it."""
+) -> Float[np.ndarray, "3"]:
+    """Where the centroid of a blob is, and its area; NaN where not all of it is seen, or too little paper around it,
+    and for the area of a small one."""
     reach = 2 * np.sqrt(np.diag(spread)) + _FROM_BORDER_PX
     if (middle < reach).any() or (middle > np.array(image.shape[::-1]) - 1 - reach).any():
-        return np.full(2, np.nan)
+        return np.full(3, np.nan)
     longest = 2 * float(np.sqrt(np.linalg.eigvalsh(spread)[1]))
     ring = max(min(_RING, (gap_px - longest) / longest), 1.0) + 2.0 / longest
     for _ in range(_ROUNDS):
@@ -299,14 +328,15 @@ def _centroid(
         radius = np.sqrt(np.einsum("ni,ij,nj->n", away, np.linalg.inv(spread), away)) / 2
         paper = (radius < ring) & (radius > 1 + 1.5 / longest)
         if paper.sum() < 8:
-            return np.full(2, np.nan)
+            return np.full(3, np.nan)
         ground = np.column_stack([np.ones(len(away)), away])
         plane = np.linalg.lstsq(ground[paper], values[paper], rcond=None)[0]
         inside = radius < ring
         darker = (ground[inside] @ plane) - values[inside]
         shift = darker @ away[inside] / darker.sum()
         middle = middle + shift
-    return np.asarray(middle)
+    contrast = plane[0] - np.median(values[radius < _CORE]) if longest > _LARGE_PX else np.nan
+    return np.array([*middle, darker.sum() / contrast])
 
 
 def centre_shifts(

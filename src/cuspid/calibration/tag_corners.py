@@ -30,9 +30,14 @@ RIGHT, ABOVE = (1, 0), (0, -1)
 _NEAR, _SO_MANY = 0.4, 0.9
 """Distance of a tag from where it would be, in sides of one; and the share of the tags that must be there."""
 _LEAST_CONTRAST_DN = 10.0
-_NEIGHBOURS, _OFF_USUAL, _OFF_PX = 15, 4.0, 0.2
-"""Corners around one that tell where it is; a corner that is farther from there than some times the usual, and some
+_NEIGHBOURS, _LEAST_NEIGHBOURS, _OFF_USUAL, _OFF_PX = 15, 7, 4.0, 0.2
+"""Corners around one that tell where it is, at most and at least; a corner that is farther from there than some times the usual, and some
 pixels, is left out."""
+_RAYS, _RING_SHARE, _RING_PX = 16, 0.12, (2.0, 6.0)
+"""Places around a corner at which brightness is compared to both sides of it, and how far from it: as a share of the side
+of its tag, and limits."""
+_ODD_USUAL, _ODD_SHARE = 2.0, 0.08
+"""Difference of the two sides, as a share of the contrast: in usual ones, and added to that."""
 _BORDER_PX = 2.0
 """A corner nearer to the border of the image is not used."""
 
@@ -62,7 +67,7 @@ def find_tag_corners(
         return None
     corner = grid.corners_of(np.array(list(found))).ravel()
     pixels = np.concatenate(list(found.values()))
-    near = _fits_neighbours(grid.corners[corner], pixels)
+    near = _fits_neighbours(grid.corners[corner], pixels) & _are_saddles(image, np.stack(list(found.values())))
     size = np.array(image.shape[::-1]) - 1
     kept = near & ((pixels > _BORDER_PX) & (pixels < size - _BORDER_PX)).all(axis=1)
     return corner[kept], pixels[kept]
@@ -169,13 +174,30 @@ def _shows(image: UInt8[np.ndarray, "h w"], outline: Outline, light_bits: Bool[n
     return bool(light - dark > _LEAST_CONTRAST_DN and wrong <= _WRONG)
 
 
+def _are_saddles(image: UInt8[np.ndarray, "h w"], outlines: Float[np.ndarray, "m 4 2"]) -> Bool[np.ndarray, "n"]:
+    """Whether the image is about as much the same to both sides of each corner as is usual: where it is not, another
+    edge, or a shadow, has drawn the corner away."""
+    sides = np.linalg.norm(outlines - np.roll(outlines, 1, axis=1), axis=2).min(axis=1)
+    angle = 2 * np.pi * np.arange(_RAYS) / _RAYS
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    reach = np.clip(_RING_SHARE * sides, *_RING_PX)[:, None, None, None] * np.array([0.5, 1.0])[:, None, None]
+    places = (outlines[:, :, None, None] + (reach * ring)[:, None]).reshape(-1, 2 * _RAYS, 2).astype(np.float32)
+    smooth = cv2.GaussianBlur(image, (3, 3), 0).astype(np.float32)
+    level = cv2.remap(smooth, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    level = level.reshape(len(level), 2, _RAYS)
+    apart = np.abs(level - np.roll(level, _RAYS // 2, axis=2)).mean(axis=(1, 2))
+    share = apart / np.maximum(np.ptp(level, axis=(1, 2)), 1.0)
+    return np.asarray(share <= _ODD_USUAL * np.median(share) + _ODD_SHARE)
+
+
 def _fits_neighbours(places: Float[np.ndarray, "n 2"], pixels: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
     """Whether each corner lies where the homography of those next to it on the board has it, to some times what is
     usual: at the border of an image, or of a shadow, some do not."""
-    if len(places) < _NEIGHBOURS + 1:
+    count = min(_NEIGHBOURS, len(places) - 1)
+    if count < _LEAST_NEIGHBOURS:
         return np.ones(len(places), dtype=bool)
     off = np.empty(len(places))
-    for k, near in enumerate(cKDTree(places).query(places, k=_NEIGHBOURS + 1)[1][:, 1:]):
+    for k, near in enumerate(cKDTree(places).query(places, k=count + 1)[1][:, 1:]):
         homography, _ = cv2.findHomography(places[near], pixels[near], cv2.LMEDS)
         if homography is None:
             off[k] = np.inf

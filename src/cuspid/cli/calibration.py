@@ -23,6 +23,7 @@ from cuspid.calibration.calibrate import (
     size_notes,
 )
 from cuspid.calibration.causes import MOST_TRIED, cause_of_absence, is_part_of_a_larger_one
+from cuspid.calibration.circle_centres import measured_share
 from cuspid.calibration.corners import BoardView, Views, find_corners
 from cuspid.calibration.instants import common_instants
 from cuspid.calibration.photometry import Photometry, PhotometryOptions, calibrate_light, look_at_patches
@@ -46,6 +47,8 @@ from cuspid.simulation.board_images import PhotographOptions, take_photographs
 from cuspid.simulation.manufacturing import ManufacturingOptions, built
 from cuspid.workers import map_in_threads
 
+_OTHER_CIRCLES = 0.06
+"""Error of the diameter of circles, as a share, that is told."""
 BoardFiles = Annotated[tuple[Path, ...], arg(name="board")]
 """Boards that are described by files."""
 
@@ -158,6 +161,7 @@ def calibrate(
         _require_views(sequences, views, shown)
         found = calibrate_rig(views, {name: each.size for name, each in sequences.items()}, shown, options)
         drawn_notes = () if given is None else size_notes(found.rig, given.rig, shown)
+        drawn_notes += tuple(_other_circles(sequences, views, shown))
         found = found if given is None else in_frame_of(found, given.rig)
         light = None
         if photometry.photometry and isinstance(shown, Board):
@@ -250,6 +254,21 @@ def _require_views(sequences: Mapping[str, ImageSequence], views: Views, board: 
             raise ReconstructionError(
                 f"calibration: the board is found in {len(seen)} of {len(sequence)} images of camera {name}; {cause}"
             )
+
+
+def _other_circles(sequences: Mapping[str, ImageSequence], views: Views, board: Target) -> Iterator[str]:
+    """Where circles are not as large as was said, so that their centres are not corrected as they should be."""
+    if isinstance(board, BoardSet) or not board.has_circles:
+        return
+    name, sequence = next(iter(sequences.items()))
+    seen = [index for index, instant in enumerate(sequence.names) if (name, instant) in views]
+    shares = [each for each in (measured_share(image, board) for image in _some(sequence, seen)) if each is not None]
+    share = float(np.median(shares)) if shares else board.circle_share
+    if abs(share / board.circle_share - 1) > _OTHER_CIRCLES:
+        yield (
+            f"the circles are {share:.2f} of their distance wide, not {board.circle_share:g}: give --circle-share "
+            f"{share:.2f}, for their centres are not seen in the middle, by how much depends on it"
+        )
 
 
 def _some(sequence: ImageSequence, indices: Sequence[int]) -> list[UInt8[np.ndarray, "h w"]]:

@@ -59,11 +59,14 @@ def _of_options(value: Mapping[str, Any]) -> Board:
             raise InputError(f"{name} is {shown(each)}; it must be true or false")
         if name in _WHOLE:
             given[name] = whole(name, each, 0, 10**6)
+        elif name not in (*_SWITCHES, *_WORDS):
+            given[name] = number(name, each, 0, 1e6)
     check("board", Board, given)
     return Board(**given)
 
 
 _SWITCHES = ("legacy", "inverted")
+_WORDS = ("kind", "dictionary")
 _WHOLE = ("columns", "rows", "border_bits", "first_id", "terraces")
 
 
