@@ -31,11 +31,11 @@ _NEAR, _SO_MANY = 0.4, 0.9
 """Distance of a tag from where it would be, in sides of one; and the share of the tags that must be there."""
 _LEAST_CONTRAST_DN = 10.0
 _NEIGHBOURS, _LEAST_NEIGHBOURS, _OFF_USUAL, _OFF_PX = 15, 7, 4.0, 0.2
-"""Corners around one that tell where it is, at most and at least; a corner that is farther from there than some times the usual, and some
-pixels, is left out."""
+"""Corners around one that tell where it is, at most and at least; a corner that is farther from there than some times
+the usual, and some pixels, is left out."""
 _RAYS, _RING_SHARE, _RING_PX = 16, 0.12, (2.0, 6.0)
-"""Places around a corner at which brightness is compared to both sides of it, and how far from it: as a share of the side
-of its tag, and limits."""
+"""Places around a corner at which brightness is compared to both sides of it, and how far from it: as a share of the
+side of its tag, and limits."""
 _ODD_USUAL, _ODD_SHARE = 2.0, 0.08
 """Difference of the two sides, as a share of the contrast: in usual ones, and added to that."""
 _BORDER_PX = 2.0
