@@ -248,6 +248,11 @@ def test_mirrored_prints_of_other_kinds_are_told(shots: Callable[[Board], list[n
     assert "mirrored" in str(cause_of_absence(images, board))
 
 
+def test_the_layout_of_one_of_several_boards_is_told(shots: Callable[[Board], list[np.ndarray]]) -> None:
+    images = shots(replace(BOARD, first_id=30, legacy=True))
+    assert "board 2: the board has the old layout of OpenCV: give --legacy" in str(cause_of_absence(images, BOTH))
+
+
 def test_a_larger_chart_of_markers_is_told_with_its_ids(tmp_path: Path) -> None:
     """More ids than the board has, so no first id would do."""
     images = pictures(tmp_path, replace(BOARD, columns=11, rows=9, first_id=100), instants=1)

@@ -29,7 +29,14 @@ def cause_of_absence(images: Sequence[Gray], board: Target) -> str | None:
     """What makes the board be found in most of some images in which it is not as it stands, and what to change; None
     where nothing does."""
     if isinstance(board, BoardSet):
-        return _other_ids(images, board)
+        told = [(number, _verified(images, each)) for number, each in enumerate(board.boards, 1)]
+        alone = next((f"board {number}: {cause}" for number, cause in told if cause is not None), None)
+        return _other_ids(images, board) or alone
+    return _verified(images, board) or _other_ids(images, board) or _other_markers(images, board)
+
+
+def _verified(images: Sequence[Gray], board: Board) -> str | None:
+    """What makes one board be found in most of the images."""
     best: tuple[int, str] = (0, "")
     for told, other, mirrored in _others(board, images):
         shown = [np.ascontiguousarray(image[:, ::-1]) if mirrored else image for image in images]
@@ -39,9 +46,7 @@ def cause_of_absence(images: Sequence[Gray], board: Target) -> str | None:
         if found == len(images):
             break
     count, told = best
-    if count > len(images) / 2:
-        return f"{told} (then {count} of {len(images)} show it)"
-    return _other_ids(images, board) or _other_markers(images, board)
+    return f"{told} (then {count} of {len(images)} show it)" if count > len(images) / 2 else None
 
 
 def is_part_of_a_larger_one(images: Sequence[Gray], board: Target) -> bool:
