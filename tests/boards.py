@@ -15,6 +15,8 @@ from cuspid.calibration.bundle import BoardScene, bending_coordinates
 from cuspid.calibration.corners import BoardView
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
+from cuspid.simulation.board_images import board_light
+from cuspid.simulation.raycast import pixel_rays
 
 BOARD = Board(columns=9, rows=7, square_mm=2.0)
 SIZE = (640, 480)
@@ -28,6 +30,21 @@ def looking_at(middle: np.ndarray, centre: np.ndarray, roll_deg: float) -> Rigid
     turn = Rotation.from_rotvec(np.deg2rad(roll_deg) * np.array([0, 0, 1.0])).as_matrix()
     rotation = turn @ np.stack([right, np.cross(forward, right), forward])
     return Rigid3(rotation, -rotation @ centre)
+
+
+def pose_before(board: Board, away_mm: float, tilt_deg: float, *, roll_deg: float = 20.0) -> Rigid3:
+    """``cam_from_board`` of a board whose middle lies on the axis of a camera."""
+    tilt = np.deg2rad(tilt_deg)
+    centre = away_mm * np.array([np.sin(tilt), 0.3 * np.sin(tilt), -np.cos(tilt)])
+    middle = np.array([*board.size_mm, 0.0]) / 2
+    return looking_at(middle, middle + centre, roll_deg)
+
+
+def photograph(board: Board, camera: Camera, cam_from_board: Rigid3, times: int = 4, seed: int = 0) -> np.ndarray:
+    """Blurred a little, with noise."""
+    light = board_light(board, camera, pixel_rays(camera, times), cam_from_board)[..., 0]
+    blurred = cv2.GaussianBlur(20.0 + 250.0 * light, (0, 0), 0.6)
+    return np.clip(blurred + np.random.default_rng(seed).normal(0, 2, blurred.shape), 0, 255).astype(np.uint8)
 
 
 def scene(seed: int, board: Board = BOARD, cameras: int = 3, instants: int = 16, scale: float = 1.0) -> BoardScene:
@@ -137,7 +154,8 @@ def views_of(
 
 def options(board: Board) -> list[object]:
     given = ["--kind", board.kind, "--columns", board.columns, "--rows", board.rows, "--square-mm", board.square_mm]
-    return given + ["--inverted"] * board.inverted
+    shares = ["--first-id", board.first_id, "--circle-share", board.circle_share]
+    return given + shares + ["--inverted"] * board.inverted
 
 
 def photographs(folder: Path, truth: BoardScene, board: Board) -> None:

@@ -264,6 +264,12 @@ def _calibration(folder: Path) -> None:
     write_calibrated(folder / "calibration")
 
 
+def _boards(folder: Path) -> None:
+    kalibr = "target_type: aprilgrid\ntagCols: 3\ntagRows: 2\ntagSize: 0.02\ntagSpacing: 0.3\ncodeOffset: 9\n"
+    (folder / "kalibr.yaml").write_text(kalibr)
+    (folder / "boards.yaml").write_text("boards:\n- {kind: charuco, columns: 5, rows: 4, square_mm: 3, legacy: true}\n")
+
+
 def _results(folder: Path) -> None:
     shutil.copytree(RESULTS, folder / "results", ignore=shutil.ignore_patterns("*opencv*", "0*", "*film*"))
 
@@ -655,6 +661,9 @@ SCENARIOS: Mapping[str, Scenario] = {
     "reconstruct": Scenario(_textured_capture, verb("reconstruct", "@capture", "--out", f"@{_OUT}")),
     "live": Scenario(_textured_capture, verb("live", "@capture", *WATCHED, "--out", f"@{_OUT}")),
     "resume": Scenario(_cut_short, _resume),
+    "boards": Scenario(
+        _boards, verb("target", "--board", "@boards.yaml", "@kalibr.yaml", "--out", f"@{_OUT}/board.svg")
+    ),
     "calibrate": Scenario(
         _photographs,
         verb("calibrate", "@photos", "--columns", "6", "--rows", "5", "--square-mm", "3", "--out", f"@{_OUT}"),

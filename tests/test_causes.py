@@ -1,6 +1,8 @@
 """Why a board is not found is told, and images count as what they are."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -8,15 +10,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from boards import photographs, scene, undistorted
+from boards import photograph, photographs, pose_before, scene, undistorted
 from builders import rig_of, shifted
 from cuspid import storage
-from cuspid.board import Board
+from cuspid.board import Board, BoardSet, Target
 from cuspid.calibration import corners
 from cuspid.calibration.calibrate import size_notes
 from cuspid.calibration.causes import cause_of_absence, is_part_of_a_larger_one
 from cuspid.calibration.corners import find_corners
 from cuspid.calibration.instants import common_instants
+from cuspid.camera import Camera
 from cuspid.cli.calibration import _matched
 from cuspid.errors import InputError
 from cuspid.image_files import exif_orientation, read_image, recorded
@@ -67,7 +70,7 @@ def test_mirrored_images_are_told(tmp_path: Path) -> None:
 
 
 def test_without_a_board_there_is_no_cause() -> None:
-    noise = np.random.default_rng(0).integers(0, 255, (2, 120, 160), dtype=np.uint8)
+    noise = np.random.default_rng(0).integers(0, 255, (1, 90, 120), dtype=np.uint8)
     assert cause_of_absence(list(noise), BOARD) is None
 
 
@@ -187,3 +190,71 @@ def test_a_camera_that_was_held_in_several_ways_has_one_sensor(tmp_path: Path, w
     assert "EXIF" in sequence.notes[0]
     for index in range(len(sequence)):
         np.testing.assert_array_equal(sequence.image(index), sensor)
+
+
+TAGS = Board(kind="aprilgrid", columns=4, rows=3, square_mm=3.0, first_id=20)
+CIRCLES = Board(kind="circles", columns=7, rows=5, square_mm=2.5)
+SHIFTED = Board(kind="asymmetric-circles", columns=4, rows=9, square_mm=1.6)
+BOTH = BoardSet(boards=(BOARD, replace(BOARD, first_id=30)))
+
+
+@pytest.fixture(scope="module")
+def shots() -> Callable[[Board], list[np.ndarray]]:
+    """Two images of a board, taken once."""
+    camera = Camera(width=320, height=240, focal_px=np.full(2, 260.0), principal_point_px=np.array([160.0, 120.0]))
+
+    @cache
+    def taken(board: Board) -> list[np.ndarray]:
+        return [photograph(board, camera, pose_before(board, 26.0, tilt), 3) for tilt in (0.0, 25.0)]
+
+    return taken
+
+
+@pytest.mark.parametrize(
+    ("shown", "asked", "told"),
+    [
+        (TAGS, replace(TAGS, first_id=100), "begin at 20: give --first-id 20 ("),
+        (TAGS, replace(TAGS, border_bits=1), "its tags have borders of 2 bits: give --border-bits 2"),
+        (TAGS, replace(TAGS, columns=3, rows=4), "there are 4 tags in a row: give --columns 4 --rows 3"),
+        (TAGS, replace(TAGS, columns=8, rows=6), "there are 4 tags in a row: give --columns 4 --rows 3"),
+        (TAGS, replace(TAGS, inverted=True), "light and dark are swapped: give --no-inverted"),
+        (TAGS, BOARD, "-31): give --kind aprilgrid"),
+        (BOARD, TAGS, "markers of the family 4X4_1000 (ids 0-20): give --kind charuco --dictionary 4X4_1000"),
+        (CHESSBOARD, TAGS, "a chessboard of 7 x 6 squares: give --kind chessboard --columns 7 --rows 6"),
+        (
+            CIRCLES,
+            replace(CIRCLES, columns=8, rows=6),
+            "a grid of 7 x 5 circles: give --kind circles --columns 7 --rows 5",
+        ),
+        (CIRCLES, SHIFTED, "a grid of 7 x 5 circles: give --kind circles --columns 7 --rows 5"),
+        (SHIFTED, CIRCLES, "a grid of 4 x 9 circles: give --kind asymmetric-circles --columns 4 --rows 9"),
+        (CHESSBOARD, CIRCLES, "a chessboard of 7 x 6 squares: give --kind chessboard --columns 7 --rows 6"),
+        (CIRCLES, replace(CIRCLES, inverted=True), "light and dark are swapped: give --no-inverted"),
+        (CIRCLES, CHESSBOARD, "a grid of 7 x 5 circles: give --kind circles --columns 7 --rows 5"),
+        (replace(BOARD, first_id=100), BOTH, "with the ids 100-120 found, these boards have 0-20 and 30-50"),
+    ],
+)
+def test_what_other_kinds_of_boards_should_have_been_called(
+    shots: Callable[[Board], list[np.ndarray]], shown: Board, asked: Target, told: str
+) -> None:
+    images = shots(shown)
+    assert not any(find_corners(image, asked) is not None for image in images)
+    assert told in str(cause_of_absence(images, asked))
+
+
+@pytest.mark.parametrize("board", [TAGS, Board(kind="asymmetric-circles", columns=4, rows=8, square_mm=1.6)])
+def test_mirrored_prints_of_other_kinds_are_told(shots: Callable[[Board], list[np.ndarray]], board: Board) -> None:
+    images = [np.ascontiguousarray(image[:, ::-1]) for image in shots(board)]
+    assert "mirrored" in str(cause_of_absence(images, board))
+
+
+def test_the_layout_of_one_of_several_boards_is_told(shots: Callable[[Board], list[np.ndarray]]) -> None:
+    images = shots(replace(BOARD, first_id=30, legacy=True))
+    assert "board 2: the board has the old layout of OpenCV: give --legacy" in str(cause_of_absence(images, BOTH))
+
+
+def test_a_larger_chart_of_markers_is_told_with_its_ids(tmp_path: Path) -> None:
+    """More ids than the board has, so no first id would do."""
+    images = pictures(tmp_path, replace(BOARD, columns=11, rows=9, first_id=100), instants=1)
+    assert "with the ids 1" in str(cause_of_absence(images, BOARD))
+    assert "found, this board has 0-20" in str(cause_of_absence(images, BOARD))

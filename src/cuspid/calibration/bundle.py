@@ -6,6 +6,8 @@ small motion (rotation vector rad, translation mm) on the left of ``cam_from_rig
 instant, by one on the left of ``rig_from_board``; and three parameters of a board that is not quite flat: out of its
 plane by b1 u^2 + b2 u v + b3 v^2 mm at the distances u and v, in units of half its diagonal, from its middle. A board
 with terraces is a solid body and not bent: there b1 is how much higher than given each step is, and b2 and b3 are 0.
+Of several boards that are fixed to one another, each is bent in its own way, and the places of all but the first are
+unknown too: X is then ``body_from_board @`` the corner on its board, and ``rig_from_board`` moves the body.
 
 Cameras that do not expose together see a board that moves where it was at other moments. A corner in a view is then at
 ``sum_k w_k(t) rig_from_board[k] @ X``: the parabola (Lagrange) through its places at three successive instants k about
@@ -19,14 +21,15 @@ Triggs et al. 2000, section 9.2), so that no camera counts as exact.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
-from cuspid.board import Board
+from cuspid.board import Board, Target
 from cuspid.calibration.corners import BoardView, Views
 from cuspid.camera import Camera
 from cuspid.epipolar import skew
@@ -35,7 +38,7 @@ from cuspid.geometry import Rigid3
 from cuspid.rig import MountedCamera
 
 _PLACE, _BENDING = 6, 3
-_LENSES, _CAMERAS, _BOARDS, _BENDINGS, _CAMERA_DELAYS, _VIEW_DELAYS = range(6)
+_LENSES, _CAMERAS, _BOARDS, _BENDINGS, _MOUNTS, _CAMERA_DELAYS, _VIEW_DELAYS = range(7)
 """Kinds of unknowns, in order."""
 _RADIAL_SIGMA, _SIDEWAYS_SIGMA = 0.5, 0.01
 """Standard deviation of radial, and of tangential and prism parameters about 0, for lenses as they are made: it matters
@@ -44,6 +47,8 @@ _CENTRE_SHARE = 0.05
 """Standard deviation of the principal point about the image centre, as a share of the image width."""
 _BENDING_SHARE = 0.01
 """Standard deviation of the bending, as a share of half the diagonal of the board."""
+_MOUNT_SIGMA = 1e3
+"""Standard deviation of a turn (rad) and a shift (mm) of a board on the body, which is to hold none."""
 _CAMERA_DELAY_SIGMA = 3.0
 """Standard deviation of the delay of a camera, in frames."""
 _VIEW_DELAY_SIGMA = 1 / np.sqrt(12)
@@ -56,6 +61,7 @@ _STEPS, _SETTLED = 100, 0.01
 _MOST_DAMPING = 1e8
 """Largest damping of a step, as a share of the diagonal of the normal equations."""
 _LEAST_SIGMA_PX = 1e-6
+_Key = TypeVar("_Key")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -98,9 +104,11 @@ class BoardScene:
     """Poses of the cameras."""
     rig_from_board: Mapping[str, Rigid3]
     """Pose of the board at each instant."""
-    bending_mm: Float[np.ndarray, "3"]
+    bending_mm: Float[np.ndarray, "k"]
     """Deviation from the plane, of u^2, u v and v^2; with terraces, how much higher than given each step is, and
-    zeros."""
+    zeros. Of several boards, one after the other."""
+    body_from_board: Mapping[int, Rigid3] = field(default_factory=dict)
+    """Places of boards on a body that several of them are fixed to, by their numbers; the others carry its frame."""
     timing: Timing | None = None
     """When each view was taken; None if all cameras expose together."""
 
@@ -144,18 +152,21 @@ class _Observations:
     """The numbers of their frames; NaN for repeated ones."""
     points: Float[np.ndarray, "n 3"]
     """On the board as it is given, mm."""
-    basis: Float[np.ndarray, "n 3"]
+    basis: Float[np.ndarray, "n b"]
     """What each number of the bending lifts them by."""
+    board: Int[np.ndarray, "n"]
+    """Which board they are on."""
     pixels: Float[np.ndarray, "n 2"]
     keys: tuple[tuple[str, str], ...]
     starts: Int[np.ndarray, "s"]
 
     @staticmethod
-    def of(views: Views, board: Board, scene: BoardScene) -> _Observations:
+    def of(views: Views, board: Target, scene: BoardScene) -> _Observations:
         """In the order of the views."""
         keys, cameras, instants = tuple(views), list(scene.cameras), list(scene.rig_from_board)
         counts = [len(views[key].corner) for key in keys]
-        points = board.corners[np.concatenate([views[key].corner for key in keys])]
+        corner = np.concatenate([views[key].corner for key in keys])
+        points, number = board.corners[corner], board.board_of(corner)
         near = [(instant,) if scene.timing is None else scene.timing.near[camera, instant] for camera, instant in keys]
         most = max(len(each) for each in near)
         frame = dict.fromkeys(instants, 0) if scene.timing is None else scene.timing.frame
@@ -165,7 +176,8 @@ class _Observations:
             near=np.array([[instants.index(each[min(k, len(each) - 1)]) for k in range(most)] for each in near]),
             frames=np.array([[*(float(frame[k]) for k in each), *[np.nan] * (most - len(each))] for each in near]),
             points=points,
-            basis=_basis(board, points),
+            basis=_bases(board, points, number),
+            board=number,
             pixels=np.concatenate([views[key].pixels for key in keys]),
             keys=keys,
             starts=np.cumsum([0, *counts]),
@@ -199,6 +211,12 @@ def _basis(board: Board, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, 
         return np.asarray(points[:, 2:] / board.step_mm * [1.0, 0.0, 0.0])
     u, v = bending_coordinates(board, points).T
     return np.stack([u * u, u * v, v * v], axis=1)
+
+
+def _bases(board: Target, points: Float[np.ndarray, "n 3"], number: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n b"]:
+    """The same of places on several boards, each with numbers of its own."""
+    own = [np.where((number == k)[:, None], _basis(each, points), 0.0) for k, each in enumerate(board.boards)]
+    return np.concatenate(own, axis=1)
 
 
 def bent(
@@ -235,7 +253,14 @@ def _project(scene: BoardScene, seen: _Observations) -> tuple[Float[np.ndarray, 
 
 
 def _bent(scene: BoardScene, seen: _Observations) -> Float[np.ndarray, "n 3"]:
-    return np.asarray(seen.points + (seen.basis @ scene.bending_mm)[:, None] * [0.0, 0.0, 1.0])
+    """On the body."""
+    points = np.asarray(seen.points + (seen.basis @ scene.bending_mm)[:, None] * [0.0, 0.0, 1.0])
+    return _moved(_all_mounts(scene, seen), seen.board, points) if scene.body_from_board else points
+
+
+def _all_mounts(scene: BoardScene, seen: _Observations) -> list[Rigid3]:
+    """Of each board that is seen, by number."""
+    return [scene.body_from_board.get(number, Rigid3.identity()) for number in range(int(seen.board.max()) + 1)]
 
 
 def _at_instants(
@@ -261,13 +286,19 @@ def _jacobian(scene: BoardScene, seen: _Observations, in_cam: Float[np.ndarray, 
     by_rig = by_point @ turn
     weights, slopes = (each[seen.view] for each in seen.weights(scene))
     places = _at_instants(scene, seen, _bent(scene, seen))
-    normals = np.stack([pose.rotation[:, 2] for pose in scene.rig_from_board.values()])[seen.near[seen.view]]
-    by_bending = np.einsum("nij,nk,nkj->ni", by_rig, weights, normals)[:, :, None] * seen.basis[:, None]
+    turns = np.stack([pose.rotation for pose in scene.rig_from_board.values()])[seen.near[seen.view]]
+    by_body = np.einsum("nij,nk,nkjm->nim", by_rig, weights, turns)
+    normals = np.stack([mount.rotation[:, 2] for mount in _all_mounts(scene, seen)])[seen.board]
+    by_bending = np.einsum("nij,nj->ni", by_body, normals)[:, :, None] * seen.basis[:, None]
     blocks = [by_parameters, _by_motion(by_point, in_cam), by_bending]
     which = [(_LENSES, seen.camera), (_CAMERAS, seen.camera), (_BENDINGS, 0 * seen.camera)]
     for k, instant in enumerate(seen.near[seen.view].T):
         blocks.append(weights[:, k, None, None] * _by_motion(by_rig, places[:, k]))
         which.append((_BOARDS, instant))
+    if scene.body_from_board:
+        mount, mounted = _mount_of(scene, seen)
+        blocks.append(mounted[:, None, None] * _by_motion(by_body, _bent(scene, seen)))
+        which.append((_MOUNTS, mount))
     if scene.timing is not None:
         by_delay = np.einsum("nij,nk,nkj->ni", by_rig, slopes, places)[:, :, None]
         blocks += [by_delay, by_delay]
@@ -287,11 +318,19 @@ def _jacobian(scene: BoardScene, seen: _Observations, in_cam: Float[np.ndarray, 
     return jacobian
 
 
+def _mount_of(scene: BoardScene, seen: _Observations) -> tuple[Int[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+    """Which of the mounts moves each corner (0 where none does), and whether one does."""
+    numbers = list(scene.body_from_board)
+    place = np.array([numbers.index(k) if k in numbers else -1 for k in range(int(seen.board.max()) + 1)])[seen.board]
+    return np.maximum(place, 0), place >= 0
+
+
 def _sizes(scene: BoardScene) -> tuple[int, ...]:
     """How many numbers there are of each kind of unknowns."""
     cameras, instants = len(scene.cameras), len(scene.rig_from_board)
     delays = (0, 0) if scene.timing is None else (cameras, len(scene.timing.by_view))
-    return _numbers(scene) * cameras, _PLACE * cameras, _PLACE * instants, _BENDING, *delays
+    mounts = _PLACE * len(scene.body_from_board)
+    return _numbers(scene) * cameras, _PLACE * cameras, _PLACE * instants, len(scene.bending_mm), mounts, *delays
 
 
 def _numbers(scene: BoardScene) -> int:
@@ -328,15 +367,16 @@ class _Free:
     precision: Float[np.ndarray, "k"]
 
     @staticmethod
-    def of(scene: BoardScene, board: Board, *, only_boards: bool) -> _Free:
+    def of(scene: BoardScene, board: Target, *, only_boards: bool) -> _Free:
         """All but the place of the first camera, which is the rig, and what a board with terraces has no use of; or
         the places of the board alone, and the delays of the views."""
-        lenses, places, boards, bending, cameras, views = _sizes(scene)
+        lenses, places, boards, bending, mounts, cameras, views = _sizes(scene)
         precision = np.concatenate(
             [
                 *(_lens_precision(camera, _numbers(scene)) for camera in scene.cameras.values()),
                 np.zeros(places + boards),
-                np.full(bending, _bending_sigma_mm(board) ** -2.0),
+                np.repeat([_bending_sigma_mm(each) ** -2.0 for each in board.boards], _BENDING),
+                np.full(mounts, _MOUNT_SIGMA**-2.0),
                 np.full(cameras, _CAMERA_DELAY_SIGMA**-2.0),
                 np.full(views, _VIEW_DELAY_SIGMA**-2.0),
             ]
@@ -367,7 +407,7 @@ def _bending_sigma_mm(board: Board) -> float:
     return _BENDING_SHARE * float(np.linalg.norm(board.size_mm)) / 2
 
 
-def adjust_board(start: BoardScene, views: Views, board: Board, *, only_boards: bool = False) -> Adjusted:
+def adjust_board(start: BoardScene, views: Views, board: Target, *, only_boards: bool = False) -> Adjusted:
     """The scene that best explains the observed corners, and its uncertainty (Levenberg-Marquardt on the Huber loss;
     its scale is found from the residuals). With ``only_boards``, cameras and bending are held fixed.
 
@@ -389,7 +429,7 @@ def adjust_board(start: BoardScene, views: Views, board: Board, *, only_boards: 
     )
 
 
-def in_front(scene: BoardScene, views: Views, board: Board) -> dict[tuple[str, str], BoardView]:
+def in_front(scene: BoardScene, views: Views, board: Target) -> dict[tuple[str, str], BoardView]:
     """The views of which every corner lies in front of the camera."""
     seen = _Observations.of(views, board, scene)
     residuals = np.split(_project(scene, seen)[1], seen.starts[1:-1])
@@ -458,7 +498,8 @@ def _held(scene: BoardScene) -> Float[np.ndarray, "k"]:
     places = np.zeros(_PLACE * (len(scene.cameras) + len(scene.rig_from_board)))
     timing = scene.timing
     delays = [] if timing is None else [*timing.by_camera.values(), *timing.by_view.values()]
-    return np.concatenate([*lenses, places, scene.bending_mm, delays])
+    mounts = np.zeros(_PLACE * len(scene.body_from_board))
+    return np.concatenate([*lenses, places, scene.bending_mm, mounts, delays])
 
 
 def _normal(
@@ -496,7 +537,7 @@ def _stepped(scene: BoardScene, free: _Free, step: Float[np.ndarray, "k"]) -> Bo
     sizes = _sizes(scene)
     whole = np.zeros(sum(sizes))
     whole[free.columns] = step
-    lenses, places, boards, bending, cameras, views = np.split(whole, np.cumsum(sizes)[:-1])
+    lenses, places, boards, bending, mounts, cameras, views = np.split(whole, np.cumsum(sizes)[:-1])
     parameters = [
         camera.parameters + shift[: len(camera.parameters)]
         for camera, shift in zip(scene.cameras.values(), lenses.reshape(-1, _numbers(scene)), strict=True)
@@ -511,11 +552,12 @@ def _stepped(scene: BoardScene, free: _Free, step: Float[np.ndarray, "k"]) -> Bo
         cam_from_rig=_all_moved(scene.cam_from_rig, places),
         rig_from_board=_all_moved(scene.rig_from_board, boards),
         bending_mm=scene.bending_mm + bending,
+        body_from_board=_all_moved(scene.body_from_board, mounts),
         timing=scene.timing and scene.timing.later(cameras, views),
     )
 
 
-def _all_moved(poses: Mapping[str, Rigid3], motions: Float[np.ndarray, "k"]) -> dict[str, Rigid3]:
+def _all_moved(poses: Mapping[_Key, Rigid3], motions: Float[np.ndarray, "k"]) -> dict[_Key, Rigid3]:
     return {
         name: Rigid3.from_rotation_vector(motion[:3], motion[3:]) @ pose
         for (name, pose), motion in zip(poses.items(), motions.reshape(-1, _PLACE), strict=True)

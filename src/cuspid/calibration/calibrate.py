@@ -11,7 +11,7 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.board import Board
+from cuspid.board import Board, BoardSet, Target
 from cuspid.calibration.bundle import (
     Adjusted,
     BoardScene,
@@ -21,9 +21,11 @@ from cuspid.calibration.bundle import (
     mounted_cameras,
     of_instants,
 )
-from cuspid.calibration.corners import Views
+from cuspid.calibration.circle_centres import centre_shifts
+from cuspid.calibration.corners import Views, split_by_board
+from cuspid.calibration.joining import joined_boards
 from cuspid.calibration.lenses import LensChoice, LensName, choose_lens
-from cuspid.calibration.start import LEAST_VIEWS, groups, joined, require_one_group
+from cuspid.calibration.start import LEAST_VIEWS, board_pose, groups, joined, require_one_group
 from cuspid.calibration.timing import adjust_scene, numbered, untied
 from cuspid.camera import Camera
 from cuspid.errors import InputError, ReconstructionError
@@ -101,8 +103,12 @@ class RigCalibration:
     """The model of the lens of each camera, and how well others did."""
     sigma_px: float
     """Standard deviation of one coordinate of a corner."""
-    bending_mm: Float[np.ndarray, "3"]
-    """Bending of the board, or the error of its steps; see :mod:`cuspid.calibration.bundle`."""
+    bending_mm: Float[np.ndarray, "k"]
+    """Bending of the board, or of several one after the other, or the error of its steps; see
+    :mod:`cuspid.calibration.bundle`."""
+    body_from_board: Mapping[int, Rigid3]
+    """Of several boards, where they are on the body that they are fixed to, by number from 0; others carry its
+    frame."""
     cameras: Mapping[str, CameraCheck]
     """Checks by camera."""
     pixels: Mapping[str, Float[np.ndarray, "n 2"]]
@@ -120,13 +126,41 @@ class RigCalibration:
 
 
 def calibrate_rig(
-    views: Views, sizes: Mapping[str, tuple[int, int]], board: Board, options: CalibrationOptions = CalibrationOptions()
+    views: Views,
+    sizes: Mapping[str, tuple[int, int]],
+    board: Target,
+    options: CalibrationOptions = CalibrationOptions(),
 ) -> RigCalibration:
     """Calibrate the cameras named in ``sizes`` (width and height, px) from their views of a board.
 
     Raises ReconstructionError for cameras with too few views, whose views fit no camera, that never saw the board
     together, or that do not agree on how it was held.
     """
+    found = _calibrated(views, sizes, board, options)
+    if isinstance(board, BoardSet) or not board.has_circles:
+        return found
+    return _calibrated(_centred(views, found, board), sizes, board, options)
+
+
+def _centred(views: Views, found: RigCalibration, board: Board) -> Views:
+    """Views of circles, with the places of their centres instead of the middles of what is seen of them."""
+    centred = {}
+    for (name, instant), view in views.items():
+        camera = found.rig[name].camera
+        try:
+            cam_from_board = board_pose(view, board, camera)
+        except InputError:  # it is left out in any case
+            continue
+        centred[name, instant] = view.moved(-centre_shifts(camera, cam_from_board, board, view.corner))
+    return centred
+
+
+def _calibrated(
+    views: Views,
+    sizes: Mapping[str, tuple[int, int]],
+    board: Target,
+    options: CalibrationOptions,
+) -> RigCalibration:
     few = [name for name in sizes if sum(camera == name for camera, _ in views) < LEAST_VIEWS]
     if few:
         raise ReconstructionError(
@@ -137,15 +171,20 @@ def calibrate_rig(
     choices = {name: choice for name, (choice, _) in lenses.items()}
     alone = {name: each for name, (_, each) in lenses.items()}
     cameras = {name: each.scene.cameras[""] for name, each in alone.items()}
-    start, chosen = joined(views, board, cameras, sorted({instant for _, instant in views}))
+    how: tuple[str, ...] = ()
+    if isinstance(board, BoardSet):
+        start, chosen, how = joined_boards(views, board, cameras)
+    else:
+        start, chosen = joined(views, board, cameras, sorted({instant for _, instant in views}))
     found, notes = _without_outliers(start, chosen, board, options)
+    notes = (*how, *notes)
     together = _described(found, chosen, board, alone, choices, notes)
     frame = numbered(start.rig_from_board)
     if frame is None or not any(_is_doubtful_together(check) for check in together.cameras.values()):
         return together
     try:
         found, notes = _without_outliers(untied(start, frame, chosen), chosen, board, options)
-        apart = _described(found, chosen, board, alone, choices, notes)
+        apart = _described(found, chosen, board, alone, choices, (*how, *notes))
     except ReconstructionError:  # the images do not tell delays as well
         return together
     return apart if _is_better(apart, together) else together
@@ -173,9 +212,12 @@ def _held_out_px(found: RigCalibration) -> float:
     return _rms(np.array([np.inf if check.held_out_px is None else check.held_out_px for check in checks]))
 
 
-def _alone(name: str, views: Views, board: Board, size: tuple[int, int], lens: LensName) -> tuple[LensChoice, Adjusted]:
+def _alone(
+    name: str, views: Views, board: Target, size: tuple[int, int], lens: LensName
+) -> tuple[LensChoice, Adjusted]:
     try:
-        return choose_lens([view for (camera, _), view in views.items() if camera == name], board, size, lens)
+        own = [part for (camera, _), view in views.items() if camera == name for part in split_by_board(view, board)]
+        return choose_lens(own, board, size, lens)
     except ReconstructionError as error:
         raise ReconstructionError(
             f"calibration: camera {name}: {str(error).removeprefix('calibration: ')}; check the columns, rows, kind "
@@ -184,7 +226,7 @@ def _alone(name: str, views: Views, board: Board, size: tuple[int, int], lens: L
 
 
 def _without_outliers(
-    scene: BoardScene, views: Views, board: Board, options: CalibrationOptions
+    scene: BoardScene, views: Views, board: Target, options: CalibrationOptions
 ) -> tuple[Adjusted, tuple[str, ...]]:
     """Adjust, leave out the views that do not fit, and again."""
     sound = in_front(scene, views, board)
@@ -253,7 +295,7 @@ def in_frame_of(found: RigCalibration, drawn: Rig) -> RigCalibration:
     return replace(found, rig=found.rig.in_frame(drawn_from_rig), rig_from_view=seen)
 
 
-def size_notes(found: Rig, drawn: Rig, board: Board) -> tuple[str, ...]:
+def size_notes(found: Rig, drawn: Rig, board: Target) -> tuple[str, ...]:
     """Where the cameras lie farther apart, or closer together, than they were drawn, as all do if the squares of the
     board are not as large as was said."""
     if set(found.names) != set(drawn.names) or len(found.names) < 2:
@@ -278,7 +320,7 @@ def size_notes(found: Rig, drawn: Rig, board: Board) -> tuple[str, ...]:
 def _described(
     found: Adjusted,
     chosen: Views,
-    board: Board,
+    board: Target,
     alone: Mapping[str, Adjusted],
     lenses: Mapping[str, LensChoice],
     notes: tuple[str, ...],
@@ -312,6 +354,7 @@ def _described(
         lenses=lenses,
         sigma_px=found.sigma_px,
         bending_mm=found.scene.bending_mm,
+        body_from_board=found.scene.body_from_board,
         cameras=checks,
         pixels=pixels,
         residuals=residuals,
@@ -393,7 +436,7 @@ def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Itera
 
 
 def _cross_validated(
-    found: Adjusted, views: Views, board: Board
+    found: Adjusted, views: Views, board: Target
 ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
     """Of two halves of the instants, each calibrated for itself: the residuals in the other one, and how far they are
     from each other, where each has views enough to tell. Nothing where a half is too small, or its cameras fall into
@@ -405,7 +448,10 @@ def _cross_validated(
         return {}, {}
     if any(len(groups(half, cameras)) > 1 for half in halves):
         return {}, {}
-    parts = [adjust_scene(of_instants(found.scene, {key[1] for key in half}), half, board) for half in halves]
+    try:
+        parts = [adjust_scene(of_instants(found.scene, {key[1] for key in half}), half, board) for half in halves]
+    except ReconstructionError:  # half of the views leave open where a board, or a camera, is
+        return {}, {}
     squares: dict[str, list[Float[np.ndarray, "n 2"]]] = {name: [] for name in found.scene.cameras}
     for part, other, other_views in zip(parts, parts[::-1], halves[::-1], strict=True):
         start = replace(part.scene, rig_from_board=other.scene.rig_from_board)

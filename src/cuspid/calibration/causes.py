@@ -10,9 +10,11 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from cuspid.board import Board
+from cuspid.board import Board, BoardSet, Target
+from cuspid.calibration.circle_centres import seen_grid
 from cuspid.calibration.corners import find_corners
 from cuspid.calibration.lattice import find_lattice
+from cuspid.calibration.tag_corners import ABOVE, detect_tags, layout_agreement, tag_beside
 from cuspid.errors import InputError
 
 MOST_TRIED = 6
@@ -23,9 +25,18 @@ _FEWEST_MARKERS = 4
 Gray = UInt8[np.ndarray, "h w"]
 
 
-def cause_of_absence(images: Sequence[Gray], board: Board) -> str | None:
+def cause_of_absence(images: Sequence[Gray], board: Target) -> str | None:
     """What makes the board be found in most of some images in which it is not as it stands, and what to change; None
     where nothing does."""
+    if isinstance(board, BoardSet):
+        told = [(number, _verified(images, each)) for number, each in enumerate(board.boards, 1)]
+        alone = next((f"board {number}: {cause}" for number, cause in told if cause is not None), None)
+        return _other_ids(images, board) or alone
+    return _verified(images, board) or _other_ids(images, board) or _other_markers(images, board)
+
+
+def _verified(images: Sequence[Gray], board: Board) -> str | None:
+    """What makes one board be found in most of the images."""
     best: tuple[int, str] = (0, "")
     for told, other, mirrored in _others(board, images):
         shown = [np.ascontiguousarray(image[:, ::-1]) if mirrored else image for image in images]
@@ -38,33 +49,33 @@ def cause_of_absence(images: Sequence[Gray], board: Board) -> str | None:
     return f"{told} (then {count} of {len(images)} show it)" if count > len(images) / 2 else None
 
 
-def is_part_of_a_larger_one(images: Sequence[Gray], board: Board) -> bool:
+def is_part_of_a_larger_one(images: Sequence[Gray], board: Target) -> bool:
     """Whether most of some images that show a chessboard show one with a square more each way, of which it is found
     anywhere: the corners were counted, not the squares."""
+    if isinstance(board, BoardSet) or board.kind != "chessboard" or not images:
+        return False
     larger = _possible(board, columns=board.columns + 1, rows=board.rows + 1)
-    if larger is None or not images or board.kind != "chessboard":
+    if larger is None:
         return False
     return sum(find_corners(image, larger) is not None for image in images) > len(images) / 2
 
 
 def _others(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, bool]]:
     """Other boards that may have been meant, the likeliest first, and whether the images are mirrored."""
-    if board.kind == "charuco":
-        if board.rows % 2 == 0:
-            old, yes = ("new", "--no-legacy") if board.legacy else ("old", "--legacy")
-            yield (
-                f"the board has the {old} layout of OpenCV: give {yes}",
-                replace(board, legacy=not board.legacy),
-                False,
-            )
+    if board.kind == "charuco" and board.rows % 2 == 0:
+        old, yes = ("new", "--no-legacy") if board.legacy else ("old", "--legacy")
+        yield f"the board has the {old} layout of OpenCV: give {yes}", replace(board, legacy=not board.legacy), False
+    if board.kind != "circles":
         yield "the images are mirrored: turn them over (or the print is: print it anew)", board, True
-        first = _first_id(board, images)
-        if first is not None and first != board.first_id:
-            with_id = _possible(board, first_id=first)
-            if with_id is not None:
-                yield f"the ids of its markers begin at {first}: give --first-id {first}", with_id, False
+    if board.has_markers:
+        yield from _other_first_ids(board, images)
+    if board.kind == "aprilgrid":
+        yield from _other_tags(board, images)
     light = "--no-inverted" if board.inverted else "--inverted"
     yield f"light and dark are swapped: give {light}", replace(board, inverted=not board.inverted), False
+    if board.has_circles or board.kind == "aprilgrid":
+        yield from _other_grids(board, images)
+        return
     for columns, rows, why in (*_seen_sizes(board, images), *_sizes(board)):
         sized = _possible(board, columns=columns, rows=rows)
         if sized is not None:
@@ -78,6 +89,7 @@ def _others(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, 
         yield "it has no markers: give --kind chessboard", replace(board, kind="chessboard", terraces=1), False
     else:
         yield "it has markers: give --kind charuco", replace(board, kind="charuco"), False
+    yield from _other_grids(board, images)
 
 
 def _seen_sizes(board: Board, images: Sequence[Gray]) -> Iterator[tuple[int, int, str]]:
@@ -113,13 +125,116 @@ def _possible(board: Board, **changes: object) -> Board | None:
         return None
 
 
-def _first_id(board: Board, images: Sequence[Gray]) -> int | None:
-    """The id at which the markers in some images begin, if they are of its family but not its own."""
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{board.family}")))
-    seen = [detector.detectMarkers(255 - image if board.inverted else image)[1] for image in images]
-    ids = np.concatenate([np.zeros(0, np.int64), *(each.ravel() for each in seen if each is not None)])
-    numbers, counts = np.unique(ids, return_counts=True)
-    numbers = numbers[counts >= min(2, len(images))]
-    if len(numbers) < _FEWEST_MARKERS or np.ptp(numbers) >= board.markers:
-        return None
-    return int(numbers.min())
+def _other_first_ids(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, bool]]:
+    """The first id with which the board has all that are seen. Those at its beginning may be hidden: of tags it is the
+    one with which they lie best beside each other, of other markers the least that is seen."""
+    ids = _ids_seen(images, board)
+    if not ids:
+        return
+    others = [_possible(board, first_id=first) for first in range(ids[0], max(ids[-1] - board.markers, -1), -1)]
+    able = [each for each in others if each is not None]
+    if board.kind == "aprilgrid":
+        seen = [detect_tags(_as_printed(image, board), board.border_bits) for image in images]
+        able.sort(key=lambda each: -sum(layout_agreement(outlines, each.tags) for outlines in seen))
+    if able and able[0] != board:
+        first = able[0].first_id
+        found = f"{ids[0]}-{ids[-1]} found, this board has {board.ids_told}"
+        yield f"the ids of its markers begin at {first}: give --first-id {first} ({found})", able[0], False
+
+
+def _ids_seen(images: Sequence[Gray], board: Board) -> list[int]:
+    """The ids of the markers of a board's family in some images, in order, but for those that are seen too seldom to be
+    trusted; none where they are few."""
+    if board.kind == "aprilgrid":
+        found = [list(detect_tags(_as_printed(image, board), board.border_bits)) for image in images]
+    else:
+        detector = cv2.aruco.ArucoDetector(_dictionary(board.family))
+        seen = [detector.detectMarkers(_as_printed(image, board))[1] for image in images]
+        found = [each.ravel().tolist() for each in seen if each is not None]
+    counts = Counter(each for ids in found for each in ids)
+    ids = sorted(each for each, count in counts.items() if count >= min(2, len(images)))
+    return ids if len(ids) >= _FEWEST_MARKERS else []
+
+
+def _as_printed(image: Gray, board: Board) -> Gray:
+    return 255 - image if board.inverted else image
+
+
+def _dictionary(family: str) -> cv2.aruco.Dictionary:
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{family}"))
+
+
+def _other_ids(images: Sequence[Gray], target: Target) -> str | None:
+    """Where images show markers with ids that are none of a board's, or of several: which, and which it has."""
+    told = []
+    for family, board in {board.family: board for board in target.boards if board.has_markers}.items():
+        own = {each for one in target.boards if one.family == family for each in one.ids}
+        strange = [each for each in _ids_seen(images, board) if each not in own]
+        if len(strange) >= _FEWEST_MARKERS:
+            has = " and ".join(one.ids_told for one in target.boards if one.family == family)
+            what = "these boards have" if len(target.boards) > 1 else "this board has"
+            told.append(f"markers of the family {family} with the ids {strange[0]}-{strange[-1]} found, {what} {has}")
+    return "; ".join(told) or None
+
+
+def _other_markers(images: Sequence[Gray], board: Board) -> str | None:
+    """Where images show markers of another kind of board: which."""
+    families = [family for family in _DICTIONARIES if board.kind != "charuco" or family[:3] != board.dictionary[:3]]
+    for other in (
+        *(Board(kind="charuco", dictionary=family, inverted=board.inverted) for family in families),  # type: ignore[arg-type]
+        *(Board(kind="aprilgrid", border_bits=bits, inverted=board.inverted) for bits in (2, 1)),
+    ):
+        ids = [] if other.family == board.family else _ids_seen(images, other)
+        if ids:
+            family = f" --dictionary {other.dictionary}" if other.kind == "charuco" else ""
+            return (
+                f"the images show markers of the family {other.family} (ids {ids[0]}-{ids[-1]}): give --kind "
+                f"{other.kind}{family}, with its --columns, --rows and --square-mm"
+            )
+    return None
+
+
+def _other_tags(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, bool]]:
+    """Other borders of tags, and other numbers of them in a row, which is by how much the ids of tags above others are
+    greater."""
+    bits = 3 - board.border_bits
+    yield f"its tags have borders of {bits} bits: give --border-bits {bits}", replace(board, border_bits=bits), False
+    pitch, steps = 1 + board.spacing_share, list[int]()
+    ids = set[int]()
+    for image in images:
+        outlines = detect_tags(_as_printed(image, board), board.border_bits)
+        above = {tag: tag_beside(outlines, tag, ABOVE, pitch) for tag in outlines}
+        steps += [other - tag for tag, other in above.items() if other is not None]
+        ids |= set(outlines)
+    if not steps or not ids:
+        return
+    columns = Counter(steps).most_common(1)[0][0]
+    rows = -(-(max(ids) + 1 - board.first_id) // max(columns, 1))
+    sized = _possible(board, columns=columns, rows=max(rows, 2)) if columns > 1 else None
+    if sized is not None:
+        yield f"there are {columns} tags in a row: give --columns {columns} --rows {rows}", sized, False
+
+
+def _other_grids(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, bool]]:
+    """The grid of circles, or the chessboard, that most images show."""
+    shown = [_as_printed(image, board) for image in images]
+    grids = Counter(each for each in map(seen_grid, shown) if each is not None)
+    squares = Counter(each.size for each in map(find_lattice, images) if each is not None)
+    for (kind, columns, rows), count in grids.most_common(1):
+        other = _possible(board, kind=kind, columns=columns, rows=rows)
+        if other is not None and other != board and count > len(images) / 2:
+            yield (
+                f"the images show a grid of {columns} x {rows} circles: give --kind {kind} --columns {columns} "
+                f"--rows {rows}",
+                other,
+                False,
+            )
+    for (columns, rows), count in squares.most_common(1):
+        other = _possible(board, kind="chessboard", columns=columns + 1, rows=rows + 1)
+        if other is not None and count > len(images) / 2:
+            yield (
+                f"the images show a chessboard of {columns + 1} x {rows + 1} squares: give --kind chessboard --columns "
+                f"{columns + 1} --rows {rows + 1}",
+                other,
+                False,
+            )

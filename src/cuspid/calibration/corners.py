@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
-from cuspid.board import Board
+from cuspid.board import Board, BoardKind, BoardSet, Target
+from cuspid.calibration.circle_centres import find_circles
 from cuspid.calibration.lattice import find_lattice, is_as_large, is_larger
+from cuspid.calibration.tag_corners import find_tag_corners
 from cuspid.camera import OPENCV_PIXEL_OFFSET
 
 LEAST_CORNERS = 6
@@ -34,26 +36,55 @@ class BoardView:
         """The same view under another numbering of the corners (``Board.orders``)."""
         return BoardView(order[self.corner], self.pixels)
 
+    def moved(self, shift_px: Float[np.ndarray, "n 2"]) -> BoardView:
+        """The same view with its corners elsewhere."""
+        return BoardView(self.corner, self.pixels + shift_px)
+
 
 Views = Mapping[tuple[str, str], BoardView]
 """Views of the board, by camera and instant."""
 
 
-def find_corners(gray: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | None:
-    """The corners of the board in an image, to a fraction of a pixel; None if too few are found.
+def find_corners(gray: UInt8[np.ndarray, "h w"], target: Target) -> BoardView | None:
+    """The corners of the board, or of all boards of a set, in an image, to a fraction of a pixel; None if too few are
+    found.
 
     A plain chessboard must be seen from border to border (A. Duda, U. Frese, BMVC 2018; where it is bent by a strong
     lens or partly hidden by glare, :mod:`cuspid.calibration.lattice`); of a ChArUco board any part may be seen
     (S. Garrido-Jurado et al., Pattern Recognition 47, 2014). Each corner is searched for where the two markers beside
-    it predict it, so that steps elsewhere do not matter.
+    it predict it, so that steps elsewhere do not matter. Tags are those of :mod:`cuspid.calibration.tag_corners`,
+    circles those of :mod:`cuspid.calibration.circle_centres`.
     """
+    if isinstance(target, BoardSet):
+        found = [find_corners(gray, each) for each in target.boards]
+        shown = [(view, start) for view, start in zip(found, target.starts, strict=False) if view is not None]
+        return _united([BoardView(view.corner + start, view.pixels) for view, start in shown])
+    return _found_alone(gray, target)
+
+
+def _united(views: list[BoardView]) -> BoardView | None:
+    """The corners of several boards in one image."""
+    if not views:
+        return None
+    return BoardView(np.concatenate([view.corner for view in views]), np.concatenate([view.pixels for view in views]))
+
+
+def split_by_board(view: BoardView, target: Target) -> list[BoardView]:
+    """The parts of a view that show a board each."""
+    number = target.board_of(view.corner)
+    return [BoardView(view.corner[number == k], view.pixels[number == k]) for k in np.unique(number)]
+
+
+def _found_alone(gray: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | None:
     image = 255 - gray if board.inverted else gray
-    found = _charuco(image, board) if board.kind == "charuco" else _chessboard(image, board)
+    found = _FINDERS[board.kind](image, board)
     return found if found is not None and _tells(found, board) else None
 
 
-def pieces(view: BoardView, board: Board) -> list[BoardView]:
-    """The flat parts of a view, terrace by terrace, of which each tells something by itself."""
+def pieces(view: BoardView, board: Target) -> list[BoardView]:
+    """The flat parts of a view, terrace by terrace or board by board, of which each tells something by itself."""
+    if isinstance(board, BoardSet):
+        return split_by_board(view, board)
     terrace = board.terrace_at(board.corners[view.corner, 0])
     parts = [BoardView(view.corner[terrace == k], view.pixels[terrace == k]) for k in range(board.terraces)]
     return [part for part in parts if _tells(part, board)]
@@ -83,14 +114,26 @@ def _chessboard(image: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | No
     if lattice is None or not is_as_large(lattice, board):
         # Of a larger chessboard it would find a part.
         return None if lattice is not None and is_larger(lattice, board) else _exhaustively(image, size)
-    numbered = lattice.numbered(board)
-    return None if numbered is None else BoardView(numbered[0], numbered[1] + OPENCV_PIXEL_OFFSET)
+    return _view(lattice.numbered(board))
 
 
 def _exhaustively(image: UInt8[np.ndarray, "h w"], size: tuple[int, int]) -> BoardView | None:
     """With the one flag of OpenCV's that does not find boards where there are none."""
     found, pixels = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_EXHAUSTIVE)
     return _whole(image, pixels, size) if found else None
+
+
+def _tags(image: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | None:
+    return _view(find_tag_corners(image, board))
+
+
+def _circles(image: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | None:
+    return _view(find_circles(image, board))
+
+
+def _view(found: tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 2"]] | None) -> BoardView | None:
+    """Of numbers of corners, and where they lie in OpenCV's coordinates."""
+    return None if found is None else BoardView(found[0], found[1] + OPENCV_PIXEL_OFFSET)
 
 
 def _whole(
@@ -131,3 +174,12 @@ def _alternates_beyond(image: UInt8[np.ndarray, "h w"], grid: Float32[np.ndarray
 def _on_a_line(points: Float[np.ndarray, "n 2"]) -> bool:
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(spread[1] < 0.1 * spread[0])
+
+
+_FINDERS: Mapping[BoardKind, Callable[[UInt8[np.ndarray, "h w"], Board], BoardView | None]] = {
+    "charuco": _charuco,
+    "chessboard": _chessboard,
+    "aprilgrid": _tags,
+    "circles": _circles,
+    "asymmetric-circles": _circles,
+}

@@ -222,7 +222,7 @@ def _grown(saddles: Saddles, tree: cKDTree, seed: int, farthest_px: float) -> di
     growing = True
     while growing:
         growing = False
-        for cell, place in _openings(cells, saddles):
+        for cell, place in openings(cells, saddles.pixels):
             step = place - saddles.pixels[cells[cell[1]]]
             near = [
                 each
@@ -241,20 +241,20 @@ Opening = tuple[tuple[Cell, Cell], Float[np.ndarray, "2"]]
 """An empty cell with the one before it, and where its corner would be."""
 
 
-def _openings(cells: dict[Cell, int], saddles: Saddles) -> Iterator[Opening]:
-    """The empty cells beside two that follow each other."""
+def openings(cells: dict[Cell, int], pixels: Float[np.ndarray, "n 2"]) -> Iterator[Opening]:
+    """The empty cells beside two that follow each other, of a lattice of some points, by cell."""
     for (i, j), here in list(cells.items()):
         for di, dj in _STEPS:
             before, after = (i - di, j - dj), (i + di, j + dj)
             if before in cells and after not in cells:
-                yield (after, (i, j)), 2 * saddles.pixels[here] - saddles.pixels[cells[before]]
+                yield (after, (i, j)), 2 * pixels[here] - pixels[cells[before]]
         for di, dj in _STEPS:  # as far as beside it
             for ei, ej in ((-dj, di), (dj, -di)):
                 beside, beyond = (i + ei, j + ej), (i + ei + di, j + ej + dj)
                 after = (i + di, j + dj)
                 if after not in cells and beside in cells and beyond in cells:
-                    step = saddles.pixels[cells[beyond]] - saddles.pixels[cells[beside]]
-                    yield (after, (i, j)), saddles.pixels[here] + step
+                    step = pixels[cells[beyond]] - pixels[cells[beside]]
+                    yield (after, (i, j)), pixels[here] + step
 
 
 def _along(

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.board import Board
+from cuspid.board import Target
 from cuspid.calibration.bundle import Adjusted, adjust_board, in_front, of_instants
 from cuspid.calibration.corners import BoardView
 from cuspid.calibration.start import LEAST_VIEWS, calibrated_alone
@@ -55,7 +55,7 @@ class LensChoice:
 
 
 def choose_lens(
-    views: Sequence[BoardView], board: Board, size: tuple[int, int], asked: LensName = "auto"
+    views: Sequence[BoardView], board: Target, size: tuple[int, int], asked: LensName = "auto"
 ) -> tuple[LensChoice, Adjusted]:
     """The model that is asked for or that the views call for, and the camera by it, calibrated alone.
 
@@ -105,7 +105,7 @@ def _sound(views: Sequence[BoardView], found: Adjusted) -> list[BoardView]:
     return [view for k, view in enumerate(views) if rms.get(k, np.inf) <= _ODD * usual]
 
 
-def _first_that_fits(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> tuple[LensChoice, Adjusted]:
+def _first_that_fits(views: Sequence[BoardView], board: Target, size: tuple[int, int]) -> tuple[LensChoice, Adjusted]:
     """One of the two simplest models: of few views more cannot be told."""
     try:
         return LensChoice(model="OPENCV", held_out_px={}), calibrated_as("OPENCV", views, board, size)
@@ -124,7 +124,7 @@ def _is_worth_more(squares: Mapping[str, Float[np.ndarray, "v"]]) -> bool:
 
 
 def calibrated_as(
-    model: str, views: Sequence[BoardView], board: Board, size: tuple[int, int], simple: Adjusted | None = None
+    model: str, views: Sequence[BoardView], board: Target, size: tuple[int, int], simple: Adjusted | None = None
 ) -> Adjusted:
     """One camera of a model from its own views; ``simple``, if it is known, is the same by OPENCV.
 
@@ -173,7 +173,7 @@ def _ideal(model: str, size: tuple[int, int], half_deg: float) -> Camera:
     )
 
 
-def _held_out(found: Adjusted, views: Sequence[BoardView], board: Board) -> Float[np.ndarray, "v"]:
+def _held_out(found: Adjusted, views: Sequence[BoardView], board: Target) -> Float[np.ndarray, "v"]:
     """Mean square of the residuals of each view by cameras that were calibrated without it; NaN where the view fits no
     camera, infinite where such a camera does not show all of it. Raises ReconstructionError where too few views are
     left."""

@@ -9,6 +9,7 @@ from typing import Annotated
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from scipy.spatial import cKDTree
 
 from cuspid.board import Board
 from cuspid.calibration.bundle import bent
@@ -93,7 +94,7 @@ def clear_places(board: Board) -> Places:
     """The centres of uniform areas: the cells of a fine grid with the largest clearance, none next to another."""
     dark = _cells(board)
     far = np.where(dark, _to_edge(dark), _to_edge(~dark))
-    far = np.minimum(far, _to_step(board)[None])
+    far = np.minimum(far, _to_step(board, far.shape[1])[None])
     ridge = far + 1e-3 * np.random.default_rng(0).random(far.shape, dtype=np.float32)  # one of a row that is all alike
     size = 2 * _APART + 1
     clear = (ridge == cv2.dilate(ridge, np.ones((size, size), np.uint8))) & (far > _LEAST_CELLS)
@@ -107,7 +108,7 @@ def clear_places(board: Board) -> Places:
 
 
 def _cells(board: Board) -> Bool[np.ndarray, "h w"]:
-    across, down = (np.arange(_CELLS * count) + 0.5 for count in (board.columns, board.rows))
+    across, down = (np.arange(round(_CELLS * size / board.square_mm)) + 0.5 for size in board.size_mm)
     points = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2) * (board.square_mm / _CELLS)
     return board.is_dark(points).reshape(len(down), len(across))
 
@@ -119,10 +120,10 @@ def _to_edge(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     return np.asarray(np.maximum(found - _HALF_CELL, 0))
 
 
-def _to_step(board: Board) -> Float[np.ndarray, "w"]:
+def _to_step(board: Board, columns: int) -> Float[np.ndarray, "w"]:
     """Distance of each column of cells to the next edge of a step, of those in front of a riser to where that hides
     nothing in a view of 45 degrees; in cells."""
-    x = (np.arange(_CELLS * board.columns) + 0.5) * (board.square_mm / _CELLS)
+    x = (np.arange(columns) + 0.5) * (board.square_mm / _CELLS)
     nearest = np.full(len(x), np.inf)
     for edge in board.edges_mm[1:-1]:
         gap = np.where(x < edge, edge - board.step_mm - x, x - edge)
@@ -166,12 +167,8 @@ def on_board(
 
 def _beside(board: Board, corner: Int[np.ndarray, "k"], places: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
     """Whether a place lies in one of the squares that meet in a corner that was seen: nothing hides these."""
-    seen = np.zeros((board.rows, board.columns), dtype=bool)
-    row, column = np.divmod(corner, board.columns - 1)
-    for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        seen[row + down, column + across] = True
-    at = np.floor(places / board.square_mm).astype(np.int64)
-    return seen[at[:, 1], at[:, 0]]
+    away, _ = cKDTree(board.corners[corner, :2]).query(places, p=np.inf)
+    return np.asarray(away < board.square_mm)
 
 
 def _smallest_scale(

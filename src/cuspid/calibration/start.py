@@ -12,7 +12,8 @@ from itertools import combinations
 import cv2
 import numpy as np
 
-from cuspid.board import Board
+from cuspid.board import Target
+from cuspid.calibration.agreement import agreed_on, apart
 from cuspid.calibration.bundle import Adjusted, BoardScene, adjust_board, in_front, of_instants
 from cuspid.calibration.corners import LEAST_CORNERS, BoardView, Views, pieces
 from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
@@ -25,15 +26,12 @@ LEAST_VIEWS = 3
 _MOST_VIEWS = 40
 """Maximum number of views for the initial calibration of a camera: more take long, and the adjustment uses all of
 them."""
-_AGREE_DEG, _AGREE_SHARE = 5.0, 0.1
-"""Relative poses of two cameras, from two instants, that may be the same: largest rotation between them, and largest
-distance as a share of that of the board."""
 _NO_FIT_SHARE = 0.01
 """Residuals of a single camera, as a share of its image width, beyond which no camera model fits."""
 
 
 def calibrated_alone(
-    views: Sequence[BoardView], board: Board, size: tuple[int, int], starts: Sequence[Camera] = ()
+    views: Sequence[BoardView], board: Target, size: tuple[int, int], starts: Sequence[Camera] = ()
 ) -> Adjusted:
     """One camera from its own views; the poses of the board relative to other cameras play no part.
 
@@ -50,7 +48,7 @@ def calibrated_alone(
 
 
 def _calibrated_from(
-    camera: Camera | None, views: Sequence[BoardView], board: Board, size: tuple[int, int]
+    camera: Camera | None, views: Sequence[BoardView], board: Target, size: tuple[int, int]
 ) -> Adjusted | None:
     """None where the views do not fit."""
     try:
@@ -58,7 +56,10 @@ def _calibrated_from(
         poses = [board_pose(view, board, camera) for view in views]
         named = {str(k): pose for k, pose in enumerate(poses)}
         start = BoardScene(
-            cameras={"": camera}, cam_from_rig={"": Rigid3.identity()}, rig_from_board=named, bending_mm=np.zeros(3)
+            cameras={"": camera},
+            cam_from_rig={"": Rigid3.identity()},
+            rig_from_board=named,
+            bending_mm=np.zeros(3 * len(board.boards)),
         )
         sound = in_front(start, {("", str(k)): view for k, view in enumerate(views)}, board)
         if len(sound) < LEAST_VIEWS:
@@ -68,7 +69,7 @@ def _calibrated_from(
         return None
 
 
-def first_camera(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> Camera:
+def first_camera(views: Sequence[BoardView], board: Target, size: tuple[int, int]) -> Camera:
     """A camera from its views of the board, with each terrace as a separate plane (Z. Zhang, IEEE PAMI 22, 2000), with
     only the first term of distortion."""
     planes = [piece for view in views for piece in pieces(view, board)]
@@ -92,7 +93,7 @@ def first_camera(views: Sequence[BoardView], board: Board, size: tuple[int, int]
     )
 
 
-def board_pose(view: BoardView, board: Board, camera: Camera) -> Rigid3:
+def board_pose(view: BoardView, board: Target, camera: Camera) -> Rigid3:
     """``cam_from_board`` of one view (T. Collins, A. Bartoli, IJCV 109, 2014; with terraces, and where that
     finds none, G. Terzakis, M. Lourakis, ECCV 2020).
 
@@ -112,7 +113,7 @@ def board_pose(view: BoardView, board: Board, camera: Camera) -> Rigid3:
 
 
 def joined(
-    views: Views, board: Board, cameras: Mapping[str, Camera], instants: Sequence[str]
+    views: Views, board: Target, cameras: Mapping[str, Camera], instants: Sequence[str]
 ) -> tuple[BoardScene, dict[tuple[str, str], BoardView]]:
     """The cameras in the frame of the first one, the board at each instant, and the views with a common numbering.
 
@@ -129,10 +130,13 @@ def joined(
         rig_from_board[instant] = cam_from_rig[first].inverse() @ poses[first, instant][0]
         for name in seeing:
             expected = cam_from_rig[name] @ rig_from_board[instant]
-            best = min(range(len(board.orders)), key=lambda k: _apart(poses[name, instant][k], expected)[0])
+            best = min(range(len(board.orders)), key=lambda k: apart(poses[name, instant][k], expected)[0])
             chosen[name, instant] = numbered[name, instant][best]
     scene = BoardScene(
-        cameras=cameras, cam_from_rig=cam_from_rig, rig_from_board=rig_from_board, bending_mm=np.zeros(3)
+        cameras=cameras,
+        cam_from_rig=cam_from_rig,
+        rig_from_board=rig_from_board,
+        bending_mm=np.zeros(3 * len(board.boards)),
     )
     return scene, {key: chosen[key] for key in views}
 
@@ -179,22 +183,10 @@ def _beside(poses: Poses, known: str, new: str, instants: Sequence[str]) -> Rigi
     """
     said = [[pose @ poses[known, instant][0].inverse() for pose in poses[new, instant]] for instant in instants]
     distance_mm = float(np.median([np.linalg.norm(poses[new, instant][0].translation) for instant in instants]))
-
-    def support(candidate: Rigid3) -> tuple[int, float]:
-        nearest = [min(_apart(each, candidate) for each in options) for options in said]
-        agreeing = [turn for turn, shift in nearest if turn < _AGREE_DEG and shift < _AGREE_SHARE * distance_mm]
-        return len(agreeing), -float(np.median([turn for turn, _ in nearest]))
-
-    best = max((each for options in said for each in options), key=support)
-    if 2 * support(best)[0] < len(instants):
+    best, agreeing = agreed_on(said, distance_mm)
+    if 2 * agreeing < len(instants):
         raise ReconstructionError(
-            f"calibration: only {support(best)[0]} of {len(instants)} instants agree on the pose of {new} relative to "
+            f"calibration: only {agreeing} of {len(instants)} instants agree on the pose of {new} relative to "
             f"{known}; check that they were triggered together, and that images with the same name belong together"
         )
     return best
-
-
-def _apart(one: Rigid3, other: Rigid3) -> tuple[float, float]:
-    """The turn between two motions, degrees, and the distance, mm."""
-    between = one @ other.inverse()
-    return between.angle_deg, float(np.linalg.norm(one.translation - other.translation))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
-from cuspid.board import Board
+from cuspid.board import Target
 from cuspid.calibration.bundle import Adjusted, BoardScene, Timing, adjust_board
 from cuspid.calibration.corners import Views
 from cuspid.geometry import Rigid3
@@ -37,7 +37,7 @@ def untied(scene: BoardScene, frame: Mapping[str, int], views: Views) -> BoardSc
     return _followed(scene, timing, scene.rig_from_board, views)
 
 
-def adjust_scene(start: BoardScene, views: Views, board: Board, *, only_boards: bool = False) -> Adjusted:
+def adjust_scene(start: BoardScene, views: Views, board: Target, *, only_boards: bool = False) -> Adjusted:
     """As ``adjust_board``, also where cameras need not have exposed together."""
     if start.timing is None:
         return adjust_board(start, views, board, only_boards=only_boards)

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 from rich.table import Table
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from cuspid import storage
-from cuspid.board import Board
+from cuspid.board import Board, BoardSet, Target
 from cuspid.calibration.calibrate import (
     CalibrationOptions,
     RigCalibration,
@@ -23,6 +23,7 @@ from cuspid.calibration.calibrate import (
     size_notes,
 )
 from cuspid.calibration.causes import MOST_TRIED, cause_of_absence, is_part_of_a_larger_one
+from cuspid.calibration.circle_centres import measured_share
 from cuspid.calibration.corners import BoardView, Views, find_corners
 from cuspid.calibration.instants import common_instants
 from cuspid.calibration.photometry import Photometry, PhotometryOptions, calibrate_light, look_at_patches
@@ -31,7 +32,7 @@ from cuspid.calibration.target import PLATE_MM, target_body
 from cuspid.calibration.uncertainty import projection_sigma_px
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, named, show_progress
-from cuspid.errors import ReconstructionError
+from cuspid.errors import InputError, ReconstructionError
 from cuspid.image_sequence import ImageSequence
 from cuspid.options import Range
 from cuspid.progress import Progress
@@ -46,14 +47,39 @@ from cuspid.simulation.board_images import PhotographOptions, take_photographs
 from cuspid.simulation.manufacturing import ManufacturingOptions, built
 from cuspid.workers import map_in_threads
 
+_OTHER_CIRCLES = 0.06
+"""Error of the diameter of circles, as a share, that is told."""
+BoardFiles = Annotated[tuple[Path, ...], arg(name="board")]
+"""Boards that are described by files."""
 
-def target(*, out: Path, board: Annotated[Board, Flat] = Board()) -> None:
-    """Draw a ChArUco board or a chessboard at true size for printing, or make the body that the print is mounted on.
+
+def target(*, out: Path, board: Annotated[Board, Flat] = Board(), board_files: BoardFiles = ()) -> None:
+    """Draw a board at true size for printing, or make the body that the print is mounted on.
 
     Args:
         out: PDF, SVG or PNG file for the pattern (with terraces, a strip to be folded over them), or STL file for the
-            body.
+            body. Of several boards each has its number appended.
+        board_files: YAML files that describe the board or boards, instead of options: Kalibr's, or options by name.
     """
+    boards = _target(board, board_files).boards
+    for number, each in enumerate(boards, 1):
+        _draw(out if len(boards) == 1 else out.with_stem(f"{out.stem}-{number}"), each)
+
+
+def _target(board: Board, files: Sequence[Path], copies: int = 1) -> Target:
+    """What cameras are calibrated from. Raises InputError where it is said twice."""
+    if files and board != Board():
+        raise InputError("--board describes the board; leave out its other options")
+    boards = [each for path in files for each in storage.read_boards(path)] or [board]
+    if copies > 1:
+        if len(boards) > 1:
+            raise InputError(f"--copies {copies}: the files describe {len(boards)} boards already")
+        first = boards[0]
+        boards = [replace(first, first_id=first.first_id + k * first.markers) for k in range(copies)]
+    return boards[0] if len(boards) == 1 else BoardSet(boards=tuple(boards))
+
+
+def _draw(out: Path, board: Board) -> None:
     width, height = board.size_mm
     if out.suffix.lower() == ".stl":
         storage.write_mesh(out, target_body(board))
@@ -62,7 +88,7 @@ def target(*, out: Path, board: Annotated[Board, Flat] = Board()) -> None:
         return
     save_board(out, board)
     size = f"{width + board.height_mm:g} x {height:g} mm"
-    console.print(f"{out}: {size}; measure the ruler on the print, and give its length over squares")
+    console.print(f"{out}: {size}; measure the ruler on the print, and give the length of one of its parts")
 
 
 def photograph(
@@ -92,6 +118,8 @@ def calibrate(
     *,
     out: Path,
     board: Annotated[Board, Flat] = Board(),
+    board_files: BoardFiles = (),
+    copies: Annotated[int, Range(1, 50)] = 1,
     working_distance_mm: Annotated[float | None, Range(0.1, 100_000)] = None,
     drawn: Path | None = None,
     options: Annotated[CalibrationOptions, Flat] = CalibrationOptions(),
@@ -104,13 +132,17 @@ def calibrate(
             name.
         out: Folder for handpiece.json, rig_config.json, calibration.json (the quality of each camera), residuals.png,
             uncertainty.png, photometry.png and report.html.
+        board_files: YAML files that describe the board or boards, instead of options: Kalibr's, or options by name.
+            Several boards must be fixed to one another, and have markers with different ids.
+        copies: Number of boards of this kind, fixed to one another, whose ids go on from one to the next.
         working_distance_mm: Distance from the cameras to the teeth; default: that of the drawn handpiece, or else the
             median distance of the board.
         drawn: handpiece.json of the handpiece as it was drawn (its design). Its lights, and no others, must have lit
             the board; they are calibrated too.
     """
+    shown = _target(board, board_files, copies)
     settings = {
-        "board": board,
+        "board": shown,
         "options": options,
         "working_distance_mm": working_distance_mm,
         "photometry": photometry,
@@ -125,17 +157,20 @@ def calibrate(
             for name, path in sources.items()
         }
         sequences, named_notes = _matched(sequences)
-        views = _views(sequences, board, progress)
-        _require_views(sequences, views, board)
-        found = calibrate_rig(views, {name: each.size for name, each in sequences.items()}, board, options)
-        drawn_notes = () if given is None else size_notes(found.rig, given.rig, board)
+        views = _views(sequences, shown, progress)
+        _require_views(sequences, views, shown)
+        found = calibrate_rig(views, {name: each.size for name, each in sequences.items()}, shown, options)
+        drawn_notes = () if given is None else size_notes(found.rig, given.rig, shown)
+        drawn_notes += tuple(_other_circles(sequences, views, shown))
         found = found if given is None else in_frame_of(found, given.rig)
-        light = _light(found, sequences, board, given, photometry, progress) if photometry.photometry else None
+        light = None
+        if photometry.photometry and isinstance(shown, Board):
+            light = _light(found, sequences, shown, given, photometry, progress)
     read = (note for each in sequences.values() for note in each.notes)
     notes = (*read, *named_notes, *_unseen(sequences, views), *drawn_notes, *found.notes)
     found = replace(found, notes=notes)
     with storage.claimed_folder(out, "calibrate", settings, hashes | drawn_hash, replace=True):
-        _write(found, light, _handpiece(found, light, given, working_distance_mm), board, out)
+        _write(found, light, _handpiece(found, light, given, working_distance_mm), shown, out)
     _print(found, out)
     if light is not None:
         _print_light(light)
@@ -160,7 +195,7 @@ def _light(
     return calibrate_light(found, patches, board, drawn, options)
 
 
-def _write(found: RigCalibration, light: Photometry | None, handpiece: Handpiece, board: Board, out: Path) -> None:
+def _write(found: RigCalibration, light: Photometry | None, handpiece: Handpiece, board: Target, out: Path) -> None:
     storage.write_handpiece(out / "handpiece.json", handpiece)
     storage.write_rig_config(out / "rig_config.json", handpiece.rig)
     storage.write_json(out / "calibration.json", {**_figures(found, board), **_light_figures(light)})
@@ -187,7 +222,7 @@ def _matched(sequences: Mapping[str, ImageSequence]) -> tuple[dict[str, ImageSeq
     return {camera: replace(each, instants=instants[camera]) for camera, each in sequences.items()}, (note,)
 
 
-def _views(sequences: Mapping[str, ImageSequence], board: Board, progress: Progress) -> Views:
+def _views(sequences: Mapping[str, ImageSequence], board: Target, progress: Progress) -> Views:
     """The board in every image that shows it."""
     images = [(camera, index) for camera, sequence in sequences.items() for index in range(len(sequence))]
 
@@ -203,14 +238,14 @@ def _views(sequences: Mapping[str, ImageSequence], board: Board, progress: Progr
     }
 
 
-def _require_views(sequences: Mapping[str, ImageSequence], views: Views, board: Board) -> None:
+def _require_views(sequences: Mapping[str, ImageSequence], views: Views, board: Target) -> None:
     """Raise ReconstructionError, which names the cause, where a camera hardly saw the board as it was described, or saw
     a larger one."""
     for name, sequence in sequences.items():
         seen = [index for index, instant in enumerate(sequence.names) if (name, instant) in views]
         unseen = [index for index in range(len(sequence)) if index not in set(seen)]
         if len(seen) >= LEAST_VIEWS:
-            if is_part_of_a_larger_one(_some(sequence, seen), board):
+            if isinstance(board, Board) and is_part_of_a_larger_one(_some(sequence, seen), board):
                 raise ReconstructionError(
                     f"calibration: the board in the images of camera {name} has a square more each way; the corners "
                     f"were counted, not the squares: give --columns {board.columns + 1} --rows {board.rows + 1}"
@@ -219,6 +254,21 @@ def _require_views(sequences: Mapping[str, ImageSequence], views: Views, board: 
             raise ReconstructionError(
                 f"calibration: the board is found in {len(seen)} of {len(sequence)} images of camera {name}; {cause}"
             )
+
+
+def _other_circles(sequences: Mapping[str, ImageSequence], views: Views, board: Target) -> Iterator[str]:
+    """Where circles are not as large as was said, so that their centres are not corrected as they should be."""
+    if isinstance(board, BoardSet) or not board.has_circles:
+        return
+    name, sequence = next(iter(sequences.items()))
+    seen = [index for index, instant in enumerate(sequence.names) if (name, instant) in views]
+    shares = [each for each in (measured_share(image, board) for image in _some(sequence, seen)) if each is not None]
+    share = float(np.median(shares)) if shares else board.circle_share
+    if abs(share / board.circle_share - 1) > _OTHER_CIRCLES:
+        yield (
+            f"the circles are {share:.2f} of their distance wide, not {board.circle_share:g}: give --circle-share "
+            f"{share:.2f}, for their centres are not seen in the middle, by how much depends on it"
+        )
 
 
 def _some(sequence: ImageSequence, indices: Sequence[int]) -> list[UInt8[np.ndarray, "h w"]]:
@@ -252,15 +302,30 @@ def _focused(handpiece: Handpiece, distance_mm: float) -> Handpiece:
     return replace(handpiece, working_distance_mm=distance_mm, depth_range_mm=depth_of_field_mm(distance_mm))
 
 
-def _figures(found: RigCalibration, board: Board) -> dict[str, object]:
+def _figures(found: RigCalibration, board: Target) -> dict[str, object]:
     bent = {"board_bending_mm": found.bending_mm}
+    steps = {"board_step_mm": board.step_mm + found.bending_mm[0]} if isinstance(board, Board) else {}
     return {
         "sigma_px": found.sigma_px,
-        **(bent if board.terraces == 1 else {"board_step_mm": board.step_mm + found.bending_mm[0]}),
+        **(bent if board.terraces == 1 else steps),
+        **({"boards": _boards(found, board)} if isinstance(board, BoardSet) else {}),
         "board_distance_mm": found.distance_mm,
         "cameras": {name: {**asdict(each), "lens": asdict(found.lenses[name])} for name, each in found.cameras.items()},
         "notes": found.notes,
     }
+
+
+def _boards(found: RigCalibration, boards: BoardSet) -> list[dict[str, object]]:
+    """Each of several boards, and where it is on the body that they are fixed to; the others carry its frame."""
+    return [
+        {
+            "kind": board.kind,
+            "ids": [board.ids[0], board.ids[-1]],
+            "body_from_board": found.body_from_board[number].matrix if number in found.body_from_board else None,
+            "views": sum((boards.board_of(view.corner) == number).any() for view in found.views.values()),
+        }
+        for number, board in enumerate(boards.boards)
+    ]
 
 
 def _light_figures(light: Photometry | None) -> dict[str, object]:

@@ -4,6 +4,7 @@ Files appear whole or not at all: they are written beside their place and rename
 ``run.json`` with what it was made from, so that a run can go on where it stopped and never mixes with another one.
 """
 
+from cuspid.storage.boards import read_boards
 from cuspid.storage.captures import (
     IMAGE_SUFFIXES,
     hash_capture,
@@ -101,6 +102,7 @@ __all__ = [
     "images_in",
     "is_jaw",
     "is_photographs",
+    "read_boards",
     "read_capture",
     "read_depth_maps",
     "read_frame_times",

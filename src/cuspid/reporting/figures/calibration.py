@@ -11,7 +11,7 @@ from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
@@ -61,7 +61,10 @@ def save_board(path: Path, board: Board) -> None:
     if board.inverted:
         ground = np.array([[-margin / 2, -margin / 2]])
         axes.add_collection(_squares(ground, np.array([[width + margin, height + margin]]), "black"))
-    axes.add_collection(_squares(places, np.stack([sides, sides], axis=1), "white" if board.inverted else "black"))
+    ink = "white" if board.inverted else "black"
+    axes.add_collection(_squares(places, np.stack([sides, sides], axis=1), ink))
+    if board.has_circles:
+        axes.add_collection(_circles(board, axes, ink))
     if board.terraces > 1:
         _draw_folds(axes, board, height)
     _draw_ruler(figure, board, height + margin)
@@ -94,9 +97,23 @@ def _squares(places: Float[np.ndarray, "n 2"], sizes: Float[np.ndarray, "n 2"], 
     )
 
 
+def _circles(board: Board, axes: Axes, colour: str) -> EllipseCollection:
+    across = np.full(len(board.corners), board.circle_mm)
+    return EllipseCollection(
+        across,
+        across,
+        np.zeros(len(across)),
+        units="xy",
+        offsets=board.corners[:, :2],
+        offset_transform=axes.transData,
+        facecolors=colour,
+        edgecolors="none",
+    )
+
+
 def _draw_ruler(figure: Figure, board: Board, top_mm: float) -> None:
-    """As many whole squares, or millimetres, as are wide; and what they must measure."""
-    axes, length = figure.axes[0], board.size_mm[0]
+    """As many sides of a square as there are in a row; and what they must measure."""
+    axes, length = figure.axes[0], board.columns * board.square_mm
     axes.plot([0, length], [top_mm, top_mm], color="black", linewidth=0.5, solid_capstyle="butt")
     for x in board.square_mm * np.arange(board.columns + 1):
         axes.plot([x, x], [top_mm - 1, top_mm + 1], color="black", linewidth=0.5, solid_capstyle="butt")
@@ -105,9 +122,16 @@ def _draw_ruler(figure: Figure, board: Board, top_mm: float) -> None:
 
 
 def _named(board: Board) -> str:
-    markers = f", {board.dictionary}, markers {board.marker_share:g}" if board.kind == "charuco" else ""
-    terraces = f"\n{board.terraces} terraces, steps of {board.step_mm:g} mm" if board.terraces > 1 else ""
-    return f"{board.kind} {board.columns} x {board.rows} x {board.square_mm:g} mm{markers}{terraces}"
+    told = f"{board.kind} {board.columns} x {board.rows} x {board.square_mm:g} mm"
+    if board.kind == "charuco":
+        told += f", {board.dictionary}, markers {board.marker_share:g}"
+    if board.kind == "aprilgrid":
+        told += f", {board.family}, spacing {board.spacing_share:g}"
+    if board.has_circles:
+        told += f", circles of {board.circle_mm:g} mm"
+    if board.has_markers:
+        told += f", ids {board.ids_told}"
+    return told + (f"\n{board.terraces} terraces, steps of {board.step_mm:g} mm" if board.terraces > 1 else "")
 
 
 def save_residuals_picture(
