@@ -4,8 +4,8 @@ Each ray through a pixel gives the albedo of the solid texture at the hit, lit b
 light with a lobe and 1/d^2 falloff, through a GGX coat with Schlick's Fresnel term (Walter et al. 2007). Few of the
 rays are traced (:mod:`cuspid.simulation.hits`, :mod:`cuspid.simulation.shadows`). Interreflection is a constant share
 of the light that reaches a point. Where light travels below the surface, what enters is known at the vertices, and
-spreads among them (:mod:`cuspid.simulation.scattering`). Radiance is linear RGB in units in which a white diffuse surface facing a light
-of power 1 at 1 mm has radiance 1 plus that share. The world is the frame of the jaw.
+spreads among them (:mod:`cuspid.simulation.scattering`). Radiance is linear RGB in units in which a white diffuse
+surface facing a light of power 1 at 1 mm has radiance 1 plus that share. The world is the frame of the jaw.
 """
 
 from __future__ import annotations
