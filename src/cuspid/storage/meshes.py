@@ -162,8 +162,8 @@ def _declared_faces(path: Path) -> int:
             raise InputError(f"{path}: truncated, it does not end with 'endsolid'; copy the file again")
         return data.count(b"facet normal")
     if suffix == ".off":
-        counts = _COMMENT.sub(b"", data[:_LONGEST_HEADER]).partition(b"OFF")[2].split(maxsplit=2)[1:2]
-        return int(counts[0]) if counts and _COUNT.fullmatch(counts[0]) else 0
+        said = _COMMENT.sub(b"", data[:_LONGEST_HEADER]).partition(b"OFF")[2].split(maxsplit=2)[1:2]
+        return int(said[0]) if said and _COUNT.fullmatch(said[0]) else 0
     return 0
 
 
