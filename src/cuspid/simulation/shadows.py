@@ -1,7 +1,7 @@
 """Which lights reach what the pixels of an image show, and how much light each of them gives there.
 
 Shadows are traced once for each surface in a pixel, at its first ray. Their edges are few: they are traced at every
-fourth pixel of every fourth row, and a pixel agrees with the four of them about it where these agree about a light and
+third pixel of every third row, and a pixel agrees with the four of them about it where these agree about a light and
 all lie on one surface.
 """
 
@@ -30,7 +30,7 @@ SAME_SURFACE = 0.03
 """Rays through a pixel whose lengths differ by less than this share hit the same surface (12 um at 5 mm, up to 85
 deg)."""
 
-STEP = 4
+STEP = 3
 """Pixels from one place where shadows are traced to the next."""
 
 _GRAZING = 0.1
