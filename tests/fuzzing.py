@@ -130,6 +130,7 @@ def _meshes(folder: Path) -> None:
     storage.write_jaw(folder / "jaw.ply", jaw)
     storage.write_mesh(folder / "binary.stl", jaw.mesh)
     storage.write_mesh(folder / "mesh.obj", jaw.mesh)
+    storage.write_mesh(folder / "mesh.off", jaw.mesh)
     loaded = trimesh.Trimesh(jaw.mesh.vertices, jaw.mesh.faces, process=False)
     (folder / "text.ply").write_bytes(loaded.export(file_type="ply", encoding="ascii"))
     (folder / "text.stl").write_text(str(loaded.export(file_type="stl_ascii")))
@@ -695,7 +696,7 @@ def damaged(data: bytes, rng: np.random.Generator, suffix: str) -> bytes:
     """Contents with one to three things wrong."""
     for _ in range(int(rng.integers(1, 4))):
         ways: list[Callable[[bytes, np.random.Generator], bytes]] = [_flipped, _cut, _removed, _inserted, _repeated]
-        if suffix in (".json", ".toml", ".txt", ".yml", ".csv", ".obj", ".stl", ".ply", ".jsonl"):
+        if suffix in (".json", ".toml", ".txt", ".yml", ".csv", ".obj", ".off", ".stl", ".ply", ".jsonl"):
             ways += 4 * [_renumbered]
         if suffix == ".json":
             ways += 9 * [_revalued]

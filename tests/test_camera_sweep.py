@@ -3,6 +3,7 @@
 import csv
 import pickle
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,12 +13,14 @@ from hypothesis import strategies as st
 from cuspid import cli, storage
 from cuspid.errors import InputError
 from cuspid.pairing import stereo_pairs
+from cuspid.room import Room
 from cuspid.studies import camera_sweep, grid
 from cuspid.studies.camera_sweep import (
     SweepOptions,
     best_setting,
     contenders,
     find_site,
+    held_clear,
     pair_handpiece,
     surface_faces,
     sweep,
@@ -89,6 +92,21 @@ def test_the_gum_of_a_tooth_lies_on_its_outer_side(coarse_phantom):
     tooth = coarse_phantom.mesh.face_centres[coarse_phantom.tooth_faces(46)]
     # 46 stands on the patient's right, which is +X in a lower jaw.
     assert np.median(coarse_phantom.mesh.face_centres[gum, 0]) > np.median(tooth[:, 0]) + 2
+
+
+def test_a_pair_that_hardly_touches_is_moved_a_little_and_one_that_is_in_the_way_is_refused(site):
+    handpiece, poses = pair_handpiece(site.pair_from_rig, (2.0, 0.0), SMALL), site.rig_from_world[0]
+    free = Room(site.jaw.mesh, handpiece.solid, SMALL.path.clearance_mm)
+    nearest_mm = min(free.clearance(pose)[0] for pose in poses.values())
+    assert held_clear(replace(free, clearance_mm=nearest_mm - 0.01), poses, site.pair_from_rig, SMALL) == dict(poses)
+    tight = replace(free, clearance_mm=nearest_mm + 0.1)
+    held = held_clear(tight, poses, site.pair_from_rig, SMALL)
+    assert list(held) == list(poses)
+    assert tight.fits_at(list(held.values())).all()
+    moved = [np.linalg.norm(held[name].matrix - poses[name].matrix) for name in poses]
+    assert 0.05 < max(moved) < 0.6
+    with pytest.raises(InputError, match=r"mm of the jaw, but must keep"):
+        held_clear(replace(free, clearance_mm=nearest_mm + 2.0), poses, site.pair_from_rig, SMALL)
 
 
 @settings(max_examples=20)

@@ -13,6 +13,7 @@ from builders import box_mesh, handpiece, image_path, make_capture, shifted, sph
 from cuspid import __version__, cli, storage
 from cuspid.cli.scan import _evaluate_trajectory
 from cuspid.cli.shared import Probe, load_probe, suited
+from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from report_folders import known_trueness
@@ -79,6 +80,13 @@ def test_plain_enamel_has_crossed_polarisers_unless_others_are_asked_for(capsys)
     assert max(glare(Probe(lights="colour-coded"), "artificial")) < 0.1
     assert suited(Probe(handpiece=Path("mine.json")), "enamel") == Probe(handpiece=Path("mine.json"))
     assert not capsys.readouterr().err
+
+
+def test_images_are_scaled_and_none_is_too_small() -> None:
+    cameras = load_probe(Probe(design="four", scale=0.3)).rig.cameras.values()
+    assert {(each.camera.width, each.camera.height) for each in cameras} == {(150, 150)}
+    with pytest.raises(InputError, match=r"--scale 0\.02 leaves images of 10 x 10 px of camera \w+; give a larger one"):
+        load_probe(Probe(scale=0.02))
 
 
 def test_broken_captures(tmp_path, capsys):

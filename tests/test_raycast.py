@@ -31,7 +31,6 @@ from cuspid.simulation.appearance import (
 )
 from cuspid.simulation.optics import Optics
 from cuspid.simulation.raycast import (
-    AMBIENT,
     Scene,
     auto_gain,
     lamps,
@@ -43,6 +42,7 @@ from cuspid.simulation.raycast import (
     render_image,
 )
 from cuspid.simulation.sensor import expose
+from cuspid.simulation.shadows import AMBIENT
 
 WHITE = Material(dark=(1.0, 1.0, 1.0), light=(1.0, 1.0, 1.0), wavelengths_mm=(1.0,))
 BLACK = replace(WHITE, dark=(0.0, 0.0, 0.0), light=(0.0, 0.0, 0.0))

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from builders import THESIS_CAMERA, rig_of, shifted
+from cuspid.camera import Camera
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import essential_four, six_cameras, stereo_pair
@@ -95,3 +96,35 @@ def test_the_depth_range_encloses_the_working_distance():
 def test_a_light_has_a_unit_direction():
     light = Light(position_mm=np.zeros(3), direction=np.array([0, 0, 4.0]))
     np.testing.assert_array_equal(light.direction, [0, 0, 1])
+
+
+@given(st.floats(0.1, 3.0), st.integers(17, 400), st.integers(17, 400))
+def test_scaled_cameras_see_the_same_rays(factor, width, height):
+    """Through the same place of the image, whole pixels or not; the corners stay where they are."""
+    camera = Camera(
+        width=width,
+        height=height,
+        focal_px=np.array([0.8 * width, 0.9 * height]),
+        principal_point_px=np.array([0.47, 0.52]) * [width, height],
+        distortion=np.array([-0.08, 0.02, 0.002, -0.003]),
+    )
+    whole = Handpiece(rig=Rig({"a": MountedCamera(camera, Rigid3.identity())}))
+    fewer = whole.scaled(factor).rig["a"].camera
+    np.testing.assert_allclose([fewer.width, fewer.height], [factor * width, factor * height], atol=0.5)
+    places = np.array([[0, 0], [1, 1], [0.5, 0.5], [0.1, 0.8]])
+    seen = [each.rays(places * [each.width, each.height]) for each in (camera, fewer)]
+    np.testing.assert_allclose(seen[1], seen[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("design", [stereo_pair, six_cameras])
+def test_a_scale_of_1_changes_nothing_and_another_only_the_images(design):
+    whole = design()
+    same, half = whole.scaled(1.0), whole.scaled(0.5)
+    assert half.footprint_mm == pytest.approx(2 * whole.footprint_mm)
+    for name, mounted in whole.rig.cameras.items():
+        camera = same.rig[name].camera
+        assert (camera.width, camera.height) == (mounted.camera.width, mounted.camera.height)
+        np.testing.assert_array_equal(camera.parameters, mounted.camera.parameters)
+        np.testing.assert_array_equal(half.rig[name].cam_from_rig.matrix, mounted.cam_from_rig.matrix)
+    assert half.lights == whole.lights
+    assert half.working_distance_mm == whole.working_distance_mm

@@ -27,7 +27,7 @@ from cuspid.trueness import ReferenceRender
 from strategies import lenses, rigid3s
 
 
-@pytest.mark.parametrize("suffix", [".stl", ".ply", ".obj"])
+@pytest.mark.parametrize("suffix", storage.MESH_SUFFIXES)
 @pytest.mark.parametrize("unit", ["mm", "m", "in", "um"])
 def test_meshes_return_from_every_format_and_unit(tmp_path, suffix, unit):
     mesh = box_mesh()
@@ -37,6 +37,17 @@ def test_meshes_return_from_every_format_and_unit(tmp_path, suffix, unit):
     assert len(again.vertices) == 8
     np.testing.assert_allclose(again.bounds, mesh.bounds, rtol=1e-6)
     assert again.face_areas.sum() == pytest.approx(mesh.face_areas.sum(), rel=1e-5)
+
+
+def test_off_files_have_comments_polygons_and_colours(tmp_path):
+    """As other programs write them: a square and two triangles, counts behind the name or below it."""
+    places = "0 0 0\n2 0 0 # a corner\n2 2 0\n0 2 0\n1 1 2\n"
+    for start in ("OFF\n# a comment: OFF 1 1 1\n5 3 0\n", "OFF 5 3 0\n"):
+        (tmp_path / "tent.off").write_text(f"{start}{places}4 0 3 2 1 255 0 0\n3 0 1 4\n3 1 2 4\n")
+        mesh = storage.read_mesh(tmp_path / "tent.off", "cm")
+        assert len(mesh.faces) == 4
+        np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [20, 20, 20]])
+        assert mesh.face_areas.sum() == pytest.approx(100 * (4 + 2 * np.sqrt(5)))
 
 
 def test_a_jaw_keeps_labels_colours_landmarks_lines_and_spheres(tmp_path):
@@ -75,7 +86,7 @@ def test_labels_may_lie_beside_the_mesh(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("jaw.txt", b"hello", "not a mesh file"),
+        ("jaw.txt", b"hello", "not a mesh file that cuspid reads; give an STL, PLY, OBJ or OFF file"),
         ("jaw.stl", b"hello", "jaw.stl: (not a mesh|the mesh is empty)"),
         (
             "jaw.ply",
@@ -84,6 +95,10 @@ def test_labels_may_lie_beside_the_mesh(tmp_path):
         ),
         ("jaw.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "jaw.obj: (not a mesh|the mesh is empty)"),
         ("jaw.obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "jaw.obj: its vertices do not have three coordinates each"),
+        ("jaw.off", b"hello", "jaw.off: not a mesh"),
+        ("jaw.off", b"OFF\n3 9 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "jaw.off: 1 of 9 faces could be read"),
+        ("jaw.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "jaw.off: not a mesh"),
+        ("jaw.off", b"OFF\n99999999999 1 0\n0 0 0\n", "jaw.off: not a mesh"),
         ("jaw.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "jaw.obj: (not a mesh|some coordinates are not finite)"),
     ],
 )

@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 
 from cuspid.errors import InputError
 from cuspid.image_files import Pixels, as_8_bits, has_opacity, image_size, read_fine, read_image, read_rgba
-from cuspid.rig import Handpiece, Rig
+from cuspid.rig import Handpiece
 from cuspid.values import checked_name
 
 
@@ -221,13 +221,7 @@ class Capture:
 
     def halved(self) -> Capture:
         """The same capture with images of half the size, and a handpiece that takes such images."""
-        cameras = {
-            name: replace(
-                mounted, camera=mounted.camera.resized(*halved_size(mounted.camera.width, mounted.camera.height))
-            )
-            for name, mounted in self.handpiece.rig.cameras.items()
-        }
-        return replace(self, handpiece=replace(self.handpiece, rig=Rig(cameras)), source=HalvedImages(self.source))
+        return replace(self, handpiece=self.handpiece.scaled(0.5), source=HalvedImages(self.source))
 
     def image(self, frame: Frame, camera: str) -> UInt8[np.ndarray, "h w 3"]:
         """RGB image. Raises InputError where it is missing, damaged, or not of the camera's size."""

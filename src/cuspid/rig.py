@@ -347,6 +347,14 @@ class Handpiece:
         """The same handpiece with other cameras; sensors of those that it no longer has are left out."""
         return replace(self, rig=rig, sensors={name: own for name, own in self.sensors.items() if name in rig.names})
 
+    def scaled(self, factor: float) -> Handpiece:
+        """The same handpiece with images of ``factor`` times the size, in whole pixels, of the same view."""
+        cameras = {
+            name: replace(mounted, camera=mounted.camera.resized(*_scaled_size(mounted.camera, factor)))
+            for name, mounted in self.rig.cameras.items()
+        }
+        return replace(self, rig=Rig(cameras))
+
     def sensor_of(self, camera: str) -> Sensor:
         """The sensor of a camera."""
         return self.sensors.get(camera, self.sensor)
@@ -368,3 +376,7 @@ class Handpiece:
             known = ", ".join(by_name) or "none"
             raise InputError(f"handpiece {self.name}: no lighting pattern named {lighting!r}; it has {known}")
         return [self.lights[name] for name in by_name[lighting]]
+
+
+def _scaled_size(camera: Camera, factor: float) -> tuple[int, int]:
+    return max(round(factor * camera.width), 1), max(round(factor * camera.height), 1)

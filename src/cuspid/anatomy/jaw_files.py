@@ -121,7 +121,7 @@ def jaw_files(folder: Path) -> list[Path]:
         raise InputError(f"{folder}: no such file or folder")
     found = sorted(path for path in finished(folder) if path.suffix.lower() in MESH_SUFFIXES)
     if not found:
-        raise InputError(f"{folder}: there are no jaw meshes in it; give a folder with STL, PLY or OBJ files")
+        raise InputError(f"{folder}: there are no jaw meshes in it; give a folder with STL, PLY, OBJ or OFF files")
     return found
 
 

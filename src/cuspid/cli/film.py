@@ -26,7 +26,7 @@ def film(
     """Render what an intra-oral camera sees while a shaky hand moves it over the arch: OUT/capture and OUT/truth.
 
     Args:
-        jaw: Mesh of a jaw (STL, PLY, OBJ); default: the built-in phantom.
+        jaw: Mesh of a jaw (STL, PLY, OBJ, OFF); default: the built-in phantom.
         out: Output folder.
         camera: The camera and its LEDs.
         handpiece: Your own handpiece.json, instead of that camera.

@@ -91,7 +91,7 @@ def visibility(
     """Find how much of each surface a handpiece sees along its scan path, camera by camera.
 
     Args:
-        jaw: Mesh of a jaw (STL, PLY, OBJ); default: the built-in phantom.
+        jaw: Mesh of a jaw (STL, PLY, OBJ, OFF); default: the built-in phantom.
         out: Folder for surfaces.csv, cameras.csv and pictures.
         seed: Seed of the hand's drift.
     """
@@ -124,7 +124,7 @@ def precision(
     """Map how precisely a handpiece could measure a tooth: the Cramer-Rao bound of all its cameras.
 
     Args:
-        jaw: Mesh of a jaw (STL, PLY, OBJ) with tooth labels; default: the built-in phantom.
+        jaw: Mesh of a jaw (STL, PLY, OBJ, OFF) with tooth labels; default: the built-in phantom.
         tooth: FDI number of the tooth.
         out: Folder for precision.csv (one row per face), surfaces.csv and precision.png.
         turns: Passes over the tooth, as in `cuspid run`. Each face is measured from the best of five positions on each

@@ -39,8 +39,8 @@ def handpiece(
         out: Output folder.
         design: Built-in design: a stereo pair, the essential four cameras, six cameras (to be turned), or all twelve.
         handpiece: Your own handpiece.json, or COLMAP's rig_config.json, instead of a built-in design.
-        body: STL, PLY or OBJ file for the holder: one solid with seats, cable channels, neck and grip, in mm in the rig
-            frame, with a picture beside it. The handpiece is then written with this body.
+        body: STL, PLY, OBJ or OFF file for the holder: one solid with seats, cable channels, neck and grip, in mm in
+            the rig frame, with a picture beside it. The handpiece is then written with this body.
     """
     made = DESIGNS[design](options) if handpiece is None else storage.read_handpiece(handpiece)
     if body is not None:

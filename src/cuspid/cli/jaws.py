@@ -44,7 +44,7 @@ def phantom(
     """Make the built-in phantom jaw, with tooth labels and landmarks, or a population of phantoms, or the sphere arch.
 
     Args:
-        out: Mesh file to write (.ply, which keeps the labels, .stl or .obj), with landmarks as JSON and a picture
+        out: Mesh file to write (.ply, which keeps the labels, .stl, .obj or .off), with landmarks as JSON and a picture
             beside it; for a population, a folder.
         group: Draw a population from this group of Table 2.1 of the thesis instead; --seed seeds the draw.
         count: Number of jaws in the population.
@@ -134,7 +134,7 @@ def box(
 def _write_jaw(path: Path, make: Callable[[], Jaw], title: str) -> Jaw:
     """Write a jaw, what its mesh file cannot hold, and a picture of it; say what it has."""
     if path.suffix.lower() not in storage.MESH_SUFFIXES:
-        raise InputError(f"{path}: give a file name that ends in .ply, .stl or .obj")
+        raise InputError(f"{path}: give a file name that ends in .ply, .stl, .obj or .off")
     if path.exists() and not (path.is_file() and storage.is_jaw(path)):
         raise OutputError(f"{path}: is there already, and no jaw that cuspid wrote; give another name as --out")
     jaw = make()

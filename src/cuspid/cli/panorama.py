@@ -44,7 +44,7 @@ def stitch(
         frames: Folder of images, a video (mp4, avi, mov, mkv), or a capture; with two or more cameras that see the same
             surface the panorama is in true millimetres.
         out: Folder for the results; if the sequence broke, it has a subfolder for each part: part-1/, part-2/ ...
-        mesh: Instead of frames: the folder of a scan (its mesh.ply), or a mesh file (STL, PLY, OBJ) in any pose.
+        mesh: Instead of frames: the folder of a scan (its mesh.ply), or a mesh file (STL, PLY, OBJ, OFF) in any pose.
         unit: Length unit of that mesh file.
         calibration: handpiece.json or rig_config.json of one camera, COLMAP's cameras.txt, or OpenCV's YAML; without
             one (and without that of a capture) the focal length is found from the images.

@@ -40,7 +40,7 @@ def repeat(
     A killed run resumes with the same command; with a larger --scans, further scans are added to the existing ones.
 
     Args:
-        jaw: Mesh of a jaw (STL, PLY, OBJ); default: the built-in phantom.
+        jaw: Mesh of a jaw (STL, PLY, OBJ, OFF); default: the built-in phantom.
         out: Folder for scans/ (each mesh, in the frame of the reference), repeat.json, results.csv, and a report.
         workers: Processes on this machine, one core each (default: one for each core).
         cluster: Address of a Dask scheduler, tcp://host:port, whose workers can access the folder too.

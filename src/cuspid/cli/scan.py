@@ -55,7 +55,7 @@ def run(
     """Scan a jaw in simulation, reconstruct it, and measure the trueness.
 
     Args:
-        jaw: Mesh of a jaw or of a part of one (STL, PLY, OBJ); default: the built-in phantom.
+        jaw: Mesh of a jaw or of a part of one (STL, PLY, OBJ, OFF); default: the built-in phantom.
         out: Folder for everything that is made. A killed run resumes when the same command is given again.
         evaluation: How the trueness is measured.
     """
@@ -75,7 +75,7 @@ def simulate(
     """Render what the handpiece sees: OUT/capture (images, calibration) and OUT/truth (what only the simulator knows).
 
     Args:
-        jaw: Mesh of a jaw or of a part of one (STL, PLY, OBJ); default: the built-in phantom.
+        jaw: Mesh of a jaw or of a part of one (STL, PLY, OBJ, OFF); default: the built-in phantom.
         out: Output folder.
     """
     _simulate(jaw, out, source, probe, simulation)
@@ -124,7 +124,7 @@ def evaluate(
     """Measure the trueness of a mesh against a reference: trueness.json, and the colour map as PLY and PNG.
 
     Args:
-        mesh: The scan (STL, PLY, OBJ), in any pose, in --unit.
+        mesh: The scan (STL, PLY, OBJ, OFF), in any pose, in --unit.
         reference: A mesh, or the folder truth/ of a simulation, which also tells what could be seen.
         out: Folder for the results.
         reference_unit: Length unit of the reference, if it is another one than that of the scan.

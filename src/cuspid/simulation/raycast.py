@@ -1,11 +1,11 @@
 """The default renderer: Embree rays, compiled shading.
 
 Each ray through a pixel gives the albedo of the solid texture at the hit, lit by the lights that are on, each a point
-light with a lobe and 1/d^2 falloff, through a GGX coat with Schlick's Fresnel term (Walter et al. 2007). Shadows are
-traced once for each surface in a pixel. Interreflection is a constant share of the light that reaches a point. Where
-light travels below the surface, what enters is known at the vertices, and spreads among them
-(:mod:`cuspid.simulation.scattering`). Radiance is linear RGB in units in which a white diffuse surface facing a light
-of power 1 at 1 mm has radiance 1 plus that share. The world is the frame of the jaw.
+light with a lobe and 1/d^2 falloff, through a GGX coat with Schlick's Fresnel term (Walter et al. 2007). Few of the
+rays are traced (:mod:`cuspid.simulation.hits`, :mod:`cuspid.simulation.shadows`). Interreflection is a constant share
+of the light that reaches a point. Where light travels below the surface, what enters is known at the vertices, and
+spreads among them (:mod:`cuspid.simulation.scattering`). Radiance is linear RGB in units in which a white diffuse
+surface facing a light of power 1 at 1 mm has radiance 1 plus that share. The world is the frame of the jaw.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from multiprocessing import get_context
 from operator import itemgetter
-from typing import NamedTuple, no_type_check
+from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, UInt8
 
 from cuspid.camera import Camera
 from cuspid.capture import Frame
@@ -41,22 +41,13 @@ from cuspid.simulation.appearance import (
     scattering_mm,
     stippled,
 )
+from cuspid.simulation.hits import Rays, ShadedMesh, dot, first_hits, normal_of, point_of, traced
 from cuspid.simulation.marks import natural_marks, no_marks
 from cuspid.simulation.optics import IDEAL, Optics, mixed, recorded, through_lens
 from cuspid.simulation.scattering import Scattering
 from cuspid.simulation.sensor import record
+from cuspid.simulation.shadows import NOTICEABLE, STEP, Lamps, darken, illuminated, incoming, lamps, segments
 from cuspid.workers import computed_once
-
-AMBIENT = 0.08
-"""Share of the light reaching a point that arrives from all directions after reflection in the mouth, unshadowed."""
-
-NOTICEABLE = 0.005
-"""A light that contributes less than this share of the light at a point is ignored there, and no shadow ray is
-traced."""
-
-SAME_SURFACE = 0.03
-"""Rays through a pixel whose lengths differ by less than this share hit the same surface (12 um at 5 mm, up to 85
-deg)."""
 
 _FILM_REFLECTANCE, _FILM_ROUGHNESS = 0.02, 0.03
 """Of a film of saliva (water): Fresnel reflectance at normal incidence, GGX roughness."""
@@ -100,6 +91,7 @@ class Scene:
         mesh = self.jaw.mesh
         marks = natural_marks(self.jaw, self.seed) if self.appearance.marked else no_marks(mesh)
         return ShadedMesh(
+            mesh.vertices,
             read_only(mesh.faces),  # arrays from another process are writable: the shading would be compiled once more
             *(mesh.face_normals, mesh.vertex_normals, face_materials(self.jaw)),
             *(marks.colours, marks.shares, marks.stippled),
@@ -135,47 +127,8 @@ class Scene:
         return self.scattering.leaving(_entering_light(self, lights))
 
 
-class ShadedMesh(NamedTuple):
-    """A mesh as arrays for the compiled shading."""
-
-    faces: np.ndarray
-    face_normals: np.ndarray
-    vertex_normals: np.ndarray
-    materials: np.ndarray
-    mark_colours: np.ndarray
-    marks: np.ndarray
-    """Share of each mark at each vertex."""
-    stippled: np.ndarray
-    """How much of the stippling of its material each vertex has."""
-
-
 _NONE: Float[np.ndarray, "0 3"] = np.zeros((0, 3))
 """Light from below the surface, where there is none."""
-
-
-class Lamps(NamedTuple):
-    """Lights in the world frame as arrays for the compiled shading."""
-
-    positions: np.ndarray
-    axes: np.ndarray
-    intensities: np.ndarray
-    exponents: np.ndarray
-    glare: np.ndarray
-
-
-def lamps(handpiece: Handpiece, lighting: str | None, rig_from_world: Rigid3) -> Lamps:
-    """The lights of a lighting pattern in the world frame. Raises InputError where there are none."""
-    on = handpiece.lights_on(lighting)
-    if not on:
-        raise InputError(f"handpiece {handpiece.name}: no light is on (lighting pattern {lighting or 'not given'})")
-    world_from_rig = rig_from_world.inverse()
-    return Lamps(
-        world_from_rig.apply(np.array([light.position_mm for light in on])),
-        world_from_rig.rotate(np.array([light.direction for light in on])),
-        np.array([light.power * light.colour for light in on]),
-        np.array([light.lobe_exponent for light in on]),
-        np.array([light.glare for light in on]),
-    )
 
 
 def pixel_rays(camera: Camera, supersampling: int) -> Float[np.ndarray, "n 3"]:
@@ -209,14 +162,18 @@ def radiance(
     rays = scene.rays(camera)
     if row is not None:
         rays = rays.reshape(camera.height, -1, 3)[row]
+    if smear is None:
+        world_from_cam = cam_from_world.inverse()
+        origins, directions = np.array([world_from_cam.translation]), _turned(rays, world_from_cam.rotation)
+        return radiance_along(scene, origins, directions, camera.width, lights, below)
     origins, directions = np.empty_like(rays), np.empty_like(rays)
-    moments = (0.0,) if smear is None else _moments(scene.supersampling**2)
+    moments = _moments(scene.supersampling**2)
     for index, moment in enumerate(moments):
-        motion = np.zeros(6) if smear is None else moment * smear
+        motion = moment * smear
         world_from_cam = (cam_from_world @ Rigid3.from_rotation_vector(motion[:3], motion[3:])).inverse()
         directions[index :: len(moments)] = _turned(rays[index :: len(moments)], world_from_cam.rotation)
         origins[index :: len(moments)] = world_from_cam.translation
-    return radiance_along(scene, origins, directions, lights, below).reshape(-1, camera.width, 3)
+    return radiance_along(scene, origins, directions, camera.width, lights, below, moving=True)
 
 
 def _row_by_row(
@@ -268,73 +225,57 @@ def smeared(motion: Float[np.ndarray, "6"], rig_from_world: Rigid3, smear_mm: fl
 
 def radiance_along(
     scene: Scene,
-    origins: Float[np.ndarray, "n 3"],
+    origins: Float[np.ndarray, "#n 3"],
     directions: Float[np.ndarray, "n 3"],
+    width: int,
     lights: Lamps,
     below: Float[np.ndarray, "v 3"] = _NONE,
-) -> Float[np.ndarray, "m 3"]:
-    """Linear light (float32) of pixels, given their rays, ``supersampling**2`` consecutive ones for each pixel.
-    ``below``: see :attr:`Scene.below`."""
+    *,
+    moving: bool = False,
+) -> Float[np.ndarray, "h w 3"]:
+    """Linear light (float32) of rows of pixels, given their rays, ``supersampling**2`` consecutive ones for each pixel.
+
+    Neighbouring rays have neighbouring origins, or one for all, unless they are ``moving`` during the exposure.
+    ``below``: see :attr:`Scene.below`.
+    """
     samples = scene.supersampling**2
-    out = np.zeros((len(directions) // samples, 3), dtype=np.float32)
-    pixels = max(1, _BLOCK // samples)
-    for begin in range(0, len(out), pixels):
-        some = slice(begin * samples, (begin + pixels) * samples)
-        _add_light(scene, origins[some], directions[some], lights, below, out[begin : begin + pixels])
+    row = samples * width
+    height = len(directions) // row
+    out = np.zeros((height, width, 3), dtype=np.float32)
+    rows = max(1, _BLOCK // (STEP * row)) * STEP
+    for top in range(0, height, rows):
+        bottom = min(top + rows, height)
+        own, firsts = slice(top * row, bottom * row), slice(top * row, (bottom + 1) * row, samples)
+        grid = traced(scene.jaw.mesh, _some(origins, firsts), directions[firsts])
+        given = scene.jaw.mesh, scene.surface, _some(origins, own), directions[own]
+        rays = first_hits(*given, grid, samples, width, moving=moving)
+        _add_light(scene, rays, grid, lights, below, out[top:bottom])
     return out
+
+
+def _some(origins: Float[np.ndarray, "#n 3"], which: slice) -> Float[np.ndarray, "#m 3"]:
+    return origins if len(origins) == 1 else origins[which]
 
 
 def _add_light(
     scene: Scene,
-    origins: Float[np.ndarray, "n 3"],
-    directions: Float[np.ndarray, "n 3"],
+    rays: Rays,
+    grid: Rays,
     lights: Lamps,
     below: Float[np.ndarray, "v 3"],
-    out: Float[np.ndarray, "m 3"],
+    out: Float[np.ndarray, "h w 3"],
 ) -> None:
-    """:func:`radiance_along` for some of the pixels, into ``out``."""
-    # One origin or direction for all, repeated by a stride of none, would be of another kind for the compiler.
-    origins, directions = np.ascontiguousarray(origins), np.ascontiguousarray(directions)
-    hits = scene.jaw.mesh.cast(origins, directions)
-    rays = _Rays(origins, directions, hits.faces, hits.distances, hits.barycentric)
-    chosen, row = _shadow_rows(hits.distances, scene.supersampling**2)
-    lit, ambient = _lighting(scene, rays, chosen, lights)
+    """:func:`radiance_along` for some rows, into ``out``. ``grid``: the first rays of their pixels and of the row
+    below."""
+    samples, width = scene.supersampling**2, out.shape[1]
+    chosen, counts, light = illuminated(scene.jaw.mesh, scene.surface, rays, samples, lights, grid, width)
     points, materials = _places(rays, scene.surface)
     albedos = albedo(points, materials, scene.palette)
     _mark(rays, scene.surface, albedos)
-    _shade(rays, albedos, scene.surface, scene.palette, lights, lit, ambient, row, below, out)
-
-
-@kernel
-@no_type_check
-def _shadow_rows(distances, samples):
-    """The rays for which shadows are traced, and for each ray the row of its answer among them.
-
-    One ray answers for a pixel, but where a pixel sees more than one surface each ray asks for itself: the shadow of an
-    edge on what lies behind must not darken the edge.
-    """
-    chosen, row = np.empty(len(distances), np.int64), np.empty(len(distances), np.int64)
-    count = 0
-    for first in range(0, len(distances), samples):
-        nearest = farthest = distances[first]
-        for i in range(first + 1, first + samples):
-            nearest, farthest = min(nearest, distances[i]), max(farthest, distances[i])
-        mixed = farthest > (1 + SAME_SURFACE) * nearest
-        for i in range(first, first + samples):
-            count += mixed or i == first
-            chosen[count - 1] = i
-            row[i] = count - 1
-    return chosen[:count], row
-
-
-class _Rays(NamedTuple):
-    """Rays and their hits, as arrays for the compiled shading."""
-
-    origins: np.ndarray
-    directions: np.ndarray
-    faces: np.ndarray
-    distances: np.ndarray
-    barycentric: np.ndarray
+    _shade(
+        *(rays, albedos, scene.surface, scene.palette, lights),
+        *(chosen, counts, light, samples, below, out.reshape(-1, 3)),
+    )
 
 
 @kernel
@@ -352,130 +293,19 @@ def _turned(directions, rotation):
     return out
 
 
-def _lighting(
-    scene: Scene, rays: _Rays, chosen: Int[np.ndarray, "n"], lights: Lamps
-) -> tuple[Bool[np.ndarray, "n l"], Float[np.ndarray, "n 3"]]:
-    """Which lights reach the hits of chosen rays (False also where a light is too weak to matter), and the ambient
-    light there."""
-    points, ambient = np.zeros((2, len(chosen), 3))
-    lit = np.zeros((len(chosen), len(lights.positions)), dtype=np.bool_)
-    _light_matters(rays, chosen, scene.surface, lights, points, lit, ambient)
-    _darken(lit, scene.jaw.mesh.occluded(*_segments(points, lit, lights.positions)))
-    return lit, ambient
-
-
-@kernel
-@no_type_check
-def _segments(points, lit, positions):
-    """The ends of the way from each point to each light that may reach it, light by light."""
-    begins, ends = np.empty((2, lit.sum(), 3))
-    n = 0
-    for k in range(len(positions)):
-        for i in range(len(points)):
-            if lit[i, k]:
-                for c in range(3):
-                    begins[n, c], ends[n, c] = points[i, c], positions[k, c]
-                n += 1
-    return begins, ends
-
-
-@kernel
-@no_type_check
-def _darken(lit, hidden):
-    """Take away the lights that something hides, in the order of :func:`_segments`."""
-    n = 0
-    for k in range(lit.shape[1]):
-        for i in range(len(lit)):
-            if lit[i, k]:
-                lit[i, k] = not hidden[n]
-                n += 1
-
-
-@kernel(fastmath=True)
-@no_type_check
-def _point(rays, i):
-    t = rays.distances[i]
-    return (
-        rays.origins[i, 0] + t * rays.directions[i, 0],
-        rays.origins[i, 1] + t * rays.directions[i, 1],
-        rays.origins[i, 2] + t * rays.directions[i, 2],
-    )
-
-
-@kernel(fastmath=True)
-@no_type_check
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@kernel(fastmath=True)
-@no_type_check
-def _normal(rays, i, surface):
-    """Interpolated unit normal at a hit, on the side that the ray came from."""
-    face = rays.faces[i]
-    u, v, w = rays.barycentric[i, 0], rays.barycentric[i, 1], rays.barycentric[i, 2]
-    a = surface.vertex_normals[surface.faces[face, 0]]
-    b = surface.vertex_normals[surface.faces[face, 1]]
-    c = surface.vertex_normals[surface.faces[face, 2]]
-    x, y, z = (u * a[0] + v * b[0] + w * c[0], u * a[1] + v * b[1] + w * c[1], u * a[2] + v * b[2] + w * c[2])
-    scale = 1 / np.sqrt(x * x + y * y + z * z + 1e-30)
-    if _dot(surface.face_normals[face], rays.directions[i]) > 0:
-        scale = -scale
-    return x * scale, y * scale, z * scale
-
-
-@kernel(fastmath=True)
-@no_type_check
-def _incoming(point, index, lights):
-    """Unit vector towards a light, and its lobe over the squared distance at a point."""
-    x = lights.positions[index, 0] - point[0]
-    y = lights.positions[index, 1] - point[1]
-    z = lights.positions[index, 2] - point[2]
-    squared = x * x + y * y + z * z
-    inverse = 1 / np.sqrt(squared)
-    towards = (x * inverse, y * inverse, z * inverse)
-    cosine = -_dot(towards, lights.axes[index])
-    if cosine <= 0:
-        return towards, 0.0
-    exponent = lights.exponents[index]
-    return towards, (cosine if exponent == 1 else cosine**exponent) / squared
-
-
-@kernel(fastmath=True)
-@no_type_check
-def _light_matters(rays, chosen, surface, lights, points, matters, ambient):
-    """Fill in for each chosen ray: the point hit, the lights that give a noticeable part of its light, the ambient
-    light."""
-    strength = np.zeros(len(lights.positions))
-    for i in range(len(chosen)):
-        if rays.faces[chosen[i]] < 0:
-            continue
-        point = _point(rays, chosen[i])
-        points[i, 0], points[i, 1], points[i, 2] = point
-        normal = _normal(rays, chosen[i], surface)
-        for k in range(len(strength)):
-            towards, falloff = _incoming(point, k, lights)
-            strength[k] = max(0.0, _dot(normal, towards)) * falloff
-            for c in range(3):
-                ambient[i, c] += AMBIENT * falloff * lights.intensities[k, c]
-        threshold = NOTICEABLE * strength.sum()
-        for k in range(len(strength)):
-            matters[i, k] = strength[k] > threshold
-
-
 @kernel(fastmath=True)
 @no_type_check
 def _reflected(normal, view, towards, reflectance, roughness, saliva):
     """Diffuse (to be multiplied by the albedo) and glossy answer to a light of strength 1; ``view`` points away."""
-    nl = _dot(normal, towards)
+    nl = dot(normal, towards)
     if nl <= 0:
         return 0.0, 0.0
     if reflectance == 0:
         return nl, 0.0
     half = (towards[0] - view[0], towards[1] - view[1], towards[2] - view[2])
-    inverse = 1 / np.sqrt(_dot(half, half))
-    nv = max(1e-3, -_dot(normal, view))
-    nh, vh = _dot(normal, half) * inverse, _dot(towards, half) * inverse
+    inverse = 1 / np.sqrt(dot(half, half))
+    nv = max(1e-3, -dot(normal, view))
+    nh, vh = dot(normal, half) * inverse, dot(towards, half) * inverse
     glossy, fresnel = coat(nl, nv, nh, vh, reflectance, roughness)
     if saliva > 0:
         glossy += saliva * (coat(nl, nv, nh, vh, _FILM_REFLECTANCE, _FILM_ROUGHNESS)[0] - glossy)
@@ -489,7 +319,7 @@ def _places(rays, surface):
     points, materials = np.zeros((len(rays.faces), 3)), np.full(len(rays.faces), NO_MATERIAL, np.uint8)
     for i in range(len(rays.faces)):
         if rays.faces[i] >= 0:
-            points[i, 0], points[i, 1], points[i, 2] = _point(rays, i)
+            points[i, 0], points[i, 1], points[i, 2] = point_of(rays, i)
             materials[i] = surface.materials[rays.faces[i]]
     return points, materials
 
@@ -519,43 +349,55 @@ def _mark(rays, surface, albedos):
 
 @kernel(fastmath=True)
 @no_type_check
-def _shade(rays, albedos, surface, palette, lights, lit, ambient, row, below, out):
-    spread = len(below) > 0
-    samples = len(rays.faces) // len(out)
-    for i in range(len(rays.faces)):
-        if rays.faces[i] < 0:
+def _shade(rays, albedos, surface, palette, lights, chosen, counts, light, samples, below, out):
+    spread, received = len(below) > 0, np.zeros(3)
+    for n in range(len(chosen)):
+        if rays.faces[chosen[n]] < 0:
             continue
-        pixel = i // samples
-        m = surface.materials[rays.faces[i]]
-        point, normal = _point(rays, i), _normal(rays, i, surface)
-        if palette.stipple_mm[m] > 0:
-            height = palette.stipple_mm[m] * _mixed(rays, i, surface, surface.stippled)
-            normal = stippled(normal, point, height, palette.stipple_from_jaw)
-        albedo = (albedos[i, 0], albedos[i, 1], albedos[i, 2])
-        direction = rays.directions[i]
-        inverse = 1 / np.sqrt(_dot(direction, direction))
-        view = (direction[0] * inverse, direction[1] * inverse, direction[2] * inverse)
-        scattered = albedo
-        if palette.exit_index[m] > 1:
-            share = leaving(-_dot(normal, view), palette.exit_index[m])
-            scattered = (albedo[0] * share, albedo[1] * share, albedo[2] * share)
+        pixel = chosen[n] // samples
         for c in range(3):
-            out[pixel, c] += scattered[c] * ambient[row[i], c] / samples
-        if spread:
-            for corner in range(3):
-                share = rays.barycentric[i, corner] / samples
+            received[c] = light.ambient[n, c]
+            for k in range(len(lights.positions)):
+                if light.lit[n, k]:
+                    received[c] += light.strengths[n, k] * lights.intensities[k, c]
+        for i in range(chosen[n], chosen[n] + counts[n]):
+            m = surface.materials[rays.faces[i]]
+            matte = palette.reflectance[m] == 0 and palette.exit_index[m] <= 1 and palette.stipple_mm[m] == 0
+            if matte and not spread:
                 for c in range(3):
-                    out[pixel, c] += scattered[c] * share * below[surface.faces[rays.faces[i], corner], c]
-        for k in range(len(lights.positions)):
-            if lit[row[i], k]:
-                towards, falloff = _incoming(point, k, lights)
-                surface_coat = palette.reflectance[m], palette.roughness[m], palette.saliva
-                diffuse, glossy = _reflected(normal, view, towards, *surface_coat)
-                glossy *= lights.glare[k]
-                if spread:
-                    diffuse = 0.0
-                for c in range(3):
-                    out[pixel, c] += falloff * lights.intensities[k, c] * (scattered[c] * diffuse + glossy) / samples
+                    out[pixel, c] += albedos[i, c] * received[c] / samples
+                continue
+            point, normal = point_of(rays, i), normal_of(rays, i, surface)
+            if palette.stipple_mm[m] > 0:
+                height = palette.stipple_mm[m] * _mixed(rays, i, surface, surface.stippled)
+                normal = stippled(normal, point, height, palette.stipple_from_jaw)
+            albedo = (albedos[i, 0], albedos[i, 1], albedos[i, 2])
+            direction = rays.directions[i]
+            inverse = 1 / np.sqrt(dot(direction, direction))
+            view = (direction[0] * inverse, direction[1] * inverse, direction[2] * inverse)
+            scattered = albedo
+            if palette.exit_index[m] > 1:
+                share = leaving(-dot(normal, view), palette.exit_index[m])
+                scattered = (albedo[0] * share, albedo[1] * share, albedo[2] * share)
+            for c in range(3):
+                out[pixel, c] += scattered[c] * light.ambient[n, c] / samples
+            if spread:
+                for corner in range(3):
+                    share = rays.barycentric[i, corner] / samples
+                    for c in range(3):
+                        out[pixel, c] += scattered[c] * share * below[surface.faces[rays.faces[i], corner], c]
+            for k in range(len(lights.positions)):
+                if light.lit[n, k]:
+                    towards, falloff = incoming(point, k, lights)
+                    surface_coat = palette.reflectance[m], palette.roughness[m], palette.saliva
+                    diffuse, glossy = _reflected(normal, view, towards, *surface_coat)
+                    glossy *= lights.glare[k]
+                    if spread:
+                        diffuse = 0.0
+                    for c in range(3):
+                        out[pixel, c] += (
+                            falloff * lights.intensities[k, c] * (scattered[c] * diffuse + glossy) / samples
+                        )
 
 
 def _entering_light(scene: Scene, lights: Lamps) -> Float[np.ndarray, "v 3"]:
@@ -567,7 +409,7 @@ def _entering_light(scene: Scene, lights: Lamps) -> Float[np.ndarray, "v 3"]:
     heights = scene.palette.stipple_mm[1] * scene.surface.stippled
     _entering(mesh.vertices, mesh.vertex_normals, heights, scene.palette, reflectance, lights, shares)
     lit = shares > NOTICEABLE * shares.sum(axis=1, keepdims=True)
-    _darken(lit, mesh.occluded(*_segments(mesh.vertices, lit, lights.positions)))
+    darken(lit, lit, mesh.occluded(*segments(mesh.vertices, lit, lights.positions)))
     return np.einsum("vl,lc->vc", np.where(lit, shares, 0.0), lights.intensities)
 
 
@@ -580,8 +422,8 @@ def _entering(points, normals, heights, palette, reflectance, lights, shares):
         if heights[i] > 0:
             normal = stippled(normal, points[i], heights[i], palette.stipple_from_jaw)
         for k in range(len(lights.positions)):
-            towards, falloff = _incoming(points[i], k, lights)
-            cosine = max(0.0, _dot(normal, towards))
+            towards, falloff = incoming(points[i], k, lights)
+            cosine = max(0.0, dot(normal, towards))
             mirrored = reflectance[i] + (1 - reflectance[i]) * (1 - cosine) ** 5
             shares[i, k] = falloff * cosine * (1 - mirrored)
 

@@ -15,8 +15,9 @@ from jaxtyping import Float, Int16
 from cuspid.errors import InputError
 from cuspid.mesh import RayHits
 from cuspid.options import Options, Range
-from cuspid.simulation.raycast import BRIGHT_LEVEL, BRIGHT_PERCENTILE, Lamps, Scene, radiance_along
+from cuspid.simulation.raycast import BRIGHT_LEVEL, BRIGHT_PERCENTILE, Scene, radiance_along
 from cuspid.simulation.sensor import expose
+from cuspid.simulation.shadows import Lamps
 from cuspid.trueness import NOTHING, ReferenceRender
 
 FAR_LIGHT_MM = 1000.0
@@ -94,7 +95,7 @@ def _rays(
 def _light(scene: Scene, plane: Float[np.ndarray, "r w s 2"], height_mm: float | None) -> Float[np.ndarray, "r w 3"]:
     lamp_mm = height_mm or FAR_LIGHT_MM
     lamp = Lamps(np.array([[0, 0, lamp_mm]]), np.array([[0, 0, -1.0]]), np.full((1, 3), lamp_mm**2), *np.ones((2, 1)))
-    return radiance_along(scene, *_rays(scene, plane, height_mm), lamp).reshape(*plane.shape[:2], 3)
+    return radiance_along(scene, *_rays(scene, plane, height_mm), plane.shape[1], lamp)
 
 
 def _surface(

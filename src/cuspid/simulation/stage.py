@@ -151,8 +151,7 @@ def _render(folder: Path, capture: Capture, truth: GroundTruth, options: RenderO
 def _less(path: ScanPath) -> tuple[str, ...]:
     share = 1 - path.further_frames / len(path.rig_from_world)
     passes = f"--passes turns takes about {share:.0%} of the images"
-    pixels = "--handpiece takes one with fewer pixels (cuspid handpiece --width-px 250 --height-px 250)"
-    return (passes, pixels) if path.further_frames else (pixels,)
+    return (passes, _FEWER_PIXELS) if path.further_frames else (_FEWER_PIXELS,)
 
 
 def _foretold(rendered: Iterator[tuple[int, int]], less: Sequence[str]) -> Iterator[tuple[int, int]]:
@@ -171,6 +170,7 @@ def _foretold(rendered: Iterator[tuple[int, int]], less: Sequence[str]) -> Itera
         yield done, total
 
 
+_FEWER_PIXELS = "half the --scale takes a quarter of the pixels"
 _TIMED = 3
 """Images of each process that are timed for the forecast."""
 _LONG_S = 60.0

@@ -1,7 +1,8 @@
-"""Triangle meshes: STL, PLY and OBJ."""
+"""Triangle meshes: STL, PLY, OBJ and OFF."""
 
 from __future__ import annotations
 
+import io
 import logging
 import re
 from collections.abc import Iterator, Mapping
@@ -26,10 +27,11 @@ from cuspid.values import LONGEST_MM, one_line
 _PLACE_AND_COLOR = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"}
 _COLOR = ("red", "green", "blue")
 _PLY_ELEMENT = re.compile(rb"^element\s+(\w+)\s+(\d{1,400})\s*$", re.MULTILINE)
+_COMMENT, _COUNT = re.compile(rb"#[^\n]*"), re.compile(rb"\d{1,18}")
 _LONGEST_HEADER = 1 << 16
 _LEAST_AREA = 1e-9
 """Of the square of its extent: less is a line."""
-MESH_SUFFIXES = (".stl", ".ply", ".obj")
+MESH_SUFFIXES = (".stl", ".ply", ".obj", ".off")
 SIGMA = "sigma_um"
 """Name of the standard deviation of each vertex along its normal, in a PLY file."""
 
@@ -49,7 +51,7 @@ class MeshFile:
 
 
 def read_mesh(path: Path, unit: Unit = "mm") -> Mesh:
-    """A mesh from an STL, PLY or OBJ file, in mm, with coincident vertices joined.
+    """A mesh from an STL, PLY, OBJ or OFF file, in mm, with coincident vertices joined.
 
     Raises InputError where the file is missing, not a mesh, empty, or has coordinates that are not finite.
     """
@@ -59,11 +61,11 @@ def read_mesh(path: Path, unit: Unit = "mm") -> Mesh:
 def read_mesh_file(path: Path, unit: Unit = "mm") -> MeshFile:
     """As :func:`read_mesh`, with what else the file says."""
     if path.suffix.lower() not in MESH_SUFFIXES:
-        raise InputError(f"{path}: not a mesh file that cuspid reads; give an STL, PLY or OBJ file")
+        raise InputError(f"{path}: not a mesh file that cuspid reads; give an STL, PLY, OBJ or OFF file")
     declared = _declared_faces(path)
     try:
         with np.errstate(all="ignore"), _in_silence():  # what cannot be used is told below
-            scene = trimesh.load_scene(path, process=False, skip_materials=True)
+            scene = trimesh.load_scene(_uncommented(path), path.suffix[1:].lower(), process=False, skip_materials=True)
             parts = list(scene.geometry.values())
             loaded = parts[0] if len(parts) == 1 else scene.to_mesh()
     except Exception as error:  # trimesh's loaders raise whatever the parser met
@@ -72,6 +74,11 @@ def read_mesh_file(path: Path, unit: Unit = "mm") -> MeshFile:
         if not isinstance(loaded, trimesh.Trimesh) or len(loaded.vertices) == 0 or len(loaded.faces) == 0:
             raise InputError(f"{path}: the mesh is empty (no triangles); export the surface, not a point cloud")
         return _checked(path, loaded, declared, unit)
+
+
+def _uncommented(path: Path) -> Path | io.BytesIO:
+    """What trimesh reads: of an OFF file with comments behind numbers it would read lines twice."""
+    return io.BytesIO(_COMMENT.sub(b"", read_bytes(path, "mesh"))) if path.suffix.lower() == ".off" else path
 
 
 @contextmanager
@@ -154,6 +161,9 @@ def _declared_faces(path: Path) -> int:
         if b"facet" in data[:_LONGEST_HEADER] and b"endsolid" not in data[-_LONGEST_HEADER:]:
             raise InputError(f"{path}: truncated, it does not end with 'endsolid'; copy the file again")
         return data.count(b"facet normal")
+    if suffix == ".off":
+        said = _COMMENT.sub(b"", data[:_LONGEST_HEADER]).partition(b"OFF")[2].split(maxsplit=2)[1:2]
+        return int(said[0]) if said and _COUNT.fullmatch(said[0]) else 0
     return 0
 
 
@@ -172,7 +182,7 @@ def write_mesh(
     comment: str | None = None,
 ) -> None:
     """Write a mesh in mm: binary PLY (with colour, labels, values of the vertices by name, and a comment of one line),
-    binary STL or OBJ, by the file's suffix. CloudCompare shows such values as scalar fields."""
+    binary STL, OBJ or OFF, by the file's suffix. CloudCompare shows such values as scalar fields."""
     exported = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
     with _let_go(exported):
         for name, each in values.items():

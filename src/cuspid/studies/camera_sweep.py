@@ -40,6 +40,7 @@ from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 from cuspid.room import Room, check_clearance
 from cuspid.simulation.appearance import Preset
+from cuspid.simulation.path.detour import repaired
 from cuspid.simulation.path.overlap import image_overlap
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path, steady_poses
 from cuspid.stereo.across import AcrossOptions
@@ -63,6 +64,8 @@ _NEIGHBOURHOOD_MM = 13.0
 """What lies farther from the middle of the surface is out of every camera's reach."""
 _NEAREST_MM = 0.5
 """Depth range of a lens begins here at the least."""
+_DRIFT_SIGMAS = 3.0
+"""Standard deviations of the hand's drift by which the pair may be moved so that it keeps clear of the jaw."""
 _BUDGET_UM = 10.0
 """The error that the theoretical study allows a point."""
 _ANY_DISTANCE_MM = 1e3
@@ -174,10 +177,9 @@ def find_site(jaw: Jaw, options: SweepOptions) -> Site:
     middle = steady_poses(jaw, options.path, per_pass=3)[1]
     pair_from_rig = pair_from_world @ middle.inverse()
     narrowest = pair_handpiece(pair_from_rig, (min(options.baseline_mm), options.angle_deg[0]), options)
-    # A sweep keeps its distance: the pair is not lifted over what it would touch.
     steady = steady_poses(jaw, options.path, per_pass=options.path.frames or 10)
     room = Room(jaw.mesh, narrowest.solid, options.path.clearance_mm)
-    check_clearance(room, {f"{index:05d}": pose for index, pose in enumerate(steady)})
+    held_clear(room, {f"{index:05d}": pose for index, pose in enumerate(steady)}, pair_from_rig, options)
     paths = {
         seed: plan_scan_path(jaw, narrowest, options.path, np.random.default_rng([seed, 1])).rig_from_world
         for seed in range(options.repeats + 1)
@@ -215,6 +217,22 @@ def _outside_of(jaw: Jaw, tooth: int, faces: Bool[np.ndarray, "f"]) -> Bool[np.n
     middle = (out[faces].min() + out[faces].max()) / 2
     within = (along >= along[faces].min()) & (along <= along[faces].max())
     return within & (out > middle) & (out < out[faces].max() + _NEIGHBOURHOOD_MM)
+
+
+def held_clear(
+    room: Room, rig_from_world: Mapping[str, Rigid3], pair_from_rig: Rigid3, options: SweepOptions
+) -> dict[str, Rigid3]:
+    """The path of the pair, its frames changed by as little as it needs to keep clear of the jaw, as those of any scan.
+
+    A sweep keeps its distance: raises InputError where a frame would have to move the pair by more than a hand drifts.
+    """
+    poses = dict(zip(rig_from_world, repaired(room, list(rig_from_world.values())), strict=True))
+    moved = [
+        np.linalg.norm((pair_from_rig @ rig_from_world[name]).inverse().translation - after.inverse().translation)
+        for name, after in ((name, pair_from_rig @ pose) for name, pose in poses.items())
+    ]
+    check_clearance(room, poses if max(moved) <= _DRIFT_SIGMAS * options.path.jitter_mm else rig_from_world)
+    return poses
 
 
 def pair_handpiece(pair_from_rig: Rigid3, setting: Setting, options: SweepOptions) -> Handpiece:
@@ -268,8 +286,8 @@ def sweep_case(
     """
     begin = time.process_time()
     handpiece = pair_handpiece(site.pair_from_rig, (baseline_mm, angle_deg), options)
-    poses = site.rig_from_world[seed]
-    check_clearance(Room(site.jaw.mesh, handpiece.solid, options.path.clearance_mm), poses)
+    room = Room(site.jaw.mesh, handpiece.solid, options.path.clearance_mm)
+    poses = held_clear(room, site.rig_from_world[seed], site.pair_from_rig, options)
     overlap = image_overlap(site.jaw.mesh, handpiece, list(poses.values()))
     how = TrialOptions(
         simulation=SimulationOptions(texture=options.texture, supersampling=options.supersampling, seed=seed),
