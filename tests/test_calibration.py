@@ -10,6 +10,7 @@ from boards import BOARD, SIZE, moving, moving_pose, options, photographs, scene
 from cuspid import storage
 from cuspid.board import Board
 from cuspid.calibration import bundle, calibrate
+from cuspid.calibration.board_shape import BoardShape
 from cuspid.calibration.bundle import BoardScene, adjust_board
 from cuspid.calibration.calibrate import RigCalibration, calibrate_rig
 from cuspid.calibration.corners import BoardView, find_corners
@@ -122,14 +123,15 @@ def test_jacobian_agrees_with_finite_differences(together):
         truth = untied(truth, numbered(truth.rig_from_board), views)
         rng = np.random.default_rng(1)
         truth = replace(truth, timing=truth.timing.later(rng.normal(0, 0.2, 3), rng.normal(0, 0.2, len(views))))
+    even = BoardShape.even(BOARD)
+    truth = replace(truth, shape=even.moved(np.random.default_rng(2).normal(0, 0.05, even.offsets_mm.size)))
     seen = bundle._Observations.of(views, BOARD, truth)
     free = bundle._Free.of(truth, BOARD, only_boards=False)
-    in_cam, _ = bundle._project(truth, seen)
-    jacobian = bundle._jacobian(truth, seen, in_cam)[:, free.columns].toarray()
+    jacobian = bundle._jacobian(truth, seen, bundle._project(truth, seen).in_cam)[:, free.columns].toarray()
     for column in range(len(free.columns)):
         step = np.zeros(len(free.columns))
         step[column] = 1e-6
-        ahead, back = (bundle._project(bundle._stepped(truth, free, sign * step), seen)[1] for sign in (1, -1))
+        ahead, back = (bundle._project(bundle._stepped(truth, free, sign * step), seen).raw for sign in (1, -1))
         numeric = -(ahead - back).ravel() / 2e-6
         assert np.allclose(jacobian[:, column], numeric, atol=1e-4 * max(1, np.abs(numeric).max())), column
 
