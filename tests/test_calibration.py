@@ -421,7 +421,7 @@ def test_halves_without_common_boards_give_no_cross_validation():
     assert all(lens_error(found, truth, name) < 2.5 for name in truth.cameras)
 
 
-def test_covariances_are_widened_by_the_square_of_how_far_halves_are_apart(monkeypatch):
+def test_covariances_are_widened_by_the_square_of_how_far_halves_are_apart_beyond_chance(monkeypatch):
     truth = scene(6)
     views = views_of(truth, BOARD, 0.1, np.random.default_rng(0))
     plain = calibrated(truth, views)
@@ -429,9 +429,10 @@ def test_covariances_are_widened_by_the_square_of_how_far_halves_are_apart(monke
     monkeypatch.setattr(calibrate, "_cross_validated", lambda *given: (dict.fromkeys(factors, 0.1), factors))
     wide = calibrated(truth, views)
     for name in truth.cameras:
-        lens, place = (max(1, plain.cameras[name].parameters_apart), max(1, plain.cameras[name].place_apart))
-        assert np.allclose(wide.rig[name].camera.covariance * (lens / 3) ** 2, plain.rig[name].camera.covariance)
-        assert np.allclose(wide.rig[name].covariance * (place / 5) ** 2, plain.rig[name].covariance)
+        assert max(plain.cameras[name].parameters_apart, plain.cameras[name].place_apart) < 2
+        assert (plain.widened[name], wide.widened[name]) == (1, 3)
+        assert np.allclose(wide.rig[name].camera.covariance / 3**2, plain.rig[name].camera.covariance)
+        assert np.allclose(wide.rig[name].covariance / 5**2, plain.rig[name].covariance)
 
 
 def test_a_search_that_did_not_end_is_told_of(monkeypatch):
