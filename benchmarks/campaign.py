@@ -2,15 +2,16 @@
 
     python benchmarks/campaign.py [--release] [--commit C] [--list] [--only NAME ...] [--hours H] [--work FOLDER]
                                   [--jaws FOLDER] [--pairs FOLDER] [--ball FOLDER] [--photographs FOLDER]
+                                  [--boards FOLDER]
 
 The commit is checked out into the work folder, so that work can go on meanwhile. Each result goes to
 benchmarks/results as soon as it is there; a campaign that was stopped goes on with what does not hold by then
 (:mod:`freshness`), and finished parts of most benchmarks are kept in the work folder. With ``--release`` it measures
 the benchmarks of a release, those that are not of this very commit; to go on with them after other commits, name
 theirs. Nothing is begun after ``--hours``. Scans of your own (``--jaws``), rectified photographs of two cameras
-(``--pairs``), photographs of a glossy ball (``--ball``) and sets of real photographs (``--photographs``) are not part
-of the project: without them, the benchmarks that need them are left out. Then make the page
-(``python benchmarks/page.py``). Pictures for the documentation stay in the work folder.
+(``--pairs``), photographs of a glossy ball (``--ball``), sets of real photographs (``--photographs``) and real views of
+boards (``--boards``) are not part of the project: without them, the benchmarks that need them are left out. Then make
+the page (``python benchmarks/page.py``). Pictures for the documentation stay in the work folder.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from pathlib import Path
 from freshness import ROOT, changes, maker_of
 
 RESULTS = ROOT / "benchmarks" / "results"
-GIVEN = ("jaws", "pairs", "ball", "photographs")
+GIVEN = ("jaws", "pairs", "ball", "photographs", "boards")
 """What is not part of the project."""
 
 
@@ -42,7 +43,7 @@ class Benchmark:
     """Of the result: a file in benchmarks/results, without its ending."""
     command: str
     """Script and options; ``{out}`` is the file, ``{folder}`` its folder, ``{work}`` a folder of its own, and
-    ``{jaws}``, ``{pairs}``, ``{ball}`` and ``{photographs}`` are what the user gives."""
+    ``{jaws}``, ``{pairs}``, ``{ball}``, ``{photographs}`` and ``{boards}`` are what the user gives."""
 
     def needs(self, given: Mapping[str, Path]) -> list[str]:
         """Options that must be given, but were not."""
@@ -80,6 +81,7 @@ BENCHMARKS = (
     Benchmark("populations", "populations.py --out {out}"),
     Benchmark("camera_pair", "camera_pair.py --pictures {work} --out {out}"),
     Benchmark("targets", "targets.py --work {work} --out {out}"),
+    Benchmark("calibrations", "calibrations.py {boards} --out {out}"),
     Benchmark("mean_shape", "mean_shape.py --work {work} --out {out}"),
     Benchmark("grid", "grid.py --out {out}"),
     Benchmark("stereo_pairs", "stereo_pairs.py {pairs} --out {out}"),

@@ -81,6 +81,7 @@ MAKERS: Mapping[str, Maker] = {
     "manufacturing*": Maker("manufacturing"),
     "expectations": Maker("expectations"),
     "targets": Maker("targets"),
+    "calibrations": Maker("calibrations"),
     "grid": Maker("grid"),
     "fuzz": Maker("fuzz", ("*",), plain=True, release=True),
     "kill": Maker("kill", ("*",), plain=True, release=True),

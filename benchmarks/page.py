@@ -183,6 +183,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
     "plain_frames": ("Single frames of plain enamel", anatomy_sections.plain_frames),
     "real_gloss": ("A real glossy ball", anatomy_sections.real_gloss),
     "targets": ("Boards and terraces", handpiece_sections.targets),
+    "calibrations": ("What calibrations state", trust_sections.calibrations),
     "manufacturing": ("Handpieces not built exactly as drawn", handpiece_sections.manufacturing),
     "manufacturing_arch": ("Handpieces not built exactly as drawn: a real arch", handpiece_sections.manufacturing),
     "manufacturing_swept": (

@@ -20,7 +20,7 @@ Triggs et al. 2000, section 9.2), so that no camera counts as exact.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -30,7 +30,9 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
 from cuspid.board import Board, Target
+from cuspid.calibration.board_shape import BoardShape, nodes_of
 from cuspid.calibration.corners import BoardView, Views
+from cuspid.calibration.scatter import covariance_of, influences
 from cuspid.camera import Camera
 from cuspid.epipolar import skew
 from cuspid.errors import ReconstructionError
@@ -38,7 +40,7 @@ from cuspid.geometry import Rigid3
 from cuspid.rig import MountedCamera
 
 _PLACE, _BENDING = 6, 3
-_LENSES, _CAMERAS, _BOARDS, _BENDINGS, _MOUNTS, _CAMERA_DELAYS, _VIEW_DELAYS = range(7)
+_LENSES, _CAMERAS, _BOARDS, _BENDINGS, _SHAPES, _MOUNTS, _CAMERA_DELAYS, _VIEW_DELAYS = range(8)
 """Kinds of unknowns, in order."""
 _RADIAL_SIGMA, _SIDEWAYS_SIGMA = 0.5, 0.01
 """Standard deviation of radial, and of tangential and prism parameters about 0, for lenses as they are made: it matters
@@ -62,6 +64,12 @@ _MOST_DAMPING = 1e8
 """Largest damping of a step, as a share of the diagonal of the normal equations."""
 _LEAST_SIGMA_PX = 1e-6
 _Key = TypeVar("_Key")
+_TELLINGS, _ALIKE = 6, 0.1
+"""Maximum number of times that the unevenness of a board, and how loosely views hang together, are estimated anew; and
+the change, as a share, below which they stay."""
+_TIGHT, _LOOSEST = 0.1, 100.0
+"""In standard deviations of a corner, what no view is taken to be off from others by less, or by more, than."""
+_LOOSE_ROUNDS = 8
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -109,8 +117,14 @@ class BoardScene:
     zeros. Of several boards, one after the other."""
     body_from_board: Mapping[int, Rigid3] = field(default_factory=dict)
     """Places of boards on a body that several of them are fixed to, by their numbers; the others carry its frame."""
+    shape: BoardShape | None = None
+    """Where the corners lie on a board that is not printed and mounted evenly; None if they lie as given, and for
+    several boards."""
     timing: Timing | None = None
     """When each view was taken; None if all cameras expose together."""
+    loose_px: float = 0.0
+    """Standard deviation by which a view may show the board elsewhere than those of the other cameras at that instant
+    do; 0 if they show it at the same place."""
 
     def rig_from_view(self, camera: str, instant: str) -> Rigid3:
         """The pose of the board when a view was taken."""
@@ -131,11 +145,14 @@ class Adjusted:
     scene: BoardScene
     """The best scene."""
     sigma_px: float
-    """Standard deviation of one coordinate of a corner."""
+    """Standard deviation of one coordinate of a corner, besides what the board was elsewhere by in its view."""
     residuals: Mapping[tuple[str, str], Float[np.ndarray, "n 2"]]
     """Observed minus projected, px, by camera and instant."""
     covariance: Float[np.ndarray, "k k"]
-    """Covariance of the cameras: the parameters of each in order, then the motion of each."""
+    """Covariance of the cameras, if the corners err independently: the parameters of each in order, then the motion of
+    each."""
+    moved: Float[np.ndarray, "i k"]
+    """By how much each instant moves these (:mod:`cuspid.calibration.scatter`)."""
     settled: bool
     """Whether the search for the minimum converged."""
 
@@ -156,6 +173,10 @@ class _Observations:
     """What each number of the bending lifts them by."""
     board: Int[np.ndarray, "n"]
     """Which board they are on."""
+    nodes: Int[np.ndarray, "n m"]
+    """The nodes of the unevenness about each, and"""
+    shares: Float[np.ndarray, "n m"]
+    """by how much it follows them."""
     pixels: Float[np.ndarray, "n 2"]
     keys: tuple[tuple[str, str], ...]
     starts: Int[np.ndarray, "s"]
@@ -167,6 +188,7 @@ class _Observations:
         counts = [len(views[key].corner) for key in keys]
         corner = np.concatenate([views[key].corner for key in keys])
         points, number = board.corners[corner], board.board_of(corner)
+        nodes, shares = nodes_of(board)
         near = [(instant,) if scene.timing is None else scene.timing.near[camera, instant] for camera, instant in keys]
         most = max(len(each) for each in near)
         frame = dict.fromkeys(instants, 0) if scene.timing is None else scene.timing.frame
@@ -178,6 +200,8 @@ class _Observations:
             points=points,
             basis=_bases(board, points, number),
             board=number,
+            nodes=nodes[corner],
+            shares=shares[corner],
             pixels=np.concatenate([views[key].pixels for key in keys]),
             keys=keys,
             starts=np.cumsum([0, *counts]),
@@ -241,20 +265,38 @@ def of_instants(scene: BoardScene, instants: set[str]) -> BoardScene:
 # --- one step ----------------------------------------------------------------------------------------------------
 
 
-def _project(scene: BoardScene, seen: _Observations) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 2"]]:
-    """The corners in the camera, and their residuals; NaN behind a camera."""
+@dataclass(frozen=True, eq=False)
+class _Projection:
+    """Where a scene puts the corners."""
+
+    in_cam: Float[np.ndarray, "n 3"]
+    raw: Float[np.ndarray, "n 2"]
+    """Residuals, px; NaN behind a camera."""
+    by_view: Float[np.ndarray, "n 2 6"] | None
+    """Derivatives by a motion of the board in each view, where the scene is loose."""
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all corners lie before the cameras."""
+        return bool(np.isfinite(self.raw).all())
+
+
+def _project(scene: BoardScene, seen: _Observations) -> _Projection:
     points = _bent(scene, seen)
     in_rig = np.einsum("nk,nkj->nj", seen.weights(scene)[0][seen.view], _at_instants(scene, seen, points))
     in_cam = _moved(list(scene.cam_from_rig.values()), seen.camera, in_rig)
     image = np.empty_like(seen.pixels)
     for number, camera in enumerate(scene.cameras.values()):
         image[seen.camera == number] = camera.project(in_cam[seen.camera == number])
-    return in_cam, seen.pixels - image
+    raw = seen.pixels - image
+    loose = scene.loose_px > 0 and bool(np.isfinite(raw).all())
+    return _Projection(in_cam, raw, _by_view(scene, seen, in_cam) if loose else None)
 
 
 def _bent(scene: BoardScene, seen: _Observations) -> Float[np.ndarray, "n 3"]:
     """On the body."""
-    points = np.asarray(seen.points + (seen.basis @ scene.bending_mm)[:, None] * [0.0, 0.0, 1.0])
+    flat = seen.points if scene.shape is None else seen.points + scene.shape.at(seen.nodes, seen.shares)
+    points = np.asarray(flat + (seen.basis @ scene.bending_mm)[:, None] * [0.0, 0.0, 1.0])
     return _moved(_all_mounts(scene, seen), seen.board, points) if scene.body_from_board else points
 
 
@@ -292,6 +334,9 @@ def _jacobian(scene: BoardScene, seen: _Observations, in_cam: Float[np.ndarray, 
     by_bending = np.einsum("nij,nj->ni", by_body, normals)[:, :, None] * seen.basis[:, None]
     blocks = [by_parameters, _by_motion(by_point, in_cam), by_bending]
     which = [(_LENSES, seen.camera), (_CAMERAS, seen.camera), (_BENDINGS, 0 * seen.camera)]
+    if scene.shape is not None:
+        blocks += [by_body * share[:, None, None] for share in seen.shares.T]
+        which += [(_SHAPES, node) for node in seen.nodes.T]
     for k, instant in enumerate(seen.near[seen.view].T):
         blocks.append(weights[:, k, None, None] * _by_motion(by_rig, places[:, k]))
         which.append((_BOARDS, instant))
@@ -329,8 +374,9 @@ def _sizes(scene: BoardScene) -> tuple[int, ...]:
     """How many numbers there are of each kind of unknowns."""
     cameras, instants = len(scene.cameras), len(scene.rig_from_board)
     delays = (0, 0) if scene.timing is None else (cameras, len(scene.timing.by_view))
+    shape = 0 if scene.shape is None else scene.shape.offsets_mm.size
     mounts = _PLACE * len(scene.body_from_board)
-    return _numbers(scene) * cameras, _PLACE * cameras, _PLACE * instants, len(scene.bending_mm), mounts, *delays
+    return _numbers(scene) * cameras, _PLACE * cameras, _PLACE * instants, len(scene.bending_mm), shape, mounts, *delays
 
 
 def _numbers(scene: BoardScene) -> int:
@@ -364,34 +410,42 @@ class _Free:
     """Which of the unknowns may move, and the prior that holds them."""
 
     columns: Int[np.ndarray, "k"]
-    precision: Float[np.ndarray, "k"]
+    prior: Float[np.ndarray, "k k"]
+    """Inverse of their covariance, before any image."""
+    of_instants: Int[np.ndarray, "p"]
+    """Which of the free ones belong to single instants."""
 
     @staticmethod
     def of(scene: BoardScene, board: Target, *, only_boards: bool) -> _Free:
         """All but the place of the first camera, which is the rig, and what a board with terraces has no use of; or
         the places of the board alone, and the delays of the views."""
-        lenses, places, boards, bending, mounts, cameras, views = _sizes(scene)
+        sizes = _sizes(scene)
+        lenses, places, boards, _, shape, mounts, cameras, views = sizes
         precision = np.concatenate(
             [
                 *(_lens_precision(camera, _numbers(scene)) for camera in scene.cameras.values()),
                 np.zeros(places + boards),
                 np.repeat([_bending_sigma_mm(each) ** -2.0 for each in board.boards], _BENDING),
+                np.zeros(shape),
                 np.full(mounts, _MOUNT_SIGMA**-2.0),
                 np.full(cameras, _CAMERA_DELAY_SIGMA**-2.0),
                 np.full(views, _VIEW_DELAY_SIGMA**-2.0),
             ]
         )
-        free = np.ones(len(precision), dtype=bool)
+        free, kind = np.ones(len(precision), dtype=bool), np.repeat(np.arange(len(sizes)), sizes)
         if only_boards:
-            free[: lenses + places] = False
-            free[lenses + places + boards : len(free) - views] = False
+            free = np.isin(kind, (_BOARDS, _VIEW_DELAYS))
         free[lenses : lenses + _PLACE] = False
         if board.terraces > 1:
-            free[lenses + places + boards + 1 : lenses + places + boards + bending] = False
+            free[np.flatnonzero(kind == _BENDINGS)[1:]] = False
         if scene.timing is not None:
             free[len(free) - views :] = ~_first_of_instants(scene.timing.by_view)
         columns = np.flatnonzero(free)
-        return _Free(columns, precision[columns])
+        prior, of_shape = np.diag(precision[columns]), np.flatnonzero(kind[columns] == _SHAPES)
+        if scene.shape is not None and len(of_shape):
+            assert isinstance(board, Board)
+            prior[np.ix_(of_shape, of_shape)] = scene.shape.precision(board)
+        return _Free(columns, prior, np.flatnonzero(np.isin(kind[columns], (_BOARDS, _VIEW_DELAYS))))
 
 
 def _first_of_instants(views: Iterable[tuple[str, str]]) -> Bool[np.ndarray, "v"]:
@@ -407,55 +461,128 @@ def _bending_sigma_mm(board: Board) -> float:
     return _BENDING_SHARE * float(np.linalg.norm(board.size_mm)) / 2
 
 
-def adjust_board(start: BoardScene, views: Views, board: Target, *, only_boards: bool = False) -> Adjusted:
+def adjust_board(
+    start: BoardScene, views: Views, board: Target, *, only_boards: bool = False, keep_scales: bool = False
+) -> Adjusted:
     """The scene that best explains the observed corners, and its uncertainty (Levenberg-Marquardt on the Huber loss;
-    its scale is found from the residuals). With ``only_boards``, cameras and bending are held fixed.
+    its scale is found from the residuals). With ``only_boards``, cameras and board are held fixed; with
+    ``keep_scales``, how uneven the board and how loose the views are.
 
     Raises ReconstructionError where the images leave something undetermined, or a corner lies behind a camera.
     """
     seen = _Observations.of(views, board, start)
     free = _Free.of(start, board, only_boards=only_boards)
     scene, settled = _minimised(start, seen, free)
-    in_cam, residuals = _project(scene, seen)
-    sigma_px = _scale(residuals)
-    matrix, _ = _normal(scene, seen, in_cam, residuals, sigma_px, free)
-    pieces = np.split(residuals, seen.starts[1:-1])
+    told = not (only_boards or keep_scales) and (scene.shape is not None or scene.loose_px > 0)
+    for _ in range(_TELLINGS if told else 0):
+        before, scene = scene, _as_told(scene, seen, free, board)
+        if _is_told_alike(before, scene):
+            break
+        free = _Free.of(scene, board, only_boards=only_boards)
+        scene, settled = _minimised(scene, seen, free)
+    there = _project(scene, seen)
+    pieces = np.split(there.raw, seen.starts[1:-1])
+    nothing = np.zeros((0, 0))
+    covariance, moved = (nothing, nothing) if only_boards else _camera_covariance(scene, seen, free)
     return Adjusted(
         scene=scene,
-        sigma_px=sigma_px,
+        sigma_px=_scale(_loosened(scene, seen, there, None)[0]),
         residuals=dict(zip(seen.keys, pieces, strict=True)),
-        covariance=np.zeros((0, 0)) if only_boards else _camera_covariance(matrix, scene, free),
+        covariance=covariance,
+        moved=moved,
         settled=settled,
     )
+
+
+def unevenness_score(found: Adjusted, views: Views, board: Board) -> float:
+    """Score test of an even board: the mean square, over the coordinates of its corners, of how hard the residuals pull
+    at each, in standard deviations; about 1 if all lie as given."""
+    scene = replace(found.scene, shape=BoardShape.even(board))
+    seen, free = _Observations.of(views, board, scene), _Free.of(scene, board, only_boards=False)
+    sizes = _sizes(scene)
+    of_shape = np.repeat(np.arange(len(sizes)), sizes)[free.columns] == _SHAPES
+    rows = _weighted(scene, seen, _project(scene, seen), found.sigma_px, free)
+    jacobian = rows.jacobian.toarray()[:, of_shape]
+    told = np.sum(jacobian**2, axis=0)
+    pull = jacobian.T @ rows.residuals
+    return float(np.mean(pull[told > 0] ** 2 / told[told > 0]))
 
 
 def in_front(scene: BoardScene, views: Views, board: Target) -> dict[tuple[str, str], BoardView]:
     """The views of which every corner lies in front of the camera."""
     seen = _Observations.of(views, board, scene)
-    residuals = np.split(_project(scene, seen)[1], seen.starts[1:-1])
+    residuals = np.split(_project(scene, seen).raw, seen.starts[1:-1])
     return {key: views[key] for key, each in zip(seen.keys, residuals, strict=True) if np.isfinite(each).all()}
 
 
 def _minimised(scene: BoardScene, seen: _Observations, free: _Free) -> tuple[BoardScene, bool]:
     """The best scene, and whether another step would not have been worth it."""
-    in_cam, residuals = _project(scene, seen)
-    if not np.isfinite(residuals).all():
+    there = _project(scene, seen)
+    if not there.is_whole:
         raise ReconstructionError("calibration: a corner of the board lies behind a camera that saw it")
     damping, settled, steps = 1e-4, False, 0
     while not settled and steps < _STEPS and damping < _MOST_DAMPING:
         steps += 1
-        sigma_px = _scale(residuals)
-        cost = _cost(scene, residuals, sigma_px, free)
-        matrix, gradient = _normal(scene, seen, in_cam, residuals, sigma_px, free)
+        sigma_px = _scale(_loosened(scene, seen, there, None)[0])
+        cost = _cost(scene, seen, there, sigma_px, free)
+        matrix, gradient = _normal(scene, seen, there, sigma_px, free)
         step = _solved(matrix + damping * np.diag(np.diag(matrix)), gradient)
         candidate = _stepped(scene, free, step)
-        there = None if candidate is None else _project(candidate, seen)
-        if candidate is None or there is None or not _cost(candidate, there[1], sigma_px, free) <= cost:
+        after = None if candidate is None else _project(candidate, seen)
+        if candidate is None or after is None or not _cost(candidate, seen, after, sigma_px, free) <= cost:
             damping *= 10
             continue
         settled = float(step @ gradient) < _SETTLED
-        scene, (in_cam, residuals), damping = candidate, there, max(damping / 10, 1e-12)
+        scene, there, damping = candidate, after, max(damping / 10, 1e-12)
     return scene, settled
+
+
+def _loosened(
+    scene: BoardScene,
+    seen: _Observations,
+    there: _Projection,
+    sigma_px: float | None,
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "v 6"]]:
+    """The residuals without what the board was elsewhere by in each view, and that, px; by a standard deviation of a
+    coordinate, or by what it is found to be."""
+    motions, residuals, by_view = np.zeros((len(seen.keys), _PLACE)), there.raw, there.by_view
+    if by_view is None:
+        return residuals, motions
+    for _ in range(_LOOSE_ROUNDS):
+        sigma = _scale(residuals) if sigma_px is None else sigma_px
+        weights = _weights(residuals, sigma)
+        matrix = _of_views(seen, np.einsum("n,nik,nil->nkl", weights, by_view, by_view))
+        right = _of_views(seen, np.einsum("n,nik,ni->nk", weights, by_view, there.raw))
+        matrix += np.eye(_PLACE) / scene.loose_px**2
+        motions = np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
+        residuals = there.raw - np.einsum("nik,nk->ni", by_view, motions[seen.view])
+    return residuals, motions
+
+
+def _of_views(seen: _Observations, values: Float[np.ndarray, "n *k"]) -> Float[np.ndarray, "v *k"]:
+    """Sums over the corners of each view."""
+    return np.asarray(np.add.reduceat(values, seen.starts[:-1], axis=0))
+
+
+def _by_view(scene: BoardScene, seen: _Observations, in_cam: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 6"]:
+    """Derivatives by a motion of the board in each view, about its middle, whose numbers are what the corners move by,
+    px."""
+    by_point, _ = _by_cameras(scene, seen, in_cam)
+    counts = np.diff(seen.starts)
+    middle = _of_views(seen, in_cam) / counts[:, None]
+    away = in_cam - middle[seen.view]
+    size = np.sqrt(_of_views(seen, np.sum(away**2, axis=1)) / counts)
+    focal = np.array([camera.focal_px.mean() for camera in scene.cameras.values()])[seen.camera]
+    px = (np.linalg.norm(middle, axis=1)[seen.view] / focal)[:, None, None]
+    return np.asarray(
+        px * np.concatenate([np.cross(away[:, None], by_point) / size[seen.view][:, None, None], by_point], 2)
+    )
+
+
+def _weights(residuals: Float[np.ndarray, "n 2"], sigma_px: float) -> Float[np.ndarray, "n"]:
+    """Of the squares of residuals, by the Huber loss."""
+    lengths = np.linalg.norm(residuals, axis=1) / sigma_px
+    return np.asarray(np.minimum(1, _KNEE / np.maximum(lengths, 1e-12)) / sigma_px**2)
 
 
 def _scale(residuals: Float[np.ndarray, "n 2"]) -> float:
@@ -463,13 +590,22 @@ def _scale(residuals: Float[np.ndarray, "n 2"]) -> float:
     return max(float(np.median(np.linalg.norm(residuals, axis=1)) / np.sqrt(2 * np.log(2))), _LEAST_SIGMA_PX)
 
 
-def _cost(scene: BoardScene, residuals: Float[np.ndarray, "n 2"], sigma_px: float, free: _Free) -> float:
+def _cost(
+    scene: BoardScene,
+    seen: _Observations,
+    there: _Projection,
+    sigma_px: float,
+    free: _Free,
+) -> float:
     """Huber loss of the residuals, and the prior; infinite where a corner lies behind a camera."""
+    residuals, motions = _loosened(scene, seen, there, sigma_px)
     lengths = np.linalg.norm(residuals, axis=1) / sigma_px
     if not np.isfinite(lengths).all():
         return np.inf
     loss = np.where(lengths <= _KNEE, lengths**2, 2 * _KNEE * lengths - _KNEE**2)
-    return float(loss.sum() + (free.precision * _held(scene)[free.columns] ** 2).sum())
+    held = _held(scene)[free.columns]
+    moved = float(np.sum(motions**2)) / scene.loose_px**2 if scene.loose_px else 0.0
+    return float(loss.sum() + held @ free.prior @ held) + moved
 
 
 def _lens_precision(camera: Camera, numbers: int) -> Float[np.ndarray, "n"]:
@@ -499,24 +635,86 @@ def _held(scene: BoardScene) -> Float[np.ndarray, "k"]:
     timing = scene.timing
     delays = [] if timing is None else [*timing.by_camera.values(), *timing.by_view.values()]
     mounts = np.zeros(_PLACE * len(scene.body_from_board))
-    return np.concatenate([*lenses, places, scene.bending_mm, mounts, delays])
+    shape = np.zeros(0) if scene.shape is None else scene.shape.offsets_mm.ravel()
+    return np.concatenate([*lenses, places, scene.bending_mm, shape, mounts, delays])
 
 
 def _normal(
     scene: BoardScene,
     seen: _Observations,
-    in_cam: Float[np.ndarray, "n 3"],
-    residuals: Float[np.ndarray, "n 2"],
+    there: _Projection,
     sigma_px: float,
     free: _Free,
 ) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k"]]:
     """Of the free unknowns: the matrix of the normal equations, and the gradient."""
-    lengths = np.linalg.norm(residuals, axis=1) / sigma_px
-    weights = np.repeat(np.minimum(1, _KNEE / np.maximum(lengths, 1e-12)) / sigma_px**2, 2)
-    jacobian = _jacobian(scene, seen, in_cam)[:, free.columns]
-    weighted = (jacobian * weights[:, None]).T
-    matrix = (weighted @ jacobian).toarray() + np.diag(free.precision)
-    return matrix, weighted @ residuals.ravel() - free.precision * _held(scene)[free.columns]
+    rows = _weighted(scene, seen, there, sigma_px, free)
+    return rows.matrix + free.prior, rows.jacobian.T @ rows.residuals - free.prior @ _held(scene)[free.columns]
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Equations of standard deviation 1, and what the board was elsewhere by in each view, px."""
+
+    jacobian: csr_array
+    """By the free unknowns."""
+    residuals: Float[np.ndarray, "m"]
+    by_motion: Float[np.ndarray, "l 6"]
+    """By the motion of the board in its view; without rows where there is none."""
+    motions: Float[np.ndarray, "v 6"]
+    spread: Float[np.ndarray, "v 6 6"]
+    """Covariance of the motions, were all else known; zeros where there are none."""
+    together: Float[np.ndarray, "v 6 k"]
+    """Of the motions and the unknowns, in the matrix of the normal equations."""
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "k k"]:
+        """Of the normal equations of the unknowns, which the motions follow."""
+        count, each, unknowns = self.together.shape
+        flat = (count * each, unknowns)
+        own = self.together.reshape(flat).T @ (self.spread @ self.together).reshape(flat)
+        return np.asarray((self.jacobian.T @ self.jacobian).toarray() - own)
+
+
+def _weighted(
+    scene: BoardScene,
+    seen: _Observations,
+    there: _Projection,
+    sigma_px: float,
+    free: _Free,
+) -> _Rows:
+    residuals, motions = _loosened(scene, seen, there, sigma_px)
+    weights = np.repeat(np.sqrt(_weights(residuals, sigma_px)), 2)
+    jacobian = csr_array(_jacobian(scene, seen, there.in_cam)[:, free.columns] * weights[:, None])
+    weighted, view = residuals.ravel() * weights, np.repeat(seen.view, 2)
+    if there.by_view is None:
+        none, together = np.zeros((0, _PLACE)), np.zeros((0, _PLACE, len(free.columns)))
+        return _Rows(jacobian, weighted, none, none, np.zeros((0, _PLACE, _PLACE)), together)
+    by_motion = (there.by_view * weights.reshape(-1, 2, 1)).reshape(-1, _PLACE)
+    matrix = _of_views(seen, np.einsum("nik,nil->nkl", *2 * [by_motion.reshape(-1, 2, _PLACE)]))
+    columns = (_PLACE * view[:, None] + np.arange(_PLACE)).ravel()
+    shape = (len(view), motions.size)
+    spread_out = csr_array((by_motion.ravel(), columns, _PLACE * np.arange(len(view) + 1)), shape=shape)
+    together = (spread_out.T @ jacobian).toarray().reshape(*motions.shape, -1)
+    spread = np.linalg.inv(matrix + np.eye(_PLACE) / scene.loose_px**2)
+    return _Rows(jacobian, weighted, by_motion, motions, spread, together)
+
+
+def _independent(
+    rows: _Rows, seen: _Observations, loose_px: float
+) -> Iterator[tuple[Float[np.ndarray, "m k"], Float[np.ndarray, "m"]]]:
+    """Of each instant, equations that err independently of those of others, the motions in its views eliminated."""
+    instants = seen.near[:, 0]
+    for instant in np.unique(instants):
+        jacobians, residuals = [], []
+        for view in np.flatnonzero(instants == instant):
+            part = slice(2 * seen.starts[view], 2 * seen.starts[view + 1])
+            jacobians.append(rows.jacobian[part].toarray())
+            residuals.append(rows.residuals[part])
+            if loose_px:
+                follow = rows.spread[view] @ rows.together[view]
+                jacobians = [*jacobians[:-1], jacobians[-1] - rows.by_motion[part] @ follow, follow / loose_px]
+                residuals.append(rows.motions[view] / loose_px)
+        yield np.concatenate(jacobians), np.concatenate(residuals)
 
 
 def _solved(matrix: Float[np.ndarray, "k k"], right: Float[np.ndarray, "k *m"]) -> Float[np.ndarray, "k *m"]:
@@ -537,7 +735,7 @@ def _stepped(scene: BoardScene, free: _Free, step: Float[np.ndarray, "k"]) -> Bo
     sizes = _sizes(scene)
     whole = np.zeros(sum(sizes))
     whole[free.columns] = step
-    lenses, places, boards, bending, mounts, cameras, views = np.split(whole, np.cumsum(sizes)[:-1])
+    lenses, places, boards, bending, shape, mounts, cameras, views = np.split(whole, np.cumsum(sizes)[:-1])
     parameters = [
         camera.parameters + shift[: len(camera.parameters)]
         for camera, shift in zip(scene.cameras.values(), lenses.reshape(-1, _numbers(scene)), strict=True)
@@ -553,7 +751,9 @@ def _stepped(scene: BoardScene, free: _Free, step: Float[np.ndarray, "k"]) -> Bo
         rig_from_board=_all_moved(scene.rig_from_board, boards),
         bending_mm=scene.bending_mm + bending,
         body_from_board=_all_moved(scene.body_from_board, mounts),
+        shape=scene.shape and scene.shape.moved(shape),
         timing=scene.timing and scene.timing.later(cameras, views),
+        loose_px=scene.loose_px,
     )
 
 
@@ -567,17 +767,55 @@ def _all_moved(poses: Mapping[_Key, Rigid3], motions: Float[np.ndarray, "k"]) ->
 # --- how well it is known ----------------------------------------------------------------------------------------
 
 
-def _camera_covariance(matrix: Float[np.ndarray, "k k"], scene: BoardScene, free: _Free) -> Float[np.ndarray, "m m"]:
-    """Of the parameters and the motions of all cameras, in the frame in which these sum up to nothing."""
+def _as_told(scene: BoardScene, seen: _Observations, free: _Free, board: Target) -> BoardScene:
+    """The scene with a board as uneven, and views as loose, as the images tell (D. MacKay, Neural Computation 4, 1992,
+    equation 3.14)."""
+    there = _project(scene, seen)
+    sigma_px = _scale(_loosened(scene, seen, there, None)[0])
+    rows = _weighted(scene, seen, there, sigma_px, free)
+    inverse = _solved(rows.matrix + free.prior, np.eye(len(free.columns)))
+    sizes = _sizes(scene)
+    of_shape = np.repeat(np.arange(len(sizes)), sizes)[free.columns] == _SHAPES
+    if scene.shape is not None and of_shape.any():
+        assert isinstance(board, Board)
+        variances = np.diag(inverse)[of_shape].reshape(-1, 3)
+        scene = replace(scene, shape=scene.shape.as_uneven(variances, board))
+    if scene.loose_px:
+        follow = (rows.spread @ rows.together).reshape(-1, len(inverse))
+        unsure = np.trace(rows.spread, axis1=1, axis2=2).sum() + np.sum((follow @ inverse) * follow)
+        told = rows.motions.size - unsure / scene.loose_px**2
+        loose_px = float(np.sqrt(np.sum(rows.motions**2) / max(told, 1e-3)))
+        scene = replace(scene, loose_px=float(np.clip(loose_px, _TIGHT * sigma_px, _LOOSEST * sigma_px)))
+    return scene
+
+
+def _is_told_alike(one: BoardScene, other: BoardScene) -> bool:
+    """Whether a board is as uneven, and views as loose, as before."""
+    before, after = ([each.loose_px, *(each.shape.sigma_mm if each.shape else ())] for each in (one, other))
+    return bool(np.allclose(before, after, rtol=_ALIKE, atol=0))
+
+
+def _camera_covariance(
+    scene: BoardScene, seen: _Observations, free: _Free
+) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "i m"]]:
+    """Of the parameters and the motions of all cameras, in the frame in which these sum up to nothing: as the scatter
+    of the corners gives it, and by how much each instant moves them."""
+    there = _project(scene, seen)
+    sigma_px = _scale(_loosened(scene, seen, there, None)[0])
+    rows = _weighted(scene, seen, there, sigma_px, free)
+    matrix = rows.matrix + free.prior
     size = (_numbers(scene) + _PLACE) * len(scene.cameras)
-    known = free.columns < size
-    inverse = _solved(matrix, np.eye(len(matrix))[:, known])[known]
+    known = np.flatnonzero(free.columns < size)
     whole = np.zeros((size, size))
-    whole[np.ix_(free.columns[known], free.columns[known])] = inverse
+    whole[np.ix_(free.columns[known], free.columns[known])] = _solved(matrix, np.eye(len(matrix))[:, known])[known]
     project = np.eye(size)
     places = _numbers(scene) * len(scene.cameras)
     project[places:, places:] = _without_common_motion(scene)
-    return np.asarray(project @ whole @ project.T)
+    common, moved = influences(matrix, _independent(rows, seen, scene.loose_px), free.of_instants)
+    by_instant = np.zeros((len(moved), size))
+    shown = common < len(known)
+    by_instant[:, free.columns[common[shown]]] = moved[:, shown]
+    return np.asarray(project @ whole @ project.T), by_instant @ project.T
 
 
 def common_free(scene: BoardScene, motions: Sequence[Float[np.ndarray, "6"]]) -> Float[np.ndarray, "c 6"]:
@@ -601,16 +839,18 @@ def _adjoint(target_from_source: Rigid3) -> Float[np.ndarray, "6 6"]:
 
 
 def mounted_cameras(found: Adjusted) -> dict[str, MountedCamera]:
-    """The cameras with their covariances."""
+    """The cameras with their covariances, by how much the instants disagree."""
     count, numbers, mounted = len(found.scene.cameras), _numbers(found.scene), {}
+
+    def known(part: slice) -> Float[np.ndarray, "n n"]:
+        return _symmetric(covariance_of(found.covariance[part, part], found.moved[:, part]))
+
     for index, (name, camera) in enumerate(found.scene.cameras.items()):
         lens = slice(numbers * index, numbers * index + len(camera.parameters))
         first = numbers * count + _PLACE * index
         place = slice(first, first + _PLACE)
         mounted[name] = MountedCamera(
-            replace(camera, covariance=_symmetric(found.covariance[lens, lens])),
-            found.scene.cam_from_rig[name],
-            _symmetric(found.covariance[place, place]),
+            replace(camera, covariance=known(lens)), found.scene.cam_from_rig[name], known(place)
         )
     return mounted
 

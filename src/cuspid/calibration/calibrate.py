@@ -12,21 +12,24 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.board import Board, BoardSet, Target
+from cuspid.calibration.board_shape import BoardShape, is_grid_of_corners
 from cuspid.calibration.bundle import (
     Adjusted,
     BoardScene,
     Timing,
+    adjust_board,
     common_free,
     in_front,
     mounted_cameras,
     of_instants,
+    unevenness_score,
 )
 from cuspid.calibration.circle_centres import centre_shifts
 from cuspid.calibration.corners import Views, split_by_board
 from cuspid.calibration.joining import joined_boards
 from cuspid.calibration.lenses import LensChoice, LensName, choose_lens
-from cuspid.calibration.start import LEAST_VIEWS, board_pose, groups, joined, require_one_group
-from cuspid.calibration.timing import adjust_scene, numbered, untied
+from cuspid.calibration.start import LEAST_VIEWS, board_pose, groups, joined, renumbered, require_one_group
+from cuspid.calibration.timing import adjust_scene, follow_each_other, numbered, untied
 from cuspid.camera import Camera
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
@@ -35,6 +38,13 @@ from cuspid.rig import MountedCamera, Rig
 
 _DOUBTFUL = 2.0
 """Difference between two halves, in standard deviations, that chance hardly explains."""
+_CHANCE, _LEAST_GAIN, _FOLDS = 2.0, 0.02, 5
+"""Standard errors beyond which one model of the board is better than another; the share by which its residuals must be
+smaller to matter; and into how many parts the instants are divided to tell."""
+_EVEN = 1.3
+"""Score of an even board below which no other is tried."""
+_TURNS = 5
+"""Maximum number of instants whose corners are numbered otherwise than they seemed."""
 _TELLING = 6
 """Views from which on a calibration states how far it may be off well enough for others to be judged by it."""
 _MUCH_MORE = 3.0
@@ -109,6 +119,14 @@ class RigCalibration:
     body_from_board: Mapping[int, Rigid3]
     """Of several boards, where they are on the body that they are fixed to, by number from 0; others carry its
     frame."""
+    uneven_mm: tuple[float, float] | None
+    """Standard deviations by which its corners lie elsewhere than given, in its plane and out of it; None if that
+    explains no more."""
+    loose_px: float | None
+    """Standard deviation by which a view shows the board elsewhere than the others at that instant do; None for one
+    camera."""
+    widened: Mapping[str, float]
+    """By what factor the standard deviations of each lens were widened for what they do not explain; 1 if not."""
     cameras: Mapping[str, CameraCheck]
     """Checks by camera."""
     pixels: Mapping[str, Float[np.ndarray, "n 2"]]
@@ -173,18 +191,19 @@ def _calibrated(
     cameras = {name: each.scene.cameras[""] for name, each in alone.items()}
     how: tuple[str, ...] = ()
     if isinstance(board, BoardSet):
-        start, chosen, how = joined_boards(views, board, cameras)
+        start, common, how = joined_boards(views, board, cameras)
     else:
-        start, chosen = joined(views, board, cameras, sorted({instant for _, instant in views}))
-    found, notes = _without_outliers(start, chosen, board, options)
-    notes = (*how, *notes)
-    together = _described(found, chosen, board, alone, choices, notes)
+        start, common = joined(views, board, cameras, sorted({instant for _, instant in views}))
+    found, chosen, notes = _fitted(start, common, board, options)
+    together = _described(found, chosen, board, choices, (*how, *notes))
     frame = numbered(start.rig_from_board)
-    if frame is None or not any(_is_doubtful_together(check) for check in together.cameras.values()):
+    if frame is None or not follow_each_other(frame):
+        return together
+    if not any(_is_doubtful_together(check) for check in together.cameras.values()):
         return together
     try:
-        found, notes = _without_outliers(untied(start, frame, chosen), chosen, board, options)
-        apart = _described(found, chosen, board, alone, choices, (*how, *notes))
+        found, chosen, notes = _fitted(untied(start, frame, common), common, board, options)
+        apart = _described(found, chosen, board, choices, (*how, *notes))
     except ReconstructionError:  # the images do not tell delays as well
         return together
     return apart if _is_better(apart, together) else together
@@ -223,6 +242,81 @@ def _alone(
             f"calibration: camera {name}: {str(error).removeprefix('calibration: ')}; check the columns, rows, kind "
             "and dictionary of the board, and show it tilted by 20 to 50 degrees"
         ) from error
+
+
+def _fitted(
+    start: BoardScene, views: Views, board: Target, options: CalibrationOptions
+) -> tuple[Adjusted, Views, tuple[str, ...]]:
+    """The cameras by the views that fit, and all views with the numbering of their corners that fits best.
+
+    The cameras need not see the board at quite the same place. It is taken to be uneven where that explains instants
+    better, by more than chance, that it was not estimated from.
+    """
+    found, notes = _without_outliers(start, views, board, options)
+    if len(start.cameras) > 1:
+        loose = replace(found.scene, loose_px=found.sigma_px)
+        found = adjust_scene(loose, {key: views[key] for key in found.residuals}, board)
+    used = {key: views[key] for key in found.residuals}
+    if not is_grid_of_corners(board) or unevenness_score(found, used, board) < _EVEN:
+        return found, views, notes
+    uneven, turned = _uneven(found, views, board)
+    if uneven.scene.shape is None or uneven.scene.shape.is_even(board):
+        return found, views, notes
+    used = {key: turned[key] for key in found.residuals}
+    before = replace(found, scene=replace(uneven.scene, shape=None)) if turned is not views else found
+    if _explains_more(uneven, before, used, board):
+        return uneven, turned, notes
+    return found, views, notes
+
+
+def _uneven(found: Adjusted, views: Views, board: Board) -> tuple[Adjusted, Views]:
+    """The cameras before a board that may be uneven, and the views with the numbering of their corners that it
+    shows."""
+    found = adjust_scene(
+        replace(found.scene, shape=BoardShape.even(board)), {key: views[key] for key in found.residuals}, board
+    )
+    for _ in range(_TURNS if len(board.orders) > 1 else 0):
+        turned = renumbered(found, {key: views[key] for key in found.residuals}, board)
+        if turned is None:
+            break
+        scene, used = turned
+        views, found = {**views, **used}, adjust_scene(scene, used, board)
+    return found, views
+
+
+def _explains_more(one: Adjusted, other: Adjusted, views: Views, board: Board) -> bool:
+    """Whether one calibration has smaller residuals than another at instants that neither was made from, by more than
+    chance and enough to matter."""
+    instants = sorted({instant for _, instant in views})
+    folds = min(_FOLDS, len(instants))
+    gains = []
+    for fold in range(folds):
+        out = {key: view for key, view in views.items() if instants.index(key[1]) % folds == fold}
+        rest = {key: view for key, view in views.items() if key not in out}
+        counts = Counter(camera for camera, _ in rest)
+        if min(counts[name] for name in one.scene.cameras) < LEAST_VIEWS or len(groups(rest, list(counts))) > 1:
+            continue
+        try:
+            squares = [_squares_without(each.scene, rest, out, board) for each in (one, other)]
+        except ReconstructionError:  # too little is left
+            continue
+        gains += [np.log(squares[1][instant] / squares[0][instant]) / 2 for instant in squares[0]]
+    if len(gains) < LEAST_VIEWS:
+        return False
+    return bool(np.mean(gains) > max(_CHANCE * np.std(gains, ddof=1) / np.sqrt(len(gains)), _LEAST_GAIN))
+
+
+def _squares_without(scene: BoardScene, rest: Views, out: Views, board: Board) -> dict[str, float]:
+    """Mean squares of the residuals at some instants by a calibration from others."""
+    found = adjust_scene(of_instants(scene, {key[1] for key in rest}), rest, board, keep_scales=True)
+    held = replace(found.scene, rig_from_board=scene.rig_from_board, timing=scene.timing)
+    held = of_instants(held, {key[1] for key in out})
+    residuals = adjust_scene(held, out, board, only_boards=True).residuals
+    instants = {key[1] for key in out}
+    return {
+        instant: float(np.mean(np.concatenate([each for key, each in residuals.items() if key[1] == instant]) ** 2))
+        for instant in instants
+    }
 
 
 def _without_outliers(
@@ -321,7 +415,6 @@ def _described(
     found: Adjusted,
     chosen: Views,
     board: Target,
-    alone: Mapping[str, Adjusted],
     lenses: Mapping[str, LensChoice],
     notes: tuple[str, ...],
 ) -> RigCalibration:
@@ -330,6 +423,7 @@ def _described(
     pixels = {name: np.concatenate([views[key].pixels for key in of[name]]) for name in names}
     residuals = {name: np.concatenate([found.residuals[key] for key in of[name]]) for name in names}
     held_out, apart = _cross_validated(found, views, board)
+    alone = {name: _by_itself(name, found, views, board) for name in names}
     seen = {key: found.scene.rig_from_view(*key) for key in views}
     distances = [np.linalg.norm((found.scene.cam_from_rig[key[0]] @ pose).translation) for key, pose in seen.items()]
     delays = _delays(found.scene, views)
@@ -355,13 +449,16 @@ def _described(
         sigma_px=found.sigma_px,
         bending_mm=found.scene.bending_mm,
         body_from_board=found.scene.body_from_board,
+        uneven_mm=found.scene.shape.sigma_mm if found.scene.shape else None,
+        loose_px=found.scene.loose_px if len(names) > 1 else None,
+        widened={name: _lens_factor(check) for name, check in checks.items()},
         cameras=checks,
         pixels=pixels,
         residuals=residuals,
         views=views,
         rig_from_view=seen,
         distance_mm=float(np.median(distances)),
-        notes=(*notes, *_doubts(found.settled, checks, rig)),
+        notes=(*notes, *_of_board(found.scene), *_doubts(found.settled, checks, rig)),
     )
 
 
@@ -381,19 +478,55 @@ def _delays(scene: BoardScene, views: Views) -> dict[str, tuple[float, float] | 
     return {name: (float(np.mean(each)), float(np.std(each))) for name, each in late.items()}
 
 
+def _by_itself(name: str, found: Adjusted, views: Views, board: Target) -> Adjusted:
+    """A camera from its own views alone, beginning from the one that was found."""
+    own = {key: view for key, view in views.items() if key[0] == name}
+    if len(found.scene.cameras) == 1:
+        return found
+    place = found.scene.cam_from_rig[name]
+    scene = replace(
+        found.scene,
+        cameras={name: found.scene.cameras[name]},
+        cam_from_rig={name: Rigid3.identity()},
+        rig_from_board={instant: place @ found.scene.rig_from_view(name, instant) for _, instant in own},
+        timing=None,
+        loose_px=0.0,
+    )
+    return adjust_board(scene, own, board, keep_scales=True)
+
+
 def _lens_apart(camera: Camera, alone: Adjusted) -> float:
     """Difference of the parameters from those of the camera alone, in the standard deviations of these."""
-    other = mounted_cameras(alone)[""].camera
+    (other,) = (each.camera for each in mounted_cameras(alone).values())
     return _in_sigmas(camera.parameters - other.parameters, known(other.covariance))
 
 
 def _widened(mounted: MountedCamera, check: CameraCheck) -> MountedCamera:
     """With covariances that account for how far two halves of the images are apart, and the lens from that of its own
-    views alone."""
-    lens = max(1.0, check.parameters_apart or 0.0, check.alone_apart or 0.0) ** 2
-    place = max(1.0, check.place_apart or 0.0) ** 2
-    camera = replace(mounted.camera, covariance=lens * known(mounted.camera.covariance))
-    return replace(mounted, camera=camera, covariance=place * known(mounted.covariance))
+    views alone, where chance hardly explains it."""
+    camera = replace(mounted.camera, covariance=_lens_factor(check) ** 2 * known(mounted.camera.covariance))
+    return replace(
+        mounted, camera=camera, covariance=_beyond_chance(check.place_apart) ** 2 * known(mounted.covariance)
+    )
+
+
+def _lens_factor(check: CameraCheck) -> float:
+    return max(_beyond_chance(check.parameters_apart), _beyond_chance(check.alone_apart))
+
+
+def _beyond_chance(apart: float | None) -> float:
+    """How many standard deviations something is apart, where chance hardly explains that; else 1."""
+    return apart if apart is not None and apart > _DOUBTFUL else 1.0
+
+
+def _of_board(scene: BoardScene) -> Iterator[str]:
+    """Where its corners do not lie as given."""
+    if scene.shape is not None:
+        across, out = (1000 * sigma for sigma in scene.shape.sigma_mm)
+        yield (
+            f"the corners of the board lie {across:.2g} um off in its plane and {out:.2g} um out of it (standard "
+            "deviations); this is taken into account"
+        )
 
 
 def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Iterator[str]:
@@ -416,7 +549,8 @@ def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Itera
         if worst > _DOUBTFUL:
             yield (
                 f"camera {name}: calibrations from two halves of the images differ by {worst:.1f} of their standard "
-                "deviations; its covariance is widened accordingly; look for a pattern in residuals.png"
+                "deviations, which already allow for views that disagree; its covariance is widened accordingly; look "
+                "for a pattern in residuals.png"
             )
         if check.alone_apart is not None and check.alone_apart > _DOUBTFUL:
             yield (
@@ -449,16 +583,23 @@ def _cross_validated(
     if any(len(groups(half, cameras)) > 1 for half in halves):
         return {}, {}
     try:
-        parts = [adjust_scene(of_instants(found.scene, {key[1] for key in half}), half, board) for half in halves]
+        parts = [
+            adjust_scene(of_instants(found.scene, {key[1] for key in half}), half, board, keep_scales=True)
+            for half in halves
+        ]
     except ReconstructionError:  # half of the views leave open where a board, or a camera, is
         return {}, {}
     squares: dict[str, list[Float[np.ndarray, "n 2"]]] = {name: [] for name in found.scene.cameras}
     for part, other, other_views in zip(parts, parts[::-1], halves[::-1], strict=True):
         start = replace(part.scene, rig_from_board=other.scene.rig_from_board)
-        for (camera, _), residuals in adjust_scene(start, other_views, board, only_boards=True).residuals.items():
+        shown = in_front(start, other_views, board) if start.timing is None else other_views
+        if not shown:
+            continue
+        start = of_instants(start, {instant for _, instant in shown})
+        for (camera, _), residuals in adjust_scene(start, shown, board, only_boards=True).residuals.items():
             squares[camera].append(residuals)
     tell = all(count[name] >= _TELLING for count in counts for name in cameras)
-    return {name: _rms(np.concatenate(each)) for name, each in squares.items()}, _apart(*parts) if tell else {}
+    return {name: _rms(np.concatenate(each)) for name, each in squares.items() if each}, _apart(*parts) if tell else {}
 
 
 def _halves(views: Views, timing: Timing | None) -> list[Views]:

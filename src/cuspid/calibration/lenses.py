@@ -20,7 +20,7 @@ from cuspid.calibration.bundle import Adjusted, adjust_board, in_front, of_insta
 from cuspid.calibration.corners import BoardView
 from cuspid.calibration.start import LEAST_VIEWS, calibrated_alone
 from cuspid.camera import Camera
-from cuspid.errors import ReconstructionError
+from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry.cameras import MODELS
 
 LensName = Literal["auto", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"]
@@ -37,7 +37,7 @@ _HALF_VIEWS_DEG = (20.0, 35.0, 50.0, 65.0, 80.0)
 """Half the angle of view across the image, from which the search begins where OpenCV's finds no camera."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class LensChoice:
     """The model of a lens, and what others did."""
 
@@ -46,6 +46,10 @@ class LensChoice:
     held_out_px: Mapping[str, float]
     """RMS of the residuals in views that a calibration by a model was not made from; empty where there were too few
     views to tell."""
+    chosen: Camera | None = None
+    """The camera by the one that was taken, and"""
+    rival: Camera | None = None
+    """by the best of those with more parameters or, if there is none, of the others; None where there was only one."""
 
     @property
     def summary(self) -> str:
@@ -89,13 +93,26 @@ def choose_lens(
         if _is_better(squares[model], squares[chosen]):
             chosen = model
     rms = {model: float(np.sqrt(np.mean(each[np.isfinite(each)]))) for model, each in squares.items()}
+    others = [model for model in rms if model != chosen]
+    richer = [model for model in others if _size(found[model]) > _size(found[chosen])]
+    rival = min(richer or others, key=rms.__getitem__, default=None)
+    taken = LensChoice(
+        model=chosen,
+        held_out_px=rms,
+        chosen=found[chosen].scene.cameras[""],
+        rival=None if rival is None else found[rival].scene.cameras[""],
+    )
     if len(some) == len(sound):
-        return LensChoice(model=chosen, held_out_px=rms), found[chosen]
+        return taken, found[chosen]
     try:
         alone = calibrated_alone(sound, board, size, [found[chosen].scene.cameras[""]])
     except ReconstructionError:  # the others lie where such a lens shows nothing
         return choice, simple
-    return LensChoice(model=chosen, held_out_px=rms), alone
+    return taken, alone
+
+
+def _size(found: Adjusted) -> int:
+    return len(found.scene.cameras[""].parameters)
 
 
 def _sound(views: Sequence[BoardView], found: Adjusted) -> list[BoardView]:
@@ -136,7 +153,7 @@ def calibrated_as(
         simple = simple or calibrated_alone(views, board, size)
         pixels = np.concatenate([view.pixels for view in views])
         starts = [as_model(simple.scene.cameras[""], model, pixels)]
-    except ReconstructionError:  # too far from such a lens
+    except (InputError, ReconstructionError):  # too far from such a lens
         starts = [_ideal(model, size, half_deg) for half_deg in _HALF_VIEWS_DEG]
     return calibrated_alone(views, board, size, starts)
 

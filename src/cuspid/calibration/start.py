@@ -7,10 +7,12 @@ then chosen for which the relative poses of any two cameras agree from instant t
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import cv2
 import numpy as np
+from jaxtyping import Float
 
 from cuspid.board import Target
 from cuspid.calibration.agreement import agreed_on, apart
@@ -26,6 +28,8 @@ LEAST_VIEWS = 3
 _MOST_VIEWS = 40
 """Maximum number of views for the initial calibration of a camera: more take long, and the adjustment uses all of
 them."""
+_MUCH_BETTER = 0.8
+"""Residuals with another numbering of the corners, as a share of those with the first one, below which it is right."""
 _NO_FIT_SHARE = 0.01
 """Residuals of a single camera, as a share of its image width, beyond which no camera model fits."""
 
@@ -139,6 +143,41 @@ def joined(
         bending_mm=np.zeros(3 * len(board.boards)),
     )
     return scene, {key: chosen[key] for key in views}
+
+
+def renumbered(found: Adjusted, views: Views, board: Target) -> tuple[BoardScene, Views] | None:
+    """The views with the corners at some instant numbered otherwise, where a board that is not quite even fits much
+    better so, and the scene with the board turned likewise; None if there is no such instant."""
+    best: tuple[float, BoardScene, dict[tuple[str, str], BoardView]] | None = None
+    for instant in found.scene.rig_from_board:
+        own = {key: view for key, view in views.items() if key[1] == instant}
+        if not own:
+            continue
+        usual = _rms_of([found.residuals[key] for key in own])
+        for order in board.orders[1:]:
+            turned = {key: view.renumbered(order) for key, view in own.items()}
+            name, view = next(iter(turned.items()))
+            try:
+                pose = board_pose(view, board, found.scene.cameras[name[0]])
+                scene = of_instants(found.scene, {instant})
+                there = {instant: found.scene.cam_from_rig[name[0]].inverse() @ pose}
+                other = adjust_board(replace(scene, rig_from_board=there), turned, board, only_boards=True)
+            except (InputError, ReconstructionError):
+                continue
+            ratio = _rms_of(list(other.residuals.values())) / usual
+            if ratio < (best[0] if best else _MUCH_BETTER):
+                best = ratio, other.scene, turned
+    if best is None:
+        return None
+    _, scene, turned = best
+    return replace(found.scene, rig_from_board={**found.scene.rig_from_board, **scene.rig_from_board}), {
+        **views,
+        **turned,
+    }
+
+
+def _rms_of(residuals: Sequence[Float[np.ndarray, "n 2"]]) -> float:
+    return float(np.sqrt(np.mean(np.concatenate(residuals) ** 2)))
 
 
 Poses = Mapping[tuple[str, str], Sequence[Rigid3]]

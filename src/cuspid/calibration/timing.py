@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 from cuspid.board import Target
 from cuspid.calibration.bundle import Adjusted, BoardScene, Timing, adjust_board
@@ -31,19 +32,28 @@ def numbered(instants: Iterable[str]) -> dict[str, int] | None:
     return frame if len(set(frame.values())) == len(frame) else None
 
 
+def follow_each_other(frame: Mapping[str, int]) -> bool:
+    """Whether most instants have one within reach, so that the path of the board can be followed."""
+    numbers = sorted(frame.values())
+    near = sum(after - before <= _REACH for before, after in pairwise(numbers))
+    return 2 * near >= len(numbers)
+
+
 def untied(scene: BoardScene, frame: Mapping[str, int], views: Views) -> BoardScene:
     """A scene whose cameras need not have exposed together; as yet, without delays."""
     timing = Timing(frame=frame, near={}, by_camera=dict.fromkeys(scene.cameras, 0.0), by_view={})
     return _followed(scene, timing, scene.rig_from_board, views)
 
 
-def adjust_scene(start: BoardScene, views: Views, board: Target, *, only_boards: bool = False) -> Adjusted:
+def adjust_scene(
+    start: BoardScene, views: Views, board: Target, *, only_boards: bool = False, keep_scales: bool = False
+) -> Adjusted:
     """As ``adjust_board``, also where cameras need not have exposed together."""
     if start.timing is None:
-        return adjust_board(start, views, board, only_boards=only_boards)
+        return adjust_board(start, views, board, only_boards=only_boards, keep_scales=keep_scales)
     scene, tried = _followed(start, start.timing, start.rig_from_board, views), []
     for _ in range(_ROUNDS):
-        found = adjust_board(scene, views, board, only_boards=only_boards)
+        found = adjust_board(scene, views, board, only_boards=only_boards, keep_scales=keep_scales)
         timing = found.scene.timing or start.timing
         tried.append(timing.near)
         scene = _followed(found.scene, timing, {**start.rig_from_board, **found.scene.rig_from_board}, views)

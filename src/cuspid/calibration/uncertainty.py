@@ -23,10 +23,7 @@ def projection_sigma_px(camera: Camera, columns: int = 32) -> Float[np.ndarray, 
     A turn of the camera is no error of its lens: of what the intrinsics may do, the rotation that explains most of it
     is taken off, where the lens is known well (D. Kogan, mrcal: projection uncertainty, "implied rotation").
     """
-    cell = camera.width / columns
-    rows = max(1, round(camera.height / cell))
-    across, down = np.meshgrid((np.arange(columns) + 0.5) * cell, (np.arange(rows) + 0.5) * camera.height / rows)
-    pixels = np.stack([across, down], axis=-1).reshape(-1, 2)
+    pixels, rows = _grid(camera, columns)
     rays = camera.rays(pixels)
     steps = np.array([*[_STEP_PX] * 4, *[_STEP] * len(camera.distortion)])
     numbers = len(steps)
@@ -44,6 +41,38 @@ def projection_sigma_px(camera: Camera, columns: int = 32) -> Float[np.ndarray, 
     sigma = np.full(len(known), np.nan)
     sigma[known] = _without_turn(lens.reshape(-1, 2, numbers)[known], turn.reshape(-1, 2, 3)[known], covariance)
     return sigma.reshape(rows, columns)
+
+
+def lens_difference_px(
+    camera: Camera, other: Camera, seen: Float[np.ndarray, "n 2"], columns: int = 32
+) -> Float[np.ndarray, "r c 2"]:
+    """By how much another lens would move the projections of a camera of far points, px, on a grid of square cells over
+    the image; NaN where either has no inverse or shows nothing.
+
+    The other camera is turned so that it agrees best where corners were seen: a turn is no difference between lenses.
+    """
+    pixels, rows = _grid(camera, columns)
+    known, rays = camera.rays(seen), camera.rays(pixels)
+    turn = Rotation.identity()
+    for _ in range(_ROUNDS):
+        turned = turn.apply(known)
+        left = seen - other.project(turned)
+        steps = [other.project(Rotation.from_rotvec(_STEP * axis).apply(turned)) for axis in np.eye(3)]
+        by_turn = np.stack([(each - other.project(turned)) / _STEP for each in steps], axis=-1)
+        sound = np.isfinite(by_turn).all(axis=(1, 2)) & np.isfinite(left).all(axis=1)
+        step = np.linalg.lstsq(by_turn[sound].reshape(-1, 3), left[sound].ravel(), rcond=None)[0]
+        turn = Rotation.from_rotvec(step) * turn
+    moved = other.project(turn.apply(rays)) - pixels
+    sound = np.linalg.norm(camera.project(rays) - pixels, axis=1) < _BACK_PX
+    return np.where(sound[:, None], moved, np.nan).reshape(rows, columns, 2)
+
+
+def _grid(camera: Camera, columns: int) -> tuple[Float[np.ndarray, "n 2"], int]:
+    """The middles of square cells over the image, and how many rows they are in."""
+    cell = camera.width / columns
+    rows = max(1, round(camera.height / cell))
+    across, down = np.meshgrid((np.arange(columns) + 0.5) * cell, (np.arange(rows) + 0.5) * camera.height / rows)
+    return np.stack([across, down], axis=-1).reshape(-1, 2), rows
 
 
 def _without_turn(

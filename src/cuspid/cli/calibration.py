@@ -26,10 +26,11 @@ from cuspid.calibration.causes import MOST_TRIED, cause_of_absence, is_part_of_a
 from cuspid.calibration.circle_centres import measured_share
 from cuspid.calibration.corners import BoardView, Views, find_corners
 from cuspid.calibration.instants import common_instants
+from cuspid.calibration.lenses import LensChoice
 from cuspid.calibration.photometry import Photometry, PhotometryOptions, calibrate_light, look_at_patches
 from cuspid.calibration.start import LEAST_VIEWS
 from cuspid.calibration.target import PLATE_MM, target_body
-from cuspid.calibration.uncertainty import projection_sigma_px
+from cuspid.calibration.uncertainty import lens_difference_px, projection_sigma_px
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, named, show_progress
 from cuspid.errors import InputError, ReconstructionError
@@ -38,6 +39,7 @@ from cuspid.options import Range
 from cuspid.progress import Progress
 from cuspid.reporting.figures.calibration import (
     save_board,
+    save_lenses_picture,
     save_photometry_picture,
     save_residuals_picture,
     save_uncertainty_picture,
@@ -131,7 +133,7 @@ def calibrate(
         images: Folder with a subfolder of images, or a video, for each camera; images taken at the same instant share a
             name.
         out: Folder for handpiece.json, rig_config.json, calibration.json (the quality of each camera), residuals.png,
-            uncertainty.png, photometry.png and report.html.
+            uncertainty.png, lenses.png (what a richer lens model would change), photometry.png and report.html.
         board_files: YAML files that describe the board or boards, instead of options: Kalibr's, or options by name.
             Several boards must be fixed to one another, and have markers with different ids.
         copies: Number of boards of this kind, fixed to one another, whose ids go on from one to the next.
@@ -203,9 +205,23 @@ def _write(found: RigCalibration, light: Photometry | None, handpiece: Handpiece
     save_residuals_picture(out / "residuals.png", cameras, found.pixels, found.residuals, title="residuals")
     sigma_px = {name: projection_sigma_px(camera) for name, camera in cameras.items()}
     save_uncertainty_picture(out / "uncertainty.png", cameras, sigma_px)
+    _draw_rivals(found, out / "lenses.png")
     if light is not None and light.sensors:
         shown = {name: (each.levels_dn, each.variances_dn2) for name, each in light.noise.items()}
         save_photometry_picture(out / "photometry.png", light.sensors, shown, light.residuals_pct)
+
+
+def _draw_rivals(found: RigCalibration, path: Path) -> None:
+    """What another lens model would change, where more than one was tried."""
+    path.unlink(missing_ok=True)
+    tried = {
+        name: (choice.chosen, choice.rival)
+        for name, choice in found.lenses.items()
+        if choice.chosen is not None and choice.rival is not None
+    }
+    if tried:
+        moved = {name: lens_difference_px(*pair, found.pixels[name]) for name, pair in tried.items()}
+        save_lenses_picture(path, tried, moved, found.pixels)
 
 
 def _matched(sequences: Mapping[str, ImageSequence]) -> tuple[dict[str, ImageSequence], tuple[str, ...]]:
@@ -307,10 +323,15 @@ def _figures(found: RigCalibration, board: Target) -> dict[str, object]:
     steps = {"board_step_mm": board.step_mm + found.bending_mm[0]} if isinstance(board, Board) else {}
     return {
         "sigma_px": found.sigma_px,
+        "board_uneven_mm": found.uneven_mm,
+        "views_loose_px": found.loose_px,
         **(bent if board.terraces == 1 else steps),
         **({"boards": _boards(found, board)} if isinstance(board, BoardSet) else {}),
         "board_distance_mm": found.distance_mm,
-        "cameras": {name: {**asdict(each), "lens": asdict(found.lenses[name])} for name, each in found.cameras.items()},
+        "cameras": {
+            name: {**asdict(each), "widened": found.widened[name], "lens": _lens_figures(found.lenses[name])}
+            for name, each in found.cameras.items()
+        },
         "notes": found.notes,
     }
 
@@ -326,6 +347,10 @@ def _boards(found: RigCalibration, boards: BoardSet) -> list[dict[str, object]]:
         }
         for number, board in enumerate(boards.boards)
     ]
+
+
+def _lens_figures(choice: LensChoice) -> dict[str, object]:
+    return {"model": choice.model, "held_out_px": choice.held_out_px}
 
 
 def _light_figures(light: Photometry | None) -> dict[str, object]:

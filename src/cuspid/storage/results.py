@@ -382,6 +382,7 @@ def _read_calibration(folder: Path, run: Mapping[str, Any]) -> CalibrationResult
     captions = {
         "residuals.png": "Where each camera saw corners, and their residuals as lines",
         "uncertainty.png": "How well each lens is known: standard deviation of a projection, px",
+        "lenses.png": "What a richer lens model would change, px",
         "photometry.png": "What the cameras make of light: gain and falloff, residuals, noise",
     }
     return CalibrationResult(

@@ -190,6 +190,57 @@ def save_uncertainty_picture(
     save_figure(figure, path)
 
 
+def save_lenses_picture(
+    path: Path,
+    cameras: Mapping[str, tuple[Camera, Camera]],
+    moved_px: Mapping[str, Float[np.ndarray, "r c 2"]],
+    seen: Mapping[str, Float[np.ndarray, "n 2"]],
+) -> None:
+    """PNG with an image frame for each camera, coloured by how far another lens model would move what it shows, on a
+    grid over the image, with arrows to where; and the corners that both were calibrated from, as dots.
+
+    Args:
+        cameras: The camera as it was taken, and by the other model.
+        moved_px: By how much the latter moves projections; NaN where there are none.
+        seen: Where corners were seen, px.
+    """
+    columns = min(4, len(cameras))
+    rows = -(-len(cameras) // columns)
+    figure = new_figure(max(4.0, 3.6 * columns), 0.5 + 3.2 * rows, dpi=130)
+    colours = colormaps[SIGMA_COLORS].with_extremes(bad="#cccccc")
+    for index, (name, (camera, other)) in enumerate(cameras.items()):
+        axes, moved = figure.add_subplot(rows, columns, index + 1), moved_px[name]
+        extent, size = (0.0, float(camera.width), float(camera.height), 0.0), np.linalg.norm(moved, axis=2)
+        drawn = axes.imshow(size, cmap=colours, norm=LogNorm(*_SIGMAS_PX), extent=extent)
+        _draw_arrows(axes, camera, moved)
+        axes.plot(*seen[name].T, ".", color="white", markersize=0.8, alpha=0.6)
+        axes.set_xlim(0, camera.width)
+        axes.set_ylim(camera.height, 0)
+        axes.set_title(f"{name}: {other.model} instead of {camera.model}", fontsize=9, color=_INK)
+        axes.tick_params(labelsize=7, colors=_INK)
+        bar = figure.colorbar(drawn, ax=axes, shrink=0.6, extend="both", label="px")
+        bar.ax.tick_params(labelsize=7, colors=_INK)
+    figure.tight_layout()
+    save_figure(figure, path)
+
+
+def _draw_arrows(axes: Axes, camera: Camera, moved: Float[np.ndarray, "r c 2"]) -> None:
+    """In every third cell, so long that the longest of most spans three; which way alone is told beyond that."""
+    rows, columns = moved.shape[:2]
+    cell = camera.width / columns
+    down, across = np.mgrid[1:rows:3, 1:columns:3]
+    arrows = moved[down, across]
+    length = np.linalg.norm(arrows, axis=2)
+    if not np.isfinite(length).any():
+        return
+    longest = max(float(np.nanpercentile(length, 90)), 1e-9)
+    shown = arrows * (3 * cell / longest * np.minimum(1, longest / np.maximum(length, 1e-12)))[..., None]
+    places = (np.stack([across, down], axis=2) + 0.5) * cell
+    axes.quiver(
+        *np.moveaxis(places, 2, 0), *np.moveaxis(shown, 2, 0), angles="xy", scale_units="xy", scale=1, color="#d1603d"
+    )
+
+
 Residuals = Mapping[str, tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]]
 """By camera: distance of patches from the principal point in halves of the diagonal, residuals before and after, %."""
 
