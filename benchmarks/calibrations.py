@@ -99,11 +99,13 @@ SETS: Mapping[str, RealSet] = {
     "viking": RealSet(
         folder="viking",
         cameras={"left": "left/*.png", "right": "right/*.png"},
+        development=True,
         board=Board(kind="chessboard", columns=15, rows=11, square_mm=3),
     ),
     "MiroCam": RealSet(
         folder=_CAPSULES,
         cameras={"cam": "MiroCam/*.jpg"},
+        development=True,
         board=Board(kind="chessboard", columns=8, rows=7, square_mm=2),
     ),
     **{
