@@ -62,6 +62,7 @@ COMMANDS: Mapping[str, Callable[..., Any]] = _Verbs(
         "photograph": "calibration",
         "calibrate": "calibration",
         "convert": "conversion",
+        "record": "record",
         "import": "footage",
         "optics": "forecasts",
         "visibility": "forecasts",
