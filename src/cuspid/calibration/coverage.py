@@ -1,10 +1,8 @@
 """What views of a board still lack for a calibration, told while they are taken.
 
 A lens is known where corners were seen, focal lengths by tilted views, and both by views from several distances; places
-of cameras by boards that they saw together. Nothing is known of the lenses yet, so that tilts and distances are read
-from the plane homography of each view: its Jacobian at the middle of the board stretches two directions by s1 >= s2,
-and s2 / s1 is the cosine of the tilt from the image plane where the board is small beside its distance; depth grows
-along the gradient of the homography's denominator.
+of cameras by boards that they saw together. The lenses are not known yet: tilts and distances are read from the plane
+homography of each view, with the focal length that all views of a camera suggest, and without distortion.
 """
 
 from __future__ import annotations
@@ -30,6 +28,10 @@ SIDES = ("left", "right", "top", "bottom")
 _ROWS, _COLUMNS = ("top", "middle", "bottom"), ("left", "centre", "right")
 _MOST_TILT_DEG = 75.0
 """Beyond, no corner is exact."""
+_USUAL, _SHORTEST, _LONGEST = 1.0, 0.2, 5.0
+"""Focal lengths, in widths of the image."""
+_LEAST_TOLD = 1e-3
+"""What views that face the camera tell of its focal length is noise."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,10 +64,8 @@ class CameraCoverage:
     """Number of different views."""
     cells: Int[np.ndarray, "6 6"] = field(default_factory=lambda: np.zeros((CELLS, CELLS), dtype=np.int64))
     """Number of views with corners in each part of the image, row by row."""
-    tilts: Mapping[str, int] = field(default_factory=lambda: dict.fromkeys(SIDES, 0))
-    """Number of views with each side nearer."""
-    scales: tuple[float, ...] = ()
-    """Size of the board in each view, px / mm."""
+    homographies: tuple[Float[np.ndarray, "3 3"], ...] = ()
+    """Of each view, from the board to the image (:func:`homography_of`)."""
     last: BoardView | None = None
     """The latest different view."""
 
@@ -92,8 +92,7 @@ class Coverage:
         seen = {name: view for name, view in views.items() if view is not None}
         fresh = {name for name, view in seen.items() if _has_moved(self.cameras[name], view, options)}
         cameras = {
-            name: _with_view(each, seen[name], board, options) if name in fresh else each
-            for name, each in self.cameras.items()
+            name: _with_view(each, seen[name], board) if name in fresh else each for name, each in self.cameras.items()
         }
         shared = {
             pair: count + int({*pair} <= seen.keys() and bool({*pair} & fresh)) for pair, count in self.shared.items()
@@ -116,22 +115,42 @@ class Coverage:
         return not self.missing(options) and len(self.apart(options)) == 1
 
 
-def tilt_of(view: BoardView, board: Board) -> tuple[float, str, float]:
-    """About how far a board is tilted from the image plane, degrees; which of its :data:`SIDES` is nearer; and its size
-    in the image, px / mm."""
-    places = board.corners[view.corner, :2]
-    middle = places.mean(axis=0)
-    homography, _ = cv2.findHomography(places - middle, view.pixels)
-    if homography is None:
-        return 0.0, SIDES[0], 0.0
-    homography = homography / homography[2, 2]
-    jacobian = homography[:2, :2] - np.outer(homography[:2, 2], homography[2, :2])
-    stretch = np.linalg.svd(jacobian, compute_uv=False)
-    # From the middle of the board to where it is nearer, in the image.
-    right, down = jacobian @ -homography[2, :2]
-    side = ("left", "right")[int(right > 0)] if abs(right) > abs(down) else ("top", "bottom")[int(down > 0)]
-    tilt_deg = np.rad2deg(np.arccos(np.clip(stretch[1] / stretch[0], 0, 1)))
-    return float(tilt_deg), side, float(np.sqrt(stretch[0] * stretch[1]))
+def focal_px_of(homographies: Sequence[Float[np.ndarray, "3 3"]], width: int) -> float:
+    """About the focal length of a camera of square pixels, from homographies between a plane and its image, whose
+    origin is the principal point (Z. Zhang, IEEE PAMI 22, 2000, with all else known). Views that face the camera tell
+    nothing; where there are no others, that of a usual lens.
+
+    Each gives two equations a s + b = 0 for s = 1 / f^2, of the orthogonality and of the equal length of two axes.
+    """
+    scaled = [each / np.linalg.norm(each[:2, :2]) for each in homographies]
+    a = [(h[:2, 0] @ h[:2, 1], h[:2, 0] @ h[:2, 0] - h[:2, 1] @ h[:2, 1]) for h in scaled]
+    b = [(h[2, 0] * h[2, 1], h[2, 0] ** 2 - h[2, 1] ** 2) for h in scaled]
+    power = np.sum(np.square(a))
+    s = -np.sum(np.multiply(a, b)) / power if power > _LEAST_TOLD else 1 / (_USUAL * width) ** 2
+    return float(width * np.clip(1 / (width * np.sqrt(max(s, 1e-12))), _SHORTEST, _LONGEST))
+
+
+def tilt_of(homography: Float[np.ndarray, "3 3"], focal_px: float) -> tuple[float, str, float]:
+    """How far a board is tilted from the image plane, degrees; which of its :data:`SIDES` is nearer; and its distance,
+    mm; from a homography between its middle and the principal point."""
+    across, down, middle = (homography / [[focal_px], [focal_px], [1]]).T
+    if middle[2] < 0:
+        across, down, middle = -across, -down, -middle
+    unit = np.sqrt(np.linalg.norm(across) * np.linalg.norm(down))
+    normal = np.cross(across, down)
+    normal = normal / np.linalg.norm(normal) * np.sign(normal @ middle)
+    # The inverse of the depth grows in the image along (nx, ny).
+    side = ("left", "right")[int(normal[0] > 0)] if abs(normal[0]) > abs(normal[1]) else None
+    side = side or ("top", "bottom")[int(normal[1] > 0)]
+    return float(np.rad2deg(np.arccos(np.clip(abs(normal[2]), 0, 1)))), side, float(middle[2] / unit)
+
+
+def homography_of(view: BoardView, board: Board, size: tuple[int, int]) -> Float[np.ndarray, "3 3"] | None:
+    """From places on a board (mm, from its middle) to the image (px, from the middle of the image); None where the
+    corners do not tell."""
+    places = board.corners[view.corner, :2] - np.array(board.size_mm) / 2
+    found, _ = cv2.findHomography(places, view.pixels - np.array(size) / 2)
+    return found
 
 
 def _has_moved(camera: CameraCoverage, view: BoardView, options: CoverageOptions) -> bool:
@@ -145,18 +164,16 @@ def _has_moved(camera: CameraCoverage, view: BoardView, options: CoverageOptions
     return bool(moved.max() >= options.move_share * camera.size[0])
 
 
-def _with_view(camera: CameraCoverage, view: BoardView, board: Board, options: CoverageOptions) -> CameraCoverage:
-    tilt_deg, side, scale = tilt_of(view, board)
+def _with_view(camera: CameraCoverage, view: BoardView, board: Board) -> CameraCoverage:
     column, row = np.clip(np.floor(CELLS * view.pixels / camera.size), 0, CELLS - 1).astype(np.int64).T
     hit = np.zeros((CELLS, CELLS), dtype=np.int64)
     hit[row, column] = 1
-    counts = options.min_tilt_deg <= tilt_deg <= _MOST_TILT_DEG
+    homography = homography_of(view, board, camera.size)
     return CameraCoverage(
         size=camera.size,
         views=camera.views + 1,
         cells=camera.cells + hit,
-        tilts={each: count + int(counts and each == side) for each, count in camera.tilts.items()},
-        scales=(*camera.scales, scale),
+        homographies=camera.homographies if homography is None else (*camera.homographies, homography),
         last=view,
     )
 
@@ -166,10 +183,14 @@ def _missing_of(camera: CameraCoverage, options: CoverageOptions) -> list[str]:
     if camera.views < options.views:
         said.append(f"{options.views - camera.views} views")
     said += [f"corners {place}" for place in _places(camera.cells < options.views_of_cell)]
-    tilts = [side for side, count in camera.tilts.items() if count < options.views_of_tilt]
+    focal_px = focal_px_of(camera.homographies, camera.size[0])
+    poses = [tilt_of(each, focal_px) for each in camera.homographies]
+    sides = [side for tilt_deg, side, _ in poses if options.min_tilt_deg <= tilt_deg <= _MOST_TILT_DEG]
+    tilts = [side for side in SIDES if sides.count(side) < options.views_of_tilt]
     if tilts:
         said.append(f"tilts with the {' / '.join(tilts)} nearer")
-    if camera.views and max(camera.scales) < options.distance_ratio * min(camera.scales):
+    distances = [distance for _, _, distance in poses]
+    if distances and max(distances) < options.distance_ratio * min(distances):
         said.append("another distance")
     return said
 

@@ -85,6 +85,8 @@ class Setting:
             return f"{self.name} not settable"
         if self.is_held:
             return f"{self.name} {self.told:g} held"
+        if self.told == self.asked:
+            return f"{self.name} {self.told:g} (the driver does not let it be set)"
         return f"{self.name} {self.asked:g} refused (it says {self.told:g})"
 
 

@@ -12,7 +12,7 @@ from threading import Lock
 
 _FOLLOW = 0.1
 """Share of the last deviation by which a phase follows."""
-_SLIP = 0.75
+_SLIP = 0.6
 
 
 class Slots:

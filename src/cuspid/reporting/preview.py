@@ -14,17 +14,15 @@ from cuspid.reporting.same_origin import address
 
 _WIDTH_PX = 480
 _PEAK = (40, 255, 90)
-_PEAK_SHARE = 0.97
-"""Of the pixels of an image, those with less contrast are not marked."""
-_LEAST_CONTRAST = 24.0
-"""Of 255; less is noise."""
+_CONTRAST, _NOISE_DN = 0.12, 8.0
+"""From which second derivative on an edge is sharp, as a share of the mean grey value; less of 255 is noise."""
 _LACKING, _TINT = (255, 110, 20), 0.35
 
 
 def marked(
     rgb: UInt8[np.ndarray, "h w 3"], covered: Float[np.ndarray, "r c"] | None = None
 ) -> UInt8[np.ndarray, "a b 3"]:
-    """A small image for focusing: the sharpest edges are green, and parts that the board has not covered (0 to 1) are
+    """A small image for focusing: sharp edges are green, and parts that the board has not covered (0 to 1) are
     orange."""
     shown = cv2.resize(
         rgb, (_WIDTH_PX, max(1, round(_WIDTH_PX * rgb.shape[0] / rgb.shape[1]))), interpolation=cv2.INTER_AREA
@@ -36,7 +34,7 @@ def marked(
     if covered is not None:
         lack = cv2.resize(1 - covered, shown.shape[1::-1], interpolation=cv2.INTER_NEAREST)[..., None]
         shown = np.rint(shown + _TINT * lack * (np.array(_LACKING) - shown)).astype(np.uint8)
-    shown[contrast > max(_LEAST_CONTRAST, float(np.quantile(contrast, _PEAK_SHARE)))] = _PEAK
+    shown[contrast > max(_NOISE_DN, _CONTRAST * float(grey.mean()))] = _PEAK
     return shown
 
 
