@@ -182,6 +182,7 @@ class _Watch:
         self._after, self._best = -1, dict.fromkeys(ready, 0.0)
         self._said_s, self._told = time.monotonic(), list[str]()
         self._preview = Preview(options.host, options.port, list(ready)) if options.show else None
+        self._shows = console.is_terminal or options.show
         self._live = Live(console=console, transient=True, auto_refresh=False) if console.is_terminal else nullcontext()
 
     def __enter__(self) -> _Watch:
@@ -198,7 +199,8 @@ class _Watch:
 
     def __call__(self, recording: Recording) -> bool:
         status = recording.status
-        shown = {name: rgb for name, each in status.items() if each.latest and (rgb := each.latest.rgb()) is not None}
+        latest = {name: each.latest for name, each in status.items() if each.latest and self._shows}
+        shown = {name: rgb for name, shot in latest.items() if (rgb := shot.rgb()) is not None}
         if self._is_coached and (found := recording.together(self._after)) is not None:
             self._after = found[0]
             self._coverage = self._coverage.with_instant(self._views(found[1]), self._board, self._enough)

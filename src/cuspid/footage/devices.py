@@ -34,6 +34,8 @@ _PER_MS = 10.0
 _MOST_LATE_S = 1.0
 """A time stamp further back than this is of another clock."""
 _LEAST_IMAGES = 8
+_WAITING = 5
+"""Images that a driver may hold back: OpenCV gives it four buffers."""
 _UNLIKE = 1.25
 """Factor by which the brightness changes where a held exposure is not the one before."""
 _SAME = 0.02
@@ -124,6 +126,9 @@ class V4L2Camera:
 
     def shots(self, start_s: float) -> Iterator[Shot]:
         """See the protocol."""
+        if not self._is_stamped:  # what has waited since would have the time at which it is fetched
+            for _ in range(_WAITING):
+                self._next()
         while True:
             shot = self._next()
             if shot is not None and shot.time_s >= start_s:
