@@ -37,7 +37,7 @@ from cuspid.footage.record import TABLE, Recording, RecordOptions
 from cuspid.footage.slots import Slots
 from cuspid.geometry import Rigid3
 from cuspid.image_files import read_image
-from cuspid.reporting.preview import marked
+from cuspid.reporting.preview import Preview, marked
 from cuspid.rig import Handpiece, MountedCamera, Rig
 from cuspid.storage.files import AppendedTable
 from verbs import refused, run
@@ -617,8 +617,9 @@ def test_a_board_that_is_held_still_is_one_view():
 
 
 def test_the_preview_marks_what_is_sharp_and_what_is_not_covered():
-    sharp = np.repeat(GROUND[:240, :240, None], 3, axis=2).copy()
-    sharp[:, 120:] = cv2.GaussianBlur(sharp[:, 120:], (0, 0), 4)
+    squares = np.kron(np.indices((30, 30)).sum(axis=0) % 2, np.ones((8, 8)))
+    sharp = np.repeat(np.rint(60 + 120 * squares).astype(np.uint8)[..., None], 3, axis=2)
+    sharp[:, 120:] = cv2.GaussianBlur(sharp[:, 120:], (0, 0), 3)
     green = (marked(sharp) == (40, 255, 90)).all(axis=2)
     half = green.shape[1] // 2
     assert green[:, :half].mean() > 0.02
@@ -629,6 +630,20 @@ def test_the_preview_marks_what_is_sharp_and_what_is_not_covered():
     shown = marked(plain, covered)
     assert (shown[100:, 100:] == 100).all()
     assert shown[20, 20, 0] > 130 > 100 > shown[20, 20, 2]
+
+
+def test_the_preview_shows_each_camera_and_what_is_said():
+    pytest.importorskip("viser")
+    preview = Preview("127.0.0.1", 8200, ["left", "right"])
+    try:
+        image = np.full((60, 80, 3), 50, np.uint8)
+        preview.show({"right": image}, ["left <b> 3 views"])
+        assert np.array_equal(preview.images["right"].image, image)
+        assert not np.array_equal(preview.images["left"].image, image)
+        assert "left &lt;b&gt; 3 views" in preview.said.content
+        assert preview.address.startswith("http://127.0.0.1:82")
+    finally:
+        preview.stop()
 
 
 def test_a_rehearsal_without_cameras_is_recorded(tmp_path):

@@ -14,7 +14,6 @@ import numpy as np
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
-from tyro.conf import arg
 
 from cuspid import storage
 from cuspid.board import Board
@@ -60,7 +59,7 @@ def record(
     *,
     cameras: tuple[str, ...] = (),
     out: Path | None = None,
-    list_: Annotated[bool, arg(name="list")] = False,
+    list: bool = False,
     rehearse: Path | None = None,
     form: Annotated[FormatOptions, Flat] = FormatOptions(),
     exposure: Annotated[ExposureOptions, Flat] = ExposureOptions(),
@@ -76,10 +75,10 @@ def record(
         cameras: The cameras, each as NAME=SOURCE or SOURCE: a device (/dev/video0, or its number), or a video or a
             folder of images that is played back.
         out: New folder for <camera>/<instant>.jpg or .png, timestamps.csv and recording.json.
-        list_: Only name the cameras that are plugged in.
+        list: Only name the cameras that are plugged in.
         rehearse: A handpiece.json whose cameras are simulated, over a board that moves, in place of --cameras.
     """
-    if list_:
+    if list:
         _print_cameras()
         return
     if out is None:

@@ -14,7 +14,7 @@ from cuspid.reporting.same_origin import address
 
 _WIDTH_PX = 480
 _PEAK = (40, 255, 90)
-_CONTRAST, _NOISE_DN = 0.12, 8.0
+_CONTRAST, _NOISE_DN = 0.2, 8.0
 """From which second derivative on an edge is sharp, as a share of the mean grey value; less of 255 is noise."""
 _LACKING, _TINT = (255, 110, 20), 0.35
 
@@ -45,19 +45,22 @@ class Preview:
         """Raises MissingDependencyError without viser, InputError where it cannot listen on the address."""
         self._server = start(host, port)
         self._server.gui.configure_theme(control_width="large")
+        self._server.scene.world_axes.visible = False
         self.address = address(host, self._server.get_port())
         blank = np.zeros((90, 120, 3), np.uint8)
-        self._said: Node = self._server.gui.add_html("")
-        self._images: dict[str, Node] = {
+        self.said: Node = self._server.gui.add_html("")
+        """What is said beside the images."""
+        self.images: dict[str, Node] = {
             name: self._server.gui.add_image(blank, label=name, format="jpeg", jpeg_quality=85) for name in cameras
         }
+        """The image of each camera."""
 
     def show(self, images: Mapping[str, UInt8[np.ndarray, "h w 3"]], lines: Sequence[str]) -> None:
         """New images, and what there is to say."""
         for name, image in images.items():
-            self._images[name].image = image
+            self.images[name].image = image
         said = "".join(f"<div>{html.escape(line)}</div>" for line in lines)
-        self._said.content = f'<div style="margin: 6px 12px; font-size: 13px">{said}</div>'
+        self.said.content = f'<div style="margin: 6px 12px; font-size: 13px">{said}</div>'
 
     def stop(self) -> None:
         """Let the port go."""
