@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -410,7 +411,7 @@ def test_a_camera_that_is_unplugged_ends_the_recording_and_what_was_taken_stays(
     assert 9 <= len(times["left"]) <= 40
 
 
-def test_a_full_disk_ends_the_recording_and_what_was_taken_stays(tmp_path, monkeypatch):
+def test_a_full_disk_ends_the_recording_and_what_was_taken_stays(tmp_path, monkeypatch, capsys):
     left, write = iter(range(12)), recorder.write_bytes
 
     def until_full(path: Path, data: bytes) -> None:
@@ -419,8 +420,11 @@ def test_a_full_disk_ends_the_recording_and_what_was_taken_stays(tmp_path, monke
         write(path, data)
 
     monkeypatch.setattr(recorder, "write_bytes", until_full)
-    with pytest.raises(OutputError, match="the disk is full"):
-        record({"left": rendered(), "right": rendered(seed=1)}, tmp_path / "footage", seconds=30.0)
+    mjpeg_film(tmp_path / "left.avi", [view(k / 100) for k in range(30)])
+    films = tmp_path / "left.avi", shutil.copy(tmp_path / "left.avi", tmp_path / "right.avi")
+    said = refused(capsys, "record", "--cameras", *films, "--out", tmp_path / "footage")
+    assert "the disk is full" in said
+    assert storage.read_json(tmp_path / "footage" / "recording.json")["cameras"]["left"]["images"] > 0
     times = require_readable(tmp_path / "footage", ["left", "right"])
     assert sum(map(len, times.values())) == 12
 
@@ -487,7 +491,7 @@ def test_images_that_cannot_be_written_in_time_are_counted(tmp_path, monkeypatch
         write(path, data)
 
     monkeypatch.setattr(recorder, "write_bytes", slowly)
-    monkeypatch.setattr(recorder, "_WAITING", 4)
+    monkeypatch.setattr(recorder, "_WAITING_MIB", 0)
     status = record({"left": rendered(300.0)}, tmp_path / "footage", seconds=0.3).status["left"]
     assert 20 <= status.written < 90
     assert status.written + status.unwritten == 90

@@ -35,6 +35,8 @@ from cuspid.workers import map_in_threads
 
 _REHEARSED_PER_S = 5.0
 _POSE_S = 2.0
+_MOST_PAIRS = 10
+"""Of more, counts are not read."""
 _PLAIN_EVERY_S = 5.0
 """Where the output is no terminal, a line so often."""
 
@@ -241,6 +243,9 @@ class _Watch:
             else f"{name}: {each.views} views of the board, enough"
             for name, each in self._coverage.cameras.items()
         ]
+        counts = [f"{' + '.join(pair)} {count}" for pair, count in self._coverage.shared.items() if count]
+        if counts and len(self._coverage.shared) <= _MOST_PAIRS:
+            said.append(f"seen together: {', '.join(counts)}")
         if len(apart) > 1:
             said.append(f"not yet joined by boards seen together: {' | '.join(', '.join(each) for each in apart)}")
         return [*said, "enough for a calibration"] if self._coverage.is_enough(self._enough) else said

@@ -31,6 +31,11 @@ class Shot:
         """Of the file that holds it without loss."""
         return ".jpg" if isinstance(self.data, bytes) else ".png"
 
+    @property
+    def size_bytes(self) -> int:
+        """What it takes of the memory."""
+        return len(self.data) if isinstance(self.data, bytes) else self.data.nbytes
+
     def file(self) -> bytes:
         """The contents of that file. Raises OutputError where the image cannot be encoded."""
         if isinstance(self.data, bytes):

@@ -27,7 +27,7 @@ from cuspid.storage.files import AppendedTable, finished, write_bytes
 TABLE = "timestamps.csv"
 """Its columns are ``camera``, ``frame`` (the name of the image) and ``time`` (s)."""
 _DIGITS = 6
-_WAITING = 64
+_WAITING_MIB, _LEAST_WAITING = 128, 4
 """Images of a camera that may wait to be written."""
 _LOOK_S = 0.2
 _RATE_OVER_S = 2.0
@@ -161,7 +161,7 @@ class Recording:
             queue.put(None)
 
     def _hand_over(self, name: str, number: int, every: int, shot: Shot, queue: Queue[_Item]) -> None:
-        is_room = queue.qsize() < _WAITING
+        is_room = queue.qsize() < max(_LEAST_WAITING, (_WAITING_MIB << 20) // shot.size_bytes)
         if is_room:
             queue.put((number, shot))
         with self._lock:
