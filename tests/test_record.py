@@ -130,6 +130,13 @@ def test_the_slowest_camera_sets_the_pace():
     assert max(abs(found["fast"][k] - found["slow"][k]) for k in found["slow"]) < 0.011
 
 
+def test_a_camera_that_slows_down_is_not_lost():
+    """In the dark it exposes for longer, and its images may all lie aside of the slots that it was quick for."""
+    quick, dark = [0.02 * k for k in range(40)], [0.812 + 0.04 * k for k in range(100)]
+    found = numbered({"a": [0.04 * k for k in range(120)], "b": quick + dark}, {"a": 0.04, "b": 0.02})
+    assert len([time_s for time_s in found["b"].values() if time_s > 0.8]) >= 98
+
+
 # --- JPEG ------------------------------------------------------------------------------------------------------------
 
 
@@ -197,6 +204,14 @@ def test_what_is_recorded_is_imported_bit_by_bit(sync, tmp_path, probe):
         assert frame.time_s - begin == pytest.approx(number / 100, abs=1e-5)
         for k, (camera, delay) in enumerate(delays.items()):
             np.testing.assert_array_equal(capture.image(frame, camera), view(number / 100 + delay, k))
+
+
+def test_a_recording_can_be_the_images_of_a_capture(tmp_path, probe):
+    """Which ``cuspid live`` follows."""
+    record({"left": rendered(), "right": rendered(seed=1)}, tmp_path / "images", seconds=0.05)
+    capture = storage.read_capture(tmp_path)
+    assert [frame.name for frame in capture.frames] == [f"{k:06d}" for k in range(5)]
+    np.testing.assert_array_equal(capture.image(capture.frames[2], "right"), view(0.02, 1))
 
 
 def test_every_keeps_the_same_instants_of_all_cameras(tmp_path):

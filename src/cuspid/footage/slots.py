@@ -33,7 +33,9 @@ class Slots:
             phase = self._phase(camera, at)
             number = round(at - phase)
             off = at - phase - number
-            if abs(off) > self._widths[camera] / 2 or number <= self._last.get(camera, -1):
+            last = self._last.get(camera, -1)
+            is_aside = abs(off) > self._widths[camera] / 2 and number == last + 1  # unless no better one came
+            if is_aside or number <= last:
                 return None
             self._phases[camera] = phase + _FOLLOW * off
             self._last[camera] = number
