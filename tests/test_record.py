@@ -384,6 +384,22 @@ def test_a_size_that_a_camera_does_not_have_is_refused():
         device(Uvc(), FormatOptions(width_px=640)).prepare(ExposureOptions())
 
 
+def test_a_bus_without_room_is_told(monkeypatch):
+    monkeypatch.setattr(Path, "exists", lambda path: True)
+    with pytest.raises(InputError, match="delivers no images; cameras on one USB hub share"):
+        device(Uvc(0)).prepare(ExposureOptions())
+    with pytest.raises(InputError, match="delivers no more images"):
+        device(Uvc(12)).prepare(ExposureOptions())
+
+    class CutOff(Uvc):
+        def read(self):
+            is_read, data = super().read()
+            return is_read, data[:, :300]
+
+    with pytest.raises(InputError, match="cut off"):
+        device(CutOff()).prepare(ExposureOptions())
+
+
 def test_grey_of_16_bits_keeps_them(tmp_path):
     class Deep(Uvc):
         def read(self):

@@ -36,6 +36,11 @@ _MOST_LATE_S = 1.0
 _LEAST_IMAGES = 8
 _WAITING = 5
 """Images that a driver may hold back: OpenCV gives it four buffers."""
+_MOST_DAMAGED = 20
+_LESS = (
+    "cameras on one USB hub share its bandwidth: ask for less (--width-px, --height-px, --frames-per-s), or use "
+    "another socket"
+)
 _UNLIKE = 1.25
 """Factor by which the brightness changes where a held exposure is not the one before."""
 _SAME = 0.02
@@ -104,7 +109,7 @@ class V4L2Camera:
     ) -> None:
         self._device, self._form, self._open, self._clock = device, form, open_device, clock
         self._capture: Device = None
-        self._is_stamped = True
+        self._is_stamped, self._has_read = True, False
 
     def prepare(self, exposure: ExposureOptions) -> Ready:
         """See the protocol."""
@@ -164,11 +169,14 @@ class V4L2Camera:
         return code, size
 
     def _run(self, seconds: float) -> list[Shot]:
-        """Images of some seconds, at least a few."""
-        end_s, found = self._clock() + seconds, list[Shot]()
+        """Images of some seconds, at least a few. Raises InputError where they are damaged."""
+        end_s, found, damaged = self._clock() + seconds, list[Shot](), 0
         while self._clock() < end_s or len(found) < _LEAST_IMAGES:
             shot = self._next()
             found += [] if shot is None else [shot]
+            damaged += shot is None
+            if damaged > _MOST_DAMAGED + len(found):
+                raise InputError(f"{self._device}: most of its images arrive cut off; {_LESS}")
         return found
 
     def _hold(self, exposure: ExposureOptions) -> tuple[Setting, ...]:
@@ -215,8 +223,12 @@ class V4L2Camera:
         is_read, delivered = self._capture.read()
         now_s = self._clock()
         if not is_read:
-            gone = "it is unplugged" if not Path(self._device).exists() else "it delivers no more images"
-            raise InputError(f"{self._device}: {gone}; plug it in and record anew (what was taken is kept)")
+            if not Path(self._device).exists():
+                raise InputError(f"{self._device}: it is unplugged; plug it in, and record anew")
+            if not self._has_read:
+                raise InputError(f"{self._device}: delivers no images; {_LESS}")
+            raise InputError(f"{self._device}: delivers no more images; look at its plug, and record anew")
+        self._has_read = True
         stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
         self._is_stamped = self._is_stamped and now_s - _MOST_LATE_S < stamp_s <= now_s
         data = _as_delivered(delivered)
