@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import signal
@@ -447,14 +448,14 @@ def test_a_full_disk_ends_the_recording_and_what_was_taken_stays(tmp_path, monke
 
     def until_full(path: Path, data: bytes) -> None:
         if next(left, None) is None:
-            raise OutputError(f"{path}: the disk is full; free some space")
+            raise OutputError(f"{path}: the disk is full") from OSError(errno.ENOSPC, "no space left")
         write(path, data)
 
     monkeypatch.setattr(recorder, "write_bytes", until_full)
     mjpeg_film(tmp_path / "left.avi", [view(k / 100) for k in range(30)])
     films = tmp_path / "left.avi", shutil.copy(tmp_path / "left.avi", tmp_path / "right.avi")
     said = refused(capsys, "record", "--cameras", *films, "--out", tmp_path / "footage")
-    assert "the disk is full" in said
+    assert "the disk is full; what was taken is kept" in said
     assert storage.read_json(tmp_path / "footage" / "recording.json")["cameras"]["left"]["images"] > 0
     times = require_readable(tmp_path / "footage", ["left", "right"])
     assert sum(map(len, times.values())) == 12

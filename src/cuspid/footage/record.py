@@ -7,10 +7,12 @@ and before its line in the table: what was taken before a run is killed can be r
 
 from __future__ import annotations
 
+import errno
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty, Queue
@@ -175,8 +177,9 @@ class Recording:
         while (item := self._next(queue)) is not None:
             number, shot = item
             frame = f"{number:0{_DIGITS}d}"
-            write_bytes(self._folder / name / f"{frame}{shot.suffix}", shot.file())
-            table.add(name, frame, f"{shot.time_s:.6f}")
+            with _anew_where_full():
+                write_bytes(self._folder / name / f"{frame}{shot.suffix}", shot.file())
+                table.add(name, frame, f"{shot.time_s:.6f}")
             with self._lock:
                 self._tallies[name].written += 1
 
@@ -193,6 +196,20 @@ class Recording:
 _HANGS_S = 12.0
 """OpenCV waits ten seconds for an image."""
 _ROUNDING = 1e-6
+
+
+@contextmanager
+def _anew_where_full() -> Iterator[None]:
+    """A recording is not continued, as other work is, once there is room."""
+    try:
+        yield
+    except OutputError as error:
+        if isinstance(error.__cause__, OSError) and error.__cause__.errno == errno.ENOSPC:
+            path = str(error).partition(": ")[0]
+            raise OutputError(
+                f"{path}: the disk is full; what was taken is kept: free some space, and record into another folder"
+            ) from error
+        raise
 
 
 class _Tally:
