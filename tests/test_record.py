@@ -487,6 +487,13 @@ def test_ctrl_c_ends_it_cleanly(tmp_path):
     assert len(list((tmp_path / "footage" / "left").iterdir())) == len(times["left"])
 
 
+def test_it_ends_when_it_is_enough(tmp_path):
+    began = time.monotonic()
+    recording = record({"left": rendered()}, tmp_path / "footage", lambda each: each.status["left"].written > 3)
+    assert 3 < recording.status["left"].written < 100 * (time.monotonic() - began)
+    assert len(require_readable(tmp_path / "footage", ["left"])["left"]) == recording.status["left"].written
+
+
 KILLED = """
 import sys, threading
 from pathlib import Path
