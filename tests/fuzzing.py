@@ -669,6 +669,10 @@ SCENARIOS: Mapping[str, Scenario] = {
         _photographs,
         verb("calibrate", "@photos", "--columns", "6", "--rows", "5", "--square-mm", "3", "--out", f"@{_OUT}"),
     ),
+    "record": Scenario(
+        _footage,
+        verb("record", "--cameras", "@footage/o1.avi", "@footage/o2.mp4", "@footage/o3", "--out", f"@{_OUT}"),
+    ),
     "import": Scenario(
         _footage,
         verb("import", "@footage", "--handpiece", "@handpiece.json", "--sync", "times", "--out", f"@{_OUT}"),

@@ -13,7 +13,7 @@ CASES = 19
 """Of each scenario."""
 FEWER = {
     **{name: 8 for name in SCENARIOS if name.startswith("report")},
-    **dict.fromkeys(("reproduce", "prepare", "calibrate", "units", "labels", "boards"), 8),
+    **dict.fromkeys(("reproduce", "prepare", "calibrate", "record", "units", "labels", "boards"), 8),
     **dict.fromkeys(("reconstruct", "evaluate", "measure", "simulate", "precision", "film"), 4),
     **dict.fromkeys(("box", "design", "live", "stitch", "stitch of a mesh", "stitch-eval", "visibility"), 2),
     **dict.fromkeys(("mean shape", "resume"), 2),

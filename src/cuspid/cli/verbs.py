@@ -24,6 +24,7 @@ GROUPS: Mapping[str, Mapping[str, Verb]] = MappingProxyType(
         "From images to a mesh that can be trusted": {
             "run": Verb("scan", "simulate, reconstruct and evaluate a scan of a jaw"),
             "simulate": Verb("scan", "render what a handpiece sees of a jaw"),
+            "record": Verb("record", "record USB cameras, with a coach for the views of a board"),
             "import": Verb("footage", "make a capture from videos or images of several cameras"),
             "reconstruct": Verb("scan", "poses and a mesh from a capture, or from photographs of one camera"),
             "live": Verb("live", "follow a scan while it is taken"),

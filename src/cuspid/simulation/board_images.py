@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from cuspid.board import Board
@@ -197,3 +197,41 @@ def _first_hits(
             hit = (rays[:, 2] > 0) & (leaves > 0) & (enters <= leaves) & (enters < nearest)
             nearest[hit], on_terrace[hit] = enters[hit], (enters == top)[hit]
     return nearest, on_terrace
+
+
+# --- a board that moves ----------------------------------------------------------------------------------------------
+
+
+class BoardFilm:
+    """What the cameras of a handpiece see of a board that is moved from one pose to the next and held there in between:
+    half of the time it is still. Light is even, and nothing is smeared."""
+
+    def __init__(
+        self, handpiece: Handpiece, board: Board, options: PhotographOptions, pose_s: float, seed: int = 0
+    ) -> None:
+        """A board that takes the poses of :func:`board_poses`, one after the other and over again."""
+        self._handpiece, self._board, self._pose_s, self._seed = handpiece, board, pose_s, seed
+        self._poses = board_poses(handpiece, board, options)
+        self._rays = {
+            name: pixel_rays(each.camera, options.supersampling) for name, each in handpiece.rig.cameras.items()
+        }
+
+    def rig_from_board(self, time_s: float) -> Rigid3:
+        """Where the board is at a moment."""
+        whole, share = divmod(time_s / self._pose_s, 1.0)
+        here, there = (self._poses[(int(whole) + k) % len(self._poses)] for k in (0, 1))
+        ease = np.clip(2 * share - 1, 0, 1)
+        ease = ease * ease * (3 - 2 * ease)
+        turn = Rotation.from_matrix(here.rotation.T @ there.rotation).as_rotvec()
+        rotation = here.rotation @ Rotation.from_rotvec(ease * turn).as_matrix()
+        middle = np.array([*self._board.size_mm, -self._board.height_mm]) / 2
+        path = [pose.apply(middle[None])[0] for pose in (here, there)]
+        return Rigid3(rotation, path[0] + ease * (path[1] - path[0]) - rotation @ middle)
+
+    def image(self, camera: str, time_s: float) -> UInt8[np.ndarray, "h w 3"]:
+        """What a camera takes at a moment."""
+        mounted = self._handpiece.rig[camera]
+        cam_from_board = mounted.cam_from_rig @ self.rig_from_board(time_s)
+        light = board_light(self._board, mounted.camera, self._rays[camera], cam_from_board)
+        rng = np.random.default_rng([self._seed, 6, round(1e6 * time_s), *camera.encode()])
+        return record(light, 1.0, self._handpiece, camera, rng)

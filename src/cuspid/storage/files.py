@@ -13,8 +13,8 @@ import os
 import tempfile
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import UnionType
 from typing import Any, BinaryIO, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -91,6 +91,35 @@ def open_to_append(path: Path) -> BinaryIO:
         raise OutputError(f"{path}: is a link, a folder, a pipe or a device, and no file; delete it")
     with _writing(path):
         return path.open("ab")
+
+
+class AppendedTable:
+    """A CSV table that grows by whole lines, so that one of a killed run can be read; threads may share it."""
+
+    def __init__(self, path: Path, columns: Sequence[str]) -> None:
+        """A new table. Raises OutputError where it cannot be written."""
+        self._path, self._lock = path, threading.Lock()
+        self._stream = open_to_append(path)
+        self.add(*columns)
+
+    def __enter__(self) -> AppendedTable:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(OSError):  # whether it could be written was told line by line
+            self._stream.close()
+
+    def add(self, *values: str) -> None:
+        """Add a line. Raises OutputError where the disk is full; no part of the line is left then."""
+        line = (",".join(values) + "\n").encode()
+        with self._lock, _writing(self._path):
+            before = os.fstat(self._stream.fileno()).st_size
+            try:
+                if os.write(self._stream.fileno(), line) < len(line):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            except OSError:
+                os.ftruncate(self._stream.fileno(), before)
+                raise
 
 
 @contextmanager

@@ -113,6 +113,33 @@ def read_video(path: Path) -> Iterator[VideoFrame]:
                 yield VideoFrame(number=number, time_s=time_s, damaged=damaged, decoded=frame)
 
 
+def video_rate(path: Path) -> float | None:
+    """Frames a second of a video, None where its header does not say. Raises InputError where it is no file."""
+    with _opened(path) as container:
+        rate = None if container is None else container.streams.video[0].average_rate
+        return float(rate) if rate else None
+
+
+def read_jpegs(path: Path) -> Iterator[tuple[float | None, bytes]] | None:
+    """The frames of a Motion JPEG video as they are stored, with their times where it has such; None where it is of
+    another codec. Raises InputError where it is no file."""
+    with _opened(path) as container:
+        if container is None or container.streams.video[0].codec_context.name != "mjpeg":
+            return None
+    return _jpegs(path)
+
+
+def _jpegs(path: Path) -> Iterator[tuple[float | None, bytes]]:
+    with _opened(path) as container:
+        if container is None:
+            return
+        has_times = container.format.name not in _STREAMS.values()
+        for packet in _packets(container):
+            if packet is not None:
+                pts = packet.pts if has_times else None
+                yield None if pts is None else float(pts * packet.time_base), bytes(packet)
+
+
 def _decoded(container: av.container.InputContainer) -> Iterator[tuple[av.VideoFrame | None, bool]]:
     """Each frame, None where it cannot be decoded, and whether it is damaged."""
     stream = container.streams.video[0]
