@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from boards import BOARD, SIZE, looking_at, options, photographs, scene, undistorted
 from builders import mottled
 from cuspid import storage
-from cuspid.board import Board
+from cuspid.board import Board, BoardSet
 from cuspid.calibration.corners import BoardView
 from cuspid.calibration.coverage import SIDES, Coverage, CoverageOptions, focal_px_of, homography_of, tilt_of
 from cuspid.camera import Camera
@@ -602,6 +602,18 @@ def test_tilts_are_read_from_a_view_alone(tilt_deg):
             assert found_deg == pytest.approx(tilt_deg, abs=0.01)
             assert distance_mm == pytest.approx(40.0)
     assert set(SIDES) == {"left", "right", "top", "bottom"}
+
+
+def test_of_several_boards_the_one_that_is_seen_best_tells_the_tilt():
+    other = replace(BOARD, first_id=BOARD.markers)
+    view = board_at(np.array([3.0, 0, 40.0]), (0, 35))
+    second = BoardView(view.corner + len(BOARD.corners), view.pixels)
+    both = BoardView(
+        np.concatenate([[0, 1, 2], second.corner]), np.concatenate([[[5.0, 5], [9, 9], [9, 5]], view.pixels])
+    )
+    alone = homography_of(view, BOARD, SIZE)
+    for each in (second, both):
+        assert np.allclose(homography_of(each, BoardSet(boards=(BOARD, other)), SIZE), alone)
 
 
 def test_the_focal_length_is_read_from_tilted_views():

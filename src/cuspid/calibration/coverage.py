@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from cuspid.board import Board
-from cuspid.calibration.corners import BoardView
+from cuspid.board import Target
+from cuspid.calibration.corners import BoardView, pieces
 from cuspid.calibration.start import groups
 from cuspid.options import Options, Range
 
@@ -87,7 +87,7 @@ class Coverage:
             shared=dict.fromkeys(combinations(sizes, 2), 0),
         )
 
-    def with_instant(self, views: Mapping[str, BoardView | None], board: Board, options: CoverageOptions) -> Coverage:
+    def with_instant(self, views: Mapping[str, BoardView | None], board: Target, options: CoverageOptions) -> Coverage:
         """After an instant, given what each camera saw."""
         seen = {name: view for name, view in views.items() if view is not None}
         fresh = {name for name, view in seen.items() if _has_moved(self.cameras[name], view, options)}
@@ -145,11 +145,13 @@ def tilt_of(homography: Float[np.ndarray, "3 3"], focal_px: float) -> tuple[floa
     return float(np.rad2deg(np.arccos(np.clip(abs(normal[2]), 0, 1)))), side, float(middle[2] / unit)
 
 
-def homography_of(view: BoardView, board: Board, size: tuple[int, int]) -> Float[np.ndarray, "3 3"] | None:
-    """From places on a board (mm, from its middle) to the image (px, from the middle of the image); None where the
-    corners do not tell."""
-    places = board.corners[view.corner, :2] - np.array(board.size_mm) / 2
-    found, _ = cv2.findHomography(places, view.pixels - np.array(size) / 2)
+def homography_of(view: BoardView, board: Target, size: tuple[int, int]) -> Float[np.ndarray, "3 3"] | None:
+    """From places on the board that is seen best (mm, from its middle) to the image (px, from the middle of the image);
+    None where the corners do not tell."""
+    part = max(pieces(view, board), key=lambda each: len(each.corner), default=view)
+    number = board.board_of(np.arange(len(board.corners)))
+    middle = board.corners[number == board.board_of(part.corner)[0], :2].mean(axis=0)
+    found, _ = cv2.findHomography(board.corners[part.corner, :2] - middle, part.pixels - np.array(size) / 2)
     return found
 
 
@@ -164,7 +166,7 @@ def _has_moved(camera: CameraCoverage, view: BoardView, options: CoverageOptions
     return bool(moved.max() >= options.move_share * camera.size[0])
 
 
-def _with_view(camera: CameraCoverage, view: BoardView, board: Board) -> CameraCoverage:
+def _with_view(camera: CameraCoverage, view: BoardView, board: Target) -> CameraCoverage:
     column, row = np.clip(np.floor(CELLS * view.pixels / camera.size), 0, CELLS - 1).astype(np.int64).T
     hit = np.zeros((CELLS, CELLS), dtype=np.int64)
     hit[row, column] = 1

@@ -63,12 +63,12 @@ def target(*, out: Path, board: Annotated[Board, Flat] = Board(), board_files: B
             body. Of several boards each has its number appended.
         board_files: YAML files that describe the board or boards, instead of options: Kalibr's, or options by name.
     """
-    boards = _target(board, board_files).boards
+    boards = target_of(board, board_files).boards
     for number, each in enumerate(boards, 1):
         _draw(out if len(boards) == 1 else out.with_stem(f"{out.stem}-{number}"), each)
 
 
-def _target(board: Board, files: Sequence[Path], copies: int = 1) -> Target:
+def target_of(board: Board, files: Sequence[Path], copies: int = 1) -> Target:
     """What cameras are calibrated from. Raises InputError where it is said twice."""
     if files and board != Board():
         raise InputError("--board describes the board; leave out its other options")
@@ -142,7 +142,7 @@ def calibrate(
         drawn: handpiece.json of the handpiece as it was drawn (its design). Its lights, and no others, must have lit
             the board; they are calibrated too.
     """
-    shown = _target(board, board_files, copies)
+    shown = target_of(board, board_files, copies)
     settings = {
         "board": shown,
         "options": options,

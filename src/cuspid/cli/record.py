@@ -16,9 +16,10 @@ from rich.table import Table
 from rich.text import Text
 
 from cuspid import storage
-from cuspid.board import Board
+from cuspid.board import Board, Target
 from cuspid.calibration.corners import BoardView, find_corners
 from cuspid.calibration.coverage import Coverage, CoverageOptions, coverage_cells
+from cuspid.cli.calibration import BoardFiles, target_of
 from cuspid.cli.shared import Flat, console
 from cuspid.errors import InputError
 from cuspid.footage.cameras import CameraSource, ExposureOptions, Ready
@@ -68,6 +69,8 @@ def record(
     options: Annotated[RecordOptions, Flat] = RecordOptions(),
     watch: Annotated[WatchOptions, Flat] = WatchOptions(),
     board: Annotated[Board, Flat] = Board(),
+    board_files: BoardFiles = (),
+    copies: Annotated[int, Range(1, 50)] = 1,
     coverage: Annotated[CoverageOptions, Flat] = CoverageOptions(),
 ) -> None:
     """Record several cameras at once, without loss, with their exposure held and a time for each image: footage for
@@ -78,6 +81,8 @@ def record(
             folder of images that is played back.
         out: New folder for <camera>/<instant>.jpg or .png, timestamps.csv and recording.json.
         list: Only name the cameras that are plugged in.
+        board_files: YAML files that describe the board or boards, as for cuspid calibrate.
+        copies: Number of boards of this kind, fixed to one another, whose ids go on from one to the next.
         rehearse: A handpiece.json whose cameras are simulated, over a board that moves, in place of --cameras.
     """
     if list:
@@ -85,14 +90,15 @@ def record(
         return
     if out is None:
         raise InputError("record: nowhere to record to; give --out, a new folder")
-    sources = _sources(cameras, rehearse, form, board)
+    target = target_of(board, board_files, copies)
+    sources = _sources(cameras, rehearse, form, target)
     require_names(sources)
     recording = Recording(sources, out, options)
     settings = {"format": form, "exposure": exposure, "record": options, "cameras": cameras, "rehearse": rehearse}
     with closing(recording), storage.claimed_folder(out, "record", settings, {}, replace=True):
         ready = recording.prepare(exposure)
         _print_ready(ready)
-        watched = _Watch(ready, watch, board, coverage)
+        watched = _Watch(ready, watch, target, coverage)
         try:
             with watched:
                 recording.run(ready, watched)
@@ -105,7 +111,9 @@ def record(
 # --- cameras ---------------------------------------------------------------------------------------------------------
 
 
-def _sources(named: Sequence[str], rehearse: Path | None, form: FormatOptions, board: Board) -> dict[str, CameraSource]:
+def _sources(
+    named: Sequence[str], rehearse: Path | None, form: FormatOptions, board: Target
+) -> dict[str, CameraSource]:
     if rehearse is not None and named:
         raise InputError("record: --rehearse simulates cameras; leave out --cameras")
     if rehearse is not None:
@@ -140,7 +148,9 @@ def _source(name: str, source: str, form: FormatOptions) -> CameraSource:
     return V4L2Camera(source, form)
 
 
-def _rehearsed(handpiece: Path, form: FormatOptions, board: Board) -> dict[str, CameraSource]:
+def _rehearsed(handpiece: Path, form: FormatOptions, board: Target) -> dict[str, CameraSource]:
+    if not isinstance(board, Board):
+        raise InputError("record: --rehearse shows one board; describe one")
     known = storage.read_handpiece(handpiece)
     film = BoardFilm(known, board, PhotographOptions(supersampling=2), _POSE_S)
 
@@ -175,7 +185,7 @@ class _Watch:
     """What is said and shown while cameras record; called several times a second."""
 
     def __init__(
-        self, ready: Mapping[str, Ready], options: WatchOptions, board: Board, enough: CoverageOptions
+        self, ready: Mapping[str, Ready], options: WatchOptions, board: Target, enough: CoverageOptions
     ) -> None:
         self._options, self._board, self._enough = options, board, enough
         self._is_coached = options.coach or options.until_enough
