@@ -112,11 +112,11 @@ def test_jacobian_by_the_places_of_boards() -> None:
     truth = replace(truth, bending_mm=np.linspace(-0.05, 0.05, 9))
     views = seen_by(truth, 1.0)
     seen, free = bundle._Observations.of(views, SET, truth), bundle._Free.of(truth, SET, only_boards=False)
-    jacobian = bundle._jacobian(truth, seen, bundle._project(truth, seen)[0])[:, free.columns].toarray()
+    jacobian = bundle._jacobian(truth, seen, bundle._project(truth, seen).in_cam)[:, free.columns].toarray()
     for column in range(len(free.columns)):
         step = np.zeros(len(free.columns))
         step[column] = 1e-6
-        ahead, back = (bundle._project(bundle._stepped(truth, free, sign * step), seen)[1] for sign in (1, -1))
+        ahead, back = (bundle._project(bundle._stepped(truth, free, sign * step), seen).raw for sign in (1, -1))
         numeric = -(ahead - back).ravel() / 2e-6
         assert np.allclose(jacobian[:, column], numeric, atol=1e-4 * max(1, np.abs(numeric).max())), column
 

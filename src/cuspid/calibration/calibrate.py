@@ -25,7 +25,7 @@ from cuspid.calibration.bundle import (
     unevenness_score,
 )
 from cuspid.calibration.circle_centres import centre_shifts
-from cuspid.calibration.corners import Views, split_by_board
+from cuspid.calibration.corners import LEAST_CORNERS, BoardView, Views, split_by_board
 from cuspid.calibration.joining import joined_boards
 from cuspid.calibration.lenses import LensChoice, LensName, choose_lens
 from cuspid.calibration.start import LEAST_VIEWS, board_pose, groups, joined, renumbered, require_one_group
@@ -479,16 +479,25 @@ def _delays(scene: BoardScene, views: Views) -> dict[str, tuple[float, float] | 
 
 
 def _by_itself(name: str, found: Adjusted, views: Views, board: Target) -> Adjusted:
-    """A camera from its own views alone, beginning from the one that was found."""
-    own = {key: view for key, view in views.items() if key[0] == name}
+    """A camera from its own views alone, beginning from the one that was found; of several boards each for itself."""
     if len(found.scene.cameras) == 1:
         return found
-    place = found.scene.cam_from_rig[name]
+    own, poses = dict[tuple[str, str], BoardView](), dict[str, Rigid3]()
+    for camera, instant in (key for key in views if key[0] == name):
+        pose = found.scene.cam_from_rig[name] @ found.scene.rig_from_view(camera, instant)
+        for part in split_by_board(views[camera, instant], board):
+            if len(part.corner) < LEAST_CORNERS:
+                continue
+            number = int(board.board_of(part.corner[:1])[0])
+            alone = f"{instant}/{number}"
+            own[camera, alone] = part
+            poses[alone] = pose @ found.scene.body_from_board.get(number, Rigid3.identity())
     scene = replace(
         found.scene,
         cameras={name: found.scene.cameras[name]},
         cam_from_rig={name: Rigid3.identity()},
-        rig_from_board={instant: place @ found.scene.rig_from_view(name, instant) for _, instant in own},
+        rig_from_board=poses,
+        body_from_board={},
         timing=None,
         loose_px=0.0,
     )
