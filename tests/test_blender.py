@@ -22,6 +22,7 @@ from cuspid.simulation import blender, raycast
 from cuspid.simulation.appearance import APPEARANCES, Appearance, Material
 from cuspid.simulation.optics import CLINICAL
 from cuspid.simulation.raycast import Scene, Sink, render_capture
+from cuspid.simulation.shadows import AMBIENT
 
 needs_blender = pytest.mark.skipif(
     blender.PYTHON_VARIABLE not in os.environ, reason=f"{blender.PYTHON_VARIABLE} is not set: no Blender here"
@@ -89,7 +90,7 @@ def test_both_renderers_show_the_same_silhouette_and_brightness(monkeypatch: pyt
     assert all((one & wrong).sum() / (one | wrong).sum() < 0.9 for wrong in flipped)
     inside = one & other
     # A thing that stands alone gets no light from around it, of which the ray caster always adds its share.
-    assert np.median(traced[inside]) == pytest.approx(np.median(cast[inside]) / (1 + raycast.AMBIENT), rel=0.03)
+    assert np.median(traced[inside]) == pytest.approx(np.median(cast[inside]) / (1 + AMBIENT), rel=0.03)
 
 
 @needs_blender
