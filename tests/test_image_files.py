@@ -14,7 +14,17 @@ import pytest
 from PIL import Image
 
 from cuspid.errors import InputError
-from cuspid.image_files import exif_orientation, image_size, read_deep, read_image, recorded, recorded_size
+from cuspid.image_files import (
+    as_8_bits,
+    exif_orientation,
+    image_size,
+    read_deep,
+    read_image,
+    recorded,
+    recorded_size,
+    stretch_fine,
+    visible_in_8_bits,
+)
 
 SHADES = np.random.default_rng(0).integers(0, 256, (24, 40), dtype=np.uint8)
 COLOURS = np.random.default_rng(1).integers(0, 256, (24, 40, 3), dtype=np.uint8)
@@ -138,6 +148,16 @@ def test_deep_colours_are_turned_as_others_are(tmp_path: Path, orientation: int)
     deep.write_bytes(data[:33] + chunk + data[33:])
     assert np.array_equal(read_image(deep), read_image(shallow))
     assert read_deep(deep).dtype == np.uint16
+
+
+def test_what_is_stretched_beyond_white_stays_white_in_8_bits() -> None:
+    dark = np.full((40, 40), 10, np.float32)
+    dark[:2, :2] = 60
+    stretched = stretch_fine(dark)
+    assert stretched.max() > 256
+    assert as_8_bits(stretched).min() > 200
+    assert visible_in_8_bits(stretched)[0, 0] == visible_in_8_bits(dark)[0, 0] == 255
+    assert as_8_bits(np.array([-3.0, 0.5, 255.9, 256.0, 300.0], np.float32)).tolist() == [0, 0, 255, 255, 255]
 
 
 def test_to_import_cuspid_leaves_the_filters_of_warnings_alone() -> None:

@@ -61,8 +61,8 @@ def read_fine(path: Path) -> Pixels:
 
 
 def as_8_bits(image: UInt8[np.ndarray, "*s"] | Float32[np.ndarray, "*s"]) -> UInt8[np.ndarray, "*s"]:
-    """The upper 8 bits of what :func:`read_fine` reads."""
-    return image if image.dtype == np.uint8 else image.astype(np.uint8)
+    """The upper 8 bits of what :func:`read_fine` reads; black and white are the ends of what was stretched."""
+    return image if image.dtype == np.uint8 else np.clip(image, 0, 255).astype(np.uint8)
 
 
 def visible_in_8_bits(grey: UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:

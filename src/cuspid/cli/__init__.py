@@ -51,7 +51,7 @@ def load(arguments: Sequence[str]) -> None:
         COMMANDS[arguments[0]]
 
 
-def checked(verb: str) -> Callable[..., None]:
+def check_options_of(verb: str) -> Callable[..., None]:
     """The function of a verb, which checks its own numbers before it begins."""
     from cuspid.options import check
 
@@ -169,6 +169,6 @@ def _run(arguments: Sequence[str]) -> None:
         else:
             import tyro
 
-            tyro.cli(checked(verb), prog=f"cuspid {verb}", args=given)
+            tyro.cli(check_options_of(verb), prog=f"cuspid {verb}", args=given)
     finally:
         sys.stdout.flush()
