@@ -38,12 +38,16 @@ docs: $(STAMP).docs
 # As users get it: in an environment of its own, far from the sources.
 wheel: $(STAMP)
 	rm -rf $(WHEEL)
-	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir $(WHEEL) .
+	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir $(WHEEL) . ./reproduction
 	$(PYTHON) -m venv $(WHEEL)/venv
-	$(WHEEL)/venv/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt $(WHEEL)/*.whl
+	$(WHEEL)/venv/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt $(WHEEL)/cuspid-*.whl
 	cd $(WHEEL) && venv/bin/cuspid handpiece --design four --width-px 160 --height-px 160 --out probe
 	cd $(WHEEL) && venv/bin/cuspid run --handpiece probe/handpiece.json --tooth 46 --frames 6 --length-mm 3 --out scan
 	test -s $(WHEEL)/scan/report.html
+	cd $(WHEEL) && ! venv/bin/cuspid reproduce --no-run --out thesis
+	$(WHEEL)/venv/bin/pip install --quiet --disable-pip-version-check --no-deps $(WHEEL)/cuspid_thesis-*.whl
+	cd $(WHEEL) && venv/bin/cuspid reproduce --no-run --out thesis
+	test -s $(WHEEL)/thesis/reproduction.html
 
 benchmarks: $(STAMP)
 	$(BIN)/python benchmarks/run.py --out benchmarks/results
@@ -57,11 +61,11 @@ $(BPY)/.installed: constraints-blender.txt
 	$(BPY)/bin/python -c 'import bpy'
 	touch $@
 
-$(STAMP): pyproject.toml constraints.txt
+$(STAMP): pyproject.toml reproduction/pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "cuspid needs Python 3.11 or newer; name one with: make PYTHON=python3.11"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]' --editable reproduction
 	touch $(STAMP)
 
 $(STAMP).docs: $(STAMP)

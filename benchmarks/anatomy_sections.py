@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from cuspid.thesis.catalogue import TABLE_3_2
-from cuspid.thesis.results import at
+from cuspid_thesis.catalogue import TABLE_3_2
+from cuspid_thesis.results import at
 
 Result = Mapping[str, Any]
 

@@ -22,7 +22,7 @@ from cuspid.jaw import Jaw
 from cuspid.storage import read_json, write_json
 from cuspid.studies.camera_pair import CameraPairOptions, Row, Term, best_pairs, study_camera_pair
 from cuspid.studies.camera_sweep import SweepOptions
-from cuspid.thesis.runs import SWEPT, sweep_arguments, sweep_result
+from cuspid_thesis.runs import SWEPT, sweep_arguments, sweep_result
 
 SURFACES = ("occlusal", "incisal", "buccal", "lingual", "labial")
 IN_THEORY = ("occlusal", "buccal", "lingual")

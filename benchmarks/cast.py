@@ -32,7 +32,7 @@ from cuspid.rig import Sensor
 from cuspid.storage import write_jaw, write_json, write_poses
 from cuspid.storage.files import whole_file
 from cuspid.storage.handpieces import camera_to_json, rigid_to_json
-from cuspid.studies.scan_cases import timed
+from cuspid_thesis.scan_cases import timed
 
 HERE = Path(__file__).parent
 BOARD = Board(square_mm=4.96)

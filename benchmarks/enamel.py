@@ -36,7 +36,7 @@ from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.simulation.stage import SimulationOptions
 from cuspid.storage import write_json
 from cuspid.studies.grid import Case, Value
-from cuspid.studies.scan_cases import commit
+from cuspid_thesis.scan_cases import commit
 
 HERE = Path(__file__).parent
 PHANTOMS = {0: 46, 1: 36, 2: 46}

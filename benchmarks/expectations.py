@@ -33,7 +33,7 @@ from cuspid.reconstruction import Expectation, Reconstruction
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.storage import SIGMA, read_json, read_mesh_file, read_poses, read_reconstruction, write_json
 from cuspid.studies.grid import Case, Value, run_grid
-from cuspid.studies.scan_cases import commit
+from cuspid_thesis.scan_cases import commit
 
 HERE = Path(__file__).parent
 

@@ -28,6 +28,9 @@ FOOTAGE = ("cuspid.storage.videos",)
 """Modules that only real footage is read by."""
 UNTOLD = "no commit, or one of uncommitted changes"
 
+_SOURCES = {"cuspid": "src", "cuspid_thesis": "reproduction/src"}
+"""Where the packages lie."""
+
 Result = Mapping[str, Any]
 
 
@@ -124,7 +127,7 @@ def _changed_since(commit: str, maker: Maker) -> frozenset[str]:
 
 def _blobs(*arguments: str) -> dict[str, str]:
     """Contents of files, by the names that Git has for them."""
-    lines = _git(*arguments, "src", "benchmarks").decode().splitlines()
+    lines = _git(*arguments, "src", "reproduction", "benchmarks").decode().splitlines()
     return {line.split("\t")[1]: line.split("\t")[0].split()[2] for line in lines}
 
 
@@ -157,7 +160,7 @@ def _is_text(statement: ast.AST) -> bool:
 def _made_by(maker: Maker) -> set[str]:
     """Files that take part."""
     scripts = set[Path]().union(*(_scripts(name) for name in (maker.script, *maker.runs)))
-    roots = {name for script in scripts for name in _imported(script) if name.split(".")[0] == "cuspid"}
+    roots = {name for script in scripts for name in _imported(script) if name.split(".")[0] in _SOURCES}
     every = [path.stem for path in (ROOT / "src/cuspid/cli").glob("*.py")]
     verbs = every if "*" in maker.verbs else maker.verbs
     modules = _upstream(roots | {f"cuspid.cli.{verb}" for verb in verbs if verb != "__init__"}, maker.leaves_out)
@@ -189,7 +192,7 @@ def _imported(script: Path) -> frozenset[str]:
 
 @cache
 def _graph(without: tuple[str, ...]) -> grimp.ImportGraph:
-    graph = grimp.build_graph("cuspid", cache_dir=None)
+    graph = grimp.build_graph(*_SOURCES, cache_dir=None)
     for name in without:
         for module in {name} | graph.find_descendants(name):
             graph.remove_module(module)
@@ -199,11 +202,11 @@ def _graph(without: tuple[str, ...]) -> grimp.ImportGraph:
 def _upstream(roots: Iterable[str], without: tuple[str, ...]) -> set[str]:
     graph = _graph(without)
     known: Sequence[str] = [root for root in roots if root in graph.modules]
-    return set(known).union(*(graph.find_upstream_modules(root) for root in known)) - {"cuspid"}
+    return set(known).union(*(graph.find_upstream_modules(root) for root in known)) - set(_SOURCES)
 
 
 def _file_of(module: str) -> Path:
-    path = ROOT / "src" / Path(*module.split("."))
+    path = ROOT / _SOURCES[module.split(".")[0]] / Path(*module.split("."))
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 

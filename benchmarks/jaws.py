@@ -42,7 +42,7 @@ from cuspid.room import Room
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 from cuspid.storage import read_json, read_poses, write_json
 from cuspid.studies.grid import Case, Value, Work, run_grid
-from cuspid.studies.scan_cases import commit
+from cuspid_thesis.scan_cases import commit
 
 HERE = Path(__file__).parent
 COARSE = 30_000

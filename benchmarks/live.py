@@ -30,7 +30,7 @@ from cuspid.capture import Capture, ImageSource
 from cuspid.geometry import Rigid3
 from cuspid.session import Session
 from cuspid.storage import write_json
-from cuspid.studies.scan_cases import ONE_PASS
+from cuspid_thesis.scan_cases import ONE_PASS
 
 HERE = Path(__file__).parent
 BLIND = 10

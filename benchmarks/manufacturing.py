@@ -41,7 +41,7 @@ from cuspid.simulation.manufacturing import ManufacturingOptions, built, told
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.storage import write_json
 from cuspid.studies.grid import Case, Value, run_grid
-from cuspid.studies.scan_cases import commit
+from cuspid_thesis.scan_cases import commit
 
 HERE = Path(__file__).parent
 LENSES = ManufacturingOptions(manufacturing_focal_pct=0.3, manufacturing_centre_px=1.0, manufacturing_k1=0.01)

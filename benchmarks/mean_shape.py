@@ -32,8 +32,8 @@ from cuspid.geometry import best_similarity
 from cuspid.jaw import GUM, Jaw, Landmark
 from cuspid.mesh import Mesh
 from cuspid.storage import read_shape_model, write_shape_model
-from cuspid.thesis.samples import MEAN_GROUP, iteration, make_phantom, make_population
 from cuspid.workers import usable_cores
+from cuspid_thesis.samples import MEAN_GROUP, iteration, make_phantom, make_population
 
 KNOWN = 6
 """Samples with a known mean."""

@@ -42,7 +42,7 @@ from cuspid.stereo.matching import DepthEstimator
 from cuspid.stereo.rectification import RectifiedPair, rectify
 from cuspid.storage import read_poses, write_json
 from cuspid.studies.grid import Case, Value
-from cuspid.studies.scan_cases import commit
+from cuspid_thesis.scan_cases import commit
 
 HERE = Path(__file__).parent
 FRAMES, LENGTH_MM = 16, 15.0

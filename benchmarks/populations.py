@@ -17,7 +17,7 @@ from run import conditions
 
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
-from cuspid.thesis.samples import measure_populations
+from cuspid_thesis.samples import measure_populations
 
 EDGE_MM = 0.28
 """Edge of the faces for the timing: about 200 000 faces."""

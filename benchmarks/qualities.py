@@ -24,8 +24,8 @@ from typing import get_args
 from run import conditions, run_timed, timed
 
 from cuspid.pipeline import Quality
-from cuspid.studies.scan_cases import ONE_PASS
 from cuspid.workers import core_numbers
+from cuspid_thesis.scan_cases import ONE_PASS
 
 HERE = Path(__file__).parent
 Known = dict[str, dict[str, object]]

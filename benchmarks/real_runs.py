@@ -13,7 +13,7 @@ from typing import Any
 from real_sets import Set, offered
 
 from cuspid.storage import read_json, write_json
-from cuspid.studies.scan_cases import commit, timed
+from cuspid_thesis.scan_cases import commit, timed
 
 TIMED_OUT = 124
 _WARNING = re.compile(rb"^.*\.py:\d+: \w*Warning: .*$", re.MULTILINE)

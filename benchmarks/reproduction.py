@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cuspid.reporting.pages.reproduction import markdown
-from cuspid.thesis.judging import judge
-from cuspid.thesis.page import GENERATED, make_page
-from cuspid.thesis.pictures import LIKENESS, TRUENESS, draw_likeness, draw_trueness
-from cuspid.thesis.runs import read_results
+from cuspid_thesis.judging import judge
+from cuspid_thesis.page import GENERATED, make_page
+from cuspid_thesis.page_format import markdown
+from cuspid_thesis.pictures import LIKENESS, TRUENESS, draw_likeness, draw_trueness
+from cuspid_thesis.runs import read_results
 
 HERE = Path(__file__).parent
 

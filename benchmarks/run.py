@@ -13,7 +13,7 @@ import json
 from pathlib import Path
 
 from cuspid.errors import CuspidError
-from cuspid.studies.scan_cases import conditions, measure_scan, run_timed, scan_cases, timed
+from cuspid_thesis.scan_cases import conditions, measure_scan, run_timed, scan_cases, timed
 
 __all__ = ["conditions", "run_timed", "timed"]  # Other benchmarks take them from here.
 

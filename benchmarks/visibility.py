@@ -27,13 +27,13 @@ from cuspid.jaw import Jaw
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece
 from cuspid.storage import write_json
-from cuspid.thesis.samples import path_over, surfaces_seen
 from cuspid.visibility import (
     VisibilityOptions,
     scannable_faces,
     survey_visibility,
     visible_counts,
 )
+from cuspid_thesis.samples import path_over, surfaces_seen
 
 EDGE_MM = 0.29
 """Edges that give the phantom about 200 000 faces."""

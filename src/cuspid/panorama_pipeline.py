@@ -43,6 +43,7 @@ from cuspid.motion.single import (
 )
 from cuspid.pairing import stereo_pairs
 from cuspid.panorama import FrameUse
+from cuspid.plugins import load_plugin
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction
 from cuspid.simulation.film import FilmOptions, film
@@ -59,7 +60,6 @@ from cuspid.stitching.ortho import (
     into_occlusal_frame,
     orthophoto,
 )
-from cuspid.stitching.thesis_method import ThesisOptions, stitch_as_thesis
 from cuspid.tolerances import NominalOptions
 from cuspid.workers import computed_once
 
@@ -91,9 +91,9 @@ class StitchOptions(OrthoOptions):
     """How the frames of one hand-held camera become a panorama."""
 
     method: Literal["ortho", "thesis"] = "ortho"
-    """ortho: frames located by structure from motion and rectified on the surface. thesis: chapter 4 of the thesis,
-    homographies chained from normal map to normal map, as a baseline. PATENT NOTICE: the method thesis appears to be
-    claimed by US 11,044,400; check the law where you are before you use it. The method ortho does not use it."""
+    """ortho: frames located by structure from motion and rectified on the surface. thesis: chapter 4 of the thesis, a
+    baseline of the distribution cuspid-thesis. PATENT NOTICE: it appears to be claimed by US 11,044,400; check the law
+    where you are before you use it. cuspid itself does not contain it."""
     motion: SingleOptions = field(default_factory=SingleOptions)
     """How the trajectory of the camera is found (method ortho)."""
     examination: bool = True
@@ -102,8 +102,6 @@ class StitchOptions(OrthoOptions):
     """How the trajectory of a handpiece of two or more cameras is found (method ortho)."""
     rig_patches: PatchOptions = field(default_factory=surface_patches)
     """How its points are followed over the dense surface."""
-    thesis: ThesisOptions = field(default_factory=ThesisOptions)
-    """Settings of the method thesis."""
 
 
 def stitch(sequence: ImageSequence, options: StitchOptions, *, progress: Progress = silent) -> tuple[Stitched, ...]:
@@ -112,7 +110,8 @@ def stitch(sequence: ImageSequence, options: StitchOptions, *, progress: Progres
     Raises ReconstructionError, naming the frames, where nothing can be placed, or nothing of it can be shown.
     """
     if options.method == "thesis":
-        panoramas = stitch_as_thesis(sequence, options.thesis, examination=options.examination, progress=progress)
+        method = load_plugin("cuspid.stitching", "thesis", asked="--method thesis", distribution="cuspid-thesis")
+        panoramas = method(sequence, examination=options.examination, progress=progress)
         return that_show_something(Stitched(panorama=panorama, motion=None, strip=None) for panorama in panoramas)
     motion = locate_single(sequence, options.motion, progress=progress)
     notes = (*sequence.notes, *motion.notes)

@@ -12,6 +12,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import wraps
 from importlib import import_module
 from inspect import signature
@@ -22,6 +23,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, get_type_hints
 from cuspid import __version__
 from cuspid.cli.verbs import VERBS, overview, reject_unknown
 from cuspid.errors import CuspidError
+from cuspid.plugins import load_plugin
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -31,8 +33,11 @@ class _Commands(Mapping[str, Callable[..., Any]]):
     """The function of each verb. Its module is loaded when it is asked for: to load them all takes seconds."""
 
     def __getitem__(self, verb: str) -> Callable[..., Any]:
+        module, _, distribution = VERBS[verb]
+        if distribution is not None:
+            return load_plugin("cuspid.verbs", verb, asked=verb, distribution=distribution)
         name = verb.replace("-", "_")
-        return getattr(import_module(f"cuspid.cli.{VERBS[verb].module}"), f"{name}_" if iskeyword(name) else name)
+        return getattr(import_module(f"cuspid.cli.{module}"), f"{name}_" if iskeyword(name) else name)
 
     def __iter__(self) -> Iterator[str]:
         return iter(VERBS)
@@ -48,7 +53,8 @@ def load(arguments: Sequence[str]) -> None:
     """Load what the verb that the arguments begin with needs."""
     if arguments and arguments[0] in COMMANDS:
         import_module("tyro")
-        COMMANDS[arguments[0]]
+        with suppress(CuspidError):  # which running it tells
+            COMMANDS[arguments[0]]
 
 
 def check_options_of(verb: str) -> Callable[..., None]:

@@ -17,6 +17,8 @@ class Verb(NamedTuple):
     """Of ``cuspid.cli``, which has a function of the verb's name."""
     summary: str
     """What it does, for the overview."""
+    distribution: str | None = None
+    """Which brings it, through an entry point of the group ``cuspid.verbs``; None for cuspid itself."""
 
 
 GROUPS: Mapping[str, Mapping[str, Verb]] = MappingProxyType(
@@ -55,7 +57,7 @@ GROUPS: Mapping[str, Mapping[str, Verb]] = MappingProxyType(
             "precision": Verb("forecasts", "how precisely a handpiece could measure a tooth"),
             "compare": Verb("comparison", "compare handpieces on the same teeth"),
             "sweep": Verb("studies", "the best baseline and angle of a camera pair"),
-            "reproduce": Verb("reproduction", "the thesis' tables, figures and equations beside ours"),
+            "reproduce": Verb("", "the thesis' tables, figures and equations beside ours", "cuspid-thesis"),
         },
         "Panoramas": {
             "film": Verb("film", "render what a hand-held camera sees of an arch"),

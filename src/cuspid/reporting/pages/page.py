@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 from jaxtyping import Shaped, UInt8
-from jinja2 import Environment, PackageLoader, StrictUndefined, UndefinedError
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, UndefinedError
 from markupsafe import Markup
 
 import cuspid
@@ -32,18 +32,22 @@ LARGEST_PAGE_BYTES = 15_000_000
 """Pages stay below this; the tests ask for it."""
 
 
-def render_page(template: str, **values: Any) -> str:
-    """The HTML of a page. ``values`` are those of the template; what it lacks is an error."""
+_PACKAGE = "cuspid.reporting.pages"
+
+
+def render_page(template: str, *, package: str = _PACKAGE, **values: Any) -> str:
+    """The HTML of a page. ``values`` are those of the template, which lies in a package's ``templates/``; what it lacks
+    is an error."""
     try:
-        return _environment().get_template(template).render(version=cuspid.__version__, **values)
+        return _environment(package).get_template(template).render(version=cuspid.__version__, **values)
     except UndefinedError as error:
         raise InputError(f"report: its data is incomplete ({one_line(error)}); make it again") from error
 
 
 @cache
-def _environment() -> Environment:
+def _environment(package: str) -> Environment:
     environment = Environment(
-        loader=PackageLoader("cuspid.reporting.pages"),
+        loader=ChoiceLoader([PackageLoader(package), PackageLoader(_PACKAGE)]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -54,9 +58,9 @@ def _environment() -> Environment:
     return environment
 
 
-def asset(name: str) -> Markup:
-    """A script or a style of the package, as it is."""
-    return Markup((resources.files("cuspid.reporting.pages") / "assets" / name).read_text(encoding="utf-8"))
+def asset(name: str, package: str = _PACKAGE) -> Markup:
+    """A script or a style of a package, as it is."""
+    return Markup((resources.files(package) / "assets" / name).read_text(encoding="utf-8"))
 
 
 def script_json(value: object) -> Markup:

@@ -1,0 +1,3 @@
+"""Every table, figure and equation of the thesis beside ours: what it states, what we find, and a verdict by a rule."""
+
+__version__ = "0.2.0"

@@ -1,0 +1,1 @@
+"""Chapter 4 of the thesis as it is written: the baseline for the method ``ortho``."""

@@ -1,1 +1,0 @@
-"""Every table, figure and equation of the thesis beside ours: what it states, what we find, and a verdict by a rule."""
