@@ -21,7 +21,7 @@ def freshness(monkeypatch):
 @pytest.fixture
 def repository(tmp_path, freshness, monkeypatch):
     """The code as it stands, committed."""
-    for folder in ("src", "benchmarks"):
+    for folder in ("src", "reproduction", "benchmarks"):
         kept = shutil.ignore_patterns("__pycache__", "results")
         shutil.copytree(ROOT / folder, tmp_path / folder, ignore=kept)
     git = ("git", "-C", str(tmp_path), "-c", "user.name=n", "-c", "user.email=e@x.org")
