@@ -41,7 +41,7 @@ wheel: $(STAMP)
 	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir $(WHEEL) . ./reproduction
 	$(PYTHON) -m venv $(WHEEL)/venv
 	$(WHEEL)/venv/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt $(WHEEL)/cuspid-*.whl
-	cd $(WHEEL) && venv/bin/cuspid handpiece --design four --width-px 160 --height-px 160 --out probe
+	cd $(WHEEL) && venv/bin/cuspid rig build --design four --width-px 160 --height-px 160 --out probe
 	cd $(WHEEL) && venv/bin/cuspid run --handpiece probe/handpiece.json --tooth 46 --frames 6 --length-mm 3 --out scan
 	test -s $(WHEEL)/scan/report.html
 	cd $(WHEEL) && ! venv/bin/cuspid reproduce --no-run --out thesis

@@ -25,7 +25,7 @@ BOARD = ("--columns", "6", "--rows", "5", "--square-mm", "1", "--supersampling",
 
 def begun(handpiece: Path, out: Path, instants: int, said: Path) -> BaseProcess:
     """A run, which goes on; what it prints goes to a file."""
-    arguments = ["photograph", str(handpiece), *BOARD, "--instants", str(instants), "--out", str(out)]
+    arguments = ["rig", "photograph", str(handpiece), *BOARD, "--instants", str(instants), "--out", str(out)]
     process = get_context("fork").Process(target=_run, args=(arguments, said))  # all is imported already
     process.start()
     return process

@@ -1,4 +1,5 @@
-"""The practical study of a pair of cameras (thesis 3.5.1): `cuspid sweep` for each surface, beside thesis and theory.
+"""The practical study of a pair of cameras (thesis 3.5.1): `cuspid study sweep` for each surface, beside
+thesis and theory.
 
     python benchmarks/camera_sweep.py [--surface occlusal incisal ...] [--work build/sweeps] [--workers 2]
 

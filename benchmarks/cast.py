@@ -36,7 +36,7 @@ from cuspid_thesis.scan_cases import timed
 
 HERE = Path(__file__).parent
 BOARD = Board(square_mm=4.96)
-"""As ``cuspid target`` draws it, with squares of 5 mm, printed a little small and measured on the print."""
+"""As ``cuspid rig target`` draws it, with squares of 5 mm, printed a little small and measured on the print."""
 SENSOR = Sensor(noise_dn=1.4, shot_noise_share=0.7)
 BRIGHT, BRIGHT_PERCENTILE = 0.72, 99.0
 """The exposure, the same for all photographs, puts this percentile of some of them at this share of full scale."""

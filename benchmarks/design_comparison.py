@@ -8,8 +8,8 @@ run goes on where it stopped; ``--report`` writes the results of what is done wi
 
 The found handpieces are in benchmarks/designs, made from the briefs beside them by
 
-    cuspid phantom --edge-mm 0.5 --out jaw.ply
-    cuspid design benchmarks/designs/ten-found.toml --jaw jaw.ply --out ten-found --noise.sigma-px 0.048
+    cuspid jaw phantom --edge-mm 0.5 --out jaw.ply
+    cuspid rig design benchmarks/designs/ten-found.toml --jaw jaw.ply --out ten-found --noise.sigma-px 0.048
         --noise.convergence-deg None --noise.deformation 0.52
 """
 

@@ -40,8 +40,8 @@ def verbs(work: Path) -> dict[str, tuple[str, ...]]:
     return {
         "run": ("run", jaw, *probe, *SCAN),
         "reconstruct": ("reconstruct", str(work / "scan" / "capture")),
-        "stitch": ("stitch", str(work / "film" / "capture" / "images" / "camera")),
-        "repeat": ("repeat", jaw, *probe, *SCAN, "--scans", "2", "--workers", "1"),
+        "stitch": ("pano", "stitch", str(work / "film" / "capture" / "images" / "camera")),
+        "repeat": ("study", "repeat", jaw, *probe, *SCAN, "--scans", "2", "--workers", "1"),
     }
 
 
@@ -52,13 +52,25 @@ def cuspid(*arguments: str) -> None:
 
 def prepare(work: Path) -> None:
     """What the verbs take: a handpiece with small images, a jaw, a scan, a film."""
-    cuspid("handpiece", "--design", "four", "--width-px", "160", "--height-px", "160", "--out", str(work / "probe"))
+    cuspid("rig", "build", "--design", "four", "--width-px", "160", "--height-px", "160", "--out", str(work / "probe"))
     jaw, probe = str(work / "jaw.ply"), str(work / "probe" / "handpiece.json")
-    cuspid("phantom", "--edge-mm", "0.5", "--out", jaw)
+    cuspid("jaw", "phantom", "--edge-mm", "0.5", "--out", jaw)
     cuspid("simulate", jaw, "--handpiece", probe, *SCAN, "--out", str(work / "scan"))
     camera = ("--camera.width-px", "320", "--camera.height-px", "240")
     cuspid(
-        "film", jaw, *camera, "--frames", "40", "--shake", "0.3", "--texture", "artificial", "--out", str(work / "film")
+        "pano",
+        "pano",
+        "film",
+        jaw,
+        *camera,
+        "--frames",
+        "40",
+        "--shake",
+        "0.3",
+        "--texture",
+        "artificial",
+        "--out",
+        str(work / "film"),
     )
 
 

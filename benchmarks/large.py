@@ -106,7 +106,7 @@ def main() -> None:
     for verb, during in (
         (("evaluate", scan, scan, "--out", scored), None),
         (("report", scored, "--reference", scan), None),
-        (("measure", str(work / "jaw.ply"), "--out", str(work / "measured")), None),
+        (("jaw", "measure", str(work / "jaw.ply"), "--out", str(work / "measured")), None),
         (("view", scored, "--reference", scan), take_all),
     ):
         found[verb[0]] = measured(verb, during)

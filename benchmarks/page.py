@@ -23,6 +23,8 @@ import real_sections
 import trust_sections
 from freshness import changes, maker_of
 
+from cuspid_thesis.scan_cases import with_todays_verb
+
 HERE = Path(__file__).parent
 
 Result = Mapping[str, Any]
@@ -128,7 +130,7 @@ def detail(result: Result) -> str:
         [
             f"### {result['case']}",
             "",
-            *(f"    {command}" for command in result["commands"]),
+            *(f"    {with_todays_verb(command)}" for command in result["commands"]),
             "",
             f"Seed {result['seed']}, commit {result['commit']}, Python {result['python']}, {result['cores']} cores, "
             + ", ".join(f"{name} {number}" for name, number in condition.items())

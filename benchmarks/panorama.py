@@ -120,7 +120,7 @@ def film_of(method: str) -> str:
 def film_command(jaw: Path, out: Path, seed: int, *options: str) -> list[str]:
     """The arguments that film a subject."""
     numbers = ("--seed", str(seed), "--supersampling", str(SUPERSAMPLING))
-    return ["film", str(jaw), "--out", str(out), *numbers, *options]
+    return ["pano", "film", str(jaw), "--out", str(out), *numbers, *options]
 
 
 def measure(name: str, method: str, folder: Path, limit_s: int) -> dict[str, object]:
@@ -131,7 +131,7 @@ def measure(name: str, method: str, folder: Path, limit_s: int) -> dict[str, obj
     score, failure = None, given_up(status, limit_s) if status else unmade(out)
     if failure is None:
         made = out if (out / "panorama.json").exists() else first_part(out)
-        run_timed("stitch-eval", str(made), str(filmed / "truth"), "--out", str(folder / f"{method}-score"))
+        run_timed("pano", "evaluate", str(made), str(filmed / "truth"), "--out", str(folder / f"{method}-score"))
         score = json.loads((folder / f"{method}-score" / "score.json").read_text())
     placed = out / "result.json"
     return {
@@ -170,7 +170,7 @@ def first_part(out: Path) -> Path:
 
 def stitched(*options: str) -> Callable[[Path, Path, int], list[str]]:
     """The command of a method of cuspid."""
-    return lambda capture, out, _: [*CUSPID, "stitch", str(capture), "--method", *options, "--out", str(out)]
+    return lambda capture, out, _: [*CUSPID, "pano", "stitch", str(capture), "--method", *options, "--out", str(out)]
 
 
 def measured_across(capture: Path, out: Path, limit_s: int) -> list[str]:
@@ -195,7 +195,7 @@ def scaled_by_cusps(capture: Path, out: Path, limit_s: int) -> list[str]:
     pixels = panorama.pixels_from_world(traced.placed[shown])
     beside_px = CLICK_MM / panorama.mm_per_px * np.random.default_rng(len(traced.labels)).normal(size=(2, 2))  # type: ignore[operator]
     measured = (*(f"{each:.0f}" for each in (pixels + beside_px).ravel()), f"{round(2 * true_mm) / 2}")
-    return [*CUSPID, "rescale", str(folder / "ortho"), "--distance", *measured, "--out", str(out)]
+    return [*CUSPID, "pano", "rescale", str(folder / "ortho"), "--distance", *measured, "--out", str(out)]
 
 
 def molars(traced: TracedPixels) -> tuple[int, int]:

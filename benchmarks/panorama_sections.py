@@ -43,7 +43,7 @@ def panoramas(results: Sequence[Result]) -> str:
             "640 x 480 px with full hand shake, texture `enamel`; `pair` is the default method on the film of two "
             "cameras 5 mm apart, `return`, `s-shape` and `cross` on a film of that path, `natural` on one of teeth "
             "with what real ones bear (texture `natural`); `callipers` is told the width of the arch; `cusps` is "
-            "`ortho`, scaled by `cuspid rescale` (whose times it tells) to the distance between two cusps. "
+            "`ortho`, scaled by `cuspid pano rescale` (whose times it tells) to the distance between two cusps. "
             "docs/panorama-evaluation.md explains the figures. *No arch* counts the panoramas that failed: too few "
             "frames, collapsed, or nowhere near the "
             "jaw. Medians are over those that did not fail.",

@@ -282,7 +282,7 @@ def _arrays(folder: Path) -> None:
 def _probe(folder: Path) -> None:
     """A labelled jaw, and a handpiece with small images to scan it with."""
     storage.write_jaw(folder / "jaw.ply", small_jaw())
-    verb("handpiece", "--design", "four", "--width-px", "96", "--height-px", "96", "--out", "@.")(folder)
+    verb("rig", "build", "--design", "four", "--width-px", "96", "--height-px", "96", "--out", "@.")(folder)
 
 
 WATCHED = ("--watch", "--end-s", "0.4", "--late-s", "0", "--quality", "standard")
@@ -528,7 +528,7 @@ def _in_use(folder: Path) -> None:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         before = sorted(folder.rglob("*"))
-        verb("photograph", "@handpiece.json", *BOARD, "--out", f"@{_OUT}")(folder)
+        verb("rig", "photograph", "@handpiece.json", *BOARD, "--out", f"@{_OUT}")(folder)
     finally:
         os.close(descriptor)
         if sorted(folder.rglob("*")) != before:
@@ -540,7 +540,7 @@ def _in_little_memory(folder: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (held + (4 << 20), hard))
     try:
-        verb("measure", "@jaw.ply", "--out", f"@{_OUT}")(folder)
+        verb("jaw", "measure", "@jaw.ply", "--out", f"@{_OUT}")(folder)
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
@@ -565,7 +565,7 @@ def _into_a_full_output(folder: Path) -> None:
     full = Path("/dev/full").open("w")  # noqa: SIM115 - what cannot be written cannot be closed either
     try:
         with contextlib.redirect_stdout(full):
-            verb("visibility", "@jaw.ply", *PROBE, *SCAN[:4], "--out", f"@{_OUT}")(folder)
+            verb("rig", "visibility", "@jaw.ply", *PROBE, *SCAN[:4], "--out", f"@{_OUT}")(folder)
     finally:
         with contextlib.suppress(OSError):
             full.close()
@@ -573,7 +573,7 @@ def _into_a_full_output(folder: Path) -> None:
 
 def _footage(folder: Path) -> None:
     """Films of two cameras in two kinds of videos, images of a third one, and when they were taken."""
-    verb("handpiece", "--design", "four", "--width-px", "96", "--height-px", "96", "--out", "@.")(folder)
+    verb("rig", "build", "--design", "four", "--width-px", "96", "--height-px", "96", "--out", "@.")(folder)
     names = storage.read_handpiece(folder / "handpiece.json").rig.names
     images = [cv2.resize(picture(seed), (96, 96)) for seed in range(4)]
     (folder / "footage").mkdir()
@@ -622,13 +622,15 @@ SCENARIOS: Mapping[str, Scenario] = {
     "report of a score": Scenario(_studies, verb("report", "@score")),
     "report of a calibration": Scenario(_calibration, verb("report", "@calibration")),
     "report of a shape": Scenario(_shape, verb("report", "@shape")),
-    "prepare": Scenario(_arch, verb("prepare", "@jaw.ply", "--tooth", str(TOOTH), "--out", f"@{_OUT}.ply", "crack")),
-    "box": Scenario(_arch, verb("box", "@jaw.ply", "--out", f"@{_OUT}.ply")),
-    "mean shape": Scenario(_population, verb("shape", "@jaws", "--most-rounds", "1", "--out", f"@{_OUT}")),
-    "visibility": Scenario(_probe, verb("visibility", "@jaw.ply", *PROBE, *SCAN[:4], "--out", f"@{_OUT}")),
-    "photograph": Scenario(_four_cameras, verb("photograph", "@handpiece.json", *BOARD, "--out", f"@{_OUT}")),
-    "film": Scenario(_filmed, verb("film", "@jaw.ply", *FILM, "--out", f"@{_OUT}")),
-    "design": Scenario(_demand, verb("design", "@brief.toml", *SEARCH, "--out", f"@{_OUT}")),
+    "prepare": Scenario(
+        _arch, verb("jaw", "prepare", "@jaw.ply", "--tooth", str(TOOTH), "--out", f"@{_OUT}.ply", "crack")
+    ),
+    "box": Scenario(_arch, verb("jaw", "box", "@jaw.ply", "--out", f"@{_OUT}.ply")),
+    "mean shape": Scenario(_population, verb("jaw", "shape", "@jaws", "--most-rounds", "1", "--out", f"@{_OUT}")),
+    "visibility": Scenario(_probe, verb("rig", "visibility", "@jaw.ply", *PROBE, *SCAN[:4], "--out", f"@{_OUT}")),
+    "photograph": Scenario(_four_cameras, verb("rig", "photograph", "@handpiece.json", *BOARD, "--out", f"@{_OUT}")),
+    "film": Scenario(_filmed, verb("pano", "film", "@jaw.ply", *FILM, "--out", f"@{_OUT}")),
+    "design": Scenario(_demand, verb("rig", "design", "@brief.toml", *SEARCH, "--out", f"@{_OUT}")),
     "reproduce": Scenario(_results, verb("reproduce", "--results", "@results", "--no-run", "--out", f"@{_OUT}")),
     "evaluate": Scenario(_meshes, _evaluate),
     "face directions": Scenario(_facing, _read_facing),
@@ -636,7 +638,7 @@ SCENARIOS: Mapping[str, Scenario] = {
     "image types": Scenario(_image_types, _read_image_types),
     "cameras in folders": Scenario(_in_folders, storage.read_capture),
     "cameras at one place": Scenario(
-        _at_one_place, verb("visibility", "@jaw.ply", *PROBE, *SCAN[:4], "--out", f"@{_OUT}"), is_good=False
+        _at_one_place, verb("rig", "visibility", "@jaw.ply", *PROBE, *SCAN[:4], "--out", f"@{_OUT}"), is_good=False
     ),
     "exchanged cameras": Scenario(_exchanged, verb("reconstruct", "@capture", "--out", f"@{_OUT}"), is_good=False),
     "strange files beside": Scenario(_strange_beside, verb("live", "@capture", *WATCHED, "--out", f"@{_OUT}")),
@@ -645,25 +647,25 @@ SCENARIOS: Mapping[str, Scenario] = {
     "little memory": Scenario(_arch, _in_little_memory, is_good=None),  # a warm process may have enough
     "full output": Scenario(_probe, _into_a_full_output, is_good=False),
     "long names": Scenario(
-        _four_cameras, verb("photograph", "@handpiece.json", *BOARD, "--out", f"@{'long' * 60}"), is_good=None
+        _four_cameras, verb("rig", "photograph", "@handpiece.json", *BOARD, "--out", f"@{'long' * 60}"), is_good=None
     ),
     **{
         f"terminal of {encoding}": Scenario(
-            _arch, on_terminal(encoding, verb("measure", "@jaw.ply", "--out", f"@{_OUT}"))
+            _arch, on_terminal(encoding, verb("jaw", "measure", "@jaw.ply", "--out", f"@{_OUT}"))
         )
         for encoding in ("ascii", "cp437", "latin-1")
     },
     "units": Scenario(_units, _compare_units),
-    "measure": Scenario(_arch, verb("measure", "@jaw.ply", "--out", f"@{_OUT}")),
+    "measure": Scenario(_arch, verb("jaw", "measure", "@jaw.ply", "--out", f"@{_OUT}")),
     "simulate": Scenario(_probe, verb("simulate", "@jaw.ply", *PROBE, *SCAN, "--out", f"@{_OUT}")),
-    "precision": Scenario(_probe, verb("precision", "@jaw.ply", *PROBE, "--out", f"@{_OUT}")),
-    "mouth": Scenario(_four_cameras, verb("mouth", "--handpiece", "@handpiece.json", "--out", f"@{_OUT}")),
-    "holder": Scenario(_four_cameras, verb("handpiece", "--handpiece", "@handpiece.json", *HOLDER)),
+    "precision": Scenario(_probe, verb("rig", "precision", "@jaw.ply", *PROBE, "--out", f"@{_OUT}")),
+    "mouth": Scenario(_four_cameras, verb("jaw", "mouth", "--handpiece", "@handpiece.json", "--out", f"@{_OUT}")),
+    "holder": Scenario(_four_cameras, verb("rig", "build", "--handpiece", "@handpiece.json", *HOLDER)),
     "reconstruct": Scenario(_textured_capture, verb("reconstruct", "@capture", "--out", f"@{_OUT}")),
     "live": Scenario(_textured_capture, verb("live", "@capture", *WATCHED, "--out", f"@{_OUT}")),
     "resume": Scenario(_cut_short, _resume),
     "boards": Scenario(
-        _boards, verb("target", "--board", "@boards.yaml", "@kalibr.yaml", "--out", f"@{_OUT}/board.svg")
+        _boards, verb("rig", "target", "--board", "@boards.yaml", "@kalibr.yaml", "--out", f"@{_OUT}/board.svg")
     ),
     "calibrate": Scenario(
         _photographs,
@@ -677,12 +679,12 @@ SCENARIOS: Mapping[str, Scenario] = {
         _footage,
         verb("import", "@footage", "--handpiece", "@handpiece.json", "--sync", "times", "--out", f"@{_OUT}"),
     ),
-    "stitch": Scenario(_film, verb("stitch", "@film/capture/images/camera", "--out", f"@{_OUT}")),
+    "stitch": Scenario(_film, verb("pano", "stitch", "@film/capture/images/camera", "--out", f"@{_OUT}")),
     "stitch of a mesh": Scenario(
-        _arch, verb("stitch", "--mesh", "@jaw.ply", "--view.mm-per-px", "2", "--out", f"@{_OUT}")
+        _arch, verb("pano", "stitch", "--mesh", "@jaw.ply", "--view.mm-per-px", "2", "--out", f"@{_OUT}")
     ),
-    "rescale": Scenario(_stitched, verb("rescale", "@panorama", *MEASURED, "--out", f"@{_OUT}")),
-    "stitch-eval": Scenario(_score, verb("stitch-eval", "@panorama", "@truth", "--out", f"@{_OUT}")),
+    "rescale": Scenario(_stitched, verb("pano", "rescale", "@panorama", *MEASURED, "--out", f"@{_OUT}")),
+    "stitch-eval": Scenario(_score, verb("pano", "evaluate", "@panorama", "@truth", "--out", f"@{_OUT}")),
 }
 
 

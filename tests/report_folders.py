@@ -163,7 +163,7 @@ def write_comparison(folder: Path, columns: int = 30) -> None:
 
 
 def write_score(folder: Path) -> None:
-    """As ``cuspid stitch-eval`` leaves it."""
+    """As ``cuspid pano evaluate`` leaves it."""
     scores = dict.fromkeys(("zncc", "ssim_teeth", "ssim_full", "ssim_teeth_fitted", "ssim_full_fitted"), 0.5)
     storage.claim_folder(folder, "stitch-eval", {"evaluation": {"samples": 10}}, {"panorama": "d" * 64})
     geometry = {

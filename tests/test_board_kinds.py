@@ -66,7 +66,7 @@ def test_tags_are_kalibrs() -> None:
 
 @pytest.mark.parametrize("board", BOARDS)
 def test_a_drawn_board_is_as_it_is_said_to_be(tmp_path: Path, board: Board) -> None:
-    run("target", "--out", tmp_path / "board.png", *options(board))
+    run("rig", "target", "--out", tmp_path / "board.png", *options(board))
     gray = cv2.imread(str(tmp_path / "board.png"), cv2.IMREAD_GRAYSCALE)
     places = np.random.default_rng(0).uniform([0, 0], board.size_mm, (2000, 2))
     inner = [board.is_dark(places + shift) for shift in ([0.05, 0], [-0.05, 0], [0, 0.05], [0, -0.05])]

@@ -90,7 +90,7 @@ def test_too_many_markers_are_refused():
 @pytest.mark.parametrize("kind", ["charuco", "chessboard"])
 def test_a_drawn_board_is_found_where_it_was_drawn(tmp_path, kind, inverted):
     board = Board(kind=kind, columns=7, rows=6, square_mm=2.0, inverted=inverted)
-    run("target", "--out", tmp_path / "board.png", *options(board))
+    run("rig", "target", "--out", tmp_path / "board.png", *options(board))
     gray = cv2.imread(str(tmp_path / "board.png"), cv2.IMREAD_GRAYSCALE)
     found = find_corners(gray, board)
     px_per_mm = 600 / 25.4
@@ -103,7 +103,7 @@ def test_a_drawn_board_is_found_where_it_was_drawn(tmp_path, kind, inverted):
 def test_a_page_is_as_large_as_it_says(tmp_path, square_mm):
     board = Board(columns=6, rows=5, square_mm=square_mm)
     for suffix in ("pdf", "svg"):
-        run("target", "--out", tmp_path / f"board.{suffix}", *options(board))
+        run("rig", "target", "--out", tmp_path / f"board.{suffix}", *options(board))
     margin = max(5.0, square_mm / 2)
     width, height = 6 * square_mm + 2 * margin, 5 * square_mm + 2 * margin + 7
     page = (tmp_path / "board.pdf").read_bytes().split(b"/MediaBox [ 0 0 ")[1].split(b"]")[0]
@@ -517,7 +517,7 @@ def test_what_cannot_be_calibrated_is_one_line(tmp_path, capsys):
     message = refused(capsys, "calibrate", tmp_path / "gray", "--out", out)
     assert "left saw the board at fewer than 3 instants" in message
     assert not out.exists()
-    assert "a board is written as .pdf" in refused(capsys, "target", "--out", tmp_path / "board.txt")
+    assert "a board is written as .pdf" in refused(capsys, "rig", "target", "--out", tmp_path / "board.txt")
 
 
 def test_a_calibration_that_fails_leaves_the_one_before(tmp_path, capsys):
@@ -535,8 +535,8 @@ def test_a_calibration_that_fails_leaves_the_one_before(tmp_path, capsys):
 
 
 def test_photographs_that_are_there_are_not_taken_again(tmp_path):
-    run("handpiece", "--design", "four", "--width-px", 60, "--height-px", 60, "--out", tmp_path / "drawn")
-    take = ("photograph", tmp_path / "drawn" / "handpiece.json", "--out", tmp_path / "out", "--instants", 3)
+    run("rig", "build", "--design", "four", "--width-px", 60, "--height-px", 60, "--out", tmp_path / "drawn")
+    take = ("rig", "photograph", tmp_path / "drawn" / "handpiece.json", "--out", tmp_path / "out", "--instants", 3)
     run(*take)
     files = sorted((tmp_path / "out" / "images").rglob("*.png"))
     before, times = [file.read_bytes() for file in files], [file.stat().st_mtime_ns for file in files]
@@ -550,9 +550,9 @@ def test_photographs_that_are_there_are_not_taken_again(tmp_path):
 def test_a_rehearsed_calibration_finds_the_handpiece_that_was_built(tmp_path):
     """Four cameras of an intra-oral size, off from the drawn ones, with lenses that distort."""
     board = ("--columns", 9, "--rows", 7, "--square-mm", 0.7)
-    run("handpiece", "--design", "four", "--width-px", 240, "--height-px", 240, "--out", tmp_path / "drawn")
+    run("rig", "build", "--design", "four", "--width-px", 240, "--height-px", 240, "--out", tmp_path / "drawn")
     run(
-        *("photograph", tmp_path / "drawn" / "handpiece.json", "--out", tmp_path / "photos", *board),
+        *("rig", "photograph", tmp_path / "drawn" / "handpiece.json", "--out", tmp_path / "photos", *board),
         *("--instants", 14, "--supersampling", 2, "--manufacturing-um", 30, "--manufacturing-deg", 0.3),
         *("--manufacturing-focal-pct", 1, "--manufacturing-centre-px", 3, "--manufacturing-k1", 0.05),
     )

@@ -557,7 +557,7 @@ def test_a_pair_of_halcon(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     about_z = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
     np.testing.assert_allclose(place.rotation, about_x @ about_y @ about_z, atol=1e-12)
     np.testing.assert_allclose(place.translation, [4.6, 0.1, -0.2], atol=1e-9)
-    assert "only read" in refused(capsys, "convert", tmp_path, tmp_path / "x.dat", "--to", "halcon")
+    assert "only read" in refused(capsys, "rig", "convert", tmp_path, tmp_path / "x.dat", "--to", "halcon")
     (tmp_path / "relpose.dat").unlink()
     with pytest.raises(InputError, match="two and a pose"):
         read_calibration(tmp_path)
@@ -635,11 +635,11 @@ def test_a_lens_that_cannot_be_carried_over_is_refused(tmp_path: Path, capsys: p
         model="OPENCV_FISHEYE",
     )
     write_calibration(tmp_path / "a.yml", Rig({"a": MountedCamera(camera, Rigid3.identity())}), "opencv")
-    line = refused(capsys, "convert", tmp_path / "a.yml", tmp_path / "m.json", "--to", "matlab")
+    line = refused(capsys, "rig", "convert", tmp_path / "a.yml", tmp_path / "m.json", "--to", "matlab")
     assert "px off over the image" in line
     assert "--most-px" in line
     assert not (tmp_path / "m.json").exists()
-    run("convert", tmp_path / "a.yml", tmp_path / "m.json", "--to", "matlab", "--most-px", "2000")
+    run("rig", "convert", tmp_path / "a.yml", tmp_path / "m.json", "--to", "matlab", "--most-px", "2000")
     assert (tmp_path / "m.json").exists()
 
 
@@ -668,16 +668,16 @@ def test_metres_are_noticed(tmp_path: Path) -> None:
 
 def test_convert_writes_a_handpiece(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_calibration(tmp_path / "pair.yml", rig_of(2), "opencv")
-    run("convert", tmp_path / "pair.yml", tmp_path / "handpiece.json", "--working-distance-mm", 30)
+    run("rig", "convert", tmp_path / "pair.yml", tmp_path / "handpiece.json", "--working-distance-mm", 30)
     handpiece = storage.read_handpiece(tmp_path / "handpiece.json")
     assert handpiece.working_distance_mm == 30
     assert handpiece.rig.names == ("c0", "c1")
     assert "2 camera(s)" in capsys.readouterr().err
-    assert "give --to" in refused(capsys, "convert", tmp_path / "pair.yml", tmp_path / "x.abc")
-    assert "is the file that is read" in refused(capsys, "convert", tmp_path / "pair.yml", tmp_path / "pair.yml")
+    assert "give --to" in refused(capsys, "rig", "convert", tmp_path / "pair.yml", tmp_path / "x.abc")
+    assert "is the file that is read" in refused(capsys, "rig", "convert", tmp_path / "pair.yml", tmp_path / "pair.yml")
     write(tmp_path, "other.yml", "a: 1\n")
-    told = refused(capsys, "convert", tmp_path / "other.yml", tmp_path / "x.json")
-    assert "cuspid convert takes it with --from" in told
+    told = refused(capsys, "rig", "convert", tmp_path / "other.yml", tmp_path / "x.json")
+    assert "cuspid rig convert takes it with --from" in told
 
 
 _JUNK = st.recursive(

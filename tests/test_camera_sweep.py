@@ -278,14 +278,14 @@ def jaw_file(tmp_path, coarse_phantom):
 
 def test_bad_input_is_one_line_and_leaves_nothing(jaw_file, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
-    absent = refused(capsys, "sweep", jaw_file, "--surface", "incisal", "--tooth", 47, "--out", out)
+    absent = refused(capsys, "study", "sweep", jaw_file, "--surface", "incisal", "--tooth", 47, "--out", out)
     assert "no incisal surface" in absent
-    close = refused(capsys, "sweep", jaw_file, "--distance-mm", 0.6, "--depth-of-field-mm", 1, "--out", out)
+    close = refused(capsys, "study", "sweep", jaw_file, "--distance-mm", 0.6, "--depth-of-field-mm", 1, "--out", out)
     assert "of the handpiece" in close
-    assert "--workers is 0" in refused(capsys, "sweep", jaw_file, "--workers", 0, "--out", out)
+    assert "--workers is 0" in refused(capsys, "study", "sweep", jaw_file, "--workers", 0, "--out", out)
     pytest.importorskip("distributed")
     monkeypatch.setattr("cuspid.studies.grid.CLUSTER_TIMEOUT_S", 1)
-    alone = refused(capsys, "sweep", jaw_file, "--cluster", "tcp://127.0.0.1:9", "--out", out)
+    alone = refused(capsys, "study", "sweep", jaw_file, "--cluster", "tcp://127.0.0.1:9", "--out", out)
     assert "no Dask scheduler answers" in alone
     assert not out.exists()
 
@@ -310,7 +310,7 @@ def test_the_verb_writes_its_results_and_does_not_mix_them(jaw_file, tmp_path, c
     storage.write_json(
         out / "cases" / f"{outcomes[1].case.name}.json", {**broken, "figures": {}, "failure": "no surface: dark"}
     )
-    cli.main(["sweep", *map(str, arguments)])
+    cli.main(["study", "sweep", *map(str, arguments)])
     printed = capsys.readouterr()
     assert "no surface: dark" in printed.err
     assert "1 mm, 0°" in printed.out
@@ -318,5 +318,5 @@ def test_the_verb_writes_its_results_and_does_not_mix_them(jaw_file, tmp_path, c
     assert summary["best"]["complete_50_um_pct"]["setting"] == [1.0, 0.0]
     assert summary["failures"] == {outcomes[1].case.name: "no surface: dark"}
     assert (out / "sweep.png").stat().st_size > 10_000
-    other = refused(capsys, "sweep", *arguments[:-2], "--angle-deg", 0, 3, "--out", out)
+    other = refused(capsys, "study", "sweep", *arguments[:-2], "--angle-deg", 0, 3, "--out", out)
     assert "holds another run of 'sweep' (settings.options.angle_deg differs)" in other

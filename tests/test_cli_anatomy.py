@@ -17,7 +17,7 @@ def test_a_jaw_and_a_broken_one_are_measured(tmp_path, capsys, phantom_file, coa
     jaws = tmp_path / "jaws"
     storage.write_jaw(jaws / "good.ply", coarse_phantom)
     (jaws / "broken.stl").write_text("solid nothing")
-    run("measure", jaws, "--out", tmp_path / "out")
+    run("jaw", "measure", jaws, "--out", tmp_path / "out")
     rows = {row["jaw"]: row for row in csv.DictReader((tmp_path / "out" / "jaws.csv").open())}
     tips = [coarse_phantom.landmarks[f"{tooth}.cusp_tip"].position for tooth in (33, 43)]
     assert float(rows["good"]["a_mm"]) == pytest.approx(np.linalg.norm(tips[0] - tips[1]), abs=1e-3)
@@ -33,7 +33,7 @@ def test_landmarks_in_the_frame_of_a_turned_mesh_are_found_beside_it(tmp_path, c
     landmarks = {label: coarse_phantom.landmarks[label] for label in ("33.cusp_tip", "43.cusp_tip")}
     storage.write_mesh(tmp_path / "my_lower.ply", coarse_phantom.mesh)
     storage.write_landmarks(tmp_path / "my_lower.mrk.json", landmarks, "mesh")
-    run("measure", tmp_path / "my_lower.ply", "--out", tmp_path / "out")
+    run("jaw", "measure", tmp_path / "my_lower.ply", "--out", tmp_path / "out")
     row = next(csv.DictReader((tmp_path / "out" / "jaws.csv").open()))
     gap = np.subtract(*(point.position for point in landmarks.values()))
     assert float(row["a_mm"]) == pytest.approx(np.linalg.norm(gap), abs=2e-3)
@@ -43,18 +43,20 @@ def test_landmarks_in_the_frame_of_a_turned_mesh_are_found_beside_it(tmp_path, c
 
 def test_a_landmark_that_the_scheme_does_not_know(tmp_path, capsys, phantom_file):
     storage.write_landmarks(tmp_path / "points.json", {"46.bucal_groove": Landmark(np.zeros(3))}, "occlusal")
-    command = ("measure", phantom_file, "--landmarks", tmp_path / "points.json", "--out", tmp_path / "out")
+    command = ("jaw", "measure", phantom_file, "--landmarks", tmp_path / "points.json", "--out", tmp_path / "out")
     assert "did you mean 46.buccal_groove" in refused(capsys, *command)
 
 
 def test_no_jaws_to_measure(tmp_path, capsys):
     (tmp_path / "empty").mkdir()
-    assert "no jaw meshes" in refused(capsys, "measure", tmp_path / "empty", "--out", tmp_path / "out")
+    assert "no jaw meshes" in refused(capsys, "jaw", "measure", tmp_path / "empty", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_a_prepared_jaw_keeps_labels_and_has_its_line(tmp_path, phantom_file):
-    run("prepare", phantom_file, "--tooth", 46, "--out", tmp_path / "cracked.ply", "crack", "--width-um", "200.0")
+    run(
+        "jaw", "prepare", phantom_file, "--tooth", 46, "--out", tmp_path / "cracked.ply", "crack", "--width-um", "200.0"
+    )
     cracked, sound = storage.read_jaw(tmp_path / "cracked.ply"), storage.read_jaw(phantom_file)
     assert cracked.teeth == sound.teeth
     assert set(cracked.landmarks) == set(sound.landmarks)
@@ -73,7 +75,7 @@ def test_a_prepared_jaw_keeps_labels_and_has_its_line(tmp_path, phantom_file):
 )
 def test_preparations_that_cannot_be(tmp_path, capsys, phantom_file, arguments, message):
     out = tmp_path / "prepared.ply"
-    assert message in refused(capsys, "prepare", phantom_file, "--out", out, *arguments)
+    assert message in refused(capsys, "jaw", "prepare", phantom_file, "--out", out, *arguments)
     assert not any(tmp_path.iterdir())
 
 
@@ -83,7 +85,7 @@ def test_preparations_that_cannot_be(tmp_path, capsys, phantom_file, arguments, 
     + [("--variation", -1.0), ("--tooth-size", 0.0)],
 )
 def test_phantoms_that_cannot_be(tmp_path, capsys, option, value):
-    assert option.removeprefix("--") in refused(capsys, "phantom", "--out", tmp_path / "jaw.ply", option, value)
+    assert option.removeprefix("--") in refused(capsys, "jaw", "phantom", "--out", tmp_path / "jaw.ply", option, value)
     assert not any(tmp_path.iterdir())
 
 
@@ -93,7 +95,9 @@ def test_a_jaw_that_is_no_manifold(tmp_path, capsys, coarse_phantom):
     labels = np.concatenate([coarse_phantom.face_labels, coarse_phantom.face_labels[:1]])
     broken = replace(coarse_phantom, mesh=Mesh(mesh.vertices, faces), face_labels=labels)
     storage.write_jaw(tmp_path / "jaw.ply", broken)
-    message = refused(capsys, "prepare", tmp_path / "jaw.ply", "--tooth", 46, "--out", tmp_path / "out.ply", "crack")
+    message = refused(
+        capsys, "jaw", "prepare", tmp_path / "jaw.ply", "--tooth", 46, "--out", tmp_path / "out.ply", "crack"
+    )
     assert "edge" in message
     assert not (tmp_path / "out.ply").exists()
 
@@ -104,29 +108,29 @@ def test_a_mean_needs_common_landmarks(tmp_path, capsys, coarse_phantom):
     for name, some in (("one", points[:20]), ("other", points[18:40])):
         bare = Jaw(mesh=coarse_phantom.mesh, arch="lower", landmarks=dict(some))
         storage.write_jaw(jaws / f"{name}.ply", bare)
-    message = refused(capsys, "shape", jaws, "--out", tmp_path / "shape")
+    message = refused(capsys, "jaw", "shape", jaws, "--out", tmp_path / "shape")
     assert "2 landmarks in common" in message
     assert not (tmp_path / "shape").exists()
 
 
 def test_a_box_needs_labels(tmp_path, capsys, coarse_phantom):
     storage.write_jaw(tmp_path / "bare.ply", replace(coarse_phantom, face_labels=None))
-    assert "label" in refused(capsys, "box", tmp_path / "bare.ply", "--out", tmp_path / "box.ply")
+    assert "label" in refused(capsys, "jaw", "box", tmp_path / "bare.ply", "--out", tmp_path / "box.ply")
     assert not (tmp_path / "box.ply").exists()
 
 
 def test_a_mouth_takes_the_size_of_a_handpiece(tmp_path, capsys):
     made = twelve_cameras()
     storage.write_handpiece(tmp_path / "handpiece.json", made)
-    run("mouth", "--handpiece", tmp_path / "handpiece.json", "--people", "50", "--out", tmp_path / "mouth")
+    run("jaw", "mouth", "--handpiece", tmp_path / "handpiece.json", "--people", "50", "--out", tmp_path / "mouth")
     needed = storage.read_json(tmp_path / "mouth" / "mouth.json")["needed_mm"]
     assert needed == pytest.approx(made.solid.bounds[1, 2])
     storage.write_handpiece(tmp_path / "bare.json", replace(made, body=None))
-    refusal = refused(capsys, "mouth", "--handpiece", tmp_path / "bare.json", "--out", tmp_path / "none")
+    refusal = refused(capsys, "jaw", "mouth", "--handpiece", tmp_path / "bare.json", "--out", tmp_path / "none")
     assert "bare.json: its body is not known" in refusal
     assert not (tmp_path / "none").exists()
 
 
 def test_a_mouth_that_cannot_be(tmp_path, capsys):
-    assert "--thickness-mm" in refused(capsys, "mouth", "--thickness-mm", "-1.0", "--out", tmp_path / "mouth")
+    assert "--thickness-mm" in refused(capsys, "jaw", "mouth", "--thickness-mm", "-1.0", "--out", tmp_path / "mouth")
     assert not (tmp_path / "mouth").exists()

@@ -22,45 +22,45 @@ def picture(seed: int, size: tuple[int, int] = (160, 120)) -> np.ndarray:
 
 
 def test_no_such_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    line = refused(capsys, "stitch", tmp_path / "nowhere", "--out", tmp_path / "out")
+    line = refused(capsys, "pano", "stitch", tmp_path / "nowhere", "--out", tmp_path / "out")
     assert "no such folder or video" in line
     assert not (tmp_path / "out").exists()
 
 
 def test_one_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_frames(tmp_path / "frames", map(picture, range(1)))
-    assert "1 image(s)" in refused(capsys, "stitch", folder, "--out", tmp_path / "out")
+    assert "1 image(s)" in refused(capsys, "pano", "stitch", folder, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_two_sizes_name_the_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_frames(tmp_path / "frames", map(picture, range(3)))
     storage.write_image(folder / "001.png", picture(1, (80, 120)))
-    line = refused(capsys, "stitch", folder, "--out", tmp_path / "out")
+    line = refused(capsys, "pano", "stitch", folder, "--out", tmp_path / "out")
     assert "001.png: 80 x 120 px, but most frames have 160 x 120 px" in line
 
 
 def test_frames_of_a_pixel_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_frames(tmp_path / "frames", [picture(seed)[:1, :1] for seed in range(3)])
-    assert "frames of 1 x 1 px" in refused(capsys, "stitch", tmp_path / "frames", "--out", tmp_path / "pan")
+    assert "frames of 1 x 1 px" in refused(capsys, "pano", "stitch", tmp_path / "frames", "--out", tmp_path / "pan")
     assert not (tmp_path / "pan").exists()
 
 
 def test_a_truncated_frame_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_frames(tmp_path / "frames", map(picture, range(3)))
     (folder / "002.png").write_bytes((folder / "002.png").read_bytes()[:-40])
-    assert "002.png: truncated" in refused(capsys, "stitch", folder, "--out", tmp_path / "out")
+    assert "002.png: truncated" in refused(capsys, "pano", "stitch", folder, "--out", tmp_path / "out")
 
 
 def test_something_that_is_no_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "film.mp4").write_bytes(b"not a film")
-    line = refused(capsys, "stitch", tmp_path / "film.mp4", "--out", tmp_path / "out")
+    line = refused(capsys, "pano", "stitch", tmp_path / "film.mp4", "--out", tmp_path / "out")
     assert "0 frame(s) could be decoded" in line
 
 
 def test_frames_without_overlap_leave_nothing_half_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_frames(tmp_path / "frames", map(picture, range(4)))
-    line = refused(capsys, "stitch", folder, "--out", tmp_path / "out")
+    line = refused(capsys, "pano", "stitch", folder, "--out", tmp_path / "out")
     assert "000 to 003" in line
     assert not (tmp_path / "out").exists()
 
@@ -127,5 +127,13 @@ def test_a_calibration_of_another_size_is_refused(tmp_path: Path, capsys: pytest
     for index in range(3):
         storage.write_image(tmp_path / "frames" / f"{index}.png", picture(index, (320, 240)))
     calibration = write_calibration(tmp_path, "json")
-    arguments = ["stitch", str(tmp_path / "frames"), "--out", str(tmp_path / "out"), "--calibration", str(calibration)]
+    arguments = [
+        "pano",
+        "stitch",
+        str(tmp_path / "frames"),
+        "--out",
+        str(tmp_path / "out"),
+        "--calibration",
+        str(calibration),
+    ]
     assert "calibration is for 160 x 120 px, but the frames are 320 x 240 px" in refused(capsys, *arguments)

@@ -231,7 +231,16 @@ def test_a_scan_is_simulated_reconstructed_and_evaluated(files, tmp_path):
 
 def test_the_verb_shows_what_is_done_without_scanning_again(files, tmp_path, capsys):
     out = tmp_path / "comparison"
-    compare = ["compare", "--jaws", str(files / "jaw.ply"), "--designs", str(files / "tiny.json"), "--turned", "tiny"]
+    compare = [
+        "study",
+        "compare",
+        "--jaws",
+        str(files / "jaw.ply"),
+        "--designs",
+        str(files / "tiny.json"),
+        "--turned",
+        "tiny",
+    ]
     compare += ["--out", str(out), "--turns"]
     storage.claim_folder(out, "simulate", {}, {})
     shares = {f"{name}_{what}_pct": 90.0 for name in ("tooth", "buccal") for what in ("seen", "within_50_um")}
@@ -261,7 +270,7 @@ def test_the_verb_shows_what_is_done_without_scanning_again(files, tmp_path, cap
     ],
 )
 def test_what_cannot_be_compared_is_refused_in_one_line(tmp_path, capsys, arguments, reason):
-    assert reason in refused(capsys, "compare", "--out", tmp_path / "out", *arguments, alone=True)
+    assert reason in refused(capsys, "study", "compare", "--out", tmp_path / "out", *arguments, alone=True)
     assert not (tmp_path / "out").exists()
 
 

@@ -85,10 +85,11 @@ def test_commands_are_found_wherever_they_stand(tmp_path, monkeypatch):
     monkeypatch.setattr("documents.ROOT", tmp_path)
     page = tmp_path / "page.md"
     page.write_text(
-        "Text `cuspid run --out a/` text, `cuspid run` text.\n\n    cuspid shape JAWS/ --out b/   # comment\n\n"
-        "<!-- not run: why -->\n```sh\n$ cuspid run \\\n    --out c/\nls\n```\n\n```sh\ncuspid optics\n```\n"
+        "Text `cuspid run --out a/` text, `cuspid run` text.\n\n    cuspid jaw shape JAWS/ --out b/   # comment\n\n"
+        "<!-- not run: why -->\n```sh\n$ cuspid run \\\n    --out c/\nls\n```\n\n```sh\ncuspid rig optics\n```\n"
     )
-    assert [" ".join(words) for _, words in commands(page)] == ["shape JAWS/ --out b/", "run --out c/", "optics"]
+    found = [" ".join(words) for _, words in commands(page)]
+    assert found == ["jaw shape JAWS/ --out b/", "run --out c/", "rig optics"]
     assert [" ".join(words) for _, words in mentions(page)] == ["run --out a/"]
     assert [block.run for block in blocks(page)] == [True, False, True]
 
@@ -170,23 +171,23 @@ def test_the_calibration_on_a_page_can_be_read(tmp_path):
 
 
 def test_every_verb_is_documented():
-    shown = {arguments[0] for page in pages() for _, arguments in commands(page)}
+    shown = {cli.split_verb(arguments)[0] for page in pages() for _, arguments in commands(page)}
     assert set(cli.COMMANDS) <= shown
 
 
 def test_the_command_line_has_a_page_for_every_verb(monkeypatch):
     command_pages = generator("command_pages", monkeypatch)
     found = command_pages.pages()
-    assert set(found) == {"index.rst", *(f"{verb}.rst" for verb in cli.COMMANDS)}
+    assert set(found) == {"index.rst", *(f"{verb.replace(' ', '-')}.rst" for verb in cli.COMMANDS)}
     for verb, command in cli.COMMANDS.items():
-        text = found[f"{verb}.rst"]
+        text = found[f"{verb.replace(' ', '-')}.rst"]
         assert f".. program:: cuspid {verb}" in text
         assert all(argument in text.replace("-", "_") for argument in own_options(command)), verb
-    assert ".. program:: cuspid prepare crown" in found["prepare.rst"]
-    assert ".. option:: --taper-deg FLOAT" in found["prepare.rst"]
+    assert ".. program:: cuspid jaw prepare crown" in found["jaw-prepare.rst"]
+    assert ".. option:: --taper-deg FLOAT" in found["jaw-prepare.rst"]
     assert all(command_pages.summary(command).endswith(".") for command in cli.COMMANDS.values())
-    assert "*(default: 46 41)*" in found["design.rst"]
-    assert "--noise.…" in found["design.rst"]
+    assert "*(default: 46 41)*" in found["rig-design.rst"]
+    assert "--noise.…" in found["rig-design.rst"]
 
 
 def own_options(command) -> list[str]:

@@ -85,5 +85,16 @@ def test_a_jaw_with_wrong_faces_is_loaded_as_the_right_one(tmp_path: Path, mesh:
 
 def test_views_of_a_mesh_say_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     storage.write_mesh(tmp_path / "wrong.stl", turned(CLOSED, np.ones(len(CLOSED.faces), dtype=bool)))
-    main(["stitch", "--mesh", str(tmp_path / "wrong.stl"), "--view.mm-per-px", "0.5", "--out", str(tmp_path / "out")])
+    main(
+        [
+            "pano",
+            "stitch",
+            "--mesh",
+            str(tmp_path / "wrong.stl"),
+            "--view.mm-per-px",
+            "0.5",
+            "--out",
+            str(tmp_path / "out"),
+        ]
+    )
     assert "all looked inwards" in " ".join(capsys.readouterr().err.split())

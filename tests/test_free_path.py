@@ -177,7 +177,7 @@ SMALL = ("--camera.width-px", "64", "--camera.height-px", "48", "--supersampling
 
 def test_film_writes_what_stitch_and_its_evaluation_read(coarse_phantom: Jaw, tmp_path: Path) -> None:
     storage.write_jaw(tmp_path / "jaw.ply", coarse_phantom)
-    main(["film", str(tmp_path / "jaw.ply"), "--out", str(tmp_path / "film"), "--video", *SMALL])
+    main(["pano", "film", str(tmp_path / "jaw.ply"), "--out", str(tmp_path / "film"), "--video", *SMALL])
     capture = storage.read_capture(tmp_path / "film" / "capture")
     truth = storage.read_truth(tmp_path / "film" / "truth")
     assert [frame.name for frame in capture.frames] == list(truth.rig_from_world) == ["00000", "00001", "00002"]
@@ -188,5 +188,5 @@ def test_film_writes_what_stitch_and_its_evaluation_read(coarse_phantom: Jaw, tm
 def test_a_refused_film_leaves_nothing(coarse_phantom: Jaw, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     storage.write_jaw(tmp_path / "jaw.ply", coarse_phantom)
     near = ("--clearance-mm", "60")
-    refused(capsys, "film", tmp_path / "jaw.ply", "--out", tmp_path / "film", *SMALL, *near)
+    refused(capsys, "pano", "film", tmp_path / "jaw.ply", "--out", tmp_path / "film", *SMALL, *near)
     assert not (tmp_path / "film").exists()

@@ -156,7 +156,9 @@ def test_measure_fails_where_nothing_was_measured(tmp_path: Path, capsys: pytest
     jaws = tmp_path / "jaws"
     jaws.mkdir()
     (jaws / "junk.stl").write_bytes(b"junk")
-    assert "none of the 1 jaws can be measured; junk: " in refused(capsys, "measure", jaws, "--out", tmp_path / "out")
+    assert "none of the 1 jaws can be measured; junk: " in refused(
+        capsys, "jaw", "measure", jaws, "--out", tmp_path / "out"
+    )
     assert not (tmp_path / "out").exists()
 
 
@@ -167,8 +169,8 @@ def test_jaws_of_one_name_are_told_apart_by_the_user(
     jaws.mkdir()
     for suffix in (".ply", ".stl"):
         shutil.copy(phantom_file, jaws / f"one{suffix}")
-    assert "has the same name" in refused(capsys, "measure", jaws, "--out", tmp_path / "out")
-    assert "has the same name" in refused(capsys, "shape", jaws, "--out", tmp_path / "out")
+    assert "has the same name" in refused(capsys, "jaw", "measure", jaws, "--out", tmp_path / "out")
+    assert "has the same name" in refused(capsys, "jaw", "shape", jaws, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

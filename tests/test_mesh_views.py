@@ -154,7 +154,7 @@ def test_a_scan_is_drawn_from_the_command_line(tmp_path: Path, capsys: pytest.Ca
     scan, out = tmp_path / "scan", tmp_path / "views"
     scan.mkdir()
     storage.write_mesh(scan / "mesh.ply", ridge())
-    run("stitch", "--mesh", scan, "--view.mm-per-px", 0.2, "--out", out)
+    run("pano", "stitch", "--mesh", scan, "--view.mm-per-px", 0.2, "--out", out)
     made = storage.read_panorama(out)
     assert made.method == "mesh"
     assert made.image[made.covered].max() > 150
@@ -166,9 +166,9 @@ def test_a_scan_is_drawn_from_the_command_line(tmp_path: Path, capsys: pytest.Ca
     for path in (*left, out / "mine.txt"):
         path.parent.mkdir(exist_ok=True)
         path.write_text("of an earlier run")
-    run("stitch", "--mesh", scan, "--view.mm-per-px", 0.4, "--out", out)
+    run("pano", "stitch", "--mesh", scan, "--view.mm-per-px", 0.4, "--out", out)
     assert not any(path.exists() for path in (*left, out / "part-2"))
     assert (out / "mine.txt").exists()
     for arguments in (["--mesh", scan, scan], []):
-        assert "either FRAMES or --mesh" in refused(capsys, "stitch", *arguments, "--out", tmp_path / "none")
+        assert "either FRAMES or --mesh" in refused(capsys, "pano", "stitch", *arguments, "--out", tmp_path / "none")
     assert not (tmp_path / "none").exists()

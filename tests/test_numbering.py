@@ -126,7 +126,7 @@ def test_the_verb_measures_the_right_teeth(tmp_path: Path, capsys: pytest.Captur
     """Labels 1-14 of a lower jaw were measured as upper teeth from 12 to 24."""
     labels = replaced(LOWER.face_labels, ALONG)
     storage.write_mesh(tmp_path / name, LOWER.mesh.transformed(any_pose(0, 40)), labels)
-    arguments = ["measure", str(tmp_path / name), "--out", str(tmp_path / "out")]
+    arguments = ["jaw", "measure", str(tmp_path / name), "--out", str(tmp_path / "out")]
     if name == "jaw.ply":
         with pytest.raises(SystemExit):
             main(arguments)

@@ -88,9 +88,11 @@ def test_every_number_of_a_verb_has_a_range(verb: Callable[..., object]) -> None
 def test_a_verb_checks_its_numbers_first(tmp_path, capsys: pytest.CaptureFixture[str]) -> None:
     """Before anything is read or written."""
     with pytest.raises(SystemExit) as status:
-        main(["compare", "--supersampling", "0", "--out", str(tmp_path / "out")])
+        main(["study", "compare", "--supersampling", "0", "--out", str(tmp_path / "out")])
     assert status.value.code == 1
-    assert capsys.readouterr().err.strip() == "cuspid: compare: --supersampling is 0; it must lie between 1 and 16"
+    assert (
+        capsys.readouterr().err.strip() == "cuspid: study compare: --supersampling is 0; it must lie between 1 and 16"
+    )
     assert not (tmp_path / "out").exists()
 
 

@@ -380,7 +380,7 @@ def test_stitch_eval_writes_its_figures_and_refuses_what_it_cannot_judge(
 ) -> None:
     truth = write_truth(known, tmp_path)
     storage.write_panorama(tmp_path / "pano", known.panorama)
-    main(["stitch-eval", str(tmp_path / "pano"), str(truth), "--out", str(tmp_path / "score")])
+    main(["pano", "evaluate", str(tmp_path / "pano"), str(truth), "--out", str(tmp_path / "score")])
     written = json.loads((tmp_path / "score" / "score.json").read_text())
     assert written["geometry"]["median_mm"] < 1e-3
     assert set(written["trivial"]) == {"empty", "grey canvas", "grey jaw", "truth shifted by 1 mm"}
@@ -389,7 +389,7 @@ def test_stitch_eval_writes_its_figures_and_refuses_what_it_cannot_judge(
     (tmp_path / "notes.png").write_text("hello")
     for wrong in (tmp_path / "missing", tmp_path / "notes.png"):
         with pytest.raises(SystemExit, match="1"):
-            main(["stitch-eval", str(wrong), str(truth), "--out", str(tmp_path / "none")])
+            main(["pano", "evaluate", str(wrong), str(truth), "--out", str(tmp_path / "none")])
         assert not (tmp_path / "none").exists()
 
 
@@ -397,7 +397,7 @@ def test_a_picture_of_another_program_is_laid_over_by_its_features(known: Known,
     truth = write_truth(known, tmp_path)
     turned = moved(known.panorama, 30.0, 1.0, np.zeros(2)).image
     storage.write_image(tmp_path / "other.png", turned)
-    main(["stitch-eval", str(tmp_path / "other.png"), str(truth), "--out", str(tmp_path / "score")])
+    main(["pano", "evaluate", str(tmp_path / "other.png"), str(truth), "--out", str(tmp_path / "score")])
     written = json.loads((tmp_path / "score" / "score.json").read_text())
     assert written["aligned_by"] == "pictures"
     assert written["geometry"] is None
@@ -413,7 +413,7 @@ def test_a_picture_that_lies_on_one_place_failed(
     storage.write_image(tmp_path / "other.png", known.panorama.image)
     onto_one_place = Similarity2(scale * np.eye(2), np.zeros(2))
     monkeypatch.setattr(evaluation, "align_by_pictures", lambda *_: onto_one_place)
-    main(["stitch-eval", str(tmp_path / "other.png"), str(truth), "--out", str(tmp_path / "score")])
+    main(["pano", "evaluate", str(tmp_path / "other.png"), str(truth), "--out", str(tmp_path / "score")])
     written = json.loads((tmp_path / "score" / "score.json").read_text())
     assert "the whole picture lies on" in written["failure"]
     assert written["picture"] is None

@@ -233,10 +233,10 @@ def test_a_body_without_modules_is_refused():
 
 
 def test_a_handpiece_of_a_file_gets_its_holder_and_its_body(tmp_path, capsys):
-    run("handpiece", "--design", "two", "--out", tmp_path / "drawn")
+    run("rig", "build", "--design", "two", "--out", tmp_path / "drawn")
     drawn = tmp_path / "drawn" / "handpiece.json"
     out, body = tmp_path / "probe", tmp_path / "probe" / "holder.stl"
-    run("handpiece", "--handpiece", drawn, "--out", out, "--body", body, "--mouth-opening-mm", 12)
+    run("rig", "build", "--handpiece", drawn, "--out", out, "--body", body, "--mouth-opening-mm", 12)
     said = capsys.readouterr().err
     assert "thinnest wall 0.80 mm" in " ".join(said.split())
     written = trimesh.load_mesh(body)
@@ -247,7 +247,7 @@ def test_a_handpiece_of_a_file_gets_its_holder_and_its_body(tmp_path, capsys):
 
 
 def test_the_command_says_what_is_wrong_and_writes_nothing(tmp_path, capsys):
-    command = ("handpiece", "--design", "four", "--out", tmp_path / "probe")
+    command = ("rig", "build", "--design", "four", "--out", tmp_path / "probe")
     body = tmp_path / "holder.stl"
     assert "less than --web-mm" in refused(capsys, *command, "--body", body, "--web-mm", 0.3)
     assert "--body must end in" in refused(capsys, *command, "--body", tmp_path / "holder.step")

@@ -40,7 +40,7 @@ def test_it_ends_at_once_and_without_a_trace_of_where_it_was(tmp_path: Path, how
 def test_an_interrupt_that_is_passed_over_stays_so(tmp_path: Path) -> None:
     """As a shell has it for what runs in the background."""
     begun = subprocess.Popen(
-        [*CUSPID, "optics", "--out", str(tmp_path / "optics.csv")],
+        [*CUSPID, "rig", "optics", "--out", str(tmp_path / "optics.csv")],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),

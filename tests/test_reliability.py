@@ -49,7 +49,7 @@ def test_a_damaged_strip_is_told_before_anything_is_written(tmp_path: Path, caps
     (tmp_path / "panorama" / "strip.json").write_text('{"mm_per_px": 0.05, "width_px": 4}')
     (tmp_path / "panorama" / "strip.csv").write_text("column,along,x,y\n")
     (tmp_path / "panorama" / "strip.png").write_bytes(b"\x89PNG no picture")
-    asked = ("rescale", tmp_path / "panorama", "--distance", 3, 4, 36, 22, 47.5, "--out", tmp_path / "out")
+    asked = ("pano", "rescale", tmp_path / "panorama", "--distance", 3, 4, 36, 22, 47.5, "--out", tmp_path / "out")
     assert "strip.png" in refused(capsys, *asked)
     assert not (tmp_path / "out").exists()
 
@@ -57,7 +57,7 @@ def test_a_damaged_strip_is_told_before_anything_is_written(tmp_path: Path, caps
 @pytest.mark.skipif(os.geteuid() == 0, reason="nothing is closed to root")
 def test_a_folder_that_may_not_be_entered_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "closed").mkdir(mode=0)
-    assert "closed" in refused(capsys, "stitch", tmp_path / "closed", "--out", tmp_path / "out")
+    assert "closed" in refused(capsys, "pano", "stitch", tmp_path / "closed", "--out", tmp_path / "out")
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def test_what_the_system_refuses_is_one_line(
         raise error
 
     monkeypatch.setattr(cli, "_run", fail)
-    assert said in refused(capsys, "optics", alone=True)
+    assert said in refused(capsys, "rig", "optics", alone=True)
 
 
 def test_what_failed_leaves_no_trace(tmp_path: Path) -> None:
@@ -145,7 +145,7 @@ def test_kernels_work_where_nothing_can_be_kept(monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.parametrize("encoding", ["latin-1", "cp437", "cp850", "ascii"])
 def test_any_terminal_shows_tables(tmp_path: Path, encoding: str) -> None:
     said = subprocess.run(
-        [sys.executable, "-m", "cuspid", "optics"],
+        [sys.executable, "-m", "cuspid", "rig", "optics"],
         env={**os.environ, "PYTHONIOENCODING": encoding},
         capture_output=True,
         check=True,
@@ -156,7 +156,7 @@ def test_any_terminal_shows_tables(tmp_path: Path, encoding: str) -> None:
 
 @pytest.mark.parametrize("how", [">&-", "> /dev/full", ">&- 2>&-"])
 def test_output_may_go_nowhere(tmp_path: Path, how: str) -> None:
-    command = f"{sys.executable} -m cuspid optics --out {tmp_path / 'table.csv'} {how}"
+    command = f"{sys.executable} -m cuspid rig optics --out {tmp_path / 'table.csv'} {how}"
     said = subprocess.run(["/bin/sh", "-c", command], capture_output=True, check=False)
     assert (tmp_path / "table.csv").exists()
     assert b"Traceback" not in said.stderr
@@ -197,8 +197,8 @@ def test_what_a_writer_writes_a_reader_reads(tmp_path: Path) -> None:
 def test_cameras_at_one_place_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     there = replace(handpiece("a", "b"), rig=rig_of(a=shifted(1.0), b=shifted(1.0)))
     storage.write_handpiece(tmp_path / "handpiece.json", there)
-    for verb in ("simulate", "visibility"):
-        said = refused(capsys, verb, "--handpiece", tmp_path / "handpiece.json", "--out", tmp_path / "out")
+    for verb in (["simulate"], ["rig", "visibility"]):
+        said = refused(capsys, *verb, "--handpiece", tmp_path / "handpiece.json", "--out", tmp_path / "out")
         assert "all 2 cameras are at one place" in said
     assert not (tmp_path / "out").exists()
 
@@ -224,7 +224,7 @@ def test_files_of_another_kind_are_not_written_over(tmp_path: Path, capsys: pyte
     storage.write_mesh(mesh, box_mesh())
     before = mesh.read_bytes()
     assert "ends in .html or .htm" in refused(capsys, "report", tmp_path, "--out", mesh)
-    assert "ends in .csv" in refused(capsys, "optics", "--out", mesh)
-    assert "no jaw that cuspid wrote" in refused(capsys, "phantom", "--edge-mm", 2, "--out", mesh)
+    assert "ends in .csv" in refused(capsys, "rig", "optics", "--out", mesh)
+    assert "no jaw that cuspid wrote" in refused(capsys, "jaw", "phantom", "--edge-mm", 2, "--out", mesh)
     assert mesh.read_bytes() == before
-    run("optics", "--out", tmp_path / "table.csv")
+    run("rig", "optics", "--out", tmp_path / "table.csv")

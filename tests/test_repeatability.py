@@ -234,5 +234,5 @@ def test_bad_input_of_repeat(tmp_path, capsys, phantom_file):
         (["--tooth", "46", "--seed", "-1"], "--seed is -1"),
         (["--tooth", "46", "--scans", "3", "--farthest-mm", "0"], "--farthest-mm"),
     ):
-        assert message in refused(capsys, "repeat", phantom_file, *arguments, "--out", tmp_path / "out")
+        assert message in refused(capsys, "study", "repeat", phantom_file, *arguments, "--out", tmp_path / "out")
         assert not (tmp_path / "out").exists()

@@ -411,7 +411,7 @@ def test_the_pages_of_a_panorama_and_its_score(tmp_path):
     assert page.count('class="zoomed"') == 2
     assert "seen from a height" not in page, "there is no such picture in this folder"
     (tmp_path / "score" / "made.png").unlink()
-    assert "run cuspid stitch-eval again" in report_page(storage.read_result(tmp_path / "score"))
+    assert "run cuspid pano evaluate again" in report_page(storage.read_result(tmp_path / "score"))
 
 
 def test_the_page_of_a_calibration(tmp_path):

@@ -379,7 +379,7 @@ def test_two_clicks_on_a_panorama_measure_and_tell_how_to_scale_it(browser, tmp_
     mm = shown.mm_per_px * np.hypot(0.6 * width, 0.4 * height)
     told = output.inner_text()
     assert float(told.split(" mm")[0]) == pytest.approx(mm, rel=0.02)
-    command = re.search(r"cuspid rescale 'pano 1' --distance ([\d. ]+) MM --out 'pano 1-mm'", told)
+    command = re.search(r"cuspid pano rescale 'pano 1' --distance ([\d. ]+) MM --out 'pano 1-mm'", told)
     pixels = np.array(command[1].split(), float).reshape(2, 2)
     np.testing.assert_allclose(pixels, [[0.2 * width, 0.3 * height], [0.8 * width, 0.7 * height]], atol=3)
     placed = np.array(page.evaluate(PLACED))

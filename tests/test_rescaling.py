@@ -156,7 +156,7 @@ def test_the_scale_of_a_film_becomes_true(coarse_phantom: Jaw) -> None:
 
 
 def write(folder: Path, shown: Panorama) -> dict[str, Rigid3]:
-    """As ``cuspid stitch`` leaves it."""
+    """As ``cuspid pano stitch`` leaves it."""
     poses = {"a": Rigid3.from_rotation_vector(np.array([3.0, 0.1, 0]), np.array([1.0, 2.0, 14.0]))}
     storage.claim_folder(folder, "stitch", {}, {})
     storage.write_poses(folder / "poses.json", poses)
@@ -179,7 +179,7 @@ def test_all_files_are_of_the_new_scale(tmp_path: Path, mm_per_px: float | None)
     poses = write(folder, shown)
     (u, v), (w, x) = FAR
     mm = 1.5 * apart(shown, np.array(FAR))
-    run("rescale", folder, "--out", out, "--distance", u, v, w, x, mm)
+    run("pano", "rescale", folder, "--out", out, "--distance", u, v, w, x, mm)
     made = storage.read_panorama(out)
     assert made.mm_per_px == pytest.approx(1.5 * (mm_per_px or 1))
     np.testing.assert_allclose(made.height_mm, 1.5 * shown.height_mm, rtol=1e-5)
@@ -203,16 +203,16 @@ def test_all_files_are_of_the_new_scale(tmp_path: Path, mm_per_px: float | None)
 def test_several_distances_are_given_one_after_the_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write(tmp_path / "pano", panorama())
     measured = ("--distance", 3, 4, 36, 22, 40.0, "--distance", 20, 3, 22, 27, 20.0)
-    run("rescale", tmp_path / "pano", "--out", tmp_path / "out", *measured)
+    run("pano", "rescale", tmp_path / "pano", "--out", tmp_path / "out", *measured)
     assert len(json.loads((tmp_path / "out" / "distances.json").read_text())["distances"]) == 2
     assert "look whether the places" in capsys.readouterr().err.replace("\n", " ")
 
 
 def test_the_page_of_a_killed_run_names_its_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write(tmp_path / "pano", panorama())
-    run("rescale", tmp_path / "pano", "--out", tmp_path / "out", "--distance", 3, 4, 36, 22, 40.0)
+    run("pano", "rescale", tmp_path / "pano", "--out", tmp_path / "out", "--distance", 3, 4, 36, 22, 40.0)
     (tmp_path / "out" / "panorama.json").unlink()
-    assert "run the same cuspid rescale command again" in refused(capsys, "report", tmp_path / "out")
+    assert "run the same command again" in refused(capsys, "report", tmp_path / "out")
 
 
 @pytest.mark.parametrize(
@@ -229,7 +229,7 @@ def test_what_cannot_be_measured_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], given: tuple[object, ...], told: str
 ) -> None:
     write(tmp_path / "pano", panorama())
-    assert told in refused(capsys, "rescale", tmp_path / "pano", "--out", tmp_path / "out", *given)
+    assert told in refused(capsys, "pano", "rescale", tmp_path / "pano", "--out", tmp_path / "out", *given)
     assert not (tmp_path / "out").exists()
 
 
@@ -237,12 +237,18 @@ def test_the_panorama_itself_parts_and_meshes_are_refused(tmp_path: Path, capsys
     measured = ("--distance", 3, 3, 20, 20, 5)
     write(tmp_path / "pano", panorama())
     before = (tmp_path / "pano" / "panorama.json").read_bytes()
-    assert "the panorama itself" in refused(capsys, "rescale", tmp_path / "pano", "--out", tmp_path / "pano", *measured)
+    assert "the panorama itself" in refused(
+        capsys, "pano", "rescale", tmp_path / "pano", "--out", tmp_path / "pano", *measured
+    )
     assert (tmp_path / "pano" / "panorama.json").read_bytes() == before
     write(tmp_path / "parts" / "part-1", panorama())
-    assert "parts/part-1" in refused(capsys, "rescale", tmp_path / "parts", "--out", tmp_path / "out", *measured)
+    assert "parts/part-1" in refused(
+        capsys, "pano", "rescale", tmp_path / "parts", "--out", tmp_path / "out", *measured
+    )
     write(tmp_path / "mesh", replace(panorama(), method="mesh"))
-    assert "view of a mesh" in refused(capsys, "rescale", tmp_path / "mesh", "--out", tmp_path / "out", *measured)
+    assert "view of a mesh" in refused(
+        capsys, "pano", "rescale", tmp_path / "mesh", "--out", tmp_path / "out", *measured
+    )
     assert not (tmp_path / "out").exists()
 
 
@@ -250,7 +256,9 @@ def test_the_panorama_itself_parts_and_meshes_are_refused(tmp_path: Path, capsys
 def test_a_damaged_file_leaves_nothing_behind(tmp_path: Path, capsys: pytest.CaptureFixture[str], file: str) -> None:
     write(tmp_path / "pano", panorama())
     (tmp_path / "pano" / file).write_bytes(b"column,along\n1")
-    line = refused(capsys, "rescale", tmp_path / "pano", "--out", tmp_path / "out", "--distance", 3, 3, 20, 20, 5)
+    line = refused(
+        capsys, "pano", "rescale", tmp_path / "pano", "--out", tmp_path / "out", "--distance", 3, 3, 20, 20, 5
+    )
     assert file in line
     assert not (tmp_path / "out").exists()
 
@@ -261,12 +269,12 @@ def test_no_panorama_is_overwritten_and_nothing_of_an_earlier_one_stays(
     measured = ("--distance", 3, 3, 20, 20, 5)
     for name in ("pano", "other"):
         write(tmp_path / name, panorama())
-    line = refused(capsys, "rescale", tmp_path / "pano", "--out", tmp_path / "other", *measured)
-    assert "other: holds a panorama of cuspid stitch" in line
-    run("rescale", tmp_path / "pano", "--out", tmp_path / "out", *measured)
+    line = refused(capsys, "pano", "rescale", tmp_path / "pano", "--out", tmp_path / "other", *measured)
+    assert "other: holds a panorama of cuspid pano stitch" in line
+    run("pano", "rescale", tmp_path / "pano", "--out", tmp_path / "out", *measured)
     for file in ("strip.json", "poses.json"):
         (tmp_path / "other" / file).unlink()
-    run("rescale", tmp_path / "other", "--out", tmp_path / "out", *measured)
+    run("pano", "rescale", tmp_path / "other", "--out", tmp_path / "out", *measured)
     assert not any((tmp_path / "out" / file).exists() for file in ("strip.png", "poses.json", "camera_path.png"))
     clear(tmp_path / "out")
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"run.json", "report.html"}

@@ -52,7 +52,7 @@ def left_over(found: np.ndarray, true: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def pano(film: tuple[Capture, GroundTruth], tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("stitched") / "pano"
-    run("stitch", film[0].source.folder, "--out", out)
+    run("pano", "stitch", film[0].source.folder, "--out", out)
     return out
 
 
@@ -132,7 +132,9 @@ def test_the_scale_is_that_of_the_handpiece_and_nothing_else(
     assert any("of the handpiece" in note and "camera left" in note for note in panorama.notes)
     assert sum(frame.used for frame in panorama.frames) == FRAMES
     for wrong in (["--scale.width-mm", 60], ["--method", "thesis"]):
-        assert wrong[0].split(".")[0] in refused(capsys, "stitch", film[0].source.folder, *wrong, "--out", tmp_path)
+        assert wrong[0].split(".")[0] in refused(
+            capsys, "pano", "stitch", film[0].source.folder, *wrong, "--out", tmp_path
+        )
     assert not (tmp_path / "panorama.json").exists()
 
 

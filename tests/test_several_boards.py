@@ -287,10 +287,10 @@ def test_boards_are_said_once_and_drawn_each(tmp_path: Path, capsys: pytest.Capt
     file.write_text(
         "boards:\n- {columns: 5, rows: 4, square_mm: 3}\n- {kind: aprilgrid, columns: 2, rows: 2, square_mm: 8}\n"
     )
-    run("target", "--board", file, "--out", out)
+    run("rig", "target", "--board", file, "--out", out)
     assert sorted(path.name for path in tmp_path.glob("*.svg")) == ["board-1.svg", "board-2.svg"]
     assert "--board describes the board; leave out its other options" in refused(
-        capsys, "target", "--board", file, "--columns", 4, "--out", out
+        capsys, "rig", "target", "--board", file, "--columns", 4, "--out", out
     )
     (tmp_path / "images" / "left").mkdir(parents=True)
     storage.write_image(tmp_path / "images" / "left" / "0.png", np.zeros((32, 32, 3), np.uint8))

@@ -179,10 +179,10 @@ def test_a_video_is_stitched_from_the_command_line_and_its_folder_takes_no_other
         return tmp_path / name
 
     command = ["--calibration", str(film[0].source.folder / "handpiece.json"), "--out", str(tmp_path / "out")]
-    main(["stitch", str(video("whole.avi", range(8))), *command])
+    main(["pano", "stitch", str(video("whole.avi", range(8))), *command])
     panorama = storage.read_panorama(tmp_path / "out")
     assert [frame.name for frame in panorama.frames if frame.used] == [f"{n:05d}" for n in range(8)]
-    assert "another run of 'decode'" in refused(capsys, "stitch", video("other.avi", range(4, 12)), *command)
+    assert "another run of 'decode'" in refused(capsys, "pano", "stitch", video("other.avi", range(4, 12)), *command)
 
 
 def test_one_camera_without_a_calibration_finds_its_focal_length(sequence: ImageSequence) -> None:

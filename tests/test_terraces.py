@@ -45,7 +45,7 @@ def test_corners_are_as_high_as_their_terrace(columns, terraces, begin):
 
 
 def test_the_body_is_closed_and_as_large_as_its_terraces(tmp_path):
-    run("target", "--out", tmp_path / "target.stl", *options(SMALL), "--terraces", 3, "--step-mm", 1)
+    run("rig", "target", "--out", tmp_path / "target.stl", *options(SMALL), "--terraces", 3, "--step-mm", 1)
     assert (tmp_path / "target.stl").stat().st_size == 84 + 50 * len(target_body(SMALL).faces)  # binary
     body = trimesh.load_mesh(tmp_path / "target.stl")
     assert body.is_watertight
@@ -69,7 +69,7 @@ def test_the_body_stays_closed_in_a_file(tmp_path, square_mm, step_mm):
 def test_the_strip_folds_onto_the_terraces(tmp_path, inverted):
     """Each place on it has the ink of the board there; risers are blank; its length is that of terraces and risers."""
     board = Board(columns=6, rows=4, square_mm=3.0, terraces=2, step_mm=2.0, inverted=inverted)
-    run("target", "--out", tmp_path / "strip.png", *options(board), "--terraces", 2, "--step-mm", 2)
+    run("rig", "target", "--out", tmp_path / "strip.png", *options(board), "--terraces", 2, "--step-mm", 2)
     gray = cv2.imread(str(tmp_path / "strip.png"), cv2.IMREAD_GRAYSCALE)
     px_per_mm, margin = 600 / 25.4, 5.0
     assert abs(gray.shape[1] - px_per_mm * (18 + 2 + 2 * margin)) <= 1
@@ -98,7 +98,7 @@ def test_what_cannot_be_built_is_refused(given, told):
 
 def test_steps_that_reach_the_cameras_are_one_line(tmp_path, capsys):
     storage.write_handpiece(tmp_path / "four.json", essential_four())
-    tall = ("photograph", tmp_path / "four.json", "--out", tmp_path / "out", "--terraces", 3, "--step-mm", 2)
+    tall = ("rig", "photograph", tmp_path / "four.json", "--out", tmp_path / "out", "--terraces", 3, "--step-mm", 2)
     assert "the last terrace is 4 mm above the first, which is too close to the cameras" in refused(capsys, *tall)
     assert not (tmp_path / "out").exists()
 
@@ -223,7 +223,7 @@ def test_photographs_of_terraces_become_a_handpiece(tmp_path):
     board = (*options(SMALL), "--terraces", 3, "--step-mm", 1, "--step-sigma-um", 1)
     storage.write_handpiece(tmp_path / "four.json", essential_four(DesignOptions(width_px=240, height_px=240)))
     run(
-        *("photograph", tmp_path / "four.json", "--out", tmp_path / "photos", *board, "--instants", 12),
+        *("rig", "photograph", tmp_path / "four.json", "--out", tmp_path / "photos", *board, "--instants", 12),
         *("--supersampling", 2, "--manufacturing-um", 30, "--manufacturing-deg", 0.3, "--manufacturing-focal-pct", 1),
     )
     run("calibrate", tmp_path / "photos", "--out", tmp_path / "rig", *board, "--working-distance-mm", 5)

@@ -81,7 +81,7 @@ def test_evaluate_compares_sizes_first(
     both = ("evaluate", wrong, right, "--unit", "m", "--out", out) if unit == "m" else ()
     if both:
         assert "--reference-unit mm" in refused(capsys, *both)
-    assert f"give --unit {unit}" in refused(capsys, "stitch", "--mesh", wrong, "--out", out)
+    assert f"give --unit {unit}" in refused(capsys, "pano", "stitch", "--mesh", wrong, "--out", out)
     assert not out.exists()
 
 

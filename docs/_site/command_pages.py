@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 from _site.docstrings import escaped
-from _site.writing import heading, listed, write_pages
+from _site.writing import file_name, heading, listed, write_pages
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -30,15 +30,18 @@ def pages() -> dict[str, str]:
     """The text of each page by its file name."""
     from cuspid.cli import COMMANDS
 
-    found = {f"{verb}.rst": _page(verb, parser(command)) for verb, command in COMMANDS.items()}
+    found = {f"{file_name(verb)}.rst": _page(verb, parser(command)) for verb, command in COMMANDS.items()}
     return {"index.rst": _index({verb: summary(command) for verb, command in COMMANDS.items()}), **found}
 
 
 def parser(command: Any) -> argparse.ArgumentParser:
     """The parser of one verb. tyro calls this way of getting it deprecated but offers no other that is public."""
+    from cuspid.cli.usage import described
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
-        return tyro.extras.get_parser(command)
+        shown, registry = described(command)
+        return tyro.extras.get_parser(shown, registry=registry)
 
 
 def summary(command: Any) -> str:
@@ -48,7 +51,7 @@ def summary(command: Any) -> str:
 
 
 def _index(verbs: Mapping[str, str]) -> str:
-    intro = "Every verb of ``cuspid`` with all its options, as ``cuspid VERB --help`` tells them."
+    intro = "Every verb of ``cuspid`` with all its options, as ``cuspid VERB --help-all`` tells them."
     return "\n".join([heading("Command line", "="), intro, "", *listed(verbs, "cuspid ")])
 
 

@@ -26,7 +26,13 @@ def heading(text: str, underline: str) -> str:
 
 
 def listed(pages: Mapping[str, str], prefix: str = "") -> Iterator[str]:
-    """A list of pages in the same folder with what they are about."""
-    yield from (".. toctree::", "   :hidden:", "", *(f"   {prefix}{name} <{name}>" for name in pages), "")
-    for name, about in pages.items():
-        yield from (f":doc:`{prefix}{name} <{name}>`", f"   {escaped(about)}", "")
+    """A list of pages in the same folder with what they are about; spaces are hyphens in the names of the files."""
+    links = {f"{prefix}{name} <{file_name(name)}>": about for name, about in pages.items()}
+    yield from (".. toctree::", "   :hidden:", "", *(f"   {link}" for link in links), "")
+    for link, about in links.items():
+        yield from (f":doc:`{link}`", f"   {escaped(about)}", "")
+
+
+def file_name(title: str) -> str:
+    """Of the page of a verb or a module, without its ending."""
+    return title.replace(" ", "-")

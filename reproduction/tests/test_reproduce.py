@@ -404,7 +404,7 @@ def test_a_run_that_fails_is_named_and_left_to_be_tried_again(tmp_path):
 def test_what_cannot_be_stitched_is_a_result_and_the_next_method_is_tried(tmp_path, monkeypatch):
     def pretend(*arguments: str, log: Path) -> dict[str, float]:
         if arguments[0] == "stitch" and "ortho" in arguments:
-            raise CuspidError("cuspid stitch failed with status 1: no frame could be placed")
+            raise CuspidError("cuspid pano stitch failed with status 1: no frame could be placed")
         if arguments[0] == "stitch-eval":
             storage.write_json(Path(arguments[-1]) / "score.json", panorama("x")["score"])
         return {"wall_s": 1.0, "cpu_s": 1.0, "peak_gib": 1.0}

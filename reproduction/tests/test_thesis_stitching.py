@@ -355,17 +355,17 @@ def test_the_verb_writes_a_panorama_and_its_help_holds_the_patent_notice(
     wall: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = write_frames(tmp_path / "frames", [cut(wall, shift) for shift in SHIFTS[:2]])
-    cli.main(["stitch", str(folder), "--method", "thesis", "--no-examination", "--out", str(tmp_path / "pano")])
+    cli.main(["pano", "stitch", str(folder), "--method", "thesis", "--no-examination", "--out", str(tmp_path / "pano")])
     panorama = storage.read_panorama(tmp_path / "pano")
     assert panorama.method == "thesis"
     assert not (tmp_path / "pano" / "poses.json").exists()
     with pytest.raises(SystemExit):
-        cli.main(["stitch", "--help"])
+        cli.main(["pano", "stitch", "--help"])
     printed = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "11,044,400" in printed
 
 
 def test_the_verb_refuses_black_frames_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_frames(tmp_path / "frames", [np.zeros((180, 240, 3), np.uint8)] * 2)
-    refused(capsys, "stitch", folder, "--method", "thesis", "--out", tmp_path / "pano")
+    refused(capsys, "pano", "stitch", folder, "--method", "thesis", "--out", tmp_path / "pano")
     assert not (tmp_path / "pano" / "panorama.png").exists()

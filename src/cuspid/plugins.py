@@ -1,6 +1,6 @@
 """What other distributions add to cuspid through entry points.
 
-``cuspid.verbs``: functions that become verbs of the command line. ``cuspid.stitching``: methods of ``cuspid stitch``,
+``cuspid.verbs``: functions that become verbs of the command line. ``cuspid.stitching``: methods of ``pano stitch``,
 ``method(sequence, *, examination, progress) -> tuple[Panorama, ...]``.
 """
 

@@ -9,6 +9,7 @@ from cuspid_thesis.judging import Finding
 from cuspid_thesis.page_format import Entry, FigureRow, Page
 from cuspid_thesis.results import PANORAMA, Result, Results, looking
 from cuspid_thesis.rules import FAVOUR, Comparison, Figure, Verdict
+from cuspid_thesis.scan_cases import with_todays_verb
 
 TITLE = "The thesis, reproduced"
 WORDS: dict[Verdict, str] = {
@@ -158,7 +159,7 @@ def conditions(name: str, result: Result) -> str:
         commands = result.get("commands") or ([result["command"]] if result.get("command") else [])
         made = [
             "quick" if result.get("quick") else "",
-            *(f"`{command}`" for command in commands),
+            *(f"`{with_todays_verb(command)}`" for command in commands),
             f"commit {result['commit']}" if result.get("commit") else "",
             f"cuspid {result['versions']['cuspid']}" if "versions" in result else "",
             f"Python {result['python']}" if "python" in result else "",

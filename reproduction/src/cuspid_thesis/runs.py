@@ -174,7 +174,7 @@ def _camera_sweep(task: Task) -> Iterator[tuple[str, Result]]:
 def sweep_arguments(surface: str, repeats: int) -> tuple[str, ...]:
     """Of ``cuspid``, without folder and workers."""
     tooth = str(SweepOptions(surface=surface).chosen_tooth)
-    return ("sweep", "--surface", surface, "--tooth", tooth, "--repeats", str(repeats))
+    return ("study", "sweep", "--surface", surface, "--tooth", tooth, "--repeats", str(repeats))
 
 
 def sweep_result(out: Path, arguments: Sequence[str]) -> dict[str, object]:
@@ -203,7 +203,17 @@ def _compact(row: Mapping[str, str]) -> dict[str, object]:
 def _design_comparison(task: Task) -> Iterator[tuple[str, Result]]:
     less = ("--jaws", "phantom", "--turns", "1", "3", "--image-scale", "0.3", "--edge-mm", "0.4")
     all_of_it = ("--jaws", "phantom", "boxed-mean", "--turns", "1", "3", "5", "--image-scale", "0.5")
-    arguments = ("compare", "--designs", "twelve", "six", "four", "--tooth", "46", *(less if task.quick else all_of_it))
+    arguments = (
+        "study",
+        "compare",
+        "--designs",
+        "twelve",
+        "six",
+        "four",
+        "--tooth",
+        "46",
+        *(less if task.quick else all_of_it),
+    )
     run_timed(*arguments, "--out", str(task.work), "--workers", str(usable_cores()), log=task.log)
     task.keep(task.work / "comparison.png", "design-comparison.png")
     found = storage.read_json(task.work / "comparison.json")
@@ -238,7 +248,7 @@ METHODS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         UNEXAMINED: ("--method", "thesis", "--no-examination"),
     }
 )
-"""Arguments of ``cuspid stitch`` by the names of the methods."""
+"""Arguments of ``cuspid pano stitch`` by the names of the methods."""
 EDGE_MM = 0.25
 """Edge of the subjects' faces."""
 
@@ -265,7 +275,7 @@ def _panoramas(task: Task) -> Iterator[tuple[str, Result]]:
     if not jaw.with_suffix(".json").exists():
         storage.write_jaw(jaw, build_phantom(subjects()[subject]))
     numbers = ("--seed", str(seed), "--supersampling", "1")
-    run_timed("film", str(jaw), "--out", str(film), *numbers, log=task.log)
+    run_timed("pano", "film", str(jaw), "--out", str(film), *numbers, log=task.log)
     for name in task.wanted:
         method = name.removeprefix(f"{PANORAMA}{subject}-")
         yield name, _stitched(task, film, subject, method)
@@ -274,14 +284,14 @@ def _panoramas(task: Task) -> Iterator[tuple[str, Result]]:
 def _stitched(task: Task, film: Path, subject: str, method: str) -> dict[str, object]:
     """A panorama of a film, evaluated; in parts, the largest one. What cannot be stitched is a result, too."""
     out, score = task.work / method, task.work / f"{method}-score"
-    command = " ".join(("cuspid", "stitch", "film/capture", *METHODS[method], "--out", method))
+    command = " ".join(("cuspid", "pano", "stitch", "film/capture", *METHODS[method], "--out", method))
     common = {"subject": subject, "method": method, "command": command}
     try:
-        figures = run_timed("stitch", str(film / "capture"), *METHODS[method], "--out", str(out), log=task.log)
+        figures = run_timed("pano", "stitch", str(film / "capture"), *METHODS[method], "--out", str(out), log=task.log)
     except CuspidError as error:
         return {**common, "failure": str(error), "score": None}
     made = out / "part-1" if (out / "part-1").is_dir() else out
-    run_timed("stitch-eval", str(made), str(film / "truth"), "--out", str(score), log=task.log)
+    run_timed("pano", "evaluate", str(made), str(film / "truth"), "--out", str(score), log=task.log)
     found = storage.read_json(score / "score.json")
     task.keep(score / "score.png", f"panorama-{subject}-{method}.png")
     return {**common, "frames_to_panorama": figures, "failure": found.get("failure"), "score": found}

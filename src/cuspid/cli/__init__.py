@@ -16,12 +16,11 @@ from contextlib import suppress
 from functools import wraps
 from importlib import import_module
 from inspect import signature
-from keyword import iskeyword
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, get_type_hints
 
 from cuspid import __version__
-from cuspid.cli.verbs import VERBS, overview, reject_unknown
+from cuspid.cli.verbs import GROUPS, VERBS, overview, reject_unknown, split_verb
 from cuspid.errors import CuspidError
 from cuspid.plugins import load_plugin
 
@@ -33,11 +32,10 @@ class _Commands(Mapping[str, Callable[..., Any]]):
     """The function of each verb. Its module is loaded when it is asked for: to load them all takes seconds."""
 
     def __getitem__(self, verb: str) -> Callable[..., Any]:
-        module, _, distribution = VERBS[verb]
+        module, _, function, distribution = VERBS[verb]
         if distribution is not None:
             return load_plugin("cuspid.verbs", verb, asked=verb, distribution=distribution)
-        name = verb.replace("-", "_")
-        return getattr(import_module(f"cuspid.cli.{module}"), f"{name}_" if iskeyword(name) else name)
+        return getattr(import_module(f"cuspid.cli.{module}"), function or verb.split()[-1])
 
     def __iter__(self) -> Iterator[str]:
         return iter(VERBS)
@@ -51,10 +49,11 @@ COMMANDS: Mapping[str, Callable[..., Any]] = _Commands()
 
 def load(arguments: Sequence[str]) -> None:
     """Load what the verb that the arguments begin with needs."""
-    if arguments and arguments[0] in COMMANDS:
+    verb, _ = split_verb(arguments)
+    if verb in VERBS:
         import_module("tyro")
         with suppress(CuspidError):  # which running it tells
-            COMMANDS[arguments[0]]
+            COMMANDS[verb]
 
 
 def check_options_of(verb: str) -> Callable[..., None]:
@@ -162,19 +161,44 @@ def _in_other_letters(error: UnicodeError) -> tuple[str, int]:
 codecs.register_error(_IN_OTHER_LETTERS, _in_other_letters)
 
 
+def _run_verb(verb: str, given: list[str]) -> None:
+    import tyro
+
+    from cuspid.cli.config import read_config, take_target, write_config
+    from cuspid.cli.usage import show_help
+
+    prog, command = f"cuspid {verb}", COMMANDS[verb]
+    if {"-h", "--help", "--help-all"} & set(given):
+        show_help(prog, command, given, every="--help-all" in given)
+    target, given = take_target(read_config(verb, command, given))
+    if target is None:
+        tyro.cli(check_options_of(verb), prog=prog, args=given)
+        return
+
+    @wraps(command)
+    def keep(*positional: object, **options: object) -> None:
+        bound = signature(command).bind(*positional, **options)
+        bound.apply_defaults()
+        write_config(target, verb, command, bound.arguments)
+
+    tyro.cli(keep, prog=prog, args=given)
+    _console().print(f"{target}: take it with --config", highlight=False)
+
+
 def _run(arguments: Sequence[str]) -> None:
-    verb, *given = arguments or ["--help"]
+    verb, given = split_verb(arguments or ["--help"])
+    group = verb.removesuffix(" --help").removesuffix(" -h")
     try:
         if verb in ("--help", "-h"):
             print(overview())
+        elif group in GROUPS:
+            print(overview(group))
         elif verb == "--version":
             print(f"cuspid {__version__}")
         elif verb not in COMMANDS:
             print(f"cuspid: {CuspidError(reject_unknown(verb))}", file=sys.stderr)
             sys.exit(2)
         else:
-            import tyro
-
-            tyro.cli(check_options_of(verb), prog=f"cuspid {verb}", args=given)
+            _run_verb(verb, given)
     finally:
         sys.stdout.flush()

@@ -24,7 +24,7 @@ from cuspid.rig import Handpiece
 from cuspid.studies.forecast import room_for, sections_of
 
 
-def handpiece(
+def build(
     *,
     out: Path,
     design: Literal["two", "four", "six", "twelve"] = "twelve",

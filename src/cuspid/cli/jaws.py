@@ -88,7 +88,7 @@ def prepare(
 ) -> None:
     """Prepare teeth of a labelled jaw: a crack, a crown preparation, a full-contour crown or a MOD inlay; or a preset.
 
-    For one tooth: cuspid prepare JAW --tooth 45 --out FILE crown --taper-deg 8. For several, pass the result to
+    For one tooth: cuspid jaw prepare JAW --tooth 45 --out FILE crown --taper-deg 8. For several, pass the result to
     the next run.
 
     Args:

@@ -27,7 +27,7 @@ from cuspid.reporting.figures.panorama_evaluation import save_panorama_evaluatio
 from cuspid.trueness import ReferenceRender
 
 
-def stitch_eval(
+def evaluate(
     panorama: Annotated[Path, Positional],
     truth: Annotated[Path, Positional],
     *,
@@ -37,9 +37,9 @@ def stitch_eval(
     """Evaluate a panorama against the arch that was filmed: score.json, a table, and score.png, where both are shown.
 
     Args:
-        panorama: Folder that cuspid stitch wrote, or a picture from another program (black or transparent pixels count
-            as empty).
-        truth: The folder truth/ that cuspid film wrote.
+        panorama: Folder that cuspid pano stitch wrote, or a picture from another program (black or transparent pixels
+            count as empty).
+        truth: The folder truth/ that cuspid pano film wrote.
         out: Folder for the results.
     """
     known, view = storage.read_truth(truth), storage.read_reference_render(truth / "occlusal")

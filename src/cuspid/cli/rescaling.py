@@ -41,7 +41,7 @@ def rescale(
     the arch, for example. Pictures stay as they are, all lengths become those of the measurement.
 
     Args:
-        panorama: Folder that cuspid stitch wrote; of a sequence that broke, that of a part.
+        panorama: Folder that cuspid pano stitch wrote; of a sequence that broke, that of a part.
         out: Folder for the scaled panorama: the files of stitch, and distances.json and distances.png.
         distance: Two places of panorama.png, in px from its upper left corner, and how many mm lie between them. The
             page of the panorama gives the pixels of places that are clicked on. Of several (give it again), the scale
@@ -55,7 +55,7 @@ def rescale(
     if not (panorama / "panorama.json").exists() and (panorama / "part-1").is_dir():
         raise InputError(f"{panorama}: has parts; give one of them: {panorama / 'part-1'}")
     if "stitch" in read_manifest(out):
-        raise InputError(f"rescale: {out}: holds a panorama of cuspid stitch; give another folder as --out")
+        raise InputError(f"rescale: {out}: holds a panorama of cuspid pano stitch; give another folder as --out")
     before, poses = storage.read_panorama(panorama), _poses(panorama)
     found = rescaled(before, measured)
     strip = read_scaled_strip(panorama, found.factor) if (panorama / "strip.json").exists() else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from types import MappingProxyType
 from typing import NamedTuple
@@ -14,69 +14,113 @@ class Verb(NamedTuple):
     """A verb of the command line."""
 
     module: str
-    """Of ``cuspid.cli``, which has a function of the verb's name."""
+    """Of ``cuspid.cli``, or of another distribution."""
     summary: str
     """What it does, for the overview."""
+    function: str | None = None
+    """In the module; None where it has the name of the verb."""
     distribution: str | None = None
     """Which brings it, through an entry point of the group ``cuspid.verbs``; None for cuspid itself."""
 
 
-GROUPS: Mapping[str, Mapping[str, Verb]] = MappingProxyType(
+class Group(NamedTuple):
+    """Verbs that belong together."""
+
+    title: str
+    """For the overview."""
+    verbs: Mapping[str, Verb]
+    """By name."""
+
+
+GROUPS: Mapping[str, Group] = MappingProxyType(
     {
-        "From images to a mesh that can be trusted": {
-            "run": Verb("scan", "simulate, reconstruct and evaluate a scan of a jaw"),
-            "simulate": Verb("scan", "render what a handpiece sees of a jaw"),
-            "record": Verb("record", "record USB cameras, with a coach for the views of a board"),
-            "import": Verb("footage", "make a capture from videos or images of several cameras"),
-            "reconstruct": Verb("scan", "poses and a mesh from a capture, or from photographs of one camera"),
-            "live": Verb("live", "follow a scan while it is taken"),
-            "evaluate": Verb("scan", "trueness of a mesh against a reference"),
-            "repeat": Verb("repeat", "trueness and precision of repeated scans"),
-            "report": Verb("report", "one HTML page on the results in a folder"),
-            "view": Verb("view", "a scan or a shape model in the browser"),
-        },
-        "Jaws": {
-            "phantom": Verb("jaws", "the built-in jaw, or a population of them"),
-            "measure": Verb("surveys", "arch dimensions of jaws"),
-            "shape": Verb("surveys", "the mean of labelled jaws, and how they vary"),
-            "prepare": Verb("jaws", "cracks, crown preparations and inlays"),
-            "box": Verb("jaws", "crowns as boxes, the hardest jaw to scan"),
-            "mouth": Verb("mouth", "room in the mouth, and whom a handpiece fits"),
-        },
-        "Handpieces and cameras": {
-            "handpiece": Verb("handpieces", "a built-in handpiece, and a printable holder"),
-            "design": Verb("handpieces", "search for a handpiece that meets a brief"),
-            "target": Verb("calibration", "a calibration board for printing"),
-            "photograph": Verb("calibration", "photograph a board in simulation"),
-            "calibrate": Verb("calibration", "calibrate cameras from images of a board"),
-            "convert": Verb("conversion", "calibrations between cuspid and other programs"),
-        },
-        "Forecasts and studies": {
-            "optics": Verb("forecasts", "compare miniature cameras"),
-            "visibility": Verb("forecasts", "how much of each surface a handpiece sees"),
-            "precision": Verb("forecasts", "how precisely a handpiece could measure a tooth"),
-            "compare": Verb("comparison", "compare handpieces on the same teeth"),
-            "sweep": Verb("studies", "the best baseline and angle of a camera pair"),
-            "reproduce": Verb("", "the thesis' tables, figures and equations beside ours", "cuspid-thesis"),
-        },
-        "Panoramas": {
-            "film": Verb("film", "render what a hand-held camera sees of an arch"),
-            "stitch": Verb("panorama", "a panorama of the arch from the frames of a camera"),
-            "rescale": Verb("rescaling", "scale a panorama by measured distances"),
-            "stitch-eval": Verb("panorama_evaluation", "a panorama against the arch that was filmed"),
-        },
+        "": Group(
+            "From images to a mesh that can be trusted",
+            {
+                "run": Verb("scan", "simulate, reconstruct and evaluate a scan of a jaw"),
+                "simulate": Verb("scan", "render what a handpiece sees of a jaw"),
+                "calibrate": Verb("calibration", "calibrate cameras from images of a board"),
+                "record": Verb("record", "record USB cameras, with a coach for the views of a board"),
+                "import": Verb("footage", "make a capture from videos or images of several cameras", "import_"),
+                "reconstruct": Verb("scan", "poses and a mesh from a capture, or from photographs of one camera"),
+                "live": Verb("live", "follow a scan while it is taken"),
+                "evaluate": Verb("scan", "trueness of a mesh against a reference"),
+                "report": Verb("report", "one HTML page on the results in a folder"),
+                "view": Verb("view", "a scan or a shape model in the browser"),
+                "reproduce": Verb(
+                    "", "the thesis' tables, figures and equations beside ours", distribution="cuspid-thesis"
+                ),
+            },
+        ),
+        "jaw": Group(
+            "Jaws",
+            {
+                "phantom": Verb("jaws", "the built-in jaw, or a population of them"),
+                "measure": Verb("surveys", "arch dimensions of jaws"),
+                "shape": Verb("surveys", "the mean of labelled jaws, and how they vary"),
+                "prepare": Verb("jaws", "cracks, crown preparations and inlays"),
+                "box": Verb("jaws", "crowns as boxes, the hardest jaw to scan"),
+                "mouth": Verb("mouth", "room in the mouth, and whom a handpiece fits"),
+            },
+        ),
+        "rig": Group(
+            "Handpieces and cameras",
+            {
+                "build": Verb("handpieces", "a built-in handpiece, and a printable holder"),
+                "design": Verb("handpieces", "search for a handpiece that meets a brief"),
+                "optics": Verb("forecasts", "compare miniature cameras"),
+                "visibility": Verb("forecasts", "how much of each surface a handpiece sees"),
+                "precision": Verb("forecasts", "how precisely a handpiece could measure a tooth"),
+                "target": Verb("calibration", "a calibration board for printing"),
+                "photograph": Verb("calibration", "photograph a board in simulation"),
+                "convert": Verb("conversion", "calibrations between cuspid and other programs"),
+            },
+        ),
+        "study": Group(
+            "Studies",
+            {
+                "repeat": Verb("repeat", "trueness and precision of repeated scans"),
+                "compare": Verb("comparison", "compare handpieces on the same teeth"),
+                "sweep": Verb("studies", "the best baseline and angle of a camera pair"),
+            },
+        ),
+        "pano": Group(
+            "Panoramas",
+            {
+                "film": Verb("film", "render what a hand-held camera sees of an arch"),
+                "stitch": Verb("panorama", "a panorama of the arch from the frames of a camera"),
+                "rescale": Verb("rescaling", "scale a panorama by measured distances"),
+                "evaluate": Verb("panorama_evaluation", "a panorama against the arch that was filmed"),
+            },
+        ),
     }
 )
 
-VERBS: Mapping[str, Verb] = MappingProxyType({name: verb for group in GROUPS.values() for name, verb in group.items()})
+VERBS: Mapping[str, Verb] = MappingProxyType(
+    {f"{group} {name}".strip(): verb for group, (_, verbs) in GROUPS.items() for name, verb in verbs.items()}
+)
+"""All verbs as they are typed: ``run``, ``jaw phantom``."""
+RENAMED: Mapping[str, str] = {"handpiece": "rig build", "stitch-eval": "pano evaluate"} | {
+    name: f"{group} {name}" for group in GROUPS if group for name in GROUPS[group].verbs if name not in GROUPS[""].verbs
+}
+"""Verbs of version 0.2 and those that took their places."""
 
 
-def overview() -> str:
-    """All verbs, for ``cuspid --help``."""
+def split_verb(arguments: Sequence[str]) -> tuple[str, list[str]]:
+    """The verb that the arguments begin with, of one word or two, and what it is given."""
+    words = 2 if arguments and arguments[0] in GROUPS and len(arguments) > 1 else 1
+    return " ".join(arguments[:words]), list(arguments[words:])
+
+
+def overview(only: str | None = None) -> str:
+    """All verbs, or those of a group, for ``--help``."""
     width = max(map(len, VERBS))
     groups = (
-        "\n".join([f"{title}:", *(f"  {name:{width}}  {verb.summary}" for name, verb in verbs.items())])
-        for title, verbs in GROUPS.items()
+        "\n".join(
+            [f"{title}:", *(f"  {f'{group} {name}'.strip():{width}}  {verb.summary}" for name, verb in verbs.items())]
+        )
+        for group, (title, verbs) in GROUPS.items()
+        if only in (None, group)
     )
     return "\n\n".join(
         [
@@ -89,6 +133,8 @@ def overview() -> str:
 
 def reject_unknown(name: str) -> str:
     """What to say where there is no such verb."""
-    near = get_close_matches(name, VERBS, n=1)
-    meant = f"did you mean {near[0]}? " if near else ""
+    if name in RENAMED:
+        return f"{name} is now called {RENAMED[name]}: cuspid {RENAMED[name]} ..."
+    near = get_close_matches(name, [*VERBS, *RENAMED], n=1)
+    meant = f"did you mean {RENAMED.get(near[0], near[0])}? " if near else ""
     return f"there is no verb {name}; {meant}cuspid --help lists them"

@@ -151,7 +151,7 @@ def evaluate_spheres(
     where the reference has no spheres or the scan shows fewer than two of them.
     """
     if not reference.spheres:
-        raise InputError("spheres: the reference has no spheres; give the jaw that 'cuspid phantom --spheres' wrote")
+        raise InputError("spheres: the reference has no spheres; give that of 'cuspid jaw phantom --spheres'")
     scan_from_reference = reference_from_scan.inverse()
     weights = scan.vertex_areas
     spheres: dict[str, SphereMeasurement] = {}

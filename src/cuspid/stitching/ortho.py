@@ -190,7 +190,7 @@ def _tripods(model: SparseModel, length: float) -> Float[np.ndarray, "k 3"]:
     return np.concatenate([pose.inverse().apply(legs) for pose in model.cam_from_world.values()])
 
 
-_TRUER = "measure between two cusps, and cuspid rescale makes it truer"
+_TRUER = "measure between two cusps, and cuspid pano rescale makes it truer"
 
 
 def _scale_note(scale: ScaleOptions, *, given: bool) -> str:
@@ -199,7 +199,7 @@ def _scale_note(scale: ScaleOptions, *, given: bool) -> str:
     if scale.working_distance_mm is None:
         return (
             "the scale is not known, so nothing is in millimetres: give --scale.working-distance-mm, or measure "
-            "between two cusps and use cuspid rescale"
+            "between two cusps and use cuspid pano rescale"
         )
     source = "as given" if given else "as the calibration says"
     return (

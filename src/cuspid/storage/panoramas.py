@@ -69,10 +69,10 @@ def read_panorama(folder: Path) -> Panorama:
     value = read_json(path)
     rgba = read_rgba(folder / "panorama.png")
     frames = _read_frames(folder / "frames.csv")
-    arrays = read_arrays(folder / "source.npz", remedy="run cuspid stitch again")
+    arrays = read_arrays(folder / "source.npz", remedy="run cuspid pano stitch again")
     with reading(path):
         if len(frames) != value["frames"]:
-            raise InputError(f"{folder / 'frames.csv'}: truncated; run cuspid stitch again")
+            raise InputError(f"{folder / 'frames.csv'}: truncated; run cuspid pano stitch again")
         header: dict[str, Any] = {name: value[name] for name in _HEADER}
         header["origin_px"] = numbers("origin_px", value["origin_px"], (2,), -float(MOST_PX), float(MOST_PX))
         header["notes"] = tuple(value["notes"])

@@ -28,9 +28,9 @@ def read_reference_render(folder: Path) -> ReferenceRender:
     """Read what :func:`write_reference_render` wrote. Raises InputError where a file is missing or damaged."""
     path = folder / "view.json"
     if not path.exists():
-        raise InputError(f"{folder}: it contains no reference render of the jaw; make one with cuspid film")
+        raise InputError(f"{folder}: it contains no reference render of the jaw; make one with cuspid pano film")
     value = read_json(path)
-    surface = read_arrays(folder / "surface.npz", remedy="run cuspid film again")
+    surface = read_arrays(folder / "surface.npz", remedy="run cuspid pano film again")
     with reading(path):
         height_mm = value["camera_height_mm"]
         return as_declared(

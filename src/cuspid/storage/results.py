@@ -301,7 +301,7 @@ def _read_study(folder: Path, run: Mapping[str, Any]) -> StudyResult:
     summary, rows = _optional_json(folder / file), _rows(folder)
     missing = []
     if summary is None:
-        missing.append(f"{file}: {len(rows)} cases are done; run the same cuspid {verb} command again to continue")
+        missing.append(f"{file}: {len(rows)} cases are done; run the same command again to continue")
     surface, values = _repeated(folder) if verb == "repeat" else (None, {})
     return StudyResult(
         surface=surface,
@@ -347,8 +347,7 @@ def _read_panorama(folder: Path, run: Mapping[str, Any]) -> PanoramaResult:
     folders = [folder, *sorted(folder.glob("part-*"))]
     there = tuple(each for each in folders if (each / "panorama.json").exists())
     if not there:
-        verb = "rescale" if "rescale" in run else "stitch"
-        raise InputError(f"{folder}: the panorama is not complete; run the same cuspid {verb} command again")
+        raise InputError(f"{folder}: the panorama is not complete; run the same command again")
     captions = {
         "distances.png": "What the scale is from: distances that were measured between places of the arch",
         "camera_path.png": "The path of the camera over the arch",
@@ -365,7 +364,7 @@ def _read_panorama(folder: Path, run: Mapping[str, Any]) -> PanoramaResult:
 
 def _read_score(folder: Path, run: Mapping[str, Any]) -> ScoreResult:
     made, true = (_if_there(folder / name) for name in ("made.png", "true.png"))
-    missing = () if made and true else ("the side-by-side pictures: run cuspid stitch-eval again",)
+    missing = () if made and true else ("the side-by-side pictures: run cuspid pano evaluate again",)
     return ScoreResult(
         name=folder.resolve().name,
         run=run,

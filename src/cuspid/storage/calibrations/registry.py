@@ -151,7 +151,8 @@ def _recognised(files: Mapping[str, Document]) -> Name:
     for name, each in FORMATS.items():
         if each.recognises(files):
             return name
-    raise InputError(f"it is no calibration that is known ({', '.join(FORMATS)}); cuspid convert takes it with --from")
+    known = ", ".join(FORMATS)
+    raise InputError(f"it is no calibration that is known ({known}); cuspid rig convert takes it with --from")
 
 
 def _unit(format: Format, found: Calibration, given: Unit | None) -> tuple[Unit, tuple[str, ...]]:
