@@ -5,8 +5,10 @@ Deviations follow the terms of ISO 5725 and are in micrometres throughout.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int16, UInt8
@@ -164,6 +166,75 @@ class Trueness:
     "1" and "2" (68 and 95 if all errors are random and accounted for); None if it predicted none."""
     notes: tuple[str, ...] = field(default=())
     """What a reader should know, for example how the scannable surface was determined."""
+
+
+class Metric(NamedTuple):
+    """A figure of an evaluation: how it is read, and what people see of it."""
+
+    heading: str
+    """Of a column."""
+    unit: Literal["µm", "%", "ppm"]
+    """Of its values."""
+    about: str
+    """What it is."""
+    better: Literal[-1, 0, 1]
+    """Whether less (-1) or more (1) is better, or nearer to zero (0)."""
+    of: Callable[[Trueness], float | None]
+    """The value of an evaluation; None where there is none."""
+    is_statistic: bool = False
+    """Whether it is one of :class:`DeviationStatistics`, which every region has."""
+
+    @property
+    def title(self) -> str:
+        """The heading with the unit."""
+        return f"{self.heading}, {self.unit}"
+
+    @property
+    def label(self) -> str:
+        """What it is, as the label of an axis."""
+        return f"{self.about} / {self.unit}"
+
+
+def _statistic(name: str) -> Callable[[Trueness], float | None]:
+    return lambda trueness: getattr(trueness.accuracy, name)
+
+
+METRICS: Mapping[str, Metric] = MappingProxyType(
+    {
+        "mean_abs_um": Metric("mean |d|", "µm", "mean absolute deviation", -1, _statistic("mean_abs_um"), True),
+        "signed_mean_um": Metric("signed mean", "µm", "mean deviation", 0, _statistic("signed_mean_um"), True),
+        "std_um": Metric("SD", "µm", "standard deviation", -1, _statistic("std_um"), True),
+        "rms_um": Metric("RMS", "µm", "root mean square deviation", -1, _statistic("rms_um"), True),
+        "p95_um": Metric("P95", "µm", "95 % deviate by less", -1, _statistic("p95_um"), True),
+        "max_um": Metric("max", "µm", "largest deviation", -1, _statistic("max_um"), True),
+        "complete_50_um_pct": Metric(
+            "within 50 µm", "%", "surface within 50 µm", 1, lambda trueness: trueness.completeness_pct["50"]
+        ),
+        "complete_100_um_pct": Metric(
+            "within 100 µm", "%", "surface within 100 µm", 1, lambda trueness: trueness.completeness_pct["100"]
+        ),
+        "crown_50_um_pct": Metric(
+            "of open crown",
+            "%",
+            "open crown surface within 50 µm",
+            1,
+            lambda trueness: None if trueness.crown is None else trueness.crown.completeness_pct["50"],
+        ),
+        "scannable_pct": Metric(
+            "scannable", "%", "share of the reference that could be seen", 1, lambda trueness: trueness.scannable_pct
+        ),
+        "scale_error_ppm": Metric("scale error", "ppm", "scale error", 0, lambda trueness: trueness.scale_error_ppm),
+        "inter_molar_error_um": Metric(
+            "inter-molar error", "µm", "inter-molar error", 0, lambda trueness: trueness.inter_molar_error_um
+        ),
+        "inter_canine_error_um": Metric(
+            "inter-canine error", "µm", "inter-canine error", 0, lambda trueness: trueness.inter_canine_error_um
+        ),
+    }
+)
+"""The figures by name. What the command line, the pages and the studies show of an evaluation comes from here."""
+STATISTICS: tuple[str, ...] = tuple(name for name, metric in METRICS.items() if metric.is_statistic)
+"""Those that every region has, in the order in which they are shown."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -20,6 +20,7 @@ from cuspid.reporting.figures.repeat import save_repeat_picture
 from cuspid.studies.grid import check_workers
 from cuspid.studies.repetition import RepeatOptions, Repetition, repeat_scans
 from cuspid.studies.trial import TrialOptions
+from cuspid.trueness import METRICS
 
 
 def repeat(
@@ -96,15 +97,7 @@ def _save(out: Path, found: Repetition) -> None:
     _print(summary)
 
 
-_NAMES = {
-    "mean_abs_um": "mean |d|, µm",
-    "signed_mean_um": "signed mean, µm",
-    "std_um": "SD, µm",
-    "rms_um": "RMS, µm",
-    "p95_um": "P95, µm",
-    "complete_50_um_pct": "within 50 µm, %",
-    "common_pct": "surface in common, %",
-}
+_COMMON = "surface in common, %"
 
 
 def _print(summary: Mapping[str, Any]) -> None:
@@ -118,7 +111,8 @@ def _print(summary: Mapping[str, Any]) -> None:
             table.add_column(column, justify="left" if column == "figure" else "right")
         for figure, cells in summary[name].items():
             values = (cells[each] for each in ("mean", "sd", "min", "max"))
-            table.add_row(_NAMES[figure], *("-" if value is None else f"{value:.2f}" for value in values))
+            title = METRICS[figure].title if figure in METRICS else _COMMON
+            table.add_row(title, *("-" if value is None else f"{value:.2f}" for value in values))
         Console().print(table)
     found = summary["spread"]
     console.print(

@@ -39,7 +39,7 @@ from cuspid.reporting.figures.margin import save_margin_picture
 from cuspid.reporting.figures.sphere import save_sphere_picture
 from cuspid.rig import Handpiece
 from cuspid.tolerances import NominalOptions, is_nominal
-from cuspid.trueness import DeviationStatistics, Trueness
+from cuspid.trueness import METRICS, STATISTICS, DeviationStatistics, Trueness
 
 
 def run(
@@ -351,15 +351,16 @@ def _print_located(reconstruction: Reconstruction, capture: Capture) -> None:
             console.print(f"note: {note}")
 
 
-_COLUMNS = ("region", "mean |d|", "signed mean", "SD", "RMS", "P95", "max", "within 50 µm, %", "of open crown, %")
+_COLUMNS = ("region", *(METRICS[name].heading for name in STATISTICS))
+_SHARES = tuple(METRICS[name].title for name in ("complete_50_um_pct", "crown_50_um_pct"))
 
 
 def _print_trueness(trueness: Trueness) -> None:
     table = Table(title="Trueness in µm, scan to reference", title_justify="left")
-    for column in _COLUMNS:
+    for column in (*_COLUMNS, *_SHARES):
         table.add_column(column, justify="left" if column == "region" else "right")
     for region, d, shares in _regions(trueness):
-        figures = (d.mean_abs_um, d.signed_mean_um, d.std_um, d.rms_um, d.p95_um, d.max_um)
+        figures = (getattr(d, name) for name in STATISTICS)
         cells = ("-" if share is None else f"{share['50']:.1f}" for share in shares)
         table.add_row(region, *(f"{figure:.1f}" for figure in figures), *cells)
     Console().print(table)

@@ -20,12 +20,13 @@ from cuspid.reporting.figures.sweep import SweepMap, save_sweep_picture
 from cuspid.studies.camera_sweep import TERMS, Best, Setting, SweepOptions, Term, best_setting, values_of
 from cuspid.studies.camera_sweep import sweep as run_sweep
 from cuspid.studies.grid import Outcome
+from cuspid.trueness import METRICS
 
 _TITLES: dict[Term, tuple[str, int]] = {
-    "complete_50_um_pct": ("surface within 50 µm / %", 1),
+    "complete_50_um_pct": (METRICS["complete_50_um_pct"].label, 1),
     "complete_10_um_pct": ("surface within 10 µm / %", 1),
     "points": ("points on the surface", 0),
-    "mean_abs_um": ("mean absolute deviation / µm", 2),
+    "mean_abs_um": (METRICS["mean_abs_um"].label, 2),
 }
 _LISTED = 4
 """Number of equally good settings that are printed; sweep.json lists all."""

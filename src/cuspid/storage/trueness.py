@@ -7,24 +7,18 @@ from pathlib import Path
 from typing import Any
 
 from cuspid.storage.files import write_json
-from cuspid.trueness import Trueness
+from cuspid.trueness import STATISTICS, Trueness
 
 
 def trueness_summary(trueness: Trueness) -> dict[str, Any]:
     """``trueness.json``: the headline at the top level, everything else below it. Unknown numbers are null."""
-    accuracy = trueness.accuracy
     details = {
         field.name: getattr(trueness, field.name)
         for field in dataclasses.fields(trueness)
         if field.name not in {"deviation_um", "reference_from_scan"}
     }
     return {
-        "mean_abs_um": accuracy.mean_abs_um,
-        "signed_mean_um": accuracy.signed_mean_um,
-        "std_um": accuracy.std_um,
-        "rms_um": accuracy.rms_um,
-        "p95_um": accuracy.p95_um,
-        "max_um": accuracy.max_um,
+        **{name: getattr(trueness.accuracy, name) for name in STATISTICS},
         **details,
         "reference_from_scan": trueness.reference_from_scan.matrix,
     }

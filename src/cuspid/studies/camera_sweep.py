@@ -48,6 +48,7 @@ from cuspid.stereo.matching import StereoOptions
 from cuspid.studies.camera_pair import Direction, baseline_axis, camera_pair, facing
 from cuspid.studies.grid import Case, Outcome, Value, run_grid
 from cuspid.studies.trial import Trial, TrialOptions, run_trial
+from cuspid.trueness import METRICS
 
 Setting = tuple[float, float]
 """Baseline in mm and axis angle in degrees."""
@@ -319,20 +320,13 @@ def _reconstruction(options: SweepOptions) -> ReconstructionOptions:
 
 
 def _figures(trial: Trial, site: Site) -> dict[str, float | int]:
-    accuracy, areas = trial.trueness.accuracy, site.jaw.mesh.face_areas
+    areas = site.jaw.mesh.face_areas
     return {
         "located_frames": len(trial.reconstruction.frames),
         "seen_pct": float(100 * areas[site.faces & trial.scannable].sum() / areas[site.faces].sum()),
         "points": int(np.isfinite(trial.trueness.deviation_um).sum()),
-        "mean_abs_um": accuracy.mean_abs_um,
-        "signed_mean_um": accuracy.signed_mean_um,
-        "std_um": accuracy.std_um,
-        "p95_um": accuracy.p95_um,
-        "max_um": accuracy.max_um,
+        **{name: value for name, metric in METRICS.items() if (value := metric.of(trial.trueness)) is not None},
         "complete_10_um_pct": _within_pct(trial, site, _BUDGET_UM),
-        "complete_50_um_pct": trial.trueness.completeness_pct["50"],
-        "complete_100_um_pct": trial.trueness.completeness_pct["100"],
-        "scale_error_ppm": trial.trueness.scale_error_ppm,
         "simulation_s": trial.simulation_s,
         "reconstruction_s": trial.reconstruction_s,
     }

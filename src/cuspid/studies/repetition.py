@@ -32,7 +32,7 @@ from cuspid.rig import Handpiece
 from cuspid.simulation.path.scan import plan_scan_path
 from cuspid.studies.grid import Case, Outcome, Value, run_grid
 from cuspid.studies.trial import TrialOptions, run_trial
-from cuspid.trueness import GroundTruth
+from cuspid.trueness import STATISTICS, GroundTruth
 
 TRUENESS = ("mean_abs_um", "signed_mean_um", "std_um", "p95_um", "complete_50_um_pct")
 """Figures of a scan of which the spread is reported."""
@@ -220,8 +220,7 @@ def compare_scans(*, first: str, second: str, folder: Path, options: RepeatOptio
     """The distances of two scans after one is laid on the other."""
     scans = _kept(folder, first), _kept(folder, second)
     found = compare_pair(*scans, options.pairs, rng=np.random.default_rng(0))
-    figures = ("mean_abs_um", "signed_mean_um", "std_um", "rms_um", "p95_um", "max_um")
-    return {name: getattr(found.deviation, name) for name in figures} | {"common_pct": found.common_pct}
+    return {name: getattr(found.deviation, name) for name in STATISTICS} | {"common_pct": found.common_pct}
 
 
 def _spread_of(folder: Path, names: Sequence[str], options: RepeatOptions) -> Spread:

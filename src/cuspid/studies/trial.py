@@ -22,7 +22,7 @@ from cuspid.mesh import Mesh
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.reconstruction import Reconstruction
 from cuspid.rig import Handpiece
-from cuspid.trueness import GroundTruth, Trueness
+from cuspid.trueness import METRICS, GroundTruth, Trueness
 from cuspid.visibility import VisibilityOptions
 
 Shoot = Callable[[Path], tuple[Capture, GroundTruth]]
@@ -72,21 +72,13 @@ class Trial:
     @property
     def figures(self) -> dict[str, float | int]:
         """The row: units in the names."""
-        accuracy, complete = self.trueness.accuracy, self.trueness.completeness_pct
         frames = len(self.capture.frames)
         return {
             "frames": frames,
             "located_frames": len(self.reconstruction.frames),
             "images": frames * len(self.truth.handpiece.rig.names),
             "points": self.points,
-            "mean_abs_um": accuracy.mean_abs_um,
-            "signed_mean_um": accuracy.signed_mean_um,
-            "std_um": accuracy.std_um,
-            "p95_um": accuracy.p95_um,
-            "max_um": accuracy.max_um,
-            "complete_50_um_pct": complete["50"],
-            "complete_100_um_pct": complete["100"],
-            "scannable_pct": self.trueness.scannable_pct,
+            **{name: value for name, metric in METRICS.items() if (value := metric.of(self.trueness)) is not None},
             "simulation_s": self.simulation_s,
             "reconstruction_s": self.reconstruction_s,
             "reconstruction_cpu_s": self.reconstruction_cpu_s,

@@ -43,6 +43,7 @@ from cuspid.reporting.pages.scene import (
 )
 from cuspid.reporting.pages.shown_mesh import ShownMesh, simplified
 from cuspid.storage import ScanResult
+from cuspid.trueness import METRICS, STATISTICS
 
 _Maps = Sequence[tuple[ColorScale, Float[np.ndarray, "v"]]]
 """What a surface can be coloured by, the first one at the start, with the values of its vertices."""
@@ -100,6 +101,7 @@ def scan_page(result: ScanResult, options: ReportOptions = ReportOptions()) -> s
         tiles=_tiles(result),
         warnings=_warnings(result),
         trueness=result.trueness,
+        statistics=[METRICS[name] for name in STATISTICS],
         rows=_table(result.trueness),
         histogram=None if result.deviation_um is None else histogram(scan, result.deviation_um, range_um),
         worst=[{"number": k + 1, **row} for k, row in enumerate(_worst_rows(worst))],
@@ -229,9 +231,6 @@ def _crown_tiles(crown: Mapping[str, Any] | None) -> list[tuple[str, str, str]]:
     return [(f"of all open crown surface within 50 µm{estimated}", f"{crown['completeness_pct']['50']:.1f}", "%")]
 
 
-_FIGURES = ("mean_abs_um", "signed_mean_um", "std_um", "rms_um", "p95_um", "max_um")
-
-
 def _table(trueness: Mapping[str, Any] | None) -> list[dict[str, Any]]:
     """Trueness in whole, by tooth, and with everything that was scanned."""
     if trueness is None:
@@ -253,7 +252,7 @@ def _table_row(
     name: str, figures: Mapping[str, Any], seen: Mapping[str, float] | None, crown: Mapping[str, float] | None
 ) -> dict[str, Any]:
     """A row; shares of what could be seen and of the open crown, None where there are none."""
-    return {"name": name, "figures": [figures[each] for each in _FIGURES], "seen": seen, "crown": crown}
+    return {"name": name, "figures": [figures[each] for each in STATISTICS], "seen": seen, "crown": crown}
 
 
 def histogram(mesh: Mesh, deviation_um: Float[np.ndarray, "v"], range_um: float) -> dict[str, Any]:

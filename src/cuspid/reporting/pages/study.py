@@ -19,6 +19,7 @@ from cuspid.reporting.pages.page import jpeg_uri, number, picture_uri, provenanc
 from cuspid.reporting.pages.scene import mesh_layer, standard_views
 from cuspid.reporting.pages.shown_mesh import simplified
 from cuspid.storage import StudyResult
+from cuspid.trueness import METRICS
 
 _MOST_FACES = 120_000
 
@@ -97,6 +98,8 @@ def _view(reference: Jaw, values: Mapping[str, Float[np.ndarray, "v"]]) -> dict[
 
 def heading(column: str) -> str:
     """The name of a column for people: words, and the unit at the end."""
+    if column in METRICS:
+        return METRICS[column].title
     *words, last = column.split("_")
     if last not in _UNITS or not words:
         return column.replace("_", " ")
