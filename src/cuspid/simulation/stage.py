@@ -64,7 +64,12 @@ class SimulationOptions(RenderOptions):
 
 
 def simulate(
-    jaw: Jaw, handpiece: Handpiece, folder: Path, options: SimulationOptions, *, progress: Progress = silent
+    jaw: Jaw,
+    handpiece: Handpiece,
+    folder: Path | str,
+    options: SimulationOptions = SimulationOptions(),
+    *,
+    progress: Progress = silent,
 ) -> tuple[Capture, GroundTruth]:
     """Scan a jaw: images to ``folder/capture``, what only the simulator knows to ``folder/truth``.
 
@@ -72,6 +77,7 @@ def simulate(
     built as it was drawn, the capture has the drawn one with its tolerances, and the truth the built one. Existing
     images are kept; a run that is resumed gives the same bits as one that was not interrupted.
     """
+    folder = Path(folder)
     handpiece = lit(handpiece)
     true, known = built(handpiece, options.manufacturing), told(handpiece, options.manufacturing)
     _check(true, options)
