@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 import cv2
 import numpy as np
 from jaxtyping import UInt8
+from PIL import Image
 
 from cuspid.capture import Capture
 from cuspid.jaw import Jaw
@@ -19,7 +20,6 @@ from cuspid.panorama import Panorama
 from cuspid.reporting.figures.design import save_design_picture
 from cuspid.reporting.figures.drawing import save_histogram, save_picture
 from cuspid.rig import Handpiece
-from cuspid.storage import write_image
 from cuspid.trueness import Trueness
 
 _WIDTH_PX = 720
@@ -36,7 +36,7 @@ def to_html(value: object) -> str:
     line = escape(repr(value))
     style, source = f"width: {_WIDTH_PX}px; max-width: 100%", f"data:image/webp;base64,{picture}"
     return (
-        f'<figure style="margin: 0"><figcaption><code>{line}</code></figcaption>'
+        f'<figure style="margin: 0"><figcaption><code style="font-size: 0.85em">{line}</code></figcaption>'
         f'<img style="{style}" alt="{line}" src="{source}"></figure>'
     )
 
@@ -68,13 +68,13 @@ def _(value: Trueness, path: Path) -> None:
 
 @_save.register
 def _(value: Panorama, path: Path) -> None:
-    write_image(path, _fitted(value.image, 2 * _WIDTH_PX))
+    Image.fromarray(_fitted(value.image, 2 * _WIDTH_PX)).save(path)
 
 
 @_save.register
 def _(value: Capture, path: Path) -> None:
     frame = value.frames[len(value.frames) // 2]
-    write_image(path, _tiled([_fitted(image, _TILE_PX) for image in value.images(frame).values()]))
+    Image.fromarray(_tiled([_fitted(image, _TILE_PX) for image in value.images(frame).values()])).save(path)
 
 
 def _fitted(image: UInt8[np.ndarray, "h w 3"], most_px: int) -> UInt8[np.ndarray, "a b 3"]:

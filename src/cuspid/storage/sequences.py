@@ -33,7 +33,7 @@ def read_sequence(
     source: Path | str,
     decoded: Path | str | None = None,
     *,
-    calibration: Path | None = None,
+    calibration: Path | str | None = None,
     progress: Progress = silent,
 ) -> ImageSequence:
     """Frames of one camera from a folder of images, a video or a capture.
@@ -52,7 +52,7 @@ def read_sequence(
         raise InputError(f"{source}: neither a folder of images nor a video ({', '.join(VIDEO_SUFFIXES)})")
     else:
         raise InputError(f"{source}: no such folder or video")
-    return found if calibration is None else _calibrated(found, calibration)
+    return found if calibration is None else _calibrated(found, Path(calibration))
 
 
 def read_sequences(
