@@ -133,7 +133,7 @@ def _check(handpiece: Handpiece, options: RenderOptions) -> None:
 def _render(folder: Path, capture: Capture, truth: GroundTruth, options: RenderOptions) -> Iterator[tuple[int, int]]:
     """Render what is not there yet; yields how many images are there, and how many there will be."""
     images = ImageFolder(folder / "capture")
-    stage = Stage("images", folder / "truth", look_of(options), CODE)
+    stage = Stage("images", folder / "truth", look_of(options), _CODE)
     # The gain is metered over the whole path, so each image depends on all of the truth.
     key = stage.key({**jaw_files(folder / "truth"), "poses": digest_of(dict(truth.rig_from_world))})
     there = {
@@ -181,8 +181,8 @@ _TIMED = 3
 """Images of each process that are timed for the forecast."""
 _LONG_S = 60.0
 """Nobody minds waiting so long."""
-CODE = ("simulation",)
-"""What images are made by: their key has the version of this code."""
+_CODE = (__name__, "cuspid.simulation.blender_script")
+"""What images are made by: their key has what this code does. Blender runs the script."""
 _RENDERERS = {"embree": render_capture, "blender": render_with_blender}
 
 
