@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from jaxtyping import UInt8
 
 from cuspid.capture import Capture, ImageFolder
 from cuspid.geometry import Rigid3
@@ -145,13 +146,21 @@ def _render(folder: Path, capture: Capture, truth: GroundTruth, options: RenderO
         scene_of(truth, options),
         capture.frames,
         truth.rig_from_world,
-        lambda frame, camera, image: write_image(images.path(frame, camera), image),
+        _Sink(images),
         skip=lambda frame, camera: there[frame, camera],
         processes=usable_cores(),
     )
     for done, image in enumerate(rendered, start=sum(there.values()) + 1):
         stage.record(key, [images.path(*image)])
         yield done, len(there)
+
+
+@dataclass(frozen=True)
+class _Sink:
+    images: ImageFolder
+
+    def __call__(self, frame: str, camera: str, image: UInt8[np.ndarray, "h w 3"]) -> None:
+        write_image(self.images.path(frame, camera), image)
 
 
 def _less(path: ScanPath) -> tuple[str, ...]:
