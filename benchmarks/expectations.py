@@ -25,7 +25,6 @@ from cuspid import pipeline
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.errors import InputError
-from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.pipeline import ReconstructionOptions, SimulationOptions
@@ -85,7 +84,7 @@ def measured(truth: Path, work: Path) -> dict[str, Value]:
     if expected is None or sigma_um is None:
         raise InputError(f"{work}: it does not say what to expect of it; run cuspid reconstruct again")
     known = pipeline.load_reference(truth)
-    trueness = pipeline.evaluate(file.mesh, known.jaw, EvaluationOptions(), scannable=known.scannable)
+    trueness = pipeline.evaluate(file.mesh, known)
     return {
         "commit": commit(),
         **of_surface(trueness.deviation_um, sigma_um),

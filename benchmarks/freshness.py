@@ -1,25 +1,24 @@
 """Which results still hold: nothing that made them has changed since the commit that they are of.
 
 What makes a result is its script, the modules that the script imports, in turn, and those of the verbs that it runs.
-Comments, docstrings and the number of the version have no part in it, nor has what only makes pages and pictures of a
+Comments, docstrings, names and places of modules (:mod:`cuspid.storage.code_digest`) and the number of the version have
+no part in it, nor has what only makes pages and pictures of a
 finished folder or reads footage, unless all verbs are tried, nor what only plain surfaces need, where none are scanned.
 """
 
 from __future__ import annotations
 
-import ast
 import subprocess
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-import grimp
+from cuspid.storage.code_digest import PACKAGE, Code, meaning
 
-HERE = Path(__file__).parent
-ROOT = HERE.parent
+ROOT = Path(__file__).parent.parent
 SHOWN_BY = ("cuspid.reporting", "cuspid.storage.results")
 """Modules that only show what was made."""
 PLAIN = ("cuspid.stereo.shading", "cuspid.motion.surface_tracking")
@@ -28,7 +27,7 @@ FOOTAGE = ("cuspid.storage.videos",)
 """Modules that only real footage is read by."""
 UNTOLD = "no commit, or one of uncommitted changes"
 
-_SOURCES = {"cuspid": "src", "cuspid_thesis": "reproduction/src"}
+_SOURCES = {PACKAGE: "src", "cuspid_thesis": "reproduction/src"}
 """Where the packages lie."""
 
 Result = Mapping[str, Any]
@@ -121,8 +120,12 @@ def _changed_since(commit: str, maker: Maker) -> frozenset[str]:
         before = _blobs("ls-tree", "-r", commit)
     except subprocess.CalledProcessError:
         return frozenset({f"commit {commit} is not in this repository"})
-    today = _made_by(maker)
-    return frozenset(file for file in today if file not in before or _differs(before[file], file))
+    roots, now = _roots(maker), _code_of_today(maker.leaves_out)
+    changed = {file for file in map(_file_of, now.modules(roots)) if file not in before or _differs(before[file], file)}
+    if all(file in before for file in changed):
+        return frozenset(changed)
+    then = _code(partial(_content_of, before), maker.leaves_out)
+    return frozenset() if _digests(then, roots) == _digests(now, roots) else frozenset(changed)  # some may have moved
 
 
 def _blobs(*arguments: str) -> dict[str, str]:
@@ -143,71 +146,57 @@ def _content(blob: str) -> bytes:
 
 @cache
 def _meaning(content: bytes) -> str:
-    """A module without what people only read."""
-    tree = ast.parse(content)
-    for node in ast.walk(tree):
-        for body in (getattr(node, "body", None), getattr(node, "orelse", None)):
-            if isinstance(body, list):
-                body[:] = [each for each in body if not _is_text(each)]
-    return ast.dump(tree)
+    return meaning(content)
 
 
-def _is_text(statement: ast.AST) -> bool:
-    constant = statement.value if isinstance(statement, ast.Expr) else None
-    return isinstance(constant, ast.Constant) and isinstance(constant.value, str)
-
-
-def _made_by(maker: Maker) -> set[str]:
-    """Files that take part."""
-    scripts = set[Path]().union(*(_scripts(name) for name in (maker.script, *maker.runs)))
-    roots = {name for script in scripts for name in _imported(script) if name.split(".")[0] in _SOURCES}
+def _roots(maker: Maker) -> list[str]:
+    """The scripts and the modules of the command line that take part."""
     every = [path.stem for path in (ROOT / "src/cuspid/cli").glob("*.py")]
     verbs = every if "*" in maker.verbs else maker.verbs
-    modules = _upstream(roots | {f"cuspid.cli.{verb}" for verb in verbs if verb != "__init__"}, maker.leaves_out)
-    return {str(path.relative_to(ROOT)) for path in [*scripts, *map(_file_of, modules)]}
+    return [maker.script, *maker.runs, *(f"cuspid.cli.{verb}" for verb in verbs if verb != "__init__")]
 
 
-def _scripts(name: str) -> set[Path]:
-    """A script and the others of this folder that it imports, in turn."""
-    found, waiting = set(), [HERE / f"{name}.py"]
-    while waiting:
-        script = waiting.pop()
-        found.add(script)
-        others = {HERE / f"{name}.py" for name in _imported(script)}
-        waiting += [other for other in others - found if other.exists()]
-    return found
+def _code(read: Callable[[str], bytes | None], without: tuple[str, ...]) -> Code:
+    """Modules of cuspid, and scripts of this folder, by the files that they are in."""
+
+    def read_module(module: str) -> bytes | None:
+        return next((text for file in _files(module) if (text := read(file)) is not None), None)
+
+    return Code(read_module, without)
 
 
 @cache
-def _imported(script: Path) -> frozenset[str]:
-    """Modules, and what else is imported from them: that may be a module, too."""
-    names: set[str] = set()
-    for node in ast.walk(ast.parse(script.read_bytes())):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return frozenset(names)
+def _code_of_today(without: tuple[str, ...]) -> Code:
+    return _code(_today, without)
 
 
-@cache
-def _graph(without: tuple[str, ...]) -> grimp.ImportGraph:
-    graph = grimp.build_graph(*_SOURCES, cache_dir=None)
-    for name in without:
-        for module in {name} | graph.find_descendants(name):
-            graph.remove_module(module)
-    return graph
+def _digests(code: Code, modules: Sequence[str]) -> list[str] | None:
+    try:
+        return [code.digest(module) for module in modules]
+    except LookupError:  # one of them is not there
+        return None
 
 
-def _upstream(roots: Iterable[str], without: tuple[str, ...]) -> set[str]:
-    graph = _graph(without)
-    known: Sequence[str] = [root for root in roots if root in graph.modules]
-    return set(known).union(*(graph.find_upstream_modules(root) for root in known)) - set(_SOURCES)
+def _files(module: str) -> tuple[str, ...]:
+    """Where a module may be."""
+    package, *inside = module.split(".")
+    if package not in _SOURCES:
+        return () if inside else (f"benchmarks/{module}.py",)
+    path = "/".join((_SOURCES[package], package, *inside))
+    return (f"{path}.py", f"{path}/__init__.py") if inside else (f"{path}/__init__.pyi",)
 
 
-def _file_of(module: str) -> Path:
-    path = ROOT / _SOURCES[module.split(".")[0]] / Path(*module.split("."))
-    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+def _file_of(module: str) -> str:
+    return next(file for file in _files(module) if _today(file) is not None)
+
+
+def _today(file: str) -> bytes | None:
+    path = ROOT / file
+    return path.read_bytes() if path.is_file() else None
+
+
+def _content_of(blobs: Mapping[str, str], file: str) -> bytes | None:
+    return _content(blobs[file]) if file in blobs else None
 
 
 def _git(*arguments: str) -> bytes:

@@ -30,7 +30,6 @@ from scipy.spatial.transform import Rotation
 
 from cuspid import pipeline
 from cuspid.anatomy.jaw_files import load_jaw
-from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.evaluation.trajectory import trajectory_error
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
@@ -176,9 +175,7 @@ def scanned(
     reconstruction, mesh = pipeline.reconstruct(capture, folder, how)
     took, took_cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
     reference = pipeline.load_reference(folder / "truth")
-    found = pipeline.evaluate(
-        mesh, reference.jaw, EvaluationOptions(), scannable=reference.scannable, crown=reference.crown
-    )
+    found = pipeline.evaluate(mesh, reference)
     crown = found.crown
     trajectory = trajectory_error(
         reconstruction.rig_from_world, read_poses(folder / "truth" / "poses.json"), found.reference_from_scan

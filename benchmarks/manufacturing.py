@@ -30,7 +30,6 @@ from cuspid.anatomy.jaw_files import load_jaw
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.capture import Capture
-from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.evaluation.trajectory import trajectory_error
 from cuspid.geometry import Rigid3, best_similarity
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
@@ -83,18 +82,11 @@ def scanned(
     mesh, sigma_um = pipeline.surface(capture, reconstruction, folder / how, options)
     took, took_cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
     reference = pipeline.load_reference(scan / "truth")
-    found = pipeline.evaluate(
-        mesh,
-        reference.jaw,
-        EvaluationOptions(),
-        scannable=reference.scannable,
-        crown=reference.crown,
-        sigma_um=sigma_um,
-    )
+    found = pipeline.evaluate(mesh, reference, sigma_um=sigma_um)
     true = storage.read_poses(scan / "truth" / "poses.json")
     trajectory = trajectory_error(reconstruction.rig_from_world, true, found.reference_from_scan)
     scaled = replace(mesh, vertices=mesh.vertices / (1 + found.scale_error_ppm / 1e6))
-    similar = pipeline.evaluate(scaled, reference.jaw, EvaluationOptions(), scannable=reference.scannable)
+    similar = pipeline.evaluate(scaled, reference)
     expected, within = reconstruction.expectation, found.within_sigmas_pct
     figures: dict[str, Value] = {
         "mean_um": found.accuracy.mean_abs_um,

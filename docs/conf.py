@@ -1,4 +1,4 @@
-"""The site of the documentation: Sphinx, with MyST for the Markdown pages and furo for the looks.
+"""The site of the documentation: Sphinx, with MyST for the Markdown pages and notebooks, and furo for the looks.
 
 Pages of the command line and of the modules are written anew by each build (``_site/``) into docs/cli and docs/api.
 Nothing in the built site asks the network for anything: formulas are MathML, their font comes along.
@@ -14,7 +14,7 @@ project = "cuspid"
 release = installed_version("cuspid")
 author = "the cuspid authors"
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx_copybutton",
     "_site.command_pages",
@@ -23,6 +23,12 @@ extensions = [
     "_site.formulas",
 ]
 exclude_patterns = ["_site"]
+
+nb_execution_mode = "force"
+nb_execution_in_temp = True
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
+nb_merge_streams = True
 
 html_theme = "furo"
 html_title = "cuspid"

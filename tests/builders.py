@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -105,6 +105,16 @@ def write_frames(folder: Path, frames: Iterable[np.ndarray]) -> Path:
     for number, frame in enumerate(frames):
         storage.write_image(folder / f"{number:03d}.png", np.ascontiguousarray(frame))
     return folder
+
+
+@dataclass(frozen=True)
+class SavedImages:
+    """A sink of rendered images, that processes may be given."""
+
+    folder: Path
+
+    def __call__(self, frame: str, camera: str, image: np.ndarray) -> None:
+        np.save(self.folder / f"{frame}-{camera}.npy", image)
 
 
 def make_capture(

@@ -147,7 +147,7 @@ def _read_meshes(folder: Path) -> None:
 def _evaluate(folder: Path) -> None:
     """As the verb does, but for its pictures, which take the most time."""
     scan, against = storage.read_mesh(folder / "binary.stl"), pipeline.load_reference(folder / "text.ply")
-    pipeline.evaluate(scan, against.jaw, EvaluationOptions(align=False, samples=2000))
+    pipeline.evaluate(scan, against, EvaluationOptions(align=False, samples=2000))
 
 
 def _units(folder: Path) -> None:
@@ -434,7 +434,7 @@ def _evaluate_tiny(folder: Path) -> None:
             scan, against = storage.read_mesh(folder / f"{name}.ply"), pipeline.load_reference(folder / "reference.ply")
             search = SearchOptions(anchors=2, targets=50, candidates=20, turn_step_deg=45.0)
             options = EvaluationOptions(samples=500, registration=RegistrationOptions(search=search, samples=200))
-            pipeline.evaluate(scan, against.jaw, options)
+            pipeline.evaluate(scan, against, options)
 
 
 def _image_types(folder: Path) -> None:

@@ -28,10 +28,14 @@ def repository(tmp_path, freshness, monkeypatch):
     for command in (("init", "-q"), ("add", "."), ("commit", "-qm", "as it stands")):
         subprocess.run([*git, *command], check=True)
     monkeypatch.setattr(freshness, "ROOT", tmp_path)
-    monkeypatch.setattr(freshness, "HERE", tmp_path / "benchmarks")
-    for each in ("_changed_since", "_imported"):
-        getattr(freshness, each).cache_clear()
+    forget(freshness)
     return tmp_path
+
+
+def forget(freshness) -> None:
+    """The code as it was."""
+    freshness._changed_since.cache_clear()
+    freshness._code_of_today.cache_clear()
 
 
 def commit_of(repository: Path) -> str:
@@ -52,6 +56,20 @@ def test_a_result_of_the_same_code_holds(freshness, repository):
 def test_what_is_only_read_changes_no_result(freshness, repository, text):
     add(repository, REFINEMENT, text)
     assert freshness.changes("jaws_half", {"commit": commit_of(repository)}) == ()
+
+
+def test_a_module_that_is_moved_changes_no_result(freshness, repository):
+    """Its folder, its name and all that import it."""
+    moved = repository / "src/cuspid/stereo/depth_refinement.py"
+    (repository / REFINEMENT).rename(moved)
+    for path in [*repository.rglob("*.py")]:
+        path.write_text(path.read_text().replace("cuspid.stereo.refinement", "cuspid.stereo.depth_refinement"))
+    result = {"commit": commit_of(repository)}
+    assert freshness.changes("measure", result) == ()
+    assert freshness.changes("stereo_pairs", result) == ()
+    moved.write_text(moved.read_text() + "\nNEW = 1\n")
+    forget(freshness)
+    assert str(moved.relative_to(repository)) in freshness.changes("stereo_pairs", result)
 
 
 def test_a_script_that_a_benchmark_starts_has_a_part_in_its_result(freshness, repository):

@@ -18,9 +18,9 @@ from cuspid.calibration import corners
 from cuspid.calibration.calibrate import size_notes
 from cuspid.calibration.causes import cause_of_absence, is_part_of_a_larger_one
 from cuspid.calibration.corners import find_corners
+from cuspid.calibration.from_images import _matched
 from cuspid.calibration.instants import common_instants
 from cuspid.camera import Camera
-from cuspid.cli.calibration import _matched
 from cuspid.errors import InputError
 from cuspid.image_files import exif_orientation, read_image, recorded
 from cuspid.image_sequence import ImageSequence

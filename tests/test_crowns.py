@@ -11,6 +11,7 @@ from cuspid.anatomy.crowns import crowns_by_shape, crowns_of
 from cuspid.anatomy.orientation import find_occlusal_frame
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
+from cuspid.evaluation.deviation import evaluate
 from cuspid.jaw import Arch, Jaw
 from cuspid.mesh import Mesh
 
@@ -99,7 +100,7 @@ def test_without_labels_open_crown_is_an_estimate_and_nothing_is_said_tooth_by_t
     scan = jaw.mesh.submesh(jaw.mesh.face_centres[:, 0] > 0)
     options = pipeline.EvaluationOptions(align=False, samples=20_000)
     for crown in (named, unnamed):
-        found = pipeline.evaluate(scan, jaw, options, crown=crown).crown
+        found = evaluate(scan, jaw, options, crown=crown).crown
         assert found is not None
         assert found.completeness_pct["50"] > 95
         assert found.open_mm2 == pytest.approx(0.5 * jaw.mesh.face_areas[named.parts > 0].sum(), rel=0.15)

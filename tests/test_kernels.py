@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -149,6 +150,16 @@ def test_a_kernel_that_cannot_be_compiled_leaves_no_lock(tmp_path: Path) -> None
     for _ in range(2):
         ended = subprocess.run([sys.executable, tmp_path / "wrong.py"], capture_output=True, text=True, timeout=60)
         assert ended.stdout.split() == ["TypingError", "TypingError"]
+
+
+def test_numba_is_bounded_by_what_is_tested() -> None:
+    """Its cache on disk is extended, which its next version may change: whoever takes that runs these tests with it."""
+    root = Path(__file__).parent.parent
+    tested = re.search(r"^numba==0\.(\d+)", (root / "constraints.txt").read_text(), re.M)
+    bound = re.search(r'"numba>=0\.\d+,<0\.(\d+)"', (root / "pyproject.toml").read_text())
+    assert tested is not None
+    assert bound is not None
+    assert int(bound[1]) == int(tested[1]) + 1
 
 
 def kernels() -> Iterator[Dispatcher]:

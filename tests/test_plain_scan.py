@@ -9,7 +9,7 @@ import numpy as np
 from cuspid import pipeline
 from cuspid.handpiece.designs import DesignOptions, essential_four
 from cuspid.jaw import Jaw
-from cuspid.pipeline import EvaluationOptions, ReconstructionOptions, SimulationOptions
+from cuspid.pipeline import ReconstructionOptions, SimulationOptions
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.storage import read_json
 
@@ -25,7 +25,7 @@ def test_a_plain_tooth_is_scanned_and_resumed(tmp_path: Path, coarse_phantom: Ja
     assert any("calibration" in note for note in found.notes)
     assert not any("polaris" in note for note in found.notes)
     reference = pipeline.load_reference(tmp_path / "truth")
-    trueness = pipeline.evaluate(mesh, reference.jaw, EvaluationOptions(), scannable=reference.scannable)
+    trueness = pipeline.evaluate(mesh, reference)
     assert 3 < trueness.accuracy.mean_abs_um < 60
     assert trueness.completeness_pct["100"] > 60
     made = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*") if file.suffix in (".npz", ".ply", ".json")}

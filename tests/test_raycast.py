@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from builders import sphere
+from builders import SavedImages, sphere
+from cuspid import workers
 from cuspid.camera import Camera
 from cuspid.capture import Frame
 from cuspid.errors import InputError
@@ -418,16 +420,14 @@ def test_light_does_not_depend_on_what_is_shaded_at_once(
     assert whole.any()
 
 
-def test_processes_give_the_same_images_as_one(scene: Scene, poses: dict[str, Rigid3], tmp_path) -> None:
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_processes_give_the_same_images_as_one(
+    scene: Scene, poses: dict[str, Rigid3], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    monkeypatch.setattr(workers, "START_METHOD", method)
     whole = rendered(scene, poses)
-    done = list(
-        render_capture(
-            scene,
-            *lit_frames(scene.handpiece, poses),
-            lambda f, c, image: np.save(tmp_path / f"{f}-{c}.npy", image),
-            processes=2,
-        )
-    )
+    frames = lit_frames(scene.handpiece, poses)
+    done = list(render_capture(scene, *frames, SavedImages(tmp_path), processes=2))
     assert sorted(done) == sorted(whole)
     for (frame, camera), image in whole.items():
         np.testing.assert_array_equal(np.load(tmp_path / f"{frame}-{camera}.npy"), image)

@@ -17,7 +17,7 @@ from cuspid.handpiece.designs import DesignOptions, twelve_cameras
 from cuspid.jaw import Jaw
 from cuspid.pipeline import RenderOptions, take_images
 from cuspid.storage.captures import hash_capture
-from cuspid.storage.stages import RECORD, Stage, code_version
+from cuspid.storage.stages import RECORD, Stage, _installed, code_version
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,8 @@ def test_a_result_is_made_once_and_again_only_when_something_changed(maker: Make
     assert made_again(maker, Stage("cut", folder, Options(size=1.5)), images="b")
     assert made_again(maker, Stage("cut", folder, Options(size=1.5)), images="b", more="c")
     assert made_again(maker, Stage("paste", folder, Options(size=1.5)), images="b", more="c")
-    assert made_again(maker, Stage("paste", folder, Options(size=1.5), ("stereo",)), images="b", more="c")
-    assert not made_again(maker, Stage("paste", folder, Options(size=1.5), ("stereo",)), images="b", more="c")
+    assert made_again(maker, Stage("paste", folder, Options(size=1.5), ("cuspid.mesh",)), images="b", more="c")
+    assert not made_again(maker, Stage("paste", folder, Options(size=1.5), ("cuspid.mesh",)), images="b", more="c")
 
 
 @pytest.mark.parametrize("damage", [b"", b"result 2", b"resul"])
@@ -135,9 +135,19 @@ def test_a_record_that_cannot_be_written_leaves_no_empty_file(tmp_path: Path) ->
 
 
 def test_the_version_of_the_code_tells_its_parts_apart() -> None:
-    parts = [(), ("stereo",), ("motion",), ("motion/features.py",), ("stereo", "motion")]
+    parts = [(), ("cuspid.stereo.stage",), ("cuspid.motion.stage",), ("cuspid.stereo.stage", "cuspid.motion.stage")]
     assert len({code_version(*each) for each in parts}) == len(parts)
-    assert code_version("stereo") == code_version("stereo")
+    with pytest.raises(LookupError, match="stereo"):
+        code_version("stereo")
+
+
+@pytest.mark.parametrize("stage", ["footage", "motion", "simulation", "stereo", "surface"])
+def test_a_stage_depends_on_what_it_uses_and_not_on_what_stands_above_it(stage: str) -> None:
+    used = _installed().modules([f"cuspid.{stage}.stage"])
+    assert f"cuspid.{stage}.stage" in used
+    assert len(used) > 20
+    above = ("cuspid.cli", "cuspid.pipeline", "cuspid.studies", "cuspid.reporting", "cuspid.session")
+    assert not [each for each in used if each.startswith(above)]
 
 
 def test_a_capture_is_the_same_in_memory_as_on_disk(tmp_path: Path, coarse_phantom: Jaw) -> None:

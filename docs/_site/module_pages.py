@@ -81,4 +81,5 @@ def _page(floor: str, modules: Mapping[str, str]) -> str:
 def _section(name: str, floor: str) -> Iterator[str]:
     if name != floor:
         yield heading(name, "-")
-    yield from (f".. automodule:: {name}", "")
+    # What the face offers has its place where it is made.
+    yield from (f".. automodule:: {name}", *(["   :no-members:"] if name == GROUND_FLOOR else []), "")

@@ -1,3 +1,20 @@
-"""cuspid: passive intra-oral 3D scanning, from the design of the handpiece to a mesh that can be trusted."""
+"""cuspid: passive intra-oral 3D scanning, from the design of the handpiece to a mesh that can be trusted.
+
+    handpiece            = build_handpiece("twelve")               or design(read_brief("brief.toml")).handpiece
+    capture, truth       = simulate(jaw, handpiece, "scan")        or read_capture("capture")
+    reconstruction, mesh = reconstruct(capture, "scan")
+    trueness             = evaluate(mesh, truth)
+    (panorama, *_)       = stitch(read_sequence("frames"))
+
+What is here is named in ``__init__.pyi``, and loaded when it is first used.
+"""
+
+from importlib import import_module
+
+import lazy_loader
+
+from cuspid.display import draw_with
 
 __version__ = "0.2.0"
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+draw_with(lambda value: import_module("cuspid.reporting.notebook").to_html(value))

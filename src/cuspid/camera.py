@@ -59,6 +59,10 @@ class Camera:
     model: str = "OPENCV"
     """The model of the lens: one of :data:`cuspid.geometry.cameras.MODELS`."""
 
+    def __repr__(self) -> str:
+        fx, fy = self.focal_px
+        return f"Camera({self.width} x {self.height} px, {self.model}, focal length {fx:.1f} x {fy:.1f} px)"
+
     def __post_init__(self) -> None:
         for name in ("focal_px", "principal_point_px", "distortion"):
             object.__setattr__(self, name, read_only(np.asarray(getattr(self, name), dtype=np.float64)))

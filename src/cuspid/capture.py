@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from cuspid.display import Displayed
 from cuspid.errors import InputError
 from cuspid.image_files import Pixels, as_8_bits, has_opacity, image_size, read_fine, read_image, read_rgba
 from cuspid.rig import Handpiece
@@ -207,7 +208,7 @@ def halved_size(width: int, height: int) -> tuple[int, int]:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Capture:
+class Capture(Displayed):
     """What a handpiece recorded. Images are read on demand."""
 
     handpiece: Handpiece
@@ -218,6 +219,11 @@ class Capture:
     """Where the images come from."""
     left_out: tuple[Dropped, ...] = ()
     """Images that are missing, and why."""
+
+    def __repr__(self) -> str:
+        images = sum(len(frame.cameras) for frame in self.frames)
+        left_out = f", {len(self.left_out)} left out" if self.left_out else ""
+        return f"Capture({len(self.frames)} frames, {images} images{left_out}, {self.handpiece})"
 
     def halved(self) -> Capture:
         """The same capture with images of half the size, and a handpiece that takes such images."""

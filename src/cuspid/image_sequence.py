@@ -41,6 +41,10 @@ class ImageSequence:
         """Names of the frames."""
         return self.instants or tuple(path.stem for path in self.paths)
 
+    def __repr__(self) -> str:
+        calibrated = "not calibrated" if self.camera is None else "calibrated"
+        return f"ImageSequence({len(self)} frames of {self.size[0]} x {self.size[1]} px, {calibrated}, {self.source})"
+
     def __len__(self) -> int:
         return len(self.paths)
 

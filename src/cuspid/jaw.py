@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
+from cuspid.display import Displayed
 from cuspid.errors import InputError
 from cuspid.geometry import read_only
 from cuspid.mesh import Mesh
@@ -61,7 +62,7 @@ class Sphere:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Jaw:
+class Jaw(Displayed):
     """What is scanned, or the reference that a scan is evaluated against."""
 
     mesh: Mesh
@@ -85,6 +86,12 @@ class Jaw:
                 raise InputError(
                     f"jaw: {len(self.face_labels)} labels for {len(self.mesh.faces)} faces; each face needs exactly one"
                 )
+
+    def __repr__(self) -> str:
+        named = {"landmarks": self.landmarks, "lines": self.lines, "spheres": self.spheres}
+        teeth = "no labels" if self.face_labels is None else f"{len(self.teeth)} teeth"
+        also = [f"{len(each)} {what}" for what, each in named.items() if each]
+        return f"Jaw({', '.join([self.arch or 'arch unknown', teeth, *also])}, {self.mesh})"
 
     @property
     def teeth(self) -> tuple[int, ...]:

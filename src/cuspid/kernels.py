@@ -6,7 +6,8 @@ loads what the index names unchecked, although two processes that compile at the
 other's numbers (numba issue 10128 is such a case), and although a function that is called, and so compiled into it, may
 have changed in another module. Either gives wrong results silently. Here each piece of compiled code records what it
 was compiled from, and is used only if that is what is wanted; and processes that need the same kernel at the same time
-wait for the one that compiles it.
+wait for the one that compiles it. Nothing public of numba does this, so pyproject.toml bounds its version by the last
+one that was tested.
 """
 
 from __future__ import annotations

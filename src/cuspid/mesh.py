@@ -15,6 +15,7 @@ from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 from jaxtyping import Bool, Float, Int, UInt8
 
+from cuspid.display import Displayed
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, owned, read_only
 from cuspid.kernels import kernel
@@ -108,7 +109,7 @@ def _backwards(points, towards, tolerance_mm):
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh:
+class Mesh(Displayed):
     """Vertices and triangles."""
 
     vertices: Float[np.ndarray, "v 3"]
@@ -125,6 +126,10 @@ class Mesh:
             object.__setattr__(self, "colors", read_only(np.asarray(self.colors, dtype=np.uint8)))
         if self.faces.size and (self.faces.min() < 0 or self.faces.max() >= len(self.vertices)):
             raise InputError(f"mesh: a face refers to a vertex outside 0..{len(self.vertices) - 1}")
+
+    def __repr__(self) -> str:
+        extent = " x ".join(f"{side:.1f}" for side in np.ptp(self.bounds, axis=0)) if len(self.vertices) else "0"
+        return f"Mesh({len(self.vertices):,} vertices, {len(self.faces):,} faces, {extent} mm)"
 
     @property
     def face_cross(self) -> Float[np.ndarray, "f 3"]:

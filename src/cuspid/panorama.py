@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int16, UInt8
 
+from cuspid.display import Displayed
 from cuspid.geometry import read_only
 
 
@@ -33,7 +34,7 @@ class FrameUse:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Panorama:
+class Panorama(Displayed):
     """One picture of an arch (or of a part of it), and where each of its pixels was seen."""
 
     image: UInt8[np.ndarray, "h w 3"]
@@ -65,6 +66,13 @@ class Panorama:
         for name in ("image", "covered", "frame_index", "frame_pixel", "height_mm", "origin_px"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    def __repr__(self) -> str:
+        height, width = self.covered.shape
+        size = "no scale" if self.size_mm is None else f"{self.size_mm[0]:.1f} x {self.size_mm[1]:.1f} mm"
+        used = sum(frame.used for frame in self.frames)
+        part = f", part {self.part} of {self.parts}" if self.parts > 1 else ""
+        return f"Panorama({width} x {height} px, {size}, {used} of {len(self.frames)} frames, {self.method}{part})"
 
     @property
     def size_mm(self) -> tuple[float, float] | None:

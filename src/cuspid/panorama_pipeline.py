@@ -104,18 +104,23 @@ class StitchOptions(OrthoOptions):
     """How its points are followed over the dense surface."""
 
 
-def stitch(sequence: ImageSequence, options: StitchOptions, *, progress: Progress = silent) -> tuple[Stitched, ...]:
-    """The panorama of an arch from the frames of one camera; several parts where the sequence broke, largest first.
+def stitch(
+    frames: ImageSequence | Capture, options: StitchOptions = StitchOptions(), *, progress: Progress = silent
+) -> tuple[Stitched, ...]:
+    """The panorama of an arch: from the frames of one camera, in several parts where the sequence broke, largest first;
+    or from a capture, as :func:`stitch_rig`.
 
     Raises ReconstructionError, naming the frames, where nothing can be placed, or nothing of it can be shown.
     """
+    if isinstance(frames, Capture):
+        return (stitch_rig(frames, options, progress=progress),)
     if options.method == "thesis":
         method = load_plugin("cuspid.stitching", "thesis", asked="--method thesis", distribution="cuspid-thesis")
-        panoramas = method(sequence, examination=options.examination, progress=progress)
+        panoramas = method(frames, examination=options.examination, progress=progress)
         return that_show_something(Stitched(panorama=panorama, motion=None, strip=None) for panorama in panoramas)
-    motion = locate_single(sequence, options.motion, progress=progress)
-    notes = (*sequence.notes, *motion.notes)
-    stitched = [_stitched(sequence, motion, number, options, progress) for number in range(len(motion.parts))]
+    motion = locate_single(frames, options.motion, progress=progress)
+    notes = (*frames.notes, *motion.notes)
+    stitched = [_stitched(frames, motion, number, options, progress) for number in range(len(motion.parts))]
     return that_show_something(
         replace(
             part,
@@ -170,7 +175,7 @@ def _stitched(
     return replace(made, panorama=replace(made.panorama, notes=(*notes, *made.panorama.notes, *loose)))
 
 
-def stitch_rig(capture: Capture, options: StitchOptions, *, progress: Progress = silent) -> Stitched:
+def stitch_rig(capture: Capture, options: StitchOptions = StitchOptions(), *, progress: Progress = silent) -> Stitched:
     """The panorama of an arch from the images of a handpiece of two or more cameras, in true millimetres: the picture
     is that of its camera which looks down most, the path and the surface are of all.
 

@@ -49,7 +49,7 @@ UNITS = 100.0
 _NEAR_PCT, _FAR_PCT = 1.0, 99.0
 _NEARER, _FARTHER = 0.9, 1.1
 """The range of depths is that of these percentiles of the sparse points, with a margin."""
-_CODE = ("motion", "calibration/corners.py")
+_CODE = (__name__,)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -5,7 +5,7 @@ capture, truth       = simulate(jaw, handpiece, folder, ...)        images, and 
 reconstruction       = locate(capture, folder, ...)                 metric poses, refined calibration
 depths               = measure_depth(capture, folder, ...)          frame by frame, from the rig alone
 mesh                 = fuse(depths, ...)
-trueness             = evaluate(mesh, truth.jaw, ...)
+trueness             = evaluate(mesh, truth)
 
 ``measure_depth``, ``locate`` and ``fuse`` see only images and calibration. Panoramas: ``panorama_pipeline``.
 """
@@ -26,7 +26,8 @@ from cuspid.anatomy.jaw_files import Labelling
 from cuspid.anatomy.orientation import find_occlusal_frame
 from cuspid.capture import Capture
 from cuspid.evaluation.crown import OpenCrown, open_parts, pieces
-from cuspid.evaluation.deviation import EvaluationOptions, evaluate
+from cuspid.evaluation.deviation import EvaluationOptions
+from cuspid.evaluation.deviation import evaluate as measure_deviation
 from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Arch, Jaw
@@ -58,7 +59,7 @@ from cuspid.surface.fusion import FusionOptions
 from cuspid.surface.sharp_edges import SharpEdgeOptions
 from cuspid.surface.stage import find_holes, fuse
 from cuspid.tolerances import NominalOptions, held, is_nominal
-from cuspid.trueness import GroundTruth
+from cuspid.trueness import GroundTruth, Trueness
 from cuspid.visibility import VisibilityOptions, scannable_faces
 
 __all__ = [
@@ -77,6 +78,7 @@ __all__ = [
     "measure_enough_depth",
     "measure_view_depth",
     "reconstruct",
+    "reference_of",
     "scannable",
     "simulate",
     "take_images",
@@ -139,14 +141,18 @@ class ReconstructionOptions(Options):
 
 def reconstruct(
     capture: Capture,
-    folder: Path,
-    options: ReconstructionOptions,
+    folder: Path | str,
+    options: ReconstructionOptions = ReconstructionOptions(),
     *,
     colmap_model: Path | None = None,
     progress: Progress = silent,
 ) -> tuple[Reconstruction, Mesh]:
-    """Reconstruct poses and a mesh from images and calibration. With a COLMAP model, its poses are taken instead of
-    found."""
+    """Reconstruct poses and a mesh from images and calibration, and keep both, and the depth of each view, in a folder.
+    With a COLMAP model, its poses are taken instead of found.
+
+    Raises ReconstructionError where too few frames can be located, or no surface is left.
+    """
+    folder = Path(folder)
     options = replace(options, signal=matched(capture, options))
     found = find_poses(capture, folder, options, colmap_model=colmap_model, progress=progress)
     return found, surface(capture, found, folder, options, progress=progress)[0]
@@ -352,7 +358,7 @@ def as_known(handpiece: Handpiece, options: ReconstructionOptions) -> Handpiece:
 # --- What a scan is compared with ------------------------------------------------------------------------------------
 
 
-def scannable(truth: GroundTruth, options: VisibilityOptions) -> Bool[np.ndarray, "f"]:
+def scannable(truth: GroundTruth, options: VisibilityOptions = VisibilityOptions()) -> Bool[np.ndarray, "f"]:
     """The faces of the true jaw that at least two cameras of one frame could see."""
     return scannable_faces(truth.jaw.mesh, truth.handpiece, truth.rig_from_world.values(), options)
 
@@ -367,10 +373,46 @@ class Reference:
     """The faces that at least two cameras of one frame could see; None if that is not known."""
     crown: OpenCrown | None
     """The open crown surface; None if nothing is crown or looks like it."""
-    hashes: Mapping[str, str]
-    """SHA-256 of the files, by what they contain."""
+    hashes: Mapping[str, str] = field(default_factory=dict)
+    """SHA-256 of the files that it was read from, by what they contain."""
     notes: tuple[str, ...] = ()
     """How its files were understood."""
+
+
+def evaluate(
+    mesh: Mesh,
+    reference: Reference | GroundTruth | Jaw | Mesh,
+    options: EvaluationOptions = EvaluationOptions(),
+    *,
+    sigma_um: Float[np.ndarray, "v"] | None = None,
+) -> Trueness:
+    """Trueness of a mesh in any pose. Evaluated is the surface that at least two cameras could see, which the ground
+    truth of a simulation tells; of a jaw or a mesh all of it.
+
+    ``sigma_um``: the standard deviation that the scan predicts for each of its vertices, along its normal. Raises
+    InputError where the two do not belong together or nothing is left to compare.
+    """
+    against = reference if isinstance(reference, Reference) else reference_of(reference)
+    scan, facing = facing_outwards(mesh)
+    found = measure_deviation(
+        scan, against.jaw, options, scannable=against.scannable, crown=against.crown, sigma_um=sigma_um
+    )
+    told = (*(f"scan: {note}" for note in facing), *(() if against is reference else against.notes))
+    return replace(found, notes=(*told, *found.notes))
+
+
+def reference_of(truth: GroundTruth | Jaw | Mesh) -> Reference:
+    """What a scan is compared with, of what is known of its object: a mesh, in any pose, tells least, the ground truth
+    of a simulation most."""
+    if isinstance(truth, GroundTruth):
+        seen = scannable(truth)
+        return Reference(jaw=truth.jaw, scannable=seen, crown=crown_surface(truth.jaw, seen=seen))
+    if isinstance(truth, Jaw):
+        return Reference(jaw=truth, scannable=None, crown=crown_surface(truth))
+    mesh, notes = facing_outwards(truth)
+    jaw = Jaw(mesh=mesh)
+    crown = crown_surface(jaw, find_occlusal_frame(mesh).occlusal_from_mesh)
+    return Reference(jaw=jaw, scannable=None, crown=crown, notes=tuple(f"reference: {note}" for note in notes))
 
 
 def load_reference(
@@ -388,13 +430,8 @@ def load_reference(
     truth = storage.read_truth(path)
     if scan is not None and not _SMALLEST_SCAN_MM < scan.width_mm < _LARGEST_SCAN_MM:
         storage.require_one_unit(scan, storage.MeasuredFile(path=path, mesh=truth.jaw.mesh, unit="mm"))
-    seen = scannable(truth, VisibilityOptions())
-    return Reference(
-        jaw=truth.jaw,
-        scannable=seen,
-        crown=crown_surface(truth.jaw, seen=seen),
-        hashes={name: storage.hash_file(path / name) for name in ("jaw.ply", "poses.json", "handpiece.json")},
-    )
+    hashes = {name: storage.hash_file(path / name) for name in ("jaw.ply", "poses.json", "handpiece.json")}
+    return replace(reference_of(truth), hashes=hashes)
 
 
 def _loaded_reference(
@@ -404,7 +441,7 @@ def _loaded_reference(
     if storage.is_jaw(path):
         jaw = storage.read_jaw(path)
         _require_sizes(storage.MeasuredFile(path=path, mesh=jaw.mesh, unit="mm", option=_REFERENCE_UNIT), scan)
-        return Reference(jaw=jaw, scannable=None, crown=crown_surface(jaw), hashes=hashes)
+        return replace(reference_of(jaw), hashes=hashes)
     mesh, labels, _ = storage.read_labelled_mesh(path, unit)
     _require_sizes(storage.MeasuredFile(path=path, mesh=mesh, unit=unit, option=_REFERENCE_UNIT), scan)
     mesh, notes = facing_outwards(mesh)

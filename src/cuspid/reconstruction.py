@@ -100,6 +100,11 @@ class DepthMap:
     best_mm: float | None = None
     """Standard deviation of a depth that has confidence 1; None where none is stated."""
 
+    def __repr__(self) -> str:
+        height, width = self.depth_mm.shape
+        share = f"{self.known.mean():.0%} known"
+        return f"DepthMap(frame {self.frame}, camera {self.camera_name}, {width} x {height} px, {share})"
+
     @property
     def known(self) -> Bool[np.ndarray, "h w"]:
         """The pixels that have a depth."""
@@ -259,6 +264,11 @@ class Reconstruction:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rig_from_world", MappingProxyType(dict(self.rig_from_world)))
+
+    def __repr__(self) -> str:
+        frames = f"{len(self.frames)} frames, {len(self.dropped)} left out"
+        points = "no points" if self.tracks is None else f"{len(self.tracks.points):,} points"
+        return f"Reconstruction({frames}, {points}, {'mm' if self.has_scale else 'no scale'}, {self.rig})"
 
     @property
     def frames(self) -> tuple[str, ...]:

@@ -16,9 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from cuspid.body import CAMERA_MM, LED_MM, Body, module
 from cuspid.camera import Camera
+from cuspid.display import Displayed
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, axes_about, read_only, unit
-from cuspid.values import checked_name, one_line
+from cuspid.values import checked_name, named, one_line, shown
 from cuspid.workers import computed_once
 
 _NO_SIDE = 1e-3
@@ -61,6 +62,11 @@ class Rig:
         for key in self.cameras:
             checked_name("rig: cameras", key)
         object.__setattr__(self, "cameras", MappingProxyType(dict(self.cameras)))
+
+    def __repr__(self) -> str:
+        sizes = sorted({f"{each.camera.width} x {each.camera.height}" for each in self.cameras.values()})
+        plural = "s" if len(self.cameras) > 1 else ""
+        return f"Rig({len(self.cameras)} camera{plural} of {named(sizes, 3)} px)"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -285,7 +291,7 @@ def depth_of_field_mm(working_distance_mm: float) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Handpiece:
+class Handpiece(Displayed):
     """Everything that is built into the handpiece."""
 
     rig: Rig
@@ -321,6 +327,12 @@ class Handpiece:
             raise InputError(
                 f"handpiece: depth range {near}-{far} mm must enclose the working distance {self.working_distance_mm}"
             )
+
+    def __repr__(self) -> str:
+        return (
+            f"Handpiece({shown(self.name)}, {self.rig}, {len(self.lights)} lights, "
+            f"{self.working_distance_mm:g} mm from the teeth)"
+        )
 
     @computed_once
     def solid(self) -> Body:

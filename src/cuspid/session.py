@@ -72,7 +72,7 @@ class Session:
         self,
         handpiece: Handpiece,
         source: ImageSource,
-        folder: Path,
+        folder: Path | str,
         options: ReconstructionOptions | None = None,
     ) -> None:
         """``source`` gives the images of the frames that will be pushed; ``folder`` is that of the results. Raises
@@ -80,7 +80,7 @@ class Session:
         self._options = options or ReconstructionOptions(quality="draft")
         settled = pipeline.settled(self._options)
         require_stereo(handpiece, settled.stereo.pairing)
-        self._settled, self._folder = settled, folder
+        self._settled, self._folder = settled, Path(folder)
         self._capture = Capture(handpiece=pipeline.as_known(handpiece, settled), frames=(), source=source)
         self._given = handpiece
         self._sized = pipeline.sized(self._capture, settled)

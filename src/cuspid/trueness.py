@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int16, UInt8
 
+from cuspid.display import Displayed
 from cuspid.geometry import Rigid3, read_only
 from cuspid.jaw import GUM, Jaw
 from cuspid.rig import Handpiece
@@ -28,6 +29,9 @@ class GroundTruth:
     """The handpiece as it was built (the capture may hold a nominal one)."""
     rig_from_world: Mapping[str, Rigid3]
     """Pose of the handpiece for each frame."""
+
+    def __repr__(self) -> str:
+        return f"GroundTruth({len(self.rig_from_world)} poses, {self.jaw})"
 
 
 NOTHING = -1
@@ -130,7 +134,7 @@ class CrownCompleteness:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Trueness:
+class Trueness(Displayed):
     """Result of an evaluation."""
 
     accuracy: DeviationStatistics
@@ -166,6 +170,12 @@ class Trueness:
     "1" and "2" (68 and 95 if all errors are random and accounted for); None if it predicted none."""
     notes: tuple[str, ...] = field(default=())
     """What a reader should know, for example how the scannable surface was determined."""
+
+    def __repr__(self) -> str:
+        return (
+            f"Trueness(mean |d| {self.accuracy.mean_abs_um:.1f} um, P95 {self.accuracy.p95_um:.1f} um, "
+            f"{self.completeness_pct['50']:.1f} % within 50 um, {len(self.deviation_um):,} vertices)"
+        )
 
 
 class Metric(NamedTuple):

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -118,3 +119,10 @@ def shown(value: object, *, longest: int = _SHOWN) -> str:
     """A value for a message: short, on one line, without control characters."""
     text = repr(value if not isinstance(value, np.ndarray) else value.tolist()).replace("\n", " ")
     return text if len(text) <= longest else f"{text[: longest - 3]}..."
+
+
+def named(names: Sequence[str], most: int = 6) -> str:
+    """Names on one line; if there are many, those in the middle are left out."""
+    if len(names) <= most:
+        return ", ".join(names)
+    return f"{', '.join(names[: most - 1])} ... {names[-1]}"

@@ -1,15 +1,21 @@
-"""How many cores this process may use, the distribution of work over them, and properties that threads share."""
+"""How many cores this process may use, the distribution of work over threads and processes, and properties that threads
+share."""
 
 from __future__ import annotations
 
+import io
 import os
+import pickle
+import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import fields, is_dataclass
 from functools import cached_property
 from itertools import islice, pairwise
 from threading import RLock
-from typing import TYPE_CHECKING, Any, TypeVar
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
@@ -19,6 +25,10 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 _BATCH_PER_CORE = 8
+
+START_METHOD: Literal["fork", "spawn"] = "fork" if sys.platform == "linux" else "spawn"
+"""How processes begin: as a copy of this one, with all that it has, or anew, with what they are given (:func:`packed`).
+Elsewhere than on Linux, system libraries do not survive a copy."""
 
 
 class computed_once(cached_property[_Result]):
@@ -43,6 +53,12 @@ def core_numbers(thread: int = 0) -> list[int]:
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(thread))
     return list(range(os.cpu_count() or 1))
+
+
+def keep_to_core(number: int) -> None:
+    """The calling thread, and those that it starts, run on this core alone from now on; where the system has a say."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {number})
 
 
 def usable_cores() -> int:
@@ -113,3 +129,34 @@ def map_slices(
     bounds = np.linspace(0, count, (parts or usable_cores()) + 1).astype(int)
     slices = [slice(*ends) for ends in pairwise(bounds.tolist())]
     return [work(each) for each in slices] if count < few or len(slices) == 1 else map_in_threads(work, slices)
+
+
+def packed(value: object) -> bytes:
+    """A value for a process that begins anew, which has it back by ``pickle.loads``. Of frozen values the fields are
+    packed, and not what was computed from them: trees and scenes of libraries cannot leave their process."""
+    stream = io.BytesIO()
+    _Packer(stream, protocol=pickle.HIGHEST_PROTOCOL).dump(value)
+    return stream.getvalue()
+
+
+class _Packer(pickle.Pickler):
+    def reducer_override(self, value: Any) -> Any:
+        if isinstance(value, MappingProxyType):
+            return _proxy, (dict(value),)
+        if is_dataclass(value) and not isinstance(value, type):
+            return _unpacked, (type(value), {each.name: getattr(value, each.name) for each in fields(value)})
+        return NotImplemented
+
+
+def _proxy(values: dict[Any, Any]) -> MappingProxyType[Any, Any]:
+    return MappingProxyType(values)
+
+
+def _unpacked(kind: type, values: dict[str, Any]) -> Any:
+    """The value bit for bit, and its arrays read-only as they were: kernels are compiled for such ones."""
+    made: Any = object.__new__(kind)
+    for name, value in values.items():
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False
+        object.__setattr__(made, name, value)
+    return made

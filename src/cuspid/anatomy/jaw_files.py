@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,10 +21,13 @@ from cuspid.inputs import is_there
 from cuspid.jaw import ARCHES, Arch, Jaw
 from cuspid.mesh import Mesh
 from cuspid.storage.files import finished, reading
-from cuspid.storage.jaws import is_jaw, read_jaw, read_label_map, read_labelled_mesh
+from cuspid.storage.jaws import is_jaw, read_label_map, read_labelled_mesh
+from cuspid.storage.jaws import read_jaw as read_own_jaw
 from cuspid.storage.landmarks import MARKUPS_SUFFIX, read_landmarks
 from cuspid.storage.meshes import MESH_SUFFIXES
 from cuspid.storage.units import Unit
+
+_log = logging.getLogger("cuspid")
 
 _GIVE_LABELS = "give a landmark file or a labelled mesh"
 
@@ -53,6 +57,16 @@ def named_arch(path: Path) -> Arch | None:
     return named[0] if len(named) == 1 else None
 
 
+def read_jaw(
+    path: Path | str, *, unit: Unit = "mm", arch: Arch | None = None, labelling: Labelling = Labelling()
+) -> Jaw:
+    """As :func:`load_jaw`; the notes are logged."""
+    jaw, notes = load_jaw(Path(path), unit=unit, arch=arch, labelling=labelling)
+    for note in notes:
+        _log.warning(note)
+    return jaw
+
+
 def load_jaw(
     path: Path, *, unit: Unit = "mm", arch: Arch | None = None, labelling: Labelling = Labelling()
 ) -> tuple[Jaw, tuple[str, ...]]:
@@ -72,7 +86,7 @@ def _load_oriented(
     """As :func:`load_jaw`, with ``occlusal_from_mesh``; where teeth are needed, what does not tell them is refused
     before it takes time."""
     if is_jaw(path):
-        return read_jaw(path), (), Rigid3.identity()
+        return read_own_jaw(path), (), Rigid3.identity()
     mesh, labels, colors = read_labelled_mesh(path, unit)
     colors = face_colors_of(mesh, colors)
     regions = tooth_regions(colors, mesh) if labels is None and colors is not None else None

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
-import cv2
 import numpy as np
-from jaxtyping import UInt8
 from rich.table import Table
 from tyro.conf import Positional, arg
 
@@ -18,25 +16,16 @@ from cuspid.board import Board, BoardSet, Target
 from cuspid.calibration.calibrate import (
     CalibrationOptions,
     RigCalibration,
-    calibrate_rig,
-    in_frame_of,
-    size_notes,
 )
-from cuspid.calibration.causes import MOST_TRIED, cause_of_absence, is_part_of_a_larger_one
-from cuspid.calibration.circle_centres import measured_share
-from cuspid.calibration.corners import BoardView, Views, find_corners
-from cuspid.calibration.instants import common_instants
+from cuspid.calibration.from_images import calibrate as calibrate_images
 from cuspid.calibration.lenses import LensChoice
-from cuspid.calibration.photometry import Photometry, PhotometryOptions, calibrate_light, look_at_patches
-from cuspid.calibration.start import LEAST_VIEWS
+from cuspid.calibration.photometry import Photometry, PhotometryOptions
 from cuspid.calibration.target import PLATE_MM, target_body
 from cuspid.calibration.uncertainty import lens_difference_px, projection_sigma_px
 from cuspid.cli.report import report
-from cuspid.cli.shared import Flat, console, named, show_progress
-from cuspid.errors import InputError, ReconstructionError
-from cuspid.image_sequence import ImageSequence
+from cuspid.cli.shared import Flat, console, show_progress
+from cuspid.errors import InputError
 from cuspid.options import Range
-from cuspid.progress import Progress
 from cuspid.reporting.figures.calibration import (
     save_board,
     save_lenses_picture,
@@ -44,13 +33,10 @@ from cuspid.reporting.figures.calibration import (
     save_residuals_picture,
     save_uncertainty_picture,
 )
-from cuspid.rig import Handpiece, Light, depth_of_field_mm
+from cuspid.rig import Handpiece, Light
 from cuspid.simulation.board_images import PhotographOptions, take_photographs
 from cuspid.simulation.manufacturing import ManufacturingOptions, built
-from cuspid.workers import map_in_threads
 
-_OTHER_CIRCLES = 0.06
-"""Error of the diameter of circles, as a share, that is told."""
 BoardFiles = Annotated[tuple[Path, ...], arg(name="board")]
 """Boards that are described by files."""
 
@@ -149,52 +135,27 @@ def calibrate(
         "working_distance_mm": working_distance_mm,
         "photometry": photometry,
     }
-    sources = storage.rig_sources(images)
-    hashes = {name: storage.hash_source(path) for name, path in sources.items()}
+    hashes = {name: storage.hash_source(path) for name, path in storage.rig_sources(images).items()}
     given = None if drawn is None else storage.read_handpiece(drawn)
     drawn_hash = {} if drawn is None else {"drawn": storage.hash_file(drawn)}
     with storage.claimed_folder(out, "frames", {}, hashes), show_progress() as progress:
-        sequences = {
-            name: storage.read_sequence(path, out / "frames" / name, progress=progress)
-            for name, path in sources.items()
-        }
-        sequences, named_notes = _matched(sequences)
-        views = _views(sequences, shown, progress)
-        _require_views(sequences, views, shown)
-        found = calibrate_rig(views, {name: each.size for name, each in sequences.items()}, shown, options)
-        drawn_notes = () if given is None else size_notes(found.rig, given.rig, shown)
-        drawn_notes += tuple(_other_circles(sequences, views, shown))
-        found = found if given is None else in_frame_of(found, given.rig)
-        light = None
-        if photometry.photometry and isinstance(shown, Board):
-            light = _light(found, sequences, shown, given, photometry, progress)
-    read = (note for each in sequences.values() for note in each.notes)
-    notes = (*read, *named_notes, *_unseen(sequences, views), *drawn_notes, *found.notes)
-    found = replace(found, notes=notes)
+        sequences = storage.read_sequences(images, out / "frames", progress=progress)
+        calibration = calibrate_images(
+            sequences,
+            shown,
+            options,
+            photometry=photometry,
+            drawn=given,
+            working_distance_mm=working_distance_mm,
+            progress=progress,
+        )
+    found, light = calibration.rig, calibration.light
     with storage.claimed_folder(out, "calibrate", settings, hashes | drawn_hash, replace=True):
-        _write(found, light, _handpiece(found, light, given, working_distance_mm), shown, out)
+        _write(found, light, calibration.handpiece, shown, out)
     _print(found, out)
     if light is not None:
         _print_light(light)
     report(out)
-
-
-def _light(
-    found: RigCalibration,
-    sequences: Mapping[str, ImageSequence],
-    board: Board,
-    drawn: Handpiece | None,
-    options: PhotometryOptions,
-    progress: Progress,
-) -> Photometry:
-    """What the cameras make of light, from the images that were used."""
-    index = {name: {frame: k for k, frame in enumerate(each.names)} for name, each in sequences.items()}
-
-    def image(camera: str, instant: str) -> UInt8[np.ndarray, "h w 3"]:
-        return sequences[camera].image(index[camera][instant])
-
-    patches = look_at_patches(found, image, board, options, progress=progress)
-    return calibrate_light(found, patches, board, drawn, options)
 
 
 def _write(found: RigCalibration, light: Photometry | None, handpiece: Handpiece, board: Target, out: Path) -> None:
@@ -222,100 +183,6 @@ def _draw_rivals(found: RigCalibration, path: Path) -> None:
     if tried:
         moved = {name: lens_difference_px(*pair, found.pixels[name]) for name, pair in tried.items()}
         save_lenses_picture(path, tried, moved, found.pixels)
-
-
-def _matched(sequences: Mapping[str, ImageSequence]) -> tuple[dict[str, ImageSequence], tuple[str, ...]]:
-    """With frames that have one name where they were taken at one instant, and how they were matched if not by theirs.
-    Raises InputError where nothing tells."""
-    instants = common_instants({camera: each.names for camera, each in sequences.items()})
-    if instants is None:
-        return dict(sequences), ()
-    (one, first), (other, second) = [(camera, each.names[0]) for camera, each in sequences.items()][:2]
-    note = (
-        f"images are matched by the numbers in their names ({one}: {first} is {instants[one][0]}, {other}: {second} is "
-        f"{instants[other][0]})"
-    )
-    return {camera: replace(each, instants=instants[camera]) for camera, each in sequences.items()}, (note,)
-
-
-def _views(sequences: Mapping[str, ImageSequence], board: Target, progress: Progress) -> Views:
-    """The board in every image that shows it."""
-    images = [(camera, index) for camera, sequence in sequences.items() for index in range(len(sequence))]
-
-    def find(image: tuple[str, int]) -> BoardView | None:
-        camera, index = image
-        return find_corners(cv2.cvtColor(sequences[camera].image(index), cv2.COLOR_RGB2GRAY), board)
-
-    found = map_in_threads(find, images, stage="corners", progress=progress)
-    return {
-        (camera, sequences[camera].names[index]): view
-        for (camera, index), view in zip(images, found, strict=True)
-        if view is not None
-    }
-
-
-def _require_views(sequences: Mapping[str, ImageSequence], views: Views, board: Target) -> None:
-    """Raise ReconstructionError, which names the cause, where a camera hardly saw the board as it was described, or saw
-    a larger one."""
-    for name, sequence in sequences.items():
-        seen = [index for index, instant in enumerate(sequence.names) if (name, instant) in views]
-        unseen = [index for index in range(len(sequence)) if index not in set(seen)]
-        if len(seen) >= LEAST_VIEWS:
-            if isinstance(board, Board) and is_part_of_a_larger_one(_some(sequence, seen), board):
-                raise ReconstructionError(
-                    f"calibration: the board in the images of camera {name} has a square more each way; the corners "
-                    f"were counted, not the squares: give --columns {board.columns + 1} --rows {board.rows + 1}"
-                )
-        elif (cause := cause_of_absence(_some(sequence, unseen), board)) is not None:
-            raise ReconstructionError(
-                f"calibration: the board is found in {len(seen)} of {len(sequence)} images of camera {name}; {cause}"
-            )
-
-
-def _other_circles(sequences: Mapping[str, ImageSequence], views: Views, board: Target) -> Iterator[str]:
-    """Where circles are not as large as was said, so that their centres are not corrected as they should be."""
-    if isinstance(board, BoardSet) or not board.has_circles:
-        return
-    name, sequence = next(iter(sequences.items()))
-    seen = [index for index, instant in enumerate(sequence.names) if (name, instant) in views]
-    shares = [each for each in (measured_share(image, board) for image in _some(sequence, seen)) if each is not None]
-    share = float(np.median(shares)) if shares else board.circle_share
-    if abs(share / board.circle_share - 1) > _OTHER_CIRCLES:
-        yield (
-            f"the circles are {share:.2f} of their distance wide, not {board.circle_share:g}: give --circle-share "
-            f"{share:.2f}, for their centres are not seen in the middle, by how much depends on it"
-        )
-
-
-def _some(sequence: ImageSequence, indices: Sequence[int]) -> list[UInt8[np.ndarray, "h w"]]:
-    """A few of some images, evenly, in grey."""
-    tried = [indices[k] for k in np.unique(np.linspace(0, len(indices) - 1, MOST_TRIED).astype(int))] if indices else []
-    return [cv2.cvtColor(sequence.image(index), cv2.COLOR_RGB2GRAY) for index in tried]
-
-
-def _unseen(sequences: Mapping[str, ImageSequence], views: Views) -> Iterator[str]:
-    """In which images the board was not found."""
-    for name, sequence in sequences.items():
-        unseen = [instant for instant in sequence.names if (name, instant) not in views]
-        if unseen:
-            yield f"camera {name}: the board was not found in {len(unseen)} of {len(sequence)} images: {named(unseen)}"
-
-
-def _handpiece(
-    found: RigCalibration, light: Photometry | None, drawn: Handpiece | None, working_distance_mm: float | None
-) -> Handpiece:
-    """The drawn handpiece with what was found, or one of what was found alone."""
-    sensors = {} if light is None else light.sensors
-    if drawn is not None:
-        lights = drawn.lights if light is None else light.lights
-        known = replace(drawn, rig=found.rig, lights=lights, sensors={**drawn.sensors, **sensors}, name="calibrated")
-        return known if working_distance_mm is None else _focused(known, working_distance_mm)
-    distance_mm = found.distance_mm if working_distance_mm is None else working_distance_mm
-    return _focused(Handpiece(rig=found.rig.over_surface(distance_mm), sensors=sensors, name="calibrated"), distance_mm)
-
-
-def _focused(handpiece: Handpiece, distance_mm: float) -> Handpiece:
-    return replace(handpiece, working_distance_mm=distance_mm, depth_range_mm=depth_of_field_mm(distance_mm))
 
 
 def _figures(found: RigCalibration, board: Target) -> dict[str, object]:

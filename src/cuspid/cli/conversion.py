@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from cuspid import storage
-from cuspid.cli.shared import console, named
+from cuspid.cli.shared import console
 from cuspid.errors import InputError
 from cuspid.options import Range
 from cuspid.storage.calibrations import (
@@ -21,7 +21,7 @@ from cuspid.storage.calibrations import (
     read_calibration,
     write_calibration,
 )
-from cuspid.values import MOST_PX
+from cuspid.values import MOST_PX, named
 
 
 def convert(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from tyro.conf import Positional
 
@@ -12,8 +12,8 @@ from cuspid.anatomy.mouth import MouthOptions
 from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
 from cuspid.errors import InputError
 from cuspid.handpiece.brief import read_brief
-from cuspid.handpiece.designs import DESIGNS, DesignOptions
-from cuspid.handpiece.optimise import SearchOptions, handpiece_outline, optimise_handpiece
+from cuspid.handpiece.designs import DesignName, DesignOptions, build_handpiece
+from cuspid.handpiece.optimise import SearchOptions, handpiece_outline
 from cuspid.handpiece.printability import check_printable
 from cuspid.handpiece.printable import printable, views_of
 from cuspid.handpiece.shell import PrintOptions
@@ -21,13 +21,13 @@ from cuspid.options import TOOTH
 from cuspid.reporting.figures.design import save_design_picture
 from cuspid.reporting.figures.holder import save_holder_picture
 from cuspid.rig import Handpiece
-from cuspid.studies.forecast import room_for, sections_of
+from cuspid.studies import forecast
 
 
 def build(
     *,
     out: Path,
-    design: Literal["two", "four", "six", "twelve"] = "twelve",
+    design: DesignName = "twelve",
     handpiece: Path | None = None,
     body: Path | None = None,
     options: Annotated[DesignOptions, Flat] = DesignOptions(),
@@ -42,7 +42,7 @@ def build(
         body: STL, PLY, OBJ or OFF file for the holder: one solid with seats, cable channels, neck and grip, in mm in
             the rig frame, with a picture beside it. The handpiece is then written with this body.
     """
-    made = DESIGNS[design](options) if handpiece is None else storage.read_handpiece(handpiece)
+    made = build_handpiece(design, options) if handpiece is None else storage.read_handpiece(handpiece)
     if body is not None:
         made = _print_holder(body, made, printing)
     elif vars(printing) != vars(PrintOptions()):
@@ -98,15 +98,13 @@ def design(
     settings = {"search": search, "mouth": mouth, "teeth": teeth, "source": source}
     inputs = {"brief": storage.hash_file(brief)} | ({} if jaw is None else {"jaw": storage.hash_file(jaw)})
     with storage.claimed_folder(out, "design", settings, inputs, replace=True), show_progress() as progress:
-        gap_mm = room_for(wanted, mouth)
-        wanted.check_gap(gap_mm)
-        sections = sections_of(load_source(jaw, source), teeth, wanted)
-        found = optimise_handpiece(wanted, sections, gap_mm, search, progress=progress)
+        found = forecast.design(wanted, load_source(jaw, source), search, teeth=teeth, mouth=mouth, progress=progress)
         storage.write_handpiece(out / "handpiece.json", found.handpiece)
         storage.write_rig_config(out / "rig_config.json", found.handpiece.rig)
-        storage.write_json(out / "design.json", {"gap_mm": gap_mm, "best": found.best, "trials": found.trials})
-        middle = sections[0].rig_from_world[len(sections[0].rig_from_world) // 2]
-        below, outline = sections[0].mesh.transformed(middle), handpiece_outline(found.handpiece, wanted.thickness_mm)
+        storage.write_json(out / "design.json", {"gap_mm": found.gap_mm, "best": found.best, "trials": found.trials})
+        first = found.sections[0]
+        below = first.mesh.transformed(first.rig_from_world[len(first.rig_from_world) // 2])
+        outline = handpiece_outline(found.handpiece, wanted.thickness_mm)
         save_design_picture(out / "design.png", found.handpiece, below, outline, title=wanted.name)
     for condition in found.best.assessment.conditions:
         console.print(f"{'met   ' if condition.met else 'missed'} {condition}")

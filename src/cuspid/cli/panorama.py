@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 from cuspid import panorama_pipeline, storage
 from cuspid.anatomy.orientation import require_one_jaw
 from cuspid.cli.report import report
-from cuspid.cli.shared import Flat, console, named, show_progress
+from cuspid.cli.shared import Flat, console, show_progress
 from cuspid.errors import InputError
 from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
@@ -23,6 +23,7 @@ from cuspid.panorama_pipeline import MeshViewOptions, StitchOptions
 from cuspid.progress import Progress
 from cuspid.reporting.figures.panorama import save_camera_path
 from cuspid.stitching.ortho import Stitched
+from cuspid.values import named
 from cuspid.workers import map_in_threads
 
 

@@ -205,9 +205,7 @@ def _measure_trueness(
         console.print(f"note: {note}")
     known, hashes = against.jaw, {**against.hashes, "mesh": storage.hash_file(mesh)}
     with storage.claimed_folder(out, "evaluate", {"evaluation": options}, hashes, replace=True):
-        trueness = pipeline.evaluate(
-            scan, known, options, scannable=against.scannable, crown=against.crown, sigma_um=sigma_um
-        )
+        trueness = pipeline.evaluate(scan, against, options, sigma_um=sigma_um)
         for name in _FURTHER:  # of another mesh or reference they would be shown as of this one
             (out / name).unlink(missing_ok=True)
         coloured = replace(scan, colors=deviation_colors(trueness.deviation_um))

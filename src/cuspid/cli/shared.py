@@ -15,12 +15,12 @@ from rich.progress import Progress as Bars
 from tyro.conf import arg
 
 from cuspid import storage
-from cuspid.anatomy.jaw_files import Labelling, load_jaw
+from cuspid.anatomy.jaw_files import Labelling, read_jaw
 from cuspid.anatomy.numbering import Numbering
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.errors import InputError
-from cuspid.handpiece.designs import DESIGNS, DesignOptions
+from cuspid.handpiece.designs import DesignName, DesignOptions, build_handpiece
 from cuspid.jaw import Arch, Jaw
 from cuspid.options import SEED, Options, Range
 from cuspid.progress import Progress
@@ -70,7 +70,7 @@ class Source(Options):
 class Probe(Options):
     """The handpiece that scans."""
 
-    design: Literal["two", "four", "six", "twelve"] = "twelve"
+    design: DesignName = "twelve"
     """Built-in design: a stereo pair, the essential four cameras, six cameras (use with --turns 3), or all twelve."""
     lights: Literal["white", "colour-coded", "in-turn"] | None = None
     """LEDs of a built-in design: white ones, or red, green and blue ones behind crossed polarisers, which plain enamel
@@ -102,13 +102,10 @@ def show_progress() -> Iterator[Progress]:
 
 
 def load_source(mesh: Path | None, source: Source) -> Jaw:
-    """The jaw of a file in the occlusal frame, or the phantom; prints notes on what was found or is uncertain."""
+    """The jaw of a file in the occlusal frame, or the phantom; logs notes on what was found or is uncertain."""
     if mesh is None:
         return build_phantom(PhantomOptions(arch=source.arch or "lower", seed=source.jaw_seed))
-    jaw, notes = load_jaw(mesh, unit=source.unit, arch=source.arch, labelling=source.labelling)
-    for note in notes:
-        console.print(f"note: {note}")
-    return jaw
+    return read_jaw(mesh, unit=source.unit, arch=source.arch, labelling=source.labelling)
 
 
 def load_probe(probe: Probe) -> Handpiece:
@@ -118,7 +115,8 @@ def load_probe(probe: Probe) -> Handpiece:
         _require_places(probe.handpiece, device)
     else:
         distance_mm = probe.working_distance_mm or DesignOptions.working_distance_mm
-        device = DESIGNS[probe.design](DesignOptions(working_distance_mm=distance_mm, lights=probe.lights or "white"))
+        options = DesignOptions(working_distance_mm=distance_mm, lights=probe.lights or "white")
+        device = build_handpiece(probe.design, options)
     return device if probe.scale == 1 else _scaled(device, probe.scale)
 
 
@@ -146,10 +144,3 @@ def suited(probe: Probe, texture: Preset) -> Probe:
     if plain:
         console.print("note: plain enamel takes coloured lights and crossed polarisers (--lights white for others)")
     return replace(probe, lights="colour-coded" if plain else "white")
-
-
-def named(names: list[str], most: int = 6) -> str:
-    """Names on one line; if there are many, those in the middle are left out."""
-    if len(names) <= most:
-        return ", ".join(names)
-    return f"{', '.join(names[: most - 1])} ... {names[-1]}"

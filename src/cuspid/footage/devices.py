@@ -7,7 +7,6 @@ in 0.1 ms (V4L2_CID_EXPOSURE_ABSOLUTE), and an automatic exposure is off at 1 (V
 
 from __future__ import annotations
 
-import fcntl
 import re
 import struct
 import time
@@ -278,6 +277,8 @@ def cameras_there(root: Path = Path("/dev")) -> tuple[FoundCamera, ...]:
 
 def _asked(device: Path, root: Path) -> FoundCamera | None:
     """What a device says of itself; None where it is no camera, or may not be asked."""
+    import fcntl  # only where there are such devices
+
     with suppress(OSError), device.open("rb", buffering=0) as stream:
         said = fcntl.ioctl(stream, _QUERY, bytes(104))
         card = said[16:48].split(b"\0")[0].decode(errors="replace")
@@ -289,6 +290,8 @@ def _asked(device: Path, root: Path) -> FoundCamera | None:
 
 
 def _formats(stream: Any) -> Iterator[str]:
+    import fcntl
+
     with suppress(OSError):
         for index in range(_MOST_FORMATS):
             said = fcntl.ioctl(stream, _FORMATS, struct.pack("II", index, 1) + bytes(56))

@@ -25,7 +25,7 @@ from cuspid.storage.files import read_arrays, write_arrays, write_bytes
 from cuspid.storage.stages import Stage
 from cuspid.workers import map_in_threads
 
-_CODE = ("footage", "storage/videos.py")
+_CODE = (__name__,)
 
 
 def open_films(sources: Mapping[str, Path], handpiece: Handpiece) -> dict[str, Film]:

@@ -175,9 +175,9 @@ class DesignBrief:
         )
 
 
-def read_brief(path: Path) -> DesignBrief:
+def read_brief(path: Path | str) -> DesignBrief:
     """Read and check a TOML file. Raises InputError with the file and the first condition that fails."""
-    text = read_text(path)
+    text = read_text(Path(path))
     try:
         return parse_brief(tomllib.loads(text))
     except (ValueError, RecursionError) as error:

@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.camera import Camera
+from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.holder import HolderOptions, with_holder
 from cuspid.options import Options, Range
@@ -102,10 +103,19 @@ def six_cameras(options: DesignOptions = DesignOptions()) -> Handpiece:
     return with_holder(six, options.holder)
 
 
+DesignName = Literal["two", "four", "six", "twelve"]
+"""A built-in design: a stereo pair, the essential four cameras, six cameras (to be turned), or all twelve."""
 DESIGNS: Mapping[str, Callable[[DesignOptions], Handpiece]] = MappingProxyType(
     {"two": stereo_pair, "four": essential_four, "six": six_cameras, "twelve": twelve_cameras}
 )
 """Designs by the name that the command line takes."""
+
+
+def build_handpiece(design: DesignName = "twelve", options: DesignOptions = DesignOptions()) -> Handpiece:
+    """A handpiece of a built-in design. Raises InputError where there is no such design."""
+    if design not in DESIGNS:
+        raise InputError(f"handpiece: there is no design {design!r}; it is one of {', '.join(DESIGNS)}")
+    return DESIGNS[design](options)
 
 
 def _four(options: DesignOptions) -> Handpiece:

@@ -173,6 +173,10 @@ class Design:
     """The best of each layout, cheapest first."""
     evaluations: int
     """How many designs were assessed."""
+    gap_mm: float
+    """Room between the jaws at the tooth that the brief names."""
+    sections: tuple[Section, ...] = field(repr=False)
+    """The teeth that it was designed for."""
 
     def check(self, brief: DesignBrief) -> None:
         """Raise InputError that names the conditions which no handpiece that was found fulfils."""
@@ -221,6 +225,8 @@ def optimise_handpiece(
         best=best,
         trials=tuple(trials),
         evaluations=search.evaluations,
+        gap_mm=gap_mm,
+        sections=tuple(sections),
     )
 
 

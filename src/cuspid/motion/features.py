@@ -193,7 +193,7 @@ def detect_all(
     """Features of every image of a capture by (frame, camera). Finished images are kept in ``cache``. Raises
     InputError."""
     options = options or FeatureOptions()
-    stage = None if cache is None else Stage("features", cache / "features", options, ("motion/features.py",))
+    stage = None if cache is None else Stage("features", cache / "features", options, (__name__,))
     images = [(frame, camera) for frame in pictures.capture.frames for camera in frame.cameras]
 
     def kept(image: tuple[Frame, str]) -> Features:

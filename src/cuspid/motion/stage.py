@@ -33,7 +33,7 @@ def locate(
             return locate_with_rig(capture, options, progress=progress, cache=folder / "cache")
         return locate_with_colmap(capture, folder / "colmap", with_rig=method == "colmap-rig")
 
-    stage = Stage("motion", folder, {"method": method, "options": options if method == "rig" else None}, ("motion",))
+    stage = Stage("motion", folder, {"method": method, "options": options if method == "rig" else None}, (__name__,))
     return _kept(stage, capture, hash_capture(capture), find)
 
 
@@ -47,7 +47,7 @@ def locate_by_surfaces(
     progress: Progress = silent,
 ) -> Reconstruction:
     """As :func:`locate`, from the depth maps of the frames; ``made_from`` is their digest."""
-    stage = Stage("motion", folder, {"method": "surfaces", "options": options}, ("motion",))
+    stage = Stage("motion", folder, {"method": "surfaces", "options": options}, (__name__,))
     inputs = {**hash_capture(capture), "depths": made_from}
     return _kept(stage, capture, inputs, lambda: track_surfaces(capture, depths, options, progress=progress))
 
@@ -56,7 +56,7 @@ def take_poses(capture: Capture, model: Path, folder: Path) -> Reconstruction:
     """The poses of a COLMAP model of the capture, made metric by the rig and kept in ``folder``."""
     inputs = {**hash_capture(capture), "model": hash_model(model)}
     return _kept(
-        Stage("motion", folder, "from poses", ("motion",)), capture, inputs, lambda: read_model(model, capture)
+        Stage("motion", folder, "from poses", (__name__,)), capture, inputs, lambda: read_model(model, capture)
     )
 
 

@@ -95,7 +95,7 @@ def take_photographs(
         )
     truth = folder / "truth" / "handpiece.json"
     write_handpiece(truth, handpiece)
-    stage = Stage("photographs", folder, [board, options], ("simulation",))
+    stage = Stage("photographs", folder, [board, options], (__name__,))
     key = stage.key({"handpiece": hash_file(truth)})
     shots, names = _shots(handpiece, board, options), handpiece.rig.names
     rays = {name: pixel_rays(each.camera, options.supersampling) for name, each in handpiece.rig.cameras.items()}

@@ -17,7 +17,7 @@ from cuspid.simulation.appearance import Preset
 from cuspid.simulation.lights import lit
 from cuspid.simulation.path.free import FreePathOptions, plan_free_path
 from cuspid.simulation.reference_render import ReferenceRenderOptions, render_reference
-from cuspid.simulation.stage import CODE, RenderOptions, jaw_files, look_of, scene_of, take_images
+from cuspid.simulation.stage import RenderOptions, jaw_files, look_of, scene_of, take_images
 from cuspid.storage.reference_renders import REFERENCE_RENDER_FILES, write_reference_render
 from cuspid.storage.stages import Stage
 from cuspid.trueness import GroundTruth
@@ -58,7 +58,7 @@ def film(
 def _render_reference(
     truth: GroundTruth, folder: Path, name: str, view: ReferenceRenderOptions, options: FilmOptions
 ) -> None:
-    stage = Stage("reference render", folder, [view, look_of(options)], CODE)
+    stage = Stage("reference render", folder, [view, look_of(options)], (__name__,))
     scene = scene_of(truth, replace(options, supersampling=max(2, options.supersampling)))
     files = [folder / name / file for file in REFERENCE_RENDER_FILES]
     stage.make(jaw_files(folder), files, lambda: write_reference_render(folder / name, render_reference(scene, view)))

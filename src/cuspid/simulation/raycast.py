@@ -10,6 +10,7 @@ surface facing a light of power 1 at 1 mm has radiance 1 plus that share. The wo
 
 from __future__ import annotations
 
+import pickle
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -22,6 +23,7 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from cuspid import workers
 from cuspid.camera import Camera
 from cuspid.capture import Frame
 from cuspid.errors import InputError
@@ -47,7 +49,7 @@ from cuspid.simulation.optics import IDEAL, Optics, mixed, recorded, through_len
 from cuspid.simulation.scattering import Scattering
 from cuspid.simulation.sensor import record
 from cuspid.simulation.shadows import NOTICEABLE, STEP, Lamps, darken, illuminated, incoming, lamps, segments
-from cuspid.workers import computed_once
+from cuspid.workers import computed_once, packed
 
 _FILM_REFLECTANCE, _FILM_ROUGHNESS = 0.02, 0.03
 """Of a film of saliva (water): Fresnel reflectance at normal incidence, GGX roughness."""
@@ -536,9 +538,9 @@ class _Worker:
 _worker: _Worker
 
 
-def _adopt(worker: _Worker) -> None:
+def _adopt(worker: _Worker | bytes) -> None:
     global _worker
-    _worker = worker
+    _worker = pickle.loads(worker) if isinstance(worker, bytes) else worker
 
 
 def _work(task: tuple[Frame, str]) -> tuple[str, str]:
@@ -568,8 +570,9 @@ def render_capture(
     """Render the cameras of every frame, except those that ``skip`` excludes, and yield (frame, camera) as each is
     done.
 
-    Embree holds the interpreter lock, so the work is distributed over processes. They are forked, and only trace rays
-    in the scene that the parent built (a forked child could not build one) and run kernels that the parent compiled.
+    Embree holds the interpreter lock, so the work is distributed over processes. Forked ones trace rays in the scene
+    that the parent built (a forked child could not build one) and run kernels that the parent compiled; those that
+    begin anew build their own, and are given the ``sink``, which must then be picklable.
     """
     tasks = _in_order(frames, skip, _TOGETHER if scene.scattering else max(len(frames), 1))
     if not tasks:
@@ -584,6 +587,7 @@ def render_capture(
     if processes == 1:
         yield from map(worker, tasks)
         return
-    with ProcessPoolExecutor(processes, get_context("fork"), _adopt, (worker,)) as pool:
+    given = worker if workers.START_METHOD == "fork" else packed(worker)
+    with ProcessPoolExecutor(processes, get_context(workers.START_METHOD), _adopt, (given,)) as pool:
         for done in as_completed([pool.submit(_work, task) for task in tasks]):
             yield done.result()

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from jaxtyping import UInt8
 
 from cuspid.capture import Capture, ImageFolder
 from cuspid.geometry import Rigid3
@@ -64,7 +65,12 @@ class SimulationOptions(RenderOptions):
 
 
 def simulate(
-    jaw: Jaw, handpiece: Handpiece, folder: Path, options: SimulationOptions, *, progress: Progress = silent
+    jaw: Jaw,
+    handpiece: Handpiece,
+    folder: Path | str,
+    options: SimulationOptions = SimulationOptions(),
+    *,
+    progress: Progress = silent,
 ) -> tuple[Capture, GroundTruth]:
     """Scan a jaw: images to ``folder/capture``, what only the simulator knows to ``folder/truth``.
 
@@ -72,6 +78,7 @@ def simulate(
     built as it was drawn, the capture has the drawn one with its tolerances, and the truth the built one. Existing
     images are kept; a run that is resumed gives the same bits as one that was not interrupted.
     """
+    folder = Path(folder)
     handpiece = lit(handpiece)
     true, known = built(handpiece, options.manufacturing), told(handpiece, options.manufacturing)
     _check(true, options)
@@ -127,7 +134,7 @@ def _check(handpiece: Handpiece, options: RenderOptions) -> None:
 def _render(folder: Path, capture: Capture, truth: GroundTruth, options: RenderOptions) -> Iterator[tuple[int, int]]:
     """Render what is not there yet; yields how many images are there, and how many there will be."""
     images = ImageFolder(folder / "capture")
-    stage = Stage("images", folder / "truth", look_of(options), CODE)
+    stage = Stage("images", folder / "truth", look_of(options), _CODE)
     # The gain is metered over the whole path, so each image depends on all of the truth.
     key = stage.key({**jaw_files(folder / "truth"), "poses": digest_of(dict(truth.rig_from_world))})
     there = {
@@ -139,13 +146,21 @@ def _render(folder: Path, capture: Capture, truth: GroundTruth, options: RenderO
         scene_of(truth, options),
         capture.frames,
         truth.rig_from_world,
-        lambda frame, camera, image: write_image(images.path(frame, camera), image),
+        _Sink(images),
         skip=lambda frame, camera: there[frame, camera],
         processes=usable_cores(),
     )
     for done, image in enumerate(rendered, start=sum(there.values()) + 1):
         stage.record(key, [images.path(*image)])
         yield done, len(there)
+
+
+@dataclass(frozen=True)
+class _Sink:
+    images: ImageFolder
+
+    def __call__(self, frame: str, camera: str, image: UInt8[np.ndarray, "h w 3"]) -> None:
+        write_image(self.images.path(frame, camera), image)
 
 
 def _less(path: ScanPath) -> tuple[str, ...]:
@@ -175,8 +190,8 @@ _TIMED = 3
 """Images of each process that are timed for the forecast."""
 _LONG_S = 60.0
 """Nobody minds waiting so long."""
-CODE = ("simulation",)
-"""What images are made by: their key has the version of this code."""
+_CODE = (__name__, "cuspid.simulation.blender_script")
+"""What images are made by: their key has what this code does. Blender runs the script."""
 _RENDERERS = {"embree": render_capture, "blender": render_with_blender}
 
 

@@ -34,7 +34,7 @@ from cuspid.storage.stages import Stage
 from cuspid.tolerances import held
 from cuspid.workers import map_ahead, map_in_threads
 
-_CODE = ("stereo",)
+_CODE = (__name__,)
 _LEFT_SHARE = 0.005
 """Share of the sparse points that matching across frames need not reach."""
 _LEAST_PLACES = 5

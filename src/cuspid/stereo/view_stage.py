@@ -38,7 +38,7 @@ from cuspid.storage.reconstructions import write_depth_maps
 from cuspid.storage.stages import Stage
 from cuspid.workers import map_in_threads
 
-_CODE = ("stereo",)
+_CODE = (__name__,)
 _KEPT_IMAGES = 32
 """Images that are kept in memory for the next views."""
 

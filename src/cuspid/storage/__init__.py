@@ -61,7 +61,7 @@ from cuspid.storage.results import (
     StudyResult,
     read_result,
 )
-from cuspid.storage.sequences import hash_source, images_in, read_sequence, rig_sources
+from cuspid.storage.sequences import hash_source, images_in, read_sequence, read_sequences, rig_sources
 from cuspid.storage.shapes import read_shape_model, write_shape_model
 from cuspid.storage.tables import csv_table, write_table
 from cuspid.storage.trueness import trueness_summary, write_trueness
@@ -122,6 +122,7 @@ __all__ = [
     "read_result",
     "read_rig_config",
     "read_sequence",
+    "read_sequences",
     "read_shape_model",
     "read_truth",
     "reading",

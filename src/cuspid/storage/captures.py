@@ -35,7 +35,9 @@ def write_image(path: Path, image: UInt8[np.ndarray, "h w 3"] | UInt16[np.ndarra
     write_bytes(path, encoded.tobytes())
 
 
-def read_capture(folder: Path, handpiece: Path | None = None, working_distance_mm: float | None = None) -> Capture:
+def read_capture(
+    folder: Path | str, handpiece: Path | str | None = None, working_distance_mm: float | None = None
+) -> Capture:
     """A capture folder: ``images/<camera>/<frame>.*`` and a handpiece file (default ``handpiece.json`` in it), or a rig
     with its working distance, as :func:`cuspid.storage.handpieces.read_handpiece` takes them.
 
@@ -44,6 +46,7 @@ def read_capture(folder: Path, handpiece: Path | None = None, working_distance_m
     Raises InputError where a folder belongs to no camera of the handpiece, a frame that ``capture.json`` names has no
     image at all, or an image is truncated or of another size than its camera's.
     """
+    folder = Path(folder)
     images = folder / "images"
     if not images.is_dir():
         raise InputError(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import errno
-import fcntl
 import hashlib
 import json
 import math
@@ -321,7 +320,7 @@ def _alone_in(folder: Path) -> Iterator[None]:
     """No other process works in a folder in the block, which is made if need be. Raises OutputError where one does.
 
     The folder itself is locked (flock), so that no file is left, and the lock of a process that ends ends with it;
-    where folders cannot be locked, nothing is.
+    where folders cannot be locked, as on Windows, nothing is.
     """
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: is a file; give a folder as --out")
@@ -343,8 +342,10 @@ def _alone_in(folder: Path) -> Iterator[None]:
 
 def _lock(folder: Path, stack: ExitStack) -> None:
     try:
+        import fcntl
+
         descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:
+    except (ImportError, OSError):
         return
     stack.callback(os.close, descriptor)
     try:

@@ -203,9 +203,9 @@ _STEEPEST_FALLOFF = 10.0
 _BOX_FIELDS = {"box_from_rig", "size_mm"}
 
 
-def write_handpiece(path: Path, handpiece: Handpiece) -> None:
+def write_handpiece(path: Path | str, handpiece: Handpiece) -> None:
     """Write ``handpiece.json``."""
-    write_json(path, handpiece_to_json(handpiece))
+    write_json(Path(path), handpiece_to_json(handpiece))
 
 
 def _light_from_json(value: Mapping[str, Any], what: str) -> Light:
@@ -249,13 +249,14 @@ def _mounted_from_json(value: Mapping[str, Any], what: str) -> MountedCamera:
     )
 
 
-def read_handpiece(path: Path, working_distance_mm: float | None = None) -> Handpiece:
+def read_handpiece(path: Path | str, working_distance_mm: float | None = None) -> Handpiece:
     """Read ``handpiece.json``, or COLMAP's ``rig_config.json``, which has no working distance: that is the one given
     here, or else guessed, and said. Its frame is then on the surface, as :meth:`cuspid.rig.Rig.over_surface` has it.
 
     Raises InputError that names a missing or unusable field, where nothing can be guessed, and where a file that has a
     working distance is given another.
     """
+    path = Path(path)
     value = read_json(path)
     if isinstance(value, list):
         return handpiece_of_rig(path, read_rig_config(path), working_distance_mm)

@@ -50,12 +50,12 @@ class MeshFile:
     """Properties of the faces (PLY), by name."""
 
 
-def read_mesh(path: Path, unit: Unit = "mm") -> Mesh:
+def read_mesh(path: Path | str, unit: Unit = "mm") -> Mesh:
     """A mesh from an STL, PLY, OBJ or OFF file, in mm, with coincident vertices joined.
 
     Raises InputError where the file is missing, not a mesh, empty, or has coordinates that are not finite.
     """
-    return read_mesh_file(path, unit).mesh
+    return read_mesh_file(Path(path), unit).mesh
 
 
 def read_mesh_file(path: Path, unit: Unit = "mm") -> MeshFile:
@@ -174,7 +174,7 @@ def _colors(loaded: trimesh.Trimesh, kind: Literal["vertex", "face"]) -> UInt8[n
 
 
 def write_mesh(
-    path: Path,
+    path: Path | str,
     mesh: Mesh,
     face_labels: Int[np.ndarray, "f"] | None = None,
     *,
@@ -183,6 +183,7 @@ def write_mesh(
 ) -> None:
     """Write a mesh in mm: binary PLY (with colour, labels, values of the vertices by name, and a comment of one line),
     binary STL, OBJ or OFF, by the file's suffix. CloudCompare shows such values as scalar fields."""
+    path = Path(path)
     exported = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
     with _let_go(exported):
         for name, each in values.items():

@@ -30,22 +30,40 @@ _NUMBERS = re.compile(r"(\D*)(\d*)")
 
 
 def read_sequence(
-    source: Path, decoded: Path, *, calibration: Path | None = None, progress: Progress = silent
+    source: Path | str,
+    decoded: Path | str | None = None,
+    *,
+    calibration: Path | str | None = None,
+    progress: Progress = silent,
 ) -> ImageSequence:
     """Frames of one camera from a folder of images, a video or a capture.
 
     A video is decoded into the folder ``decoded``. Raises InputError where there are fewer than two frames, a frame is
     truncated or of another size than the others, or the calibration belongs to another size.
     """
+    source = Path(source)
     if source.is_dir():
         found = _of_capture(source) if (source / "images").is_dir() else _of_folder(source)
     elif source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():
-        found = _of_video(source, decoded, progress)
+        if decoded is None:
+            raise InputError(f"{source}: a video needs a folder for its frames; name one")
+        found = _of_video(source, Path(decoded), progress)
     elif source.is_file():
         raise InputError(f"{source}: neither a folder of images nor a video ({', '.join(VIDEO_SUFFIXES)})")
     else:
         raise InputError(f"{source}: no such folder or video")
-    return found if calibration is None else _calibrated(found, calibration)
+    return found if calibration is None else _calibrated(found, Path(calibration))
+
+
+def read_sequences(
+    folder: Path | str, decoded: Path | str | None = None, *, progress: Progress = silent
+) -> dict[str, ImageSequence]:
+    """The frames of each camera of a rig, by name, as :func:`rig_sources` finds them and :func:`read_sequence` reads
+    them; those of videos are decoded into subfolders of ``decoded``."""
+    return {
+        name: read_sequence(path, None if decoded is None else Path(decoded) / name, progress=progress)
+        for name, path in rig_sources(Path(folder)).items()
+    }
 
 
 def rig_sources(folder: Path) -> dict[str, Path]:

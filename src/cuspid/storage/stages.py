@@ -1,13 +1,13 @@
 """Stages: results on disk that are used again only where they are still those of what made them.
 
-What makes a result has a key: SHA-256 over the name of the stage, its options, the contents of its inputs and the code.
+What makes a result has a key: SHA-256 over the name of the stage, its options, the contents of its inputs and what the
+code does.
 A folder of results keeps ``made.jsonl``, a line for each file with the key that it was made under and the SHA-256 of
 its contents. A file with another key, or with other contents, is made again.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import os
@@ -19,9 +19,9 @@ from importlib.resources import files as package_files
 from pathlib import Path
 from threading import Lock
 
-import cuspid
 from cuspid.errors import InputError, OutputError
 from cuspid.inputs import read_bytes
+from cuspid.storage.code_digest import PACKAGE, Code
 from cuspid.storage.files import digest_of, hash_file, open_to_append
 
 RECORD = "made.jsonl"
@@ -31,17 +31,25 @@ _log = logging.getLogger("cuspid")
 
 
 @cache
-def code_version(*parts: str) -> str:
-    """Version of cuspid, and SHA-256 of the modules of its ground floor and of some packages or modules, given as
-    ``stereo`` or ``motion/features.py``."""
-    root = Path(str(package_files("cuspid")))
-    modules = [*root.glob("*.py")]
-    for part in parts:
-        modules += [root / part] if part.endswith(".py") else (root / part).rglob("*.py")
-    digest = hashlib.sha256()
-    for path in sorted(modules):
-        digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
-    return f"{cuspid.__version__} {digest.hexdigest()}"
+def _installed() -> Code:
+    """The modules of cuspid as they are installed."""
+    root = Path(str(package_files(PACKAGE)))
+
+    def read(module: str) -> bytes | None:
+        package, *inside = module.split(".")
+        if package != PACKAGE:
+            return None
+        path = root.joinpath(*inside)
+        file = path / f"__init__.py{'' if inside else 'i'}" if path.is_dir() else path.with_suffix(".py")
+        return file.read_bytes() if file.is_file() else None
+
+    return Code(read)
+
+
+@cache
+def code_version(*modules: str) -> str:
+    """What some modules do, and those that they import: see :mod:`cuspid.storage.code_digest`."""
+    return digest_of([_installed().digest(module) for module in modules])
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +63,7 @@ class Stage:
     options: object
     """How it is made."""
     code: tuple[str, ...] = ()
-    """What of cuspid makes it, as :func:`code_version` takes it."""
+    """The modules of cuspid that make it, as ``__name__``; those that they import count, too."""
     _version: str = field(init=False, repr=False)
     _made: dict[str, tuple[str, str]] = field(init=False, repr=False)
     _lock: Lock = field(init=False, repr=False, default_factory=Lock)

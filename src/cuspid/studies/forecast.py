@@ -7,14 +7,37 @@ from collections.abc import Sequence
 import numpy as np
 
 from cuspid.anatomy.mouth import MouthOptions, room_mm, study_mouths
+from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.surfaces import named_surfaces
 from cuspid.handpiece.brief import DesignBrief
-from cuspid.handpiece.optimise import Section
+from cuspid.handpiece.optimise import Design, SearchOptions, Section, optimise_handpiece
 from cuspid.handpiece.precision import NoiseModel, PrecisionMap, at_best, precision_map
 from cuspid.jaw import Jaw
+from cuspid.progress import Progress, silent
 from cuspid.rig import Handpiece
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path, steady_poses
 from cuspid.visibility import Visibility, VisibilityOptions, survey_visibility
+
+
+def design(
+    brief: DesignBrief,
+    jaw: Jaw | None = None,
+    options: SearchOptions = SearchOptions(),
+    *,
+    teeth: Sequence[int] = (46, 41),
+    mouth: MouthOptions = MouthOptions(),
+    progress: Progress = silent,
+) -> Design:
+    """Search for a handpiece that meets a brief: it has room in the mouths of the asked share of people, and sees the
+    named surfaces of some teeth (FDI) of a labelled jaw, by default of the built-in phantom.
+
+    The best one that was found comes back even if it does not meet all (:meth:`Design.check`). Raises InputError where
+    the mouth has no room for any, or the jaw does not have the teeth.
+    """
+    gap_mm = room_for(brief, mouth)
+    brief.check_gap(gap_mm)
+    sections = sections_of(build_phantom() if jaw is None else jaw, teeth, brief)
+    return optimise_handpiece(brief, sections, gap_mm, options, progress=progress)
 
 
 def room_for(brief: DesignBrief, mouth: MouthOptions) -> float:

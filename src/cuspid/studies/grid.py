@@ -25,7 +25,7 @@ from typing import Any
 from cuspid import storage
 from cuspid.errors import CuspidError, InputError, MissingDependencyError
 from cuspid.progress import Progress, silent
-from cuspid.workers import core_numbers, usable_cores
+from cuspid.workers import core_numbers, keep_to_core, usable_cores
 
 Value = float | int | str | bool | None
 """What a cell of the table holds."""
@@ -209,7 +209,7 @@ def _start(case: Case, work: Work, core: int) -> _Running:
 
 def _work_alone(sending: Connection, work: Work, case: Case, core: int) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    os.sched_setaffinity(0, {core})
+    keep_to_core(core)
     sending.send(_attempt(work, case))
     sending.close()
     sys.stdout.flush()
@@ -292,5 +292,5 @@ def _attempt_on_worker(work: Work, case: Case, slots: Mapping[str, int]) -> Outc
 
     cores = core_numbers(os.getpid())
     number = _threads.setdefault(threading.get_ident(), len(_threads))
-    os.sched_setaffinity(0, {cores[(slots.get(distributed.get_worker().address, 0) + number) % len(cores)]})
+    keep_to_core(cores[(slots.get(distributed.get_worker().address, 0) + number) % len(cores)])
     return _attempt(work, case)

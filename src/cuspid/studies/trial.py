@@ -13,7 +13,7 @@ from jaxtyping import Bool
 from cuspid import pipeline
 from cuspid.capture import Capture
 from cuspid.errors import ReconstructionError
-from cuspid.evaluation.deviation import EvaluationOptions
+from cuspid.evaluation.deviation import EvaluationOptions, evaluate
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import fit
 from cuspid.geometry import Rigid3
@@ -136,9 +136,9 @@ def _compare(
 ) -> Trueness:
     """Trueness of a mesh whose pose is to be found, or is near ``start``."""
     if start is None or not options.align:
-        return pipeline.evaluate(mesh, jaw, options, scannable=evaluated)
+        return evaluate(mesh, jaw, options, scannable=evaluated)
     points, _ = mesh.sample(options.registration.samples, np.random.default_rng(0))
     aligned = fit(points, SignedDistance(jaw.mesh), start, options.registration).reference_from_scan
     moved = mesh.transformed(aligned)
-    found = pipeline.evaluate(moved, jaw, replace(options, align=False), scannable=evaluated)
+    found = evaluate(moved, jaw, replace(options, align=False), scannable=evaluated)
     return replace(found, reference_from_scan=aligned)

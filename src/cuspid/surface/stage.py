@@ -27,7 +27,7 @@ from cuspid.surface.fusion import fuse as fuse_depth_maps
 from cuspid.surface.sharp_edges import SharpEdgeOptions, sharpened
 from cuspid.workers import usable_cores
 
-_CODE = ("surface",)
+_CODE = (__name__,)
 
 
 def find_holes(

@@ -226,10 +226,20 @@ def save_deviation_picture(
     colored = replace(scan.transformed(trueness.reference_from_scan), colors=colors)
     figure = new_figure(12.0, 8.4, dpi=130)
     _draw_views(figure, colored, 0.30, width_px=options.width_px)
-    _draw_histogram(figure, colored, trueness.deviation_um, options)
+    _draw_histogram(figure, colored.vertex_areas, trueness.deviation_um, options)
     _draw_figures(figure, trueness)
     _draw_title(figure, title)
     save_figure(figure, path)
+
+
+def save_histogram(path: Path, trueness: Trueness) -> None:
+    """PNG of the deviations of the vertices of a scan, and of the key figures, where the scan itself is not at hand."""
+    options = FigureOptions()
+    figure = new_figure(12.0, 8.4, dpi=130)
+    _draw_histogram(figure, np.ones(len(trueness.deviation_um)), trueness.deviation_um, options)
+    _draw_figures(figure, trueness)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, bbox_inches="tight")
 
 
 def save_expected_picture(path: Path, mesh: Mesh, sigma_um: Float[np.ndarray, "v"], *, width_px: int = 1000) -> None:
@@ -320,13 +330,14 @@ def _round_length(upper: float) -> float:
     return float(power * max(factor for factor in (1, 2, 5) if factor * power <= upper))
 
 
-def _draw_histogram(figure: Figure, mesh: Mesh, deviation_um: Float[np.ndarray, "v"], options: FigureOptions) -> None:
-    """Surface over deviation, standing on the colour bar that it shares its axis with."""
+def _draw_histogram(
+    figure: Figure, weights: Float[np.ndarray, "v"], deviation_um: Float[np.ndarray, "v"], options: FigureOptions
+) -> None:
+    """Surface, or number of vertices, over deviation, standing on the colour bar that it shares its axis with."""
     limit = options.range_um
-    shares = np.bincount(mesh.faces.ravel(), np.repeat(mesh.face_areas, 3), minlength=len(mesh.vertices))
     known = np.isfinite(deviation_um)
     clipped = np.clip(deviation_um[known], -limit, limit)
-    counts, edges = np.histogram(clipped, bins=100, range=(-limit, limit), weights=shares[known])
+    counts, edges = np.histogram(clipped, bins=100, range=(-limit, limit), weights=weights[known])
     centres = (edges[1:] + edges[:-1]) / 2
     bars = figure.add_axes((0.06, 0.135, 0.50, 0.13))
     bars.bar(centres, counts, width=np.diff(edges), color=deviation_map(options)(0.5 + 0.5 * centres / limit))
