@@ -15,11 +15,12 @@ from cuspid.calibration.bundle import BoardScene, adjust_board
 from cuspid.calibration.calibrate import RigCalibration, calibrate_rig
 from cuspid.calibration.corners import BoardView, find_corners
 from cuspid.calibration.start import board_pose, first_camera
-from cuspid.calibration.timing import numbered, untied
+from cuspid.calibration.timing import rolling, untied
 from cuspid.camera import Camera
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.rig import Rig
+from cuspid.shutter import numbered
 from verbs import refused, run
 
 CHESS = Board(kind="chessboard", columns=8, rows=8, square_mm=2.0)
@@ -115,14 +116,16 @@ def test_a_page_is_as_large_as_it_says(tmp_path, square_mm):
 # --- closed loops ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("together", [True, False])
-def test_jacobian_agrees_with_finite_differences(together):
-    truth = scene(0, cameras=2, instants=4) if together else moving(0, instants=6)
+@pytest.mark.parametrize("exposure", ["together", "apart", "rolling"])
+def test_jacobian_agrees_with_finite_differences(exposure):
+    truth = scene(0, cameras=2, instants=4) if exposure == "together" else moving(0, instants=6)
     views = views_of(truth, BOARD, 1.0, np.random.default_rng(0))
-    if not together:
-        truth = untied(truth, numbered(truth.rig_from_board), views)
-        rng = np.random.default_rng(1)
-        truth = replace(truth, timing=truth.timing.later(rng.normal(0, 0.2, 3), rng.normal(0, 0.2, len(views))))
+    if exposure != "together":
+        frame, rng = numbered(truth.rig_from_board), np.random.default_rng(1)
+        truth = untied(truth, frame, views)
+        truth = rolling(truth, frame, views) if exposure == "rolling" else truth
+        later = [rng.normal(0, 0.2, count) for count in (3, len(truth.timing.readout), len(views))]
+        truth = replace(truth, timing=truth.timing.later(*later))
     even = BoardShape.even(BOARD)
     truth = replace(truth, shape=even.moved(np.random.default_rng(2).normal(0, 0.05, even.offsets_mm.size)))
     seen = bundle._Observations.of(views, BOARD, truth)
@@ -385,15 +388,15 @@ def test_delays_that_explain_nothing_are_not_taken(monkeypatch, worse):
     assert all(check.delay_frames is None for check in found.cameras.values())
 
 
-def test_a_parabola_goes_through_what_it_is_of():
+def test_a_polynomial_goes_through_what_it_is_of():
     frames = np.array([[4.0, 2.0, 5.0], [7.0, 8.0, np.nan], [3.0, np.nan, np.nan]])
     times, paths = np.array([4.6, 7.4, 3.9]), ([0.5, -2.0, 1.0], [3.0, 1.0], [2.0])
-    weights, slopes = bundle.parabola(frames, times)
+    weights, slopes = bundle.interpolation(frames, times)
     assert np.allclose(weights.sum(axis=1), 1)
     assert np.allclose(slopes.sum(axis=1), 0)
     for path, weight, frame, time in zip(paths, weights, frames, times, strict=True):
         assert weight @ np.polyval(path, np.nan_to_num(frame)) == pytest.approx(np.polyval(path, time))
-    ahead, back = (bundle.parabola(frames, times + step)[0] for step in (1e-6, -1e-6))
+    ahead, back = (bundle.interpolation(frames, times + step)[0] for step in (1e-6, -1e-6))
     assert np.allclose(slopes, (ahead - back) / 2e-6, atol=1e-6)
 
 

@@ -59,6 +59,7 @@ from cuspid.surface.sharp_edges import SharpEdgeOptions
 from cuspid.surface.stage import find_holes, fuse
 from cuspid.tolerances import NominalOptions, held, is_nominal
 from cuspid.trueness import GroundTruth
+from cuspid.unrolling import unrolled
 from cuspid.visibility import VisibilityOptions, scannable_faces
 
 __all__ = [
@@ -209,7 +210,7 @@ def surface(
     """The mesh, given the poses of the frames (second part of :func:`reconstruct`), and how well each of its vertices
     is known: standard deviation along the normal, um."""
     give_back()
-    options = settled(options)
+    options, capture = settled(options), unrolled(capture, found)
     of_size = sized(replace(capture, handpiece=replace(capture.handpiece, rig=found.rig)), options)
     detail = detail_mm(of_size.handpiece)
     if matched(capture, options) == "shading":

@@ -31,6 +31,7 @@ from cuspid.jaw import Jaw
 from cuspid.kernels import kernel
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece, MountedCamera
+from cuspid.shutter import Shutter
 from cuspid.simulation.appearance import (
     NO_MATERIAL,
     Appearance,
@@ -184,13 +185,13 @@ def _row_by_row(
     motion: Float[np.ndarray, "6"],
     smear: Float[np.ndarray, "6"] | None,
 ) -> Float[np.ndarray, "h w 3"]:
-    """As :func:`radiance`, if the rows are exposed one after the other while the jaw moves in its own frame by
-    ``motion`` (rotation vector and shift) from one frame to the next. The lights go along with the camera; what is
-    softened below the surface is that of the middle row."""
+    """As :func:`radiance`, if the rows are exposed as the shutter of the camera says while the jaw moves in its own
+    frame by ``motion`` (rotation vector and shift) from one frame to the next. The lights go along with the camera;
+    what is softened below the surface is that of the middle row."""
     camera, rows = mounted.camera, []
     below = scene.below(lighting, rig_from_world)
     for row in range(camera.height):
-        moved = scene.optics.readout * ((row + 0.5) / camera.height - 0.5) * motion
+        moved = mounted.shutter.late(np.array((row + 0.5) / camera.height)) * motion
         then = rig_from_world @ Rigid3.from_rotation_vector(moved[:3], moved[3:])
         lights = lamps(scene.handpiece, lighting, then)
         rows.append(radiance(scene, camera, mounted.cam_from_rig @ then, lights, below, smear, row))
@@ -497,10 +498,12 @@ def render_image(
     """One image; ``motion`` is the jaw's about it (:func:`motions`), none at rest. Depends on its arguments alone, so
     that a resumed capture equals an uninterrupted one."""
     mounted, optics = scene.handpiece.rig[camera_name], scene.optics
+    if mounted.shutter.is_plain and optics.readout > 0:
+        mounted = replace(mounted, shutter=Shutter(readout=optics.readout))
     motion = np.zeros(6) if motion is None else motion
     cam_from_world = mounted.cam_from_rig @ rig_from_world
     smear = smeared(motion, rig_from_world, optics.smear_mm) if optics.smear_mm > 0 else None
-    if optics.readout > 0:
+    if not mounted.shutter.is_plain:
         light = _row_by_row(scene, mounted, frame.lighting, rig_from_world, motion, smear)
     else:
         lights = lamps(scene.handpiece, frame.lighting, rig_from_world)
