@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -74,6 +74,9 @@ class CalibrationOptions(Options):
     lens: LensName = "auto"
     """COLMAP's name of the model of the lenses. auto: for each camera the simplest one that no richer one beats, by
     more than chance, in views that it was not made from."""
+    shutter: Literal["auto", "global"] = "auto"
+    """auto: where a filmed board moves, it is estimated how long after the first row of an image the last one is
+    exposed, and kept if that explains images that it was not estimated from. global: all rows are exposed at once."""
 
     outlier_sigmas: Annotated[float, Range(2, 1000)] = 4.0
     """A view is left out if the RMS of its residuals is beyond this, in standard deviations of all residuals or of its
@@ -220,7 +223,7 @@ def _calibrated(
             apart = tried(untied(start, frame, common))
             best = apart if _is_better(apart.described, best.described) else best
     used = best.described.views
-    if readout_score(rolling(best.found.scene, frame, used), used, board) < _ROLLING:
+    if options.shutter == "global" or readout_score(rolling(best.found.scene, frame, used), used, board) < _ROLLING:
         return best.described
     scene = replace(best.found.scene, rig_from_board={**start.rig_from_board, **best.found.scene.rig_from_board})
     with suppress(ReconstructionError):  # nor readouts
