@@ -220,18 +220,19 @@ def asked() -> argparse.Namespace:
 def main() -> None:
     """Measure what is asked for and write the figures."""
     arguments = asked()
-    simulated, real, scans = dict[str, object](), dict[str, object](), dict[str, object]()
-    for case in CASES if arguments.seeds else ():
-        simulated[case] = [film_figures(case, seed) for seed in range(arguments.seeds)]
-        print(case, simulated[case], flush=True)
+    figures: dict[str, dict[str, object]] = {"simulated": {}, "real": {}, "scans": {}}
+
+    def keep(part: str, name: str, found: object) -> None:
+        figures[part][name] = found
+        print(name, found, flush=True)
+        write_json(arguments.out, {"noise_px": NOISE_PX, "readouts": READOUTS, **figures, **conditions()})
+
     for name in arguments.sets if arguments.folder else ():
-        real[name] = real_figures(name, arguments.folder)
-        print(name, real[name], flush=True)
+        keep("real", name, real_figures(name, arguments.folder))
     for name in arguments.scans:
-        scans[name] = scan_figures(name, arguments.work)
-        print(name, scans[name], flush=True)
-    figures = {"noise_px": NOISE_PX, "readouts": READOUTS, "simulated": simulated, "real": real, "scans": scans}
-    write_json(arguments.out, {**figures, **conditions()})
+        keep("scans", name, scan_figures(name, arguments.work))
+    for case in CASES if arguments.seeds else ():
+        keep("simulated", case, [film_figures(case, seed) for seed in range(arguments.seeds)])
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from cuspid.capture import Capture, ImageSource
 from cuspid.image_files import Pixels
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
-from cuspid.shutter import film_times, motions, moved
+from cuspid.shutter import PLAIN, film_times, motions, moved
 from cuspid.workers import computed_once
 
 _FEWEST = 4
@@ -175,7 +175,11 @@ def _unrolling(
 
 
 def unrolled(capture: Capture, found: Reconstruction) -> Capture:
-    """A capture whose images show what they would if all rows had been exposed at the instants of their frames; the
-    capture itself where they are."""
+    """A capture whose images show what they would if all rows had been exposed at the instants of their frames, and
+    whose handpiece says so; the capture itself where they are."""
     made = unrollings(found)
-    return replace(capture, source=UnrolledImages(capture.source, made)) if made else capture
+    if not made:
+        return capture
+    plain = {name: replace(mounted, shutter=PLAIN) for name, mounted in capture.handpiece.rig.cameras.items()}
+    handpiece = replace(capture.handpiece, rig=Rig(plain))
+    return replace(capture, handpiece=handpiece, source=UnrolledImages(capture.source, made))

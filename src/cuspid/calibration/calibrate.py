@@ -218,12 +218,16 @@ def _calibrated(
     frame = numbered(start.rig_from_board)
     if frame is None or not follow_each_other(frame):
         return best.described
-    if any(_is_doubtful_together(check) for check in best.described.cameras.values()):
+
+    def may_roll(scene: BoardScene, used: Views) -> bool:
+        return options.shutter == "auto" and readout_score(rolling(scene, frame, used), used, board) > _ROLLING
+
+    doubtful = any(_is_doubtful_together(check) for check in best.described.cameras.values())
+    if len(sizes) > 1 and (doubtful or may_roll(best.found.scene, best.described.views)):
         with suppress(ReconstructionError):  # the images do not tell delays as well
             apart = tried(untied(start, frame, common))
             best = apart if _is_better(apart.described, best.described) else best
-    used = best.described.views
-    if options.shutter == "global" or readout_score(rolling(best.found.scene, frame, used), used, board) < _ROLLING:
+    if not may_roll(best.found.scene, best.described.views):
         return best.described
     scene = replace(best.found.scene, rig_from_board={**start.rig_from_board, **best.found.scene.rig_from_board})
     with suppress(ReconstructionError):  # nor readouts
@@ -415,7 +419,7 @@ def _require_views(views: Views, scene: BoardScene) -> None:
     require_one_group(views, list(scene.cameras))
 
 
-def _rms(residuals: Float[np.ndarray, "n 2"]) -> float:
+def _rms(residuals: Float[np.ndarray, "*n"]) -> float:
     """Of a coordinate."""
     return float(np.sqrt(np.mean(residuals**2)))
 
