@@ -89,13 +89,13 @@ def motions(poses: Sequence[Rigid3], times: Sequence[float] | None) -> Float[np.
             continue
         first, last = min(*beside, k), max(*beside, k)
         in_world = poses[first].inverse() @ poses[last]
-        turn, shift = _screw(in_world)
+        turn, shift = screw_of(in_world)
         turn, shift = (pose.rotate(each) / (times[last] - times[first]) for each in (turn, shift))
         found[k] = np.concatenate([turn, shift - np.cross(turn, pose.translation)])
     return found
 
 
-def _screw(motion: Rigid3) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+def screw_of(motion: Rigid3) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """The turn and the shift of which a motion of much less than a radian is the exponential."""
     turn, shift = motion.rotation_vector, motion.translation
     across = np.cross(turn, shift)

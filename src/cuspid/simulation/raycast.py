@@ -31,7 +31,7 @@ from cuspid.jaw import Jaw
 from cuspid.kernels import kernel
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece, MountedCamera
-from cuspid.shutter import Shutter
+from cuspid.shutter import Shutter, screw_of
 from cuspid.simulation.appearance import (
     NO_MATERIAL,
     Appearance,
@@ -205,16 +205,25 @@ def _moments(count: int) -> Float[np.ndarray, "n"]:
     return in_order[np.random.default_rng(count).permutation(count)]
 
 
-def motions(frames: Sequence[Frame], poses: Mapping[str, Rigid3]) -> dict[str, Float[np.ndarray, "6"]]:
+def motions(
+    frames: Sequence[Frame], poses: Mapping[str, Rigid3], *, steady: bool = False
+) -> dict[str, Float[np.ndarray, "6"]]:
     """How the jaw moves in its own frame (rotation vector and shift) from each frame to the next, as it does on average
-    from the frame before."""
+    from the frame before; if ``steady``, by a screw, so that its speed in a frame is that of the way through it."""
     names = [frame.name for frame in frames]
     found = {}
     for index, name in enumerate(names):
         before, after = max(index - 1, 0), min(index + 1, len(names) - 1)
         motion = poses[names[before]].inverse() @ poses[names[after]]
-        found[name] = np.concatenate([motion.rotation_vector, motion.translation]) / max(after - before, 1)
+        way = screw_of(motion) if steady else (motion.rotation_vector, motion.translation)
+        found[name] = np.concatenate(way) / max(after - before, 1)
     return found
+
+
+def _is_rolling(scene: Scene) -> bool:
+    """Whether not all rows are exposed at the instants of the frames."""
+    cameras = scene.handpiece.rig.cameras.values()
+    return scene.optics.readout > 0 or not all(each.shutter.is_plain for each in cameras)
 
 
 def smeared(motion: Float[np.ndarray, "6"], rig_from_world: Rigid3, smear_mm: float) -> Float[np.ndarray, "6"]:
@@ -581,7 +590,7 @@ def render_capture(
         scene=scene,
         poses=poses,
         gains=metered_gains(scene, frames, poses),
-        motions=motions(frames, poses),
+        motions=motions(frames, poses, steady=_is_rolling(scene)),
         sink=sink,
     )
     if processes == 1:
