@@ -1,10 +1,10 @@
 """Rolling shutters and delays: in calibrations from simulated films and from real webcams, and in scans.
 
-    python benchmarks/rolling.py [FOLDER] [--seeds 8] [--sets webcams] [--work FOLDER]
+    python benchmarks/rolling.py [FOLDER] [--seeds 12] [--sets webcams] [--work FOLDER]
                                  [--out benchmarks/results/rolling.json]
 
-Three cameras film a board that a hand moves, each with a readout of its own (``simulated``): the errors of the readouts
-and lenses in what is stated, and those of the lenses if the readouts are ignored. The same with webcams (``FOLDER``,
+Cameras film a board that a hand moves, each with a readout of its own (``simulated``): the errors of the readouts and
+lenses in what is stated, and those of the lenses if the readouts are ignored. The same with webcams (``FOLDER``,
 with ``caliscope/``): residuals in held-out images without and with readouts. The molar 46 of the phantom is scanned by
 twelve cameras (``scans``) with global shutters, and with rolling ones that are known, ignored or unknown, together and
 delayed. Finished scans are kept in the work folder and not made again.
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -42,14 +42,33 @@ from cuspid.tolerances import with_cameras
 
 HERE = Path(__file__).parent
 INSTANTS = 28
-READOUTS = {"cam0": 0.3, "cam1": 0.8, "cam2": -0.5}
-"""The third is mounted upside down."""
-CASES: Mapping[str, tuple[Mapping[str, float], Mapping[str, float]]] = {
-    "rolling": (READOUTS, {}),
-    "rolling and late": (READOUTS, {"cam1": 0.4}),
-    "global": (dict.fromkeys(READOUTS, 0.0), {}),
+READOUTS = (0.3, 0.8, -0.5)
+"""The images of the third are turned by half a turn."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Film:
+    """Cameras that film a board."""
+
+    cameras: int
+    rolls: bool = True
+    """Whether they have readouts, which take turns from seed to seed."""
+    late: float = 0.0
+    """By how many frames the second one is late."""
+    share: float = 1.0
+    """Of the seeds that are tried."""
+
+    def readouts(self, seed: int) -> dict[str, float]:
+        """Of each camera."""
+        return {f"cam{k}": self.rolls * READOUTS[(k + seed) % len(READOUTS)] for k in range(self.cameras)}
+
+
+FILMS = {
+    "one camera": Film(cameras=1),
+    "one camera, global": Film(cameras=1, rolls=False),
+    "three cameras": Film(cameras=3, share=0.25),
+    "three cameras, one late": Film(cameras=3, late=0.4, share=0.25),
 }
-"""Readouts and delays, by what they are called."""
 UNKNOWN = 0.5
 """Standard deviation of a readout of which nothing is known."""
 READOUT, DELAYS = 0.5, (0.0, 0.2, -0.2, 0.1, -0.1, 0.3, 0.0, -0.3, 0.15, -0.15, 0.25, -0.25)
@@ -116,9 +135,9 @@ def _when_exposed(x: Callable[[float], float], y: Callable[[float], float], heig
 def film_figures(case: str, seed: int) -> dict[str, Value]:
     """Errors of the readouts and of the lenses in what is stated, and of the focal lengths; also if the readouts are
     ignored."""
-    rng = np.random.default_rng(2000 + seed)
-    truth, (readouts, delays) = rig_before_board(rng), CASES[case]
-    views = filmed(truth, hand(rng), readouts, delays, rng)
+    rng, film = np.random.default_rng(2000 + seed), FILMS[case]
+    truth, readouts = rig_before_board(rng, film.cameras), film.readouts(seed)
+    views = filmed(truth, hand(rng), readouts, {"cam1": film.late}, rng)
     sizes = dict.fromkeys(truth.cameras, SIZE)
     found = calibrate_rig(views, sizes, BOARD, CalibrationOptions(lens="OPENCV"))
     ignored = calibrate_rig(views, sizes, BOARD, CalibrationOptions(lens="OPENCV", shutter="global"))
@@ -209,7 +228,7 @@ def asked() -> argparse.Namespace:
     """What the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, nargs="?")
-    parser.add_argument("--seeds", type=int, default=8)
+    parser.add_argument("--seeds", type=int, default=12)
     parser.add_argument("--sets", nargs="*", default=["webcams"])
     parser.add_argument("--scans", nargs="*", default=list(SCANS))
     parser.add_argument("--work", type=Path, default=Path("build/rolling"))
@@ -231,8 +250,10 @@ def main() -> None:
         keep("real", name, real_figures(name, arguments.folder))
     for name in arguments.scans:
         keep("scans", name, scan_figures(name, arguments.work))
-    for case in CASES if arguments.seeds else ():
-        keep("simulated", case, [film_figures(case, seed) for seed in range(arguments.seeds)])
+    for case, film in FILMS.items():
+        seeds = range(round(film.share * arguments.seeds))
+        if seeds:
+            keep("simulated", case, [film_figures(case, seed) for seed in seeds])
 
 
 if __name__ == "__main__":

@@ -318,10 +318,10 @@ def rolling(result: Result) -> str:
         )
         for name, scan in result["scans"].items()
     ]
-    readouts = ", ".join(f"{each:g}" for each in result["readouts"].values())
+    readouts = ", ".join(f"{each:g}" for each in result["readouts"])
     return "\n".join(
         [
-            f"Three cameras film a board that a hand moves over 28 frames ({result['noise_px']} px of noise; readouts "
+            f"Cameras film a board that a hand moves over 28 frames ({result['noise_px']} px of noise; readouts "
             f"{readouts} of the time between frames; *late*: one exposes 0.4 frames after the others; *global*: "
             "readouts of 0). Errors are root mean squares, in stated standard deviations where it says so (bar: 0.8 to "
             "1.2):",
