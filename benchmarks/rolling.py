@@ -7,7 +7,8 @@ Cameras film a board that a hand moves, each with a readout of its own (``simula
 lenses in what is stated, and those of the lenses if the readouts are ignored. The same with webcams (``FOLDER``,
 with ``caliscope/``): residuals in held-out images without and with readouts. The molar 46 of the phantom is scanned by
 twelve cameras (``scans``) with global shutters, and with rolling ones that are known, ignored or unknown, together and
-delayed. Finished scans are kept in the work folder and not made again.
+delayed. Finished scans are kept in the work folder, and what the same code has measured in the file of results; neither
+is made again.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +39,9 @@ from cuspid.shutter import PLAIN, Shutter
 from cuspid.simulation.optics import OpticsOptions
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.storage import write_json
+from cuspid.storage.files import read_json
 from cuspid.studies.grid import Value
+from cuspid.studies.scan_cases import commit
 from cuspid.tolerances import with_cameras
 
 HERE = Path(__file__).parent
@@ -158,6 +162,11 @@ def film_figures(case: str, seed: int) -> dict[str, Value]:
     }
 
 
+def films_figures(case: str, seeds: int) -> list[dict[str, Value]]:
+    """Of several seeds."""
+    return [film_figures(case, seed) for seed in range(seeds)]
+
+
 def _focal_error_permille(found: RigCalibration, truth: BoardScene) -> float:
     return 1000 * rms([found.rig[name].camera.focal_px / lens.focal_px - 1 for name, lens in truth.cameras.items()])
 
@@ -236,24 +245,31 @@ def asked() -> argparse.Namespace:
     return parser.parse_args()
 
 
+def kept(path: Path) -> dict[str, dict[str, object]]:
+    """What was measured by the same code before."""
+    before = read_json(path) if path.exists() else {}
+    same = before.get("commit") == commit()
+    return {part: before[part] if same else {} for part in ("simulated", "real", "scans")}
+
+
 def main() -> None:
     """Measure what is asked for and write the figures."""
     arguments = asked()
-    figures: dict[str, dict[str, object]] = {"simulated": {}, "real": {}, "scans": {}}
+    figures = kept(arguments.out)
 
-    def keep(part: str, name: str, found: object) -> None:
-        figures[part][name] = found
-        print(name, found, flush=True)
+    def keep(part: str, name: str, measure: Callable[[], object]) -> None:
+        if name in figures[part]:
+            return
+        figures[part][name] = measure()
+        print(name, figures[part][name], flush=True)
         write_json(arguments.out, {"noise_px": NOISE_PX, "readouts": READOUTS, **figures, **conditions()})
 
     for name in arguments.sets if arguments.folder else ():
-        keep("real", name, real_figures(name, arguments.folder))
+        keep("real", name, partial(real_figures, name, arguments.folder))
     for name in arguments.scans:
-        keep("scans", name, scan_figures(name, arguments.work))
-    for case, film in FILMS.items():
-        seeds = range(round(film.share * arguments.seeds))
-        if seeds:
-            keep("simulated", case, [film_figures(case, seed) for seed in seeds])
+        keep("scans", name, partial(scan_figures, name, arguments.work))
+    for case, film in FILMS.items() if arguments.seeds else ():
+        keep("simulated", case, partial(films_figures, case, round(film.share * arguments.seeds)))
 
 
 if __name__ == "__main__":
