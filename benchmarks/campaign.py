@@ -82,6 +82,7 @@ BENCHMARKS = (
     Benchmark("camera_pair", "camera_pair.py --pictures {work} --out {out}"),
     Benchmark("targets", "targets.py --work {work} --out {out}"),
     Benchmark("calibrations", "calibrations.py {boards} --out {out}"),
+    Benchmark("rolling", "rolling.py {boards} --work {work} --out {out}"),
     Benchmark("mean_shape", "mean_shape.py --work {work} --out {out}"),
     Benchmark("grid", "grid.py --out {out}"),
     Benchmark("stereo_pairs", "stereo_pairs.py {pairs} --out {out}"),

@@ -84,6 +84,7 @@ MAKERS: Mapping[str, Maker] = {
     "expectations": Maker("expectations"),
     "targets": Maker("targets"),
     "calibrations": Maker("calibrations"),
+    "rolling": Maker("rolling"),
     "grid": Maker("grid"),
     "fuzz": Maker("fuzz", ("*",), plain=True, release=True),
     "kill": Maker("kill", ("*",), plain=True, release=True),

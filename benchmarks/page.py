@@ -186,6 +186,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
     "real_gloss": ("A real glossy ball", anatomy_sections.real_gloss),
     "targets": ("Boards and terraces", handpiece_sections.targets),
     "calibrations": ("What calibrations state", trust_sections.calibrations),
+    "rolling": ("Rolling shutters", trust_sections.rolling),
     "manufacturing": ("Handpieces not built exactly as drawn", handpiece_sections.manufacturing),
     "manufacturing_arch": ("Handpieces not built exactly as drawn: a real arch", handpiece_sections.manufacturing),
     "manufacturing_swept": (

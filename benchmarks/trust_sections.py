@@ -289,6 +289,113 @@ def _trueness_cells(trueness: Result) -> tuple[str, ...]:
     )
 
 
+def rolling(result: Result) -> str:
+    """Rolling shutters and delays, in calibrations and in scans."""
+    films = [
+        (
+            name,
+            len(runs),
+            f"{sum(run['taken_as_rolling'] for run in runs)} of {len(runs)}",
+            f"{_rms([run['readout_error'] for run in runs]):.4f}",
+            _z_of([run["readout_z"] for run in runs]),
+            mark_z(_rms([run["lens_z"] for run in runs])),
+            f"{_rms([run['focal_error_permille'] for run in runs]):.2f}",
+            f"{_rms([run['ignored_lens_z'] for run in runs]):.1f}",
+            f"{_rms([run['ignored_focal_error_permille'] for run in runs]):.2f}",
+        )
+        for name, runs in result["simulated"].items()
+    ]
+    real = [_rolling_row(camera, name, each) for name, each in result["real"].items() for camera in each["global"]]
+    scans = [
+        (
+            name,
+            f"{scan['mean_um']:.1f}",
+            f"{scan['p95_um']:.1f}",
+            f"{scan['complete_50_um_pct']:.1f}",
+            f"{scan['scale_ppm']:+.0f}",
+            f"{scan['reprojection_px']:.2f}",
+            "" if scan["readout_z"] is None else f"{scan['readout_error']:.4f} ({scan['readout_z']:.1f})",
+        )
+        for name, scan in result["scans"].items()
+    ]
+    readouts = ", ".join(f"{each:g}" for each in result["readouts"])
+    return "\n".join(
+        [
+            f"Cameras film a board that a hand moves over 28 frames ({result['noise_px']} px of noise; readouts "
+            f"{readouts} of the time between frames; *late*: one exposes 0.4 frames after the others; *global*: "
+            "readouts of 0). Errors are root mean squares, in stated standard deviations where it says so (bar: 0.8 to "
+            "1.2):",
+            "",
+            markdown_table(
+                (
+                    "shutters",
+                    "seeds",
+                    "taken as rolling",
+                    "readout error, frames",
+                    "in sigmas",
+                    "lens in sigmas",
+                    "focal error, per mille",
+                    "lens in sigmas, readouts ignored",
+                    "focal error, per mille, ignored",
+                ),
+                films,
+            ),
+            "",
+            "Real webcams at six frames a second, free running; without readouts and with them:",
+            "",
+            markdown_table(
+                (
+                    "camera",
+                    "views",
+                    "RMS px without",
+                    "with",
+                    "held out px without",
+                    "with",
+                    "readout, frames",
+                    "alone: lens apart, without",
+                    "with",
+                ),
+                real,
+            ),
+            "",
+            "The molar 46 of the phantom, ten frames 0.9 mm apart, twelve cameras with exact calibration: global "
+            "shutters; a readout of half a frame, known to the file, unknown, and ignored; and delays of up to 0.3 "
+            "frames:",
+            "",
+            markdown_table(
+                (
+                    "shutters",
+                    "mean um",
+                    "P95 um",
+                    "within 50 um, %",
+                    "scale ppm",
+                    "reprojection px",
+                    "readout error, frames (in sigmas)",
+                ),
+                scans,
+            ),
+            "",
+            "`python benchmarks/rolling.py FOLDER`.",
+        ]
+    )
+
+
+def _z_of(values: list[float | None]) -> str:
+    told = [value for value in values if value is not None]
+    return mark_z(_rms(told)) if told else ""
+
+
+def _rolling_row(camera: str, name: str, found: Result) -> tuple[object, ...]:
+    before, after = found["global"][camera], found["auto"][camera]
+    readout = "" if after["readout"] is None else f"{after['readout']:+.3f} ± {after['readout_sigma']:.3f}"
+    pairs = [
+        "" if each[key] is None else f"{each[key]:.{digits}f}"
+        for key, digits in (("rms_px", 3), ("held_out_px", 3), ("alone_apart", 1))
+        for each in (before, after)
+    ]
+    return (f"{name}, {camera}", after["views"], *pairs[:4], readout, *pairs[4:])
+
+
 def calibrations(result: Result) -> str:
     """Errors of calibrations in what they state, against the truth and between real halves."""
     lenses, rigs = [], []

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from cuspid import storage
 from cuspid.board import Board
-from cuspid.calibration.bundle import BoardScene, bending_coordinates
+from cuspid.calibration.bundle import BoardScene, bending_coordinates, interpolation
 from cuspid.calibration.corners import BoardView
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
@@ -125,6 +125,33 @@ def moving_pose(time: float) -> Rigid3:
     middle = np.array([4.0, 0, 24.0]) + [2, 2, 3] * np.cos(phase[::-1])
     in_world = Rigid3(tilt, middle - tilt @ np.array([*BOARD.size_mm, 0]) / 2)
     return looking_at(np.array([4.0, 0, 24.0]), np.zeros(3), 0.0) @ in_world
+
+
+def rolling_views(
+    truth: BoardScene, readouts: dict[str, float], delays: dict[str, float], noise_px: float, rng: np.random.Generator
+) -> dict[tuple[str, str], BoardView]:
+    """What cameras see of the board of :func:`moving` whose rows are exposed one after the other."""
+    u, v = bending_coordinates(BOARD, BOARD.corners).T
+    bent = BOARD.corners + np.outer(np.stack([u * u, u * v, v * v], 1) @ truth.bending_mm, [0, 0, 1.0])
+    views = {}
+    for camera, lens in truth.cameras.items():
+        for instant in truth.rig_from_board:
+            middle, late = int(instant) + delays.get(camera, 0.0), readouts[camera]
+            pixels = np.stack(
+                [
+                    lens.project((truth.cam_from_rig[camera] @ moving_pose(middle + share * late)).apply(bent))
+                    for share in (-0.5, 0.0, 0.5)
+                ]
+            )
+            share, at = np.zeros(len(bent)), pixels[1]
+            for _ in range(6):  # the row depends on the time, and the time on the row
+                weights = interpolation(np.tile([-0.5, 0.0, 0.5], (len(share), 1)), share)[0]
+                at = np.einsum("nk,knj->nj", weights, pixels)
+                share = at[:, 1] / lens.height - 0.5
+            seen = np.flatnonzero(lens.contains(at))
+            if len(seen) >= 12:
+                views[camera, instant] = BoardView(seen, at[seen] + rng.normal(0, noise_px, (len(seen), 2)))
+    return views
 
 
 def scaled(pose: Rigid3, scale: float) -> Rigid3:

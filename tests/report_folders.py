@@ -210,7 +210,7 @@ def write_calibrated(folder: Path) -> None:
     }
     storage.claim_folder(folder, "calibrate", {"board": {"square_mm": 2.0}}, {"one": "c" * 64})
     cameras = {
-        name: {**check, "delay_frames": delay, "delay_spread_frames": 0.1}
+        name: {**check, "delay_frames": delay, "delay_spread_frames": 0.1, "readout": 0.312, "readout_sigma": 0.004}
         for name, delay in (("one", -0.25), ("<other>", 0.25))
     }
     response = {

@@ -19,6 +19,7 @@ from cuspid.motion.adjustment import AdjustmentOptions, adjust, left_jacobian
 from cuspid.motion.expectation import covariance_factor
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
+from cuspid.shutter import Shutter
 
 SIGMA_PX = 0.3
 EXTRINSIC_SIGMA = np.array([2e-3, 2e-3, 2e-3, 0.02, 0.02, 0.02])
@@ -162,7 +163,7 @@ def linearised(state, frame, camera, point):
     """Pixel and Jacobian of one observation."""
     pixel, jacobian = np.zeros(2), np.zeros((2, 9 + state.basis.shape[1]))
     assert normal_equations.linearise(
-        state, point, frame, camera, True, normal_equations.make_scratch(state), pixel, jacobian
+        state, point, frame, camera, 100.0, True, normal_equations.make_scratch(state), pixel, jacobian
     )
     return pixel, jacobian
 
@@ -180,19 +181,23 @@ def with_other_lenses(rig: Rig, rng: np.random.Generator) -> Rig:
 
 
 @settings(max_examples=10, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), mixed=st.booleans())
-def test_jacobian_agrees_with_finite_differences(seed: int, mixed: bool) -> None:
-    """By point, pose, extrinsics and intrinsics, with distortion, away from the prior."""
+@given(seed=st.integers(0, 2**32 - 1), mixed=st.booleans(), rolling=st.booleans())
+def test_jacobian_agrees_with_finite_differences(seed: int, mixed: bool, rolling: bool) -> None:
+    """By point, pose, extrinsics, intrinsics and shutter, with distortion, away from the prior."""
     rng = np.random.default_rng(seed)
     rig = with_priors(make_rig())
     rig = with_other_lenses(rig, rng) if mixed else rig
+    shutter = Shutter(delay_frames=0.2, delay_sigma_frames=0.01, readout=0.7, readout_sigma=0.02)
+    rig = Rig({name: replace(each, shutter=shutter) for name, each in rig.cameras.items()}) if rolling else rig
     prior = adjustment._Prior.of(rig)
+    assert prior.numbers == 6 + max(len(each.camera.parameters) for each in rig.cameras.values()) + 2 * rolling
     scene = Reconstruction(rig=rig, rig_from_world=make_path(2))
     point = np.array([*rng.uniform(-1, 1, 2), rng.uniform(4, 6)])
     whitened = 10 * rng.normal(size=(len(rig.names), prior.numbers))
     start = adjustment._with_calibration(
-        adjustment._initial_state(poses_of(scene), point[None], prior), prior, whitened
+        adjustment._initial_state(poses_of(scene), point[None], prior, (0.0, 1.0)), prior, whitened
     )
+    assert start.motions.any()
     camera = int(rng.integers(4))
     nothing = normal_equations.Observations(
         np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(2, np.int64)

@@ -6,20 +6,21 @@ import cv2
 import numpy as np
 import pytest
 
-from boards import BOARD, SIZE, moving, moving_pose, options, photographs, scene, undistorted, views_of
+from boards import BOARD, SIZE, moving, moving_pose, options, photographs, rolling_views, scene, undistorted, views_of
 from cuspid import storage
 from cuspid.board import Board
 from cuspid.calibration import bundle, calibrate
 from cuspid.calibration.board_shape import BoardShape
 from cuspid.calibration.bundle import BoardScene, adjust_board
-from cuspid.calibration.calibrate import RigCalibration, calibrate_rig
+from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, calibrate_rig
 from cuspid.calibration.corners import BoardView, find_corners
 from cuspid.calibration.start import board_pose, first_camera
-from cuspid.calibration.timing import numbered, untied
+from cuspid.calibration.timing import rolling, untied
 from cuspid.camera import Camera
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.rig import Rig
+from cuspid.shutter import PLAIN, numbered
 from verbs import refused, run
 
 CHESS = Board(kind="chessboard", columns=8, rows=8, square_mm=2.0)
@@ -115,14 +116,16 @@ def test_a_page_is_as_large_as_it_says(tmp_path, square_mm):
 # --- closed loops ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("together", [True, False])
-def test_jacobian_agrees_with_finite_differences(together):
-    truth = scene(0, cameras=2, instants=4) if together else moving(0, instants=6)
+@pytest.mark.parametrize("exposure", ["together", "apart", "rolling"])
+def test_jacobian_agrees_with_finite_differences(exposure):
+    truth = scene(0, cameras=2, instants=4) if exposure == "together" else moving(0, instants=6)
     views = views_of(truth, BOARD, 1.0, np.random.default_rng(0))
-    if not together:
-        truth = untied(truth, numbered(truth.rig_from_board), views)
-        rng = np.random.default_rng(1)
-        truth = replace(truth, timing=truth.timing.later(rng.normal(0, 0.2, 3), rng.normal(0, 0.2, len(views))))
+    if exposure != "together":
+        frame, rng = numbered(truth.rig_from_board), np.random.default_rng(1)
+        truth = untied(truth, frame, views)
+        truth = rolling(truth, frame, views) if exposure == "rolling" else truth
+        later = [rng.normal(0, 0.2, count) for count in (3, len(truth.timing.readout), len(views))]
+        truth = replace(truth, timing=truth.timing.later(*later))
     even = BoardShape.even(BOARD)
     truth = replace(truth, shape=even.moved(np.random.default_rng(2).normal(0, 0.05, even.offsets_mm.size)))
     seen = bundle._Observations.of(views, BOARD, truth)
@@ -385,15 +388,15 @@ def test_delays_that_explain_nothing_are_not_taken(monkeypatch, worse):
     assert all(check.delay_frames is None for check in found.cameras.values())
 
 
-def test_a_parabola_goes_through_what_it_is_of():
+def test_a_polynomial_goes_through_what_it_is_of():
     frames = np.array([[4.0, 2.0, 5.0], [7.0, 8.0, np.nan], [3.0, np.nan, np.nan]])
     times, paths = np.array([4.6, 7.4, 3.9]), ([0.5, -2.0, 1.0], [3.0, 1.0], [2.0])
-    weights, slopes = bundle.parabola(frames, times)
+    weights, slopes = bundle.interpolation(frames, times)
     assert np.allclose(weights.sum(axis=1), 1)
     assert np.allclose(slopes.sum(axis=1), 0)
     for path, weight, frame, time in zip(paths, weights, frames, times, strict=True):
         assert weight @ np.polyval(path, np.nan_to_num(frame)) == pytest.approx(np.polyval(path, time))
-    ahead, back = (bundle.parabola(frames, times + step)[0] for step in (1e-6, -1e-6))
+    ahead, back = (bundle.interpolation(frames, times + step)[0] for step in (1e-6, -1e-6))
     assert np.allclose(slopes, (ahead - back) / 2e-6, atol=1e-6)
 
 
@@ -573,3 +576,48 @@ def apart_um(one: Rig, other: Rig) -> float:
     centres = (np.array([each.centre_in_rig for each in rig.cameras.values()]) for rig in (one, other))
     ours, theirs = (np.linalg.norm(each[:, None] - each, axis=2) for each in centres)
     return float(1000 * np.sqrt(np.mean((ours - theirs) ** 2)))
+
+
+def upside_down(camera: Camera, views: dict) -> tuple[Camera, dict]:
+    """A camera that is turned by half a turn about its axis, and what it sees."""
+    size, (k1, k2, p1, p2) = np.array(SIZE), camera.distortion
+    turned = replace(
+        camera, principal_point_px=size - camera.principal_point_px, distortion=np.array([k1, k2, -p1, -p2])
+    )
+    return turned, {key: BoardView(view.corner, size - view.pixels) for key, view in views.items()}
+
+
+def test_a_readout_is_found_along_the_path_of_the_board_and_turns_with_the_camera():
+    """Within what is stated, and the lens too, which is wrong if the readout is ignored; a board that is held still
+    tells none."""
+    whole = moving(3, instants=20)
+    truth = replace(whole, cameras={"cam1": whole.cameras["cam1"]})
+    views = rolling_views(truth, {"cam1": 0.6}, {}, 0.1, np.random.default_rng(3))
+    found = calibrate_rig(views, {"cam1": SIZE}, BOARD, CalibrationOptions(lens="OPENCV"))
+    check, shutter = found.cameras["cam1"], found.rig["cam1"].shutter
+    assert (shutter.readout, shutter.readout_sigma) == (check.readout, check.readout_sigma)
+    assert check.delay_frames is None
+    assert 0 < check.readout_sigma < 0.02
+    assert abs(check.readout - 0.6) < 3 * check.readout_sigma
+    assert lens_error(found, truth, "cam1") < 2
+    assert any(f"cam1 {check.readout:+.3f} ± {check.readout_sigma:.3f}" in note for note in found.notes)
+    ignored = calibrate_rig(views, {"cam1": SIZE}, BOARD, CalibrationOptions(lens="OPENCV", shutter="global"))
+    assert ignored.cameras["cam1"].readout is None
+    assert ignored.rig["cam1"].shutter == PLAIN
+    assert ignored.cameras["cam1"].rms_px > 1.3 * check.rms_px
+    turned, seen = upside_down(truth.cameras["cam1"], views)
+    again = calibrate_rig(seen, {"cam1": SIZE}, BOARD, CalibrationOptions(lens="OPENCV"))
+    assert again.cameras["cam1"].readout == pytest.approx(-check.readout, abs=0.1 * check.readout_sigma)
+    assert np.allclose(again.rig["cam1"].camera.focal_px, found.rig["cam1"].camera.focal_px, rtol=1e-4)
+    assert np.allclose(again.rig["cam1"].camera.principal_point_px, turned.principal_point_px, atol=3)
+
+
+@pytest.mark.parametrize("film", [True, False])
+def test_a_global_shutter_and_a_board_at_rest_tell_no_readout(film):
+    whole = moving(4, instants=16) if film else scene(4, cameras=2)
+    truth = replace(whole, cameras={"cam1": whole.cameras["cam1"]})
+    views = views_of(truth, BOARD, 0.1, np.random.default_rng(4))
+    found = calibrate_rig(views, {"cam1": SIZE}, BOARD, CalibrationOptions(lens="OPENCV"))
+    assert found.cameras["cam1"].readout is None
+    assert found.rig["cam1"].shutter == PLAIN
+    assert not any("rows" in note for note in found.notes)

@@ -60,6 +60,7 @@ from cuspid.surface.sharp_edges import SharpEdgeOptions
 from cuspid.surface.stage import find_holes, fuse
 from cuspid.tolerances import NominalOptions, held, is_nominal
 from cuspid.trueness import GroundTruth, Trueness
+from cuspid.unrolling import is_rolling, unrolled
 from cuspid.visibility import VisibilityOptions, scannable_faces
 
 __all__ = [
@@ -175,14 +176,28 @@ def find_poses(
     if matched(capture, options) == "shading":
         depths = _shaded_depth(capture, folder, options, progress)
         made_from, how = depths.digest, options.surfaces
-        return locate_by_surfaces(capture, depths, made_from, folder / "motion", how, progress=progress)
-    doubts: tuple[str, ...] = ()
+        found = locate_by_surfaces(capture, depths, made_from, folder / "motion", how, progress=progress)
+        return replace(found, notes=(*_unused_shutters(capture, "shading"), *found.notes))
+    doubts = _unused_shutters(capture, "texture")
     if options.own_images:
         cache = folder / "motion" / "cache"
-        doubts = require_own_images(capture, options.tracking, cache=cache, progress=progress)
+        doubts += require_own_images(capture, options.tracking, cache=cache, progress=progress)
     capture, notes = _hold_what_fits(capture, nominal, folder / "motion", options, progress)
     found = locate(capture, folder / "motion", options.tracking, options.motion, progress=progress)
     return replace(found, notes=(*doubts, *notes, *found.notes))
+
+
+def _unused_shutters(capture: Capture, signal: Signal) -> tuple[str, ...]:
+    """That rolling shutters and delays are not taken into account, and why."""
+    cameras = capture.handpiece.rig.cameras.values()
+    if len(capture.frames) < 2 or all(each.shutter.is_plain for each in cameras):
+        return ()
+    unused = "shutter: readouts and delays of the handpiece's file are not taken into account"
+    if signal == "shading":
+        return (f"{unused}: on plain surfaces depth comes before the motion, which they depend on",)
+    if not is_rolling(capture.handpiece.rig, [frame.name for frame in capture.frames]):
+        return (f"{unused}: the frames' names are no numbers in order, and do not tell their times",)
+    return ()
 
 
 def _hold_what_fits(
@@ -215,7 +230,7 @@ def surface(
     """The mesh, given the poses of the frames (second part of :func:`reconstruct`), and how well each of its vertices
     is known: standard deviation along the normal, um."""
     give_back()
-    options = settled(options)
+    options, capture = settled(options), unrolled(capture, found)
     of_size = sized(replace(capture, handpiece=replace(capture.handpiece, rig=found.rig)), options)
     detail = detail_mm(of_size.handpiece)
     if matched(capture, options) == "shading":

@@ -19,6 +19,7 @@ from cuspid.camera import Camera
 from cuspid.display import Displayed
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, axes_about, read_only, unit
+from cuspid.shutter import PLAIN, Shutter
 from cuspid.values import checked_name, named, one_line, shown
 from cuspid.workers import computed_once
 
@@ -37,6 +38,8 @@ class MountedCamera:
     covariance: Float[np.ndarray, "6 6"] | None = None
     """Covariance of a small motion (rotation vector rad, translation mm) applied on the left of ``cam_from_rig``; zero
     for an exact one, None if its uncertainty is not stated (an adjustment then holds it fixed)."""
+    shutter: Shutter = PLAIN
+    """When its rows are exposed."""
 
     @property
     def centre_in_rig(self) -> Float[np.ndarray, "3"]:

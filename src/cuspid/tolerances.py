@@ -95,9 +95,12 @@ def is_nominal(handpiece: Handpiece) -> bool:
 
 def held(handpiece: Handpiece) -> Handpiece:
     """The handpiece without covariances: as if it were built exactly as its file says."""
-    return with_cameras(
-        handpiece, lambda each: replace(each, camera=replace(each.camera, covariance=None), covariance=None)
-    )
+
+    def exact(each: MountedCamera) -> MountedCamera:
+        shutter = replace(each.shutter, delay_sigma_frames=0.0, readout_sigma=0.0)
+        return replace(each, camera=replace(each.camera, covariance=None), covariance=None, shutter=shutter)
+
+    return with_cameras(handpiece, exact)
 
 
 def with_cameras(handpiece: Handpiece, change: Callable[[MountedCamera], MountedCamera]) -> Handpiece:

@@ -10,9 +10,10 @@ Of several boards that are fixed to one another, each is bent in its own way, an
 unknown too: X is then ``body_from_board @`` the corner on its board, and ``rig_from_board`` moves the body.
 
 Cameras that do not expose together see a board that moves where it was at other moments. A corner in a view is then at
-``sum_k w_k(t) rig_from_board[k] @ X``: the parabola (Lagrange) through its places at three successive instants k about
-the time t at which the view was taken, in frames: the number of its frame, and a delay of the camera and one of the
-view, both unknown. :mod:`cuspid.calibration.timing` chooses the instants.
+``sum_k w_k(t) rig_from_board[k] @ X``: the polynomial (Lagrange) through its places at successive instants k about
+the time t at which it was exposed, in frames: the number of the frame of its view, a delay of the camera and one of
+the view, and where the shutter rolls ``readout * (y / height - 1/2)`` for a corner at the height y of the image; delays
+and readouts are unknown. :mod:`cuspid.calibration.timing` chooses the instants.
 
 The rig frame is that of the first camera; for the covariance it is defined by all cameras together (inner constraints,
 Triggs et al. 2000, section 9.2), so that no camera counts as exact.
@@ -40,7 +41,7 @@ from cuspid.geometry import Rigid3
 from cuspid.rig import MountedCamera
 
 _PLACE, _BENDING = 6, 3
-_LENSES, _CAMERAS, _BOARDS, _BENDINGS, _SHAPES, _MOUNTS, _CAMERA_DELAYS, _VIEW_DELAYS = range(8)
+_LENSES, _CAMERAS, _BOARDS, _BENDINGS, _SHAPES, _MOUNTS, _CAMERA_DELAYS, _READOUTS, _VIEW_DELAYS = range(9)
 """Kinds of unknowns, in order."""
 _RADIAL_SIGMA, _SIDEWAYS_SIGMA = 0.5, 0.01
 """Standard deviation of radial, and of tangential and prism parameters about 0, for lenses as they are made: it matters
@@ -56,6 +57,8 @@ _CAMERA_DELAY_SIGMA = 3.0
 _VIEW_DELAY_SIGMA = 1 / np.sqrt(12)
 """Standard deviation of the delay of a view from that of its camera, in frames: a camera that runs freely may expose at
 any moment of a frame."""
+_READOUT_SIGMA = 1.0
+"""Standard deviation of the readout of a camera about 0, in frames: it ends before the next one begins."""
 _KNEE = 2.5
 """Residuals beyond this, in standard deviations, have less weight (Huber)."""
 _STEPS, _SETTLED = 100, 0.01
@@ -74,16 +77,20 @@ _LOOSE_ROUNDS = 8
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Timing:
-    """When each view was taken, of cameras that do not expose together."""
+    """When each view was taken, and each row of it, of cameras that do not expose all rows together."""
 
     frame: Mapping[str, int]
     """Number of the frame of each instant: frames follow each other at equal times."""
     near: Mapping[tuple[str, str], tuple[str, ...]]
-    """By camera and instant of a view, the instant nearest to when it was taken, and up to two beside that."""
+    """By camera and instant of a view, the instant nearest to when it was taken, and up to four beside that."""
     by_camera: Mapping[str, float]
     """How many frames after an instant each camera exposes."""
     by_view: Mapping[tuple[str, str], float]
     """How many frames later still it did so in each view."""
+    readout: Mapping[str, float] = field(default_factory=dict)
+    """How many frames after the first row of an image each camera exposes the last one; of none, all at once."""
+    together: bool = False
+    """Whether the cameras expose together, their middle rows that is, so that there are no delays."""
 
     def delay(self, camera: str, instant: str) -> float:
         """How many frames after an instant a camera exposed."""
@@ -93,13 +100,20 @@ class Timing:
         """When a view was taken, in frames."""
         return self.frame[instant] + self.delay(camera, instant)
 
-    def later(self, cameras: Float[np.ndarray, "c"], views: Float[np.ndarray, "v"]) -> Timing:
-        """With delays that are longer by so many frames."""
+    def later(
+        self, cameras: Float[np.ndarray, "c"], readouts: Float[np.ndarray, "r"], views: Float[np.ndarray, "v"]
+    ) -> Timing:
+        """With delays and readouts that are longer by so many frames."""
         return replace(
             self,
-            by_camera=dict(zip(self.by_camera, np.add([*self.by_camera.values()], cameras).tolist(), strict=True)),
-            by_view=dict(zip(self.by_view, np.add([*self.by_view.values()], views).tolist(), strict=True)),
+            by_camera=_longer(self.by_camera, cameras),
+            readout=_longer(self.readout, readouts),
+            by_view=_longer(self.by_view, views),
         )
+
+
+def _longer(frames: Mapping[_Key, float], by: Float[np.ndarray, "n"]) -> dict[_Key, float]:
+    return dict(zip(frames, np.add([*frames.values()], by).tolist(), strict=True))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -132,7 +146,7 @@ class BoardScene:
             return self.rig_from_board[instant]
         near = self.timing.near[camera, instant]
         frames = np.array([[self.timing.frame[each] for each in near]], dtype=np.float64)
-        weights, _ = parabola(frames, np.array([self.timing.time(camera, instant)]))
+        weights, _ = interpolation(frames, np.array([self.timing.time(camera, instant)]))
         blend = np.einsum("k,kij->ij", weights[0], np.stack([self.rig_from_board[each].matrix for each in near]))
         u, _, vt = np.linalg.svd(blend[:3, :3])
         return Rigid3(u @ vt, blend[:3, 3])
@@ -150,7 +164,7 @@ class Adjusted:
     """Observed minus projected, px, by camera and instant."""
     covariance: Float[np.ndarray, "k k"]
     """Covariance of the cameras, if the corners err independently: the parameters of each in order, then the motion of
-    each."""
+    each, then their readouts, where there are any."""
     moved: Float[np.ndarray, "i k"]
     """By how much each instant moves these (:mod:`cuspid.calibration.scatter`)."""
     settled: bool
@@ -178,6 +192,8 @@ class _Observations:
     shares: Float[np.ndarray, "n m"]
     """by how much it follows them."""
     pixels: Float[np.ndarray, "n 2"]
+    rows: Float[np.ndarray, "n"]
+    """How far below the middle of the image each was seen, as a share of its height."""
     keys: tuple[tuple[str, str], ...]
     starts: Int[np.ndarray, "s"]
 
@@ -187,6 +203,7 @@ class _Observations:
         keys, cameras, instants = tuple(views), list(scene.cameras), list(scene.rig_from_board)
         counts = [len(views[key].corner) for key in keys]
         corner = np.concatenate([views[key].corner for key in keys])
+        heights = [scene.cameras[camera].height for camera, _ in keys]
         points, number = board.corners[corner], board.board_of(corner)
         nodes, shares = nodes_of(board)
         near = [(instant,) if scene.timing is None else scene.timing.near[camera, instant] for camera, instant in keys]
@@ -203,17 +220,25 @@ class _Observations:
             nodes=nodes[corner],
             shares=shares[corner],
             pixels=np.concatenate([views[key].pixels for key in keys]),
+            rows=np.concatenate(
+                [views[key].pixels[:, 1] / height - 0.5 for key, height in zip(keys, heights, strict=True)]
+            ),
             keys=keys,
             starts=np.cumsum([0, *counts]),
         )
 
-    def weights(self, scene: BoardScene) -> tuple[Float[np.ndarray, "v k"], Float[np.ndarray, "v k"]]:
-        """Of the instants about each view, and their derivatives by its time."""
-        times = self.frames[:, 0] if scene.timing is None else np.array([scene.timing.time(*key) for key in self.keys])
-        return parabola(self.frames, times)
+    def weights(self, scene: BoardScene) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
+        """For each corner, of the instants about its view, and their derivatives by its time."""
+        timing = scene.timing
+        times = self.frames[:, 0] if timing is None else np.array([timing.time(*key) for key in self.keys])
+        if timing is None or not timing.readout:
+            weights, slopes = interpolation(self.frames, times)
+            return weights[self.view], slopes[self.view]
+        readouts = np.array([timing.readout[name] for name in scene.cameras])
+        return interpolation(self.frames[self.view], times[self.view] + readouts[self.camera] * self.rows)
 
 
-def parabola(
+def interpolation(
     frames: Float[np.ndarray, "v k"], times: Float[np.ndarray, "v"]
 ) -> tuple[Float[np.ndarray, "v k"], Float[np.ndarray, "v k"]]:
     """Weights of values at some frames for the polynomial through them, and their derivatives by the time (Lagrange);
@@ -283,7 +308,7 @@ class _Projection:
 
 def _project(scene: BoardScene, seen: _Observations) -> _Projection:
     points = _bent(scene, seen)
-    in_rig = np.einsum("nk,nkj->nj", seen.weights(scene)[0][seen.view], _at_instants(scene, seen, points))
+    in_rig = np.einsum("nk,nkj->nj", seen.weights(scene)[0], _at_instants(scene, seen, points))
     in_cam = _moved(list(scene.cam_from_rig.values()), seen.camera, in_rig)
     image = np.empty_like(seen.pixels)
     for number, camera in enumerate(scene.cameras.values()):
@@ -326,7 +351,7 @@ def _jacobian(scene: BoardScene, seen: _Observations, in_cam: Float[np.ndarray, 
     by_point, by_parameters = _by_cameras(scene, seen, in_cam)
     turn = np.stack([place.rotation for place in scene.cam_from_rig.values()])[seen.camera]
     by_rig = by_point @ turn
-    weights, slopes = (each[seen.view] for each in seen.weights(scene))
+    weights, slopes = seen.weights(scene)
     places = _at_instants(scene, seen, _bent(scene, seen))
     turns = np.stack([pose.rotation for pose in scene.rig_from_board.values()])[seen.near[seen.view]]
     by_body = np.einsum("nij,nk,nkjm->nim", by_rig, weights, turns)
@@ -345,9 +370,12 @@ def _jacobian(scene: BoardScene, seen: _Observations, in_cam: Float[np.ndarray, 
         blocks.append(mounted[:, None, None] * _by_motion(by_body, _bent(scene, seen)))
         which.append((_MOUNTS, mount))
     if scene.timing is not None:
-        by_delay = np.einsum("nij,nk,nkj->ni", by_rig, slopes, places)[:, :, None]
-        blocks += [by_delay, by_delay]
+        by_time = np.einsum("nij,nk,nkj->ni", by_rig, slopes, places)[:, :, None]
+        blocks += [by_time, by_time]
         which += [(_CAMERA_DELAYS, seen.camera), (_VIEW_DELAYS, seen.view)]
+        if scene.timing.readout:
+            blocks.append(by_time * seen.rows[:, None, None])
+            which.append((_READOUTS, seen.camera))
     first = np.cumsum([0, *_sizes(scene)])
     columns = [
         first[group] + block.shape[2] * index[:, None] + np.arange(block.shape[2])
@@ -373,10 +401,11 @@ def _mount_of(scene: BoardScene, seen: _Observations) -> tuple[Int[np.ndarray, "
 def _sizes(scene: BoardScene) -> tuple[int, ...]:
     """How many numbers there are of each kind of unknowns."""
     cameras, instants = len(scene.cameras), len(scene.rig_from_board)
-    delays = (0, 0) if scene.timing is None else (cameras, len(scene.timing.by_view))
+    timing = scene.timing
+    times = (0, 0, 0) if timing is None else (cameras, len(timing.readout), len(timing.by_view))
     shape = 0 if scene.shape is None else scene.shape.offsets_mm.size
     mounts = _PLACE * len(scene.body_from_board)
-    return _numbers(scene) * cameras, _PLACE * cameras, _PLACE * instants, len(scene.bending_mm), shape, mounts, *delays
+    return _numbers(scene) * cameras, _PLACE * cameras, _PLACE * instants, len(scene.bending_mm), shape, mounts, *times
 
 
 def _numbers(scene: BoardScene) -> int:
@@ -420,7 +449,7 @@ class _Free:
         """All but the place of the first camera, which is the rig, and what a board with terraces has no use of; or
         the places of the board alone, and the delays of the views."""
         sizes = _sizes(scene)
-        lenses, places, boards, _, shape, mounts, cameras, views = sizes
+        lenses, places, boards, _, shape, mounts, cameras, readouts, views = sizes
         precision = np.concatenate(
             [
                 *(_lens_precision(camera, _numbers(scene)) for camera in scene.cameras.values()),
@@ -429,6 +458,7 @@ class _Free:
                 np.zeros(shape),
                 np.full(mounts, _MOUNT_SIGMA**-2.0),
                 np.full(cameras, _CAMERA_DELAY_SIGMA**-2.0),
+                np.full(readouts, _READOUT_SIGMA**-2.0),
                 np.full(views, _VIEW_DELAY_SIGMA**-2.0),
             ]
         )
@@ -440,6 +470,8 @@ class _Free:
             free[np.flatnonzero(kind == _BENDINGS)[1:]] = False
         if scene.timing is not None:
             free[len(free) - views :] = ~_first_of_instants(scene.timing.by_view)
+            if scene.timing.together:
+                free[np.isin(kind, (_CAMERA_DELAYS, _VIEW_DELAYS))] = False
         columns = np.flatnonzero(free)
         prior, of_shape = np.diag(precision[columns]), np.flatnonzero(kind[columns] == _SHAPES)
         if scene.shape is not None and len(of_shape):
@@ -513,6 +545,16 @@ def in_front(scene: BoardScene, views: Views, board: Target) -> dict[tuple[str, 
     seen = _Observations.of(views, board, scene)
     residuals = np.split(_project(scene, seen).raw, seen.starts[1:-1])
     return {key: views[key] for key, each in zip(seen.keys, residuals, strict=True) if np.isfinite(each).all()}
+
+
+def at_middle_rows(scene: BoardScene, views: Views, board: Target) -> dict[tuple[str, str], BoardView]:
+    """Views with their corners where they would have been seen if all rows were exposed with the middle one."""
+    if scene.timing is None or not scene.timing.readout:
+        return dict(views)
+    at_once = replace(scene, timing=replace(scene.timing, readout={}))
+    seen = _Observations.of(views, board, scene)
+    late = np.split(_project(scene, seen).raw - _project(at_once, seen).raw, seen.starts[1:-1])
+    return {key: view.moved(each) for (key, view), each in zip(views.items(), late, strict=True)}
 
 
 def _minimised(scene: BoardScene, seen: _Observations, free: _Free) -> tuple[BoardScene, bool]:
@@ -633,10 +675,10 @@ def _held(scene: BoardScene) -> Float[np.ndarray, "k"]:
     ]
     places = np.zeros(_PLACE * (len(scene.cameras) + len(scene.rig_from_board)))
     timing = scene.timing
-    delays = [] if timing is None else [*timing.by_camera.values(), *timing.by_view.values()]
+    times = [] if timing is None else [*timing.by_camera.values(), *timing.readout.values(), *timing.by_view.values()]
     mounts = np.zeros(_PLACE * len(scene.body_from_board))
     shape = np.zeros(0) if scene.shape is None else scene.shape.offsets_mm.ravel()
-    return np.concatenate([*lenses, places, scene.bending_mm, shape, mounts, delays])
+    return np.concatenate([*lenses, places, scene.bending_mm, shape, mounts, times])
 
 
 def _normal(
@@ -735,7 +777,7 @@ def _stepped(scene: BoardScene, free: _Free, step: Float[np.ndarray, "k"]) -> Bo
     sizes = _sizes(scene)
     whole = np.zeros(sum(sizes))
     whole[free.columns] = step
-    lenses, places, boards, bending, shape, mounts, cameras, views = np.split(whole, np.cumsum(sizes)[:-1])
+    lenses, places, boards, bending, shape, mounts, cameras, readouts, views = np.split(whole, np.cumsum(sizes)[:-1])
     parameters = [
         camera.parameters + shift[: len(camera.parameters)]
         for camera, shift in zip(scene.cameras.values(), lenses.reshape(-1, _numbers(scene)), strict=True)
@@ -752,7 +794,7 @@ def _stepped(scene: BoardScene, free: _Free, step: Float[np.ndarray, "k"]) -> Bo
         bending_mm=scene.bending_mm + bending,
         body_from_board=_all_moved(scene.body_from_board, mounts),
         shape=scene.shape and scene.shape.moved(shape),
-        timing=scene.timing and scene.timing.later(cameras, views),
+        timing=scene.timing and scene.timing.later(cameras, readouts, views),
         loose_px=scene.loose_px,
     )
 
@@ -798,23 +840,27 @@ def _is_told_alike(one: BoardScene, other: BoardScene) -> bool:
 def _camera_covariance(
     scene: BoardScene, seen: _Observations, free: _Free
 ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "i m"]]:
-    """Of the parameters and the motions of all cameras, in the frame in which these sum up to nothing: as the scatter
-    of the corners gives it, and by how much each instant moves them."""
+    """Of the parameters and the motions of all cameras, in the frame in which these sum up to nothing, and of their
+    readouts: as the scatter of the corners gives it, and by how much each instant moves them."""
     there = _project(scene, seen)
     sigma_px = _scale(_loosened(scene, seen, there, None)[0])
     rows = _weighted(scene, seen, there, sigma_px, free)
     matrix = rows.matrix + free.prior
-    size = (_numbers(scene) + _PLACE) * len(scene.cameras)
-    known = np.flatnonzero(free.columns < size)
-    whole = np.zeros((size, size))
-    whole[np.ix_(free.columns[known], free.columns[known])] = _solved(matrix, np.eye(len(matrix))[:, known])[known]
+    sizes = _sizes(scene)
+    kind = np.repeat(np.arange(len(sizes)), sizes)
+    size = sizes[_LENSES] + sizes[_CAMERAS] + sizes[_READOUTS]
+    place = np.full(len(kind), -1)  # of each unknown in the covariance
+    place[np.isin(kind, (_LENSES, _CAMERAS, _READOUTS))] = np.arange(size)
+    known = np.flatnonzero(place[free.columns] >= 0)
+    whole, among = np.zeros((size, size)), place[free.columns[known]]
+    whole[np.ix_(among, among)] = _solved(matrix, np.eye(len(matrix))[:, known])[known]
     project = np.eye(size)
-    places = _numbers(scene) * len(scene.cameras)
-    project[places:, places:] = _without_common_motion(scene)
+    places = slice(sizes[_LENSES], sizes[_LENSES] + sizes[_CAMERAS])
+    project[places, places] = _without_common_motion(scene)
     common, moved = influences(matrix, _independent(rows, seen, scene.loose_px), free.of_instants)
     by_instant = np.zeros((len(moved), size))
-    shown = common < len(known)
-    by_instant[:, free.columns[common[shown]]] = moved[:, shown]
+    shown = place[free.columns[common]] >= 0
+    by_instant[:, place[free.columns[common[shown]]]] = moved[:, shown]
     return np.asarray(project @ whole @ project.T), by_instant @ project.T
 
 
@@ -836,6 +882,26 @@ def _adjoint(target_from_source: Rigid3) -> Float[np.ndarray, "6 6"]:
     """A small motion in the source, as one of the target."""
     turn = target_from_source.rotation
     return np.block([[turn, np.zeros((3, 3))], [skew(target_from_source.translation) @ turn, turn]])
+
+
+def readout_score(scene: BoardScene, views: Views, board: Target) -> float:
+    """How far a first step from the readouts of a scene would change one of them, in its standard deviations."""
+    seen, free = _Observations.of(views, board, scene), _Free.of(scene, board, only_boards=False)
+    there, sizes = _project(scene, seen), _sizes(scene)
+    of_readouts = np.repeat(np.arange(len(sizes)), sizes)[free.columns] == _READOUTS
+    matrix, gradient = _normal(scene, seen, there, _scale(_loosened(scene, seen, there, None)[0]), free)
+    inverse = _solved(matrix, np.eye(len(matrix))[:, of_readouts])
+    return float(np.max(np.abs(gradient @ inverse) / np.sqrt(np.diag(inverse[of_readouts]))))
+
+
+def readout_sigmas(found: Adjusted) -> dict[str, float]:
+    """Standard deviations of the readouts of the cameras, by how much the instants disagree."""
+    timing = found.scene.timing
+    if timing is None or not timing.readout:
+        return {}
+    part = slice(-len(timing.readout), None)
+    covariance = covariance_of(found.covariance[part, part], found.moved[:, part])
+    return dict(zip(timing.readout, np.sqrt(np.diag(covariance)).tolist(), strict=True))
 
 
 def mounted_cameras(found: Adjusted) -> dict[str, MountedCamera]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -18,10 +19,13 @@ from cuspid.calibration.bundle import (
     BoardScene,
     Timing,
     adjust_board,
+    at_middle_rows,
     common_free,
     in_front,
     mounted_cameras,
     of_instants,
+    readout_score,
+    readout_sigmas,
     unevenness_score,
 )
 from cuspid.calibration.circle_centres import centre_shifts
@@ -29,12 +33,13 @@ from cuspid.calibration.corners import LEAST_CORNERS, BoardView, Views, split_by
 from cuspid.calibration.joining import joined_boards
 from cuspid.calibration.lenses import LensChoice, LensName, choose_lens
 from cuspid.calibration.start import LEAST_VIEWS, board_pose, groups, joined, renumbered, require_one_group
-from cuspid.calibration.timing import adjust_scene, follow_each_other, numbered, untied
+from cuspid.calibration.timing import adjust_scene, follow_each_other, rolling, untied
 from cuspid.camera import Camera
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.options import Options, Range
 from cuspid.rig import MountedCamera, Rig
+from cuspid.shutter import Shutter, numbered
 
 _DOUBTFUL = 2.0
 """Difference between two halves, in standard deviations, that chance hardly explains."""
@@ -52,6 +57,8 @@ _MUCH_MORE = 3.0
 _LESS = 0.9
 """Residuals in views that a calibration was not made from, as a share of those if all cameras exposed together, below
 which they did not; and the share of the views that must then remain."""
+_ROLLING = 4.0
+"""How far readouts of 0 must be from the best ones, in standard deviations by the corners, for these to be tried."""
 _RUN = 6
 """Number of successive instants that stay in the same half, where cameras do not expose together."""
 _ODD_SIZE = 0.02
@@ -67,6 +74,9 @@ class CalibrationOptions(Options):
     lens: LensName = "auto"
     """COLMAP's name of the model of the lenses. auto: for each camera the simplest one that no richer one beats, by
     more than chance, in views that it was not made from."""
+    shutter: Literal["auto", "global"] = "auto"
+    """auto: where a filmed board moves, it is estimated how long after the first row of an image the last one is
+    exposed, and kept if that explains images that it was not estimated from. global: all rows are exposed at once."""
 
     outlier_sigmas: Annotated[float, Range(2, 1000)] = 4.0
     """A view is left out if the RMS of its residuals is beyond this, in standard deviations of all residuals or of its
@@ -101,6 +111,11 @@ class CameraCheck:
     """How many frames after the others it saw the board, in the mean; None if all cameras exposed together."""
     delay_spread_frames: float | None
     """Standard deviation of that over its views."""
+    readout: float | None = None
+    """Time from its first row to its last, as a share of that from one frame to the next; None if all are taken to be
+    exposed at once."""
+    readout_sigma: float | None = None
+    """Standard deviation of that."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -194,25 +209,61 @@ def _calibrated(
         start, common, how = joined_boards(views, board, cameras)
     else:
         start, common = joined(views, board, cameras, sorted({instant for _, instant in views}))
-    found, chosen, notes = _fitted(start, common, board, options)
-    together = _described(found, chosen, board, choices, (*how, *notes))
+
+    def tried(scene: BoardScene) -> _Trial:
+        found, chosen, notes = _fitted(scene, common, board, options)
+        return _Trial(found, _described(found, chosen, board, choices, (*how, *notes)))
+
+    best = tried(start)
     frame = numbered(start.rig_from_board)
     if frame is None or not follow_each_other(frame):
-        return together
-    if not any(_is_doubtful_together(check) for check in together.cameras.values()):
-        return together
-    try:
-        found, chosen, notes = _fitted(untied(start, frame, common), common, board, options)
-        apart = _described(found, chosen, board, choices, (*how, *notes))
-    except ReconstructionError:  # the images do not tell delays as well
-        return together
-    return apart if _is_better(apart, together) else together
+        return best.described
+
+    def may_roll(scene: BoardScene, used: Views) -> bool:
+        return options.shutter == "auto" and readout_score(rolling(scene, frame, used), used, board) > _ROLLING
+
+    doubtful = any(_is_doubtful_together(check) for check in best.described.cameras.values())
+    if len(sizes) > 1 and (doubtful or may_roll(best.found.scene, best.described.views)):
+        with suppress(ReconstructionError):  # the images do not tell delays as well
+            apart = tried(untied(start, frame, common))
+            best = apart if _is_better(apart.described, best.described) else best
+    if not may_roll(best.found.scene, best.described.views):
+        return best.described
+    scene = replace(best.found.scene, rig_from_board={**start.rig_from_board, **best.found.scene.rig_from_board})
+    with suppress(ReconstructionError):  # nor readouts
+        rolled = tried(rolling(replace(scene, loose_px=0.0, shape=None), frame, common))
+        best = rolled if _rolls(rolled, board) and _keeps_most(rolled.described, best.described) else best
+    return best.described
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A calibration under one assumption."""
+
+    found: Adjusted
+    described: RigCalibration
+
+
+def _rolls(rolled: _Trial, board: Target) -> bool:
+    """Whether a readout is certain, and explains images that it was not estimated from."""
+    checks, timing = rolled.described.cameras.values(), rolled.found.scene.timing
+    assert timing is not None
+    if not any(abs(each.readout or 0.0) > _DOUBTFUL * (each.readout_sigma or np.inf) for each in checks):
+        return False
+    at_once = replace(rolled.found, scene=replace(rolled.found.scene, timing=replace(timing, readout={})))
+    before, _ = _cross_validated(at_once, rolled.described.views, board)
+    return bool(_held_out_px(rolled.described) < (1 - _LEAST_GAIN) * _rms(np.array([*before.values()] or [0.0])))
 
 
 def _is_better(apart: RigCalibration, together: RigCalibration) -> bool:
     """Whether delays explain images that they were not estimated from, and not by leaving out views."""
     before, after = _held_out_px(together), _held_out_px(apart)
-    return bool(np.isfinite(before) and after < _LESS * before and len(apart.views) > _LESS * len(together.views))
+    return bool(np.isfinite(before) and after < _LESS * before and _keeps_most(apart, together))
+
+
+def _keeps_most(one: RigCalibration, other: RigCalibration) -> bool:
+    """Whether a calibration is made from about as many views as another."""
+    return len(one.views) > _LESS * len(other.views)
 
 
 def _is_worse_together(check: CameraCheck) -> bool:
@@ -368,7 +419,7 @@ def _require_views(views: Views, scene: BoardScene) -> None:
     require_one_group(views, list(scene.cameras))
 
 
-def _rms(residuals: Float[np.ndarray, "n 2"]) -> float:
+def _rms(residuals: Float[np.ndarray, "*n"]) -> float:
     """Of a coordinate."""
     return float(np.sqrt(np.mean(residuals**2)))
 
@@ -426,7 +477,7 @@ def _described(
     alone = {name: _by_itself(name, found, views, board) for name in names}
     seen = {key: found.scene.rig_from_view(*key) for key in views}
     distances = [np.linalg.norm((found.scene.cam_from_rig[key[0]] @ pose).translation) for key, pose in seen.items()]
-    delays = _delays(found.scene, views)
+    delays, readouts = _delays(found.scene, views), readout_sigmas(found)
     checks = {
         name: CameraCheck(
             views=len(of[name]),
@@ -439,6 +490,8 @@ def _described(
             alone_apart=_lens_apart(found.scene.cameras[name], alone[name]) if len(of[name]) >= _TELLING else None,
             delay_frames=delays[name][0],
             delay_spread_frames=delays[name][1],
+            readout=found.scene.timing.readout[name] if found.scene.timing and readouts else None,
+            readout_sigma=readouts.get(name),
         )
         for name in names
     }
@@ -465,7 +518,7 @@ def _described(
 def _delays(scene: BoardScene, views: Views) -> dict[str, tuple[float, float] | tuple[None, None]]:
     """Of each camera, how many frames after the mean of those that saw the board with it it exposed, and the standard
     deviation of that."""
-    if scene.timing is None:
+    if scene.timing is None or scene.timing.together:
         return dict.fromkeys(scene.cameras, (None, None))
     seen = {instant: [camera for camera, at in views if at == instant] for _, instant in views}
     late: dict[str, list[float]] = {name: [] for name in scene.cameras}
@@ -482,8 +535,9 @@ def _by_itself(name: str, found: Adjusted, views: Views, board: Target) -> Adjus
     """A camera from its own views alone, beginning from the one that was found; of several boards each for itself."""
     if len(found.scene.cameras) == 1:
         return found
+    views = at_middle_rows(found.scene, {key: view for key, view in views.items() if key[0] == name}, board)
     own, poses = dict[tuple[str, str], BoardView](), dict[str, Rigid3]()
-    for camera, instant in (key for key in views if key[0] == name):
+    for camera, instant in views:
         pose = found.scene.cam_from_rig[name] @ found.scene.rig_from_view(camera, instant)
         for part in split_by_board(views[camera, instant], board):
             if len(part.corner) < LEAST_CORNERS:
@@ -512,10 +566,18 @@ def _lens_apart(camera: Camera, alone: Adjusted) -> float:
 
 def _widened(mounted: MountedCamera, check: CameraCheck) -> MountedCamera:
     """With covariances that account for how far two halves of the images are apart, and the lens from that of its own
-    views alone, where chance hardly explains it."""
+    views alone, where chance hardly explains it; and with its shutter."""
     camera = replace(mounted.camera, covariance=_lens_factor(check) ** 2 * known(mounted.camera.covariance))
     return replace(
-        mounted, camera=camera, covariance=_beyond_chance(check.place_apart) ** 2 * known(mounted.covariance)
+        mounted,
+        camera=camera,
+        covariance=_beyond_chance(check.place_apart) ** 2 * known(mounted.covariance),
+        shutter=Shutter(
+            delay_frames=check.delay_frames or 0.0,
+            delay_sigma_frames=check.delay_spread_frames or 0.0,
+            readout=check.readout or 0.0,
+            readout_sigma=check.readout_sigma or 0.0,
+        ),
     )
 
 
@@ -552,6 +614,16 @@ def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Itera
         yield (
             "the cameras did not expose together; by the motion of the board, in frames from their mean: "
             f"{', '.join(delays)}; this is taken into account, but a board that is held still gives more"
+        )
+    readouts = [
+        f"{name} {check.readout:+.3f} ± {check.readout_sigma:.3f}"
+        for name, check in checks.items()
+        if check.readout is not None
+    ]
+    if readouts:
+        yield (
+            "the cameras do not expose all rows at once; by the motion of the board, from the first row to the last, "
+            f"as a share of the time between frames: {', '.join(readouts)}; this is taken into account"
         )
     for name, check in checks.items():
         worst = max(check.parameters_apart or 0.0, check.place_apart or 0.0)

@@ -1,12 +1,13 @@
-"""Cameras that do not expose together: the instants between which the board is followed.
+"""Cameras that do not expose together, or not all of their rows: the instants between which the board is followed.
 
-Its path is the parabola through its poses at three neighbouring instants (:mod:`cuspid.calibration.bundle`). Which ones
-these are follows from the times of the views; both are improved in turn.
+Its path is the parabola through its poses at three neighbouring instants (:mod:`cuspid.calibration.bundle`); where
+readouts are sought, for which its velocity matters, the polynomial through five. Which ones these are follows from the
+times of the views; both are improved in turn.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -23,15 +24,6 @@ _ROUNDS = 10
 """Maximum number of times that instants are chosen anew."""
 
 
-def numbered(instants: Iterable[str]) -> dict[str, int] | None:
-    """The number of the frame of each instant, from its name; None unless all have different ones."""
-    names = list(instants)
-    if not all(name.isascii() and name.isdigit() for name in names):
-        return None
-    frame = {name: int(name) for name in names}
-    return frame if len(set(frame.values())) == len(frame) else None
-
-
 def follow_each_other(frame: Mapping[str, int]) -> bool:
     """Whether most instants have one within reach, so that the path of the board can be followed."""
     numbers = sorted(frame.values())
@@ -42,6 +34,13 @@ def follow_each_other(frame: Mapping[str, int]) -> bool:
 def untied(scene: BoardScene, frame: Mapping[str, int], views: Views) -> BoardScene:
     """A scene whose cameras need not have exposed together; as yet, without delays."""
     timing = Timing(frame=frame, near={}, by_camera=dict.fromkeys(scene.cameras, 0.0), by_view={})
+    return _followed(scene, timing, scene.rig_from_board, views)
+
+
+def rolling(scene: BoardScene, frame: Mapping[str, int], views: Views) -> BoardScene:
+    """A scene whose cameras may expose their rows one after the other; as yet, all at once."""
+    together = Timing(frame=frame, near={}, by_camera=dict.fromkeys(scene.cameras, 0.0), by_view={}, together=True)
+    timing = replace(scene.timing or together, readout=dict.fromkeys(scene.cameras, 0.0))
     return _followed(scene, timing, scene.rig_from_board, views)
 
 
@@ -70,7 +69,8 @@ def _followed(scene: BoardScene, timing: Timing, poses: Mapping[str, Rigid3], vi
     nearest = {key: _nearest(timing, key, poses) for key in views}
     order = sorted(set(nearest.values()), key=lambda instant: frame[instant])
     place = {instant: k for k, instant in enumerate(order)}
-    near = {key: _within_reach(order, place[instant], frame) for key, instant in nearest.items()}
+    beside = 2 if timing.readout else 1
+    near = {key: _within_reach(order, place[instant], frame, beside) for key, instant in nearest.items()}
     board = {instant: poses[instant] for instant in order}
     return replace(scene, rig_from_board=board, timing=replace(timing, near=near))
 
@@ -81,7 +81,15 @@ def _nearest(timing: Timing, view: tuple[str, str], instants: Iterable[str]) -> 
     return min(instants, key=lambda instant: abs(timing.frame[instant] - time) - _STAY * (instant == was))
 
 
-def _within_reach(order: Sequence[str], k: int, frame: Mapping[str, int]) -> tuple[str, ...]:
-    """An instant, then those before and after it unless they are too far."""
-    beside = [*order[max(k - 1, 0) : k], *order[k + 1 : k + 2]]
-    return order[k], *(each for each in beside if abs(frame[each] - frame[order[k]]) <= _REACH)
+def _within_reach(order: Sequence[str], k: int, frame: Mapping[str, int], beside: int) -> tuple[str, ...]:
+    """An instant, then so many before and after it, up to where one is too far from the next."""
+    before, after = order[max(k - beside, 0) : k][::-1], order[k + 1 : k + 1 + beside]
+    return order[k], *_unbroken(order[k], before, frame), *_unbroken(order[k], after, frame)
+
+
+def _unbroken(first: str, others: Iterable[str], frame: Mapping[str, int]) -> Iterator[str]:
+    """Those of instants in order that follow each other, from a first one."""
+    for each in others:
+        if abs(frame[each] - frame[first]) > _REACH:
+            return
+        yield (first := each)

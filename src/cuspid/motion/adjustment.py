@@ -7,6 +7,11 @@ Unknowns and how a step changes them:
 - a point, by a displacement (mm);
 - the calibration of a camera, by its whitened parameters z with prior N(0, 1): cam_from_rig = exp(L_e z_e) prior and
   parameters = prior + L_i z_i, where L L^T is the covariance of the prior. Without one L = 0: the calibration is fixed.
+  So it is with the delay and the readout of its shutter.
+
+Where a row is exposed a time t after the instant of its frame (:mod:`cuspid.shutter`), X is seen at
+``cam_from_rig[c] @ exp(t v) @ rig_from_world[f] @ X``, to first order in t. The motion v in the frame follows from the
+poses before and after it; it is held while the minimum is sought, and both are found in turn.
 
 Levenberg-Marquardt on the Huber loss of the residuals in units of their standard deviation. The points are eliminated
 (Schur complement); what remains is a dense system of 6 unknowns a frame and 14 to 18 a camera. After each step the
@@ -51,13 +56,20 @@ from cuspid.motion.normal_equations import (
 from cuspid.options import Options, Range
 from cuspid.reconstruction import Expectation, Reconstruction, Refinement, Tracks
 from cuspid.rig import MountedCamera, Rig
+from cuspid.shutter import film_times, motions
 from cuspid.sparse_model import SparseModel
+from cuspid.unrolling import is_rolling
 
 _LEAST_SIGMA_PX = 1e-6
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
 """Damping of a step, as shares of the diagonal of the normal equations. What moves everything at once, such as the
 scale and the bending of an arch, stands out so little from that diagonal that 1e-4 of it would freeze it."""
 _GAUGE_STEPS = 5
+_MOTIONS, _SAME_PX = 6, 0.01
+"""Maximum number of times that the motions in the frames follow the poses; and by how much they must move what is seen,
+px (root mean square), to do so once more."""
+_SHUTTER = 2
+"""Numbers of a shutter."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,20 +114,25 @@ class _Prior:
     rig: Rig
     extrinsic_factor: Float[np.ndarray, "c 6 6"]
     parameter_factor: Float[np.ndarray, "c n n"]
+    """Of the lens, and of the shutter where one is unknown."""
 
     @staticmethod
     def of(rig: Rig) -> _Prior:
         """From the covariances that the rig carries."""
         mounted = rig.cameras.values()
-        lenses = np.zeros((len(mounted), *2 * (max(len(m.camera.parameters) for m in mounted),)))
+        numbers = max(len(m.camera.parameters) for m in mounted)
+        numbers += 0 if all(m.shutter.is_known for m in mounted) else _SHUTTER
+        lenses = np.zeros((len(mounted), numbers, numbers))
         for factor, m in zip(lenses, mounted, strict=True):
             count = len(m.camera.parameters)
+            if not m.shutter.is_known:
+                factor[-2, -2], factor[-1, -1] = m.shutter.delay_sigma_frames, m.shutter.readout_sigma
             factor[:count, :count] = covariance_factor(m.camera.covariance, count)
         return _Prior(rig, np.stack([covariance_factor(m.covariance, 6) for m in mounted]), lenses)
 
     @property
     def numbers(self) -> int:
-        """Unknowns of each camera: of its place, and of its lens."""
+        """Unknowns of each camera: of its place, of its lens, and of its shutter."""
         return POSE + self.parameter_factor.shape[1]
 
     @property
@@ -137,7 +154,8 @@ class _Prior:
         moved = Rigid3.from_rotation_vector(motion[:3], motion[3:]) @ mounted.cam_from_rig
         parameters = mounted.camera.parameters
         camera = mounted.camera.with_parameters(parameters + shift[: len(parameters)])
-        return replace(mounted, camera=camera, cam_from_rig=moved)
+        shutter = mounted.shutter if mounted.shutter.is_known else mounted.shutter.later(*shift[-_SHUTTER:].tolist())
+        return replace(mounted, camera=camera, cam_from_rig=moved, shutter=shutter)
 
     def whitened_places(
         self, rotations: Float[np.ndarray, "c 3 3"], translations: Float[np.ndarray, "c 3"]
@@ -171,13 +189,18 @@ def _with_calibration(state: State, prior: _Prior, whitened: Float[np.ndarray, "
         camera_translation=np.stack([m.cam_from_rig.translation for m in cameras]),
         models=models,
         intrinsics=intrinsics,
+        shutters=np.array(
+            [[m.shutter.delay_frames, m.shutter.readout, m.camera.height] for m in cameras], dtype=np.float64
+        ),
         whitened=whitened,
         basis=np.stack([prior.basis_at(index, z) for index, z in enumerate(whitened)]),
     )
 
 
-def _initial_state(poses: Sequence[Rigid3], points: Float[np.ndarray, "p 3"], prior: _Prior) -> State:
-    """Poses, points and the given calibration as arrays."""
+def _initial_state(
+    poses: Sequence[Rigid3], points: Float[np.ndarray, "p 3"], prior: _Prior, times: Sequence[float] | None = None
+) -> State:
+    """Poses, at the times of a film, points and the given calibration as arrays."""
     empty = np.zeros(0)
     state = State(
         frame_rotation=np.stack([pose.rotation for pose in poses]),
@@ -186,6 +209,8 @@ def _initial_state(poses: Sequence[Rigid3], points: Float[np.ndarray, "p 3"], pr
         camera_translation=empty,
         models=empty,
         intrinsics=empty,
+        shutters=empty,
+        motions=motions(poses, times),
         points=np.ascontiguousarray(points),
         whitened=empty,
         basis=empty,
@@ -290,6 +315,36 @@ def _minimise(
     return _Minimum(state, steps, decrease)
 
 
+def _minimise_film(
+    state: State,
+    observations: Observations,
+    weighting: Weighting,
+    prior: _Prior,
+    options: AdjustmentOptions,
+    times: Sequence[float] | None,
+) -> _Minimum:
+    """As :func:`_minimise`, with the motions in the frames as they follow from their poses."""
+    minimum = _minimise(state, observations, weighting, prior, options)
+    for _ in range(_MOTIONS if times is not None else 0):
+        found = minimum.state
+        following = found._replace(motions=motions(_poses(found), times))
+        shifts = residual_vectors(following, observations) - residual_vectors(found, observations)
+        if np.sqrt(np.mean(np.sum(shifts**2, axis=1))) < _SAME_PX:
+            break
+        again = _minimise(following, observations, weighting, prior, options)
+        minimum = replace(again, steps=minimum.steps + again.steps)
+    return minimum
+
+
+def _poses(state: State) -> tuple[Rigid3, ...]:
+    return tuple(map(Rigid3, state.frame_rotation, state.frame_translation))
+
+
+def _times(rig: Rig, frames: Sequence[str]) -> tuple[float, ...] | None:
+    """When the frames of a film were taken, if that matters."""
+    return film_times(frames) if is_rolling(rig, frames) else None
+
+
 def _sigma_px(state: State, observations: Observations, weighting: Weighting, unknowns: int) -> float:
     """Standard deviation (px) that an observation counts for in the estimate.
 
@@ -388,7 +443,8 @@ def residuals_px(reconstruction: Reconstruction) -> Float[np.ndarray, "o 2"]:
         return np.zeros((0, 2))
     observations, points = _sorted_by_point(tracks, np.ones(len(tracks.point_index), dtype=bool))
     poses = tuple(reconstruction.rig_from_world.values())
-    state = _initial_state(poses, tracks.points[points], _Prior.of(reconstruction.rig))
+    times = _times(reconstruction.rig, reconstruction.frames)
+    state = _initial_state(poses, tracks.points[points], _Prior.of(reconstruction.rig), times)
     residuals = np.empty_like(observations.pixels)
     residuals[np.argsort(tracks.point_index, kind="stable")] = residual_vectors(state, observations)
     return residuals
@@ -488,6 +544,11 @@ def _adjusted_rig(state: State, prior: _Prior, covariance: Float[np.ndarray, "c 
             mounted = replace(mounted, camera=camera)
         if mounted.covariance is not None:
             mounted = replace(mounted, covariance=covariance[index, :6, :6])
+        if not mounted.shutter.is_known:
+            delay, readout = np.sqrt(np.diag(covariance[index])[-_SHUTTER:]).tolist()
+            mounted = replace(
+                mounted, shutter=replace(mounted.shutter, delay_sigma_frames=delay, readout_sigma=readout)
+            )
         cameras[name] = mounted
     return Rig(cameras)
 
@@ -518,7 +579,10 @@ def adjust(
     where the observations do not determine every pose.
     """
     poses = tuple(reconstruction.rig_from_world.values())
-    found = _adjusted(reconstruction.rig, poses, reconstruction.tracks, options or AdjustmentOptions(), judge=judge)
+    times = _times(reconstruction.rig, reconstruction.frames)
+    found = _adjusted(
+        reconstruction.rig, poses, reconstruction.tracks, options or AdjustmentOptions(), times=times, judge=judge
+    )
     return replace(
         reconstruction,
         rig=found.rig,
@@ -555,14 +619,15 @@ def _adjusted(
     tracks: Tracks | None,
     options: AdjustmentOptions,
     *,
+    times: Sequence[float] | None = None,
     judge: bool,
 ) -> _Adjusted:
-    """The adjustment itself; to be judged it needs a scale."""
+    """The adjustment itself; to be judged it needs a scale. ``times``: of the frames, where shutters matter."""
     if tracks is None or len(tracks.point_index) == 0:
         raise ReconstructionError("adjustment: no tracks to adjust; more texture or more overlap is needed")
     prior = _Prior.of(rig)
     observations, points = _sorted_by_point(tracks, np.ones(len(tracks.point_index), dtype=bool))
-    state, colors = _initial_state(poses, tracks.points[points], prior), tracks.colors[points]
+    state, colors = _initial_state(poses, tracks.points[points], prior, times), tracks.colors[points]
     sigma_px, limit_px, steps = options.sigma_px, options.start_px, 0
     for _ in range(options.rounds):
         keep = _good(state, observations, limit_px, options.minimum_angle_deg)
@@ -570,7 +635,7 @@ def _adjusted(
             raise ReconstructionError("adjustment: no consistent points are left; check the handpiece's calibration")
         state, observations, colors = _select(state, observations, colors, keep)
         weighting = Weighting(sigma_px, options.huber_sigmas, prior.is_free)
-        minimum = _minimise(state, observations, weighting, prior, options)
+        minimum = _minimise_film(state, observations, weighting, prior, options, times)
         state, steps = minimum.state, steps + minimum.steps
         unknowns = state.points.size + POSE * (len(state.frame_rotation) - 1)
         sigma_px = _sigma_px(state, observations, weighting, unknowns)
@@ -582,7 +647,7 @@ def _adjusted(
         rig=_adjusted_rig(state, prior, None if posterior is None else posterior.calibration),
         refinement=None if posterior is None else _refinement(state, prior),
         expectation=None if posterior is None else posterior.expectation,
-        poses=tuple(map(Rigid3, state.frame_rotation, state.frame_translation)),
+        poses=_poses(state),
         tracks=_as_tracks(state, observations, colors),
         pose_covariance=None if posterior is None else posterior.poses,
         reprojection_rms_px=float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))),

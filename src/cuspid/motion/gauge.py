@@ -118,9 +118,12 @@ def moved_world(state: State, gauge: Gauge) -> State:
     world_turn, world_shift = before.T @ rotation[0], before.T @ (translation[0] - place)
     # Rounding would grow threefold in each step: what is not quite a rotation is not quite undone by its transpose.
     rotation = Rotation.from_matrix(rotation @ world_turn.T).as_matrix()
+    turning = state.motions[:, :3] @ gauge.turn.T
+    moving = gauge.scale * state.motions[:, 3:] @ gauge.turn.T - np.cross(turning, gauge.shift)
     return state._replace(
         frame_rotation=rotation,
         frame_translation=translation - rotation @ world_shift,
+        motions=np.concatenate([turning, moving], axis=1),
         points=gauge.scale * state.points @ world_turn.T + world_shift,
     )
 

@@ -29,7 +29,7 @@ from cuspid.motion.odometry import (
     rays_in_rig,
     triangulate_frame,
 )
-from cuspid.motion.pairs import MatchingOptions, frame_pairs, index_features, match_guided
+from cuspid.motion.pairs import IndexedFeatures, MatchingOptions, frame_pairs, index_features, match_guided
 from cuspid.motion.pictures import Pictures
 from cuspid.motion.tracks import intersect_rays, join, points_across, thin
 from cuspid.options import SEED, SHARE, Options, Range
@@ -37,12 +37,15 @@ from cuspid.pairing import PairingOptions, require_stereo, resolved_mm, stereo_p
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import Handpiece, Rig
+from cuspid.unrolling import is_rolling, unrollings
 from cuspid.workers import computed_once, map_in_threads
 
 _LOOSE_SCALE_PPM, _LOOSE_SPAN_PPM = 1000.0, 300.0
 """Standard deviations of the scale and, apart from it, of the length of a scan, above which advice is given."""
 
 
+_ROLLING_SHARE = 0.008
+"""Of the height of an image, by which what it shows may move between its rows, before that is known."""
 _HELD = (
     "calibration: held as in the file, since the images of the one frame share too few points to refine it: its "
     "cameras stand far apart, or the surface shows little detail"
@@ -130,6 +133,9 @@ class _Scan:
 
     handpiece: Handpiece
     frames: Sequence[FrameFeatures]
+    """Keypoints where they are at the instants of the frames."""
+    taken: Sequence[FrameFeatures]
+    """Where the images show them."""
     clouds: Sequence[Cloud]
     poses: Sequence[Rigid3]
 
@@ -199,7 +205,7 @@ def _triangulated(scan: _Scan, track: Int[np.ndarray, "n"]) -> Tracks:
     points = intersect_rays(np.concatenate(centres)[seen], np.concatenate(directions)[seen], track[seen], count)
     finite = np.isfinite(points).all(axis=1)
     seen = seen[finite[track[seen]]]
-    every = [view.features for views in scan.frames for view in views.values()]
+    every = [view.features for views in scan.taken for view in views.values()]
     colors = np.zeros((count, 3), dtype=np.uint8)
     colors[track[seen]] = np.concatenate([f.colors for f in every])[seen]
     return Tracks(
@@ -227,7 +233,7 @@ def _tracks(scan: _Scan, matches: Sequence[Int[np.ndarray, "_ 2"]], cell_px: flo
     track = join(np.concatenate([np.zeros((0, 2), dtype=np.int64), *matches]), image)
     if cell_px > 0:
         seen = np.flatnonzero(track >= 0)
-        pixels = np.concatenate([view.features.pixels for views in scan.frames for view in views.values()])
+        pixels = np.concatenate([view.features.pixels for views in scan.taken for view in views.values()])
         track[seen[~thin(track[seen], image[seen], pixels[seen], cell_px)]] = -1
     return _triangulated(scan, track)
 
@@ -280,9 +286,57 @@ def locate_features(
     it, keypoint positions are not refined.
     """
     given, handpiece = handpiece.rig.names, replace(handpiece, rig=handpiece.rig.in_own_order())
-    rig, log = handpiece.rig, dict[str, float]()
     options = loosened(options, handpiece)
-    frames = [indexed(rig, features, name) for name in names]
+    taken = {name: indexed(handpiece.rig, features, name) for name in names}
+    refined = read if options.least_squares.enabled else None
+    if not is_rolling(handpiece.rig, names):
+        found = _located(handpiece, taken, taken, options, refined, progress)
+    else:
+        rough = _located(handpiece, taken, taken, _roughly(options, handpiece), None, progress)
+        found = _located(handpiece, taken, _at_instants(taken, rough), options, refined, progress)
+    noted = with_advice(found, options.odometry.minimum_matches)
+    return noted.with_cameras_as(given)
+
+
+def _roughly(options: MotionOptions, handpiece: Handpiece) -> MotionOptions:
+    """With tolerances for what moves between the rows of an image."""
+    slack_px = _ROLLING_SHARE * float(np.mean([each.camera.height for each in handpiece.rig.cameras.values()]))
+    within, odometry, across = options.within, options.odometry, options.across_frames
+    return replace(
+        options,
+        within=replace(within, tolerance_px=within.tolerance_px + slack_px),
+        odometry=replace(odometry, error_px=odometry.error_px + slack_px),
+        across_frames=replace(across, tolerance_px=across.tolerance_px + slack_px),
+    )
+
+
+def _at_instants(taken: Mapping[str, FrameFeatures], found: Reconstruction) -> dict[str, FrameFeatures]:
+    """The keypoints where they would have been seen at the instants of the frames, by poses that are about right."""
+    made = unrollings(found)
+
+    def moved(frame: str, camera: str, view: IndexedFeatures) -> IndexedFeatures:
+        unrolling = made.get((frame, camera))
+        if unrolling is None or not len(view.features):
+            return view
+        features = replace(view.features, pixels=unrolling.at_instant(view.features.pixels))
+        return index_features(features, found.rig[camera].camera)
+
+    return {
+        frame: {camera: moved(frame, camera, view) for camera, view in views.items()} for frame, views in taken.items()
+    }
+
+
+def _located(
+    handpiece: Handpiece,
+    taken: Mapping[str, FrameFeatures],
+    at_instants: Mapping[str, FrameFeatures],
+    options: MotionOptions,
+    read: ReadGray | None,
+    progress: Progress,
+) -> Reconstruction:
+    """As :func:`locate_features`, from keypoints as the images show them and where they are at the instants of the
+    frames."""
+    rig, log, names, frames = handpiece.rig, dict[str, float](), list(taken), list(at_instants.values())
     with _timed(log, "triangulation"):
         pairs = stereo_pairs(rig, handpiece.working_distance_mm, options.pairing)
         clouds = map_in_threads(
@@ -302,17 +356,17 @@ def locate_features(
     scan = _Scan(
         handpiece=handpiece,
         frames=[frames[f] for f in trajectory.rig_from_world],
+        taken=[taken[names[f]] for f in trajectory.rig_from_world],
         clouds=[clouds[f] for f in trajectory.rig_from_world],
         poses=list(trajectory.rig_from_world.values()),
     )
     try:
-        adjusted = _adjusted(start, scan, options, read if options.least_squares.enabled else None, log, progress)
+        adjusted = _adjusted(start, scan, options, read, log, progress)
     except ReconstructionError:
         if len(scan.frames) > 1:
             raise
         adjusted = replace(start, notes=(*start.notes, _HELD))  # the rig alone tells where the cameras of a frame are
-    noted = with_advice(adjusted, options.odometry.minimum_matches)
-    return replace(noted.with_cameras_as(given), log={**log, **adjusted.log})
+    return replace(adjusted, log={**log, **adjusted.log})
 
 
 def with_advice(found: Reconstruction, least: int) -> Reconstruction:

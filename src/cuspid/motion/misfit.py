@@ -196,7 +196,7 @@ def _after(raw: State, observations: Observations, weighting: Weighting, step: F
     moved = with_poses_moved(raw, step[:poses])._replace(
         camera_rotation=turns @ raw.camera_rotation,
         camera_translation=np.einsum("cij,cj->ci", turns, raw.camera_translation) + numbers[:, 3:POSE],
-        intrinsics=raw.intrinsics + numbers[:, POSE:],
+        intrinsics=raw.intrinsics + numbers[:, POSE : POSE + raw.intrinsics.shape[1]],
         points=substitute(raw, observations, weighting, step[:, None])[0],
     )
     return settle(moved, observations, weighting)

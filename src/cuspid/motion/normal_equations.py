@@ -43,11 +43,15 @@ class State(NamedTuple):
     """Code of the model of each camera's lens."""
     intrinsics: np.ndarray
     """(cameras, n): parameters, with zeros after those of models that have fewer."""
+    shutters: np.ndarray
+    """(cameras, 3): delay and readout in frames, and the height of the image, px."""
+    motions: np.ndarray
+    """(frames, 6): how the handpiece moves in a frame, on the left of its pose (:mod:`cuspid.shutter`)."""
     points: np.ndarray
     whitened: np.ndarray
-    """(cameras, 6 + n): z of each camera, zero at the prior."""
+    """(cameras, m): z of each camera, zero at the prior; m is 6 + n, or 6 + n + 2 where a shutter is unknown."""
     basis: np.ndarray
-    """(cameras, 6 + n, 6 + n): derivative of (motion on the left of cam_from_rig, parameters) with respect to z."""
+    """(cameras, m, m): derivative of (motion on the left of cam_from_rig, parameters, delay and readout) by z."""
 
 
 class Observations(NamedTuple):
@@ -89,6 +93,29 @@ def _move(rotation, translation, x, out):
 
 @kernel
 @no_type_check
+def _place(state, point, frame, camera, row, x_at, x_in_rig):
+    """A point in the rig at the instant of a frame, and when a row was exposed; how many frames later that was."""
+    _move(state.frame_rotation[frame], state.frame_translation[frame], state.points[point], x_at)
+    delay, readout, height = state.shutters[camera]
+    late = delay + readout * (row / height - 0.5)
+    x_in_rig[:] = x_at
+    if late != 0:
+        motion = state.motions[frame]
+        for i in range(3):
+            x_in_rig[i] += late * _velocity(motion, x_at, i)
+    return late
+
+
+@kernel
+@no_type_check
+def _velocity(motion, x, i):
+    """A component of how a point in the rig moves in a frame."""
+    j, k = (i + 1) % 3, (i + 2) % 3
+    return motion[j] * x[k] - motion[k] * x[j] + motion[3 + i]
+
+
+@kernel
+@no_type_check
 def _is_before(model, x_in_cam):
     """Whether a point lies where a lens may show it: before a perspective one, and not almost beside it; not right
     behind an equidistant one."""
@@ -118,10 +145,33 @@ def _times_motion(a, x, out):
 
 @kernel
 @no_type_check
-def linearise(state, point, frame, camera, calibrated, scratch, pixel, jacobian):
-    """Projected pixel and its derivatives (2xn) by point, pose and whitened calibration. False behind the camera."""
-    x_in_rig, x_in_cam, by_cam, by_rig, raw = scratch
-    _move(state.frame_rotation[frame], state.frame_translation[frame], state.points[point], x_in_rig)
+def _times_shutter(by_rig, motion, x, below, out):
+    """out (2x2): derivatives by the delay and the readout of a camera, for a row so far below the middle."""
+    for i in range(2):
+        out[i, 0] = 0.0
+        for j in range(3):
+            out[i, 0] += by_rig[i, j] * _velocity(motion, x, j)
+        out[i, 1] = below * out[i, 0]
+
+
+@kernel
+@no_type_check
+def _times_turn(by_rig, late, motion):
+    """From derivatives by a point when a row was exposed to those by its place at the instant of the frame."""
+    for i in range(2):
+        a, b, c = by_rig[i]
+        by_rig[i, 0] += late * (b * motion[2] - c * motion[1])
+        by_rig[i, 1] += late * (c * motion[0] - a * motion[2])
+        by_rig[i, 2] += late * (a * motion[1] - b * motion[0])
+
+
+@kernel
+@no_type_check
+def linearise(state, point, frame, camera, row, calibrated, scratch, pixel, jacobian):
+    """Projected pixel, seen at the height ``row``, and its derivatives (2xn) by point, pose and whitened calibration;
+    the motion in the frame is held. False behind the camera."""
+    x_at, x_in_rig, x_in_cam, by_cam, by_rig, raw = scratch
+    late = _place(state, point, frame, camera, row, x_at, x_in_rig)
     _move(state.camera_rotation[camera], state.camera_translation[camera], x_in_rig, x_in_cam)
     model = state.models[camera]
     if not _is_before(model, x_in_cam):
@@ -129,10 +179,15 @@ def linearise(state, point, frame, camera, calibrated, scratch, pixel, jacobian)
     x, y, z = x_in_cam
     camera_jacobian(model, state.intrinsics[camera], x, y, z, pixel, by_cam, raw[:, POSE:])
     _times(by_cam, state.camera_rotation[camera], by_rig)
-    _times(by_rig, state.frame_rotation[frame], jacobian[:, :3])
-    _times_motion(by_rig, x_in_rig, jacobian[:, 3 : 3 + POSE])
     if calibrated:
         _times_motion(by_cam, x_in_cam, raw[:, :POSE])
+        if raw.shape[1] > POSE + state.intrinsics.shape[1]:
+            _times_shutter(by_rig, state.motions[frame], x_at, row / state.shutters[camera, 2] - 0.5, raw[:, -2:])
+    if late != 0:
+        _times_turn(by_rig, late, state.motions[frame])
+    _times(by_rig, state.frame_rotation[frame], jacobian[:, :3])
+    _times_motion(by_rig, x_at, jacobian[:, 3 : 3 + POSE])
+    if calibrated:
         for i in range(2):
             for j in range(raw.shape[1]):
                 total = 0.0
@@ -181,7 +236,8 @@ def pose_equations(models, lenses, rotations, translations, pose, points, pixels
 @no_type_check
 def make_scratch(state):
     """Working memory of :func:`linearise`."""
-    return np.zeros(3), np.zeros(3), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, state.basis.shape[1]))
+    by_calibration = np.zeros((2, state.basis.shape[1]))
+    return np.zeros(3), np.zeros(3), np.zeros(3), np.zeros((2, 3)), np.zeros((2, 3)), by_calibration
 
 
 @kernel
@@ -195,11 +251,11 @@ def _columns(state):
 @no_type_check
 def _residuals(state, observations, out):
     """Projected minus observed pixel for each observation; NaN behind the camera."""
-    x_in_rig, x_in_cam, by_cam, _, raw = make_scratch(state)
+    x_at, x_in_rig, x_in_cam, by_cam, _, raw = make_scratch(state)
     for point in range(observations.start.shape[0] - 1):
         for o in range(observations.start[point], observations.start[point + 1]):
             frame, camera = observations.frame[o], observations.camera[o]
-            _move(state.frame_rotation[frame], state.frame_translation[frame], state.points[point], x_in_rig)
+            _place(state, point, frame, camera, observations.pixels[o, 1], x_at, x_in_rig)
             _move(state.camera_rotation[camera], state.camera_translation[camera], x_in_rig, x_in_cam)
             out[o] = np.nan
             model = state.models[camera]
@@ -217,7 +273,8 @@ def _residuals(state, observations, out):
 def _weigh(state, observations, weighting, point, o, scratch, residual, jacobian):
     """Residual and Jacobian of an observation, scaled by the root of its weight. False behind the camera."""
     frame, camera = observations.frame[o], observations.camera[o]
-    if not linearise(state, point, frame, camera, weighting.calibrated, scratch, residual, jacobian):
+    row = observations.pixels[o, 1]
+    if not linearise(state, point, frame, camera, row, weighting.calibrated, scratch, residual, jacobian):
         return False
     residual -= observations.pixels[o]
     scale = 1 / weighting.sigma_px
@@ -408,11 +465,11 @@ def _add_products(left, right, out):
 @no_type_check
 def _loss(state, observations, weighting, point, scratch, residual):
     """Huber loss of the observations of a point; infinite where it lies behind one of their cameras."""
-    x_in_rig, x_in_cam, by_cam, _, raw = scratch
+    x_at, x_in_rig, x_in_cam, by_cam, _, raw = scratch
     total = 0.0
     for o in range(observations.start[point], observations.start[point + 1]):
         frame, camera = observations.frame[o], observations.camera[o]
-        _move(state.frame_rotation[frame], state.frame_translation[frame], state.points[point], x_in_rig)
+        _place(state, point, frame, camera, observations.pixels[o, 1], x_at, x_in_rig)
         _move(state.camera_rotation[camera], state.camera_translation[camera], x_in_rig, x_in_cam)
         model = state.models[camera]
         if not _is_before(model, x_in_cam):

@@ -118,7 +118,7 @@ def _off(mounted: MountedCamera, tolerances: Tolerances, rng: np.random.Generato
         return mounted
     place = Rigid3.from_rotation_vector(motion[:3], motion[3:]) @ mounted.cam_from_rig
     camera = replace(mounted.camera.with_parameters(mounted.camera.parameters + shift), covariance=None)
-    return MountedCamera(camera, place)
+    return replace(mounted, camera=camera, cam_from_rig=place, covariance=None)
 
 
 def _open(mounted: MountedCamera, tolerances: Tolerances) -> MountedCamera:

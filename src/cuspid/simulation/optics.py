@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal, no_type_check
 
 import cv2
@@ -10,8 +10,11 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from cuspid.camera import Camera
+from cuspid.errors import InputError
 from cuspid.kernels import kernel
 from cuspid.options import SHARE, Options, Range
+from cuspid.rig import Handpiece, Rig
+from cuspid.shutter import Shutter
 
 _WAVELENGTH_MM = 0.00055
 """Of green light."""
@@ -68,7 +71,11 @@ class OpticsOptions(Options):
     """How far the handpiece moves during an exposure."""
     readout: Annotated[float | None, SHARE] = None
     """Rolling shutter: share (0 to 1) of the time from one frame to the next in which the rows are exposed one after
-    the other; 0 for all at once. The true pose of a frame is that of its middle."""
+    the other; 0 for all at once. The true pose of a frame is that of its middle. The capture's handpiece.json says so
+    (``readout``)."""
+    delays_frames: Annotated[tuple[float, ...], Range(-1, 1)] = ()
+    """How much later than the others each camera exposes, in the order of the handpiece, in shares of the time from one
+    frame to the next; none for all together. The capture's handpiece.json says so (``delay_frames``)."""
     scattering: Annotated[float | None, Range(0, 10)] = None
     """How far light travels below the surface before it leaves it, as a multiple of what is known of enamel (0.3 to 0.5
     mm, by colour) and gums; 0 for not at all."""
@@ -88,6 +95,23 @@ class OpticsOptions(Options):
         return Optics(
             **{name: value if (own := getattr(self, name)) is None else own for name, value in preset.items()}
         )
+
+
+def with_shutters(handpiece: Handpiece, options: OpticsOptions) -> Handpiece:
+    """A handpiece whose cameras expose as the options say. Raises InputError where there are not as many delays as
+    cameras."""
+    readout, names = options.settled.readout, handpiece.rig.names
+    if not readout and not options.delays_frames:
+        return handpiece
+    if options.delays_frames and len(options.delays_frames) != len(names):
+        raise InputError(
+            f"optics: --delays-frames has {len(options.delays_frames)} numbers; give one for each of the {len(names)} "
+            f"cameras: {', '.join(names)}"
+        )
+    delays = dict(zip(names, options.delays_frames or (0.0,) * len(names), strict=True))
+    shutters = {name: Shutter(delay_frames=delay, readout=readout) for name, delay in delays.items()}
+    cameras = {name: replace(mounted, shutter=shutters[name]) for name, mounted in handpiece.rig.cameras.items()}
+    return replace(handpiece, rig=Rig(cameras))
 
 
 def through_lens(

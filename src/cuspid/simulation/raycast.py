@@ -33,6 +33,7 @@ from cuspid.jaw import Jaw
 from cuspid.kernels import kernel
 from cuspid.mesh import Mesh
 from cuspid.rig import Handpiece, MountedCamera
+from cuspid.shutter import Shutter, screw_of
 from cuspid.simulation.appearance import (
     NO_MATERIAL,
     Appearance,
@@ -186,13 +187,13 @@ def _row_by_row(
     motion: Float[np.ndarray, "6"],
     smear: Float[np.ndarray, "6"] | None,
 ) -> Float[np.ndarray, "h w 3"]:
-    """As :func:`radiance`, if the rows are exposed one after the other while the jaw moves in its own frame by
-    ``motion`` (rotation vector and shift) from one frame to the next. The lights go along with the camera; what is
-    softened below the surface is that of the middle row."""
+    """As :func:`radiance`, if the rows are exposed as the shutter of the camera says while the jaw moves in its own
+    frame by ``motion`` (rotation vector and shift) from one frame to the next. The lights go along with the camera;
+    what is softened below the surface is that of the middle row."""
     camera, rows = mounted.camera, []
     below = scene.below(lighting, rig_from_world)
     for row in range(camera.height):
-        moved = scene.optics.readout * ((row + 0.5) / camera.height - 0.5) * motion
+        moved = mounted.shutter.late(np.array((row + 0.5) / camera.height)) * motion
         then = rig_from_world @ Rigid3.from_rotation_vector(moved[:3], moved[3:])
         lights = lamps(scene.handpiece, lighting, then)
         rows.append(radiance(scene, camera, mounted.cam_from_rig @ then, lights, below, smear, row))
@@ -206,16 +207,25 @@ def _moments(count: int) -> Float[np.ndarray, "n"]:
     return in_order[np.random.default_rng(count).permutation(count)]
 
 
-def motions(frames: Sequence[Frame], poses: Mapping[str, Rigid3]) -> dict[str, Float[np.ndarray, "6"]]:
+def motions(
+    frames: Sequence[Frame], poses: Mapping[str, Rigid3], *, steady: bool = False
+) -> dict[str, Float[np.ndarray, "6"]]:
     """How the jaw moves in its own frame (rotation vector and shift) from each frame to the next, as it does on average
-    from the frame before."""
+    from the frame before; if ``steady``, by a screw, so that its speed in a frame is that of the way through it."""
     names = [frame.name for frame in frames]
     found = {}
     for index, name in enumerate(names):
         before, after = max(index - 1, 0), min(index + 1, len(names) - 1)
         motion = poses[names[before]].inverse() @ poses[names[after]]
-        found[name] = np.concatenate([motion.rotation_vector, motion.translation]) / max(after - before, 1)
+        way = screw_of(motion) if steady else (motion.rotation_vector, motion.translation)
+        found[name] = np.concatenate(way) / max(after - before, 1)
     return found
+
+
+def _is_rolling(scene: Scene) -> bool:
+    """Whether not all rows are exposed at the instants of the frames."""
+    cameras = scene.handpiece.rig.cameras.values()
+    return scene.optics.readout > 0 or not all(each.shutter.is_plain for each in cameras)
 
 
 def smeared(motion: Float[np.ndarray, "6"], rig_from_world: Rigid3, smear_mm: float) -> Float[np.ndarray, "6"]:
@@ -499,10 +509,12 @@ def render_image(
     """One image; ``motion`` is the jaw's about it (:func:`motions`), none at rest. Depends on its arguments alone, so
     that a resumed capture equals an uninterrupted one."""
     mounted, optics = scene.handpiece.rig[camera_name], scene.optics
+    if mounted.shutter.is_plain and optics.readout > 0:
+        mounted = replace(mounted, shutter=Shutter(readout=optics.readout))
     motion = np.zeros(6) if motion is None else motion
     cam_from_world = mounted.cam_from_rig @ rig_from_world
     smear = smeared(motion, rig_from_world, optics.smear_mm) if optics.smear_mm > 0 else None
-    if optics.readout > 0:
+    if not mounted.shutter.is_plain:
         light = _row_by_row(scene, mounted, frame.lighting, rig_from_world, motion, smear)
     else:
         lights = lamps(scene.handpiece, frame.lighting, rig_from_world)
@@ -581,7 +593,7 @@ def render_capture(
         scene=scene,
         poses=poses,
         gains=metered_gains(scene, frames, poses),
-        motions=motions(frames, poses),
+        motions=motions(frames, poses, steady=_is_rolling(scene)),
         sink=sink,
     )
     if processes == 1:

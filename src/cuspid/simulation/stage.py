@@ -22,7 +22,7 @@ from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.blender import check_blender, render_with_blender
 from cuspid.simulation.lights import lit
 from cuspid.simulation.manufacturing import ManufacturingOptions, built, told
-from cuspid.simulation.optics import OpticsOptions
+from cuspid.simulation.optics import OpticsOptions, with_shutters
 from cuspid.simulation.path.scan import ScanPath, ScanPathOptions, plan_scan_path
 from cuspid.simulation.raycast import Scene, lit_frames, render_capture
 from cuspid.storage.captures import write_capture, write_image
@@ -79,7 +79,7 @@ def simulate(
     images are kept; a run that is resumed gives the same bits as one that was not interrupted.
     """
     folder = Path(folder)
-    handpiece = lit(handpiece)
+    handpiece = with_shutters(lit(handpiece), options.optics)
     true, known = built(handpiece, options.manufacturing), told(handpiece, options.manufacturing)
     _check(true, options)
     path = plan_scan_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
@@ -112,7 +112,7 @@ def take_images(
     default the true one, as exact. ``less``: what takes less time, for those who are told that it takes long."""
     if options.optics.scattering and not any(APPEARANCES[options.texture].enamel.scattering_mm):
         _LOG.info(f"optics: --scattering changes nothing, for light does not go below the texture {options.texture}")
-    handpiece = lit(handpiece)
+    handpiece = with_shutters(lit(handpiece), options.optics)
     _check(handpiece, options)
     frames, poses = lit_frames(handpiece, rig_from_world)
     truth = GroundTruth(jaw=jaw, handpiece=handpiece, rig_from_world=poses)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from cuspid.geometry import Rigid3
 from cuspid.geometry.cameras import MODELS
 from cuspid.pairing import guess_working_distance_mm
 from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor, depth_of_field_mm
+from cuspid.shutter import Shutter
 from cuspid.storage.files import digest_of, read_json, reading, write_json
 from cuspid.values import LONGEST_MM, MOST_PX, checked_name, covariance, number, numbers, shown, title, whole
 
@@ -146,6 +148,7 @@ def _optics_to_json(handpiece: Handpiece) -> dict[str, Any]:
             **camera_to_json(mounted.camera),
             "cam_from_rig": rigid_to_json(mounted.cam_from_rig),
             "covariance_rotation_rad_translation_mm": _symmetric(mounted.covariance),
+            **{name: value for name, value in asdict(mounted.shutter).items() if value},
         }
         for name, mounted in handpiece.rig.cameras.items()
     }
@@ -200,6 +203,12 @@ _SHORTEST_DIRECTION = 1e-6
 _LIGHT_FIELDS = ("position_mm", "direction", "power", "colour", "lobe_exponent", "glare")
 _SENSOR_RANGES = {"noise_dn": (0.0, 255.0), "shot_noise_share": (0.0, 1.0), "gamma": (0.1, 10.0), "gain": (1e-3, 1e3)}
 _STEEPEST_FALLOFF = 10.0
+_SHUTTER_RANGES = {
+    "delay_frames": (-100.0, 100.0),
+    "delay_sigma_frames": (0.0, 100.0),
+    "readout": (-10.0, 10.0),
+    "readout_sigma": (0.0, 10.0),
+}
 _BOX_FIELDS = {"box_from_rig", "size_mm"}
 
 
@@ -246,6 +255,13 @@ def _mounted_from_json(value: Mapping[str, Any], what: str) -> MountedCamera:
         camera_from_json(value, what),
         rigid_from_json(value["cam_from_rig"], f"{what}: cam_from_rig"),
         None if matrix is None else covariance(f"{what}: covariance_rotation_rad_translation_mm", matrix, 6),
+        Shutter(
+            **{
+                name: number(f"{what}: {name}", value[name], *limits)
+                for name, limits in _SHUTTER_RANGES.items()
+                if name in value
+            }
+        ),
     )
 
 

@@ -30,6 +30,7 @@ def calibration_page(result: CalibrationResult) -> str:
         ],
         cameras=cameras,
         timed=any(each.get("delay_frames") is not None for each in cameras.values()),
+        rolling=any(each.get("readout") is not None for each in cameras.values()),
         lenses={} if result.rig is None else {name: _lens(each) for name, each in result.rig.cameras.items()},
         parameter_names=[] if result.rig is None else _parameter_names(result.rig),
         places={} if result.rig is None else {name: _place(each) for name, each in result.rig.cameras.items()},
