@@ -208,7 +208,7 @@ def test_jacobian_agrees_with_finite_differences(seed: int, mixed: bool, rolling
         unknowns = np.zeros(6 + whitened.size)
         unknowns[:6] = step[3:9]
         unknowns[6 + prior.numbers * camera : 6 + prior.numbers * (camera + 1)] = step[9:]
-        moved = adjustment._moved(start, nothing, weighting, prior, unknowns)
+        moved = adjustment._apply_step(start, nothing, weighting, prior, unknowns)
         return linearised(moved._replace(points=start.points + step[:3]), 1, camera, 0)[0]
 
     _, jacobian = linearised(start, 1, camera, 0)
@@ -387,7 +387,7 @@ def test_a_point_behind_a_camera_holds_up_no_other(monkeypatch: pytest.MonkeyPat
     thrown = state.points + 0.01
     thrown[[3, 7]] *= -1
     monkeypatch.setattr(adjustment, "settle", lambda moved, *_: moved._replace(points=thrown))
-    found = adjustment._moved(state, observations, weighting, prior, nothing)
+    found = adjustment._apply_step(state, observations, weighting, prior, nothing)
     assert np.flatnonzero(np.any(found.points != thrown, axis=1)).tolist() == [3, 7]
     np.testing.assert_array_equal(found.points[[3, 7]], state.points[[3, 7]])
     assert np.isfinite(adjustment._cost(found, observations, weighting))

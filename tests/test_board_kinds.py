@@ -15,7 +15,7 @@ from cuspid import storage
 from cuspid.board import Board
 from cuspid.board.circles import turned_orders
 from cuspid.calibration.bundle import BoardScene
-from cuspid.calibration.calibrate import CalibrationOptions, _calibrated, calibrate_rig
+from cuspid.calibration.calibrate import CalibrationOptions, _calibrate_once, calibrate_rig
 from cuspid.calibration.circle_centres import centre_shifts, measured_share
 from cuspid.calibration.corners import BoardView, find_corners
 from cuspid.camera import Camera
@@ -184,7 +184,7 @@ def test_the_middle_of_what_is_seen_of_a_circle_is_not_its_centre() -> None:
     board = Board(kind="asymmetric-circles", columns=4, rows=11, square_mm=1.5, circle_share=0.7)
     truth = replace(scene(1, board, cameras=2, instants=16), bending_mm=np.zeros(3))
     views, sizes = seen_circles(truth, board, 0.02, 1), dict.fromkeys(truth.cameras, SIZE)
-    from_middles = _calibrated(views, sizes, board, OPENCV)
+    from_middles = _calibrate_once(views, sizes, board, OPENCV)
     from_centres = calibrate_rig(views, sizes, board, OPENCV)
     before, after = (
         focal_sigmas([(found.rig[name].camera, truth.cameras[name]) for name in truth.cameras])

@@ -134,7 +134,7 @@ def test_jacobian_agrees_with_finite_differences(exposure):
     for column in range(len(free.columns)):
         step = np.zeros(len(free.columns))
         step[column] = 1e-6
-        ahead, back = (bundle._project(bundle._stepped(truth, free, sign * step), seen).raw for sign in (1, -1))
+        ahead, back = (bundle._project(bundle._apply_step(truth, free, sign * step), seen).raw for sign in (1, -1))
         numeric = -(ahead - back).ravel() / 2e-6
         assert np.allclose(jacobian[:, column], numeric, atol=1e-4 * max(1, np.abs(numeric).max())), column
 
@@ -366,7 +366,7 @@ def test_a_few_views_judge_no_calibration():
 def test_delays_that_explain_nothing_are_not_taken(monkeypatch, worse):
     """Doubtful views are tried with delays; the calibration without stays where these fail, or leave much out."""
     truth, views = shaken()
-    usual, tried = calibrate._described, []
+    usual, tried = calibrate._describe, []
 
     def described(found, *rest):
         made = usual(found, *rest)
@@ -382,7 +382,7 @@ def test_delays_that_explain_nothing_are_not_taken(monkeypatch, worse):
             made, views=some, cameras={n: replace(each, held_out_px=held_out) for n, each in made.cameras.items()}
         )
 
-    monkeypatch.setattr(calibrate, "_described", described)
+    monkeypatch.setattr(calibrate, "_describe", described)
     found = calibrated(truth, views)
     assert tried == [worse]
     assert all(check.delay_frames is None for check in found.cameras.values())

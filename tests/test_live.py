@@ -17,7 +17,7 @@ import pytest
 
 from cuspid import storage
 from cuspid.capture import Capture, Frame
-from cuspid.cli.live import _Feed, _followed, _paced
+from cuspid.cli.live import _Feed, _follow_feed, _pace_frames
 from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
@@ -103,7 +103,7 @@ def test_pauses_and_incomplete_frames_before_the_first_whole_one_do_no_harm(tmp_
     torn, alone, whole = scan().frames[:3]
     alone = replace(alone, cameras=alone.cameras[:1])
     capture = with_frame(scan(), torn.name, np.zeros((8, 160, 3), np.uint8))
-    taken = _followed(feed(None, torn, None, alone, None, whole, capture=capture), tmp_path, FIXED, None)
+    taken = _follow_feed(feed(None, torn, None, alone, None, whole, capture=capture), tmp_path, FIXED, None)
     assert [frame.name for frame in taken.frames] == [alone.name, whole.name]
     assert [each.what for each in taken.left_out] == [f"frame {torn.name}"]
 
@@ -112,18 +112,18 @@ def test_what_was_taken_is_reconstructed_whatever_ends_the_scan(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     error = InputError("folder: closed")
-    taken = _followed(feed(scan().frames[0], error=error), tmp_path, FIXED, None)
+    taken = _follow_feed(feed(scan().frames[0], error=error), tmp_path, FIXED, None)
     assert len(taken.frames) == 1
     assert "note: folder: closed; the scan is ended" in capsys.readouterr().err
     with pytest.raises(InputError, match="closed"):
-        _followed(feed(error=error), tmp_path, FIXED, None)
+        _follow_feed(feed(error=error), tmp_path, FIXED, None)
 
 
 def test_a_replay_keeps_its_pace() -> None:
     frames = tuple(replace(frame, time_s=100 + 0.1 * k) for k, frame in enumerate(scan().frames[:3]))
     for capture, pace, most_s in ((replace(scan(), frames=frames), None, 0.6), (scan(), 25.0, 0.6)):
         begin = time.monotonic()
-        assert list(_paced(capture, pace)) == list(capture.frames)
+        assert list(_pace_frames(capture, pace)) == list(capture.frames)
         took = time.monotonic() - begin
         assert (0.2 if pace is None else 4 / pace) <= took < most_s
 

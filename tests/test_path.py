@@ -256,9 +256,9 @@ def test_frames_are_evaluated_by_all_their_cameras() -> None:
 
 
 def test_a_detour_is_about_what_is_looked_at() -> None:
-    from cuspid.simulation.path.detour import _changed
+    from cuspid.simulation.path.detour import _motion
 
-    change = _changed(np.array([0.1, 0.5, 2.0, *np.deg2rad([10.0, 0, 0])])).inverse()
+    change = _motion(np.array([0.1, 0.5, 2.0, *np.deg2rad([10.0, 0, 0])])).inverse()
     np.testing.assert_allclose(change.translation, [0.1, 0.5, 2.0], atol=1e-12)
     assert np.rad2deg(np.linalg.norm(change.rotation_vector)) == pytest.approx(10)
     assert isinstance(change, Rigid3)

@@ -116,7 +116,7 @@ def test_jacobian_by_the_places_of_boards() -> None:
     for column in range(len(free.columns)):
         step = np.zeros(len(free.columns))
         step[column] = 1e-6
-        ahead, back = (bundle._project(bundle._stepped(truth, free, sign * step), seen).raw for sign in (1, -1))
+        ahead, back = (bundle._project(bundle._apply_step(truth, free, sign * step), seen).raw for sign in (1, -1))
         numeric = -(ahead - back).ravel() / 2e-6
         assert np.allclose(jacobian[:, column], numeric, atol=1e-4 * max(1, np.abs(numeric).max())), column
 

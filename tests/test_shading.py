@@ -139,15 +139,15 @@ def test_lights_that_are_not_told_are_asked_for(images: dict[str, np.ndarray]) -
 
 def test_neighbours_tell_how_well_a_smooth_surface_is_known() -> None:
     sigma, known = np.full((40, 50), 3.0), np.ones((40, 50), dtype=bool)
-    assert shading._pooled(sigma, known) == pytest.approx(3.0)
+    assert shading._pool_sigma(sigma, known) == pytest.approx(3.0)
     sigma[20, 20] = 30.0
-    assert 3.0 < shading._pooled(sigma, known)[20, 20] < 3.2
+    assert 3.0 < shading._pool_sigma(sigma, known)[20, 20] < 3.2
     sigma[20, 20], known[:, 25:] = np.nan, False
     known[20, 20] = False
-    pooled = shading._pooled(sigma, known)
+    pooled = shading._pool_sigma(sigma, known)
     assert np.array_equal(np.isfinite(pooled), known)
     assert 3.5 < pooled[20, 24] < 3.0 * np.sqrt(2.0)  # little more than half of its neighbours are known
-    assert shading._pooled(7 * sigma, known)[known] == pytest.approx(7 * pooled[known])
+    assert shading._pool_sigma(7 * sigma, known)[known] == pytest.approx(7 * pooled[known])
 
 
 @pytest.mark.parametrize("how", [{"sweep_spacing": 100}, {"sweep_step_px": 100.0}, {"radius_px": 1}, {"radius_px": 7}])

@@ -15,7 +15,7 @@ from cuspid.geometry import Rigid3, unit
 from cuspid.mesh import Mesh
 from cuspid.motion.expectation import expectation_of
 from cuspid.motion.held_calibration import depth_sigma_mm
-from cuspid.motion.surface_tracking import SurfaceTrackingOptions, _drift, _onto, adjusted, track_surfaces
+from cuspid.motion.surface_tracking import SurfaceTrackingOptions, _drift, _register_icp, adjusted, track_surfaces
 from cuspid.motion.surfaces import Shown, Surface, surface_of
 from cuspid.progress import silent
 from cuspid.reconstruction import DepthMap, Reconstruction
@@ -312,7 +312,7 @@ def test_what_looks_like_a_place_is_not_taken_for_it() -> None:
     left, right = np.linspace(-14, -4, 10), np.linspace(4, 14, 9)
     way = {f"{k:05d}": Rigid3(np.eye(3), np.array([-x, 0, 0])) for k, x in enumerate([*left, *right])}
     maps, names = depth_maps(way, height_field(twins, half_width_mm=19.0)), list(way)
-    lying = _onto(surface(maps, names[4]), surface(maps, names[14]), Rigid3.identity(), 5.0)
+    lying = _register_icp(surface(maps, names[4]), surface(maps, names[14]), Rigid3.identity(), 5.0)
     assert lying.laid is not None
     assert lying.laid.share > 0.5
     found = tracked(maps)
@@ -373,7 +373,7 @@ def test_rounding_does_not_add_up_along_a_path() -> None:
     maps = depth_maps(dict(list(OUT.items())[:2]))
     one, other = (surface(maps, name) for name in ("00000", "00001"))
     off = Rigid3(OUT["00001"].rotation @ (np.eye(3) + 4e-7 * np.eye(3)[::-1]), OUT["00001"].translation)
-    found = _onto(one, other, off, 5.0).this_from_other.rotation
+    found = _register_icp(one, other, off, 5.0).this_from_other.rotation
     np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-12)
 
 

@@ -80,11 +80,11 @@ class ArchCurve:
 def arch_curve(jaw: Jaw) -> ArchCurve:
     """The arch of a jaw in its occlusal frame, from the mesh; labels, if there are any, exclude the gum."""
     crowns = _crown_tops(jaw)
-    curves = [_centred(rough, crowns) for rough in _rough_curves(crowns)]
+    curves = [_center_on_crowns(rough, crowns) for rough in _rough_curves(crowns)]
     return ArchCurve(points=min(curves, key=lambda points: max(_farthest_mm(points, crowns), NEAR_MM)))
 
 
-def _centred(points: Float[np.ndarray, "m 3"], crowns: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
+def _center_on_crowns(points: Float[np.ndarray, "m 3"], crowns: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
     for _ in range(3):
         points = _centred_curve(points, crowns)
     return points
@@ -137,7 +137,7 @@ def _straight_curve(crowns: Float[np.ndarray, "n 3"], centre: Float[np.ndarray, 
 
 def _centred_curve(points: Float[np.ndarray, "m 3"], crowns: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
     """A curve moved sideways to the middle of the crowns and lengthened or shortened to where they end."""
-    line = _lengthened(points, NEAR_MM)
+    line = _extend_line(points, NEAR_MM)
     lengths = lengths_along(line[:, :2])
     tangents = np.gradient(line[:, :2], lengths, axis=0)
     normals = np.stack([-tangents[:, 1], tangents[:, 0]], axis=1)
@@ -153,7 +153,7 @@ def _centred_curve(points: Float[np.ndarray, "m 3"], crowns: Float[np.ndarray, "
     return centred if short else _smooth(at, centred)[1]
 
 
-def _lengthened(points: Float[np.ndarray, "m 3"], by_mm: float) -> Float[np.ndarray, "k 3"]:
+def _extend_line(points: Float[np.ndarray, "m 3"], by_mm: float) -> Float[np.ndarray, "k 3"]:
     """A line with straight pieces added at both ends."""
     reach = np.arange(1, round(by_mm / _SAMPLE_MM) + 1)[:, None] * _SAMPLE_MM
     start, end = points[0] - points[10], points[-1] - points[-11]

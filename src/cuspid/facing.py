@@ -41,29 +41,29 @@ def facing_outwards(mesh: Mesh) -> tuple[Mesh, tuple[str, ...]]:
     """The mesh with faces that look inwards turned, and notes on that; the mesh itself where none does."""
     one, other, against = _neighbours(mesh)
     uneven, pieces = _uneven(mesh, one, other, against)
-    even = _turned(mesh, uneven)
+    even = _flip_faces(mesh, uneven)
     turned = uneven ^ _inwards(even, pieces)
     left = float(np.mean((against ^ turned[one] ^ turned[other]) if len(one) else 0.0))
     notes: tuple[str, ...] = ()
     if turned.any():
-        notes = (f"faces: {_told(mesh, turned)} looked inwards; turned to look out of the surface",)
+        notes = (f"faces: {_note(mesh, turned)} looked inwards; turned to look out of the surface",)
     if left > _TORN:
         notes = (*notes, f"faces: {left:.0%} of the edges join faces that look to different sides; repair the mesh")
-    return (_turned(mesh, turned) if turned.any() else mesh), notes
+    return (_flip_faces(mesh, turned) if turned.any() else mesh), notes
 
 
 def pieces_of(mesh: Mesh) -> Int[np.ndarray, "f"]:
     """The number of the piece of each face; faces that share an edge are of one piece."""
     one, other, _ = _neighbours(mesh)
-    return _linked(len(mesh.faces), one, other)
+    return _connected_components(len(mesh.faces), one, other)
 
 
-def _told(mesh: Mesh, turned: Bool[np.ndarray, "f"]) -> str:
+def _note(mesh: Mesh, turned: Bool[np.ndarray, "f"]) -> str:
     share = float(mesh.face_areas[turned].sum() / max(float(mesh.face_areas.sum()), 1e-300))
     return "all" if turned.all() else f"{turned.sum()} of {len(turned)} ({share:.0%} of the surface)"
 
 
-def _turned(mesh: Mesh, faces: Bool[np.ndarray, "f"]) -> Mesh:
+def _flip_faces(mesh: Mesh, faces: Bool[np.ndarray, "f"]) -> Mesh:
     if not faces.any():
         return mesh
     return Mesh(mesh.vertices, owned(np.where(faces[:, None], mesh.faces[:, [0, 2, 1]], mesh.faces)), mesh.colors)
@@ -89,11 +89,11 @@ def _uneven(
     together with itself turned has no two sides, and is left as it is.
     """
     count = len(mesh.faces)
-    piece = _linked(count, one, other)
+    piece = _connected_components(count, one, other)
     if not against.any():
         return np.zeros(count, dtype=bool), piece
     as_is, turned = np.where(against, other + count, other), np.where(against, other, other + count)
-    sheet = _linked(2 * count, np.concatenate([one, one + count]), np.concatenate([as_is, turned]))
+    sheet = _connected_components(2 * count, np.concatenate([one, one + count]), np.concatenate([as_is, turned]))
     one_sided = sheet[:count] == sheet[count:]
     first = np.full(int(piece.max()) + 1, np.iinfo(np.int64).max)
     np.minimum.at(first, piece, np.minimum(sheet[:count], sheet[count:]))
@@ -103,7 +103,7 @@ def _uneven(
     return np.where(one_sided, False, is_second ^ keep_second), piece
 
 
-def _linked(count: int, one: Int[np.ndarray, "e"], other: Int[np.ndarray, "e"]) -> Int[np.ndarray, "n"]:
+def _connected_components(count: int, one: Int[np.ndarray, "e"], other: Int[np.ndarray, "e"]) -> Int[np.ndarray, "n"]:
     """The number of the piece of each of some nodes that links join."""
     links = coo_array((np.ones(len(one), dtype=bool), (one, other)), shape=(count, count))
     return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)

@@ -45,7 +45,7 @@ _FULL, _FEWER_BITS = 16, (8, 10, 12)
 def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     """An 8-bit RGB image, upright. Raises InputError where the file is missing or cannot be decoded whole, or holds
     numbers that are no grey values."""
-    return _decoded(path, "RGB")
+    return _decode(path, "RGB")
 
 
 def read_fine(path: Path) -> Pixels:
@@ -57,7 +57,7 @@ def read_fine(path: Path) -> Pixels:
         if levels is not None:
             fine = (levels / np.float32(1 << (_bits_of(path, image) - 8))).astype(np.float32)
             return np.ascontiguousarray(fine[..., :3] if fine.ndim == 3 else np.repeat(fine[..., None], 3, axis=2))
-        return _shown(image, "RGB")
+        return _as_8_bit(image, "RGB")
 
 
 def as_8_bits(image: UInt8[np.ndarray, "*s"] | Float32[np.ndarray, "*s"]) -> UInt8[np.ndarray, "*s"]:
@@ -92,12 +92,12 @@ def _brightening(grey: UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]) ->
 
 def read_rgba(path: Path) -> UInt8[np.ndarray, "h w 4"]:
     """As :func:`read_image`, with the opacity of each pixel; 255 where the file has none."""
-    return _decoded(path, "RGBA")
+    return _decode(path, "RGBA")
 
 
 def read_as_stored(path: Path) -> UInt8[np.ndarray, "h w 4"]:
     """As :func:`read_rgba`, but in the grid of the sensor, whichever way the camera was held."""
-    return _decoded(path, "RGBA", upright=False)
+    return _decode(path, "RGBA", upright=False)
 
 
 def read_deep(path: Path) -> UInt8[np.ndarray, "h w *c"] | UInt16[np.ndarray, "h w *c"]:
@@ -173,10 +173,10 @@ def recorded_size(path: Path) -> tuple[int, int]:
 def recorded(upright: Shaped[np.ndarray, "h w *c"], orientation: int) -> Shaped[np.ndarray, "h2 w2 *c"]:
     """An image that was turned upright by its EXIF orientation, as the sensor recorded it."""
     # Each way is its own reverse, but for the two quarter turns, which are each other's.
-    return _turned(upright, {6: 8, 8: 6}.get(orientation, orientation))
+    return _undo_exif_rotation(upright, {6: 8, 8: 6}.get(orientation, orientation))
 
 
-def _turned(image: Shaped[np.ndarray, "h w *c"], orientation: int) -> Shaped[np.ndarray, "h2 w2 *c"]:
+def _undo_exif_rotation(image: Shaped[np.ndarray, "h w *c"], orientation: int) -> Shaped[np.ndarray, "h2 w2 *c"]:
     """An image as the sensor recorded it, upright."""
     across = image.swapaxes(0, 1)
     return {
@@ -219,17 +219,17 @@ def _chunks(stream: io.BufferedIOBase) -> Iterator[tuple[bytes, bytes, int, int]
 # --- grey values ------------------------------------------------------------------------------------------------------
 
 
-def _decoded(path: Path, mode: Literal["RGB", "RGBA"], *, upright: bool = True) -> UInt8[np.ndarray, "h w *c"]:
+def _decode(path: Path, mode: Literal["RGB", "RGBA"], *, upright: bool = True) -> UInt8[np.ndarray, "h w *c"]:
     image_size(path)
     with _reading(path), Image.open(path) as image:
         levels = _levels(path, image, upright=upright)
         if levels is not None:
             shown = Image.fromarray((levels >> (_bits_of(path, image) - 8)).astype(np.uint8))
             return np.asarray(shown.convert(mode))
-        return _shown(image, mode, upright=upright)
+        return _as_8_bit(image, mode, upright=upright)
 
 
-def _shown(image: Image.Image, mode: Literal["RGB", "RGBA"], *, upright: bool = True) -> UInt8[np.ndarray, "h w *c"]:
+def _as_8_bit(image: Image.Image, mode: Literal["RGB", "RGBA"], *, upright: bool = True) -> UInt8[np.ndarray, "h w *c"]:
     """Of an image of 8 bits."""
     if upright:
         ImageOps.exif_transpose(image, in_place=True)
@@ -263,7 +263,7 @@ def _levels(path: Path, image: Image.Image, *, upright: bool = True) -> UInt16[n
         return None
     if stored.ndim == 3:
         stored = cv2.cvtColor(stored, cv2.COLOR_BGR2RGB if stored.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
-    return np.ascontiguousarray(_turned(stored, turn), dtype=np.uint16)
+    return np.ascontiguousarray(_undo_exif_rotation(stored, turn), dtype=np.uint16)
 
 
 def _as_levels(path: Path, values: Shaped[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:

@@ -72,7 +72,7 @@ def rank_sources(
         pair = names[one], names[other]
         if rig.angle_deg(*pair) > options.maximum_angle_deg + _ROUNDING_DEG:
             continue
-        shared = _shared(rig, pair, distance_mm)
+        shared = _shared_view(rig, pair, distance_mm)
         if shared >= options.minimum_overlap:
             angles = np.array([rig.meeting_deg(*pair, distance_mm), rig.meeting_deg(*pair[::-1], distance_mm)])
             worth[one, other], worth[other, one] = shared * worth_of_angle(angles)
@@ -170,7 +170,7 @@ def _sharing_mm(rig: Rig, pairs: Sequence[tuple[str, str]]) -> float:
     paired = [name for name in rig.names if any(name in pair for pair in pairs)]
 
     def usual_share(distance_mm: float) -> float:
-        shares = {pair: _shared(rig, pair, distance_mm) for pair in pairs}
+        shares = {pair: _shared_view(rig, pair, distance_mm) for pair in pairs}
         return float(np.median([max(share for pair, share in shares.items() if name in pair) for name in paired]))
 
     baselines = [float(np.linalg.norm(rig[one].centre_in_rig - rig[other].centre_in_rig)) for one, other in pairs]
@@ -178,7 +178,7 @@ def _sharing_mm(rig: Rig, pairs: Sequence[tuple[str, str]]) -> float:
     return float(distances[bisect_left(distances[:-1].tolist(), _SHARED, key=usual_share)])
 
 
-def _shared(rig: Rig, pair: tuple[str, str], distance_mm: float) -> float:
+def _shared_view(rig: Rig, pair: tuple[str, str], distance_mm: float) -> float:
     """What either camera of a pair sees at a distance that the other sees, too (0 to 1)."""
     first, second = pair
     return min(rig.overlap(first, second, distance_mm), rig.overlap(second, first, distance_mm))

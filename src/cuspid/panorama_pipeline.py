@@ -121,7 +121,7 @@ def stitch(
         return that_show_something(Stitched(panorama=panorama, motion=None, strip=None) for panorama in panoramas)
     motion = locate_single(frames, options.motion, progress=progress)
     notes = (*frames.notes, *motion.notes)
-    stitched = [_stitched(frames, motion, number, options, progress) for number in range(len(motion.parts))]
+    stitched = [_stitch_part(frames, motion, number, options, progress) for number in range(len(motion.parts))]
     return that_show_something(
         replace(
             part,
@@ -152,7 +152,7 @@ def _shared_points(motion: SparseModel) -> float:
     return float(np.median([len(before & after) for before, after in pairwise(seen)] or [0]))
 
 
-def _stitched(
+def _stitch_part(
     sequence: ImageSequence, motion: SingleMotion, number: int, options: StitchOptions, progress: Progress
 ) -> Stitched:
     """The panorama of a part of the motion, whose path is made more precise on the surface that it shows."""

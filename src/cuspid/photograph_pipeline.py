@@ -91,7 +91,7 @@ def locate(
 
     names = (*RECONSTRUCTION_FILES, "scale.json", "points.ply")
     stage.make(inputs, [folder / name for name in names], write)
-    return _read(folder, photographs)
+    return _read_poses(folder, photographs)
 
 
 def find_scale(
@@ -103,7 +103,7 @@ def find_scale(
         sightings = _sightings(photographs, board, progress)
         return scale_by_board(model, sightings, board, len(photographs.names))
     if options.distance:
-        return scale_by_distances(model, _picked(options, photographs))
+        return scale_by_distances(model, _picked_distances(options, photographs))
     return None
 
 
@@ -156,7 +156,7 @@ def _sightings(photographs: Photographs, board: Board, progress: Progress) -> li
     return [each for each in found if each is not None]
 
 
-def _picked(options: PhotoScaleOptions, photographs: Photographs) -> list[PickedDistance]:
+def _picked_distances(options: PhotoScaleOptions, photographs: Photographs) -> list[PickedDistance]:
     """The distances of the command line, whose places are px of the upright pictures."""
     assert options.between is not None
     taken = [photographs[name] for name in options.between]
@@ -181,7 +181,7 @@ def _write(folder: Path, located: LocatedPhotographs) -> None:
     storage.write_reconstruction(folder, found, capture.handpiece)
 
 
-def _read(folder: Path, photographs: Photographs) -> LocatedPhotographs:
+def _read_poses(folder: Path, photographs: Photographs) -> LocatedPhotographs:
     found, value = storage.read_reconstruction(folder), storage.read_json(folder / "scale.json")
     with storage.reading(folder / "scale.json"):
         fields = {name: each for name, each in value.items() if name != "scale"}

@@ -261,7 +261,7 @@ def sized(capture: Capture, options: ReconstructionOptions) -> Capture:
     return capture
 
 
-def _spaced(stereo: StereoOptions, capture: Capture) -> StereoOptions:
+def _resolve_spacing(stereo: StereoOptions, capture: Capture) -> StereoOptions:
     """With depth at so many pixels that a view of large images has not many more than one of a handpiece's."""
     spacing_px = round(float(np.sqrt(_largest_px(capture) / _MOST_DEPTHS)))
     if stereo.spacing_px is not None or spacing_px <= stereo.grid_px:
@@ -291,7 +291,7 @@ def _textured_depth(
 ) -> StoredDepthMaps:
     """Depth within frames and, where only one camera of a group saw the surface, from consecutive ones."""
     assert options.left_share is not None
-    handpiece, stereo = capture.handpiece, _spaced(options.stereo, capture)
+    handpiece, stereo = capture.handpiece, _resolve_spacing(options.stereo, capture)
     if not stereo_pairs(handpiece.rig, handpiece.working_distance_mm, stereo.pairing):
         return measure_view_depth(capture, found, folder / "depth", stereo, progress=progress)
     agreement_mm = options.fusion.agreement * detail
@@ -336,13 +336,13 @@ def settled(options: ReconstructionOptions) -> ReconstructionOptions:
         left = {"draft": _DRAFT_LEFT_SHARE, "standard": _LEFT_SHARE, "fine": 0.0}
         options = replace(options, left_share=left[options.quality])
     if options.quality == "draft":
-        return _drafted(options)
+        return _resolve_draft(options)
     if options.quality == "fine" and options.stereo.spacing_px is None:
         options = replace(options, stereo=replace(options.stereo, spacing_px=_FINE_SPACING_PX))
     return options
 
 
-def _drafted(options: ReconstructionOptions) -> ReconstructionOptions:
+def _resolve_draft(options: ReconstructionOptions) -> ReconstructionOptions:
     """As for a draft, where nothing else was asked for."""
     tracking, across, fusion = options.tracking, options.across, options.fusion
     features = tracking.features

@@ -132,7 +132,7 @@ class Room:
 
         Infinite if they are some millimetres apart.
         """
-        inside = self._inside(rig_from_world)
+        inside = self._parts_inside(rig_from_world)
         if inside.any():
             return -np.inf, self.body.names[int(np.argmax(inside))]
         reach = self.clearance_mm + FAR_MM
@@ -185,7 +185,7 @@ class Room:
         """Winding number of the jaw, in the world."""
         return _winding_of(self.mesh)
 
-    def _inside(self, rig_from_world: Rigid3) -> Bool[np.ndarray, "p"]:
+    def _parts_inside(self, rig_from_world: Rigid3) -> Bool[np.ndarray, "p"]:
         """Which parts have their middle inside the jaw."""
         winding = self._winding
         middles = rig_from_world.inverse().apply(self._middles)
@@ -371,7 +371,7 @@ def _is_free(rotation, translation, surface, solid, limit, stack):
     while count > 0:
         count -= 1
         ball = stack[count]
-        x, y, z = _moved(rotation, translation, surface.centres[ball])
+        x, y, z = _transform_point(rotation, translation, surface.centres[ball])
         if _at_least(x, y, z, solid) - surface.radii[ball] >= limit:
             continue
         if ball < leaves - 1:
@@ -380,7 +380,7 @@ def _is_free(rotation, translation, surface, solid, limit, stack):
             continue
         first = (ball - leaves + 1) * leaf
         for n in range(first, first + leaf):
-            x, y, z = _moved(rotation, translation, surface.points[n])
+            x, y, z = _transform_point(rotation, translation, surface.points[n])
             least = _at_least(x, y, z, solid)
             if least >= limit:
                 continue
@@ -393,7 +393,7 @@ def _is_free(rotation, translation, surface, solid, limit, stack):
 
 @kernel
 @no_type_check
-def _moved(rotation, translation, p):
+def _transform_point(rotation, translation, p):
     return (
         rotation[0, 0] * p[0] + rotation[0, 1] * p[1] + rotation[0, 2] * p[2] + translation[0],
         rotation[1, 0] * p[0] + rotation[1, 1] * p[1] + rotation[1, 2] * p[2] + translation[1],

@@ -87,7 +87,7 @@ class Session:
         self._estimator = DepthEstimator(self._sized.handpiece, settled.stereo)
         detail, fusion = detail_mm(self._sized.handpiece), pipeline.fusion_for(self._sized.handpiece, settled)
         self._surface, self._voxel_mm = GrowingSurface(detail, fusion), fusion.voxel_for(detail)
-        self._tracker = Tracker(self._capture.handpiece, settled.tracking, self._recalled)
+        self._tracker = Tracker(self._capture.handpiece, settled.tracking, self._find_again)
         self._ranks = Counter[str | None]()
         self._every_second = set[str]()
         """Frames whose depth is measured where they are placed: the same ones as in the reconstruction at the end."""
@@ -128,7 +128,7 @@ class Session:
         else:
             if plain:
                 raise InputError(f"frame {frame.name}: {_PLAIN}")
-            placed = self._placed(frame, features)
+            placed = self._place_frame(frame, features)
         return Step(
             frame=frame.name,
             rig_from_world=placed.rig_from_world,
@@ -147,7 +147,7 @@ class Session:
         found = pipeline.find_poses(self.capture, self._folder, self._options, progress=progress)
         self._tracker.correct(found.rig_from_world)
         for frame in self.frames:
-            self._put(frame, found.rig_from_world.get(frame.name))
+            self._set_pose(frame, found.rig_from_world.get(frame.name))
         return self._surface.changed()
 
     def missing(self) -> Float[np.ndarray, "n 3"]:
@@ -160,13 +160,13 @@ class Session:
             raise ReconstructionError("session: no frame has come in")
         return pipeline.reconstruct(self.capture, self._folder, self._options, progress=progress)
 
-    def _placed(self, frame: Frame, features: Mapping[tuple[str, str], Features]) -> Placed:
+    def _place_frame(self, frame: Frame, features: Mapping[tuple[str, str], Features]) -> Placed:
         placed = self._tracker.push(frame.name, features)
         self._capture = replace(self._capture, frames=(*self.frames, frame))
         self._ranks[frame.lighting] += 1
         if self._ranks[frame.lighting] % 2 == 1:
             self._every_second.add(frame.name)
-        self._put(frame, placed.rig_from_world)
+        self._set_pose(frame, placed.rig_from_world)
         return placed
 
     def _is_plain(self, frame: Frame) -> bool:
@@ -179,10 +179,10 @@ class Session:
         cache = self._folder / "motion" / "cache"
         return detect_all(Pictures(one, most_bytes=0), self._settled.tracking.sought, cache=cache)
 
-    def _recalled(self, name: str) -> Mapping[tuple[str, str], Features]:
+    def _find_again(self, name: str) -> Mapping[tuple[str, str], Features]:
         return self._features(next(frame for frame in self.frames if frame.name == name))
 
-    def _put(self, frame: Frame, rig_from_world: Rigid3 | None) -> None:
+    def _set_pose(self, frame: Frame, rig_from_world: Rigid3 | None) -> None:
         """Have the depth of a frame at a place in the surface, and nowhere else."""
         if frame.name not in self._every_second:
             return

@@ -49,7 +49,7 @@ class SparseModel:
 
     def scaled(self, scale: float) -> SparseModel:
         """The same model in a unit that is smaller by this factor."""
-        poses, tracks = _scaled(self.cam_from_world, self.tracks, scale)
+        poses, tracks = _rescale(self.cam_from_world, self.tracks, scale)
         return replace(self, cam_from_world=poses, tracks=tracks)
 
 
@@ -95,7 +95,7 @@ class PhotoModel:
 
     def scaled(self, scale: float) -> PhotoModel:
         """The same model in a unit that is smaller by this factor."""
-        poses, tracks = _scaled(self.cam_from_world, self.tracks, scale)
+        poses, tracks = _rescale(self.cam_from_world, self.tracks, scale)
         return replace(self, cam_from_world=poses, tracks=tracks)
 
 
@@ -124,6 +124,6 @@ def _depths(cam_from_world: Mapping[str, Rigid3], tracks: Tracks) -> Float[np.nd
     return np.asarray(along + shifts[tracks.frame_index])
 
 
-def _scaled(cam_from_world: Mapping[str, Rigid3], tracks: Tracks, scale: float) -> tuple[dict[str, Rigid3], Tracks]:
+def _rescale(cam_from_world: Mapping[str, Rigid3], tracks: Tracks, scale: float) -> tuple[dict[str, Rigid3], Tracks]:
     poses = {name: Rigid3(pose.rotation, scale * pose.translation) for name, pose in cam_from_world.items()}
     return poses, replace(tracks, points=scale * tracks.points)

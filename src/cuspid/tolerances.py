@@ -48,9 +48,9 @@ class Tolerances:
 
     def fill(self, handpiece: Handpiece) -> Handpiece:
         """The handpiece with these as the covariances of everything that has none."""
-        return with_cameras(handpiece, self._filled)
+        return with_cameras(handpiece, self._fill_tolerances)
 
-    def _filled(self, mounted: MountedCamera) -> MountedCamera:
+    def _fill_tolerances(self, mounted: MountedCamera) -> MountedCamera:
         if mounted.camera.covariance is None:
             lens = self.lens_factor(mounted.camera)
             mounted = replace(mounted, camera=replace(mounted.camera, covariance=lens @ lens.T))

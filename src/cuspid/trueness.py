@@ -76,13 +76,13 @@ class ReferenceRender:
         rows, columns = np.nonzero(where)
         z = self.height_mm[where].astype(np.float64)
         plane = (np.column_stack([columns, rows]) + 0.5 - self.origin_px) * [1, -1] * self.mm_per_px
-        return np.column_stack([plane / self._spread(z)[:, None], z])
+        return np.column_stack([plane / self._perspective_factor(z)[:, None], z])
 
     def on_plane(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
         """Where points appear on the occlusal plane, mm."""
-        return points[:, :2] * self._spread(points[:, 2])[:, None]
+        return points[:, :2] * self._perspective_factor(points[:, 2])[:, None]
 
-    def _spread(self, z: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    def _perspective_factor(self, z: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         """How much farther out than it is a point of that height is seen on the occlusal plane."""
         return np.ones_like(z) if self.camera_height_mm is None else self.camera_height_mm / (self.camera_height_mm - z)
 

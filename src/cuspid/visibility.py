@@ -71,7 +71,7 @@ def scannable_faces(
     for pose in rig_from_world:
         near = _within_reach(mesh, views, pose)
         undecided = near[~found[near]]
-        seen = _seen(mesh, views, pose, options, undecided)
+        seen = _visible_faces(mesh, views, pose, options, undecided)
         found[undecided[seen.sum(axis=1) >= options.cameras]] = True
     return found
 
@@ -89,7 +89,7 @@ def visible_counts(
     for pose in rig_from_world:
         near = _within_reach(mesh, views, pose)
         faces = near if among is None else near[among[near]]
-        most[faces] = np.maximum(most[faces], _seen(mesh, views, pose, options, faces).sum(axis=1))
+        most[faces] = np.maximum(most[faces], _visible_faces(mesh, views, pose, options, faces).sum(axis=1))
     return most
 
 
@@ -235,7 +235,7 @@ def _at_each_pose(
     views = _views(handpiece)
     for pose in rig_from_world:
         faces = _within_reach(mesh, views, pose)
-        yield faces, _seen(mesh, views, pose, options, faces), _eyes(views, pose)
+        yield faces, _visible_faces(mesh, views, pose, options, faces), _eyes(views, pose)
 
 
 def _eyes(views: tuple[_View, ...], rig_from_world: Rigid3) -> Float[np.ndarray, "c 3"]:
@@ -250,7 +250,7 @@ def _within_reach(mesh: Mesh, views: tuple[_View, ...], rig_from_world: Rigid3) 
     return np.asarray(np.flatnonzero(_within_ball(mesh.face_centres, middle, radius)))
 
 
-def _seen(
+def _visible_faces(
     mesh: Mesh,
     views: tuple[_View, ...],
     rig_from_world: Rigid3,

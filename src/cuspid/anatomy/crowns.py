@@ -78,8 +78,8 @@ def crowns_of(jaw: Jaw) -> Crowns:
 
 def crowns_by_shape(mesh: Mesh) -> Bool[np.ndarray, "f"]:
     """The faces that look like crown, of a mesh in the occlusal frame; none where nothing looks like a top."""
-    walked = _simplified(mesh, _FACE_MM2)
-    look = _look(walked, _simplified(mesh, _COARSE_FACE_MM2))
+    walked = _simplify(mesh, _FACE_MM2)
+    look = _look(walked, _simplify(mesh, _COARSE_FACE_MM2))
     if look is None:
         return np.zeros(len(mesh.faces), dtype=bool)
     pairs = np.unique(np.sort(edges_of(walked.faces), axis=1), axis=0)
@@ -88,7 +88,7 @@ def crowns_by_shape(mesh: Mesh) -> Bool[np.ndarray, "f"]:
     return np.asarray((by_face if walked is mesh else by_face[walked.closest(mesh.face_centres)[1]]) > _LEAST_SHARE)
 
 
-def _simplified(mesh: Mesh, face_mm2: float) -> Mesh:
+def _simplify(mesh: Mesh, face_mm2: float) -> Mesh:
     """With faces of that mean area, or the mesh itself where its own are about as large."""
     wanted = max(int(mesh.face_areas.sum() / face_mm2), 100)
     return mesh if len(mesh.faces) <= 1.3 * wanted else mesh.simplified(wanted)

@@ -93,7 +93,7 @@ def number_teeth(
     if not values:
         return Numbered(labels=labels)
     if label_map is not None:
-        return Numbered(labels=_mapped(labels, _complete(source, label_map, values)))
+        return Numbered(labels=_map_labels(labels, _complete(source, label_map, values)))
     if numbering in ("fdi", "universal"):
         return _plainly_read(source, labels, values, numbering, arch)
     plain = _by_value(values) if numbering == "auto" else None
@@ -109,7 +109,7 @@ def _values(labels: Int[np.ndarray, "f"]) -> tuple[int, ...]:
     return tuple(int(value) for value in np.unique(labels) if value != GUM)
 
 
-def _mapped(labels: Int[np.ndarray, "f"], table: Mapping[int, int]) -> Int[np.ndarray, "f"]:
+def _map_labels(labels: Int[np.ndarray, "f"], table: Mapping[int, int]) -> Int[np.ndarray, "f"]:
     """Labels by a table; what it does not know is gum."""
     known, place = np.unique(labels, return_inverse=True)
     return np.array([table.get(int(value), GUM) for value in known], dtype=np.int64)[place.reshape(-1)]
@@ -137,22 +137,22 @@ def _plainly_read(
     if numbering is None or not set(values) <= set(table):
         what = "neither FDI nor Universal" if numbering is None else f"not {_NAMES[numbering]}"
         raise InputError(
-            f"{source}: tooth labels {_shown(values)} are {what} numbers; give --label-map, a JSON file of each label "
-            "and its FDI number"
+            f"{source}: tooth labels {_abbreviate(values)} are {what} numbers; give --label-map, a JSON file of each "
+            "label and its FDI number"
         )
     told = _arch_of(table[value] for value in values)
     if arch is not None and told is not None and told != arch:
         raise InputError(
-            f"{source}: its labels {_shown(values)}, read as {_NAMES[numbering]} numbers, are {told} teeth, but its "
-            f"name or --arch says {arch}; give the right --arch or --labels, or --label-map"
+            f"{source}: its labels {_abbreviate(values)}, read as {_NAMES[numbering]} numbers, are {told} teeth, but "
+            f"its name or --arch says {arch}; give the right --arch or --labels, or --label-map"
         )
-    return Numbered(labels=_mapped(labels, table))
+    return Numbered(labels=_map_labels(labels, table))
 
 
 _NAMES = {"fdi": "FDI", "universal": "Universal", "along-arch": "along-the-arch"}
 
 
-def _shown(values: tuple[int, ...]) -> str:
+def _abbreviate(values: tuple[int, ...]) -> str:
     """Labels in few words: ``1-14``, or the first of them."""
     runs: list[list[int]] = []
     for value in values:
@@ -257,7 +257,7 @@ def _read_in_place(
     plainly = next((each for each in found if each.name == _NAMES.get(plain or "")), None)
     if plainly is not None and numbering == "auto" and plainly.misfit_mm < _DOUBTFUL_MM:
         if arch in (None, plainly.arch) and not any(_is_better(each, plainly) for each in others):
-            return Numbered(labels=_mapped(labels, plainly.fdi()))
+            return Numbered(labels=_map_labels(labels, plainly.fdi()))
         fitting = [each for each in others if each.arch == arch]
         against = arch not in (None, plainly.arch) and plainly.misfit_mm < _FITS_MM
         if against and not any(_is_better(each, plainly) for each in fitting):
@@ -265,7 +265,7 @@ def _read_in_place(
     best = _only([each for each in others if each.arch == arch])
     if best is None:
         raise InputError(f"{source}: {_complaint(teeth.values, plain, arch, others)}")
-    return _noted(_mapped(labels * teeth.sides, best.fdi()), best)
+    return _with_note(_map_labels(labels * teeth.sides, best.fdi()), best)
 
 
 def _is_better(one: _Reading, other: _Reading) -> bool:
@@ -280,7 +280,7 @@ def _only(readings: list[_Reading]) -> _Reading | None:
     return first
 
 
-def _noted(labels: Int[np.ndarray, "f"], reading: _Reading) -> Numbered:
+def _with_note(labels: Int[np.ndarray, "f"], reading: _Reading) -> Numbered:
     there = set(_values(labels))
     fdi = [each for _, each in sorted(reading.fdi().items()) if each in there]
     note = f"labels: read as {reading} (FDI {fdi[0]} to {fdi[-1]}), as the teeth stand; --label-map overrules that"
@@ -291,18 +291,18 @@ def _against(values: tuple[int, ...], plainly: _Reading, arch: Arch | None, othe
     """What is said of teeth that stand where their numbers say, in the other jaw."""
     along = ", or --labels along-arch" if any(each.arch == arch for each in others) else ""
     return (
-        f"its labels {_shown(values)} are {plainly.name} numbers of {plainly.arch} teeth and stand as those do, but "
-        f"its name or --arch says {arch}; give --arch {plainly.arch}{along}"
+        f"its labels {_abbreviate(values)} are {plainly.name} numbers of {plainly.arch} teeth and stand as those do, "
+        f"but its name or --arch says {arch}; give --arch {plainly.arch}{along}"
     )
 
 
 def _complaint(values: tuple[int, ...], plain: str | None, arch: Arch | None, others: list[_Reading]) -> str:
     """What is said of labels that are not understood."""
-    what = f"tooth labels {_shown(values)}"
+    what = f"tooth labels {_abbreviate(values)}"
     if plain is None:
         what += " are not understood"
     else:
-        what += f" are no {_NAMES[plain]} numbers, as its teeth do not stand where those{_in(arch)} do"
+        what += f" are no {_NAMES[plain]} numbers, as its teeth do not stand where those{_teeth_of_arch(arch)} do"
     fitting = [each for each in others if arch in (None, each.arch)]
     if not fitting:
         return f"{what}, and no other numbering fits; is the mesh mirrored? Give --label-map, or --labels to insist"
@@ -311,7 +311,7 @@ def _complaint(values: tuple[int, ...], plain: str | None, arch: Arch | None, ot
     return f"{what}; {' or '.join(map(str, fitting[:3]))} fit about as well: give --label-map"
 
 
-def _in(arch: Arch | None) -> str:
+def _teeth_of_arch(arch: Arch | None) -> str:
     return "" if arch is None else f" of {'an' if arch == 'upper' else 'a'} {arch} jaw"
 
 
@@ -329,16 +329,19 @@ def _numberings(teeth: _Teeth, arch: Arch) -> Iterator[tuple[str, Positions]]:
         row = [*right[-half:], *range(1, half + 1)]
         for first, side in (("right", 1), ("left", -1)):
             numbers = f"1-{2 * half}"
-            yield f"{numbers} along the arch from the patient's {first}", _counted(side * at for at in row)
+            yield f"{numbers} along the arch from the patient's {first}", _positions(side * at for at in row)
             backwards = [*(-n for n in range(1, half + 1)), *range(1, half + 1)]
-            yield f"{numbers} from the midline backwards, {first} side first", _counted(side * at for at in backwards)
+            yield (
+                f"{numbers} from the midline backwards, {first} side first",
+                _positions(side * at for at in backwards),
+            )
             towards = [*row[:half], *reversed(row[half:])]
-            yield f"{numbers} towards the midline, {first} side first", _counted(side * at for at in towards)
+            yield f"{numbers} towards the midline, {first} side first", _positions(side * at for at in towards)
 
 
 def _position(fdi: int) -> int:
     return (-1 if fdi // 10 in (1, 4) else 1) * (fdi % 10)
 
 
-def _counted(positions: Iterator[int]) -> dict[int, int]:
+def _positions(positions: Iterator[int]) -> dict[int, int]:
     return dict(enumerate(positions, start=1))

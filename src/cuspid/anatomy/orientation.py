@@ -102,14 +102,14 @@ def find_occlusal_frame(mesh: Mesh) -> OcclusalFrame:
     mesh = mesh.thinned(_ENOUGH_FACES)
     start, notes = _upright(mesh)
     rests = not _is_part(mesh, start.rotation[2])
-    relief, level = _levelled(mesh, _resting(_relief(mesh, start), start) if rests else start)
+    relief, level = _level_frame(mesh, _resting(_relief(mesh, start), start) if rests else start)
     crowns = relief.crowns()
     if len(crowns) == 0:
         note = "occlusal frame: unsure, as nothing looks like a crown; check the picture"
         return OcclusalFrame(occlusal_from_mesh=level, notes=(*notes, note))
     anterior, whole = _anterior(crowns[:, :2])
     if not whole:
-        relief, level = _levelled(mesh, _roughest(mesh, start))
+        relief, level = _level_frame(mesh, _roughest(mesh, start))
         crowns, notes = relief.crowns(), (*notes, _PART_NOTE)
         anterior, _ = _anterior(crowns[:, :2])
     centre = np.array([*crowns[:, :2].mean(axis=0), relief.tips()[:, 2].mean()])
@@ -195,7 +195,7 @@ def _roughness(relief: _Relief) -> float:
     return float(np.arccos(np.clip(cosines[known], -1, 1)).mean()) if known.any() else 0.0
 
 
-def _levelled(mesh: Mesh, start: Rigid3) -> tuple[_Relief, Rigid3]:
+def _level_frame(mesh: Mesh, start: Rigid3) -> tuple[_Relief, Rigid3]:
     """A frame turned so that the tips of the crowns lie in the plane XY on average, and what is seen from there."""
     frame = levelled(lambda turn: _relief(mesh, turn @ start).points, _GRID_MM, _TILT_SD_DEG) @ start
     return _relief(mesh, frame), frame
@@ -263,7 +263,7 @@ def _fit_arch(
         source = np.concatenate([arch[from_places[on]], arch[near]])
         target = np.concatenate([places[on], places[to_places[near]]])
         weights = np.concatenate([np.full(on.sum(), 1 / on.sum()), np.full(near.sum(), 1 / len(arch))])
-        laid = _laid(source, target, weights, arch)
+        laid = _apply_similarity(source, target, weights, arch)
     there, _ = cKDTree(laid).query(places)
     there = there[there <= np.quantile(there, _ON_ARCH)]
     back, _ = tree.query(laid)
@@ -272,7 +272,7 @@ def _fit_arch(
     return float(misfit / 2), front / np.linalg.norm(front)
 
 
-def _laid(
+def _apply_similarity(
     source: Float[np.ndarray, "n 2"],
     target: Float[np.ndarray, "n 2"],
     weights: Float[np.ndarray, "n"],

@@ -97,7 +97,7 @@ def nodes_of(board: Target) -> tuple[Int[np.ndarray, "n m"], Float[np.ndarray, "
     corners, nodes = (board.columns - 1, board.rows - 1), _grid(board)
     if corners == nodes:
         return np.arange(corners[0] * corners[1])[:, None], np.ones((corners[0] * corners[1], 1))
-    before, beyond = zip(*(_between(n, k) for n, k in zip(corners, nodes, strict=True)), strict=True)
+    before, beyond = zip(*(_interpolation_shares(n, k) for n, k in zip(corners, nodes, strict=True)), strict=True)
     index, share = [], []
     for down in (0, 1):
         for right in (0, 1):
@@ -108,7 +108,7 @@ def nodes_of(board: Target) -> tuple[Int[np.ndarray, "n m"], Float[np.ndarray, "
     return np.stack(index, axis=1), np.stack(share, axis=1)
 
 
-def _between(corners: int, nodes: int) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+def _interpolation_shares(corners: int, nodes: int) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Of the corners along a side, the node before each, and what share of the way to the next one it lies at."""
     place = np.linspace(0, nodes - 1, corners)
     before = np.minimum(place.astype(np.int64), nodes - 2)

@@ -307,9 +307,9 @@ class _Projection:
 
 
 def _project(scene: BoardScene, seen: _Observations) -> _Projection:
-    points = _bent(scene, seen)
+    points = _bend_points(scene, seen)
     in_rig = np.einsum("nk,nkj->nj", seen.weights(scene)[0], _at_instants(scene, seen, points))
-    in_cam = _moved(list(scene.cam_from_rig.values()), seen.camera, in_rig)
+    in_cam = _move_points(list(scene.cam_from_rig.values()), seen.camera, in_rig)
     image = np.empty_like(seen.pixels)
     for number, camera in enumerate(scene.cameras.values()):
         image[seen.camera == number] = camera.project(in_cam[seen.camera == number])
@@ -318,11 +318,11 @@ def _project(scene: BoardScene, seen: _Observations) -> _Projection:
     return _Projection(in_cam, raw, _by_view(scene, seen, in_cam) if loose else None)
 
 
-def _bent(scene: BoardScene, seen: _Observations) -> Float[np.ndarray, "n 3"]:
+def _bend_points(scene: BoardScene, seen: _Observations) -> Float[np.ndarray, "n 3"]:
     """On the body."""
     flat = seen.points if scene.shape is None else seen.points + scene.shape.at(seen.nodes, seen.shares)
     points = np.asarray(flat + (seen.basis @ scene.bending_mm)[:, None] * [0.0, 0.0, 1.0])
-    return _moved(_all_mounts(scene, seen), seen.board, points) if scene.body_from_board else points
+    return _move_points(_all_mounts(scene, seen), seen.board, points) if scene.body_from_board else points
 
 
 def _all_mounts(scene: BoardScene, seen: _Observations) -> list[Rigid3]:
@@ -335,10 +335,10 @@ def _at_instants(
 ) -> Float[np.ndarray, "n k 3"]:
     """Points of the board in the rig, at the instants about their views."""
     boards = list(scene.rig_from_board.values())
-    return np.stack([_moved(boards, which[seen.view], points) for which in seen.near.T], axis=1)
+    return np.stack([_move_points(boards, which[seen.view], points) for which in seen.near.T], axis=1)
 
 
-def _moved(
+def _move_points(
     motions: Sequence[Rigid3], which: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
     rotations = np.stack([motion.rotation for motion in motions])[which]
@@ -352,7 +352,7 @@ def _jacobian(scene: BoardScene, seen: _Observations, in_cam: Float[np.ndarray, 
     turn = np.stack([place.rotation for place in scene.cam_from_rig.values()])[seen.camera]
     by_rig = by_point @ turn
     weights, slopes = seen.weights(scene)
-    places = _at_instants(scene, seen, _bent(scene, seen))
+    places = _at_instants(scene, seen, _bend_points(scene, seen))
     turns = np.stack([pose.rotation for pose in scene.rig_from_board.values()])[seen.near[seen.view]]
     by_body = np.einsum("nij,nk,nkjm->nim", by_rig, weights, turns)
     normals = np.stack([mount.rotation[:, 2] for mount in _all_mounts(scene, seen)])[seen.board]
@@ -367,7 +367,7 @@ def _jacobian(scene: BoardScene, seen: _Observations, in_cam: Float[np.ndarray, 
         which.append((_BOARDS, instant))
     if scene.body_from_board:
         mount, mounted = _mount_of(scene, seen)
-        blocks.append(mounted[:, None, None] * _by_motion(by_body, _bent(scene, seen)))
+        blocks.append(mounted[:, None, None] * _by_motion(by_body, _bend_points(scene, seen)))
         which.append((_MOUNTS, mount))
     if scene.timing is not None:
         by_time = np.einsum("nij,nk,nkj->ni", by_rig, slopes, places)[:, :, None]
@@ -504,21 +504,21 @@ def adjust_board(
     """
     seen = _Observations.of(views, board, start)
     free = _Free.of(start, board, only_boards=only_boards)
-    scene, settled = _minimised(start, seen, free)
+    scene, settled = _minimize(start, seen, free)
     told = not (only_boards or keep_scales) and (scene.shape is not None or scene.loose_px > 0)
     for _ in range(_TELLINGS if told else 0):
         before, scene = scene, _as_told(scene, seen, free, board)
         if _is_told_alike(before, scene):
             break
         free = _Free.of(scene, board, only_boards=only_boards)
-        scene, settled = _minimised(scene, seen, free)
+        scene, settled = _minimize(scene, seen, free)
     there = _project(scene, seen)
     pieces = np.split(there.raw, seen.starts[1:-1])
     nothing = np.zeros((0, 0))
     covariance, moved = (nothing, nothing) if only_boards else _camera_covariance(scene, seen, free)
     return Adjusted(
         scene=scene,
-        sigma_px=_scale(_loosened(scene, seen, there, None)[0]),
+        sigma_px=_scale(_project_out_motions(scene, seen, there, None)[0]),
         residuals=dict(zip(seen.keys, pieces, strict=True)),
         covariance=covariance,
         moved=moved,
@@ -533,7 +533,7 @@ def unevenness_score(found: Adjusted, views: Views, board: Board) -> float:
     seen, free = _Observations.of(views, board, scene), _Free.of(scene, board, only_boards=False)
     sizes = _sizes(scene)
     of_shape = np.repeat(np.arange(len(sizes)), sizes)[free.columns] == _SHAPES
-    rows = _weighted(scene, seen, _project(scene, seen), found.sigma_px, free)
+    rows = _weigh_equations(scene, seen, _project(scene, seen), found.sigma_px, free)
     jacobian = rows.jacobian.toarray()[:, of_shape]
     told = np.sum(jacobian**2, axis=0)
     pull = jacobian.T @ rows.residuals
@@ -557,7 +557,7 @@ def at_middle_rows(scene: BoardScene, views: Views, board: Target) -> dict[tuple
     return {key: view.moved(each) for (key, view), each in zip(views.items(), late, strict=True)}
 
 
-def _minimised(scene: BoardScene, seen: _Observations, free: _Free) -> tuple[BoardScene, bool]:
+def _minimize(scene: BoardScene, seen: _Observations, free: _Free) -> tuple[BoardScene, bool]:
     """The best scene, and whether another step would not have been worth it."""
     there = _project(scene, seen)
     if not there.is_whole:
@@ -565,11 +565,11 @@ def _minimised(scene: BoardScene, seen: _Observations, free: _Free) -> tuple[Boa
     damping, settled, steps = 1e-4, False, 0
     while not settled and steps < _STEPS and damping < _MOST_DAMPING:
         steps += 1
-        sigma_px = _scale(_loosened(scene, seen, there, None)[0])
+        sigma_px = _scale(_project_out_motions(scene, seen, there, None)[0])
         cost = _cost(scene, seen, there, sigma_px, free)
         matrix, gradient = _normal(scene, seen, there, sigma_px, free)
-        step = _solved(matrix + damping * np.diag(np.diag(matrix)), gradient)
-        candidate = _stepped(scene, free, step)
+        step = _solve(matrix + damping * np.diag(np.diag(matrix)), gradient)
+        candidate = _apply_step(scene, free, step)
         after = None if candidate is None else _project(candidate, seen)
         if candidate is None or after is None or not _cost(candidate, seen, after, sigma_px, free) <= cost:
             damping *= 10
@@ -579,7 +579,7 @@ def _minimised(scene: BoardScene, seen: _Observations, free: _Free) -> tuple[Boa
     return scene, settled
 
 
-def _loosened(
+def _project_out_motions(
     scene: BoardScene,
     seen: _Observations,
     there: _Projection,
@@ -640,12 +640,12 @@ def _cost(
     free: _Free,
 ) -> float:
     """Huber loss of the residuals, and the prior; infinite where a corner lies behind a camera."""
-    residuals, motions = _loosened(scene, seen, there, sigma_px)
+    residuals, motions = _project_out_motions(scene, seen, there, sigma_px)
     lengths = np.linalg.norm(residuals, axis=1) / sigma_px
     if not np.isfinite(lengths).all():
         return np.inf
     loss = np.where(lengths <= _KNEE, lengths**2, 2 * _KNEE * lengths - _KNEE**2)
-    held = _held(scene)[free.columns]
+    held = _prior_offset(scene)[free.columns]
     moved = float(np.sum(motions**2)) / scene.loose_px**2 if scene.loose_px else 0.0
     return float(loss.sum() + held @ free.prior @ held) + moved
 
@@ -662,7 +662,7 @@ def _lens_precision(camera: Camera, numbers: int) -> Float[np.ndarray, "n"]:
     return np.pad(known, (0, numbers - len(known)), constant_values=1.0)
 
 
-def _held(scene: BoardScene) -> Float[np.ndarray, "k"]:
+def _prior_offset(scene: BoardScene) -> Float[np.ndarray, "k"]:
     """How far all unknowns are from where the prior holds them; 0 where it does not."""
     lenses = [
         np.pad(
@@ -689,8 +689,8 @@ def _normal(
     free: _Free,
 ) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k"]]:
     """Of the free unknowns: the matrix of the normal equations, and the gradient."""
-    rows = _weighted(scene, seen, there, sigma_px, free)
-    return rows.matrix + free.prior, rows.jacobian.T @ rows.residuals - free.prior @ _held(scene)[free.columns]
+    rows = _weigh_equations(scene, seen, there, sigma_px, free)
+    return rows.matrix + free.prior, rows.jacobian.T @ rows.residuals - free.prior @ _prior_offset(scene)[free.columns]
 
 
 @dataclass(frozen=True, eq=False)
@@ -717,14 +717,14 @@ class _Rows:
         return np.asarray((self.jacobian.T @ self.jacobian).toarray() - own)
 
 
-def _weighted(
+def _weigh_equations(
     scene: BoardScene,
     seen: _Observations,
     there: _Projection,
     sigma_px: float,
     free: _Free,
 ) -> _Rows:
-    residuals, motions = _loosened(scene, seen, there, sigma_px)
+    residuals, motions = _project_out_motions(scene, seen, there, sigma_px)
     weights = np.repeat(np.sqrt(_weights(residuals, sigma_px)), 2)
     jacobian = csr_array(_jacobian(scene, seen, there.in_cam)[:, free.columns] * weights[:, None])
     weighted, view = residuals.ravel() * weights, np.repeat(seen.view, 2)
@@ -759,7 +759,7 @@ def _independent(
         yield np.concatenate(jacobians), np.concatenate(residuals)
 
 
-def _solved(matrix: Float[np.ndarray, "k k"], right: Float[np.ndarray, "k *m"]) -> Float[np.ndarray, "k *m"]:
+def _solve(matrix: Float[np.ndarray, "k k"], right: Float[np.ndarray, "k *m"]) -> Float[np.ndarray, "k *m"]:
     """Raises ReconstructionError where the matrix is singular to rounding."""
     scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     try:
@@ -772,7 +772,7 @@ def _solved(matrix: Float[np.ndarray, "k k"], right: Float[np.ndarray, "k *m"]) 
     return np.asarray((scale * cho_solve(factor, (scale * right.T).T).T).T)
 
 
-def _stepped(scene: BoardScene, free: _Free, step: Float[np.ndarray, "k"]) -> BoardScene | None:
+def _apply_step(scene: BoardScene, free: _Free, step: Float[np.ndarray, "k"]) -> BoardScene | None:
     """None where a camera would be turned inside out."""
     sizes = _sizes(scene)
     whole = np.zeros(sum(sizes))
@@ -813,9 +813,9 @@ def _as_told(scene: BoardScene, seen: _Observations, free: _Free, board: Target)
     """The scene with a board as uneven, and views as loose, as the images tell (D. MacKay, Neural Computation 4, 1992,
     equation 3.14)."""
     there = _project(scene, seen)
-    sigma_px = _scale(_loosened(scene, seen, there, None)[0])
-    rows = _weighted(scene, seen, there, sigma_px, free)
-    inverse = _solved(rows.matrix + free.prior, np.eye(len(free.columns)))
+    sigma_px = _scale(_project_out_motions(scene, seen, there, None)[0])
+    rows = _weigh_equations(scene, seen, there, sigma_px, free)
+    inverse = _solve(rows.matrix + free.prior, np.eye(len(free.columns)))
     sizes = _sizes(scene)
     of_shape = np.repeat(np.arange(len(sizes)), sizes)[free.columns] == _SHAPES
     if scene.shape is not None and of_shape.any():
@@ -843,8 +843,8 @@ def _camera_covariance(
     """Of the parameters and the motions of all cameras, in the frame in which these sum up to nothing, and of their
     readouts: as the scatter of the corners gives it, and by how much each instant moves them."""
     there = _project(scene, seen)
-    sigma_px = _scale(_loosened(scene, seen, there, None)[0])
-    rows = _weighted(scene, seen, there, sigma_px, free)
+    sigma_px = _scale(_project_out_motions(scene, seen, there, None)[0])
+    rows = _weigh_equations(scene, seen, there, sigma_px, free)
     matrix = rows.matrix + free.prior
     sizes = _sizes(scene)
     kind = np.repeat(np.arange(len(sizes)), sizes)
@@ -853,7 +853,7 @@ def _camera_covariance(
     place[np.isin(kind, (_LENSES, _CAMERAS, _READOUTS))] = np.arange(size)
     known = np.flatnonzero(place[free.columns] >= 0)
     whole, among = np.zeros((size, size)), place[free.columns[known]]
-    whole[np.ix_(among, among)] = _solved(matrix, np.eye(len(matrix))[:, known])[known]
+    whole[np.ix_(among, among)] = _solve(matrix, np.eye(len(matrix))[:, known])[known]
     project = np.eye(size)
     places = slice(sizes[_LENSES], sizes[_LENSES] + sizes[_CAMERAS])
     project[places, places] = _without_common_motion(scene)
@@ -889,8 +889,8 @@ def readout_score(scene: BoardScene, views: Views, board: Target) -> float:
     seen, free = _Observations.of(views, board, scene), _Free.of(scene, board, only_boards=False)
     there, sizes = _project(scene, seen), _sizes(scene)
     of_readouts = np.repeat(np.arange(len(sizes)), sizes)[free.columns] == _READOUTS
-    matrix, gradient = _normal(scene, seen, there, _scale(_loosened(scene, seen, there, None)[0]), free)
-    inverse = _solved(matrix, np.eye(len(matrix))[:, of_readouts])
+    matrix, gradient = _normal(scene, seen, there, _scale(_project_out_motions(scene, seen, there, None)[0]), free)
+    inverse = _solve(matrix, np.eye(len(matrix))[:, of_readouts])
     return float(np.max(np.abs(gradient @ inverse) / np.sqrt(np.diag(inverse[of_readouts]))))
 
 

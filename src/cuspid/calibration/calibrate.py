@@ -169,13 +169,13 @@ def calibrate_rig(
     Raises ReconstructionError for cameras with too few views, whose views fit no camera, that never saw the board
     together, or that do not agree on how it was held.
     """
-    found = _calibrated(views, sizes, board, options)
+    found = _calibrate_once(views, sizes, board, options)
     if isinstance(board, BoardSet) or not board.has_circles:
         return found
-    return _calibrated(_centred(views, found, board), sizes, board, options)
+    return _calibrate_once(_correct_circle_centres(views, found, board), sizes, board, options)
 
 
-def _centred(views: Views, found: RigCalibration, board: Board) -> Views:
+def _correct_circle_centres(views: Views, found: RigCalibration, board: Board) -> Views:
     """Views of circles, with the places of their centres instead of the middles of what is seen of them."""
     centred = {}
     for (name, instant), view in views.items():
@@ -188,7 +188,7 @@ def _centred(views: Views, found: RigCalibration, board: Board) -> Views:
     return centred
 
 
-def _calibrated(
+def _calibrate_once(
     views: Views,
     sizes: Mapping[str, tuple[int, int]],
     board: Target,
@@ -211,8 +211,8 @@ def _calibrated(
         start, common = joined(views, board, cameras, sorted({instant for _, instant in views}))
 
     def tried(scene: BoardScene) -> _Trial:
-        found, chosen, notes = _fitted(scene, common, board, options)
-        return _Trial(found, _described(found, chosen, board, choices, (*how, *notes)))
+        found, chosen, notes = _fit_cameras(scene, common, board, options)
+        return _Trial(found, _describe(found, chosen, board, choices, (*how, *notes)))
 
     best = tried(start)
     frame = numbered(start.rig_from_board)
@@ -295,7 +295,7 @@ def _alone(
         ) from error
 
 
-def _fitted(
+def _fit_cameras(
     start: BoardScene, views: Views, board: Target, options: CalibrationOptions
 ) -> tuple[Adjusted, Views, tuple[str, ...]]:
     """The cameras by the views that fit, and all views with the numbering of their corners that fits best.
@@ -462,7 +462,7 @@ def size_notes(found: Rig, drawn: Rig, board: Target) -> tuple[str, ...]:
 # --- what it is worth --------------------------------------------------------------------------------------------
 
 
-def _described(
+def _describe(
     found: Adjusted,
     chosen: Views,
     board: Target,
@@ -495,7 +495,7 @@ def _described(
         )
         for name in names
     }
-    rig = Rig({name: _widened(mounted, checks[name]) for name, mounted in mounted_cameras(found).items()})
+    rig = Rig({name: _widen_covariance(mounted, checks[name]) for name, mounted in mounted_cameras(found).items()})
     return RigCalibration(
         rig=rig,
         lenses=lenses,
@@ -564,7 +564,7 @@ def _lens_apart(camera: Camera, alone: Adjusted) -> float:
     return _in_sigmas(camera.parameters - other.parameters, known(other.covariance))
 
 
-def _widened(mounted: MountedCamera, check: CameraCheck) -> MountedCamera:
+def _widen_covariance(mounted: MountedCamera, check: CameraCheck) -> MountedCamera:
     """With covariances that account for how far two halves of the images are apart, and the lens from that of its own
     views alone, where chance hardly explains it; and with its shutter."""
     camera = replace(mounted.camera, covariance=_lens_factor(check) ** 2 * known(mounted.camera.covariance))

@@ -29,13 +29,13 @@ def cause_of_absence(images: Sequence[Gray], board: Target) -> str | None:
     """What makes the board be found in most of some images in which it is not as it stands, and what to change; None
     where nothing does."""
     if isinstance(board, BoardSet):
-        told = [(number, _verified(images, each)) for number, each in enumerate(board.boards, 1)]
+        told = [(number, _verify_board(images, each)) for number, each in enumerate(board.boards, 1)]
         alone = next((f"board {number}: {cause}" for number, cause in told if cause is not None), None)
         return _other_ids(images, board) or alone
-    return _verified(images, board) or _other_ids(images, board) or _other_markers(images, board)
+    return _verify_board(images, board) or _other_ids(images, board) or _other_markers(images, board)
 
 
-def _verified(images: Sequence[Gray], board: Board) -> str | None:
+def _verify_board(images: Sequence[Gray], board: Board) -> str | None:
     """What makes one board be found in most of the images."""
     best: tuple[int, str] = (0, "")
     for told, other, mirrored in _others(board, images):

@@ -69,14 +69,14 @@ def find_circles(
 ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 2"]] | None:
     """Numbers of the circles of a board that is seen from border to border, and the centroids of what is seen of them
     (OpenCV's coordinates); None where there is no such board. Some circles may be hidden."""
-    found = _measured(image, board)
+    found = _measure_circles(image, board)
     return None if found is None else found[:2]
 
 
 def measured_share(image: UInt8[np.ndarray, "h w"], board: Board) -> float | None:
     """Diameter of the circles that an image shows, as a share of the distance to the nearest one, by the area of each
     and how large the grid is there; None where it does not show the board, or they are small."""
-    found = _measured(image, board)
+    found = _measure_circles(image, board)
     if found is None or np.isnan(found[2]).all():
         return None
     numbers, pixels, areas = found
@@ -89,12 +89,12 @@ def measured_share(image: UInt8[np.ndarray, "h w"], board: Board) -> float | Non
     return float(board.circle_share * np.nanmedian(shares))
 
 
-def _measured(
+def _measure_circles(
     image: UInt8[np.ndarray, "h w"], board: Board
 ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]] | None:
     """Numbers, centroids and areas (px) of circles."""
     blobs = _find_blobs(image)
-    found = _numbered(_largest_lattice(blobs), board)
+    found = _number_circles(_largest_lattice(blobs), board)
     if found is None:
         return None
     numbers, chosen = found
@@ -140,7 +140,7 @@ def _largest_lattice(blobs: _Blobs) -> dict[Cell, int]:
     for seed in order[:_SEEDS].tolist():
         start = {} if tried[seed] else _cross_at(blobs, tree, seed)
         if start:
-            cells = _filled(blobs, tree, _grown(blobs, tree, start))
+            cells = _fill_lattice(blobs, tree, _grow_lattice(blobs, tree, start))
             tried[list(cells.values())] = True
             best = max(best, cells, key=len)
     return best
@@ -166,7 +166,7 @@ def _cross_at(blobs: _Blobs, tree: cKDTree, seed: int) -> dict[Cell, int]:
     return {}
 
 
-def _grown(blobs: _Blobs, tree: cKDTree, cells: dict[Cell, int]) -> dict[Cell, int]:
+def _grow_lattice(blobs: _Blobs, tree: cKDTree, cells: dict[Cell, int]) -> dict[Cell, int]:
     """A lattice with all that continues it."""
     cells, used, growing = dict(cells), set(cells.values()), True
     while growing:
@@ -181,13 +181,13 @@ def _grown(blobs: _Blobs, tree: cKDTree, cells: dict[Cell, int]) -> dict[Cell, i
     return cells
 
 
-def _filled(blobs: _Blobs, tree: cKDTree, cells: dict[Cell, int]) -> dict[Cell, int]:
+def _fill_lattice(blobs: _Blobs, tree: cKDTree, cells: dict[Cell, int]) -> dict[Cell, int]:
     """A lattice with what lies beyond hidden circles, where the affine map of the cells next to it has it."""
     cells, found = dict(cells), True
     while found:
         places, pixels = np.array(list(cells)), blobs.pixels[list(cells.values())]
         used, found = set(cells.values()), False
-        for cell in _around(cells):
+        for cell in _empty_neighbours(cells):
             near = np.argsort(np.linalg.norm(places - cell, axis=1), kind="stable")[:_NEIGHBOURS]
             design = np.pad(places[near].astype(np.float64), ((0, 0), (0, 1)), constant_values=1.0)
             if np.linalg.matrix_rank(design) < 3:
@@ -202,7 +202,7 @@ def _filled(blobs: _Blobs, tree: cKDTree, cells: dict[Cell, int]) -> dict[Cell, 
     return cells
 
 
-def _around(cells: dict[Cell, int]) -> list[Cell]:
+def _empty_neighbours(cells: dict[Cell, int]) -> list[Cell]:
     """The empty cells beside those of a lattice."""
     beside = {(i + di, j + dj) for i, j in cells for di in (-1, 0, 1) for dj in (-1, 0, 1)}
     return sorted(beside - set(cells))
@@ -229,7 +229,7 @@ def _sine(one: Float[np.ndarray, "2"], other: Float[np.ndarray, "2"]) -> float:
     return float((one[0] * other[1] - one[1] * other[0]) / (np.linalg.norm(one) * np.linalg.norm(other)))
 
 
-def _numbered(cells: dict[Cell, int], board: Board) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]] | None:
+def _number_circles(cells: dict[Cell, int], board: Board) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]] | None:
     """Numbers of the circles of a lattice that reaches from border to border of the board, and the blobs that they are,
     whatever the two directions in which the lattice has grown; None where it is none of the board."""
     if len(cells) < _ENOUGH * len(board.corners):

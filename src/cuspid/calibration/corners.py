@@ -58,11 +58,11 @@ def find_corners(gray: UInt8[np.ndarray, "h w"], target: Target) -> BoardView | 
     if isinstance(target, BoardSet):
         found = [find_corners(gray, each) for each in target.boards]
         shown = [(view, start) for view, start in zip(found, target.starts, strict=False) if view is not None]
-        return _united([BoardView(view.corner + start, view.pixels) for view, start in shown])
+        return _unite_views([BoardView(view.corner + start, view.pixels) for view, start in shown])
     return _found_alone(gray, target)
 
 
-def _united(views: list[BoardView]) -> BoardView | None:
+def _unite_views(views: list[BoardView]) -> BoardView | None:
     """The corners of several boards in one image."""
     if not views:
         return None

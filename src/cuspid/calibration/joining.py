@@ -102,7 +102,7 @@ def joined_boards(
         camera={name: (k, Rigid3.identity()) for k, name in enumerate(cameras)},
         board={number: (number, Rigid3.identity()) for number in boards},
     )
-    while (more := _grown(groups, seen)) is not None:
+    while (more := _join_two_groups(groups, seen)) is not None:
         groups = more
     _require_one_group(groups)
     rig_from_cameras = groups.camera[next(iter(cameras))][1].inverse()
@@ -139,20 +139,20 @@ def _all_seen(views: Views, target: BoardSet, cameras: Mapping[str, Camera]) -> 
     return found
 
 
-def _grown(groups: _Groups, seen: Sequence[_Seen]) -> _Groups | None:
+def _join_two_groups(groups: _Groups, seen: Sequence[_Seen]) -> _Groups | None:
     """With two groups joined: those that share most instants, or else by their motion; None where there are none."""
     poses = groups.poses(seen)
     shared: list[tuple[int, str, int, int]] = []
     for kind, side in (("cameras", 0), ("boards", 1)):
         for one, other in combinations(sorted({key[side] for key in poses}), 2):
-            count = len(_between(poses, one, other, side))
+            count = len(_estimate_hand_eye(poses, one, other, side))
             if count:
                 shared.append((count, kind, one, other))
     if not shared:
         return _joined_by_motion(groups, poses)
     _, kind, one, other = max(shared, key=lambda each: each[0])
     side = 0 if kind == "cameras" else 1
-    said = _between(poses, one, other, side)
+    said = _estimate_hand_eye(poses, one, other, side)
     away = [pose.translation for each in poses.values() for pose in each.values()]
     best, agreeing = agreed_on([[each] for each in said], float(np.median(np.linalg.norm(away, axis=1))))
     if 2 * agreeing < len(said):
@@ -160,7 +160,9 @@ def _grown(groups: _Groups, seen: Sequence[_Seen]) -> _Groups | None:
     return groups.joined_cameras(one, other, best) if side == 0 else groups.joined_boards(one, other, best)
 
 
-def _between(poses: Mapping[tuple[int, int], Mapping[str, Rigid3]], one: int, other: int, side: int) -> list[Rigid3]:
+def _estimate_hand_eye(
+    poses: Mapping[tuple[int, int], Mapping[str, Rigid3]], one: int, other: int, side: int
+) -> list[Rigid3]:
     """``one_from_other`` of two groups of cameras (``side`` 0) or of boards (1), as each instant says at which both
     saw, or were seen by, the same group."""
     said = []

@@ -83,14 +83,14 @@ class Lattice:
         columns, rows, place = board.columns - 1, board.rows - 1, self.cells
         for _ in range(4):
             if tuple(place.max(axis=0) + 1) == (columns, rows) and _is_coloured_so(place, self.saddles, board):
-                return place[:, 1] * columns + place[:, 0], _refined(self.image, self.saddles.pixels)
+                return place[:, 1] * columns + place[:, 0], _refine_corners(self.image, self.saddles.pixels)
             place = np.stack([place[:, 1].max() - place[:, 1], place[:, 0]], axis=1)  # a quarter turn
         return None
 
 
 def find_lattice(image: UInt8[np.ndarray, "h w"]) -> Lattice | None:
     """The largest lattice in an image, without what stands out of its rectangle; None where there is none of 2 x 2."""
-    even = _evened(image)
+    even = _equalize_contrast(image)
     saddles = find_saddles(even)
     if not len(saddles.pixels):
         return None
@@ -98,7 +98,7 @@ def find_lattice(image: UInt8[np.ndarray, "h w"]) -> Lattice | None:
     tried, best = np.zeros(len(saddles.pixels), dtype=bool), dict[Cell, int]()
     for seed in range(min(_SEEDS, len(tried))):
         if not tried[seed]:
-            cells = _grown(saddles, tree, seed, _FARTHEST * max(image.shape))
+            cells = _grow_lattice(saddles, tree, seed, _FARTHEST * max(image.shape))
             tried[list(cells.values())] = True
             best = max(best, cells, key=len)
     place, chosen = np.array(list(best)), np.array(list(best.values()))
@@ -123,7 +123,7 @@ def is_larger(lattice: Lattice, board: Board) -> bool:
     return over and len(lattice.cells) >= _ENOUGH * columns * rows
 
 
-def _evened(image: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+def _equalize_contrast(image: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     """Relative to the mean around each pixel, as a lamp close by lights places differently; what is almost black stays
     so."""
     values = image.astype(np.float32)
@@ -209,13 +209,13 @@ def _have_four_squares(
     return np.asarray(least - most > _LEAST_GAP * spread)
 
 
-def _grown(saddles: Saddles, tree: cKDTree, seed: int, farthest_px: float) -> dict[Cell, int]:
+def _grow_lattice(saddles: Saddles, tree: cKDTree, seed: int, farthest_px: float) -> dict[Cell, int]:
     """The lattice about a saddle, by cell."""
     first, second = saddles.axes[seed]
     second = second if _cross(first, second) > 0 else -second
     cells, used = {(0, 0): seed}, {seed}
     for step, direction in zip(_STEPS, (first, second, -first, -second), strict=True):
-        found = _along(saddles, tree, seed, direction, farthest_px)
+        found = _next_saddle(saddles, tree, seed, direction, farthest_px)
         if found is not None and found not in used:
             cells[step] = found
             used.add(found)
@@ -257,7 +257,7 @@ def openings(cells: dict[Cell, int], pixels: Float[np.ndarray, "n 2"]) -> Iterat
                     yield (after, (i, j)), pixels[here] + step
 
 
-def _along(
+def _next_saddle(
     saddles: Saddles, tree: cKDTree, here: int, direction: Float[np.ndarray, "2"], farthest_px: float
 ) -> int | None:
     """The nearest saddle in a direction whose bright squares are the other ones."""
@@ -293,7 +293,7 @@ def _is_coloured_so(place: Int[np.ndarray, "n 2"], saddles: Saddles, board: Boar
     return votes > 0
 
 
-def _refined(image: UInt8[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+def _refine_corners(image: UInt8[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     """To a fraction of a pixel, in windows that hold no other corner."""
     spacing = float(np.median(cKDTree(pixels).query(pixels, k=2)[0][:, 1]))
     half = int(np.clip(_WINDOW * spacing, 2, 11))

@@ -144,10 +144,10 @@ def patches_of(
     """The patches of an image around the corners that were found in it."""
     points = on_board(board, places.points, bending_mm)
     pixels = camera.project(cam_from_board.apply(points))
-    inside = camera.contains(pixels, options.clear_px) & _beside(board, corner, places.points)
+    inside = camera.contains(pixels, options.clear_px) & _in_squares(board, corner, places.points)
     scale = _smallest_scale(camera, cam_from_board, points, places.clearance_mm)
     chosen = np.flatnonzero(inside & (places.clearance_mm * scale >= options.clear_px))
-    chosen = _spread(chosen, places.dark, options.patches // 2)
+    chosen = _spread_samples(chosen, places.dark, options.patches // 2)
     level, variance = _grey(image, pixels[chosen])
     return Patches(
         pixels=np.floor(pixels[chosen]) + 0.5,
@@ -165,7 +165,7 @@ def on_board(
     return bent(board, np.column_stack([places, -board.step_mm * board.terrace_at(places[:, 0])]), bending_mm)
 
 
-def _beside(board: Board, corner: Int[np.ndarray, "k"], places: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
+def _in_squares(board: Board, corner: Int[np.ndarray, "k"], places: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
     """Whether a place lies in one of the squares that meet in a corner that was seen: nothing hides these."""
     away, _ = cKDTree(board.corners[corner, :2]).query(places, p=np.inf)
     return np.asarray(away < board.square_mm)
@@ -182,7 +182,7 @@ def _smallest_scale(
     return np.asarray(np.sqrt(np.maximum(squares - np.sqrt(np.maximum(squares**2 - 4 * area**2, 0)), 0) / 2))
 
 
-def _spread(chosen: Int[np.ndarray, "n"], dark: Bool[np.ndarray, "m"], most: int) -> Int[np.ndarray, "k"]:
+def _spread_samples(chosen: Int[np.ndarray, "n"], dark: Bool[np.ndarray, "m"], most: int) -> Int[np.ndarray, "k"]:
     """So many of paper and of ink at most, spread over all."""
     tones = [chosen[dark[chosen] == tone] for tone in (False, True)]
     return np.concatenate(

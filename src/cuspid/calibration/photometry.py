@@ -192,7 +192,7 @@ def calibrate_light(
         )
         case = replace(case, lamps_known=False)
         fit = case.adjusted()
-    return _described(case, fit, {name: _share(~each.usable) for name, each in looked_at.items()}, notes)
+    return _describe(case, fit, {name: _share(~each.usable) for name, each in looked_at.items()}, notes)
 
 
 def _nothing(drawn: Handpiece | None, notes: Sequence[str]) -> Photometry:
@@ -342,7 +342,7 @@ class _Case:
 # --- what it is worth --------------------------------------------------------------------------------------------
 
 
-def _described(case: _Case, fit: Shading, clipped: Mapping[str, float], notes: list[str]) -> Photometry:
+def _describe(case: _Case, fit: Shading, clipped: Mapping[str, float], notes: list[str]) -> Photometry:
     halves = case.halves()
     apart = _apart(halves, len(case.names)) if halves else None
     fit = replace(fit, covariance=fit.covariance * max(1.0, apart or 0.0) ** 2)

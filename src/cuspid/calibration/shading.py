@@ -246,7 +246,7 @@ def adjust_shading(
         extra = extra + normal.extra_step
         before = sigma
         if learn:
-            sigma = _spread(extra, normal.extra_variance, sigma)
+            sigma = _degree_sigmas(extra, normal.extra_variance, sigma)
         steady = bool(np.all(np.abs(np.log(sigma / before)) < _STEADY))
         settled = float(normal.step @ normal.gradient) < _SETTLED and steady
     normal = _normal(samples, given, unknowns, extra, sigma, free)
@@ -312,7 +312,7 @@ def _normal(
     )
 
 
-def _spread(
+def _degree_sigmas(
     extra: Float[np.ndarray, "i t"], variance: Float[np.ndarray, "i t"], before: Float[np.ndarray, "d"]
 ) -> Float[np.ndarray, "d"]:
     """Standard deviations of the terms of each degree: the squares of the terms over how many of them the images tell

@@ -126,7 +126,7 @@ def joined(
     """
     numbered = {key: [view.renumbered(order) for order in board.orders] for key, view in views.items()}
     poses = {key: [board_pose(each, board, cameras[key[0]]) for each in numbered[key]] for key in views}
-    cam_from_rig = _chained(poses, list(cameras))
+    cam_from_rig = _chain_pairs(poses, list(cameras))
     rig_from_board, chosen = {}, {}
     for instant in instants:
         seeing = [name for name in cameras if (name, instant) in views]
@@ -202,7 +202,7 @@ def require_one_group(views: Collection[tuple[str, str]], cameras: Sequence[str]
         )
 
 
-def _chained(poses: Poses, cameras: Sequence[str]) -> dict[str, Rigid3]:
+def _chain_pairs(poses: Poses, cameras: Sequence[str]) -> dict[str, Rigid3]:
     """Each camera beside the first, along the pairs that saw the board together most often (a spanning tree)."""
     require_one_group(poses, cameras)
     seen = {name: {instant for camera, instant in poses if camera == name} for name in cameras}
@@ -211,11 +211,11 @@ def _chained(poses: Poses, cameras: Sequence[str]) -> dict[str, Rigid3]:
     while len(placed) < len(cameras):
         pair = next(each for each in common if len({*each} & set(placed)) == 1 and seen[each[0]] & seen[each[1]])
         known, new = pair if pair[0] in placed else pair[::-1]
-        placed[new] = _beside(poses, known, new, sorted(seen[known] & seen[new])) @ placed[known]
+        placed[new] = _average_relative_pose(poses, known, new, sorted(seen[known] & seen[new])) @ placed[known]
     return {name: placed[name] for name in cameras}
 
 
-def _beside(poses: Poses, known: str, new: str, instants: Sequence[str]) -> Rigid3:
+def _average_relative_pose(poses: Poses, known: str, new: str, instants: Sequence[str]) -> Rigid3:
     """``new_from_known``: of what each instant and numbering says, what the most instants agree with.
 
     Raises ReconstructionError where less than half of them do.

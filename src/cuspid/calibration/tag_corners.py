@@ -58,7 +58,7 @@ def find_tag_corners(
     outlines = {tag: each for tag, each in detect_tags(image, grid.border_bits).items() if tag in set(grid.ids.flat)}
     if not outlines or layout_agreement(outlines, grid) < _SO_MANY:
         return None
-    found = {tag: each for tag, outline in outlines.items() if (each := _refined(image, outline)) is not None}
+    found = {tag: each for tag, outline in outlines.items() if (each := _refine_tag(image, outline)) is not None}
     new = found
     while new:
         new = dict(_foretold(image, board, found, new))
@@ -119,7 +119,7 @@ def tag_beside(outlines: Mapping[int, Outline], tag: int, step: tuple[int, int],
     return others[int(np.argmin(away))] if away.min() < _NEAR else None
 
 
-def _refined(image: UInt8[np.ndarray, "h w"], outline: Outline) -> Outline | None:
+def _refine_tag(image: UInt8[np.ndarray, "h w"], outline: Outline) -> Outline | None:
     """The corners of a tag, each where the edges around it meet; None where one of them goes astray."""
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
     side = float(np.linalg.norm(outline - np.roll(outline, 1, axis=0), axis=1).min())
@@ -148,14 +148,14 @@ def _foretold(
         if homography is None:
             continue
         there = cv2.perspectiveTransform(own[None], homography)[0]
-        if not _inside(there, image):
+        if not _is_inside(there, image):
             continue
-        exact = _refined(image, there)
-        if exact is not None and _inside(exact, image) and _shows(image, exact, board.tag_bits(tag)):
+        exact = _refine_tag(image, there)
+        if exact is not None and _is_inside(exact, image) and _shows(image, exact, board.tag_bits(tag)):
             yield tag, exact
 
 
-def _inside(outline: Outline, image: UInt8[np.ndarray, "h w"]) -> bool:
+def _is_inside(outline: Outline, image: UInt8[np.ndarray, "h w"]) -> bool:
     size = np.array(image.shape[::-1]) - 1
     return bool(((outline > _BORDER_PX) & (outline < size - _BORDER_PX)).all())
 

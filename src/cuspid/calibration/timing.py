@@ -34,14 +34,14 @@ def follow_each_other(frame: Mapping[str, int]) -> bool:
 def untied(scene: BoardScene, frame: Mapping[str, int], views: Views) -> BoardScene:
     """A scene whose cameras need not have exposed together; as yet, without delays."""
     timing = Timing(frame=frame, near={}, by_camera=dict.fromkeys(scene.cameras, 0.0), by_view={})
-    return _followed(scene, timing, scene.rig_from_board, views)
+    return _choose_instants(scene, timing, scene.rig_from_board, views)
 
 
 def rolling(scene: BoardScene, frame: Mapping[str, int], views: Views) -> BoardScene:
     """A scene whose cameras may expose their rows one after the other; as yet, all at once."""
     together = Timing(frame=frame, near={}, by_camera=dict.fromkeys(scene.cameras, 0.0), by_view={}, together=True)
     timing = replace(scene.timing or together, readout=dict.fromkeys(scene.cameras, 0.0))
-    return _followed(scene, timing, scene.rig_from_board, views)
+    return _choose_instants(scene, timing, scene.rig_from_board, views)
 
 
 def adjust_scene(
@@ -50,18 +50,18 @@ def adjust_scene(
     """As ``adjust_board``, also where cameras need not have exposed together."""
     if start.timing is None:
         return adjust_board(start, views, board, only_boards=only_boards, keep_scales=keep_scales)
-    scene, tried = _followed(start, start.timing, start.rig_from_board, views), []
+    scene, tried = _choose_instants(start, start.timing, start.rig_from_board, views), []
     for _ in range(_ROUNDS):
         found = adjust_board(scene, views, board, only_boards=only_boards, keep_scales=keep_scales)
         timing = found.scene.timing or start.timing
         tried.append(timing.near)
-        scene = _followed(found.scene, timing, {**start.rig_from_board, **found.scene.rig_from_board}, views)
+        scene = _choose_instants(found.scene, timing, {**start.rig_from_board, **found.scene.rig_from_board}, views)
         if scene.timing is None or scene.timing.near in tried:
             return found
     return replace(found, settled=False)
 
 
-def _followed(scene: BoardScene, timing: Timing, poses: Mapping[str, Rigid3], views: Views) -> BoardScene:
+def _choose_instants(scene: BoardScene, timing: Timing, poses: Mapping[str, Rigid3], views: Views) -> BoardScene:
     """The board at the instants nearest to the views, which suffice for its path, and a delay of each view."""
     by_view = {key: timing.by_view.get(key, 0.0) for key in views}
     timing = replace(timing, by_view=by_view)

@@ -261,8 +261,8 @@ def _print(found: RigCalibration, out: Path) -> None:
     ):
         table.add_column(heading, justify="left" if heading in ("camera", "lens") else "right")
     for name, each in found.cameras.items():
-        apart = [_shown(value, 1) for value in (each.parameters_apart, each.place_apart)]
-        pixels = [_shown(value) for value in (each.rms_px, each.alone_px, each.held_out_px)]
+        apart = [_format_value(value, 1) for value in (each.parameters_apart, each.place_apart)]
+        pixels = [_format_value(value) for value in (each.rms_px, each.alone_px, each.held_out_px)]
         model = found.lenses[name].model
         table.add_row(name, model, str(each.views), str(each.corners), *pixels, ", ".join(apart))
     console.print(table)
@@ -283,7 +283,7 @@ def _print_light(light: Photometry) -> None:
         loss, sigma = each.corner_loss_pct, each.corner_loss_sigma_pct
         corner = "-" if loss is None or sigma is None else f"{-loss:.1f} ±{sigma:.1f}"
         gamma = f"{each.gamma:.2f} ±{each.gamma_sigma_pct:.1f}"
-        left = [_shown(value) for value in (each.noise_dn, each.before_pct, each.held_out_pct)]
+        left = [_format_value(value) for value in (each.noise_dn, each.before_pct, each.held_out_pct)]
         table.add_row(name, gain, corner, gamma, *left)
     console.print(table)
     found = [np.sqrt(np.diag(lamp.covariance)) for lamp in light.lights.values() if lamp.covariance is not None]
@@ -294,5 +294,5 @@ def _print_light(light: Photometry) -> None:
         )
 
 
-def _shown(value: float | None, digits: int = 2) -> str:
+def _format_value(value: float | None, digits: int = 2) -> str:
     return "-" if value is None else f"{value:.{digits}f}"

@@ -77,10 +77,10 @@ def _rows(plan: Plan, films: Films, looks: Mapping[str, Looks]) -> list[dict[str
             "frame": frame,
             "camera": camera,
             "source": films[camera].name(number),
-            "time_s": _known(plan.times_s[camera][number], 6),
-            "level_dn": _known(looks[camera].level_dn[number], 2),
-            "sharpness": _known(looks[camera].sharpness[number], 4),
-            "change_dn": _known(looks[camera].change_dn[number], 3),
+            "time_s": _format_value(plan.times_s[camera][number], 6),
+            "level_dn": _format_value(looks[camera].level_dn[number], 2),
+            "sharpness": _format_value(looks[camera].sharpness[number], 4),
+            "change_dn": _format_value(looks[camera].change_dn[number], 3),
             "left_out": reasons.get((frame, camera)),
         }
         for frame, numbers in plan.numbers.items()
@@ -108,7 +108,7 @@ def _figures(plan: Plan, films: Films, looks: Mapping[str, Looks], options: Impo
     }
 
 
-def _known(value: float, digits: int) -> float | None:
+def _format_value(value: float, digits: int) -> float | None:
     return round(float(value), digits) if np.isfinite(value) else None
 
 
@@ -129,7 +129,7 @@ def _print(plan: Plan, looks: Mapping[str, Looks], out: Path) -> None:
     for name, each in looks.items():
         began = "-" if plan.starts_frames is None else f"{plan.starts_frames[name]} frames"
         used = sum(name in frame.cameras for frame in plan.frames)
-        table.add_row(name, f"{len(each.level_dn)} frames", began, str(used), "; ".join(_named(plan, name)) or "-")
+        table.add_row(name, f"{len(each.level_dn)} frames", began, str(used), "; ".join(_drop_notes(plan, name)) or "-")
     console.print(table)
     if plan.apart_ms is not None:
         apart = f"{_median(plan.apart_ms):.1f} ms apart at the median, {_most(plan.apart_ms):.1f} at most"
@@ -137,7 +137,7 @@ def _print(plan: Plan, looks: Mapping[str, Looks], out: Path) -> None:
     console.print(f"{out}: {len(plan.frames)} frames of {len(looks)} cameras")
 
 
-def _named(plan: Plan, camera: str) -> Iterator[str]:
+def _drop_notes(plan: Plan, camera: str) -> Iterator[str]:
     """What was left out of a camera's images: ``2 blurred (00004, 00007)``."""
     bad = [each for each in plan.bad if each.camera == camera]
     for kind, count in kinds_of(bad).items():

@@ -54,7 +54,7 @@ def optics(
     rows = [_optics_row(name, lens, distance_mm, blur_px, baseline_mm) for name, lens in PRESETS.items()]
     if out is not None:
         storage.write_table(out, rows)
-    _print_rows(f"Miniature cameras at {distance_mm:g} mm", _turned(rows), digits=2)
+    _print_rows(f"Miniature cameras at {distance_mm:g} mm", _transpose(rows), digits=2)
     for name, lens in PRESETS.items():
         console.print(f"{name}: {lens.source}")
 
@@ -218,7 +218,7 @@ def _print_rows(title: str, rows: Sequence[Mapping[str, object]], *, digits: int
     Console().print(table)
 
 
-def _turned(rows: Sequence[Mapping[str, object]]) -> list[dict[str, object]]:
+def _transpose(rows: Sequence[Mapping[str, object]]) -> list[dict[str, object]]:
     """A row for each column but the first, whose cells become the names of the columns."""
     head, *names = rows[0]
     return [{head: name.replace("_", " "), **{str(row[head]): row[name] for row in rows}} for name in names]

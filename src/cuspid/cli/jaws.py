@@ -99,13 +99,13 @@ def prepare(
         tooth: FDI number of the one tooth to prepare.
         how: Kind of preparation.
     """
-    asked = _asked(preset_name, tooth, how)
+    asked = _preparations(preset_name, tooth, how)
     title = f"prepared: {', '.join(map(str, asked))}"
     prepared = _write_jaw(out, lambda: prepare_teeth(load_source(jaw, source), asked), title)
     save_preparation_picture(out.with_suffix(".teeth.png"), prepared, title=title)
 
 
-def _asked(name: str | None, tooth: int | None, how: PreparationOptions | None) -> dict[int, PreparationOptions]:
+def _preparations(name: str | None, tooth: int | None, how: PreparationOptions | None) -> dict[int, PreparationOptions]:
     if name is not None and tooth is None and how is None:
         return dict(preset(name))
     if name is None and tooth is not None and how is not None:

@@ -76,14 +76,14 @@ def live(
         working_distance_mm: Distance from the cameras to the teeth, for a rig_config.json, which does not contain it
             (guessed unless given).
     """
-    feed = (_watched if follow.watch else _replayed)(capture, handpiece, working_distance_mm, follow)
+    feed = (_watch_folder if follow.watch else _replay_capture)(capture, handpiece, working_distance_mm, follow)
     settings = {"follow": follow, "reconstruction": reconstruction}
     with storage.claimed_folder(out, "live", settings, {"handpiece": hash_handpiece(feed.handpiece)}):
-        taken = _followed(feed, out, reconstruction, _opened(view))
+        taken = _follow_feed(feed, out, reconstruction, _open_view(view))
     reconstruct_capture(taken, out, reconstruction)
 
 
-def _opened(options: ShowOptions) -> GrowingView | None:
+def _open_view(options: ShowOptions) -> GrowingView | None:
     if not options.show:
         return None
     view = GrowingView(options.host, options.port)
@@ -103,17 +103,17 @@ class _Feed:
     """Images that are missing so far, and why."""
 
 
-def _replayed(folder: Path, handpiece: Path | None, distance_mm: float | None, options: FollowOptions) -> _Feed:
+def _replay_capture(folder: Path, handpiece: Path | None, distance_mm: float | None, options: FollowOptions) -> _Feed:
     capture = storage.read_capture(folder, handpiece, distance_mm)
     return _Feed(
         handpiece=capture.handpiece,
         source=lambda: capture.source,
-        frames=_paced(capture, options.pace),
+        frames=_pace_frames(capture, options.pace),
         left_out=lambda: capture.left_out,
     )
 
 
-def _paced(capture: Capture, pace: float | None) -> Iterator[Frame]:
+def _pace_frames(capture: Capture, pace: float | None) -> Iterator[Frame]:
     begin = time.monotonic()
     first_s = capture.frames[0].time_s if capture.frames else None
     for number, frame in enumerate(capture.frames):
@@ -125,7 +125,7 @@ def _paced(capture: Capture, pace: float | None) -> Iterator[Frame]:
         yield frame
 
 
-def _watched(folder: Path, handpiece: Path | None, distance_mm: float | None, options: FollowOptions) -> _Feed:
+def _watch_folder(folder: Path, handpiece: Path | None, distance_mm: float | None, options: FollowOptions) -> _Feed:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give the one in which images/<camera>/<frame>.png appear")
     known = storage.read_handpiece(handpiece or folder / "handpiece.json", distance_mm)
@@ -153,14 +153,14 @@ def _arriving(arrivals: Arrivals, options: FollowOptions) -> Iterator[Frame | No
     yield from arrivals.rest()
 
 
-def _followed(feed: _Feed, out: Path, options: ReconstructionOptions, view: GrowingView | None) -> Capture:
+def _follow_feed(feed: _Feed, out: Path, options: ReconstructionOptions, view: GrowingView | None) -> Capture:
     """What came in, until it ends or Ctrl-C."""
     session: Session | None = None
     words, begin = _Words(), time.monotonic()
     try:
         for frame in feed.frames:
             if frame is None:
-                changed = {} if session is None else _corrected(session)
+                changed = {} if session is None else _describe_corrections(session)
             else:
                 session = session or Session(feed.handpiece, feed.source(), out, options)
                 changed = words.of(session.push(frame))
@@ -184,7 +184,7 @@ def _followed(feed: _Feed, out: Path, options: ReconstructionOptions, view: Grow
     return replace(session.capture, left_out=(*left_out, *session.capture.left_out))
 
 
-def _corrected(session: Session) -> Mapping[int, Mesh]:
+def _describe_corrections(session: Session) -> Mapping[int, Mesh]:
     try:
         return session.correct()
     except ReconstructionError as error:

@@ -35,7 +35,7 @@ def mouth(*, out: Path, handpiece: Path | None = None, options: Annotated[MouthO
     """
     inputs = {} if handpiece is None else {"handpiece": storage.hash_file(handpiece)}
     if handpiece is not None:
-        options = _sized(options, handpiece)
+        options = _read_handpiece_size(options, handpiece)
     with storage.claimed_folder(out, "mouth", {"mouth": options}, inputs, replace=True):
         report, people = study_mouths(options)
         storage.write_json(out / "mouth.json", report)
@@ -65,7 +65,7 @@ def mouth(*, out: Path, handpiece: Path | None = None, options: Annotated[MouthO
     _print_thesis(report)
 
 
-def _sized(options: MouthOptions, path: Path) -> MouthOptions:
+def _read_handpiece_size(options: MouthOptions, path: Path) -> MouthOptions:
     device = storage.read_handpiece(path)
     if device.body is None:
         raise InputError(

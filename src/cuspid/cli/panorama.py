@@ -64,7 +64,7 @@ def stitch(
 
 def _stitch_frames(frames: Path, out: Path, calibration: Path | None, options: StitchOptions) -> None:
     with show_progress() as progress:
-        sequence = _read(frames, out, calibration, progress)
+        sequence = _read_frames(frames, out, calibration, progress)
         hashes = _hashes(sequence, calibration)
         with storage.claimed_folder(out, "stitch", {"stitch": options}, hashes, replace=True):
             parts = panorama_pipeline.stitch(sequence, options, progress=progress)
@@ -112,7 +112,7 @@ def _view_mesh(path: Path, out: Path, unit: storage.Unit, options: MeshViewOptio
         console.print(f"note: {note}")
 
 
-def _read(frames: Path, out: Path, calibration: Path | None, progress: Progress) -> ImageSequence:
+def _read_frames(frames: Path, out: Path, calibration: Path | None, progress: Progress) -> ImageSequence:
     """The frames; those of a video are decoded into the folder of the results, which is home to this video alone."""
     read = partial(storage.read_sequence, frames, out / "frames", calibration=calibration, progress=progress)
     if not frames.is_file():

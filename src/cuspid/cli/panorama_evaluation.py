@@ -84,7 +84,7 @@ def _save_picture(path: Path, view: ReferenceRender, comparison: PanoramaCompari
         places * [1, -1] / view.mm_per_px + view.origin_px,
         comparison.errors_mm,
         title=f"{score.method}: {score.frames_used} of {score.frames} frames" if score.frames else score.method,
-        captions=("reference render of the true jaw", _pictured(score), _measured(score)),
+        captions=("reference render of the true jaw", _draw_score(score), _format_score(score)),
     )
 
 
@@ -95,7 +95,7 @@ def _save_beside(out: Path, view: ReferenceRender, comparison: PanoramaCompariso
         storage.write_image(out / "made.png", np.rint(255 * np.clip(comparison.aligned, 0, 1)).astype(np.uint8))
 
 
-def _pictured(score: PanoramaScore) -> str:
+def _draw_score(score: PanoramaScore) -> str:
     if score.failure or score.picture is None:
         return f"failed: {score.failure}"
     one = score.picture
@@ -104,7 +104,7 @@ def _pictured(score: PanoramaScore) -> str:
     )
 
 
-def _measured(score: PanoramaScore) -> str:
+def _format_score(score: PanoramaScore) -> str:
     if score.geometry is None:
         return "geometric error not known"
     found = score.geometry
@@ -125,7 +125,7 @@ def _print(score: PanoramaScore) -> None:
     if score.failure:
         console.print(f"failed: {score.failure}", style="red")
         return
-    console.print(_measured(score) if score.geometry is None else f"geometric {_measured(score)}")
+    console.print(_format_score(score) if score.geometry is None else f"geometric {_format_score(score)}")
     _print_extent(score)
     for note in score.notes:
         console.print(f"note: {note}")

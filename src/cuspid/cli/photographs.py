@@ -30,7 +30,7 @@ def reconstruct_photographs(
     """Reconstruct, and tell how it went. ``model``: a COLMAP model, whose poses are taken."""
     settings = {"reconstruction": options, "photographs": photographs, "scale": scale, "from_poses": model}
     with show_progress() as progress:
-        given = _read(source, out, handpiece, progress)
+        given = _read_photographs(source, out, handpiece, progress)
     inputs = storage.hash_photographs(given) | ({} if model is None else {"poses": hash_sparse(model)})
     with storage.claimed_folder(out, "reconstruct", settings, inputs):
         with show_progress() as progress:
@@ -52,7 +52,7 @@ def reconstruct_photographs(
         )
 
 
-def _read(source: Path, out: Path, handpiece: Path | None, progress: Progress) -> Photographs:
+def _read_photographs(source: Path, out: Path, handpiece: Path | None, progress: Progress) -> Photographs:
     """The photographs; a video is decoded into the output folder first."""
     if source.is_dir():
         return storage.read_photographs(source, out / "frames", handpiece=handpiece, progress=progress)

@@ -117,10 +117,10 @@ def _sources(
     if rehearse is not None and named:
         raise InputError("record: --rehearse simulates cameras; leave out --cameras")
     if rehearse is not None:
-        return _rehearsed(rehearse, form, board)
+        return _simulate_cameras(rehearse, form, board)
     found = dict[str, tuple[str, CameraSource]]()
     for each in named:
-        name, source = _parsed(each)
+        name, source = _parse_camera(each)
         if name in found:
             raise InputError(f"record: --cameras {each}: two cameras are named {name}; give names: left={source}")
         twice = next(
@@ -132,7 +132,7 @@ def _sources(
     return {name: camera for name, (_, camera) in found.items()}
 
 
-def _parsed(said: str) -> tuple[str, str]:
+def _parse_camera(said: str) -> tuple[str, str]:
     """Name and source of a camera."""
     name, is_named, source = said.rpartition("=")
     source = f"/dev/video{source}" if source.isascii() and source.isdigit() else source
@@ -148,7 +148,7 @@ def _source(name: str, source: str, form: FormatOptions) -> CameraSource:
     return V4L2Camera(source, form)
 
 
-def _rehearsed(handpiece: Path, form: FormatOptions, board: Target) -> dict[str, CameraSource]:
+def _simulate_cameras(handpiece: Path, form: FormatOptions, board: Target) -> dict[str, CameraSource]:
     if not isinstance(board, Board):
         raise InputError("record: --rehearse shows one board; describe one")
     known = storage.read_handpiece(handpiece)

@@ -49,7 +49,7 @@ def rescale(
     """
     if not distance:
         raise InputError("rescale: give at least one --distance U1 V1 U2 V2 MM")
-    measured = tuple(_measured(each) for each in distance)
+    measured = tuple(_parse_distance(each) for each in distance)
     if out.resolve() == panorama.resolve():
         raise InputError(f"rescale: {out}: is the panorama itself; give another folder as --out")
     if not (panorama / "panorama.json").exists() and (panorama / "part-1").is_dir():
@@ -69,7 +69,7 @@ def rescale(
     report(out)
 
 
-def _measured(given: tuple[float, float, float, float, float]) -> MeasuredDistance:
+def _parse_distance(given: tuple[float, float, float, float, float]) -> MeasuredDistance:
     """A distance of the command line."""
     if given[-1] < _LEAST_MM:
         raise InputError(f"rescale: --distance: {given[-1]:g} mm; it must be {_LEAST_MM} mm or more")

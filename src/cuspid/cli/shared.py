@@ -117,10 +117,10 @@ def load_probe(probe: Probe) -> Handpiece:
         distance_mm = probe.working_distance_mm or DesignOptions.working_distance_mm
         options = DesignOptions(working_distance_mm=distance_mm, lights=probe.lights or "white")
         device = build_handpiece(probe.design, options)
-    return device if probe.scale == 1 else _scaled(device, probe.scale)
+    return device if probe.scale == 1 else _scale_images(device, probe.scale)
 
 
-def _scaled(device: Handpiece, scale: float) -> Handpiece:
+def _scale_images(device: Handpiece, scale: float) -> Handpiece:
     scaled = device.scaled(scale)
     for name, mounted in scaled.rig.cameras.items():
         if min(mounted.camera.width, mounted.camera.height) < _SMALLEST_PX:

@@ -115,7 +115,7 @@ def _print_survey(found: Survey) -> None:
         groups.add_column(column, justify="left" if column == "group" else "right", no_wrap=True)
     for group, cells in found.groups.items():
         count = str(max(cell.count for cell in cells.values()))
-        groups.add_row(group, count, *(_spread(cells.get(name)) for name in DIMENSIONS))
+        groups.add_row(group, count, *(_format_spread(cells.get(name)) for name in DIMENSIONS))
     Console().print(groups)
     for jaw in found.jaws:
         for flag in (*jaw.notes, *implausible(jaw)):
@@ -130,7 +130,7 @@ def _length(found: Dimension | None) -> str:
     return f"{found.value_mm:.2f}" if found.sigma_mm is None else f"{found.value_mm:.1f}±{found.sigma_mm:.1f}"
 
 
-def _spread(cell: GroupStatistics | None) -> str:
+def _format_spread(cell: GroupStatistics | None) -> str:
     if cell is None:
         return "-"
     return f"{cell.mean_mm:.1f}" + ("" if cell.std_mm is None else f"±{cell.std_mm:.1f}")
@@ -159,7 +159,7 @@ def shape(
     files, labelling = jaw_files(jaws), Labelling(numbering=labels, label_map=label_map)
     hashes = {path.name: storage.hash_file(path) for path in _of_different_names(files)}
     with storage.claimed_folder(out, "shape", {"shape": options}, hashes, replace=True), show_progress() as progress:
-        samples = {path.stem: _loaded(path, unit, arch, labelling) for path in files}
+        samples = {path.stem: _load_jaw(path, unit, arch, labelling) for path in files}
         model = mean_shape(samples, options, progress=progress)
         storage.write_shape_model(out, model)
         save_picture(out / "mean.png", model.mean.mesh, title=f"Mean of {len(samples)} jaws")
@@ -169,7 +169,7 @@ def shape(
     report(out)
 
 
-def _loaded(path: Path, unit: storage.Unit, arch: Arch | None, labelling: Labelling) -> Jaw:
+def _load_jaw(path: Path, unit: storage.Unit, arch: Arch | None, labelling: Labelling) -> Jaw:
     jaw, notes = load_landmarked_jaw(path, unit=unit, arch=arch, labelling=labelling)
     for note in notes:
         console.print(f"note: {path.stem}: {note}")

@@ -46,7 +46,7 @@ def show_help(prog: str, command: Callable[..., None], given: Sequence[str] = ()
 
 def described(command: Callable[..., None], *, every: bool = True) -> tuple[Callable[..., None], ConstructorRegistry]:
     """A verb as tyro should describe it, with the registry that it needs."""
-    near = frozenset(_undotted(command))
+    near = frozenset(_flat_option_classes(command))
 
     def describe(name: str, hint: Any, default: object) -> Any:
         if default in (tyro.MISSING, Parameter.empty):
@@ -84,7 +84,7 @@ def described(command: Callable[..., None], *, every: bool = True) -> tuple[Call
     return shown, registry
 
 
-def _undotted(command: Callable[..., None]) -> Iterator[Any]:
+def _flat_option_classes(command: Callable[..., None]) -> Iterator[Any]:
     """Classes of options whose fields have no dot in their names."""
     waiting = [(hint, ()) for hint in get_type_hints(command, include_extras=True).values()]
     while waiting:

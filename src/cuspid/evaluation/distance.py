@@ -59,7 +59,7 @@ class SignedDistance:
         one, other = (self.mesh.faces[faces, (opposite + step) % 3] for step in (1, 2))
         return np.minimum(one, other) * len(self.mesh.vertices) + np.maximum(one, other)
 
-    def _shared(self, keys: Int[np.ndarray, "n"]) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+    def _index_edges(self, keys: Int[np.ndarray, "n"]) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
         """Where the faces of each edge begin among all, and how many there are."""
         ordered, _ = self._edges
         begin = np.searchsorted(ordered, keys)
@@ -80,7 +80,7 @@ class SignedDistance:
 
     def _edge_normals(self, keys: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
         """Sums of the normals of the faces that share each edge."""
-        (begin, counts), faces = self._shared(keys), self._edges[1]
+        (begin, counts), faces = self._index_edges(keys), self._edges[1]
         summed = np.zeros((len(keys), 3))
         for turn in range(counts.max(initial=0)):
             more = turn < counts
@@ -128,7 +128,7 @@ class SignedDistance:
         corner = self.mesh.faces[faces, np.argmin(on_edge, axis=1)]
         at_border = (on_edge.sum(axis=1) >= 2) & self._border_vertices[corner]
         points, opposite = np.nonzero(on_edge)
-        _, counts = self._shared(self._edge_keys(faces[points], opposite))
+        _, counts = self._index_edges(self._edge_keys(faces[points], opposite))
         at_border[points[counts == 1]] = True
         return np.asarray(at_border)
 

@@ -328,7 +328,7 @@ def image_scores(
     frames saw."""
     black = np.where(shown, picture, 0.0)
     raw = _ssim_map(black, truth)
-    on_teeth = _ssim_map(np.where(shown, _fitted(picture, truth, shown & teeth), 0.0), truth)
+    on_teeth = _ssim_map(np.where(shown, _fit_gain_offset(picture, truth, shown & teeth), 0.0), truth)
     gain = float(np.sum(black * truth)) / max(float(np.sum(black**2)), 1e-12)
     on_canvas = _ssim_map(np.clip(gain * black, 0, 1), truth)
     return ImageScores(
@@ -349,7 +349,7 @@ def _zncc(a: Float[np.ndarray, "n"], b: Float[np.ndarray, "n"]) -> float:
     return float(a @ b) / spread if spread > 1e-9 * len(a) else 0.0
 
 
-def _fitted(
+def _fit_gain_offset(
     picture: Float[np.ndarray, "h w"], truth: Float[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w"]:
     """The picture with the gain and offset that bring it nearest to the truth, in least squares."""
@@ -474,34 +474,34 @@ class _Comparison:
     def by_geometry(self, traced: TracedPixels) -> PanoramaComparison:
         """The alignment from where the pixels truly are."""
         if len(traced.labels) < FEWEST_TEETH_PX:
-            return self._failed(f"only {len(traced.labels)} of the sampled pixels show teeth")
+            return self._failure(f"only {len(traced.labels)} of the sampled pixels show teeth")
         plane_from_panorama = Similarity2.best(traced.placed, traced.true_mm[:, :2])
         errors = np.linalg.norm(plane_from_panorama.apply(traced.placed) - traced.true_mm[:, :2], axis=1)
-        failure = self._too_few_frames() or self._collapsed(plane_from_panorama.scale, float(np.median(errors)))
+        failure = self._too_few_frames() or self._collapse_reason(plane_from_panorama.scale, float(np.median(errors)))
         if failure:
-            return self._failed(failure)
+            return self._failure(failure)
         shot_from_panorama = None
         if self.shot is not None:
             on_plane = self.shot.on_plane(traced.true_mm)
             shot_from_panorama = Similarity2.best(traced.placed, on_plane)
         geometry = self._geometry(errors, plane_from_panorama.scale, *own_direction(traced.placed, traced.true_mm))
         molars = inter_molar_error(traced, 1.0 if self.panorama.mm_per_px else plane_from_panorama.scale)
-        made = self._scored(plane_from_panorama, shot_from_panorama, geometry=geometry, inter_molar_error_mm=molars)
+        made = self._score(plane_from_panorama, shot_from_panorama, geometry=geometry, inter_molar_error_mm=molars)
         return replace(made, points_mm=traced.true_mm[:, :2], errors_mm=errors)
 
     def by_pictures(self) -> PanoramaComparison:
         """The alignment by features; the geometric error stays unknown."""
         plane_from_panorama = align_by_pictures(self.panorama, self.view)
         if plane_from_panorama is None:
-            return self._failed(f"fewer than {FEWEST_MATCHES} image features agree with the true jaw")
-        failure = self._too_few_frames() or self._collapsed(plane_from_panorama.scale, 0.0)
+            return self._failure(f"fewer than {FEWEST_MATCHES} image features agree with the true jaw")
+        failure = self._too_few_frames() or self._collapse_reason(plane_from_panorama.scale, 0.0)
         if failure:
-            return self._failed(failure)
+            return self._failure(failure)
         on_shot = None if self.shot is None else align_by_pictures(self.panorama, self.shot)
-        if on_shot is not None and self._collapsed(on_shot.scale, 0.0):
+        if on_shot is not None and self._collapse_reason(on_shot.scale, 0.0):
             on_shot = None
         note = "aligned by image features: without the frames of its pixels, its geometric error is unknown"
-        made = self._scored(plane_from_panorama, on_shot)
+        made = self._score(plane_from_panorama, on_shot)
         return replace(made, score=replace(made.score, aligned_by="pictures", notes=(*made.score.notes, note)))
 
     def _too_few_frames(self) -> str | None:
@@ -510,7 +510,7 @@ class _Comparison:
             return f"only {used} of {frames} frames are placed"
         return None
 
-    def _collapsed(self, scale: float, median_mm: float) -> str | None:
+    def _collapse_reason(self, scale: float, median_mm: float) -> str | None:
         if median_mm > self.options.worst_median_mm:
             return f"no arch: half of its tooth pixels lie more than {median_mm:.1f} mm from where they should"
         most = self.options.largest_scale
@@ -539,7 +539,7 @@ class _Comparison:
             own_p95_mm=float(np.percentile(own_errors, 95)),
         )
 
-    def _scored(
+    def _score(
         self, plane_from_panorama: Similarity2, shot_from_panorama: Similarity2 | None, **figures: Any
     ) -> PanoramaComparison:
         laid, shown = lay_over(self.panorama, self.view, plane_from_panorama)
@@ -570,7 +570,7 @@ class _Comparison:
         found = [int(number) for number in np.unique(numbers) if number != NOTHING]
         return {number: 100 * float(shown[numbers == number].mean()) for number in found}
 
-    def _failed(self, reason: str) -> PanoramaComparison:
+    def _failure(self, reason: str) -> PanoramaComparison:
         score = replace(self._blank(), failure=reason)
         return PanoramaComparison(score=score, aligned=None, points_mm=np.zeros((0, 2)), errors_mm=np.zeros(0))
 

@@ -94,8 +94,8 @@ def compare_pair(first: Mesh, second: Mesh, options: PairOptions, *, rng: np.ran
     if options.align:
         points, _ = second.sample(options.registration.samples, rng)
         second = second.transformed(refine(points, surface, Rigid3.identity(), options.registration))
-    onto_first, first_common = _signed(second, surface, options, rng)
-    onto_second, second_common = _signed(first, SignedDistance(second), options, rng)
+    onto_first, first_common = _signed_distances(second, surface, options, rng)
+    onto_second, second_common = _signed_distances(first, SignedDistance(second), options, rng)
     common = np.concatenate([first_common, second_common])
     if not common.any():
         raise InputError("repeatability: two scans have no surface in common; check that both show the same teeth")
@@ -103,7 +103,7 @@ def compare_pair(first: Mesh, second: Mesh, options: PairOptions, *, rng: np.ran
     return PairDeviation(deviation=statistics(signed_mm), common_pct=float(100 * common.mean()))
 
 
-def _signed(
+def _signed_distances(
     scan: Mesh, surface: SignedDistance, options: PairOptions, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
     """Signed distances of points of a scan from a surface, and which of them the surface has, too."""

@@ -85,7 +85,7 @@ def find_poses(moving: Mesh, fixed: Mesh, options: SearchOptions, *, rng: np.ran
     table = _table(_cloud(fixed, 30_000, smoothing_mm, rng), 1.5 * cap_mm)
     poses = _try_all(cloud, table, cap_mm, options)
     for fraction in np.geomspace(1.0, 0.2, 12):
-        poses = _improved(poses, cloud, table, fraction * cap_mm)
+        poses = _step_point_to_plane(poses, cloud, table, fraction * cap_mm)
     order = np.argsort(_scores(poses, cloud, table, 0.2 * cap_mm), kind="stable")
     return _distinct(poses[order], cloud.points[:50], 0.05 * reach_mm, options.finalists)
 
@@ -115,7 +115,7 @@ def _frames(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
     return np.ascontiguousarray(np.swapaxes(axes_about(normals), 1, 2))
 
 
-def _spread(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, "k"]:
+def _farthest_points(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, "k"]:
     """Farthest-point sampling that begins at the point nearest the centroid."""
     picks = [int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
     distances = np.full(len(points), np.inf)
@@ -127,7 +127,7 @@ def _spread(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, "k"
 
 def _try_all(cloud: _Cloud, table: _Table, cap_mm: float, options: SearchOptions) -> Float[np.ndarray, "k 3 4"]:
     """The best poses of anchors x targets x turns."""
-    anchors = _spread(cloud.points[:1000], options.anchors)
+    anchors = _farthest_points(cloud.points[:1000], options.anchors)
     targets = table.cloud.points[: options.targets]
     target_frames = _frames(table.cloud.smooth_normals[: options.targets])
     angles = np.deg2rad(np.arange(0, 360, options.turn_step_deg))
@@ -192,7 +192,7 @@ def _distance(turned, k, i, targets, frames, t, fixed, nearest, origin, pitch, c
     return np.sqrt(squared) / cap
 
 
-def _moved(poses: Float[np.ndarray, "k 3 4"], vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k n 3"]:
+def _perturb_poses(poses: Float[np.ndarray, "k 3 4"], vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k n 3"]:
     return np.einsum("kij,nj->kni", poses[:, :, :3], vectors) + poses[:, None, :, 3]
 
 
@@ -202,14 +202,14 @@ def _pairs(
     Float[np.ndarray, "k n 3"], Float[np.ndarray, "k n 3"], Float[np.ndarray, "k n 3"], Float[np.ndarray, "k n"]
 ]:
     """Moved points, their offsets from the nearest fixed points, the normals there, and how far the normals agree."""
-    moved = _moved(poses, cloud.points[:count])
+    moved = _perturb_poses(poses, cloud.points[:count])
     nearest = table.look_up(moved)
     normals = table.cloud.normals[nearest]
     agreement = np.einsum("kni,kij,nj->kn", normals, poses[:, :, :3], cloud.normals[:count], optimize=True)
     return moved, moved - table.cloud.points[nearest], normals, agreement
 
 
-def _improved(
+def _step_point_to_plane(
     poses: Float[np.ndarray, "k 3 4"], cloud: _Cloud, table: _Table, cap_mm: float
 ) -> Float[np.ndarray, "k 3 4"]:
     """One damped point-to-plane step for each pose."""
@@ -237,7 +237,7 @@ def _distinct(
     poses: Float[np.ndarray, "k 3 4"], probes: Float[np.ndarray, "n 3"], apart_mm: float, count: int
 ) -> list[Rigid3]:
     """The first poses that differ from all before by more than ``apart_mm`` on the probes."""
-    moved = _moved(poses, probes)
+    moved = _perturb_poses(poses, probes)
     kept: list[int] = []
     for k in range(len(poses)):
         if all(np.linalg.norm(moved[k] - moved[other], axis=1).mean() > apart_mm for other in kept):

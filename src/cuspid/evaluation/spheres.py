@@ -346,9 +346,9 @@ def _report(
         spacing_rms_um=float(np.sqrt(np.mean(error**2))),
         scale_ppm=float(1000 * slope),
         spacing_rms_without_scale_um=float(np.sqrt(np.mean((error - slope * distance) ** 2))),
-        inter_canine_um=_across(error_um, 3),
-        inter_first_molar_um=_across(error_um, 6),
-        inter_second_molar_um=_across(error_um, 7),
+        inter_canine_um=_span_error(error_um, 3),
+        inter_first_molar_um=_span_error(error_um, 6),
+        inter_second_molar_um=_span_error(error_um, 7),
         cross_arch_um={f"{a}-{b}": error_um[pair] for a, b in crossing if (pair := frozenset((a, b))) in error_um},
         notes=_notes(options),
     )
@@ -362,7 +362,7 @@ def _spacing(
     return SphereSpacing(first=first, second=second, nominal_mm=expected, error_um=1000 * (measured - expected))
 
 
-def _across(error_um: Mapping[frozenset[str], float], position: int) -> float | None:
+def _span_error(error_um: Mapping[frozenset[str], float], position: int) -> float | None:
     """Error of the distance between the two spheres at a tooth position."""
     pairs = (frozenset((f"{one}{position}", f"{other}{position}")) for one, other in _SIDES)
     return next((error_um[pair] for pair in pairs if pair in error_um), None)

@@ -272,10 +272,10 @@ def cameras_there(root: Path = Path("/dev")) -> tuple[FoundCamera, ...]:
     """The cameras that are plugged in; devices that deliver no images, as of metadata, are left out."""
     devices = [path for path in root.glob("video*") if re.fullmatch(r"video\d+", path.name)]
     ordered = sorted(devices, key=lambda path: int(path.name.removeprefix("video")))
-    return tuple(found for device in ordered if (found := _asked(device, root)) is not None)
+    return tuple(found for device in ordered if (found := _query_device(device, root)) is not None)
 
 
-def _asked(device: Path, root: Path) -> FoundCamera | None:
+def _query_device(device: Path, root: Path) -> FoundCamera | None:
     """What a device says of itself; None where it is no camera, or may not be asked."""
     import fcntl  # only where there are such devices
 

@@ -130,11 +130,11 @@ def plan_import(
     ]
     is_kept = [options.sync.sync == "none" or len(films) == 1 or len(instant.numbers) > 1 for instant in every]
     notes += _alone([instant for instant, kept in zip(every, is_kept, strict=True) if not kept])
-    chosen = _selected(np.flatnonzero(is_kept).tolist(), clock, options.selection)
+    chosen = _select_instants(np.flatnonzero(is_kept).tolist(), clock, options.selection)
     wrong = {camera: faults(each, options.quality) for camera, each in looks.items()}
     lit = _lightings(every, clock, options.lightings, handpiece)
     taken = [(every[k], _time(clock, k), lit[k]) for k in chosen]
-    frames, bad = _judged(taken, wrong, handpiece)
+    frames, bad = _judge_frames(taken, wrong, handpiece)
     return Plan(
         frames=frames,
         numbers={every[k].name: every[k].numbers for k in chosen},
@@ -215,7 +215,7 @@ def _names(films: Films, counts: Mapping[str, int]) -> dict[str, list[str]]:
     return names
 
 
-def _selected(instants: Sequence[int], clock: Clock | None, options: SelectionOptions) -> list[int]:
+def _select_instants(instants: Sequence[int], clock: Clock | None, options: SelectionOptions) -> list[int]:
     """Those of the instants that are asked for. Raises InputError where none is, or times are not known."""
     if options.start_s is None and options.end_s is None:
         return list(instants[:: options.every])
@@ -257,7 +257,7 @@ def _lightings(
     return [in_turn[turn] for turn in turns]
 
 
-def _judged(
+def _judge_frames(
     taken: Sequence[tuple[Instant, float | None, str | None]],
     wrong: Mapping[str, Mapping[int, str]],
     handpiece: Handpiece,

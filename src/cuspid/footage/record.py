@@ -100,8 +100,8 @@ class Recording:
         self._folder.mkdir(parents=True, exist_ok=True)
         with AppendedTable(self._folder / TABLE, ("camera", "frame", "time")) as table:
             queues: dict[str, Queue[_Item]] = {name: Queue() for name in self._cameras}
-            takers = [Thread(target=self._guarded, args=(self._take, each, slots, queues[each])) for each in queues]
-            writers = [Thread(target=self._guarded, args=(self._write, each, queues[each], table)) for each in queues]
+            takers = [Thread(target=self._guard, args=(self._take, each, slots, queues[each])) for each in queues]
+            writers = [Thread(target=self._guard, args=(self._write, each, queues[each], table)) for each in queues]
             for thread in (*takers, *writers):
                 thread.daemon = True  # a camera that hangs does not hold the program
                 thread.start()
@@ -138,7 +138,7 @@ class Recording:
 
     # --- in threads ----------------------------------------------------------------------------------------------
 
-    def _guarded(self, work: Callable[..., None], name: str, *given: object) -> None:
+    def _guard(self, work: Callable[..., None], name: str, *given: object) -> None:
         """The first error of any thread ends the recording."""
         try:
             work(name, *given)

@@ -73,7 +73,7 @@ def _looks(film: Film, options: DevelopmentOptions, progress: Progress) -> Looks
     size, before = None, None
     for frame in frames_of(film, options):
         time = np.nan if frame.time_s is None else frame.time_s
-        shown, highest = _seen(frame, options)
+        shown, highest = _judge_image(frame, options)
         if shown is None:
             rows[frame.number] = (time, *[np.nan] * 6)
         elif shown.shape != (size or shown.shape):
@@ -90,7 +90,7 @@ def _looks(film: Film, options: DevelopmentOptions, progress: Progress) -> Looks
     )
 
 
-def _seen(frame: FilmFrame, options: DevelopmentOptions) -> tuple[np.ndarray | None, float]:
+def _judge_image(frame: FilmFrame, options: DevelopmentOptions) -> tuple[np.ndarray | None, float]:
     """A frame as it is judged, None where it cannot be read; and its largest value, 0 of 8 bits."""
     try:
         stored = frame.stored()

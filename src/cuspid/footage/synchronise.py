@@ -99,7 +99,7 @@ def by_starts(starts: Mapping[str, int], counts: Mapping[str, int]) -> tuple[Ins
     running = [
         {camera: k - start for camera, start in starts.items() if 0 <= k - start < counts[camera]} for k in range(last)
     ]
-    return _numbered(running)
+    return _number_groups(running)
 
 
 def by_times(times_s: Signals, options: SyncOptions) -> tuple[Instant, ...]:
@@ -132,7 +132,7 @@ def by_times(times_s: Signals, options: SyncOptions) -> tuple[Instant, ...]:
             f"no image of {alone[0]} was taken within {1000 * apart_s:.0f} ms of an image of another camera ({spans}); "
             "give times from a single clock, or --sync flash or motion"
         )
-    return _numbered(groups)
+    return _number_groups(groups)
 
 
 def one_by_one(counts: Mapping[str, int], times_s: Signals) -> tuple[Instant, ...]:
@@ -143,7 +143,7 @@ def one_by_one(counts: Mapping[str, int], times_s: Signals) -> tuple[Instant, ..
     return tuple(Instant(name=f"{camera}_{number:05d}", numbers={camera: number}) for camera, number in images)
 
 
-def _numbered(groups: Sequence[Mapping[str, int]]) -> tuple[Instant, ...]:
+def _number_groups(groups: Sequence[Mapping[str, int]]) -> tuple[Instant, ...]:
     return tuple(Instant(name=f"{k:05d}", numbers=numbers) for k, numbers in enumerate(groups))
 
 
@@ -246,9 +246,9 @@ def flashes_of(camera: str, brightness: Float[np.ndarray, "_"], options: SyncOpt
     """The first frame of each flash, in order. Raises InputError where there is none, or brightness always rises."""
     if len(brightness) < 6:
         raise InputError(f"{camera}: {len(brightness)} frames are too few to find a flash")
-    rises = _rises(_filled(brightness))
+    rises = _rises(_fill_gaps(brightness))
     top = int(rises.argmax())
-    usual = _spread(np.diff(_filled(brightness)))
+    usual = _robust_sigma(np.diff(_fill_gaps(brightness)))
     least = max(_LEAST_DN, options.flash_sigmas * usual)
     if rises[top] < least:
         raise InputError(
@@ -323,7 +323,7 @@ def offset_between(one: Float[np.ndarray, "m"], other: Float[np.ndarray, "n"], o
     heights = np.where(usable, found * np.sqrt(overlaps), -np.inf)
     best = int(heights.argmax())
     far = usable & (np.abs(offsets - offsets[best]) > 3)
-    usual = _spread(heights[far])
+    usual = _robust_sigma(heights[far])
     sigmas = float(heights[best] / usual) if usual > 0 else 0.0
     second_best = int(np.where(far, heights, -np.inf).argmax())
     frames = int(offsets[best])
@@ -368,13 +368,13 @@ def _correlations(
 
 def _quick(signal: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """What changes quickly, in its usual size; NaN where there was none."""
-    logs = np.log(_filled(signal) + 0.1)
+    logs = np.log(_fill_gaps(signal) + 0.1)
     quick = logs - median_filter(logs, _SLOW, mode="nearest")
     scale = quick.std()
     return np.where(np.isfinite(signal), quick / scale if scale > 0 else np.nan, np.nan)
 
 
-def _filled(signal: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def _fill_gaps(signal: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """With a straight line where there is nothing."""
     known = np.flatnonzero(np.isfinite(signal))
     if not len(known):
@@ -382,7 +382,7 @@ def _filled(signal: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     return np.interp(np.arange(len(signal)), known, signal[known])
 
 
-def _spread(values: Float[np.ndarray, "n"]) -> float:
+def _robust_sigma(values: Float[np.ndarray, "n"]) -> float:
     """Standard deviation, from the median of the deviations."""
     return float(1.4826 * np.median(np.abs(values - np.median(values))))
 

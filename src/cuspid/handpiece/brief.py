@@ -204,7 +204,7 @@ def parse_brief(content: Mapping[str, Any]) -> DesignBrief:
         "[surfaces] must hold lines like name = share",
     )
     values["surfaces"] = {surface: float(share) for surface, share in shares.items()}
-    return DesignBrief(**_typed(values, DesignBrief, ""))
+    return DesignBrief(**_convert_types(values, DesignBrief, ""))
 
 
 def _sensor(given: object) -> Optics:
@@ -224,17 +224,17 @@ def _figures(own: dict[str, Any], *, complete: bool) -> dict[str, Any]:
     needed = {each.name for each in fields(Optics) if each.default is MISSING} - {"name"} if complete else set()
     _check(not set(own) - known, f"sensor: unknown key {one_line(', '.join(sorted(set(own) - known)))}")
     _check(not needed - set(own), f"sensor: {', '.join(sorted(needed - set(own)))} missing; give them or name a preset")
-    return _typed(own, Optics, "sensor.")
+    return _convert_types(own, Optics, "sensor.")
 
 
 def _table(given: object, kind: type, name: str) -> Any:
     _check(isinstance(given, Mapping), f"{name} must be a table, [{name}]")
     values = dict(given)  # type: ignore[call-overload]
     _check_keys(values, kind, f"[{name}]")
-    return kind(**_typed(values, kind, f"{name}."))
+    return kind(**_convert_types(values, kind, f"{name}."))
 
 
-def _typed(values: Mapping[str, Any], kind: type, where: str) -> dict[str, Any]:
+def _convert_types(values: Mapping[str, Any], kind: type, where: str) -> dict[str, Any]:
     """Whole numbers where a length may have decimals become such; what is no number where one belongs is refused."""
     typed = dict(values)
     for each in fields(kind):

@@ -126,7 +126,7 @@ def _handpiece(name: str, views: Mapping[str, Rigid3], options: DesignOptions) -
     cameras: dict[str, MountedCamera] = {}
     for prefix, group_from_rig in views.items():
         cameras |= _group_cameras(prefix, group_from_rig, options)
-    lights, lightings = _lit(views, options)
+    lights, lightings = _add_leds(views, options)
     return Handpiece(
         rig=Rig(cameras),
         lights=lights,
@@ -191,7 +191,7 @@ def _group_cameras(prefix: str, group_from_rig: Rigid3, options: DesignOptions) 
     }
 
 
-def _lit(views: Mapping[str, Rigid3], options: DesignOptions) -> tuple[dict[str, Light], tuple[Lighting, ...]]:
+def _add_leds(views: Mapping[str, Rigid3], options: DesignOptions) -> tuple[dict[str, Light], tuple[Lighting, ...]]:
     """The LEDs about all groups, and which of them are on together."""
     if options.lights == "white":
         white = {name: light for view in views.items() for name, light in _group_lights(*view, options).items()}

@@ -405,7 +405,7 @@ def _survey(
 ) -> tuple[Bool[np.ndarray, "f"], Int[np.ndarray, "p"], Float[np.ndarray, "p"]]:
     """Whether each face is seen; some faces, and the bound there (NaN where unseen)."""
     rig, mesh = handpiece.rig, section.mesh
-    paired = _paired(handpiece, options.pairing)
+    paired = _pair_cameras(handpiece, options.pairing)
     wanted = np.flatnonzero(np.any(list(section.surfaces.values()), axis=0))
     places = wanted[np.linspace(0, len(wanted) - 1, min(options.points, len(wanted))).astype(int)]
     found, best = np.zeros(len(mesh.faces), dtype=bool), np.full(len(places), np.inf)
@@ -425,7 +425,7 @@ def _survey(
     return found, places, np.where(np.isfinite(best), best, np.nan)
 
 
-def _paired(handpiece: Handpiece, pairing: PairingOptions) -> Bool[np.ndarray, "c c"]:
+def _pair_cameras(handpiece: Handpiece, pairing: PairingOptions) -> Bool[np.ndarray, "c c"]:
     names = handpiece.rig.names
     paired = np.zeros((len(names), len(names)), dtype=bool)
     for first, second in stereo_pairs(handpiece.rig, handpiece.working_distance_mm, pairing):

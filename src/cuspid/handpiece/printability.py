@@ -209,7 +209,7 @@ def _walls(made: Printable) -> tuple[list[Wall], list[Wall]]:
     walls: list[Wall] = []
     webs: list[Wall] = []
     for start in np.unique(made.source):
-        points, thickness, end = _across(made.mesh, made.source == start)
+        points, thickness, end = _wall_samples(made.mesh, made.source == start)
         across_pockets = pockets[start] & pockets[made.source[end]]
         across_ducts = ducts[start] & ducts[made.source[end]]
         for found, which in ((walls, ~across_pockets & ~across_ducts), (webs, across_pockets)):
@@ -221,7 +221,7 @@ def _walls(made: Printable) -> tuple[list[Wall], list[Wall]]:
     return walls, webs
 
 
-def _across(
+def _wall_samples(
     mesh: Mesh, part: Bool[np.ndarray, "f"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"], Int[np.ndarray, "n"]]:
     """Points on a part of a surface, how thick the wall is there (infinite where none is), and the face across."""

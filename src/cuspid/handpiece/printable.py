@@ -103,7 +103,7 @@ def printable(handpiece: Handpiece, options: PrintOptions = PrintOptions()) -> P
 
 def block(box: Box) -> Manifold:
     """A box as a solid."""
-    return _placed(Manifold.cube(2 * box.half_mm, True), box.box_from_rig)
+    return _place_solid(Manifold.cube(2 * box.half_mm, True), box.box_from_rig)
 
 
 def _shells(shell: Shell, options: PrintOptions) -> dict[str, Manifold]:
@@ -128,17 +128,17 @@ def _ducts(shell: Shell, options: PrintOptions) -> dict[str, Manifold]:
 
 def rounded(box: Box, radius_mm: float) -> Manifold:
     """A box with rounded edges, within the box."""
-    return _placed(_rounded(box.half_mm, radius_mm), box.box_from_rig)
+    return _place_solid(_rounded_box(box.half_mm, radius_mm), box.box_from_rig)
 
 
-def _rounded(half: Float[np.ndarray, "3"], radius_mm: float) -> Manifold:
+def _rounded_box(half: Float[np.ndarray, "3"], radius_mm: float) -> Manifold:
     radius = min(radius_mm, 0.999 * float(half.min()))
     ball = Manifold.sphere(radius, _SEGMENTS)
     signs = np.array(list(np.ndindex(2, 2, 2))) * 2 - 1
     return Manifold.batch_hull([ball.translate(sign * (half - radius)) for sign in signs])
 
 
-def _placed(solid: Manifold, own_from_rig: Rigid3) -> Manifold:
+def _place_solid(solid: Manifold, own_from_rig: Rigid3) -> Manifold:
     return solid.transform(own_from_rig.inverse().matrix[:3])
 
 
@@ -184,8 +184,8 @@ def _neck(handle: Handle, options: PrintOptions) -> Manifold:
     """Rounded, but flat at its end."""
     width, start = options.neck_width_mm / 2, -options.handle_wall_mm
     longer = np.array([width, (options.neck_mm - start) / 2 + options.handle_wall_mm, width])
-    solid = _rounded(longer, options.handle_wall_mm).translate([0, start + longer[1], 0])
-    return _placed(solid.trim_by_plane((0, -1, 0), -options.neck_mm), handle.handle_from_rig)
+    solid = _rounded_box(longer, options.handle_wall_mm).translate([0, start + longer[1], 0])
+    return _place_solid(solid.trim_by_plane((0, -1, 0), -options.neck_mm), handle.handle_from_rig)
 
 
 def _grip(handle: Handle, options: PrintOptions, inside_mm: float) -> Manifold:
@@ -197,13 +197,13 @@ def _grip(handle: Handle, options: PrintOptions, inside_mm: float) -> Manifold:
     neck, grip = options.neck_width_mm / 2, options.grip_width_mm / 2
     collar = _bar(neck - inside_mm, options.handle_wall_mm - inside_mm, start - _COLLAR_MM, start)
     body = _bar(grip - inside_mm, _GRIP_ROUNDED * options.grip_width_mm - inside_mm, start + taper, end)
-    return _placed(Manifold.batch_hull([collar, body]), handle.handle_from_rig)
+    return _place_solid(Manifold.batch_hull([collar, body]), handle.handle_from_rig)
 
 
 def _bar(half_mm: float, radius_mm: float, start: float, end: float) -> Manifold:
     """Along Y, square, with rounded edges and flat ends."""
     radius = max(radius_mm, _SHARP_MM)
-    longer = _rounded(np.array([half_mm, (end - start) / 2 + 2 * radius, half_mm]), radius)
+    longer = _rounded_box(np.array([half_mm, (end - start) / 2 + 2 * radius, half_mm]), radius)
     middle = longer.translate([0, (start + end) / 2, 0])
     return middle.trim_by_plane((0, 1, 0), start).trim_by_plane((0, -1, 0), -end)
 

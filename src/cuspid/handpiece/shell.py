@@ -292,7 +292,7 @@ def _arm(one: Head, other: Head, options: PrintOptions) -> tuple[Tube, Tube]:
     to_one, to_other = (unit(_centre(head) - elbow) for head in (one, other))
     bend = np.sqrt(max(0.0, 1 + to_one @ to_other) / max(1e-9, 1 - to_one @ to_other))
     beyond = max(_OVERLAP_MM, options.duct_mm / 2 * min(float(bend), 1.0))
-    return _towards(one, elbow, beyond, options), _towards(other, elbow, beyond, options)
+    return _tube_to(one, elbow, beyond, options), _tube_to(other, elbow, beyond, options)
 
 
 def _elbow(one: Head, other: Head) -> Float[np.ndarray, "3"]:
@@ -313,7 +313,7 @@ def _centre(head: Head) -> Float[np.ndarray, "3"]:
     return head.tube.inner.box_from_rig.inverse().translation
 
 
-def _towards(head: Head, end: Float[np.ndarray, "3"], beyond_mm: float, options: PrintOptions) -> Tube:
+def _tube_to(head: Head, end: Float[np.ndarray, "3"], beyond_mm: float, options: PrintOptions) -> Tube:
     """A tube from the middle of a duct to a point and beyond."""
     start = _centre(head)
     length = float(np.linalg.norm(end - start))

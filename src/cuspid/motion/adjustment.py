@@ -218,7 +218,7 @@ def _initial_state(
     return _with_calibration(state, prior, np.zeros((len(prior.rig.names), prior.numbers)))
 
 
-def _moved(state: State, observations: Observations, weighting: Weighting, prior: _Prior, step: Any) -> State:
+def _apply_step(state: State, observations: Observations, weighting: Weighting, prior: _Prior, step: Any) -> State:
     """The state after a step of poses and calibration, with the points where their rays then meet."""
     size = POSE * (len(state.frame_rotation) - 1)
     points = substitute(state, observations, weighting, step[:, None])[0]
@@ -304,7 +304,7 @@ def _minimise(
         full = _solve(system, _LEAST_DAMPING)
         step = full if damping == _LEAST_DAMPING else _solve(system, damping)
         decrease = np.inf if full is None else float(-full @ system.gradient)
-        candidate = state if step is None else _moved(state, observations, weighting, prior, step)
+        candidate = state if step is None else _apply_step(state, observations, weighting, prior, step)
         lower = np.inf if step is None else _cost(candidate, observations, weighting)
         settled = decrease < options.tolerance
         if lower <= cost:
@@ -580,7 +580,7 @@ def adjust(
     """
     poses = tuple(reconstruction.rig_from_world.values())
     times = _times(reconstruction.rig, reconstruction.frames)
-    found = _adjusted(
+    found = _minimize(
         reconstruction.rig, poses, reconstruction.tracks, options or AdjustmentOptions(), times=times, judge=judge
     )
     return replace(
@@ -603,7 +603,7 @@ def adjust_model(model: SparseModel, options: AdjustmentOptions | None = None) -
     name = "camera"
     rig = Rig({name: MountedCamera(model.camera, Rigid3.identity())})
     poses = tuple(model.cam_from_world.values())
-    found = _adjusted(rig, poses, model.tracks, options or AdjustmentOptions(), judge=False)
+    found = _minimize(rig, poses, model.tracks, options or AdjustmentOptions(), judge=False)
     return replace(
         model,
         camera=found.rig[name].camera,
@@ -613,7 +613,7 @@ def adjust_model(model: SparseModel, options: AdjustmentOptions | None = None) -
     )
 
 
-def _adjusted(
+def _minimize(
     rig: Rig,
     poses: Sequence[Rigid3],
     tracks: Tracks | None,
@@ -651,7 +651,7 @@ def _adjusted(
         tracks=_as_tracks(state, observations, colors),
         pose_covariance=None if posterior is None else posterior.poses,
         reprojection_rms_px=float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))),
-        notes=(*_unsettled(minimum, options), *_implausible(state, prior), *misfits),
+        notes=(*_is_unconverged(minimum, options), *_implausible(state, prior), *misfits),
         log={
             "observation_sigma_px": sigma_px,
             "observations": len(residuals),
@@ -674,7 +674,7 @@ def _misfits(
     return held_misfit(settle(state, observations, weighting), observations, weighting, prior.rig.names)
 
 
-def _unsettled(minimum: _Minimum, options: AdjustmentOptions) -> tuple[str, ...]:
+def _is_unconverged(minimum: _Minimum, options: AdjustmentOptions) -> tuple[str, ...]:
     """Whether the adjustment stopped before it had settled."""
     if minimum.decrease < options.tolerance:
         return ()

@@ -32,7 +32,7 @@ def closing_pairs(handpiece: Handpiece, poses: Sequence[Rigid3], tracks: Tracks)
     reach_mm = _LARGEST_SHIFT * _seen_mm(handpiece)
     near = KDTree(looked_at).query_pairs(reach_mm, output_type="ndarray")
     alike = np.einsum("ij,ij->i", axes[near[:, 0]], axes[near[:, 1]]) > np.cos(np.deg2rad(_LARGEST_ANGLE_DEG))
-    near = near[alike & ~_joined(tracks, len(poses))[frame[near[:, 0]], frame[near[:, 1]]]]
+    near = near[alike & ~_share_tracks(tracks, len(poses))[frame[near[:, 0]], frame[near[:, 1]]]]
     apart_mm = np.linalg.norm(looked_at[near[:, 0]] - looked_at[near[:, 1]], axis=1)
     return [(images[i], images[j]) for i, j in near[_nearest(near, apart_mm)].tolist()]
 
@@ -56,7 +56,7 @@ def _seen_mm(handpiece: Handpiece) -> float:
     return handpiece.working_distance_mm * float(np.median(shares))
 
 
-def _joined(tracks: Tracks, frames: int) -> Bool[np.ndarray, "f f"]:
+def _share_tracks(tracks: Tracks, frames: int) -> Bool[np.ndarray, "f f"]:
     """Whether some track joins two frames."""
     seen = coo_array(
         (np.ones(len(tracks.frame_index), np.int64), (tracks.frame_index, tracks.point_index)),

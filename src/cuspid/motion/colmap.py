@@ -153,7 +153,7 @@ def write_model(folder: Path, found: Reconstruction, capture: Capture, names: Ma
     with whole_files(folder) as part:
         try:
             model.write(part)
-            written = _read(part)
+            written = _read_checked_model(part)
         except (InputError, RuntimeError, ValueError) as error:
             raise OutputError(f"{folder}: the sparse model cannot be written ({error}); free some space") from error
         if (written.num_points3D(), written.num_reg_images()) != (model.num_points3D(), model.num_reg_images()):
@@ -248,7 +248,7 @@ def _is_whole(data: bytes, after: Callable[[bytes, int], int]) -> bool:
     return at == len(data)
 
 
-def _read(folder: Path) -> pycolmap.Reconstruction:
+def _read_checked_model(folder: Path) -> pycolmap.Reconstruction:
     """A model from disk. Raises InputError, also for truncated files, on which COLMAP's own reader may hang."""
     folder = _model_folder(folder)
     for name, after in _AFTER.items():
@@ -273,11 +273,11 @@ def read_sparse(folder: Path) -> pycolmap.Reconstruction:
                     (Path(made) / path.name).write_bytes(read_bytes(path, "arrays"))
                 (Path(made) / f"{MODEL_FILES[2]}{suffix}").write_bytes(empty)
                 try:
-                    return _read(Path(made))
+                    return _read_checked_model(Path(made))
                 except InputError as error:
                     message = f"{candidate}: the COLMAP model is damaged or of another version; export it again"
                     raise InputError(message) from error
-    return _read(folder)
+    return _read_checked_model(folder)
 
 
 def hash_sparse(folder: Path) -> str:
@@ -421,7 +421,7 @@ def read_model(folder: Path, capture: Capture) -> Reconstruction:
     Raises InputError where the folder contains no model, its image names are not those of the capture, or its cameras
     do not have the distances that they have in the handpiece.
     """
-    found = from_colmap(_read(folder), capture, str(folder))
+    found = from_colmap(_read_checked_model(folder), capture, str(folder))
     if found.log["scale_spread"] > SCALE_SPREAD:
         raise InputError(
             f"{folder}: relative to the handpiece, the distances between its cameras vary by "

@@ -125,7 +125,7 @@ def check_features(
     agreeing = matches.agreeing_as(own)
     if bool(_fits(agreeing, matches.counts).all()) and motion.is_one(own):
         return _NOTHING
-    lost = _contradicted(matches.agreeing_as(own, _LOOSE_PX), matches.counts)
+    lost = _contradicted_cameras(matches.agreeing_as(own, _LOOSE_PX), matches.counts)
     contradicted = tuple(names[k] for k in np.flatnonzero(lost))
     nothing = replace(_NOTHING, contradicted=contradicted)
     if len(names) > _MOST_CAMERAS:
@@ -238,7 +238,7 @@ def _fits(agreeing: Int[np.ndarray, "c c"], counts: Int[np.ndarray, "c c"]) -> B
     return np.asarray((those >= _LEAST) & (those >= _SHARE * all_of))
 
 
-def _contradicted(agreeing: Int[np.ndarray, "c c"], counts: Int[np.ndarray, "c c"]) -> Bool[np.ndarray, "c"]:
+def _contradicted_cameras(agreeing: Int[np.ndarray, "c c"], counts: Int[np.ndarray, "c c"]) -> Bool[np.ndarray, "c"]:
     """Cameras of which hardly a match with those beside them agrees, while those of others do."""
     told = counts >= _TOLD
     lost = told.any(axis=1) & ~(told & (agreeing >= _LOST_SHARE * counts)).any(axis=1)

@@ -46,7 +46,7 @@ class Gauge(NamedTuple):
 def best_gauge(state: State) -> Gauge:
     """The similarity that most reduces the prior cost of the cameras' poses, to first order; it moves no pose in a
     direction in which it is held fixed."""
-    free, whitened = _allowed(state)
+    free, whitened = _free_similarities(state)
     along = np.linalg.lstsq(whitened.reshape(-1, 7) @ free, -state.whitened[:, :PLACE].ravel(), rcond=None)[0]
     return Gauge.of(free @ along)
 
@@ -55,7 +55,7 @@ def gauge_basis(state: State) -> tuple[Float[np.ndarray, "k k"], int]:
     """A basis of the steps of the reduced unknowns (poses and z), and how many of its last vectors are the similarities
     that the prior allows, to first order. The others are single unknowns, of which those are left out that a similarity
     can best replace."""
-    free, whitened = _allowed(state)
+    free, whitened = _free_similarities(state)
     calibration = np.zeros((*state.whitened.shape, 7))
     calibration[:, :PLACE] = whitened
     poses = np.stack([_pose_steps(state, unit) for unit in np.eye(7)], axis=-1)
@@ -66,7 +66,7 @@ def gauge_basis(state: State) -> tuple[Float[np.ndarray, "k k"], int]:
     return np.concatenate([single, along / np.linalg.norm(along[start:], axis=0)], axis=1), count
 
 
-def _allowed(state: State) -> tuple[Float[np.ndarray, "7 m"], Float[np.ndarray, "c 6 7"]]:
+def _free_similarities(state: State) -> tuple[Float[np.ndarray, "7 m"], Float[np.ndarray, "c 6 7"]]:
     """The similarities that move no camera in a direction in which it is held fixed; and how all seven kinds move the
     z of the cameras' poses."""
     motions = np.stack(

@@ -75,15 +75,15 @@ def refine(
     ``again`` are pairs of frames (indices) that show the same place, beside those of ``options.steps``. The scale is
     free and changes. Raises ReconstructionError where too little is consistent.
     """
-    model = _rescaled(model)
+    model = _normalize_scale(model)
     pairs = list(dict.fromkeys([*_successive(len(features), options.steps), *again]))
     for number, (tolerance_px, share) in enumerate(zip(options.tolerances_px, options.depth_shares, strict=True)):
         views = [index_features(each, model.camera) for each in features]
         matching = replace(options.matching, tolerance_px=tolerance_px)
         track, image_of = _tracks(model, views, matching, share, pairs)
         limit_px = options.start_px / (1 if number == 0 else 2)
-        found = _triangulated(model, features, views, track, image_of, limit_px, options)
-        model = _rescaled(adjust_model(found, replace(options.adjustment, start_px=limit_px)))
+        found = _triangulate_tracks(model, features, views, track, image_of, limit_px, options)
+        model = _normalize_scale(adjust_model(found, replace(options.adjustment, start_px=limit_px)))
         progress("refining", number + 1, len(options.tolerances_px))
     return model
 
@@ -92,7 +92,7 @@ def _successive(count: int, steps: Sequence[int]) -> list[tuple[int, int]]:
     return [(i, i + step) for step in steps for i in range(count - step)]
 
 
-def _rescaled(model: SparseModel) -> SparseModel:
+def _normalize_scale(model: SparseModel) -> SparseModel:
     """With a median depth of `_DEPTH`."""
     return model.scaled(_DEPTH / float(np.median(model.depths)))
 
@@ -135,7 +135,7 @@ def _tracks(
     return join(matches, image_of), image_of
 
 
-def _triangulated(
+def _triangulate_tracks(
     model: SparseModel,
     features: Sequence[Features],
     views: Sequence[IndexedFeatures],

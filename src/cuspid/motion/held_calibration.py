@@ -32,18 +32,18 @@ def depth_sigma_mm(handpiece: Handpiece) -> float:
         partners = {each for pair in pairs if name in pair for each in pair}
         if partners:
             place = mounted.centre_in_rig + distance_mm * mounted.axis_in_rig
-            factor = _moved(place, [rig.cameras[each] for each in sorted(partners)])
+            factor = _place_factor(place, [rig.cameras[each] for each in sorted(partners)])
             variances.append(float(np.sum((mounted.axis_in_rig @ factor) ** 2)))
     return float(np.sqrt(np.mean(variances))) if variances else 0.0
 
 
-def _moved(place: Float[np.ndarray, "3"], cameras: list[MountedCamera]) -> Float[np.ndarray, "3 n"]:
+def _place_factor(place: Float[np.ndarray, "3"], cameras: list[MountedCamera]) -> Float[np.ndarray, "3 n"]:
     """L, with L L^T the covariance of a place that cameras see."""
     square, factors = np.zeros((3, 3)), []
     for mounted in cameras:
 
         def seen(step: Float[np.ndarray, "k"], mounted: MountedCamera = mounted) -> Float[np.ndarray, "2"]:
-            return _seen(mounted, place + step[:3], step[3:])
+            return _project_perturbed(mounted, place + step[:3], step[3:])
 
         numbers = len(mounted.camera.parameters)
         by_all = _jacobian(seen, 3 + numbers + _MOTION)
@@ -55,7 +55,7 @@ def _moved(place: Float[np.ndarray, "3"], cameras: list[MountedCamera]) -> Float
     return np.asarray(np.linalg.pinv(square) @ np.hstack(factors))
 
 
-def _seen(
+def _project_perturbed(
     mounted: MountedCamera, place: Float[np.ndarray, "3"], step: Float[np.ndarray, "k"]
 ) -> Float[np.ndarray, "2"]:
     """The pixel at which a camera with other parameters, turned and shifted, sees a place of the rig frame."""

@@ -95,7 +95,7 @@ class MotionOptions(Options):
 
 
 @contextmanager
-def _timed(log: dict[str, float], stage: str) -> Iterator[None]:
+def _log_time(log: dict[str, float], stage: str) -> Iterator[None]:
     """Add the seconds that a stage takes to the log."""
     start = time.perf_counter()
     yield
@@ -192,7 +192,7 @@ def _within_frames(scan: _Scan) -> list[Int[np.ndarray, "_ 2"]]:
     ]
 
 
-def _triangulated(scan: _Scan, track: Int[np.ndarray, "n"]) -> Tracks:
+def _triangulate_tracks(scan: _Scan, track: Int[np.ndarray, "n"]) -> Tracks:
     """Tracks with a point each where their rays meet."""
     centres, directions = [], []
     for views, pose in zip(scan.frames, scan.poses, strict=True):
@@ -235,7 +235,7 @@ def _tracks(scan: _Scan, matches: Sequence[Int[np.ndarray, "_ 2"]], cell_px: flo
         seen = np.flatnonzero(track >= 0)
         pixels = np.concatenate([view.features.pixels for views in scan.taken for view in views.values()])
         track[seen[~thin(track[seen], image[seen], pixels[seen], cell_px)]] = -1
-    return _triangulated(scan, track)
+    return _triangulate_tracks(scan, track)
 
 
 def _require_enough(trajectory: Trajectory, clouds: Sequence[Cloud], options: MotionOptions) -> None:
@@ -337,7 +337,7 @@ def _located(
     """As :func:`locate_features`, from keypoints as the images show them and where they are at the instants of the
     frames."""
     rig, log, names, frames = handpiece.rig, dict[str, float](), list(taken), list(at_instants.values())
-    with _timed(log, "triangulation"):
+    with _log_time(log, "triangulation"):
         pairs = stereo_pairs(rig, handpiece.working_distance_mm, options.pairing)
         clouds = map_in_threads(
             lambda views: triangulate_frame(handpiece, pairs, views, options.within),
@@ -345,7 +345,7 @@ def _located(
             stage="triangulation",
             progress=progress,
         )
-    with _timed(log, "odometry"):
+    with _log_time(log, "odometry"):
         trajectory = chain(find_edges(rig, frames, clouds, options.odometry, options.seed), names, options.odometry)
     _require_enough(trajectory, clouds, options)
     start = Reconstruction(
@@ -361,7 +361,7 @@ def _located(
         poses=list(trajectory.rig_from_world.values()),
     )
     try:
-        adjusted = _adjusted(start, scan, options, read, log, progress)
+        adjusted = _adjust_and_reconnect(start, scan, options, read, log, progress)
     except ReconstructionError:
         if len(scan.frames) > 1:
             raise
@@ -419,7 +419,7 @@ def stereo_ties(tracks: Tracks, frames: int) -> Int[np.ndarray, "k"]:
     return points_across(point, frame, frames)
 
 
-def _adjusted(
+def _adjust_and_reconnect(
     start: Reconstruction,
     scan: _Scan,
     options: MotionOptions,
@@ -431,14 +431,14 @@ def _adjusted(
     places."""
     cell_px = options.cell_for(start.rig)
     first = options.adjustment if read is None else replace(options.adjustment, rounds=2)
-    with _timed(log, "matching"):
+    with _log_time(log, "matching"):
         pairs = frame_pairs(len(scan.frames), options.reach)
         images = (((i, camera), (j, camera)) for i, j in pairs for camera in scan.handpiece.rig.names)
         matches = [*_within_frames(scan), *_across_frames(scan, images, options, "matching", progress)]
         tracks = _tracks(scan, matches, cell_px)
-    with _timed(log, "adjustment"):
+    with _log_time(log, "adjustment"):
         adjusted = adjust(replace(start, tracks=tracks), first, judge=read is None)
-    with _timed(log, "closure"):
+    with _log_time(log, "closure"):
         scan = replace(scan, poses=list(adjusted.rig_from_world.values()))
         closing = closing_pairs(scan.handpiece, scan.poses, adjusted.tracks or tracks)
         again = _across_frames(scan, closing, options, "loop closure", progress)
@@ -449,7 +449,7 @@ def _adjusted(
             adjusted = adjust(joined, first, judge=read is None)
     if read is None:
         return adjusted
-    with _timed(log, "patches"):
+    with _log_time(log, "patches"):
         placed = match_patches(adjusted, read, options.least_squares, progress=progress)
         found = np.bincount(placed.frame_index, minlength=len(adjusted.frames))
         few = np.flatnonzero(found < options.odometry.minimum_matches)
@@ -459,7 +459,7 @@ def _adjusted(
                 "as with glare or blur: keypoints are used as detected, and the path is less accurate"
             )
             start, placed = replace(start, notes=(*start.notes, note)), tracks
-    with _timed(log, "adjustment"):
+    with _log_time(log, "adjustment"):
         exact = replace(start, rig_from_world=adjusted.rig_from_world, tracks=placed)
         return adjust(exact, options.adjustment)
 
@@ -478,7 +478,7 @@ def locate(
     options, log = options or MotionOptions(), dict[str, float]()
     require_stereo(capture.handpiece, options.pairing)
     pictures = Pictures(capture) if options.least_squares.enabled else Pictures(capture, most_bytes=0)
-    with _timed(log, "features"):
+    with _log_time(log, "features"):
         features = detect_all(pictures, options.sought, progress=progress, cache=cache)
     names = [frame.name for frame in capture.frames]
     frames = {frame.name: frame for frame in capture.frames}

@@ -121,7 +121,7 @@ def held_misfit(
 
     Poses, and the free part of the calibration, are as an adjustment left them.
     """
-    held, tracks = _held(state), len(state.points)
+    held, tracks = _held_parameters(state), len(state.points)
     if not held.any():
         return ()
     raw, free = (
@@ -129,7 +129,7 @@ def held_misfit(
         weighting._replace(calibrated=True),
     )
     numbers = _numbers(state, _curvature(raw, observations, free), observations, weighting, held)
-    left = _after(raw, observations, free, numbers.raw_step())
+    left = _apply_step(raw, observations, free, numbers.raw_step())
     wanted, square, directions = numbers.pull(scatter_of_tracks(left, observations, free)).wanted()
     if tracks <= directions or square * (1 - directions / tracks) <= chdtri(directions, CHANCE):
         return ()
@@ -143,7 +143,7 @@ def held_misfit(
     )
 
 
-def _held(state: State) -> Bool[np.ndarray, "c n"]:
+def _held_parameters(state: State) -> Bool[np.ndarray, "c n"]:
     """Which numbers of each camera are held: all of its place, or all of its lens."""
     place, lens = (~state.basis[:, :, part].any(axis=(1, 2)) for part in (slice(POSE), slice(POSE, None)))
     return np.repeat(np.stack([place, lens], axis=1), [POSE, state.basis.shape[1] - POSE], axis=1)
@@ -188,7 +188,7 @@ def _farthest(wanted: Float[np.ndarray, "k"], held: Bool[np.ndarray, "c n"], nam
     return names[int(np.argmax(squares.sum(axis=1)))]
 
 
-def _after(raw: State, observations: Observations, weighting: Weighting, step: Float[np.ndarray, "n"]) -> State:
+def _apply_step(raw: State, observations: Observations, weighting: Weighting, step: Float[np.ndarray, "n"]) -> State:
     """The state after a step of poses, motions and parameters of the cameras, with the points where rays then meet."""
     poses = len(step) - raw.whitened.size
     numbers = step[poses:].reshape(raw.whitened.shape)

@@ -182,7 +182,7 @@ def _match_one_way(a, b, low, high, rotation, translation, options):
     return found
 
 
-def _guided(
+def _match_guided(
     a: IndexedFeatures,
     b: IndexedFeatures,
     b_from_a: Rigid3,
@@ -221,8 +221,8 @@ def match_guided(
     options = options or MatchingOptions()
     if not len(a.features) or not len(b.features):
         return np.zeros((0, 2), dtype=np.int64)
-    forward = _guided(a, b, b_from_a, bounds_a_mm, options)
-    return _mutual(forward, _guided(b, a, b_from_a.inverse(), bounds_b_mm, options))
+    forward = _match_guided(a, b, b_from_a, bounds_a_mm, options)
+    return _mutual(forward, _match_guided(b, a, b_from_a.inverse(), bounds_b_mm, options))
 
 
 def match_unguided(a: Features, b: Features, options: MatchingOptions | None = None) -> Int[np.ndarray, "k 2"]:

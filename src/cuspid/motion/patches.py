@@ -81,7 +81,7 @@ def smooth(picture: UInt8[np.ndarray, "h w"], sigma_px: float) -> Float32[np.nda
 
 @kernel
 @no_type_check
-def _at(image, x, y):
+def _sample_bilinear(image, x, y):
     """Bilinear; NaN outside."""
     height, width = image.shape
     if not (0 <= x < width - 1 and 0 <= y < height - 1):
@@ -94,13 +94,13 @@ def _at(image, x, y):
 
 @kernel
 @no_type_check
-def _cut(image, places, patches):
+def _cut_patch(image, places, patches):
     """Fill in the levels around places; NaN outside."""
     side = patches.shape[1]
     for n in range(len(places)):
         for j in range(side):
             for i in range(side):
-                patches[n, j, i] = _at(image, places[n, 0] + i - side // 2, places[n, 1] + j - side // 2)
+                patches[n, j, i] = _sample_bilinear(image, places[n, 0] + i - side // 2, places[n, 1] + j - side // 2)
 
 
 @kernel
@@ -144,7 +144,7 @@ def _template(patch, levels, slopes):
 
 @kernel
 @no_type_check
-def _aligned(patches, image, there, warps, bends, limit, iterations, shifts, correlations):
+def _align(patches, image, there, warps, bends, limit, iterations, shifts, correlations):
     """Fill in for every patch its shift from where it should be, and the correlation there; NaN where it is lost.
     ``bends`` are empty where the warps are all."""
     radius = patches.shape[1] // 2 - 1
@@ -175,7 +175,7 @@ def _aligned(patches, image, there, warps, bends, limit, iterations, shifts, cor
                     if len(bends) > 0:
                         off_x += bends[n, k, 0]
                         off_y += bends[n, k, 1]
-                    found[k] = _at(image, x + off_x, y + off_y)
+                    found[k] = _sample_bilinear(image, x + off_x, y + off_y)
                     k += 1
             _flatten(found, radius)
             power, common = (found**2).sum(), (found * levels).sum()
@@ -197,7 +197,7 @@ def cut_patches(
 ) -> Float32[np.ndarray, "n s s"]:
     """The patches around positions in an image, one px larger on each side, for their gradients; NaN outside."""
     patches = np.empty((len(places_px), 2 * radius_px + 3, 2 * radius_px + 3), dtype=np.float32)
-    _cut(picture, np.ascontiguousarray(places_px - OPENCV_PIXEL_OFFSET), patches)
+    _cut_patch(picture, np.ascontiguousarray(places_px - OPENCV_PIXEL_OFFSET), patches)
     return patches
 
 
@@ -217,7 +217,7 @@ def align_patches(
     """
     shifts, correlations = np.empty_like(there_px), np.empty(len(there_px))
     start = np.ascontiguousarray(there_px - OPENCV_PIXEL_OFFSET)
-    _aligned(
+    _align(
         *(patches, picture, start, np.ascontiguousarray(warps), np.ascontiguousarray(bends_px)),
         *(options.limit_px, options.iterations, shifts, correlations),
     )
@@ -307,7 +307,7 @@ class _Scene(NamedTuple):
         """The patches around observations in an image that show something known."""
         tracks, camera, radius = self.tracks, self.views.cameras[image], self.options.radius_px
         middles, points = tracks.pixels[own], tracks.point_index[own]
-        rays = camera.rays(middles[:, None] + _around(radius))
+        rays = camera.rays(middles[:, None] + _patch_offsets(radius))
         if self.surface is None:
             depths = self.views.inside(image, tracks.points[points])[:, 2:]
         else:
@@ -338,7 +338,7 @@ class _Scene(NamedTuple):
         seen[seen] = self.visible(there, middles[seen])
         facets, expected = facets.some(seen), expected[seen]
         offsets = camera.project(views.inside(there, facets.places)) - expected[:, None]
-        warps, bends = _straightened(offsets, options.radius_px)
+        warps, bends = _residual_offsets(offsets, options.radius_px)
         pixels, correlation = align_patches(facets.levels, pictures[there], expected, warps, options, bends)
         good = correlation > options.correlation
         return facets.points[good], np.full(int(good.sum()), there), pixels[good]
@@ -379,17 +379,17 @@ class _Scene(NamedTuple):
         return point[often], image_index[often], pixels[often]
 
 
-def _around(radius_px: int) -> Float[np.ndarray, "p 2"]:
+def _patch_offsets(radius_px: int) -> Float[np.ndarray, "p 2"]:
     """Offsets of the pixels of a patch from its middle, row by row."""
     steps = np.arange(-radius_px, radius_px + 1.0)
     return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
 
 
-def _straightened(
+def _residual_offsets(
     offsets: Float[np.ndarray, "k p 2"], radius_px: int
 ) -> tuple[Float[np.ndarray, "k 2 2"], Float[np.ndarray, "k p 2"]]:
     """Offsets of the pixels of patches in another image: the linear maps that fit them best, and what is left."""
-    around = _around(radius_px)
+    around = _patch_offsets(radius_px)
     warps = np.einsum("kpi,pj->kij", offsets, around) / np.sum(around[:, 0] ** 2)
     return warps, offsets - around @ warps.swapaxes(1, 2)
 

@@ -86,17 +86,17 @@ def _detect(photograph: Photograph, options: FeatureOptions, largest_px: int, ev
     shrink = min(1.0, largest_px / float(size.max()))
     searched = np.maximum(np.rint(size * shrink), 1).astype(int)
     if shrink < 1:
-        image = _resized(image, searched, cv2.INTER_AREA)
-        mask = None if mask is None else _resized(mask, searched, cv2.INTER_NEAREST)
-    found = detect(_evened(image) if even else image, options, mask)
+        image = _resize(image, searched, cv2.INTER_AREA)
+        mask = None if mask is None else _resize(mask, searched, cv2.INTER_NEAREST)
+    found = detect(_equalize_contrast(image) if even else image, options, mask)
     return replace(found, pixels=found.pixels * (size / searched))
 
 
-def _resized(image: UInt8[np.ndarray, "h w *c"], size: Int[np.ndarray, "2"], how: int) -> UInt8[np.ndarray, "a b *c"]:
+def _resize(image: UInt8[np.ndarray, "h w *c"], size: Int[np.ndarray, "2"], how: int) -> UInt8[np.ndarray, "a b *c"]:
     return np.asarray(cv2.resize(image, size.tolist(), interpolation=how), dtype=np.uint8)
 
 
-def _evened(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+def _equalize_contrast(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """Grey with even local contrast, for what is plain or badly lit."""
     clahe = cv2.createCLAHE(_CLAHE_CLIP, (_CLAHE_TILES, _CLAHE_TILES))
     return np.repeat(clahe.apply(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))[..., None], 3, axis=2)

@@ -51,7 +51,7 @@ def take_photograph_poses(
     with quiet():
         model = read_sparse(folder)
         images = _by_name(model, photographs, folder)
-        known = _taken(model, images, photographs, folder)
+        known = _take_model(model, images, photographs, folder)
         if len(known.tracks.points) < _LEAST_POINTS:
             known = _with_points(known, photographs, options, progress)
     missing = [
@@ -85,14 +85,14 @@ def _by_name(model: pycolmap.Reconstruction, photographs: Photographs, folder: P
     return {name: found[name] for name in photographs.names if name in found}
 
 
-def _taken(
+def _take_model(
     model: pycolmap.Reconstruction, images: Mapping[str, pycolmap.Image], photographs: Photographs, folder: Path
 ) -> PhotoModel:
     """Poses, lenses, and the points that the model has. Photographs of one size may have several of its cameras."""
     keys = {name: (photographs[name].camera, image.camera_id) for name, image in images.items()}
     several = len(set(keys.values())) > len({camera for camera, _ in keys.values()})
     label = {key: f"{key[0]}-{key[1]}" if several else key[0] for key in keys.values()}
-    cameras = {label[key]: _resized(model.cameras[key[1]], photographs, name, folder) for name, key in keys.items()}
+    cameras = {label[key]: _to_size(model.cameras[key[1]], photographs, name, folder) for name, key in keys.items()}
     camera_names = {name: label[key] for name, key in keys.items()}
     known = PhotoModel(
         cameras=cameras,
@@ -103,7 +103,7 @@ def _taken(
     return from_first(known)
 
 
-def _resized(camera: pycolmap.Camera, photographs: Photographs, name: str, folder: Path) -> Camera:
+def _to_size(camera: pycolmap.Camera, photographs: Photographs, name: str, folder: Path) -> Camera:
     """A camera of the model for the size of a photograph. Raises InputError where that has another shape."""
     known = camera_of(camera, f"{folder}: camera {camera.camera_id}")
     width, height = photographs[name].size
@@ -171,13 +171,13 @@ def _with_points(
     with tempfile.TemporaryDirectory() as folder:
         database = Path(folder) / "first.db"
         match_all(own, order, features, database, options, plain=False, progress=progress)
-        posed = _posed(known, order, features)
+        posed = _build(known, order, features)
         how = pycolmap.IncrementalPipelineOptions(random_seed=options.seed, num_threads=1, extract_colors=False)
         found = pycolmap.triangulate_points(posed, database, folder, folder, True, how)
     return replace(photo_model(own, order, found, features), reprojection_rms_px=adjusted_rms(found))
 
 
-def _posed(known: PhotoModel, order: Sequence[Photograph], features: Mapping[int, Features]) -> pycolmap.Reconstruction:
+def _build(known: PhotoModel, order: Sequence[Photograph], features: Mapping[int, Features]) -> pycolmap.Reconstruction:
     """The poses as COLMAP's model without points, numbered as in the database."""
     model, names = pycolmap.Reconstruction(), list(known.cameras)
     for number, camera in enumerate(known.cameras.values(), start=1):

@@ -294,7 +294,7 @@ def refined(model: pycolmap.Reconstruction, held: frozenset[int]) -> tuple[pycol
     A parameter more must pay: one that the images do not determine turns with the poses. The principal point stays in
     the middle: it can hardly be told from a turn of the camera, above all in a ring of photographs.
     """
-    rms = _adjusted(model, held)
+    rms = _adjust_model(model, held)
     by_camera = dict.fromkeys(model.cameras, 0)
     for identifier in model.reg_image_ids():
         by_camera[model.images[identifier].camera_id] += 1
@@ -303,7 +303,7 @@ def refined(model: pycolmap.Reconstruction, held: frozenset[int]) -> tuple[pycol
         wider = pycolmap.Reconstruction(model)
         for number in free:
             _widen(wider.cameras[number], kind)
-        better = _adjusted(wider, held)
+        better = _adjust_model(wider, held)
         if better < (1 - _LENS_GAIN) * rms:
             model, rms = wider, better
     return model, rms
@@ -317,7 +317,7 @@ def _widen(camera: pycolmap.Camera, kind: str) -> None:
     camera.params = wide.parameters[chosen].tolist()
 
 
-def _adjusted(model: pycolmap.Reconstruction, held: frozenset[int]) -> float:
+def _adjust_model(model: pycolmap.Reconstruction, held: frozenset[int]) -> float:
     """Adjust all, twice, without what does not fit after the first time; RMS, px."""
     for _ in range(2):
         config = pycolmap.BundleAdjustmentConfig()
@@ -355,7 +355,7 @@ def _as_noun(photographs: Photographs, order: Sequence[Photograph], found: _Atte
     held = frozenset(number for number, known in numbered if known.calibrated is not None)
     model, rms = refined(found.models[0], held & set(found.models[0].cameras))
     noun = photo_model(photographs, order, model, found.features)
-    dropped = (*photographs.left_out, *found.unread, *_unplaced(order, found))
+    dropped = (*photographs.left_out, *found.unread, *_unlocated_reasons(order, found))
     counts = {"models": len(found.models), "pairs": len(found.pairs), "points": len(noun.tracks.points)}
     return replace(
         noun,
@@ -381,7 +381,7 @@ def photo_model(
     camera_names = {name: photographs[name].camera for name in names}
     cameras = {name: camera for name, camera in cameras.items() if name in camera_names.values()}
     known = PhotoModel(
-        cameras={name: _settled(photographs, name, camera) for name, camera in cameras.items()},
+        cameras={name: _keep_calibration(photographs, name, camera) for name, camera in cameras.items()},
         camera_of=camera_names,
         cam_from_world=poses,
         tracks=_tracks(model, [by_name[name] for name in names], list(cameras), camera_names, names, features),
@@ -389,7 +389,7 @@ def photo_model(
     return from_first(known)
 
 
-def _settled(photographs: Photographs, name: str, camera: Camera) -> Camera:
+def _keep_calibration(photographs: Photographs, name: str, camera: Camera) -> Camera:
     """A given calibration as it was given, with its covariance."""
     return photographs.cameras[name].calibrated or camera
 
@@ -436,7 +436,7 @@ def from_first(model: PhotoModel) -> PhotoModel:
 # --- what to tell ------------------------------------------------------------------------------------------------
 
 
-def _unplaced(order: Sequence[Photograph], found: _Attempt) -> list[Dropped]:
+def _unlocated_reasons(order: Sequence[Photograph], found: _Attempt) -> list[Dropped]:
     """The photographs that are not in the largest model, and why not."""
     placed, *others = ({int(identifier) - 1 for identifier in model.reg_image_ids()} for model in found.models)
     dropped = []

@@ -52,7 +52,7 @@ def typical(descriptors: Sequence[UInt8[np.ndarray, "_ 128"]], seed: int) -> Flo
     sample = every[rng.choice(len(every), min(_SAMPLE, len(every)), replace=False)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a word that is nearest to nothing stays where it is
-        words, _ = vq.kmeans2(_scaled(sample), WORDS, iter=_ROUNDS, minit="points", rng=rng)
+        words, _ = vq.kmeans2(_normalize_descriptors(sample), WORDS, iter=_ROUNDS, minit="points", rng=rng)
     return np.asarray(words)
 
 
@@ -60,11 +60,11 @@ def look(
     descriptors: Sequence[UInt8[np.ndarray, "_ 128"]], words: Float[np.ndarray, "k 128"]
 ) -> Float[np.ndarray, "d"]:
     """Unit vector of how images look together, as measured by typical descriptors."""
-    code = _sums(_scaled(np.concatenate(list(descriptors))), words)
+    code = _sums(_normalize_descriptors(np.concatenate(list(descriptors))), words)
     return np.asarray(code / max(float(np.linalg.norm(code)), 1e-12))
 
 
-def _scaled(descriptors: UInt8[np.ndarray, "n 128"]) -> Float[np.ndarray, "n 128"]:
+def _normalize_descriptors(descriptors: UInt8[np.ndarray, "n 128"]) -> Float[np.ndarray, "n 128"]:
     return descriptors.astype(np.float64) / DESCRIPTOR_NORM
 
 

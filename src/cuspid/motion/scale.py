@@ -182,7 +182,7 @@ def scale_by_board(model: PhotoModel, sightings: Sequence[BoardSighting], board:
             f"{what}: only {len(corner)} of its corners are seen alike in two photographs; it moved, or is not this "
             "board"
         )
-    return _fitted(board, board.corners[corner], points, what, len(located))
+    return _fit_board(board, board.corners[corner], points, what, len(located))
 
 
 def _corners(
@@ -228,7 +228,7 @@ def _misfit(model: PhotoModel, one: BoardSighting, other: BoardSighting) -> floa
     return float(np.median(np.nan_to_num(np.concatenate(off), nan=np.inf))) if off else np.inf
 
 
-def _fitted(
+def _fit_board(
     board: Board, in_board: Float[np.ndarray, "n 3"], in_model: Float[np.ndarray, "n 3"], what: str, photographs: int
 ) -> Scale:
     """The similarity from the board to the model, without the corners that do not agree."""

@@ -373,7 +373,7 @@ def _same_points(one: _Model, other: _Model) -> Int[np.ndarray, "k 2"]:
     return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
 
 
-def _joined(one: _Model, other: _Model, least: int) -> _Model | None:
+def _join_models(one: _Model, other: _Model, least: int) -> _Model | None:
     """Both models in the frame of the first, joined by the points that they share; None where those do not agree."""
     same = _same_points(one, other)
     for _ in range(3):
@@ -397,7 +397,7 @@ def _join_all(models: Sequence[_Model], least: int) -> list[_Model]:
     parts: list[_Model] = []
     for model in models:
         for index, part in enumerate(parts):
-            joined = _joined(part, model, least)
+            joined = _join_models(part, model, least)
             if joined is not None:
                 parts[index] = joined
                 break
@@ -480,7 +480,7 @@ def locate_single(
         raise ReconstructionError(_why_nothing(sequence, kept, features, verified))
     parts = _join_all([_model_of(model) for model in models], options.minimum_matches)
     first = _camera_of(models[0].cameras[1], sequence.camera, options)
-    refined = [_refined(part, first, sequence, features, list(again), options, progress) for part in parts]
+    refined = [_refine_part(part, first, sequence, features, list(again), options, progress) for part in parts]
     return SingleMotion(
         parts=tuple(refined),
         frames=_uses(names, refused, refined, verified),
@@ -492,7 +492,7 @@ def locate_single(
     )
 
 
-def _refined(
+def _refine_part(
     part: _Model,
     camera: Camera,
     sequence: ImageSequence,

@@ -34,7 +34,7 @@ def locate(
         return locate_with_colmap(capture, folder / "colmap", with_rig=method == "colmap-rig")
 
     stage = Stage("motion", folder, {"method": method, "options": options if method == "rig" else None}, (__name__,))
-    return _kept(stage, capture, hash_capture(capture), find)
+    return _make_and_read(stage, capture, hash_capture(capture), find)
 
 
 def locate_by_surfaces(
@@ -49,18 +49,18 @@ def locate_by_surfaces(
     """As :func:`locate`, from the depth maps of the frames; ``made_from`` is their digest."""
     stage = Stage("motion", folder, {"method": "surfaces", "options": options}, (__name__,))
     inputs = {**hash_capture(capture), "depths": made_from}
-    return _kept(stage, capture, inputs, lambda: track_surfaces(capture, depths, options, progress=progress))
+    return _make_and_read(stage, capture, inputs, lambda: track_surfaces(capture, depths, options, progress=progress))
 
 
 def take_poses(capture: Capture, model: Path, folder: Path) -> Reconstruction:
     """The poses of a COLMAP model of the capture, made metric by the rig and kept in ``folder``."""
     inputs = {**hash_capture(capture), "model": hash_model(model)}
-    return _kept(
+    return _make_and_read(
         Stage("motion", folder, "from poses", (__name__,)), capture, inputs, lambda: read_model(model, capture)
     )
 
 
-def _kept(
+def _make_and_read(
     stage: Stage, capture: Capture, inputs: Mapping[str, str], find: Callable[[], Reconstruction]
 ) -> Reconstruction:
     def write() -> None:

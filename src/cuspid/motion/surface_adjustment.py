@@ -48,7 +48,7 @@ def _blocks(surface: Surface, pose: Rigid3, distance_mm: float) -> _Blocks:
     return set(map(tuple, blocks.tolist()))
 
 
-def _shared(one: _Blocks, other: _Blocks) -> float:
+def _shared_part(one: _Blocks, other: _Blocks) -> float:
     """The part of the smaller surface that both share."""
     return len(one & other) / max(min(len(one), len(other)), 1)
 
@@ -64,7 +64,7 @@ def neighbours(
     to a pose adds up along a path; pairs of one pass and another stay where these come closest.
     """
     blocks = [_blocks(surface, pose, distance_mm) for surface, pose in zip(surfaces, poses, strict=True)]
-    shared = np.array([[_shared(one, other) for other in blocks] for one in blocks])
+    shared = np.array([[_shared_part(one, other) for other in blocks] for one in blocks])
     np.fill_diagonal(shared, 0.0)
     through_third = np.array([np.minimum(one, shared).max(axis=1) for one in shared])
     found = (shared > least_overlap) & (shared >= through_third)
@@ -84,7 +84,7 @@ def lay_together(
     mm, and what follows for the surface."""
     found, laid = list(poses), list[Laid | None]()
     for number in range(rounds):
-        laid = map_in_threads(partial(_compared, some, surfaces, found, distance_mm), pairs)
+        laid = map_in_threads(partial(_compare_surfaces, some, surfaces, found, distance_mm), pairs)
         step = _step(_in_world(pairs, laid, found), len(found))
         found = [pose @ moved(motion).inverse() for pose, motion in zip(found, step, strict=True)]
         progress("adjustment", number + 1, rounds)
@@ -92,10 +92,10 @@ def lay_together(
             break
     progress("adjustment", rounds, rounds)
     scatter = float(np.mean([each.sigma for each in laid if each is not None] or [0.0]))
-    return found, scatter, _expected(some, _in_world(pairs, laid, found), found, distance_mm)
+    return found, scatter, _expected_error(some, _in_world(pairs, laid, found), found, distance_mm)
 
 
-def _compared(
+def _compare_surfaces(
     some: Sequence[Shown],
     surfaces: Sequence[Surface],
     poses: Sequence[Rigid3],
@@ -199,7 +199,7 @@ def _scatter(
     return (by_block.T @ by_block).toarray()[6:, 6:] / left
 
 
-def _expected(
+def _expected_error(
     some: Sequence[Shown], pairs: Sequence[_Pair], poses: Sequence[Rigid3], distance_mm: float
 ) -> Expectation | None:
     """How far the surface may be off by its poses; None for a single frame, and where none lies on another."""

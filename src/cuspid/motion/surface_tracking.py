@@ -99,7 +99,7 @@ class _Step:
 # --- one frame onto another --------------------------------------------------------------------------------------
 
 
-def _onto(
+def _register_icp(
     one: Surface | Shown,
     other: Surface,
     start: Rigid3,
@@ -145,7 +145,7 @@ def _starts(motion: Rigid3 | None, distance_mm: float) -> Iterator[Rigid3]:
             yield Rigid3(np.eye(3), distance_mm * np.array([along, across, 0.0]))
 
 
-def _followed(
+def _track_frame(
     surfaces: Sequence[Surface],
     placed: Mapping[int, Rigid3],
     frame: int,
@@ -157,7 +157,7 @@ def _followed(
     reason = "no earlier frame shows any surface"
     for number, earlier in enumerate(list(placed)[: -_BRIEFLY - 1 : -1]):
         starts = _starts(motion, distance_mm)
-        step = _found(surfaces, earlier, frame, starts, options, distance_mm)
+        step = _register_from_starts(surfaces, earlier, frame, starts, options, distance_mm)
         doubt = _doubt(step, options.minimum_overlap, options, distance_mm)
         if doubt is None:
             return step.this_from_other @ placed[earlier], ""
@@ -165,7 +165,7 @@ def _followed(
     return None, reason
 
 
-def _found(
+def _register_from_starts(
     surfaces: Sequence[Surface],
     earlier: int,
     frame: int,
@@ -176,11 +176,11 @@ def _found(
     """A frame laid onto an earlier one from the best of some starts."""
     one, other = surfaces[earlier], surfaces[frame]
     some = one.some(options.samples, np.random.default_rng([options.seed, frame]))
-    tried = max((_onto(some, other, start, distance_mm) for start in starts), key=lambda step: step.rank)
-    return _onto(one, other, tried.this_from_other, distance_mm, _REACHES[-_LAST_STEPS:])
+    tried = max((_register_icp(some, other, start, distance_mm) for start in starts), key=lambda step: step.rank)
+    return _register_icp(one, other, tried.this_from_other, distance_mm, _REACHES[-_LAST_STEPS:])
 
 
-def _chained(
+def _track_frames(
     surfaces: Sequence[Surface],
     names: Sequence[str],
     options: SurfaceTrackingOptions,
@@ -201,7 +201,7 @@ def _chained(
         largest, pose = sorted(pieces, key=len)[-1:], None
         for piece in pieces[-1:] + [each for each in largest if each is not pieces[-1]]:
             moved_on = motion if frame - 1 in piece else None
-            pose, reason = _followed(surfaces, piece, frame, moved_on, options, distance_mm)
+            pose, reason = _track_frame(surfaces, piece, frame, moved_on, options, distance_mm)
             reasons.setdefault(frame, reason)
             if pose is not None:
                 break
@@ -210,7 +210,7 @@ def _chained(
             pieces.append(piece)
         motion = pose @ piece[frame - 1].inverse() if frame - 1 in piece else None
         piece[frame] = pose
-    placed = _joined(surfaces, sorted(pieces, key=len, reverse=True), options, distance_mm, progress)
+    placed = _join_pieces(surfaces, sorted(pieces, key=len, reverse=True), options, distance_mm, progress)
     dropped = [
         Dropped(what=f"frame {name}", reason=reasons.get(frame) or "it lies only on frames that lie on no others")
         for frame, name in enumerate(names)
@@ -220,7 +220,7 @@ def _chained(
     return {frame: placed[frame] @ world_from_first for frame in sorted(placed)}, dropped
 
 
-def _joined(
+def _join_pieces(
     surfaces: Sequence[Surface],
     pieces: Sequence[Mapping[int, Rigid3]],
     options: SurfaceTrackingOptions,
@@ -254,10 +254,10 @@ def _found_on(
     few = {each: surfaces[each].some(_FEW, np.random.default_rng([options.seed, each])) for each in placed}
     for frame, pose in piece.items():
         for earlier in sorted(placed, key=lambda each: abs(each - frame)):
-            tried = _onto(few[earlier], surfaces[frame], Rigid3.identity(), distance_mm)
+            tried = _register_icp(few[earlier], surfaces[frame], Rigid3.identity(), distance_mm)
             if _doubt(tried, options.minimum_overlap, options, distance_mm) is not None:
                 continue
-            step = _found(surfaces, earlier, frame, [tried.this_from_other], options, distance_mm)
+            step = _register_from_starts(surfaces, earlier, frame, [tried.this_from_other], options, distance_mm)
             if _doubt(step, overlap, options, distance_mm) is not None:
                 continue
             found = pose.inverse() @ step.this_from_other @ placed[earlier]
@@ -282,7 +282,7 @@ def _is_borne_out(
     ]
     witnesses = near[:: max(len(near) // _WITNESSES, 1)]
     steps = (
-        _onto(surfaces[a], surfaces[b], there[b] @ placed[a].inverse(), distance_mm, _REACHES[-_LAST_STEPS:])
+        _register_icp(surfaces[a], surfaces[b], there[b] @ placed[a].inverse(), distance_mm, _REACHES[-_LAST_STEPS:])
         for a, b in witnesses
     )
     agree = [_doubt(step, overlap, options, distance_mm) is None for step in steps]
@@ -328,7 +328,7 @@ def track_surfaces(
         names.append(name)
         surfaces.append(surface_of(maps, distance_mm, thinning=options.thinning, border_px=options.border_px))
         progress("surfaces", len(names), max(len(capture.frames), len(names)))
-    placed, dropped = _chained(surfaces, names, options, distance_mm, progress)
+    placed, dropped = _track_frames(surfaces, names, options, distance_mm, progress)
     _require_enough(len(placed), len(names), dropped, capture.handpiece, options)
     kept = [surfaces[frame] for frame in placed]
     poses, scatter_mm, expectation = adjusted(kept, list(placed.values()), options, distance_mm, progress)
@@ -339,7 +339,7 @@ def track_surfaces(
         dropped=(*capture.left_out, *dropped),
         log={"surface_scatter_um": 1000 * scatter_mm},
         notes=(
-            _held(capture.handpiece),
+            _held_calibration(capture.handpiece),
             *_drift(poses, distance_mm),
             *glare_notes(capture.handpiece),
             *_lost(names, placed),
@@ -347,7 +347,7 @@ def track_surfaces(
     )
 
 
-def _held(handpiece: Handpiece) -> str:
+def _held_calibration(handpiece: Handpiece) -> str:
     """What the calibration, which surfaces do not refine, does to them."""
     taken = "motion: the frames were located by their surfaces, which do not refine the calibration"
     sigma_mm = depth_sigma_mm(handpiece)

@@ -115,7 +115,7 @@ class Laid(NamedTuple):
         return float(np.linalg.eigvalsh(self.normals.T @ self.normals / len(self.normals))[0])
 
 
-def _shown(depth_map: DepthMap, jump_mm: float, border_px: int) -> Shown:
+def _oriented_points(depth_map: DepthMap, jump_mm: float, border_px: int) -> Shown:
     """The points of a depth map that have neighbours on all sides, in the rig frame."""
     camera = depth_map.camera
     rays = camera.rays(camera.pixel_centres().reshape(-1, 2)).reshape(camera.height, camera.width, 3)
@@ -146,7 +146,7 @@ def surface_of(depth_maps: Iterable[DepthMap], distance_mm: float, *, thinning: 
     ``thinning`` is the side of a cube, as a share of the working distance; what lies within ``border_px`` pixels of a
     depth that is not known is left out.
     """
-    parts = [_shown(each, _JUMP * distance_mm, border_px) for each in depth_maps]
+    parts = [_oriented_points(each, _JUMP * distance_mm, border_px) for each in depth_maps]
     nothing = Shown(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
     points, normals, trust = (np.concatenate(each) for each in zip(nothing, *parts, strict=True))
     cubes = np.floor(points / (thinning * distance_mm)).astype(np.int64)

@@ -20,7 +20,7 @@ def _root(parent, node):
 
 @kernel
 @no_type_check
-def _joined(matches, image_of, images):
+def _join_kernel(matches, image_of, images):
     """One keypoint, the same for all, of the track of each; see :func:`join`."""
     count = len(image_of)
     parent, tail, size = np.arange(count), np.arange(count), np.ones(count, np.int64)
@@ -54,7 +54,7 @@ def join(matches: Int[np.ndarray, "m 2"], image_of: Int[np.ndarray, "n"]) -> Int
     two keypoints in one image is left out. Dropping such tracks entirely would cost a long film half of its points and
     gain a rig nothing.
     """
-    root = _joined(matches, image_of, image_of.max(initial=-1) + 1)
+    root = _join_kernel(matches, image_of, image_of.max(initial=-1) + 1)
     _, label, sizes = np.unique(root, return_inverse=True, return_counts=True)
     kept = sizes >= 2
     return np.where(kept, np.cumsum(kept) - 1, -1)[label]

@@ -69,7 +69,7 @@ class GrowingView:
         self._show_path(scan, lost)
         if time.monotonic() - self._rims_at > _RIMS_EVERY_S:
             self._show_rims(scan.missing())
-        self._words.content = self._told(scan, lost)
+        self._words.content = self._status_text(scan, lost)
 
     def _show_part(self, key: int, mesh: Mesh) -> None:
         if len(mesh.faces) == 0:
@@ -95,7 +95,7 @@ class GrowingView:
             shown = self._toggles["Path"].value
             self._server.scene.add_line_segments("/path", segments, np.array(_PATH), line_width=2, visible=shown)
         if not self._looked:
-            self._look_at(path[-1], _towards(rig, latest), scan.handpiece.working_distance_mm)
+            self._look_at(path[-1], _mean_view_direction(rig, latest), scan.handpiece.working_distance_mm)
 
     def _look_at(self, place: Float[np.ndarray, "3"], towards: Float[np.ndarray, "3"], distance_mm: float) -> None:
         """From behind the handpiece, at what it sees first, and with light from there."""
@@ -118,7 +118,7 @@ class GrowingView:
             "/holes", rims.astype(np.float32), colors, point_size=0.08, point_shape="circle", visible=visible
         )
 
-    def _told(self, scan: Scan, lost: int) -> str:
+    def _status_text(self, scan: Scan, lost: int) -> str:
         rate = len(scan.frames) / max(time.monotonic() - self._begin, 1e-3)
         lines = [
             f"**{len(scan.rig_from_world)}** of {len(scan.frames)} frames placed, {rate:.1f} a second",
@@ -135,7 +135,7 @@ class GrowingView:
         return "\n".join(lines)
 
 
-def _towards(rig: Rig, rig_from_world: Rigid3) -> Float[np.ndarray, "3"]:
+def _mean_view_direction(rig: Rig, rig_from_world: Rigid3) -> Float[np.ndarray, "3"]:
     """Unit vector (world) in which the cameras look on the average."""
     mean = np.mean([mounted.cam_from_rig.rotation[2] for mounted in rig.cameras.values()], axis=0)
     towards = rig_from_world.inverse().rotate(mean)

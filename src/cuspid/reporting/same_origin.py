@@ -76,7 +76,7 @@ def only_own_pages(bound: str) -> Iterator[None]:
 
     def guarded(*given: Any, process_request: Answer, **options: Any) -> Any:
         started.append(bound)
-        return serve(*given, process_request=_guarded(process_request, bound), **options)
+        return serve(*given, process_request=_guard_handler(process_request, bound), **options)
 
     server.serve = guarded  # type: ignore[misc, assignment]
     try:
@@ -89,7 +89,7 @@ def only_own_pages(bound: str) -> Iterator[None]:
         )
 
 
-def _guarded(answer: Answer, bound: str) -> Answer:
+def _guard_handler(answer: Answer, bound: str) -> Answer:
     def guarded(connection: Any, request: Request) -> Any:
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
         if len(hosts) == 1 and len(origins) < 2 and is_own(hosts[0], next(iter(origins), None), bound):

@@ -65,7 +65,7 @@ def render_with_blender(
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         _write_scene(folder, scene, poses, tasks, processes)
-        for frame, camera in _run(python, folder):
+        for frame, camera in _run_script(python, folder):
             image = folder / f"{frame}-{camera}.npy"
             rng = image_rng(scene, frame, camera)
             sink(frame, camera, record(np.load(image), gain_of[frame], scene.handpiece, camera, rng))
@@ -114,7 +114,7 @@ def _with_bpy(given: str | None) -> Path:
     return Path(given)
 
 
-def _run(python: Path, folder: Path) -> Iterator[tuple[str, str]]:
+def _run_script(python: Path, folder: Path) -> Iterator[tuple[str, str]]:
     """Run the script and yield frame and camera of each image as it is there."""
     with (
         (folder / "errors.txt").open("w+") as errors,

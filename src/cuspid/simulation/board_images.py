@@ -65,12 +65,12 @@ def board_poses(handpiece: Handpiece, board: Board, options: PhotographOptions) 
     rng = np.random.default_rng([options.seed, 4])
     cameras = list(handpiece.rig.cameras.values())
     return [
-        cameras[k % len(cameras)].cam_from_rig.inverse() @ _held(handpiece.working_distance_mm, board, options, rng)
+        cameras[k % len(cameras)].cam_from_rig.inverse() @ _any_pose(handpiece.working_distance_mm, board, options, rng)
         for k in range(options.instants)
     ]
 
 
-def _held(distance_mm: float, board: Board, options: PhotographOptions, rng: np.random.Generator) -> Rigid3:
+def _any_pose(distance_mm: float, board: Board, options: PhotographOptions, rng: np.random.Generator) -> Rigid3:
     """``cam_from_board`` of a board before a camera."""
     towards, turn = rng.uniform(-np.pi, np.pi, 2)
     tilt = np.deg2rad(options.most_tilt_deg) * np.sqrt(rng.uniform())

@@ -21,11 +21,11 @@ def lit(handpiece: Handpiece) -> Handpiece:
         return handpiece
     _log.info(f"handpiece {handpiece.name}: it has no lights; one beside each camera is assumed")
     offset_mm = _BESIDE * handpiece.working_distance_mm
-    lights = {name: _beside(mounted, offset_mm) for name, mounted in handpiece.rig.cameras.items()}
+    lights = {name: _light_beside(mounted, offset_mm) for name, mounted in handpiece.rig.cameras.items()}
     return replace(handpiece, lights=lights, lightings=(Lighting(lights=tuple(lights)),))
 
 
-def _beside(mounted: MountedCamera, offset_mm: float) -> Light:
+def _light_beside(mounted: MountedCamera, offset_mm: float) -> Light:
     """To the right of the camera, in its plane, shining along its axis."""
     place = mounted.cam_from_rig.inverse().apply(np.array([offset_mm, 0.0, 0.0]))
     return Light(position_mm=place, direction=mounted.axis_in_rig)

@@ -62,7 +62,7 @@ class ManufacturingOptions(Options):
 def built(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:
     """One of the handpieces that are built to the tolerances; the drawn one if there are none."""
     rng = np.random.default_rng([options.manufacturing_seed, 3])
-    placed = with_cameras(drawn, lambda mounted: _off(mounted, options.tolerances, rng))
+    placed = with_cameras(drawn, lambda mounted: _draw_error(mounted, options.tolerances, rng))
     return _lit_anew(_exposing_anew(placed, options), options)
 
 
@@ -111,7 +111,7 @@ def told(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:
     return options.tolerances.fill(with_cameras(drawn, lambda mounted: _open(mounted, options.tolerances)))
 
 
-def _off(mounted: MountedCamera, tolerances: Tolerances, rng: np.random.Generator) -> MountedCamera:
+def _draw_error(mounted: MountedCamera, tolerances: Tolerances, rng: np.random.Generator) -> MountedCamera:
     motion = tolerances.motion_sigma * rng.standard_normal(6)
     shift = tolerances.lens_factor(mounted.camera) @ rng.standard_normal(4)
     if not (motion.any() or shift.any()):

@@ -127,14 +127,14 @@ def through_lens(
     focal_px = float(camera.focal_px.mean())
     focus_mm = _NEAREST_FOCUS * working_distance_mm
     radius_px = focal_px * optics.aperture_mm / 2 * np.abs(1 / depth_mm - 1 / focus_mm)
-    spread = _defocused(np.asarray(radiance, dtype=np.float32), depth_mm, radius_px)
+    spread = _defocus(np.asarray(radiance, dtype=np.float32), depth_mm, radius_px)
     sigma_px = _AIRY * _WAVELENGTH_MM / optics.aperture_mm * focal_px
     return np.asarray(cv2.GaussianBlur(spread, (0, 0), sigma_px), dtype=np.float32)
 
 
 @kernel(fastmath=True)
 @no_type_check
-def _defocused(light, depth, radius):
+def _defocus(light, depth, radius):
     """Each pixel gathers what the discs of its neighbours spread over it; discs of what lies behind it end at its own
     (as what is in front hides them)."""
     height, width = depth.shape

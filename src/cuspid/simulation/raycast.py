@@ -121,9 +121,9 @@ class Scene:
     def below(self) -> Callable[[str | None, Rigid3], Float[np.ndarray, "v 3"]]:
         """The light that leaves each vertex from below under a lighting pattern, by the pose of the handpiece
         (``rig_from_world``), cached for the last ones; of no vertex where light does not travel below the surface."""
-        return lru_cache(maxsize=_TOGETHER)(self._below)
+        return lru_cache(maxsize=_TOGETHER)(self._light_from_below)
 
-    def _below(self, lighting: str | None, rig_from_world: Rigid3) -> Float[np.ndarray, "v 3"]:
+    def _light_from_below(self, lighting: str | None, rig_from_world: Rigid3) -> Float[np.ndarray, "v 3"]:
         if self.scattering is None:
             return _NONE
         lights = lamps(self.handpiece, lighting, rig_from_world)
@@ -167,14 +167,14 @@ def radiance(
         rays = rays.reshape(camera.height, -1, 3)[row]
     if smear is None:
         world_from_cam = cam_from_world.inverse()
-        origins, directions = np.array([world_from_cam.translation]), _turned(rays, world_from_cam.rotation)
+        origins, directions = np.array([world_from_cam.translation]), _rotate_directions(rays, world_from_cam.rotation)
         return radiance_along(scene, origins, directions, camera.width, lights, below)
     origins, directions = np.empty_like(rays), np.empty_like(rays)
     moments = _moments(scene.supersampling**2)
     for index, moment in enumerate(moments):
         motion = moment * smear
         world_from_cam = (cam_from_world @ Rigid3.from_rotation_vector(motion[:3], motion[3:])).inverse()
-        directions[index :: len(moments)] = _turned(rays[index :: len(moments)], world_from_cam.rotation)
+        directions[index :: len(moments)] = _rotate_directions(rays[index :: len(moments)], world_from_cam.rotation)
         origins[index :: len(moments)] = world_from_cam.translation
     return radiance_along(scene, origins, directions, camera.width, lights, below, moving=True)
 
@@ -292,7 +292,7 @@ def _add_light(
 
 @kernel
 @no_type_check
-def _turned(directions, rotation):
+def _rotate_directions(directions, rotation):
     """``Rigid3.rotate`` without BLAS, whose threads would fight with the other processes."""
     out = np.empty_like(directions)
     for i in range(len(directions)):
@@ -307,7 +307,7 @@ def _turned(directions, rotation):
 
 @kernel(fastmath=True)
 @no_type_check
-def _reflected(normal, view, towards, reflectance, roughness, saliva):
+def _reflect(normal, view, towards, reflectance, roughness, saliva):
     """Diffuse (to be multiplied by the albedo) and glossy answer to a light of strength 1; ``view`` points away."""
     nl = dot(normal, towards)
     if nl <= 0:
@@ -338,7 +338,7 @@ def _places(rays, surface):
 
 @kernel(fastmath=True)
 @no_type_check
-def _mixed(rays, i, surface, values):
+def _interpolate_hit(rays, i, surface, values):
     """What a hit has of a value of each vertex."""
     corners, total = surface.faces[rays.faces[i]], 0.0
     for corner in range(3):
@@ -354,7 +354,7 @@ def _mark(rays, surface, albedos):
         if rays.faces[i] < 0 or surface.materials[rays.faces[i]] != 0:
             continue
         for mark in range(len(surface.mark_colours)):
-            share = _mixed(rays, i, surface, surface.marks[:, mark])
+            share = _interpolate_hit(rays, i, surface, surface.marks[:, mark])
             for c in range(3):
                 albedos[i, c] += share * (surface.mark_colours[mark, c] - albedos[i, c])
 
@@ -381,7 +381,7 @@ def _shade(rays, albedos, surface, palette, lights, chosen, counts, light, sampl
                 continue
             point, normal = point_of(rays, i), normal_of(rays, i, surface)
             if palette.stipple_mm[m] > 0:
-                height = palette.stipple_mm[m] * _mixed(rays, i, surface, surface.stippled)
+                height = palette.stipple_mm[m] * _interpolate_hit(rays, i, surface, surface.stippled)
                 normal = stippled(normal, point, height, palette.stipple_from_jaw)
             albedo = (albedos[i, 0], albedos[i, 1], albedos[i, 2])
             direction = rays.directions[i]
@@ -402,7 +402,7 @@ def _shade(rays, albedos, surface, palette, lights, chosen, counts, light, sampl
                 if light.lit[n, k]:
                     towards, falloff = incoming(point, k, lights)
                     surface_coat = palette.reflectance[m], palette.roughness[m], palette.saliva
-                    diffuse, glossy = _reflected(normal, view, towards, *surface_coat)
+                    diffuse, glossy = _reflect(normal, view, towards, *surface_coat)
                     glossy *= lights.glare[k]
                     if spread:
                         diffuse = 0.0

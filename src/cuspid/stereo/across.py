@@ -80,10 +80,10 @@ def measure_moving_cameras(
         )
         measured = measure_views(views, both, handpiece.depth_range_mm, resolution, stereo, widenings=())
         found += depth_maps_of(views, measured, both, masks, frame, resolution, stereo.confidence, stereo.grid_px)
-    return tuple(_discounted(depth_map, options.confidence_share) for depth_map in found)
+    return tuple(_discount_weight(depth_map, options.confidence_share) for depth_map in found)
 
 
-def _discounted(depth_map: DepthMap, share: float) -> DepthMap:
+def _discount_weight(depth_map: DepthMap, share: float) -> DepthMap:
     """With so much less weight, though its depths scatter no more: they share the errors of two poses."""
     best_mm = None if depth_map.best_mm is None else depth_map.best_mm * float(np.sqrt(share))
     return replace(depth_map, confidence=(share * depth_map.confidence).astype(np.float32), best_mm=best_mm)

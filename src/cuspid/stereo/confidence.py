@@ -171,7 +171,7 @@ def at_near_borders(
     inverse = 1 / one.depth_mm
     near = np.zeros(inverse.shape, dtype=bool)
     for down, right in _disc(radius):
-        falls, rises = inverse - _moved(inverse, down, right), _moved(inverse, -down, -right) - inverse
+        falls, rises = inverse - _shift_values(inverse, down, right), _shift_values(inverse, -down, -right) - inverse
         limit = np.maximum(least, gradient_limit * np.hypot(down, right))
         with np.errstate(invalid="ignore"):
             near |= (falls > limit) & ~(rises > falls / 2)
@@ -184,7 +184,7 @@ def _disc(radius: int) -> list[tuple[int, int]]:
     return [(down, right) for down in span for right in span if 0 < down**2 + right**2 <= radius**2]
 
 
-def _moved(values: Float[np.ndarray, "h w"], down: int, right: int) -> Float[np.ndarray, "h w"]:
+def _shift_values(values: Float[np.ndarray, "h w"], down: int, right: int) -> Float[np.ndarray, "h w"]:
     """At each pixel the value of the one so many rows below and columns to the right; NaN where there is none."""
     height, width = values.shape
     padded = np.pad(values, ((abs(down),) * 2, (abs(right),) * 2), constant_values=np.nan)

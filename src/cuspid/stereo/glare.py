@@ -66,7 +66,7 @@ def seen(
     rays = grid.rays(grid.pixel_centres().reshape(-1, 2)).reshape(grid.height, grid.width, 3)
     spots, share = np.zeros((2, *rays.shape), np.float32), np.ones(depth_mm.shape, np.float32)
     for spot, window in zip(spots, (_WIDE, _MIDDLE), strict=True):
-        inverse, slopes = _smoothed(1 / depth_mm, max(_LEAST_PX, round(window * float(grid.focal_px.mean()))))
+        inverse, slopes = _smooth_depth(1 / depth_mm, max(_LEAST_PX, round(window * float(grid.focal_px.mean()))))
         # The plane 1 / Z = a x + b y + c, with x = X / Z and y = Y / Z, has the normal (a, b, c).
         across = slopes * grid.focal_px
         normals = -unit(np.dstack([across, inverse - (across * rays[..., :2]).sum(axis=-1)]))
@@ -78,7 +78,7 @@ def seen(
     return Seen(spot, STRENGTH * spot + _PLACE * np.maximum(past_pits - spot, 0), share)
 
 
-def _smoothed(
+def _smooth_depth(
     inverse_depth: Float[np.ndarray, "h w"], window: int
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w 2"]]:
     """Inverse depth, filled in where it is unknown, and its mean change to the next pixel to the right and below; NaN

@@ -113,7 +113,7 @@ def initial_points(
         return np.zeros((0, 3))
     # Nothing is matched where only one of the images shows anything, nor at disparities below the lowest one.
     shift = int(np.floor(low))
-    found = matcher(first[:, start:end].copy(), _shifted(second, shift)[:, start:end], (low - shift, high - shift))
+    found = matcher(first[:, start:end].copy(), _shift_right(second, shift)[:, start:end], (low - shift, high - shift))
     rows, columns = np.nonzero(np.isfinite(found))
     depth = pair.disparity(1.0) / (found[rows, columns].astype(np.float64) + shift)
     rays = pair.camera.rays(np.stack([columns + start, rows], axis=-1) + 0.5)
@@ -131,7 +131,7 @@ def _shared_columns(
     return max(int(here[0]), int(there[0]) + low), min(int(here[-1]), int(there[-1]) + high) + 1
 
 
-def _shifted(image: UInt8[np.ndarray, "h w"], columns: int) -> UInt8[np.ndarray, "h w"]:
+def _shift_right(image: UInt8[np.ndarray, "h w"], columns: int) -> UInt8[np.ndarray, "h w"]:
     """The image so many columns to the right, black where it shows nothing."""
     moved = np.zeros_like(image)
     width = image.shape[1]

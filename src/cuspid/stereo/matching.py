@@ -400,7 +400,7 @@ class Match:
             return self._stack
         return np.stack([image - cv2.GaussianBlur(image, (0, 0), _SHADE_PX) + MID_GREY_DN for image in self._stack])
 
-    def _seen(self, widening: int) -> Float[np.ndarray, "c h w"]:
+    def _views_for_widening(self, widening: int) -> Float[np.ndarray, "c h w"]:
         """The images for windows that are so many times wider, of which as many fewer pixels are sampled."""
         if widening == 1:
             return self._stack
@@ -419,15 +419,15 @@ class Match:
         """Depth of a reference view before the checks."""
         view, grid = self._views.views[index], self._views.grids[index]
         layers = np.stack([initial_layer(self._initial[pair], view, grid) for pair in self._views.layers[index]])
-        return self._refined(index, layers, begun=np.isfinite(layers).any(axis=0))
+        return self._refine_layer(index, layers, begun=np.isfinite(layers).any(axis=0))
 
     def widen(self, index: int, one: Measured, agreed: Float[np.ndarray, "h w 6"], widening: int) -> Measured:
         """What was measured of a view where other views agree with it (planes), and what these planes, carried on to
         the rest of it, lead to in wider windows."""
         none = np.full((1, *one.depth_mm.shape), np.nan)
-        return self._refined(index, none, begun=one.begun, known=agreed, widening=widening)
+        return self._refine_layer(index, none, begun=one.begun, known=agreed, widening=widening)
 
-    def _refined(
+    def _refine_layer(
         self,
         index: int,
         layers: Float[np.ndarray, "l h w"],
@@ -438,7 +438,7 @@ class Match:
     ) -> Measured:
         geometry, (height, width) = self._views.geometry[index], self._sizes[index]
         assert geometry is not None
-        seen = self._seen(widening)
+        seen = self._views_for_widening(widening)
         planes = refine(
             seen,
             self._sizes,

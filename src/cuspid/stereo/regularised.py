@@ -48,15 +48,15 @@ def sweep(
     scale = next((s for s in _SCALES if s**3 * height * width * (high - low) / _STEP_PX <= _MOST_CELLS), _SCALES[-1])
     step = _STEP_PX / scale
     labels = low + step * np.arange(max(int(np.ceil((high - low) / step)) + 1, 3))
-    one, to_full = _reduced(images[reference, :height, :width], scale)
-    others = [_reduced(images[k, : sizes[k, 0], : sizes[k, 1]], scale) for k in geometry.others]
+    one, to_full = _downsample(images[reference, :height, :width], scale)
+    others = [_downsample(images[k, : sizes[k, 0], : sizes[k, 1]], scale) for k in geometry.others]
     mean, variance = _moments(one)
     zncc = np.empty((*one.shape, len(labels)), dtype=np.float32)
     for number, q in enumerate(labels):
         seen = []
         for (other, to_other), a, b in zip(others, geometry.infinite, geometry.parallax, strict=True):
             homography = np.linalg.inv(to_other) @ (a + q * _column(b)) @ to_full
-            seen.append(_zncc(one, mean, variance, *_warped(other, homography, one.shape), noise_dn))
+            seen.append(_zncc(one, mean, variance, *_warp_image(other, homography, one.shape), noise_dn))
         # Half of the sources may look past what is in front of the surface there.
         best = np.sort(np.stack(seen), axis=0)[len(seen) // 2 :]
         zncc[..., number] = best.mean(axis=0)
@@ -71,7 +71,7 @@ def _column(parallax: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     return np.outer(parallax, [0.0, 0.0, 1.0])
 
 
-def _reduced(
+def _downsample(
     image: Float[np.ndarray, "h w"], scale: float
 ) -> tuple[Float[np.ndarray, "r c"], Float[np.ndarray, "3 3"]]:
     """A smaller image, and what takes its pixels (first centre at 0) to those of the whole one."""
@@ -82,7 +82,7 @@ def _reduced(
     return np.asarray(reduced), np.array([[by_x, 0, (by_x - 1) / 2], [0, by_y, (by_y - 1) / 2], [0, 0, 1.0]])
 
 
-def _warped(
+def _warp_image(
     image: Float[np.ndarray, "h w"], homography: Float[np.ndarray, "3 3"], shape: tuple[int, ...]
 ) -> tuple[Float[np.ndarray, "r c"], Float[np.ndarray, "r c"]]:
     """An image as seen through a homography from another one's pixels, and where it shows anything there."""

@@ -175,7 +175,7 @@ def brightness(
     return stack
 
 
-def _blurred(image: Float32[np.ndarray, "h w 3"], sigma_px: float) -> Float32[np.ndarray, "h w 3"]:
+def _masked_blur(image: Float32[np.ndarray, "h w 3"], sigma_px: float) -> Float32[np.ndarray, "h w 3"]:
     """Smooth where it is usable."""
     usable = (image >= 0).astype(np.float32)
     weight = cv2.GaussianBlur(usable, (0, 0), sigma_px)
@@ -204,7 +204,7 @@ def _is_in(view, x, y, z):
 
 @kernel(inline="always", **FAST)
 @no_type_check
-def _around(view, j, row, column, channel):
+def _bilinear_corners(view, j, row, column, channel):
     """The four pixels around a place, and whether all of them are usable."""
     images, camera = view.images, view.others[j]
     a, b = images[camera, row, column, channel], images[camera, row, column + 1, channel]
@@ -227,7 +227,7 @@ def _difference(view, j, u, v, q):
     total, count = np.float32(0), 0
     for channel in range(view.images.shape[3]):
         here = view.images[view.reference, v, u, channel]
-        a, b, c, d, usable = _around(view, j, row, column, channel)
+        a, b, c, d, usable = _bilinear_corners(view, j, row, column, channel)
         if usable and here >= 0:
             top, bottom = a + fx * (b - a), c + fx * (d - c)
             total += abs(top + fy * (bottom - top) - here)
@@ -275,7 +275,7 @@ def _every(count: int, spacing: int) -> Int[np.ndarray, "n"]:
 
 @kernel
 @no_type_check
-def _carried(coarse, spacing, rows, columns, fine):
+def _upsample_planes(coarse, spacing, rows, columns, fine):
     """Planes for a grid of pixels from those of a coarser one: q, and its slopes where the surface is smooth."""
     out = np.zeros((rows.size, columns.size, 3))
     height, width = coarse.shape
@@ -312,7 +312,7 @@ def _add_sample(view, j, u, v, du, dv, plane, weight, system):
     along_y = (view.parallax[j, 1] - y * view.parallax[j, 2]) / z
     for channel in range(view.images.shape[3]):
         here = view.images[view.reference, v + dv, u + du, channel]
-        a, b, c, d, usable = _around(view, j, row, column, channel)
+        a, b, c, d, usable = _bilinear_corners(view, j, row, column, channel)
         if not usable or here < 0:
             continue
         top, bottom = a + fx * (b - a), c + fx * (d - c)
@@ -449,7 +449,7 @@ def shaded_depths(
 
     ``images`` are those of :func:`brightness`.
     """
-    blurred = np.stack([_blurred(image, options.blur_px) for image in images])
+    blurred = np.stack([_masked_blur(image, options.blur_px) for image in images])
     compared_of = _ratios if _are_coloured(views[0].lights) else _as_they_are
     compared, trust = compared_of(blurred, np.ones_like(blurred))
     how = depth_range_mm, spacing_px, options
@@ -481,7 +481,7 @@ def _matte(
     for view, image, weight, depth in zip(views, matte, trust, depths, strict=True):
         part, encoded = np.s_[: view.size[0], : view.size[1]], np.float32(-1 / view.gamma)
         what = seen(view.grid, depth, view.lights, options.exit_index)
-        spot, uncertain, share = (_spread(each, view.size, spacing_px) for each in what)
+        spot, uncertain, share = (_spread_values(each, view.size, spacing_px) for each in what)
         weight[part] = trusted(image[part], uncertain, view.gamma, options.glare_dn)
         image[part] = np.where(image[part] >= 0, image[part] * ((1 + spot) * share[..., None]) ** encoded, _UNUSABLE)
     return matte, trust
@@ -524,7 +524,7 @@ def _hues(images: Float32[np.ndarray, "*n 3"]) -> Float32[np.ndarray, "*n 3"]:
     return level - np.roll(level, -1, axis=-1)
 
 
-def _spread(
+def _spread_values(
     values: Float32[np.ndarray, "h w *c"], size: tuple[int, int], spacing_px: int
 ) -> Float32[np.ndarray, "_ _ *c"]:
     """From every n-th pixel to all."""
@@ -559,7 +559,7 @@ class _Refinement:
         coarse = _sweep(
             self._view, self._rows[every // 2 :: every], self._columns[every // 2 :: every], planes, options
         )
-        self._planes = _carried(coarse, every, self._rows, self._columns, spacing_px)
+        self._planes = _upsample_planes(coarse, every, self._rows, self._columns, spacing_px)
 
     def refined(
         self, images: Float32[np.ndarray, "c h w 3"], trust: Float32[np.ndarray, "c h w 3"], lenient: int
@@ -573,7 +573,7 @@ class _Refinement:
         q = smoothed(np.where(known, found[..., 0], np.nan), sigma, self._bend_px, self._colours)
         self._restart(q)
         scale = self._geometry.scale
-        return scale / q, _pooled(sigma, known) * scale / q**2
+        return scale / q, _pool_sigma(sigma, known) * scale / q**2
 
     def _restart(self, q: Float[np.ndarray, "rows columns"]) -> None:
         """From a smooth surface, next time, where it is known."""
@@ -582,7 +582,7 @@ class _Refinement:
             self._planes[..., channel] = np.where(np.isfinite(values), values, self._planes[..., channel])
 
 
-def _pooled(sigma: Float[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+def _pool_sigma(sigma: Float[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Standard deviation of a smooth surface, of which neighbours tell, too; NaN where it is not known."""
     precision = cv2.GaussianBlur(np.where(known, sigma, np.inf) ** -2, (0, 0), _POOLED_PX)
     return np.where(known, np.maximum(precision, _TINY) ** -0.5, np.nan)

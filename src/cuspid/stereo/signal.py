@@ -75,7 +75,7 @@ def _least_dn(image: UInt8[np.ndarray, "h w"]) -> float:
 
 def detail_dn(image: UInt8[np.ndarray, "h w"]) -> float | None:
     """RMS detail in windows of lit surface, in the smoothest tenth of them; None where there is hardly any."""
-    lit = _lit(image)
+    lit = _lit_pixels(image)
     if lit.mean() < _LEAST_LIT:
         return None
     return float(np.sqrt(np.percentile(detail_power(image)[lit], _SMOOTHEST)))
@@ -84,7 +84,7 @@ def detail_dn(image: UInt8[np.ndarray, "h w"]) -> float | None:
 def _plain_share(capture: Capture, frames: Sequence[Frame]) -> float:
     """Share of what is lit in some frames that is plain."""
     grays = [gray(capture.image(frame, camera)) for frame in frames for camera in frame.cameras]
-    lit = [_lit(image) for image in grays]
+    lit = [_lit_pixels(image) for image in grays]
     plain = sum(int((_is_plain(image) & where).sum()) for image, where in zip(grays, lit, strict=True))
     return plain / max(sum(int(where.sum()) for where in lit), 1)
 
@@ -93,5 +93,5 @@ def _is_plain(image: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     return np.asarray(detail_power(image) < (_PLAIN * _least_dn(image)) ** 2)
 
 
-def _lit(image: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def _lit_pixels(image: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     return (image > _USUAL_DN[0]) & (image < _USUAL_DN[1])

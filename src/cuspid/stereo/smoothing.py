@@ -79,10 +79,10 @@ def _second_differences(known: Bool[np.ndarray, "h w"]) -> sparse.csr_array:
     known."""
     across = np.array([[1.0, -2.0, 1.0]])
     stencils = across, across.T, np.sqrt(2) * np.array([[1, -1], [-1, 1]])
-    return sparse.vstack([_filtered(stencil, known) for stencil in stencils], format="csr")
+    return sparse.vstack([_filter_stencils(stencil, known) for stencil in stencils], format="csr")
 
 
-def _filtered(stencil: Float[np.ndarray, "a b"], known: Bool[np.ndarray, "h w"]) -> sparse.csr_array:
+def _filter_stencils(stencil: Float[np.ndarray, "a b"], known: Bool[np.ndarray, "h w"]) -> sparse.csr_array:
     """The stencil at each place where it fits, one row for each."""
     rows, columns = (size - extent + 1 for size, extent in zip(known.shape, stencil.shape, strict=True))
     index = np.arange(known.size).reshape(known.shape)

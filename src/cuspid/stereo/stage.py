@@ -128,7 +128,7 @@ def measure_enough_depth(
         return depths
     sightings = Sightings.of(found, found.tracks)
     missing = sightings.confirmed(depths, found.rig_from_world, agreement_mm) < _ENOUGH_MAPS
-    between = _between(capture, set(every_second), sightings, missing, left_share, options)
+    between = _unmeasured_frames(capture, set(every_second), sightings, missing, left_share, options)
     return depths | measure_depth(
         *(replace(capture, frames=between), folder, options),
         progress=lambda _, done, total: progress("more depth", done, total),
@@ -146,7 +146,7 @@ def _every_second(frames: Sequence[Frame]) -> tuple[Frame, ...]:
     return tuple(kept)
 
 
-def _between(
+def _unmeasured_frames(
     capture: Capture,
     measured: Container[Frame],
     sightings: Sightings,

@@ -84,9 +84,9 @@ class _Views:
         self.used = [number for number, view in enumerate(located) if view.sources]
         rig = capture.handpiece.rig
         self._ideal = {name: IdealView.of(name, mounted) for name, mounted in rig.cameras.items()}
-        self._gray = lru_cache(maxsize=_KEPT_IMAGES)(self._read)
+        self._gray = lru_cache(maxsize=_KEPT_IMAGES)(self._read_view)
 
-    def _read(self, number: int) -> UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]:
+    def _read_view(self, number: int) -> UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]:
         """The grey image of a view, without distortion."""
         view = self.located[number]
         return self._ideal[view.camera].resample(stretch_fine(gray(self.capture.fine_image(view.frame, view.camera))))
@@ -94,7 +94,7 @@ class _Views:
     def _with_sources(self, number: int) -> tuple[int, ...]:
         return number, *self.located[number].sources
 
-    def _prepared(self, number: int) -> Match:
+    def _prepare_match(self, number: int) -> Match:
         """A view and its sources, ready to be matched; the view is the first of them."""
         of, view = self._with_sources(number), self.located[number]
         cameras = {
@@ -105,7 +105,7 @@ class _Views:
         images = {_name(k): self._gray(k) for k in of}
         return Match(views, images, view.depth_range_mm, self.options, shaded=True)
 
-    def _measured(self, number: int, matched: Mapping[int, _Matched]) -> Measured:
+    def _measure_view(self, number: int, matched: Mapping[int, _Matched]) -> Measured:
         """What was matched of a view."""
         view = self.located[number]
         arrays = read_arrays(matched[number].file, remedy="give the command again: it is made anew")
@@ -123,7 +123,7 @@ class _Views:
         images = [self.capture.source.digest(view.frame.name, view.camera) for view in of]
         inputs = {"images": digest_of(images), "views": digest_of([(each.mounted, each.depth_range_mm) for each in of])}
         file = stage.folder / f"{of[0].frame.name}.{of[0].camera}.npz"
-        key = stage.make(inputs, [file], lambda: _write_measured(file, self._prepared(number).measure(0)))
+        key = stage.make(inputs, [file], lambda: _write_measured(file, self._prepare_match(number).measure(0)))
         return number, _Matched(file, key)
 
     def match_again(
@@ -131,8 +131,8 @@ class _Views:
     ) -> tuple[int, _Matched]:
         """The same in wider windows, where its sources contradict much of it."""
         others = self._others(number, matched)
-        one = self._measured(number, matched)
-        beside = [self._measured(other, matched) for other in others]
+        one = self._measure_view(number, matched)
+        beside = [self._measure_view(other, matched) for other in others]
         agreed = agreed_planes(one, beside, view_resolution(self.located, number), self.options.confidence)
         if agreed is None:
             return number, matched[number]
@@ -140,7 +140,7 @@ class _Views:
         file = stage.folder / matched[number].file.name
         inputs = {"matched": digest_of([matched[k].key for k in (number, *others)])}
         key = stage.make(
-            inputs, [file], lambda: _write_measured(file, self._prepared(number).widen(0, one, known, widening))
+            inputs, [file], lambda: _write_measured(file, self._prepare_match(number).widen(0, one, known, widening))
         )
         return number, _Matched(file, key)
 
@@ -156,8 +156,8 @@ class _Views:
     def _depth_map(self, matched: Mapping[int, _Matched], number: int) -> DepthMap:
         view, ideal = self.located[number], self._ideal[self.located[number].camera]
         checked = checked_depth_map(
-            self._measured(number, matched),
-            [self._measured(other, matched) for other in self._others(number, matched)],
+            self._measure_view(number, matched),
+            [self._measure_view(other, matched) for other in self._others(number, matched)],
             self.capture.image(view.frame, view.camera),
             self.capture.source.mask(view.frame.name, view.camera),
             ideal,

@@ -137,7 +137,7 @@ class HeightMap:
         start = round(_RIM_MM / self.cell_mm) + 1
         places, centre = np.array(places, order="C"), np.array(centre)  # of one kind for the compiler
         _mark_occluded(places, centre, self._occluder, self.corner, self.cell_mm, start, _OVER_MM, occluded)
-        return occluded if self.visible is None else occluded & ~self._marked(self.visible, places[..., :2])
+        return occluded if self.visible is None else occluded & ~self._mark_cells(self.visible, places[..., :2])
 
     def scaled(self, scale: float) -> HeightMap:
         """The same surface in a unit that is smaller by this factor."""
@@ -160,9 +160,9 @@ class HeightMap:
 
     def known_at(self, xy: Float[np.ndarray, "h w 2"]) -> Bool[np.ndarray, "h w"]:
         """Whether the surface was seen at a grid of places; not so beyond the border."""
-        return self._marked(self.known, xy)
+        return self._mark_cells(self.known, xy)
 
-    def _marked(self, cells: Bool[np.ndarray, "r c"], xy: Float[np.ndarray, "h w 2"]) -> Bool[np.ndarray, "h w"]:
+    def _mark_cells(self, cells: Bool[np.ndarray, "r c"], xy: Float[np.ndarray, "h w 2"]) -> Bool[np.ndarray, "h w"]:
         place = np.rint((xy - self.corner) / self.cell_mm).astype(int)
         rows, columns = np.array(cells.shape) - 1
         inside = ((place >= 0) & (place <= [columns, rows])).all(axis=-1)
@@ -189,7 +189,7 @@ def in_occlusal_frame(model: SparseModel, scale: ScaleOptions | None) -> SparseM
     near = model.scaled(nearer)
     points, (centres, axes) = near.tracks.points, _centres_and_axes(near)
     world_from_model = _upright(points, centres, axes)
-    world_from_model = _levelled(world_from_model.apply(points)) @ world_from_model
+    world_from_model = _level_rotation(world_from_model.apply(points)) @ world_from_model
     above = world_from_model.apply(centres)
     front = _facing_front(above[: frames_there(above[:, :2])], world_from_model.apply(points))
     found = transformed(near, front @ world_from_model)
@@ -261,7 +261,7 @@ def _tops(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "k 3"]:
     return found[found[:, 2] > highest - _BELOW_MM]
 
 
-def _levelled(points: Float[np.ndarray, "p 3"]) -> Rigid3:
+def _level_rotation(points: Float[np.ndarray, "p 3"]) -> Rigid3:
     """Turns the plane through the tops of the teeth to z = 0; the fewer and the closer they are, the less it turns.
 
     Least squares with a prior on the tilt; what stands off the plane is dropped in rounds.
@@ -319,7 +319,7 @@ def height_map(model: SparseModel, options: HeightMapOptions) -> HeightMap:
     known = near.sum(axis=-1) >= 3
     upper = np.full(known.shape, np.nan)
     upper[known] = np.nanpercentile(heights[known], _UPPER, axis=-1)
-    smooth = _filled(_bulging(upper), options.smoothing_mm / options.cell_mm, float(np.median(points[:, 2])))
+    smooth = _fill_smooth(_bulging(upper), options.smoothing_mm / options.cell_mm, float(np.median(points[:, 2])))
     heights = smooth.astype(np.float32)
     return HeightMap(corner=low, cell_mm=options.cell_mm, heights=heights, known=np.ones(heights.shape, bool))
 
@@ -359,7 +359,7 @@ def _sure_points(model: SparseModel) -> Float[np.ndarray, "p 3"]:
     return points[(points[:, 2] >= max(low, min(-_DEEP_MM, high - 1))) & (points[:, 2] <= high)]
 
 
-def _filled(heights: Float[np.ndarray, "r c"], sigma: float, background: float) -> Float[np.ndarray, "r c"]:
+def _fill_smooth(heights: Float[np.ndarray, "r c"], sigma: float, background: float) -> Float[np.ndarray, "r c"]:
     """Smooth, and without holes: what is unknown takes the mean of what is known farther and farther away."""
     known = np.isfinite(heights)
     values, weights = np.where(known, heights, 0.0), known.astype(np.float64)

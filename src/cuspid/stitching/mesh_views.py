@@ -78,7 +78,7 @@ def draw_mesh(
         for name, rays in _strip_rays(mesh, line, options):
             strips[name] = _strip(mesh, line, name, rays, options)
             progress("views", 1 + len(strips), steps)
-    return MeshViews(panorama=panorama, strips=_cropped(strips))
+    return MeshViews(panorama=panorama, strips=_crop_strips(strips))
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ def _from_above(mesh: Mesh, options: MeshViewOptions) -> Panorama:
     origin_px = np.array([_MARGIN_MM - low[0], _MARGIN_MM + high[1]]) / step
     u, v = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
     eyes = np.stack([(u - origin_px[0]) * step, (origin_px[1] - v) * step, np.full(u.shape, high[2] + 1)], axis=-1)
-    image, distance_mm = _drawn(mesh, _Rays(eyes, np.broadcast_to([0, 0, -1.0], eyes.shape)))
+    image, distance_mm = _cast_rays(mesh, _Rays(eyes, np.broadcast_to([0, 0, -1.0], eyes.shape)))
     covered = np.isfinite(distance_mm)
     return Panorama(
         image=image,
@@ -120,7 +120,7 @@ def _require_few(columns: int, rows: int) -> None:
         raise InputError(f"stitch: a picture would have {columns} x {rows} px; give a larger --view.mm-per-px")
 
 
-def _drawn(mesh: Mesh, rays: _Rays) -> tuple[UInt8[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
+def _cast_rays(mesh: Mesh, rays: _Rays) -> tuple[UInt8[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
     """What rays see, and how far away; black and infinite where they meet nothing, or a back."""
     shape = rays.eyes.shape[:2]
     eyes, directions = rays.eyes.reshape(-1, 3), rays.directions.reshape(-1, 3)
@@ -172,13 +172,13 @@ def _strip_rays(mesh: Mesh, line: Float[np.ndarray, "w 3"], options: MeshViewOpt
 
 
 def _strip(mesh: Mesh, line: Float[np.ndarray, "w 3"], name: str, rays: _Rays, options: MeshViewOptions) -> Strip:
-    image, distance_mm = _drawn(mesh, rays)
+    image, distance_mm = _cast_rays(mesh, rays)
     covered = np.isfinite(distance_mm)
     zone = _zone(name, np.where(covered, rays.eyes[..., 2] - distance_mm, -np.inf), covered, options.strip)
     return Strip(image=image, covered=covered, zone=zone, curve=line[:, :2], mm_per_px=options.mm_per_px)
 
 
-def _cropped(strips: Mapping[str, Strip]) -> dict[str, Strip]:
+def _crop_strips(strips: Mapping[str, Strip]) -> dict[str, Strip]:
     """Without the columns in which no strip shows anything, and those from the sides without empty rows."""
     if not strips:
         return {}

@@ -283,7 +283,7 @@ class _Layers:
         layers, finer = _Layers(window, [], []), image
         for level, sigma in enumerate([*sigmas, sigmas[-1]]):
             last = level == len(sigmas)
-            coarser = np.zeros_like(finer) if last else _blurred(finer, valid, sigma)
+            coarser = np.zeros_like(finer) if last else _masked_blur(finer, valid, sigma)
             weight = valid * _soft(chosen, sigma)
             layers.bands.append((finer - coarser) * weight[..., None])
             layers.weights.append(weight)
@@ -330,7 +330,7 @@ def _gaussian(array: np.ndarray, sigma: float) -> np.ndarray:
     return np.asarray(cv2.resize(small, size, interpolation=cv2.INTER_LINEAR))
 
 
-def _blurred(image: Float[np.ndarray, "h w 3"], valid: Float[np.ndarray, "h w"], sigma: float) -> np.ndarray:
+def _masked_blur(image: Float[np.ndarray, "h w 3"], valid: Float[np.ndarray, "h w"], sigma: float) -> np.ndarray:
     """Gaussian filter that looks at valid pixels alone."""
     total = _gaussian(valid, sigma)
     return np.asarray(_gaussian(image * valid[..., None], sigma) / np.maximum(total, 1e-3)[..., None])
@@ -351,7 +351,7 @@ def compose(
     views = [place(canvas, camera, motion.cam_from_world[name]) for name in names]
     best, samples, overlaps = _survey(canvas, views, names, surface, read, options, progress)
     compensation = balance(samples, len(names), options.gain_compensation)
-    choice = choose(best.cost, best.frame, _evened(best, compensation), options.seams)
+    choice = choose(best.cost, best.frame, _compensated_colors(best, compensation), options.seams)
     return _render(canvas, views, names, surface, read, choice, compensation, overlaps, options, progress)
 
 
@@ -386,7 +386,7 @@ def _survey(
     return best, samples, tuple(overlaps)
 
 
-def _evened(best: _Best, compensation: Compensation) -> Float[np.ndarray, "k r c 3"]:
+def _compensated_colors(best: _Best, compensation: Compensation) -> Float[np.ndarray, "k r c 3"]:
     """Colours of the candidates after the gains, for comparing them across a seam."""
     gains = np.append(compensation.gains, 0.0)[best.frame]
     return np.asarray(best.color * np.exp(-gains)[..., None], dtype=np.float32)
@@ -415,7 +415,7 @@ def _render(
         if not chosen.any():
             return None
         px = frame_map(canvas, view, surface)
-        return _parted(canvas, view, surface, px, read(names[index]), chosen, compensation, index, options), px
+        return _split_bands(canvas, view, surface, px, read(names[index]), chosen, compensation, index, options), px
 
     for index, found in enumerate(map_ahead(layers, range(len(names)))):
         if found is not None:
@@ -442,7 +442,7 @@ def unlit(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
     return np.asarray(cv2.morphologyEx(dark, cv2.MORPH_OPEN, disc) > 0)
 
 
-def _parted(
+def _split_bands(
     canvas: Canvas,
     view: PlacedFrame,
     surface: HeightMap,

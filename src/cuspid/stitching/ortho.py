@@ -111,7 +111,7 @@ def find_surface_again(
     and scaled anew to what sets the scale; arguments as for :func:`find_surface`."""
     motion = _laid_onto(located, shown.motion, keeps_scale=beside is not None)
     sparse = height_map(motion, options.height_map)
-    start = None if shown.dense is None else (shown.dense, _SLACK * _moved(motion, shown.motion))
+    start = None if shown.dense is None else (shown.dense, _SLACK * _largest_shift(motion, shown.motion))
     dense = _dense(located, motion, sparse, read, beside, options, progress, start)
     factor = 1.0 if shown.scale is None else scale_factor(motion, shown.scale)
     surface = None if dense is None else dense.scaled(factor)
@@ -177,7 +177,7 @@ def _laid_onto(model: SparseModel, other: SparseModel, *, keeps_scale: bool) -> 
     return transformed(model.scaled(scale), onto)
 
 
-def _moved(model: SparseModel, other: SparseModel) -> float:
+def _largest_shift(model: SparseModel, other: SparseModel) -> float:
     """The farthest way between what one and what the other has in the middle of the same frame."""
     depth = float(np.median(other.depths))
     ways = _tripods(model, depth)[3::4] - _tripods(other, depth)[3::4]

@@ -342,7 +342,7 @@ def _add_agreement(
 # --- all of them ------------------------------------------------------------------------------------------------
 
 
-def _compared(
+def _prepare_frame(
     image: UInt8[np.ndarray, "h w 3"], maps: tuple[np.ndarray, np.ndarray] | None, gain: float, detail_px: float
 ) -> UInt8[np.ndarray, "h w 3"]:
     """What is compared of a frame, as a camera without distortion sees it: its grey levels, their fine detail (times
@@ -369,7 +369,7 @@ class _Pictures:
         if image in self._kept:
             return self._kept[image]
         name, maps = self._names[image], self._maps[self._cameras[image]]
-        made = _compared(self._read(name), maps, self._gains.get(name.rpartition("/")[0], 1.0), self._detail_px)
+        made = _prepare_frame(self._read(name), maps, self._gains.get(name.rpartition("/")[0], 1.0), self._detail_px)
         if (len(self._kept) + 1) * made.nbytes <= _BYTES:
             self._kept[image] = made
         return made
@@ -445,13 +445,13 @@ def _swept(
     agreed = sure & (certainty >= options.agreement)
     sure = np.asarray(remove_small_objects(agreed, max_size=round(_SPECK_MM2 / pooled.cell_mm**2)))
     known = remove_small_holes(sure, max_size=round(HOLE_MM2 / pooled.cell_mm**2))
-    heights = _bridged((base + moved).astype(np.float32), known & ~sure)
+    heights = _bridge_holes((base + moved).astype(np.float32), known & ~sure)
     smooth = np.asarray(cv2.GaussianBlur(heights, (0, 0), options.smoothing_mm / pooled.cell_mm))
     corner = pooled.centres[0, 0]
     return HeightMap(corner=corner, cell_mm=pooled.cell_mm, heights=smooth, known=np.asarray(known)), sure
 
 
-def _bridged(heights: Float32[np.ndarray, "r c"], holes: Bool[np.ndarray, "r c"]) -> Float32[np.ndarray, "r c"]:
+def _bridge_holes(heights: Float32[np.ndarray, "r c"], holes: Bool[np.ndarray, "r c"]) -> Float32[np.ndarray, "r c"]:
     """Heights that span the holes smoothly: where a highlight leaves nothing to agree on, those found are false."""
     wide = cv2.dilate(holes.astype(np.uint8), np.ones((2 * _RIM_CELLS + 1,) * 2, np.uint8)) > 0
     return np.asarray(inpaint_biharmonic(heights, wide, split_into_regions=True), dtype=np.float32)

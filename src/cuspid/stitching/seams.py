@@ -60,14 +60,20 @@ def choose(
         shown = np.take_along_axis(color, chosen[None, ..., None], axis=0)[0]
         energy = cost.copy()
         for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
-            energy += _seam(frame, color, _beside(label, axis, step, -2.0), _beside(shown, axis, step, 0.0), options)
+            energy += _seam(
+                frame,
+                color,
+                _shift(label, axis, step, -2.0),
+                _shift(shown, axis, step, 0.0),
+                options,
+            )
         better = np.argmin(energy, axis=0)
         chosen = np.where(even == (round_number % 2 == 0), better, chosen)
     label = np.take_along_axis(frame, chosen[None], axis=0)[0].astype(np.int64)
     return np.where(np.isfinite(cost[0]), label, -1)
 
 
-def _beside(array: np.ndarray, axis: int, step: int, beyond: float) -> np.ndarray:
+def _shift(array: np.ndarray, axis: int, step: int, beyond: float) -> np.ndarray:
     """What the neighbour of each cell has; ``beyond`` outside."""
     moved = np.roll(array, step, axis=axis)
     edge: list[slice | int] = [slice(None)] * array.ndim

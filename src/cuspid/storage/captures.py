@@ -61,7 +61,7 @@ def read_capture(
             f"are {', '.join(known.rig.names)}"
         )
     suffix, stems = _image_stems(images, known.rig.names)
-    frames, left_out = _present(_listed(folder, known, stems), stems, folder)
+    frames, left_out = _present(_list_frames(folder, known, stems), stems, folder)
     used = Rig({name: mounted for name, mounted in known.rig.cameras.items() if stems[name]})
     capture = Capture(
         handpiece=known.with_cameras(used), frames=frames, source=ImageFolder(folder, suffix), left_out=left_out
@@ -84,7 +84,7 @@ def folders_of_images(images: Path) -> set[str]:
     return found
 
 
-def _listed(folder: Path, handpiece: Handpiece, stems: Mapping[str, set[str]]) -> list[Frame]:
+def _list_frames(folder: Path, handpiece: Handpiece, stems: Mapping[str, set[str]]) -> list[Frame]:
     """The frames that there should be, with all cameras that should have an image."""
     manifest = folder / "capture.json"
     if not manifest.exists():

@@ -92,7 +92,7 @@ def _own(landmarks: Mapping[str, Landmark], frame: LandmarkFrame) -> dict[str, o
 def _from_own(content: Mapping[str, Any], path: Path) -> LandmarkFile:
     frame: LandmarkFrame = _one_of(content.get("frame"), ("occlusal", "mesh"), "frame", path)
     entries = []
-    for label, entry in _labelled(content.get("landmarks"), "landmarks", path):
+    for label, entry in _parse_label(content.get("landmarks"), "landmarks", path):
         position = _position(entry.get("position_mm"), label, path)
         entries.append((label, Landmark(position, _sigma(entry.get("estimated_sigma_mm"), label, path))))
     return LandmarkFile(landmarks=_unique(entries, path), frame=frame)
@@ -130,7 +130,7 @@ def _from_markups(content: Mapping[str, Any], path: Path) -> LandmarkFile:
             notes.append(f"{path}: skipped a markup of type {markup.get('type')}; landmarks must be of type Fiducial")
             continue
         to_mesh_mm = _to_mesh_mm(markup, path)
-        for label, point in _labelled(markup.get("controlPoints", []), "controlPoints", path):
+        for label, point in _parse_label(markup.get("controlPoints", []), "controlPoints", path):
             status = _one_of(
                 point.get("positionStatus", "defined"), ("defined", "undefined", "preview"), "positionStatus", path
             )
@@ -167,7 +167,7 @@ def _objects(value: Any, name: str, path: Path) -> list[Mapping[str, Any]]:
     return value
 
 
-def _labelled(value: Any, name: str, path: Path) -> Iterable[tuple[str, Mapping[str, Any]]]:
+def _parse_label(value: Any, name: str, path: Path) -> Iterable[tuple[str, Mapping[str, Any]]]:
     for number, entry in enumerate(_objects(value, name, path), start=1):
         label = entry.get("label")
         if not isinstance(label, str) or not label:

@@ -65,7 +65,7 @@ def read_mesh_file(path: Path, unit: Unit = "mm") -> MeshFile:
     declared = _declared_faces(path)
     try:
         with np.errstate(all="ignore"), _in_silence():  # what cannot be used is told below
-            scene = trimesh.load_scene(_uncommented(path), path.suffix[1:].lower(), process=False, skip_materials=True)
+            scene = trimesh.load_scene(_readable(path), path.suffix[1:].lower(), process=False, skip_materials=True)
             parts = list(scene.geometry.values())
             loaded = parts[0] if len(parts) == 1 else scene.to_mesh()
     except Exception as error:  # trimesh's loaders raise whatever the parser met
@@ -73,10 +73,10 @@ def read_mesh_file(path: Path, unit: Unit = "mm") -> MeshFile:
     with _let_go(loaded, *parts):
         if not isinstance(loaded, trimesh.Trimesh) or len(loaded.vertices) == 0 or len(loaded.faces) == 0:
             raise InputError(f"{path}: the mesh is empty (no triangles); export the surface, not a point cloud")
-        return _checked(path, loaded, declared, unit)
+        return _check_mesh(path, loaded, declared, unit)
 
 
-def _uncommented(path: Path) -> Path | io.BytesIO:
+def _readable(path: Path) -> Path | io.BytesIO:
     """What trimesh reads: of an OFF file with comments behind numbers it would read lines twice."""
     return io.BytesIO(_COMMENT.sub(b"", read_bytes(path, "mesh"))) if path.suffix.lower() == ".off" else path
 
@@ -104,7 +104,7 @@ def _let_go(*meshes: trimesh.parent.Geometry) -> Iterator[None]:
             vars(mesh).clear()
 
 
-def _checked(path: Path, loaded: trimesh.Trimesh, declared: int, unit: Unit) -> MeshFile:
+def _check_mesh(path: Path, loaded: trimesh.Trimesh, declared: int, unit: Unit) -> MeshFile:
     mm_per_unit = MM_PER_UNIT[unit]
     vertices, faces = np.asarray(loaded.vertices, dtype=np.float64), np.asarray(loaded.faces, dtype=np.int64)
     if len(faces) < declared:

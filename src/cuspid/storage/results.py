@@ -302,7 +302,7 @@ def _read_study(folder: Path, run: Mapping[str, Any]) -> StudyResult:
     missing = []
     if summary is None:
         missing.append(f"{file}: {len(rows)} cases are done; run the same command again to continue")
-    surface, values = _repeated(folder) if verb == "repeat" else (None, {})
+    surface, values = _read_repeated_surface(folder) if verb == "repeat" else (None, {})
     return StudyResult(
         surface=surface,
         values=values,
@@ -316,7 +316,7 @@ def _read_study(folder: Path, run: Mapping[str, Any]) -> StudyResult:
     )
 
 
-def _repeated(folder: Path) -> tuple[Jaw | None, dict[str, Float[np.ndarray, "v"]]]:
+def _read_repeated_surface(folder: Path) -> tuple[Jaw | None, dict[str, Float[np.ndarray, "v"]]]:
     """The reference of repeated scans, and what is known at its vertices."""
     if not (folder / "repeat.ply").exists():
         return None, {}

@@ -52,7 +52,7 @@ def read_sequence(
         raise InputError(f"{source}: neither a folder of images nor a video ({', '.join(VIDEO_SUFFIXES)})")
     else:
         raise InputError(f"{source}: no such folder or video")
-    return found if calibration is None else _calibrated(found, Path(calibration))
+    return found if calibration is None else _with_calibration(found, Path(calibration))
 
 
 def read_sequences(
@@ -177,7 +177,7 @@ def _of_video(video: Path, decoded: Path, progress: Progress) -> ImageSequence:
 # --- calibration ---------------------------------------------------------------------------------------------------
 
 
-def _calibrated(sequence: ImageSequence, path: Path) -> ImageSequence:
+def _with_calibration(sequence: ImageSequence, path: Path) -> ImageSequence:
     """With the calibration of one camera, of any program; the working distance is told by handpiece.json alone."""
     found = read_calibration(path, image_size_px=sequence.size)
     for loss in found.losses.values():

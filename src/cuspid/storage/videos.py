@@ -89,7 +89,7 @@ class VideoLength:
 
 def video_length(path: Path) -> VideoLength:
     """What the header of a video says. Raises InputError where it is no file."""
-    with _opened(path) as container:
+    with _open_video(path) as container:
         if container is None:
             return VideoLength(frames=0, is_counted=False, seconds=0.0)
         stream = container.streams.video[0]
@@ -103,11 +103,11 @@ def read_video(path: Path) -> Iterator[VideoFrame]:
 
     Raises InputError where it is no file.
     """
-    with _opened(path) as container:
+    with _open_video(path) as container:
         if container is None:
             return
         clock_s = None if container.format.name in _STREAMS.values() else container.streams.video[0].time_base
-        for number, (frame, damaged) in enumerate(_decoded(container)):
+        for number, (frame, damaged) in enumerate(_decode_frames(container)):
             if frame is not None:
                 time_s = None if clock_s is None or frame.pts is None else float(frame.pts * clock_s)
                 yield VideoFrame(number=number, time_s=time_s, damaged=damaged, decoded=frame)
@@ -115,7 +115,7 @@ def read_video(path: Path) -> Iterator[VideoFrame]:
 
 def video_rate(path: Path) -> float | None:
     """Frames a second of a video, None where its header does not say. Raises InputError where it is no file."""
-    with _opened(path) as container:
+    with _open_video(path) as container:
         rate = None if container is None else container.streams.video[0].average_rate
         return float(rate) if rate else None
 
@@ -123,14 +123,14 @@ def video_rate(path: Path) -> float | None:
 def read_jpegs(path: Path) -> Iterator[tuple[float | None, bytes]] | None:
     """The frames of a Motion JPEG video as they are stored, with their times where it has such; None where it is of
     another codec. Raises InputError where it is no file."""
-    with _opened(path) as container:
+    with _open_video(path) as container:
         if container is None or container.streams.video[0].codec_context.name != "mjpeg":
             return None
     return _jpegs(path)
 
 
 def _jpegs(path: Path) -> Iterator[tuple[float | None, bytes]]:
-    with _opened(path) as container:
+    with _open_video(path) as container:
         if container is None:
             return
         has_times = container.format.name not in _STREAMS.values()
@@ -140,7 +140,7 @@ def _jpegs(path: Path) -> Iterator[tuple[float | None, bytes]]:
                 yield None if pts is None else float(pts * packet.time_base), bytes(packet)
 
 
-def _decoded(container: av.container.InputContainer) -> Iterator[tuple[av.VideoFrame | None, bool]]:
+def _decode_frames(container: av.container.InputContainer) -> Iterator[tuple[av.VideoFrame | None, bool]]:
     """Each frame, None where it cannot be decoded, and whether it is damaged."""
     stream = container.streams.video[0]
     stream.thread_type = "AUTO"
@@ -166,7 +166,7 @@ def _packets(container: av.container.InputContainer) -> Iterator[av.Packet[av.Vi
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[av.container.InputContainer | None]:
+def _open_video(path: Path) -> Iterator[av.container.InputContainer | None]:
     require_file(path, "file")
     kind = _STREAMS.get(path.suffix.lower())
     try:

@@ -113,13 +113,13 @@ def camera_pair(baseline_mm: float, axis_angle_deg: float, camera: Camera) -> Ri
     """Two equal cameras, ``left`` and ``right``, in the pair frame."""
     return Rig(
         {
-            name: _turned(side * baseline_mm / 2, -side * axis_angle_deg / 2, camera)
+            name: _toed_in_camera(side * baseline_mm / 2, -side * axis_angle_deg / 2, camera)
             for name, side in (("left", -1), ("right", 1))
         }
     )
 
 
-def _turned(x_mm: float, yaw_deg: float, camera: Camera) -> MountedCamera:
+def _toed_in_camera(x_mm: float, yaw_deg: float, camera: Camera) -> MountedCamera:
     """A camera at (x, 0, 0) whose axis is turned from +Z towards +X by an angle."""
     rotation = Rigid3.from_rotation_vector(np.array([0.0, -np.deg2rad(yaw_deg), 0.0]), np.zeros(3)).rotation
     return MountedCamera(camera, Rigid3(rotation, -rotation @ np.array([x_mm, 0.0, 0.0])))

@@ -164,7 +164,7 @@ def _phantom(edge_mm: float) -> Jaw:
     return build_phantom(PhantomOptions(edge_mm=edge_mm))
 
 
-def _prepared(edge_mm: float) -> Jaw:
+def _prepared_jaw(edge_mm: float) -> Jaw:
     return prepare(_phantom(edge_mm), preset("thesis-reference"))
 
 
@@ -177,7 +177,7 @@ def _boxed_mean(edge_mm: float) -> Jaw:
 
 
 _JAWS: Mapping[str, Callable[[float], Jaw]] = MappingProxyType(
-    {"phantom": _phantom, "thesis-reference": _prepared, "boxed-mean": _boxed_mean}
+    {"phantom": _phantom, "thesis-reference": _prepared_jaw, "boxed-mean": _boxed_mean}
 )
 
 

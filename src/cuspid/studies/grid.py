@@ -97,7 +97,7 @@ def run_grid(
     names = [case.name for case in cases]
     if len(set(names)) < len(names):
         raise InputError(f"study: two cases are called {next(name for name in names if names.count(name) > 1)}")
-    done = {case.name: found for case in cases if (found := _read(folder, case)) is not None}
+    done = {case.name: found for case in cases if (found := _read_outcome(folder, case)) is not None}
     if retry_failed:
         done = {name: outcome for name, outcome in done.items() if outcome.failure is None}
     left = [case for case in cases if case.name not in done]
@@ -140,7 +140,7 @@ def _write(folder: Path, outcome: Outcome) -> None:
     storage.write_json(_path(folder, outcome.case), entry)
 
 
-def _read(folder: Path, case: Case) -> Outcome | None:
+def _read_outcome(folder: Path, case: Case) -> Outcome | None:
     path = _path(folder, case)
     if not path.exists():
         return None

@@ -130,7 +130,7 @@ def _sample_pair(
     epipolar = _epipolar(cameras[1], points.in_rig)
     starts_px = options.start_px * rng.standard_normal(len(true_px))
     found = {
-        "slanted": _slanted(images, cameras, points, starts_px, options),
+        "slanted": _match_slanted(images, cameras, points, starts_px, options),
         "upright": _upright(images, points, true_px + starts_px[:, None] * epipolar, options),
     }
     seen = np.ones((2, len(true_px)), dtype=bool)
@@ -208,7 +208,7 @@ def _epipolar(camera: MountedCamera, in_rig: Float[np.ndarray, "n 3"]) -> Float[
     return np.asarray(moved / np.linalg.norm(moved, axis=1, keepdims=True))
 
 
-def _slanted(
+def _match_slanted(
     images: Sequence[UInt8[np.ndarray, "h w"]],
     cameras: Sequence[MountedCamera],
     points: _Points,

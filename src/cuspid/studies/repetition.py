@@ -207,7 +207,7 @@ def _keep(
     storage.write_mesh(folder / "scans" / f"{name}.ply", aligned, values={"deviation_um": deviation_um})
 
 
-def _kept(folder: Path, name: str) -> Mesh:
+def _evaluated_part(folder: Path, name: str) -> Mesh:
     """The part of a scan that is evaluated: where the reference could be seen."""
     file = storage.read_mesh_file(folder / "scans" / f"{name}.ply")
     evaluated = np.isfinite(file.vertex_values["deviation_um"])[file.mesh.faces].all(axis=1)
@@ -218,7 +218,7 @@ def _kept(folder: Path, name: str) -> Mesh:
 
 def compare_scans(*, first: str, second: str, folder: Path, options: RepeatOptions) -> dict[str, Value]:
     """The distances of two scans after one is laid on the other."""
-    scans = _kept(folder, first), _kept(folder, second)
+    scans = _evaluated_part(folder, first), _evaluated_part(folder, second)
     found = compare_pair(*scans, options.pairs, rng=np.random.default_rng(0))
     return {name: getattr(found.deviation, name) for name in STATISTICS} | {"common_pct": found.common_pct}
 

@@ -122,7 +122,7 @@ class _Sides(NamedTuple):
     def of(mesh: Mesh) -> _Sides:
         """Of all faces."""
         ends = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
-        return _Sides(ends, *_joined(ends.min(axis=1), ends.max(axis=1), len(mesh.vertices)))
+        return _Sides(ends, *_join_sides(ends.min(axis=1), ends.max(axis=1), len(mesh.vertices)))
 
     @property
     def uses(self) -> Int[np.ndarray, "e"]:
@@ -144,7 +144,7 @@ class _Sides(NamedTuple):
 
 @kernel
 @no_type_check
-def _joined(low, high, vertices):
+def _join_sides(low, high, vertices):
     """Of sides by their two vertices: the number of their edge, and the side before that has the same."""
     start = np.zeros(vertices + 2, np.int64)
     for vertex in low:

@@ -65,7 +65,7 @@ class Evidence:
         intrinsics = np.concatenate([focal, centre])
         plane, cosine = _planes(inverse, intrinsics, largest_jump_mm)
         weight = np.where(known, depth_map.confidence * cosine, 0).astype(np.float32)
-        plane, weight = _grown(plane, weight)
+        plane, weight = _extend_planes(plane, weight)
         return Evidence(plane, weight, intrinsics)
 
 
@@ -129,7 +129,7 @@ def _planes(inverse, intrinsics, jump):
 
 @kernel
 @no_type_check
-def _grown(plane, weight):
+def _extend_planes(plane, weight):
     """Carry the planes one pixel on, for the outermost half windows and voxels would be lost at every border."""
     height, width = weight.shape
     wide_plane, wide_weight = plane.copy(), weight.copy()

@@ -146,7 +146,7 @@ def _votes(
         evidence = Evidence.of(one.depth_map, jump_mm)
         return one.number, volume.reached(evidence, one.cam_from_world, one.points_in_world())
 
-    for batch in map_batches(reached, _located(depth_maps, rig_from_world)):
+    for batch in map_batches(reached, _select_located(depth_maps, rig_from_world)):
         volume.integrate([where for _, where in batch])
         progress(stage, batch[-1][0], 2 * half)
     rough = extract(volume, options.least_weight_for(half))
@@ -156,7 +156,7 @@ def _votes(
     def in_view(one: _Located) -> Voter:
         return votes.in_view(Evidence.of(one.depth_map, jump_mm), one.depth_map, one.cam_from_world, one.number)
 
-    for voters in map_batches(in_view, _located(depth_maps, rig_from_world)):
+    for voters in map_batches(in_view, _select_located(depth_maps, rig_from_world)):
         votes.collect(voters, agreement_mm)
         progress(stage, half + voters[-1].frame, 2 * half)
     return votes
@@ -181,7 +181,7 @@ class _Located:
         return self.rig_from_world.inverse().apply(self.depth_map.points_in_rig()[0])
 
 
-def _located(depth_maps: Iterable[DepthMap], rig_from_world: Mapping[str, Rigid3]) -> Iterator[_Located]:
+def _select_located(depth_maps: Iterable[DepthMap], rig_from_world: Mapping[str, Rigid3]) -> Iterator[_Located]:
     """Depth maps of located frames."""
     begun: set[str] = set()
     for depth_map in depth_maps:

@@ -76,11 +76,11 @@ def sharpened(mesh: Mesh, detail_mm: float, options: SharpEdgeOptions | None = N
     near = _within_reach(mesh, candidates, options.reach * detail_mm)
     used = used_vertices(mesh.faces[near], len(mesh.vertices))
     vertices = mesh.vertices.copy()
-    vertices[used] = _moved(mesh.submesh(near), np.flatnonzero(candidates[used]), detail_mm, options)
+    vertices[used] = _move_to_edges(mesh.submesh(near), np.flatnonzero(candidates[used]), detail_mm, options)
     return replace(mesh, vertices=vertices), int((vertices != mesh.vertices).any(axis=1).sum())
 
 
-def _moved(
+def _move_to_edges(
     mesh: Mesh, candidates: Int[np.ndarray, "c"], detail_mm: float, options: SharpEdgeOptions
 ) -> Float[np.ndarray, "v 3"]:
     """The vertices, with those of the candidates that an edge asks for on it."""

@@ -126,8 +126,8 @@ class SparseVolume:
         slots = np.array([table.setdefault(key, len(table)) for key in keys.tolist()], dtype=np.int64)
         if len(table) > len(self.distance):
             room = max(len(table), int(1.5 * len(self.distance)) + 1024)
-            self.distance = _grown(self.distance, room)
-            self.weight = _grown(self.weight, room)
+            self.distance = _grow_array(self.distance, room)
+            self.weight = _grow_array(self.weight, room)
         return slots
 
 
@@ -146,7 +146,7 @@ def find(keys: Int[np.ndarray, "b"], wanted: Int[np.ndarray, "*n"]) -> Int[np.nd
     return np.where(ranked[place] == wanted, order[place], -1)
 
 
-def _grown(array: Float[np.ndarray, "b v"], room: int) -> Float[np.ndarray, "r v"]:
+def _grow_array(array: Float[np.ndarray, "b v"], room: int) -> Float[np.ndarray, "r v"]:
     grown = np.zeros((room, array.shape[1]), dtype=array.dtype)
     grown[: len(array)] = array
     return grown

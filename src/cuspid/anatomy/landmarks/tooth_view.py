@@ -145,7 +145,7 @@ def view_teeth(jaw: Jaw, grid_mm: float) -> Mapping[int, ToothView]:
     centroids = np.array([crown.face_areas @ crown.face_centres / crown.face_areas.sum() for crown in crowns])[:, :2]
     views = {}
     for fdi, crown, centroid, tangent, up in zip(
-        order, crowns, centroids, _along(centroids), _leans(crowns), strict=True
+        order, crowns, centroids, _arch_tangents(centroids), _leans(crowns), strict=True
     ):
         view = _view(fdi, crown, _axes(fdi, tangent, centroid, up), grid_mm)
         if view is not None:
@@ -168,7 +168,7 @@ def _leans(crowns: list[Mesh]) -> Float[np.ndarray, "t 3"]:
     return unit(np.column_stack([mean, np.ones(len(mean))]))
 
 
-def _along(centroids: Float[np.ndarray, "t 2"]) -> Float[np.ndarray, "t 2"]:
+def _arch_tangents(centroids: Float[np.ndarray, "t 2"]) -> Float[np.ndarray, "t 2"]:
     """Unit tangents (t, 2) of the arch at its teeth."""
     if len(centroids) < 2:
         return np.tile([1.0, 0.0], (len(centroids), 1))
@@ -204,7 +204,7 @@ def _view(fdi: int, crown: Mesh, axes: Float[np.ndarray, "3 3"], grid_mm: float)
         origin=middle @ axes,
         half_width_mm=float(half[0]),
         half_depth_mm=float(half[1]),
-        surface=RegularGridInterpolator((u, v), _filled(heights), bounds_error=False, fill_value=None),
+        surface=RegularGridInterpolator((u, v), _fill_unknown(heights), bounds_error=False, fill_value=None),
         places=places,
         heights=np.where(np.isnan(heights), -np.inf, heights),
     )
@@ -227,7 +227,7 @@ def _heights(
     return np.asarray(bounded.reshape(places.shape[:2]))
 
 
-def _filled(heights: Grid) -> Grid:
+def _fill_unknown(heights: Grid) -> Grid:
     """Heights with the nearest known one where there is none."""
     nearest = distance_transform_edt(np.isnan(heights), return_distances=False, return_indices=True)
     return np.asarray(heights[tuple(nearest)])

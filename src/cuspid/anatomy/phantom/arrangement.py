@@ -111,17 +111,17 @@ def place_teeth(
     for turn in range(_rounds(options) + 1):
         if turn:
             closing = _closed_up(teeth, closing)
-            seen = _seen(teeth, aim, papilla_of)
+            seen = _measure_landmarks(teeth, aim, papilla_of)
         if turn == CONTACT_ROUNDS:
             loose = closing
         if turn >= CONTACT_ROUNDS and turn % 2 == 0 and options.crowding_mm:
-            crowd = _more_crowded(crowd, _shortened(closing, loose), options.crowding_mm)
-        stood = _crowded(rows, crowd, options)
-        sized = _sized(stood, shape.size)
+            crowd = _more_crowded(crowd, _closed_gaps_mm(closing, loose), options.crowding_mm)
+        stood = _crowd_front(rows, crowd, options)
+        sized = _resize_teeth(stood, shape.size)
         shape = solve_shape(_chains(sized, closing, options.arch), shape.size, aim, seen, shape)
-        teeth = _arrange(_sized(stood, shape.size), closing, shape, options)
+        teeth = _arrange(_resize_teeth(stood, shape.size), closing, shape, options)
     _check(teeth, shape, aim, papilla_of)
-    short_mm = options.crowding_mm - _shortened(closing, loose)
+    short_mm = options.crowding_mm - _closed_gaps_mm(closing, loose)
     if options.crowding_mm and abs(short_mm) > CROWDING_TOLERANCE_MM:
         raise InputError(
             f"crowding_mm: these teeth can overlap by at most {options.crowding_mm - short_mm:.1f} mm, not "
@@ -154,14 +154,14 @@ def _rows(options: PhantomOptions, individuals: dict[int, tuple[Tooth, ...]]) ->
         kept = [(k + 1, tooth) for k, tooth in enumerate(individuals[side])]
         named = [(position, tooth, fdi_of(options.arch, side, position)) for position, tooth in kept]
         rows[side] = tuple(
-            (position, _turned(tooth, options.rotate_deg.get(fdi, 0.0), options.displace_mm.get(fdi, 0.0)))
+            (position, _rotate_tooth(tooth, options.rotate_deg.get(fdi, 0.0), options.displace_mm.get(fdi, 0.0)))
             for position, tooth, fdi in named
             if fdi not in options.missing
         )
     return rows
 
 
-def _turned(tooth: Tooth, rotation_deg: float, displacement_mm: float) -> Tooth:
+def _rotate_tooth(tooth: Tooth, rotation_deg: float, displacement_mm: float) -> Tooth:
     """A tooth rotated about its axis and displaced towards buccal."""
     return replace(tooth, rotation_deg=tooth.rotation_deg + rotation_deg, offset_mm=tooth.offset_mm + displacement_mm)
 
@@ -190,7 +190,7 @@ def _aim(options: PhantomOptions, rows: Rows) -> Aim:
     return Aim(widths_mm=widths, length_mm=options.arch_length_mm, free_size=free, size_weight=weight)
 
 
-def _sized(rows: Rows, size: float) -> Rows:
+def _resize_teeth(rows: Rows, size: float) -> Rows:
     """The teeth at another size."""
 
     def scaled(tooth: Tooth) -> Tooth:
@@ -259,7 +259,7 @@ def _arrange(
     return _level((*reversed(quadrants[0]), *quadrants[1]), options)
 
 
-def _seen(teeth: tuple[PlacedTooth, ...], aim: Aim, papilla_of: PapillaOf) -> Seen:
+def _measure_landmarks(teeth: tuple[PlacedTooth, ...], aim: Aim, papilla_of: PapillaOf) -> Seen:
     """Heights of the landmarks, and the place of the papilla, of teeth as they stand."""
     heights = {
         (1 if placed.origin[0] > 0 else -1, placed.position): float(dimension_point(placed)[2])
@@ -295,7 +295,7 @@ def can_stand(options: PhantomOptions) -> bool:
     """Whether a row of textbook teeth can have the asked dimensions: quick, before contacts are looked at."""
     rows = _rows(options, dict.fromkeys((-1, 1), QUADRANTS[options.arch]))
     aim, size = _aim(options, rows), options.tooth_size or 1.0
-    chains = _chains(_sized(rows, size), {side: np.zeros(len(row)) for side, row in rows.items()}, options.arch)
+    chains = _chains(_resize_teeth(rows, size), {side: np.zeros(len(row)) for side, row in rows.items()}, options.arch)
     shape = solve_shape(chains, size, aim, Seen(), Shape(size=size))
     missed = np.abs(dimensions(chains, size, shape, aim, Seen()) - aim.values).max()
     return bool(missed < TOLERANCE_MM and shape.kinks_deg.max() < MOST_KINK_DEG - KINK_MARGIN_DEG)
@@ -355,14 +355,14 @@ def clearance(one: PlacedTooth, other: PlacedTooth) -> float:
 # A crowded front
 
 
-def _crowded(rows: Rows, lingual_mm: float, options: PhantomOptions) -> Rows:
+def _crowd_front(rows: Rows, lingual_mm: float, options: PhantomOptions) -> Rows:
     """The front teeth displaced and rotated by the pattern `CROWDED`, unevenly, for lateral incisors that stand
     lingually by the given mm."""
     uneven = 1.0 + 0.3 * options.variation * np.random.default_rng([options.seed, 1]).uniform(-1.0, 1.0, (2, 3))
     crowded: Rows = {}
     for side in (-1, 1):
         crowded[side] = tuple(
-            (position, _turned(tooth, *(lingual_mm * uneven[(side + 1) // 2, position - 1] * CROWDED[position])))
+            (position, _rotate_tooth(tooth, *(lingual_mm * uneven[(side + 1) // 2, position - 1] * CROWDED[position])))
             if position in CROWDED
             else (position, tooth)
             for position, tooth in rows[side]
@@ -370,7 +370,7 @@ def _crowded(rows: Rows, lingual_mm: float, options: PhantomOptions) -> Rows:
     return crowded
 
 
-def _shortened(closing: dict[int, Float[np.ndarray, "_"]], loose: dict[int, Float[np.ndarray, "_"]]) -> float:
+def _closed_gaps_mm(closing: dict[int, Float[np.ndarray, "_"]], loose: dict[int, Float[np.ndarray, "_"]]) -> float:
     """By how much the five contacts of the front have closed up, mm."""
     return float(sum((closing[side] - loose[side])[:3].sum() for side in (-1, 1)))
 

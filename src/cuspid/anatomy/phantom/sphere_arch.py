@@ -152,7 +152,7 @@ def _ball(options: SphereArchOptions) -> Manifold:
 def _ridge(options: SphereArchOptions, centres: Float[np.ndarray, "n 3"]) -> Manifold:
     """A ridge with a flat underside along the spheres, its top `rise_mm` below their centres."""
     half = np.sqrt(options.radius_mm**2 - options.rise_mm**2) + _RIDGE_MARGIN_MM
-    line = _lengthened(_through(centres), half)
+    line = _extend_line(_through(centres), half)
     tangents = np.gradient(line[:, :2], axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     outwards = np.column_stack([-tangents[:, 1], tangents[:, 0], np.zeros(len(line))])
@@ -170,7 +170,7 @@ def _through(centres: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
     return np.asarray(CubicSpline(run, centres)(np.linspace(0, run[-1], round(run[-1] / _RIDGE_STEP_MM))))
 
 
-def _lengthened(line: Float[np.ndarray, "m 3"], by_mm: float) -> Float[np.ndarray, "k 3"]:
+def _extend_line(line: Float[np.ndarray, "m 3"], by_mm: float) -> Float[np.ndarray, "k 3"]:
     """The line with a straight level piece added at both ends."""
     start, end = ((line[k] - line[j]) * [1, 1, 0] for k, j in ((0, 1), (-1, -2)))
     return np.vstack(

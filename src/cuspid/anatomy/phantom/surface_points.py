@@ -35,7 +35,7 @@ REACH = 0.5
 def landmarks_of(solid: Solid, arch: Arch) -> dict[str, Landmark]:
     """All landmarks of the teeth and the midline, by label, in the occlusal frame."""
     points = {f"{placed.fdi}.{name}": p for placed in solid.teeth for name, p in _crown_points(placed).items()}
-    points = dict(zip(points, _onto(solid, np.array(list(points.values()))), strict=True))
+    points = dict(zip(points, _project_to_surface(solid, np.array(list(points.values()))), strict=True))
     points |= _cervices(solid) | {"papilla": papilla(solid, arch), "midline": _midline(solid, points)}
     return {label: Landmark(points[label]) for label in labels_of(placed.fdi for placed in solid.teeth)}
 
@@ -46,7 +46,7 @@ def _crown_points(placed: PlacedTooth) -> dict[str, Point]:
     return {name: placed.to_jaw(point) for name, point in points.items()}
 
 
-def _onto(solid: Solid, points: Points) -> Points:
+def _project_to_surface(solid: Solid, points: Points) -> Points:
     """Points (n, 3) moved onto the surface: where neighbours touch, their crease is rounded."""
     for _ in range(5):
         points = newton_step(points, *value_and_gradient(solid.distance, points), 0.2)
@@ -133,7 +133,7 @@ def _midline(solid: Solid, points: dict[str, Point]) -> Point:
     below = np.linspace(0.0, 3.0, 60)[:, None] * [0.0, 0.0, -1.0]
     if (solid.distance(middle + below) < 0).any():
         return _first_inside(solid, middle[None] + [0.0, 0.0, 2.0], np.array([0.0, 0.0, -1.0]), 6.0)[0]
-    return _onto(solid, middle[None])[0]
+    return _project_to_surface(solid, middle[None])[0]
 
 
 def _incisive_papilla(solid: Solid) -> Point:

@@ -189,22 +189,22 @@ def _profile(
     wall = wall[wall[:, 1] >= heights[0] + rise]
     foot = [np.interp(heights[0] + rise, heights, radii), heights[0] + rise]
     corners = np.vstack([[line.radius[turn], line.height[turn]], foot, wall[1:], np.column_stack([across, crest])])
-    return _rounded(shape, corners)
+    return _round_corner(shape, corners)
 
 
-def _rounded(shape: CrownShape, corners: Float[np.ndarray, "c 2"]) -> Float[np.ndarray, "rows 2"]:
+def _round_corner(shape: CrownShape, corners: Float[np.ndarray, "c 2"]) -> Float[np.ndarray, "rows 2"]:
     """A profile resampled evenly, the inner corner rounded by the chamfer, the outer one by the edge radius."""
     run = lengths_along(corners)
     even = np.linspace(0.0, run[-1], _ROWS)
     points = np.column_stack([np.interp(even, run, corners[:, k]) for k in range(2)])
     step = even[1]
     inner = 0.35 * shape.width_mm if shape.finish_line == "chamfer" else 0.12
-    lower, upper = (_smoothed(points, size / step) for size in (inner, 0.5 * shape.edge_radius_mm))
+    lower, upper = (_smooth_line(points, size / step) for size in (inner, 0.5 * shape.edge_radius_mm))
     weight = smooth_step(even, run[1] + 0.8, run[1] + 1.2)[:, None]
     return lower + weight * (upper - lower)
 
 
-def _smoothed(points: Float[np.ndarray, "n 2"], sigma: float) -> Float[np.ndarray, "n 2"]:
+def _smooth_line(points: Float[np.ndarray, "n 2"], sigma: float) -> Float[np.ndarray, "n 2"]:
     """Points smoothed along their line; the ends stay."""
     pad = 40
     before, after = 2 * points[0] - points[pad:0:-1], 2 * points[-1] - points[-2 : -pad - 2 : -1]

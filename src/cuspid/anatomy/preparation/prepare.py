@@ -194,7 +194,7 @@ def prepare(jaw: Jaw, preparations: Mapping[int, PreparationOptions]) -> Jaw:
         [(tools[fdi], _blocks(sites[fdi], preparations)) for fdi in preparations],
         [f"tooth {fdi}" for fdi in preparations],
     )
-    return _assembled(jaw, preparations, tools, cut)
+    return _assemble_jaw(jaw, preparations, tools, cut)
 
 
 def _tool(site: ToothSite, options: PreparationOptions) -> Tool:
@@ -245,7 +245,7 @@ def _blocks(site: ToothSite, preparations: Mapping[int, PreparationOptions]) -> 
     ]
 
 
-def _assembled(jaw: Jaw, preparations: Mapping[int, PreparationOptions], tools: Mapping[int, Tool], cut: Cut) -> Jaw:
+def _assemble_jaw(jaw: Jaw, preparations: Mapping[int, PreparationOptions], tools: Mapping[int, Tool], cut: Cut) -> Jaw:
     """The jaw of a cut: labels and lines."""
     assert jaw.face_labels is not None
     order = list(preparations)

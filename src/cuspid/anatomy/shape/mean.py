@@ -88,7 +88,7 @@ def mean_shape(
     Raises InputError where there are fewer than two jaws or all are the same, lower and upper ones are mixed, fewer
     than three landmarks are common or they lie in a line, or the first sample is not among the jaws.
     """
-    samples = _superposed(jaws, options.scale)
+    samples = _superpose(jaws, options.scale)
     first = options.first or next(iter(sorted(jaws)))
     if first not in jaws:
         raise InputError(f"mean shape: the first sample '{first}' is not among the jaws ({', '.join(jaws)})")
@@ -133,7 +133,7 @@ def _positions(jaw: Jaw, labels: tuple[str, ...]) -> Float[np.ndarray, "l 3"]:
     return np.stack([jaw.landmarks[label].position for label in labels])
 
 
-def _superposed(jaws: Mapping[str, Jaw], scale: bool) -> _Samples:
+def _superpose(jaws: Mapping[str, Jaw], scale: bool) -> _Samples:
     if len(jaws) < 2:
         raise InputError(f"mean shape: {len(jaws)} jaws given; at least two are needed")
     arches = {name: jaw.arch for name, jaw in jaws.items() if jaw.arch is not None}

@@ -178,7 +178,7 @@ def _derivatives(model, k, points, by_point, by_parameters):
 
 @kernel
 @no_type_check
-def _undistorted(model, k, limit, a, b):
+def _invert_distortion(model, k, limit, a, b):
     """The place of the ideal lens that is shown at (a, b), by Newton's method; NaN where there is none."""
     u, v = a, b
     for _ in range(_STEPS):
@@ -208,7 +208,7 @@ def _directions(model, k, limit, pixels, out):
     for n in range(pixels.shape[0]):
         u, v = (pixels[n, 0] - k[2]) / k[0], (pixels[n, 1] - k[3]) / k[1]
         if not straight:
-            u, v = _undistorted(model, k, limit, u, v)
+            u, v = _invert_distortion(model, k, limit, u, v)
         if model <= _FULL_OPENCV:
             out[n, 0], out[n, 1], out[n, 2] = u, v, 1.0
             continue

@@ -57,7 +57,7 @@ def save_board(path: Path, board: Board) -> None:
     axes.set_xlim(-margin, width + margin)
     axes.set_ylim(height + margin + _RULER_MM, -margin)
     axes.set_axis_off()
-    places, sides = _unfolded(board)
+    places, sides = _unfold_squares(board)
     if board.inverted:
         ground = np.array([[-margin / 2, -margin / 2]])
         axes.add_collection(_squares(ground, np.array([[width + margin, height + margin]]), "black"))
@@ -71,7 +71,7 @@ def save_board(path: Path, board: Board) -> None:
     save_figure(figure, path)
 
 
-def _unfolded(board: Board) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
+def _unfold_squares(board: Board) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
     """The printed squares on the strip that is folded over the steps: the top left corner and the side of each, mm."""
     places, sides = board.dark
     risers = board.step_mm * board.terrace_at(places[:, 0] + sides / 2)
@@ -118,10 +118,10 @@ def _draw_ruler(figure: Figure, board: Board, top_mm: float) -> None:
     for x in board.square_mm * np.arange(board.columns + 1):
         axes.plot([x, x], [top_mm - 1, top_mm + 1], color="black", linewidth=0.5, solid_capstyle="butt")
     size = min(8.0, 72 / _MM_PER_INCH * length / 30)
-    axes.text(0, top_mm + 1.5, f"{length:g} mm, {_named(board)}", fontsize=size, va="top", color="black")
+    axes.text(0, top_mm + 1.5, f"{length:g} mm, {_describe_board(board)}", fontsize=size, va="top", color="black")
 
 
-def _named(board: Board) -> str:
+def _describe_board(board: Board) -> str:
     told = f"{board.kind} {board.columns} x {board.rows} x {board.square_mm:g} mm"
     if board.kind == "charuco":
         told += f", {board.dictionary}, markers {board.marker_share:g}"
@@ -287,7 +287,7 @@ def _draw_left_over(axes: Axes, residuals: Residuals) -> None:
         left = np.concatenate([each[index + 1] for each in residuals.values()])
         axes.plot(r, left, ".", color=colour, markersize=1, alpha=0.25, rasterized=True)
         for camera in residuals.values():
-            axes.plot(*_binned(camera[0], camera[index + 1]), color=colour, linewidth=1.2)
+            axes.plot(*_bin_means(camera[0], camera[index + 1]), color=colour, linewidth=1.2)
         axes.plot([], [], color=colour, label=f"{label}: {np.sqrt(np.mean(left**2)):.2f} % RMS")
     before = np.concatenate([each[1] for each in residuals.values()])
     axes.set_ylim(*(1.2 * np.percentile(before, [0.5, 99.5])))
@@ -301,14 +301,14 @@ def _draw_noise(
     colour: Float[np.ndarray, "4"],
 ) -> None:
     """Of patches alike, as points, and of the sensor, as a line."""
-    at, variance = _binned(levels, variances)
+    at, variance = _bin_means(levels, variances)
     axes.plot(at, np.sqrt(variance), ".", color=colour, markersize=5)
     level = np.linspace(0, 255, 60)
     axes.plot(level, sensor.noise_sd_dn(level), color=colour, linewidth=1)
     axes.set_ylim(bottom=0)
 
 
-def _binned(
+def _bin_means(
     at: Float[np.ndarray, "n"], values: Float[np.ndarray, "n"]
 ) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k"]]:
     """Means over runs of points that are near to each other."""

@@ -138,14 +138,14 @@ def render(
     eye = (across + (y[:, None, None] * axes[1]).astype(np.float32)).reshape(-1, 3)
     hits = mesh.cast_on_all_cores(eye, np.broadcast_to(-axes[2].astype(np.float32), eye.shape))
     depth = hits.distances.reshape(rows, columns)
-    canvas = _lit(mesh, hits, _crevices(depth, step).ravel(), axes).reshape(rows, columns, 3)
+    canvas = _shade_hits(mesh, hits, _crevices(depth, step).ravel(), axes).reshape(rows, columns, 3)
     pixels = cv2.resize(canvas, (width_px, rows // supersampling), interpolation=cv2.INTER_AREA)
     return RenderedMesh(
         image=np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8), mm_per_px=float(step * supersampling)
     )
 
 
-def _lit(
+def _shade_hits(
     mesh: Mesh, hits: RayHits, crevices: Float[np.ndarray, "n"], axes: Float[np.ndarray, "3 3"]
 ) -> Float32[np.ndarray, "n 3"]:
     """Colour of each ray under a soft light from the upper left, mild enough to be read off a colour bar; white for a

@@ -68,7 +68,7 @@ def _draw_section(axes: Axes, number: int, section: MarginSection) -> None:
         axes.plot(*section.scan.T, color=_FOUND, linewidth=1.8)
     if section.scan_edge is not None:
         axes.plot(*section.scan_edge, "o", color=_FOUND, markersize=5)
-    axes.set_title(f"{number}: {_told(section)}", fontsize=11, color=_INK)
+    axes.set_title(f"{number}: {_section_caption(section)}", fontsize=11, color=_INK)
     left, low = -0.12, -_BELOW_MM + 0.03
     axes.plot([left, left + _BAR_MM], [low, low], color=_INK, linewidth=2)
     axes.text(left + _BAR_MM + 0.02, low, f"{1000 * _BAR_MM:.0f} µm", fontsize=9, color=_INK, va="center")
@@ -84,7 +84,7 @@ def _with_inside(section: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "k 2"]:
     return np.array([*rightwards, [far, rightwards[-1, 1]], [far, -deep], [-far, -deep], [-far, rightwards[0, 1]]])
 
 
-def _told(section: MarginSection) -> str:
+def _section_caption(section: MarginSection) -> str:
     if section.scan is None:
         return "not scanned"
     if section.scan_edge is None:

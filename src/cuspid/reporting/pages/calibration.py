@@ -55,7 +55,7 @@ def _lens(mounted: MountedCamera) -> dict[str, Any]:
     camera = mounted.camera
     sigma = _sigmas(camera.covariance, len(camera.parameters))
     values = {
-        name: f"{number(value, _DIGITS[name[0]])} ± {number(_known(each), _DIGITS[name[0]])}"
+        name: f"{number(value, _DIGITS[name[0]])} ± {number(_is_known(each), _DIGITS[name[0]])}"
         for name, value, each in zip(camera.parameter_names, camera.parameters, sigma, strict=True)
     }
     return {"model": camera.model, "values": values}
@@ -65,8 +65,8 @@ def _place(mounted: MountedCamera) -> dict[str, Any]:
     sigma = _sigmas(mounted.covariance, 6)
     return {
         "centre_mm": [number(value, 3) for value in mounted.centre_in_rig],
-        "sigma_um": number(_known(1000 * np.linalg.norm(sigma[3:])), 1),
-        "sigma_deg": number(_known(np.rad2deg(np.linalg.norm(sigma[:3]))), 3),
+        "sigma_um": number(_is_known(1000 * np.linalg.norm(sigma[3:])), 1),
+        "sigma_deg": number(_is_known(np.rad2deg(np.linalg.norm(sigma[:3]))), 3),
     }
 
 
@@ -75,5 +75,5 @@ def _sigmas(covariance: Float[np.ndarray, "n n"] | None, size: int) -> Float[np.
     return np.full(size, np.nan) if covariance is None else np.sqrt(np.diag(covariance))
 
 
-def _known(value: np.floating[Any]) -> float | None:
+def _is_known(value: np.floating[Any]) -> float | None:
     return float(value) if np.isfinite(value) else None

@@ -57,8 +57,8 @@ def _part(part: Panorama, folder: Path) -> dict[str, Any]:
         "caption": f"{width} × {height} px",
         "width_px": width,
         "mm_per_px": part.mm_per_px,
-        "rescale": shlex.quote(_named(folder)) if part.frames else None,
-        "scaled": shlex.quote(f"{_named(folder)}-mm"),
+        "rescale": shlex.quote(_folder_title(folder)) if part.frames else None,
+        "scaled": shlex.quote(f"{_folder_title(folder)}-mm"),
         "strips": [
             (caption, photo_uri(folder / file, widest_px=_WIDEST_PX))
             for file, caption in _STRIPS.items()
@@ -67,7 +67,7 @@ def _part(part: Panorama, folder: Path) -> dict[str, Any]:
     }
 
 
-def _named(folder: Path) -> str:
+def _folder_title(folder: Path) -> str:
     """A folder by its last name, that of a part with the folder that it is in: pages name no folders of a machine."""
     whole = folder.resolve()
     return f"{whole.parent.name}/{whole.name}" if whole.name.startswith("part-") else whole.name

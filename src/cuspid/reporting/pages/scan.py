@@ -329,7 +329,7 @@ def _frames(capture: Capture | None, count: int, located: bool) -> list[dict[str
 def contact_sheet(images: Sequence[UInt8[np.ndarray, "_ _ 3"]]) -> UInt8[np.ndarray, "h w 3"]:
     """Images beside each other in two rows (one for up to three), each made small."""
     widest = 2 * _THUMBNAIL_PX if len(images) == 1 else _THUMBNAIL_PX
-    small = [_fitted(image, widest) for image in images]
+    small = [_fit_width(image, widest) for image in images]
     columns = len(small) if len(small) <= 3 else (len(small) + 1) // 2
     height, width = (max(image.shape[axis] for image in small) for axis in (0, 1))
     rows = -(-len(small) // columns)
@@ -340,7 +340,7 @@ def contact_sheet(images: Sequence[UInt8[np.ndarray, "_ _ 3"]]) -> UInt8[np.ndar
     return sheet
 
 
-def _fitted(image: UInt8[np.ndarray, "_ _ 3"], width: int) -> UInt8[np.ndarray, "_ _ 3"]:
+def _fit_width(image: UInt8[np.ndarray, "_ _ 3"], width: int) -> UInt8[np.ndarray, "_ _ 3"]:
     if image.shape[1] <= width:
         return image
     size = (width, max(1, round(image.shape[0] * width / image.shape[1])))

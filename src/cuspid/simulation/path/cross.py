@@ -71,10 +71,10 @@ class Crossing:
         """The handpiece after this travel along the sweep."""
         place = np.clip(travel_mm / self.length_mm, 0, 1) * (len(self.rig_from_world) - 1)
         before = min(int(place), len(self.rig_from_world) - 2)
-        return _between(self.rig_from_world[before], self.rig_from_world[before + 1], float(place - before))
+        return _interpolate_pose(self.rig_from_world[before], self.rig_from_world[before + 1], float(place - before))
 
 
-def _between(one: Rigid3, other: Rigid3, share: float) -> Rigid3:
+def _interpolate_pose(one: Rigid3, other: Rigid3, share: float) -> Rigid3:
     """A pose on the way from one to another, with an even turn and the origin on a straight line."""
     first, second = one.inverse(), other.inverse()
     turn = Rotation.from_matrix(second.rotation @ first.rotation.T).as_rotvec()

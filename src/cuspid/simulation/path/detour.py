@@ -79,10 +79,10 @@ class Detour:
 
     def at(self, travel_mm: float) -> Rigid3:
         """``changed_rig_from_rig``."""
-        return _changed(np.array([np.interp(travel_mm, self.travel_mm, column) for column in self.changes.T]))
+        return _motion(np.array([np.interp(travel_mm, self.travel_mm, column) for column in self.changes.T]))
 
 
-def _changed(change: Float[np.ndarray, "6"]) -> Rigid3:
+def _motion(change: Float[np.ndarray, "6"]) -> Rigid3:
     return Rigid3.from_rotation_vector(change[3:], change[:3]).inverse()
 
 
@@ -97,11 +97,11 @@ class _Candidates:
     @staticmethod
     def of(changes: Float[np.ndarray, "k 6"]) -> _Candidates:
         """Sorted."""
-        ordered = changes[np.argsort(_off(changes), kind="stable")]
-        return _Candidates(ordered, [_changed(change) for change in ordered])
+        ordered = changes[np.argsort(_deviation_cost(changes), kind="stable")]
+        return _Candidates(ordered, [_motion(change) for change in ordered])
 
 
-def _off(changes: Float[np.ndarray, "k 6"]) -> Float[np.ndarray, "k"]:
+def _deviation_cost(changes: Float[np.ndarray, "k 6"]) -> Float[np.ndarray, "k"]:
     """What it costs to be off the steady pose."""
     return np.asarray(_OFF * np.sum((changes / _UNITS) ** 2, axis=1))
 
@@ -155,7 +155,7 @@ def repaired(room: Room, rig_from_world: Sequence[Rigid3]) -> list[Rigid3]:
     parts = np.multiply.outer(_SHARES, needed[np.linspace(0, len(needed) - 1, min(len(needed), _NEEDED)).astype(int)])
     changes = _changes(rig_from_world, blocked, partial(_eased_least, roomy, parts.reshape(-1, 6)))
     return [
-        _changed(change) @ pose if change.any() else pose for change, pose in zip(changes, rig_from_world, strict=True)
+        _motion(change) @ pose if change.any() else pose for change, pose in zip(changes, rig_from_world, strict=True)
     ]
 
 
@@ -177,7 +177,7 @@ def _fitting(room: Room, crowns: CrownPoints, handpiece: Handpiece, pose: Rigid3
     """The best candidates at a station that fit."""
     near = crowns.within(pose.inverse().translation[None], _REACH_MM)
     near = near[np.abs(pose.apply(crowns.points[near])[:, 0]) < _BESIDE_MM]
-    return _best(room, pose, _coarse(), partial(_missed, crowns, near, handpiece, pose))
+    return _best(room, pose, _coarse(), partial(_coverage_cost, crowns, near, handpiece, pose))
 
 
 def _least(room: Room, pose: Rigid3) -> _Choice:
@@ -188,8 +188,8 @@ def _least(room: Room, pose: Rigid3) -> _Choice:
 def _eased_least(room: Room, parts: Float[np.ndarray, "k 6"], pose: Rigid3) -> _Choice:
     """Those, and parts of what frames nearby need, so that there is a smooth way to it."""
     changes, costs = _least(room, pose)
-    fits = room.fits(pose, [_changed(part) for part in parts])
-    return np.concatenate([changes, parts[fits]]), np.concatenate([costs, _off(parts[fits])])
+    fits = room.fits(pose, [_motion(part) for part in parts])
+    return np.concatenate([changes, parts[fits]]), np.concatenate([costs, _deviation_cost(parts[fits])])
 
 
 def _best(
@@ -200,7 +200,7 @@ def _best(
 ) -> _Choice:
     """Of the candidates that fit those that cost least. They are looked at in the order of what it costs to be off the
     pose, until that alone is too much."""
-    off = _off(candidates.changes)
+    off = _deviation_cost(candidates.changes)
     found, costs = np.empty(0, dtype=int), np.empty(0)
     for first in range(0, len(off), _AT_ONCE):
         if len(costs) >= _KEPT and off[first] > np.partition(costs, _KEPT - 1)[_KEPT - 1]:
@@ -224,11 +224,11 @@ def _outwards(room: Room, pose: Rigid3) -> _Choice:
     out_mm = room.mesh.bounds[1, 2] + room.clearance_mm + 2 * FAR_MM - corners[:, 2].min()
     heights = np.linspace(0, out_mm, _OUT + 1)[1:, None]
     changes = np.concatenate([heights * pose.rotation[:, 2], np.zeros((_OUT, 3))], axis=1)
-    fits = room.fits(pose, [_changed(change) for change in changes])
-    return changes[fits], _off(changes[fits])
+    fits = room.fits(pose, [_motion(change) for change in changes])
+    return changes[fits], _deviation_cost(changes[fits])
 
 
-def _missed(
+def _coverage_cost(
     crowns: CrownPoints, near: Int[np.ndarray, "n"], handpiece: Handpiece, pose: Rigid3, motions: Sequence[Rigid3]
 ) -> Float[np.ndarray, "k"]:
     """What it costs that two cameras do not see some points of the crowns, from each of several poses about a pose."""

@@ -128,10 +128,10 @@ def _steady(jaw: Jaw, room: Room, handpiece: Handpiece, shape: PathShape) -> tup
         case "s-shape":
             return length, swung
         case "cross":
-            return _across(jaw, room, handpiece, curve, there_and_back)
+            return _plan_across(jaw, room, handpiece, curve, there_and_back)
 
 
-def _across(
+def _plan_across(
     jaw: Jaw, room: Room, handpiece: Handpiece, curve: ArchCurve, there_and_back: Steady
 ) -> tuple[float, Steady]:
     """Along the arch, back to where there is surface all the way to the other side, and over it."""

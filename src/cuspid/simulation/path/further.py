@@ -54,12 +54,12 @@ class _Trial:
         # A point counts at the middle of the places that see it.
         at = np.array([np.median(np.flatnonzero(new[:, point])) for point in added], dtype=int)
         gain = np.bincount(at, minlength=len(self.lengths_mm)) / len(unseen) - _WORTH * _STATION_MM
-        gain[~self._tied(legs)] = -1.0  # no stretch gains as much as that
+        gain[~self._shared_places(legs)] = -1.0  # no stretch gains as much as that
         first, last = _largest_sum(gain)
         net = float(gain[first : last + 1].sum()) - _WORTH * _ARM_MM * abs(np.deg2rad(self.roll_deg))
         return float(self.lengths_mm[first]), float(self.lengths_mm[last]), net
 
-    def _tied(self, legs: Sequence[Leg]) -> Bool[np.ndarray, "s"]:
+    def _shared_places(self, legs: Sequence[Leg]) -> Bool[np.ndarray, "s"]:
         """Places where the pass shares enough surface with others."""
         if abs(self.roll_deg) <= _STEEP_DEG:
             return np.ones(len(self.lengths_mm), bool)
@@ -106,10 +106,10 @@ def _woven(first: Sequence[Leg], further: Sequence[Leg]) -> Iterator[Leg]:
         back = high - min(_ends(leg)[0] for leg in stretch) if len(stretch) % 2 else 0.0
         if at < high < base.end_mm - back:
             coming = replace(base, start_mm=at, end_mm=high)
-            yield from (coming, *_ordered(coming, stretch))
+            yield from (coming, *_order_passes(coming, stretch))
             at, left = high, [leg for leg in left if leg not in stretch]
     last = replace(base, start_mm=at)
-    yield from (last, *_ordered(last, left))
+    yield from (last, *_order_passes(last, left))
 
 
 def _ends(leg: Leg) -> tuple[float, float]:
@@ -127,20 +127,20 @@ def _stretches(legs: Sequence[Leg]) -> list[list[Leg]]:
     return found
 
 
-def _ordered(last: Leg, legs: Sequence[Leg]) -> Iterator[Leg]:
+def _order_passes(last: Leg, legs: Sequence[Leg]) -> Iterator[Leg]:
     """From the end of each pass to the nearest end of one that is left."""
     left = list(legs)
     while left:
-        candidates = [leg for each in left for leg in (each, _reversed(each))]
+        candidates = [leg for each in left for leg in (each, _reverse_pass(each))]
         following = min(
             candidates, key=lambda leg: abs(leg.start_mm - last.end_mm) + abs(leg.roll_deg - last.roll_deg) / 10
         )
-        left = [each for each in left if each not in (following, _reversed(following))]
+        left = [each for each in left if each not in (following, _reverse_pass(following))]
         yield following
         last = following
 
 
-def _reversed(leg: Leg) -> Leg:
+def _reverse_pass(leg: Leg) -> Leg:
     return replace(leg, start_mm=leg.end_mm, end_mm=leg.start_mm)
 
 

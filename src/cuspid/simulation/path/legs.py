@@ -176,7 +176,7 @@ def _lifts(mesh: Mesh, hold_from_world: Sequence[Rigid3], roll_deg: float) -> Fl
         hits = mesh.cast(world_from_rig.apply(patch), np.broadcast_to(-world_from_rig.rotation[:, 2], patch.shape))
         heights = _FAR_MM - hits.distances[hits.distances < 2 * _FAR_MM]
         lifts[index] = np.median(heights) if len(heights) else 0.0
-    return np.asarray(np.clip(_followed(lifts, NEAR_MM), -_LIFT_MM, _LIFT_MM))
+    return np.asarray(np.clip(_follow_heights(lifts, NEAR_MM), -_LIFT_MM, _LIFT_MM))
 
 
 def _sinks(mesh: Mesh, curve: ArchCurve, stations_mm: Float[np.ndarray, "s"]) -> Float[np.ndarray, "s"]:
@@ -191,7 +191,7 @@ def _sinks(mesh: Mesh, curve: ArchCurve, stations_mm: Float[np.ndarray, "s"]) ->
         heights[index] = highest if np.isfinite(highest) else 0.0
     between = np.logical_and(*(_any_before(heights > -_GAP_MM, order) for order in (1, -1)))
     heights[~between] = 0.0
-    return np.asarray(np.maximum(-_followed(heights, _GAP_NEAR_MM) - _GAP_MM, 0.0))
+    return np.asarray(np.maximum(-_follow_heights(heights, _GAP_NEAR_MM) - _GAP_MM, 0.0))
 
 
 def _any_before(which: Bool[np.ndarray, "s"], order: int) -> Bool[np.ndarray, "s"]:
@@ -199,7 +199,7 @@ def _any_before(which: Bool[np.ndarray, "s"], order: int) -> Bool[np.ndarray, "s
     return np.asarray(np.logical_or.accumulate(which[::order])[::order])
 
 
-def _followed(heights_mm: Float[np.ndarray, "s"], near_mm: float) -> Float[np.ndarray, "s"]:
+def _follow_heights(heights_mm: Float[np.ndarray, "s"], near_mm: float) -> Float[np.ndarray, "s"]:
     """Heights at the stations as a hand follows them: what stands out most nearby, smoothly."""
     highest = maximum_filter(heights_mm, size=round(near_mm / _STATION_MM), mode="nearest")
     return np.asarray(gaussian_filter1d(highest, near_mm / 2 / _STATION_MM, mode="nearest"))

@@ -163,7 +163,7 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
     if _goes_on(options, curve):
         steady = further_legs(jaw.mesh, room, crowns, handpiece, first)
     if options.cross_sweep:
-        steady = _crossed(jaw.mesh, room, handpiece, steady, options)
+        steady = _cross(jaw.mesh, room, handpiece, steady, options)
     detour = plan_detour(room, crowns, handpiece, steady.rig_from_world, steady.span_mm)
     hand = hand_motion(
         steady.span_mm,
@@ -172,14 +172,14 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
         jitter_deg=options.jitter_deg,
         jitter_length_mm=options.jitter_length_mm,
     )
-    pose_at = lifted(room, _held(steady, detour, hand), steady.span_mm)
+    pose_at = lifted(room, _apply_drift(steady, detour, hand), steady.span_mm)
     path = _with_frames(room, handpiece, first, steady, pose_at, options)
     if not np.isfinite(path.overlap).any():
         raise InputError(
             f"scan path: with the handpiece {options.clearance_mm:g} mm from the jaw, no camera sees it in focus; "
             "use a narrower handpiece, a larger depth of field or a smaller --clearance-mm"
         )
-    seen, further = _seen(crowns, handpiece, path, options.tooth), _further_frames(first, path)
+    seen, further = _seen_faces(crowns, handpiece, path, options.tooth), _further_frames(first, path)
     path = replace(path, seen=seen, further_frames=further)
     notes = (_gap_notes(steady), _detour_notes(jaw, steady, detour), _further_pass_notes(steady, first, path))
     across = _crossing_notes(jaw, path) if options.cross_sweep else ()
@@ -188,7 +188,7 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
     return path
 
 
-def _seen(crowns: CrownPoints, handpiece: Handpiece, path: ScanPath, tooth: int | None) -> dict[int, float]:
+def _seen_faces(crowns: CrownPoints, handpiece: Handpiece, path: ScanPath, tooth: int | None) -> dict[int, float]:
     """As :attr:`ScanPath.seen`."""
     found = np.asarray(seen_from(crowns, handpiece, list(path.rig_from_world.values())).any(axis=0))
     if tooth is not None:
@@ -218,7 +218,7 @@ def _goes_on(options: ScanPathOptions, curve: ArchCurve) -> bool:
     return float(curve.lengths_mm[-1]) > _ARCH_MM and options.turns == 1 and all(each is None for each in said)
 
 
-def _crossed(mesh: Mesh, room: Room, handpiece: Handpiece, steady: SteadyPath, options: ScanPathOptions) -> SteadyPath:
+def _cross(mesh: Mesh, room: Room, handpiece: Handpiece, steady: SteadyPath, options: ScanPathOptions) -> SteadyPath:
     """With a sweep to the other side from that on which the passes end; as it was where there is none.
 
     Raises InputError for a single tooth and for a part of an arch, which have no other side.
@@ -255,7 +255,7 @@ def _reach_mm(handpiece: Handpiece) -> float:
     return handpiece.depth_range_mm[1]
 
 
-def _held(steady: SteadyPath, detour: Detour, hand: HandMotion) -> PoseAt:
+def _apply_drift(steady: SteadyPath, detour: Detour, hand: HandMotion) -> PoseAt:
     """The trajectory of a hand that drifts."""
     if not detour.changes.any():
         return lambda at: hand.at(at) @ steady.rig_from_world(at)
@@ -280,7 +280,7 @@ def _with_frames(
         path = _even_path(room, handpiece, steady, pose_at, frames)
         if path.minimum_overlap >= options.minimum_overlap:
             return path
-        needed = _needed(frames, path, options)
+        needed = _needed_frames(frames, path, options)
         shortfall = (
             f"with {frames} frames, consecutive images overlap by only {path.minimum_overlap:.0%}, less than "
             f"{options.minimum_overlap:.0%}"
@@ -300,7 +300,7 @@ def _usual_frames(steady: SteadyPath, first: SteadyPath, options: ScanPathOption
     return round(per_pass * len(first.legs) * np.ptp(steady.span_mm) / np.ptp(first.span_mm))
 
 
-def _needed(frames: int, path: ScanPath, options: ScanPathOptions) -> int:
+def _needed_frames(frames: int, path: ScanPath, options: ScanPathOptions) -> int:
     """Frames that are about enough: the surface that an image loses is in proportion to the step."""
     growth = (1 - path.minimum_overlap) / (1 - options.minimum_overlap)
     if len(path.steady.legs) > 1:

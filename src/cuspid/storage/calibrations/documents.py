@@ -65,7 +65,7 @@ def parse(text: str) -> Document:
     if _is_nested_deeply(text):
         raise InputError(f"it is no calibration (nested more than {_DEEPEST} deep)")
     try:
-        found = _parsed(text)
+        found = _parse(text)
     except (ValueError, ElementTree.ParseError, yaml.YAMLError, RecursionError) as error:
         raise InputError(f"it can be read neither as JSON nor as YAML, TOML or XML ({one_line(error)})") from error
     if found.kind == "values":
@@ -73,7 +73,7 @@ def parse(text: str) -> Document:
     return found
 
 
-def _parsed(text: str) -> Document:
+def _parse(text: str) -> Document:
     start = text.lstrip()[:1]
     if start == "<":
         if "<!DOCTYPE" in text or "<!ENTITY" in text:

@@ -74,11 +74,11 @@ def _camera(what: str, text: str) -> tuple[Camera, Loss | None]:
         return pinhole, None
     if "Kappa" in told:
         kappa = number(f"{what}: Kappa", told["Kappa"], -1e12, 1e12) * focus**2
-        return of_projection(lambda points: _divided(kappa, pinhole, points), size, "the division model")
+        return of_projection(lambda points: _distort_division(kappa, pinhole, points), size, "the division model")
     k1, k2, k3, p1, p2 = (told[each] for each in _POLYNOMIAL)
     values = [k1 * focus**2, k2 * focus**4, p2 * focus, p1 * focus, k3 * focus**6, 0.0, 0.0, 0.0]
     inverse = camera(what, size, focal, centre, values, "FULL_OPENCV")
-    return of_projection(lambda points: _solved(inverse, points), size, "the polynomial model")
+    return of_projection(lambda points: _invert_division(inverse, points), size, "the polynomial model")
 
 
 def _plane(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
@@ -89,14 +89,14 @@ def _pixels(pinhole: Camera, plane: Float[np.ndarray, "n 2"]) -> Float[np.ndarra
     return plane * pinhole.focal_px + pinhole.principal_point_px
 
 
-def _divided(kappa: float, pinhole: Camera, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+def _distort_division(kappa: float, pinhole: Camera, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """Of d with u = d / (1 + kappa d^2) in units of the focal length."""
     plane = _plane(points)
     root = 1 - 4 * kappa * (plane**2).sum(axis=1, keepdims=True)
     return _pixels(pinhole, 2 * plane / (1 + np.sqrt(np.where(root >= 0, root, np.nan))))
 
 
-def _solved(inverse: Camera, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+def _invert_division(inverse: Camera, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """With a lens that takes distorted places to undistorted ones as one of OpenCV's takes them the other way."""
     plane = _plane(points)
     seen = np.isfinite(plane).all(axis=1)

@@ -79,13 +79,13 @@ def _camera(name: str, entry: Mapping[str, Any]) -> tuple[Camera, Loss | None]:
     return of_projection(project, size, model if distortion == "none" else f"{model} with {distortion}")
 
 
-def _over(points: Float[np.ndarray, "n 3"], depth: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
+def _project_pinhole(points: Float[np.ndarray, "n 3"], depth: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
     return points[:, :2] / np.where(depth > 1e-6, depth, np.nan)[:, None]
 
 
 def _omni(own: _Values, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """C. Mei, P. Rives, ICRA 2007."""
-    return _over(points, points[:, 2] + own[0] * np.linalg.norm(points, axis=1))
+    return _project_pinhole(points, points[:, 2] + own[0] * np.linalg.norm(points, axis=1))
 
 
 def _double_sphere(own: _Values, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
@@ -94,21 +94,21 @@ def _double_sphere(own: _Values, points: Float[np.ndarray, "n 3"]) -> Float[np.n
     first = np.linalg.norm(points, axis=1)
     ahead = xi * first + points[:, 2]
     second = np.hypot(np.hypot(points[:, 0], points[:, 1]), ahead)
-    return _over(points, alpha * second + (1 - alpha) * ahead)
+    return _project_pinhole(points, alpha * second + (1 - alpha) * ahead)
 
 
-def _unified(own: _Values, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+def _project_unified(own: _Values, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """B. Khomutenko, G. Garcia, P. Martinet, IEEE RA-L 1, 2016: the extended unified model."""
     alpha, beta = own
     away = np.sqrt(beta * (points[:, 0] ** 2 + points[:, 1] ** 2) + points[:, 2] ** 2)
-    return _over(points, alpha * away + (1 - alpha) * points[:, 2])
+    return _project_pinhole(points, alpha * away + (1 - alpha) * points[:, 2])
 
 
 _PLANES: Mapping[str, Callable[[_Values, Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 2"]]] = {
-    "pinhole": lambda own, points: _over(points, points[:, 2]),
+    "pinhole": lambda own, points: _project_pinhole(points, points[:, 2]),
     "omni": _omni,
     "ds": _double_sphere,
-    "eucm": _unified,
+    "eucm": _project_unified,
 }
 
 

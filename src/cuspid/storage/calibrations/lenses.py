@@ -141,11 +141,11 @@ def _nearest(
     lenses: Sequence[Lens],
     said: str,
 ) -> tuple[Camera, Loss]:
-    found = [_fitted(directions, pixels, start, size_px, lens, said) for lens in lenses]
+    found = [_fit_lens(directions, pixels, start, size_px, lens, said) for lens in lenses]
     return min(found, key=lambda each: each[1].largest_px)
 
 
-def _fitted(
+def _fit_lens(
     directions: Float[np.ndarray, "n 3"],
     pixels: Float[np.ndarray, "n 2"],
     start: Float[np.ndarray, "4"],

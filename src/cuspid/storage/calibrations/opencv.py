@@ -56,7 +56,7 @@ _COUNTS = (0, 1, 4, 5, 8, 12, 14)
 def recognises(files: Mapping[str, Document]) -> bool:
     """Whether there is a camera matrix under one of the names in use."""
     try:
-        values = _merged(files)
+        values = _merge_files(files)
     except InputError:
         return False
     return bool("matrix" in _single(values) or any("matrix" in each for each in _sides(values)) or _several(values))
@@ -64,7 +64,7 @@ def recognises(files: Mapping[str, Document]) -> bool:
 
 def read(files: Mapping[str, Document], hints: Hints) -> Calibration:
     """Cameras of OpenCV's files, of a pair also where intrinsics and extrinsics are in two. Raises InputError."""
-    values = _merged(files)
+    values = _merge_files(files)
     notes: list[str] = []
     losses: dict[str, Loss] = {}
 
@@ -87,7 +87,7 @@ def read(files: Mapping[str, Document], hints: Hints) -> Calibration:
         first, second = (_name(side, usual) for side, usual in zip(sides, ("left", "right"), strict=True))
         if first == second:
             raise InputError(f"both of its cameras are named {first}")
-        between = _named(values, _OF_PAIR)
+        between = _find_fields(values, _OF_PAIR)
         if len(between) < 2:
             raise InputError("it has two cameras but no R and T between them; give both files in one folder")
         second_from_first = pose("R and T", between["rotation"], between["shift"])
@@ -105,7 +105,7 @@ def _name(found: Mapping[str, Any], usual: str) -> str:
     return checked_name("camera_name", found.get("name", usual))
 
 
-def _merged(files: Mapping[str, Document]) -> Mapping[str, Any]:
+def _merge_files(files: Mapping[str, Document]) -> Mapping[str, Any]:
     merged: dict[str, Any] = {}
     for document in files.values():
         values = _of_xml(document.value) if document.kind == "xml" else document.value
@@ -132,7 +132,7 @@ def _plain(key: str) -> str:
     return re.sub(r"[^a-z0-9]", "", key.lower())
 
 
-def _named(values: Mapping[str, Any], meanings: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
+def _find_fields(values: Mapping[str, Any], meanings: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
     return {
         meaning: value
         for key, value in values.items()
@@ -142,7 +142,7 @@ def _named(values: Mapping[str, Any], meanings: Mapping[str, tuple[str, ...]]) -
 
 
 def _single(values: Mapping[str, Any]) -> dict[str, Any]:
-    return _named(values, _MEANINGS)
+    return _find_fields(values, _MEANINGS)
 
 
 def _sides(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -155,7 +155,7 @@ def _sides(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     for found, value in hits:
         side = found[1] or found[4]
         index = 1 if from_zero and side == "1" else _SIDES[side]
-        sides[index].update(_named({found["a"] or found["b"]: value}, _MEANINGS))
+        sides[index].update(_find_fields({found["a"] or found["b"]: value}, _MEANINGS))
     return sides
 
 

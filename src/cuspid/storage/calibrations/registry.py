@@ -127,7 +127,7 @@ def read_calibration(
     file does not tell, ``kind`` what it is. Raises InputError."""
     files = _documents(path)
     with reading(path):
-        name = kind or _recognised(files)
+        name = kind or _recognise(files)
         found = FORMATS[name].read(files, Hints(image_size_px=image_size_px))
         told, note = _unit(FORMATS[name], found, unit)
         rig = Rig({each: scaled(mounted, MM_PER_UNIT[told]) for each, mounted in found.cameras.items()})
@@ -147,7 +147,7 @@ def _documents(path: Path) -> Mapping[str, Document]:
     return documents
 
 
-def _recognised(files: Mapping[str, Document]) -> Name:
+def _recognise(files: Mapping[str, Document]) -> Name:
     for name, each in FORMATS.items():
         if each.recognises(files):
             return name

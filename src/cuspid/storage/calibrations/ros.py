@@ -59,7 +59,7 @@ def read(files: Mapping[str, Document], hints: Hints) -> Calibration:
         name = checked_name("camera_name", values.get("camera_name") or stem)
         if name in cameras:
             name = checked_name("camera", stem)
-        cameras[name], is_placed = _mounted(f"camera {name}", values)
+        cameras[name], is_placed = _mount_camera(f"camera {name}", values)
         placed += [name] if is_placed else []
     if len(cameras) == 2 and not placed:
         raise InputError("its two cameras have no baseline in projection_matrix; give those of a calibrated pair")
@@ -70,7 +70,7 @@ def read(files: Mapping[str, Document], hints: Hints) -> Calibration:
     return Calibration(cameras=cameras)
 
 
-def _mounted(what: str, values: Mapping[str, Any]) -> tuple[MountedCamera, bool]:
+def _mount_camera(what: str, values: Mapping[str, Any]) -> tuple[MountedCamera, bool]:
     """A camera in the rectified frame of the first of its pair, and whether it is another than the first."""
 
     def field_of(*names: str) -> Any:
@@ -122,14 +122,14 @@ def write(cameras: Mapping[str, MountedCamera], suffix: str) -> str | Mapping[st
         raise InputError("ROS rectifies pairs whose images have one size; convert each camera alone")
     if first.camera.lens.is_equidistant != second.camera.lens.is_equidistant:
         raise InputError("one camera has a fisheye lens and the other has none: OpenCV cannot rectify such a pair")
-    rectified = _rectified(first, second)
+    rectified = _rectification(first, second)
     return {
         f"{name}.yaml": _text(name, cameras[name], turn, projection)
         for name, (turn, projection) in zip(names, rectified, strict=True)
     }
 
 
-def _rectified(
+def _rectification(
     first: MountedCamera, second: MountedCamera
 ) -> tuple[tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 4"]], ...]:
     """R and P of both cameras."""

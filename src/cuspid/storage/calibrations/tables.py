@@ -66,13 +66,13 @@ def read(files: Mapping[str, Document], hints: Hints) -> Calibration:
         if len(tables) > 1 and not ("rotation" in table and "translation" in table):
             notes.append(f"camera {name} has no place, and is left out")
             continue
-        cameras[name] = _mounted(f"camera {name}", table)
+        cameras[name] = _mount_camera(f"camera {name}", table)
     if not cameras:
         raise InputError("none of its cameras has a matrix, rotation and translation")
     return Calibration(cameras=cameras, notes=tuple(notes))
 
 
-def _mounted(what: str, table: Mapping[str, Any]) -> MountedCamera:
+def _mount_camera(what: str, table: Mapping[str, Any]) -> MountedCamera:
     table = mapped(what, table)
     size = image_size(what, *vector(f"{what}: size", table["size"], 2).tolist())
     focal, centre = calibration_matrix(f"{what}: matrix", table["matrix"])
