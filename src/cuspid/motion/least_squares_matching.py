@@ -178,8 +178,9 @@ class _Matching:
 def _perspective_bends(arms: Float[np.ndarray, "k 9 2"], radius_px: int) -> Float[np.ndarray, "k s 2"]:
     """What perspective adds to the linear warp at each pixel of a patch, to second order, px.
 
-    Without it a slanted patch is found where its pixels lie on the average: a disparity is too large by tan^2 of the
-    slant, times the mean square of the offsets over that of the focal length (60 ppm at 45 deg), and an arch opens.
+    Without it a patch is found where its pixels lie on the average, which between views that are tilted by an angle
+    against each other is off by that angle times the mean square of the offsets over the focal length: 0.005 px at 12
+    deg. That is always to the same side, and an arch opens.
     """
     middle, right, left, below, above, *diagonal = np.moveaxis(arms, 1, 0)
     both = (diagonal[0] + diagonal[1] - diagonal[2] - diagonal[3]) / 4
