@@ -1,5 +1,6 @@
 """The command line as a user meets it: what bad input gets, and that each verb is documented."""
 
+import re
 import shutil
 import subprocess
 import sys
@@ -25,8 +26,10 @@ def test_every_verb_has_help(capsys, verb):
     with pytest.raises(SystemExit) as caught:
         cli.main([verb, "--help"])
     assert caught.value.code == 0
-    printed = capsys.readouterr().out
-    assert cli.COMMANDS[verb].__doc__.split(".")[0].split()[0] in printed
+    printed = " ".join(re.sub("[│╭╮╰╯─]", " ", capsys.readouterr().out).split())
+    sentence = re.split(r"(?<=[.:])\s", cli.COMMANDS[verb].__doc__.strip())[0]
+    assert f"usage: cuspid {verb}" in printed
+    assert " ".join(sentence.split()) in printed
     assert "--out" in printed or verb in ("convert", "view")
 
 

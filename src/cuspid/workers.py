@@ -154,7 +154,7 @@ def _proxy(values: dict[Any, Any]) -> MappingProxyType[Any, Any]:
 
 def _unpacked(kind: type, values: dict[str, Any]) -> Any:
     """The value bit for bit, and its arrays read-only as they were: kernels are compiled for such ones."""
-    made = object.__new__(kind)
+    made: Any = object.__new__(kind)
     for name, value in values.items():
         if isinstance(value, np.ndarray):
             value.flags.writeable = False
