@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from cuspid.camera import Camera
@@ -17,7 +19,7 @@ from cuspid.geometry.cameras import LENSES, MODELS
 from cuspid.motion import adjustment, gauge, normal_equations
 from cuspid.motion.adjustment import AdjustmentOptions, adjust, left_jacobian
 from cuspid.motion.expectation import covariance_factor
-from cuspid.reconstruction import Reconstruction, Tracks
+from cuspid.reconstruction import Reconstruction, Tracks, chosen_tracks
 from cuspid.rig import MountedCamera, Rig
 from cuspid.shutter import Shutter
 
@@ -628,3 +630,74 @@ def test_a_frame_without_observations_is_an_error() -> None:
     tracks = replace(start.tracks, **{name: getattr(start.tracks, name)[kept] for name in names})
     with pytest.raises(ReconstructionError, match="overlap"):
         adjust(replace(start, tracks=tracks), AdjustmentOptions(rounds=1))
+
+
+# --- an oracle ---------------------------------------------------------------------------------------------------
+
+
+def moved(motions: np.ndarray, rotations: np.ndarray, translations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses after small motions on the left (rotation vector, translation)."""
+    turns = Rotation.from_rotvec(motions[:, :3]).as_matrix()
+    return turns @ rotations, np.einsum("nij,nj->ni", turns, translations) + motions[:, 3:]
+
+
+def by_general_least_squares(given: Reconstruction, sigma_px: float, knee: float) -> tuple[np.ndarray, ...]:
+    """What the adjustment is to find, the least sum of Huber's losses and of the prior's: rotations and translations of
+    the frames, points, and calibrations in standard deviations. By a solver that knows no points and poses, with
+    differences for derivatives and OpenCV's projection."""
+    tracks, mounted = given.tracks, list(given.rig.cameras.values())
+    assert tracks is not None
+    frame, camera, point = tracks.frame_index, tracks.camera_index, tracks.point_index
+    poses = np.stack([pose.matrix for pose in poses_of(given)])
+    places = np.stack([each.cam_from_rig.matrix for each in mounted])
+    parameters = np.stack([each.camera.parameters for each in mounted])
+    sizes = np.cumsum([6 * (len(poses) - 1), tracks.points.size])
+
+    def unpacked(x: np.ndarray) -> tuple[np.ndarray, ...]:
+        steps, points, whitened = np.split(x, sizes)
+        motions = np.concatenate([np.zeros((1, 6)), steps.reshape(-1, 6)])
+        return *moved(motions, poses[:, :3, :3], poses[:, :3, 3]), points.reshape(-1, 3), whitened.reshape(-1, 14)
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        rotations, translations, points, whitened = unpacked(x)
+        in_rig = np.einsum("oij,oj->oi", rotations[frame], points[point]) + translations[frame]
+        turns, shifts = moved(EXTRINSIC_SIGMA * whitened[:, :6], places[:, :3, :3], places[:, :3, 3])
+        in_cam = np.einsum("oij,oj->oi", turns[camera], in_rig) + shifts[camera]
+        found = np.empty_like(tracks.pixels)
+        for c, (fx, fy, cx, cy, *lens) in enumerate(parameters + PARAMETER_SIGMA * whitened[:, 6:]):
+            matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+            seen, _ = cv2.projectPoints(in_cam[camera == c], np.zeros(3), np.zeros(3), matrix, np.array(lens))
+            found[camera == c] = seen[:, 0]
+        sigmas = (found - tracks.pixels) / sigma_px
+        lengths = np.linalg.norm(sigmas, axis=1, keepdims=True)
+        inside = np.minimum(lengths, knee)
+        return np.concatenate([(sigmas * np.sqrt(inside * (2 * lengths - inside)) / lengths).ravel(), whitened.ravel()])
+
+    start = np.concatenate([np.zeros(sizes[0]), tracks.points.ravel(), np.zeros(14 * len(mounted))])
+    least = least_squares(residuals, start, "3-point", x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-12)
+    return unpacked(least.x)
+
+
+@pytest.mark.parametrize(("knee", "points_mm"), [(1000.0, 1e-6), (1.5, 5e-6)])
+def test_the_minimum_is_that_of_a_general_solver(knee: float, points_mm: float) -> None:
+    """With free cameras; and with a loss in which many residuals do not count in full, whose kinks such a solver gets
+    over slowly: its gradient ends a hundred times larger."""
+    cameras = make_rig().cameras
+    scene = make_scene(rig=Rig({name: cameras[name] for name in ("c0", "c4")}), frames=3, points=24)
+    well_seen = np.bincount(scene.tracks.point_index, minlength=24) >= 4
+    scene = replace(scene, tracks=chosen_tracks(scene.tracks, well_seen[scene.tracks.point_index]))
+    given = disturbed(scene, np.random.default_rng(3), rig=with_priors(scene.rig))
+    exactly = AdjustmentOptions(
+        sigma_px=SIGMA_PX, huber_sigmas=knee, rounds=1, iterations=500, tolerance=1e-12, start_px=1e9
+    )
+    found = adjust(given, exactly, judge=False)
+    rotations, translations, points, whitened = by_general_least_squares(given, SIGMA_PX, knee)
+    assert found.tracks is not None
+    np.testing.assert_allclose([pose.rotation for pose in poses_of(found)], rotations, atol=1e-6)
+    np.testing.assert_allclose([pose.translation for pose in poses_of(found)], translations, atol=1e-6)
+    np.testing.assert_allclose(found.tracks.points, points, atol=points_mm)
+    motions, parameters = calibration_errors(found.rig, scene.rig)
+    np.testing.assert_allclose(parameters / PARAMETER_SIGMA, whitened[:, 6:], atol=1e-5)
+    np.testing.assert_allclose(motions[:, :3] / EXTRINSIC_SIGMA[:3], whitened[:, :3], atol=1e-5)
+    assert np.abs(whitened).max() > 0.1
+    assert np.abs(translations - [pose.translation for pose in poses_of(given)]).max() > 1e-3

@@ -15,6 +15,7 @@ import pytest
 
 import cuspid
 from builders import folder_capture, handpiece, write_frames
+from cuspid import panorama_pipeline
 from cuspid.arch_curve import arch_curve
 from cuspid.capture import Dropped
 from cuspid.geometry import Rigid3
@@ -24,6 +25,7 @@ from cuspid.jaw import Jaw
 from cuspid.panorama import FrameUse, Panorama
 from cuspid.pipeline import scannable
 from cuspid.reconstruction import DepthMap, Reconstruction
+from cuspid.stitching.ortho import Stitched
 from cuspid.trueness import GroundTruth, Trueness
 
 QUICK = cuspid.EvaluationOptions(align=False, samples=20_000)
@@ -154,6 +156,12 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> cuspid.Capture:
         write_frames(folder / "images" / name, images)
     stems = sorted(path.stem for path in (folder / "images" / "left").iterdir())
     return folder_capture(folder, device, stems)
+
+
+def test_a_capture_is_stitched_with_all_its_cameras(capture: cuspid.Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Stitched(panorama=panorama(), motion=None, strip=None)
+    monkeypatch.setattr(panorama_pipeline, "stitch_rig", lambda frames, options, progress: made)
+    assert cuspid.stitch(capture) == (made,)
 
 
 def panorama() -> Panorama:

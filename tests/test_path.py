@@ -8,10 +8,9 @@ from itertools import pairwise, product
 import numpy as np
 import pytest
 
-from builders import sphere
+from builders import any_pose, sphere
 from cuspid.arch_curve import ArchCurve, arch_curve
 from cuspid.evaluation.crown import open_parts
-from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import twelve_cameras
 from cuspid.jaw import GUM, Jaw
 from cuspid.room import Room
@@ -256,9 +255,12 @@ def test_frames_are_evaluated_by_all_their_cameras() -> None:
 
 
 def test_a_detour_is_about_what_is_looked_at() -> None:
-    from cuspid.simulation.path.detour import _motion
-
-    change = _motion(np.array([0.1, 0.5, 2.0, *np.deg2rad([10.0, 0, 0])])).inverse()
-    np.testing.assert_allclose(change.translation, [0.1, 0.5, 2.0], atol=1e-12)
-    assert np.rad2deg(np.linalg.norm(change.rotation_vector)) == pytest.approx(10)
-    assert isinstance(change, Rigid3)
+    """A turn leaves the place below the handpiece where it is; a shift moves that along the axes of the handpiece."""
+    pose = any_pose(3, 20.0)
+    place = pose.inverse().translation
+    turned = _motion(np.array([0, 0, 0, *np.deg2rad([10.0, -20, 5])])) @ pose
+    np.testing.assert_allclose(turned.apply(place[None]), 0, atol=1e-12)
+    turn = turned.rotation @ pose.rotation.T
+    assert np.rad2deg(np.arccos((np.trace(turn) - 1) / 2)) == pytest.approx(np.linalg.norm([10, 20, 5]))
+    shifted = _motion(np.array([0.1, 0.5, 2.0, 0, 0, 0])) @ pose
+    np.testing.assert_allclose(pose.apply(shifted.inverse().translation[None])[0], [0.1, 0.5, 2.0], atol=1e-12)

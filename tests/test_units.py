@@ -108,7 +108,7 @@ def test_a_small_simulated_scan_is_compared_with_its_truth(
         raise LookupError
 
     monkeypatch.setattr(storage, "read_truth", lambda path: Known)
-    monkeypatch.setattr(pipeline, "scannable", seen)
+    monkeypatch.setattr(pipeline, "reference_of", seen)
     part = measured(scaled(JAW, size_mm / 58.6))
     with pytest.raises(InputError if refused else LookupError):
         pipeline.load_reference(tmp_path, scan=part)

@@ -81,5 +81,20 @@ def _page(floor: str, modules: Mapping[str, str]) -> str:
 def _section(name: str, floor: str) -> Iterator[str]:
     if name != floor:
         yield heading(name, "-")
-    # What the face offers has its place where it is made.
-    yield from (f".. automodule:: {name}", *(["   :no-members:"] if name == GROUND_FLOOR else []), "")
+    if name == GROUND_FLOOR:
+        yield from (f".. automodule:: {name}", "   :no-members:", "", *_face(), "")
+    else:
+        yield from (f".. automodule:: {name}", "")
+
+
+def _face() -> Iterator[str]:
+    """What the package offers by name; it has its place where it is made."""
+    stub = ast.parse((SOURCE / GROUND_FLOOR / "__init__.pyi").read_text())
+    places = {
+        alias.name: f"{GROUND_FLOOR}.{node.module}.{alias.name}"
+        for node in stub.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    for name in sorted(places, key=str.swapcase):
+        yield f"- :py:obj:`{GROUND_FLOOR}.{name} <{places[name]}>`"

@@ -6,7 +6,7 @@
     trueness             = evaluate(mesh, truth)
     (panorama, *_)       = stitch(read_sequence("frames"))
 
-What is here is named in ``__init__.pyi``, and loaded when it is first used.
+What is here (``__init__.pyi``) is loaded when it is first used:
 """
 
 from importlib import import_module

@@ -445,8 +445,9 @@ def load_reference(
     truth = storage.read_truth(path)
     if scan is not None and not _SMALLEST_SCAN_MM < scan.width_mm < _LARGEST_SCAN_MM:
         storage.require_one_unit(scan, storage.MeasuredFile(path=path, mesh=truth.jaw.mesh, unit="mm"))
+    reference = reference_of(truth)
     hashes = {name: storage.hash_file(path / name) for name in ("jaw.ply", "poses.json", "handpiece.json")}
-    return replace(reference_of(truth), hashes=hashes)
+    return replace(reference, hashes=hashes)
 
 
 def _loaded_reference(
