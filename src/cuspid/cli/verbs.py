@@ -30,6 +30,7 @@ GROUPS: Mapping[str, Mapping[str, Verb]] = MappingProxyType(
             "live": Verb("live", "follow a scan while it is taken"),
             "evaluate": Verb("scan", "trueness of a mesh against a reference"),
             "repeat": Verb("repeat", "trueness and precision of repeated scans"),
+            "study": Verb("study", "trueness and precision of any scanners, from folders of meshes"),
             "report": Verb("report", "one HTML page on the results in a folder"),
             "view": Verb("view", "a scan or a shape model in the browser"),
         },
