@@ -13,17 +13,20 @@ from functools import partial
 
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from cuspid.facing import pieces_of
+from cuspid.geometry import lengths_along
 from cuspid.mesh import Mesh
 
 Points = Float[np.ndarray, "n 3"]
 Field = Callable[[Points], Points]
 BESIDE_MM = 11.0
 """Surface farther beside the curve is cut away: a palate between the sides belongs to both."""
+LINK = 8
+"""Samples of the curve in a link: they are 0.1 mm apart."""
 DENT_UM, DENT_MM = 100.0, 2.5
 """Depth and radius of the dent."""
 
@@ -50,17 +53,24 @@ class Case:
 
 def bent(points: Points, curve: Points, mode: str, amplitude_um: float) -> Points:
     """Points moved by a bend of a bar along the curve, the middle held; ``amplitude_um``: RMS of both ends."""
-    unit = 1e-4
-    for _ in range(6):  # nearly linear: a secant is enough
+    curve, unit = curve[_links(curve)], 1e-4
+    for _ in range(3):  # nearly linear
         ends = _bent(curve[[0, -1]], curve, mode, unit) - curve[[0, -1]]
         reached_um = 1000 * np.sqrt(np.mean(np.sum(ends**2, axis=1)))
         unit *= abs(amplitude_um) / reached_um
     return _bent(points, curve, mode, unit * np.sign(amplitude_um))
 
 
+def _links(curve: Points) -> Int[np.ndarray, "k"]:
+    """Ends of links of about a millimetre, the middle of the curve among them."""
+    middle = len(curve) // 2
+    return np.unique([*range(middle, -1, -LINK), 0, *range(middle, len(curve), LINK), len(curve) - 1])
+
+
 def _bent(points: Points, curve: Points, mode: str, rate: float) -> Points:
     """``rate``: rad per mm of curvature, or rad per mm of torsion."""
-    middle = len(curve) // 2
+    lengths = lengths_along(curve)
+    middle = int(np.argmin(np.abs(lengths - lengths[-1] / 2)))
     nearest = KDTree(curve[:, :2]).query(points[:, :2])[1]
     moved = points.copy()
     for side in (1, -1):
@@ -148,7 +158,7 @@ def fields(curve: Points) -> dict[str, tuple[dict[str, float], Field]]:
     for ppm in (-50, 200, 500):
         found[f"scale {ppm:+d} ppm"] = {"scale": float(ppm)}, partial(_scaled, middle, ppm)
     for mode in ("spread", "lift", "twist"):
-        for um in (10, -50, 200):
+        for um in (10, 200) if mode != "lift" else (-50, 200):
             found[f"{mode} {um:+d} um"] = {mode: float(um)}, partial(_bent_by, curve, ((mode, um),))
     told = {"scale": 150.0, "spread": -60.0, "lift": 120.0, "twist": 80.0}
     bends = tuple((mode, told[mode]) for mode in ("spread", "lift", "twist"))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,7 +26,7 @@ from cuspid.studies.grid import check_workers
 from cuspid.studies.scanners.files import Remark
 from cuspid.studies.scanners.scan import StudyOptions
 from cuspid.studies.scanners.statistics import summary as summarised
-from cuspid.studies.scanners.study import Intake, Prepared, Study, compare, prepare
+from cuspid.studies.scanners.study import Intake, Prepared, Study, compare, foreseen, prepare
 from cuspid.studies.scanners.text import ANCHORS, checklist, methods
 from cuspid.studies.scanners.views import write_views
 
@@ -99,10 +99,11 @@ def study(
                 progress=progress,
             )
             found = None if dry_run else compare(prepared, out, options, progress)
-        _print_remarks(prepared.remarks if found is None else found.remarks)
         if found is None:
+            _print_remarks(foreseen(prepared, out, options))
             _print_plan(prepared)
             return
+        _print_remarks(found.remarks)
         _save(out, found, options, plan_um)
     report(out)
 
@@ -190,10 +191,14 @@ def _print_plan(prepared: Prepared) -> None:
             specimen,
             str(len(told)),
             ", ".join(sorted({each["unit"] for each in told})),
-            f"{min(faces):,} to {max(faces):,}",
-            f"{min(overlap):.0%} to {max(overlap):.0%}",
+            _range([f"{each:,}" for each in sorted(faces)]),
+            _range([f"{each:.0%}" for each in sorted(overlap)]),
         )
     Console().print(table)
+
+
+def _range(ordered: Sequence[str]) -> str:
+    return ordered[0] if ordered[0] == ordered[-1] else f"{ordered[0]} to {ordered[-1]}"
 
 
 def _print(told: Mapping[str, Any]) -> None:

@@ -381,12 +381,12 @@ _STUDY_FIGURES: Mapping[str, str] = {
 
 def _read_scanner_study(folder: Path, run: Mapping[str, Any]) -> ScannerStudyResult:
     summary = read_json(folder / "study.json")
-    views = tuple(_specimen_view(path) for path in sorted((folder / "specimens").glob("*/view.npz")))
+    views = [_specimen_view(path) for path in (folder / "specimens").glob("*/view.npz")]
     return ScannerStudyResult(
         name=folder.resolve().name,
         run=run,
         summary=summary,
-        views=views,
+        views=tuple(sorted(views, key=lambda view: view.name)),
         missing=() if views else ("the 3-D view: run cuspid study again",),
         pictures=_pictures(folder / "figures", _STUDY_FIGURES),
     )

@@ -187,7 +187,7 @@ def _of_scanner(scanner: Path, references: Mapping[str, Path], remarks: list[Rem
             yield from ((folder.name, path) for path in meshes)
         elif meshes:
             known = ", ".join(references)
-            why = f"no reference of this name (there are {known}); its {len(meshes)} scans are left out"
+            why = f"no reference of this name (there are {known}); left out, with {len(meshes)} meshes"
             remarks.append(Remark(what=f"{scanner.name}/{folder.name}", why=why, left_out=True))
 
 

@@ -67,7 +67,7 @@ class Contrast:
     first: str
     second: str
     difference: Estimate
-    """First minus second, in the unit of the figure, from the model."""
+    """First minus second, in the unit of the figure, from the model; by Welch where variances are not equal."""
     p: float
     """Of the test that decides, corrected for the number of pairs (Holm)."""
     effect: Estimate
@@ -209,7 +209,7 @@ def compare_scanners(
         rank_p=float(rank.pvalue),
         assumptions=assumptions,
         components=model.components,
-        contrasts=_contrasts(model, names, groups, by_ranks=by_ranks, rng=rng),
+        contrasts=_contrasts(model, names, groups, by_ranks=by_ranks, equal=assumptions[1].holds is not False, rng=rng),
         scans=int(chosen.sum()),
     )
 
@@ -384,15 +384,18 @@ def _contrasts(
     groups: Sequence[Float[np.ndarray, "_"]],
     *,
     by_ranks: bool,
+    equal: bool,
     rng: np.random.Generator,
 ) -> tuple[Contrast, ...]:
     pairs = list(combinations(range(len(names)), 2))
-    reach = float(stats.t.ppf(0.5 + LEVEL / 2, model.freedom))
+    pooled = float(stats.t.ppf(0.5 + LEVEL / 2, model.freedom))
     found, p = [], []
     for a, b in pairs:
-        difference = float(model.means[a] - model.means[b])
+        difference, reach = float(model.means[a] - model.means[b]), pooled
         variance = model.covariance[a, a] + model.covariance[b, b] - 2 * model.covariance[a, b]
         error = float(np.sqrt(max(variance, 1e-300)))
+        if not equal:
+            error, reach = _welch(groups[a], groups[b])
         if by_ranks:
             p.append(float(stats.mannwhitneyu(groups[a], groups[b]).pvalue))
         else:
@@ -416,6 +419,14 @@ def _contrasts(
         )
         for (a, b, difference, effect), each in zip(found, holm(p), strict=True)
     )
+
+
+def _welch(one: Float[np.ndarray, "n"], other: Float[np.ndarray, "m"]) -> tuple[float, float]:
+    """Standard error of a difference of means where variances are not equal, and how many of them reach to the ends of
+    its interval (B. Welch, Biometrika 34, 1947)."""
+    parts = np.array([each.var(ddof=1) / len(each) for each in (one, other)])
+    freedom = parts.sum() ** 2 / np.sum(parts**2 / (np.array([len(one), len(other)]) - 1))
+    return float(np.sqrt(parts.sum())), float(stats.t.ppf(0.5 + LEVEL / 2, freedom))
 
 
 def hedges_g(difference: float, sd: float, one: int, other: int, freedom: float) -> Estimate:

@@ -122,9 +122,9 @@ def guessed_unit(path: Path, like_mm: float | None = None) -> tuple[Unit, str | 
     width_mm = file.width_in(nearest)
     if not low <= width_mm <= high:
         raise InputError(
-            f"{file.width_mm:.3g} wide, which is no size of teeth or jaws in any unit"
-            + ("" if like_mm is None else f" (its reference is {like_mm:.3g} mm wide)")
-            + "; scale it to millimetres"
+            f"{path}: {file.width_mm:.4g} wide, which is no size of teeth or jaws in any unit"
+            + ("" if like_mm is None else f", as its reference is {like_mm:.3g} mm wide")
+            + f"; divided by 25.4 it would be {file.width_mm / 25.4:.3g}; scale it to millimetres"
         )
     unit = next(each for each in UNITS if each == nearest)
     return unit, f"read in {unit}: in mm it would be {file.width_mm:.3g} mm wide, so it is {width_mm:.3g} mm"

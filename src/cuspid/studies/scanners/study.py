@@ -26,7 +26,7 @@ from cuspid.studies.grid import Case, Value, run_grid
 from cuspid.studies.scanners.files import Remark, ScanFile, StudyFiles, belongings, find_files, without_repeats
 from cuspid.studies.scanners.scan import StudyOptions, measure_file, write_measured
 from cuspid.studies.scanners.specimen import Specimen, load_specimen, read_specimen, write_specimen
-from cuspid.studies.scanners.summary import Compared, Group, Tables, summarise
+from cuspid.studies.scanners.summary import Compared, Group, Tables, coverage_remarks, summarise
 
 CODE = ("anatomy", "evaluation", "geometry", "storage", "studies/scanners")
 """What of cuspid makes the results."""
@@ -141,6 +141,12 @@ def compare(prepared: Prepared, out: Path, options: StudyOptions, progress: Prog
         tables=tables,
         remarks=(*prepared.remarks, *remarks),
     )
+
+
+def foreseen(prepared: Prepared, out: Path, options: StudyOptions) -> tuple[Remark, ...]:
+    """All that is odd about scans that were prepared, before they are compared."""
+    found = coverage_remarks(partial(specimen_of, out), prepared.scans, out / "scans", options)
+    return (*prepared.remarks, *found)
 
 
 def specimen_of(out: Path, name: str) -> Specimen:

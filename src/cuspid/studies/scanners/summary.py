@@ -123,6 +123,20 @@ def find_common(specimen: Specimen, scans: Sequence[ScanFile], folder: Path, opt
     )
 
 
+def coverage_remarks(
+    specimen_of: Callable[[str], Specimen], scans: Sequence[ScanFile], folder: Path, options: StudyOptions
+) -> tuple[Remark, ...]:
+    """Which scans are partial, and what all of each specimen show, without any figures."""
+    remarks: list[Remark] = []
+    for name in dict.fromkeys(scan.specimen for scan in scans):
+        of = [scan for scan in scans if scan.specimen == name]
+        try:
+            remarks += find_common(specimen_of(name), of, folder, options).remarks
+        except InputError as error:
+            remarks.append(Remark(what=f"specimen {name}", why=str(error), left_out=True))
+    return tuple(remarks)
+
+
 def _shown(folder: Path, key: str) -> Bool[np.ndarray, "p"]:
     return np.isfinite(read_arrays(folder / f"{key}.npz", remedy="delete it and run again")["place_um"])
 
