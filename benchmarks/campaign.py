@@ -84,6 +84,7 @@ BENCHMARKS = (
     Benchmark("calibrations", "calibrations.py {boards} --out {out}"),
     Benchmark("mean_shape", "mean_shape.py --work {work} --out {out}"),
     Benchmark("grid", "grid.py --out {out}"),
+    Benchmark("study", "study.py {jaws} --work {work} --out {out}"),
     Benchmark("stereo_pairs", "stereo_pairs.py {pairs} --out {out}"),
     Benchmark("real_gloss", "real_gloss.py {ball} --out {out}"),
     Benchmark("real", "real.py --data {photographs} --work {work} --out {out}"),

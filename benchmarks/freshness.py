@@ -83,6 +83,7 @@ MAKERS: Mapping[str, Maker] = {
     "targets": Maker("targets"),
     "calibrations": Maker("calibrations"),
     "grid": Maker("grid"),
+    "study": Maker("study", ("study",)),
     "fuzz": Maker("fuzz", ("*",), plain=True, release=True),
     "kill": Maker("kill", ("*",), plain=True, release=True),
     "large": Maker("large", ("*",), plain=True, release=True),

@@ -271,20 +271,20 @@ def _holds(low: float | None, value: float, high: float | None) -> bool:
 # --- scan bodies ------------------------------------------------------------------------------------------------------
 
 
-def library_body() -> Mesh:
+def library_body(edge_mm: float) -> Mesh:
     """A cylinder with a bevelled flat, 9 mm high, as the bodies of most makers; finely meshed."""
     from manifold3d import Manifold
 
     bar = Manifold.cylinder(9.0, 2.2, 1.8, 96)
     flat = Manifold.cube([4.0, 6.0, 4.0]).translate([1.2, -3.0, 5.5])
-    made = (bar - flat).refine_to_length(0.25).to_mesh()
+    made = (bar - flat).refine_to_length(edge_mm).to_mesh()
     return Mesh(np.asarray(made.vert_properties[:, :3], dtype=np.float64), np.asarray(made.tri_verts, dtype=np.int64))
 
 
-def scan_bodies(count: int = 60) -> dict[str, Any]:
+def scan_bodies(count: int = 60, edge_mm: float = 0.25) -> dict[str, Any]:
     """Errors of bodies at known poses, of which a third is missing, with noise of 10 um and gum around the foot."""
     rng = np.random.default_rng(4)
-    body = library_body()
+    body = library_body(edge_mm)
     library = SignedDistance(body)
     offsets, axes, lost = [], [], 0
     for _ in range(count):

@@ -77,7 +77,7 @@ def boxes(scans: Rows, figures: Mapping[str, str]) -> Figure | None:
     if not known:
         return None
     names = _names(scans)
-    across = min(2, len(known)) if len(names) > 4 else min(4, len(known))
+    across = min(2 if len(names) > 4 or max(map(len, known.values())) > 24 else 4, len(known))
     down = -(-len(known) // across)
     figure = new_figure(7.2, 0.4 + (2.2 + 0.13 * _longest(names)) * down, dpi=_DPI, layout="constrained")
     for k, (column, label) in enumerate(known.items(), start=1):
@@ -237,17 +237,17 @@ def maps(views: Sequence[SpecimenView], *, means: bool) -> Figure | None:
     down = -(-len(chosen) // across)
     width_in = 7.2
     side_in = width_in / across
-    figure = new_figure(width_in, 0.75 + (side_in + 0.12) * down, dpi=_DPI)
+    figure = new_figure(width_in, 0.7 + (0.9 * side_in + 0.24) * down, dpi=_DPI)
     top = 1 - 0.05 / figure.get_figheight()
     step = (top - 0.62 / figure.get_figheight()) / down
     for k, (view, name, field) in enumerate(chosen):
         row, column = divmod(k, across)
-        axes = figure.add_axes((column / across, top - (row + 1) * step, 0.97 / across, step * 0.86))
+        axes = figure.add_axes((column / across, top - (row + 1) * step, 0.97 / across, step * 0.84))
         axes.imshow(_picture(view.mesh, field, options, round(_DPI * side_in)))
         axes.set_axis_off()
         title = name.removeprefix("mean of ") if means else name
         told = f"{_short(title)}\n{_short(view.name)}" if len(views) > 1 else _short(title)
-        axes.set_title(told, fontsize=7 if means else 4.6, color=_INK, pad=1.5)
+        axes.set_title(told, fontsize=7 if means else 5, color=_INK, pad=1.5)
     _draw_bar(figure, options)
     return figure
 

@@ -274,7 +274,7 @@ def _factor_table(factor: str, levels: Mapping[str, Any]) -> Table:
     heads = [factor, "scans", *(_HEADS[name] for name in figures)]
     return {
         "title": f"By {factor}",
-        "caption": "Means over specimens with 95 % intervals.",
+        "caption": "Means with 95 % intervals.",
         "heads": heads,
         "rows": rows,
     }
@@ -306,7 +306,7 @@ def _groups_table(groups: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def _p(value: float) -> str:
-    return "< 0.0001" if value < 1e-4 else f"{value:.4f}" if value < 0.01 else f"{value:.3f}"
+    return "< 0.0001" if value < 1e-4 else f"= {value:.4f}" if value < 0.01 else f"= {value:.3f}"
 
 
 def _holds(assumption: Mapping[str, Any]) -> str:
@@ -323,7 +323,7 @@ def _tests(comparisons: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             [
                 f"{pair['first']} − {pair['second']}",
                 _estimate(pair["difference"], digits, plus=True),
-                _p(pair["p"]),
+                _p(pair["p"]).removeprefix("= "),
                 f"{pair['effect_name']} {_estimate(pair['effect'], 2, plus=True)}",
             ]
             for pair in each["contrasts"]
@@ -332,7 +332,7 @@ def _tests(comparisons: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         found.append(
             {
                 "title": _HEADS[each["figure"]],
-                "told": f"{each['test']}: statistic {each['statistic']:.2f}, p = {_p(each['p'])}, corrected for "
+                "told": f"{each['test']}: statistic {each['statistic']:.2f}, p {_p(each['p'])}, corrected for "
                 f"{len(comparisons)} figures {_p(each['p_holm'])} ({each['scans']} scans). By the model "
                 f"{_p(each['model_p'])}, by ranks {_p(each['rank_p'])}. Standard deviations: {parts}.",
                 "assumptions": [f"{_holds(one)} ({one['told']})" for one in each["assumptions"]],

@@ -223,9 +223,11 @@ def corrected(comparisons: Sequence[Comparison]) -> tuple[Comparison, ...]:
 
 
 def holm(p: Sequence[float]) -> Float[np.ndarray, "n"]:
-    """Holm's correction for multiple tests."""
-    multitest = _statsmodels("statsmodels.stats.multitest")
-    return np.asarray(multitest.multipletests(np.asarray(p, dtype=np.float64), method="holm")[1])
+    """Correction of p for multiple tests (S. Holm, Scand. J. Stat. 6, 1979)."""
+    # As statsmodels' multipletests, which collects all garbage of the process each time.
+    order = np.argsort(p)
+    steps = np.maximum.accumulate(np.asarray(p)[order] * np.arange(len(p), 0, -1))
+    return np.minimum(steps, 1.0)[np.argsort(order)]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
