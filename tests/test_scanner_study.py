@@ -19,10 +19,10 @@ from cuspid.evaluation.repeatability import PairOptions, compare_pair
 from cuspid.evaluation.search import SearchOptions
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
-from cuspid.studies.scanners.files import StudyFiles, find_files, without_repeats
+from cuspid.studies.scanners.files import find_files, without_repeats
 from cuspid.studies.scanners.scan import StudyOptions
 from cuspid.studies.scanners.specimen import guessed_unit, load_specimen
-from cuspid.studies.scanners.study import Intake, Prepared, compare, measure_share, prepare
+from cuspid.studies.scanners.study import Intake, compare, measure_share, prepare
 from cuspid.studies.scanners.summary import difference_um, region_of
 from horseshoe import horseshoe, without_base
 from verbs import refused, run
@@ -181,22 +181,22 @@ def test_points_are_aligned_without_scale_and_a_line_is_refused():
 # --- a whole study ----------------------------------------------------------------------------------------------------
 
 
-def prepared_here(given: Path, out: Path, options: StudyOptions, monkeypatch: pytest.MonkeyPatch) -> Prepared:
+@pytest.fixture
+def in_place(monkeypatch):
     """Without processes of its own, which take seconds to start."""
 
-    def in_place(cases, work, folder, **_):
+    def done(cases, work, folder, **_):
         for case in cases:
             work(**case.parameters)
         return ()
 
-    monkeypatch.setattr("cuspid.studies.scanners.study.run_grid", in_place)
-    return prepare(given, out, options, Intake())
+    monkeypatch.setattr("cuspid.studies.scanners.study.run_grid", done)
 
 
-def test_known_errors_come_back_and_the_rest_is_left_out(tmp_path, jaw, cases, monkeypatch):
+def test_known_errors_come_back_and_the_rest_is_left_out(tmp_path, jaw, cases, in_place):
     mesh, rng = jaw.mesh, np.random.default_rng(0)
-    storage.write_mesh(tmp_path / "reference" / "m.ply", without_base(mesh), None)
     probe = without_base(mesh)
+    put(tmp_path, "reference/m.ply", probe)
     specimen = load_specimen("m", tmp_path / "reference" / "m.ply")
     upright = probe.transformed(specimen.occlusal_from_file)
     curve = specimen.curve
@@ -211,7 +211,7 @@ def test_known_errors_come_back_and_the_rest_is_left_out(tmp_path, jaw, cases, m
     put(tmp_path, "B/m/part.stl", noisy(part, rng))
     (tmp_path / "B" / "m" / "empty.stl").touch()
     out = tmp_path / "out"
-    found = compare(prepared_here(tmp_path, out, QUICK, monkeypatch), out, QUICK)
+    found = compare(prepare(tmp_path, out, QUICK, Intake()), out, QUICK)
     rows = {row["scan"]: row for row in found.tables.scans}
     assert set(rows) == {"bent", "inches"}
     assert rows["bent"]["lift_um"] == pytest.approx(120, rel=0.05)
@@ -228,7 +228,7 @@ def test_known_errors_come_back_and_the_rest_is_left_out(tmp_path, jaw, cases, m
     assert any("read in in" in str(remark) for remark in found.remarks)
 
 
-def test_what_is_kept_is_used_again_until_a_file_changes(tmp_path, jaw, monkeypatch):
+def test_what_is_kept_is_used_again_until_a_file_changes(tmp_path, jaw, in_place, monkeypatch):
     probe, rng = without_base(jaw.mesh), np.random.default_rng(0)
     put(tmp_path, "reference/m.ply", probe)
     for name in ("1", "2"):
@@ -241,12 +241,12 @@ def test_what_is_kept_is_used_again_until_a_file_changes(tmp_path, jaw, monkeypa
         return measure_share(keys=keys, **others)
 
     monkeypatch.setattr("cuspid.studies.scanners.study.measure_share", counted)
-    prepared_here(tmp_path, out, QUICK, monkeypatch)
+    prepare(tmp_path, out, QUICK, Intake())
     assert len(measured) == 2
-    prepared_here(tmp_path, out, QUICK, monkeypatch)
+    prepare(tmp_path, out, QUICK, Intake())
     assert len(measured) == 2
     put(tmp_path, "A/m/2.stl", noisy(probe, rng))
-    prepared_here(tmp_path, out, QUICK, monkeypatch)
+    prepare(tmp_path, out, QUICK, Intake())
     assert len(measured) == 3
     changed = find_files(tmp_path).scans[1]
     record = storage.read_json(out / "scans" / f"{changed.key}.json")
@@ -258,7 +258,7 @@ def test_what_is_kept_is_used_again_until_a_file_changes(tmp_path, jaw, monkeypa
     assert "changed while" in storage.read_json(out / "scans" / f"{changed.key}.json")["failure"]
 
 
-def test_the_command_writes_the_page_figures_and_tables(tmp_path, jaw, capsys):
+def test_the_command_writes_the_page_figures_and_tables(tmp_path, jaw, in_place, capsys):
     pytest.importorskip("statsmodels", reason="statsmodels is not installed: pip install 'cuspid[study]'")
     openpyxl = pytest.importorskip("openpyxl", reason="openpyxl is not installed: pip install 'cuspid[study]'")
     probe, rng = without_base(jaw.mesh), np.random.default_rng(0)
@@ -306,7 +306,3 @@ def test_a_region_that_is_not_there_is_refused(tmp_path, jaw):
         region_of(specimen, StudyOptions(region="area"))
     with pytest.raises(InputError, match="no tooth 46"):
         load_specimen("m", tmp_path / "m.ply", align_teeth=(46,))
-
-
-def test_files_are_plain_values():
-    assert StudyFiles(scans=(), references={}).of("m") == ()

@@ -242,7 +242,10 @@ def _is_done(out: Path, key: str, made_from: str, retry_failed: bool) -> bool:
     path = _record(out, key)
     if not path.exists():
         return False
-    told = storage.read_json(path)
+    try:
+        told = storage.read_json(path)
+    except InputError:  # damaged: it is made again
+        return False
     if told.get("made_from") != made_from or (told["failure"] is not None and retry_failed):
         return False
     return told["failure"] is not None or (out / "scans" / f"{key}.npz").exists()

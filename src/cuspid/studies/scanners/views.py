@@ -26,6 +26,8 @@ _UM_PER_STEP, UNKNOWN = 0.1, -32768
 def write_views(out: Path, study: Study) -> None:
     """Write ``view.npz`` beside each specimen, and ``means.ply`` with the mean and the standard deviation of each
     scanner for other programs."""
+    for stale in (out / "specimens").glob("*/view.*"):
+        stale.unlink()  # of specimens that have no part in the study any more
     for name in study.specimens:
         rows = [row for row in study.tables.scans if row["specimen"] == name]
         shown = {(row["scanner"], row["scan"]) for row in rows}
