@@ -24,7 +24,7 @@ _TURNS, _TILT_DEG = 12, 15.0
 """Starts about the axis, and how far some of them are tilted to either side."""
 _NARROWER_MM = (1.0, 0.4, 0.15)
 """Points of the scan farther than this from the body have no part in the fit, round by round."""
-_ROUGH, _MOST_POINTS = 800, 20_000
+_ROUGH, _MOST_POINTS = 500, 8_000
 _TRUNCATED_MM = 0.3
 _COVERED_MM = 0.15
 """Surface of the body is found where the scan is this near."""

@@ -252,7 +252,7 @@ class _Page(Figure):
 
     def draw(self, renderer: RendererBase | MixedModeRenderer) -> None:
         self._take_texts_as_they_are()
-        super().draw(renderer)
+        super().draw(renderer)  # type: ignore[arg-type]  # a mixed one passes on what it does not draw itself
 
     def tight_layout(self, **options: Any) -> None:
         self._take_texts_as_they_are()
