@@ -58,7 +58,7 @@ JAWS = {
     "teeth3ds/Q5GSR6N2_lower.ply": False,
 }
 """Whether the jaw was looked at while the code was written."""
-STUDIES, LARGE_FACES, SPEED_SCANS = 200, 300_000, 12
+STUDIES, LARGE_FACES, SPEED_SCANS = 200, 300_000, 4
 
 
 def random_motion(rng: np.random.Generator) -> Rigid3:

@@ -122,11 +122,14 @@ def measure_file(scan: ScanFile, specimen: Specimen, surface: SignedDistance, op
     )
 
 
-def write_measured(folder: Path, key: str, measured: Measured, *, made_from: str) -> None:
-    """Write ``<key>.npz`` and, when that is complete, ``<key>.json``, with what identifies what it was made from."""
+def write_measured(folder: Path, key: str, measured: Measured, *, made_from: str, sha256: str) -> None:
+    """Write ``<key>.npz`` and, when that is complete, ``<key>.json``, with the digest of the scan's file and what
+    identifies all that it was made from."""
     arrays = {name: getattr(measured, name) for name in ("place_um", "sample_um", "sample_place")}
     write_arrays(folder / f"{key}.npz", arrays)
-    storage.write_json(folder / f"{key}.json", {"made_from": made_from, "failure": None, **measured.told})
+    storage.write_json(
+        folder / f"{key}.json", {"made_from": made_from, "sha256": sha256, "failure": None, **measured.told}
+    )
 
 
 def _read(scan: ScanFile, specimen: Specimen) -> tuple[Mesh, dict[str, Any]]:

@@ -155,7 +155,12 @@ def _pooled_sd(groups: Sequence[Row], scanner: str) -> float | None:
 def factors(scans: Sequence[Row], rng: np.random.Generator) -> dict[str, dict[str, dict[str, Any]]]:
     """Figures by the levels of each factor that has several."""
     known = {name for row in scans[:1] for name in row}
-    figure_names = {name for name in known if name.endswith(("_um", "_pct", "_ppm"))} | {"faces", "unit", "file"}
+    figure_names = {name for name in known if name.endswith(("_um", "_pct", "_ppm"))} | {
+        "faces",
+        "unit",
+        "file",
+        "sha256",
+    }
     named = ["scanner", "specimen", "operator", *sorted(known - figure_names - set(COLUMNS))]
     found = {}
     for factor in named:

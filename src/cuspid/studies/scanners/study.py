@@ -316,7 +316,7 @@ def measure_share(*, keys: str, out: Path, options: StudyOptions) -> dict[str, V
             measured = measure_file(scan, specimen, surface, options)
             if storage.hash_file(scan.path) != entry["digest"]:
                 raise InputError("the file changed while the study ran; run the same command again")
-            write_measured(out / "scans", key, measured, made_from=entry["made_from"])
+            write_measured(out / "scans", key, measured, made_from=entry["made_from"], sha256=entry["digest"])
         except CuspidError as error:
             failed += 1
             _fail(out, key, entry["made_from"], _without_path(str(error), scan.path))

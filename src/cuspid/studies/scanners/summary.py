@@ -229,6 +229,7 @@ def scan_row(found: Compared, common: Common) -> Row:
         "faces": told["faces"],
         "unit": told["unit"],
         "file": str(found.scan.path),
+        "sha256": told["sha256"],
     }
 
 
