@@ -59,6 +59,8 @@ JAWS = {
 }
 """Whether the jaw was looked at while the code was written."""
 STUDIES, LARGE_FACES, SPEED_SCANS = 200, 300_000, 4
+LEAST_PIECE = 500
+"""Places on a piece that is aligned or read."""
 
 
 def random_motion(rng: np.random.Generator) -> Rigid3:
@@ -169,7 +171,7 @@ def at_one_end(work: Path, count: int) -> list[dict[str, Any]]:
         reference = work / "errors" / "reference" / f"{stem}.ply"
         specimen = load_specimen(stem, reference)
         mesh = specimen.mesh
-        sizes = [piece for piece in specimen.pieces if np.sum(specimen.piece == piece) > 1500]
+        sizes = [piece for piece in specimen.pieces if np.sum(specimen.piece == piece) > LEAST_PIECE]
         first, last = sizes[0], sizes[-1]
         nearest = specimen.places.points[specimen.piece == first]
         on_first = np.zeros(len(mesh.faces), dtype=bool)
