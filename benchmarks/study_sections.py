@@ -64,7 +64,7 @@ def study(result: Result) -> str:
             f"{mark(max(row['apart_rms_um'] for row in result['cloudcompare']), APART_UM)} um (bar {APART_UM:g} um), "
             f"means apart at most {_means_apart(result['cloudcompare']):.3f} um.",
             "",
-            _speed(result["speed"]),
+            _speed(result["speed"]) if "speed" in result else "Time and memory of many scans: not measured.",
         ]
     )
 

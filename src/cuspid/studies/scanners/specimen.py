@@ -143,6 +143,7 @@ def load_specimen(
     read_in, odd = (unit, None) if unit is not None else guessed_unit(path)
     jaw, occlusal_from_file, notes = _load_reference(path, read_in, arch, labelling)
     mesh, mm = jaw.mesh, MM_PER_UNIT[read_in]
+    area = _area_of(path, jaw, occlusal_from_file, read_in, align_teeth)
     places = scatter(mesh, PLACES, np.random.default_rng(0))
     crowns = crowns_of(jaw)
     curve, told = _curve_of(jaw)
@@ -158,12 +159,12 @@ def load_specimen(
         occlusal_from_file=occlusal_from_file,
         places=places,
         tooth=labels[places.faces],
-        surface=_surfaces_of(jaw)[places.faces] if labelled else np.full(PLACES, -1),
+        surface=_surfaces_of(jaw)[places.faces] if labelled else np.full(len(places.points), -1),
         piece=labels[places.faces] if labelled else np.where(crown, _stations(at), 0),
         segment=_segments(at, curve),
         crown=np.asarray(crown),
         margin=_near_lines(jaw, places.points),
-        area_faces=_area_of(path, jaw, occlusal_from_file, read_in, align_teeth),
+        area_faces=area,
         crown_faces=np.asarray(crowns.faces),
         curve=curve,
         spheres={**_spheres_of(path, occlusal_from_file, mm), **jaw.spheres},
