@@ -188,6 +188,23 @@ def best_scale(
     return float(1 / shrinking)
 
 
+def located(
+    points: Float[np.ndarray, "n 3"],
+    surface: SignedDistance,
+    reference_from_scan: Rigid3,
+    place: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, "3"]:
+    """Where a place of the reference lies in a scan, by the similarity next to a rigid alignment of points around it.
+
+    Where a piece of surface has grown, what is open of it would shift a rigid fit by a share of its growth.
+    """
+    moved = reference_from_scan.apply(points)
+    closest, centre = surface.closest_points(moved), moved.mean(axis=0)
+    step = _gauss_newton(moved - centre, closest, _weights(closest), with_scale=True)
+    offset = np.cross(step[:3], place - centre) + step[3:6] + step[6] * (place - centre)
+    return reference_from_scan.inverse().apply(place - offset)
+
+
 def _about(centre: Float[np.ndarray, "3"], step: Float[np.ndarray, "6"]) -> Rigid3:
     """The motion that turns about a centre and shifts."""
     turn = Rigid3.from_rotation_vector(step[:3], np.zeros(3))

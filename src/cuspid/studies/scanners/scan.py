@@ -17,7 +17,7 @@ from cuspid.evaluation.alignments import AlignmentKind, align_on_area, align_poi
 from cuspid.evaluation.deformation import fit_deformation
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.places import deviations_um
-from cuspid.evaluation.registration import Alignment, RegistrationOptions, best_scale, register
+from cuspid.evaluation.registration import Alignment, RegistrationOptions, best_scale, located, register
 from cuspid.evaluation.scan_bodies import BodyFit, BodyOptions, fit_body
 from cuspid.evaluation.spans import Station, angle_between_deg, spans
 from cuspid.evaluation.spheres import SphereOptions, evaluate_spheres
@@ -284,12 +284,13 @@ def _pieces(
     }
     found = find_teeth(points[near], piece[near], centroids, surface, options.registration, order=specimen.pieces)
     kind = "teeth" if specimen.labelled else "stations"
-    return {(kind, specimen.piece_name(each)): _as_station(tooth) for each, tooth in found.items()}
+    return {(kind, specimen.piece_name(each)): _as_station(tooth, surface) for each, tooth in found.items()}
 
 
-def _as_station(tooth: ScannedTooth) -> Station:
-    nominal = Rigid3(np.eye(3), tooth.centroid)
-    return Station(nominal=nominal, measured=tooth.reference_from_scan.inverse() @ nominal)
+def _as_station(tooth: ScannedTooth, surface: SignedDistance) -> Station:
+    pose = tooth.reference_from_scan
+    measured = Rigid3(pose.inverse().rotation, located(tooth.points, surface, pose, tooth.centroid))
+    return Station(nominal=Rigid3(np.eye(3), tooth.centroid), measured=measured)
 
 
 def _kinds(stations: Mapping[tuple[str, str], Station]) -> dict[str, dict[str, Station]]:
