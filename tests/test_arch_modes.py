@@ -11,6 +11,7 @@ from cuspid.errors import InputError
 from cuspid.evaluation.deformation import MODES, fit_deformation, mode_fields
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.places import scatter
+from cuspid.evaluation.registration import RegistrationOptions, located, refine
 from cuspid.evaluation.scan_bodies import fit_body
 from cuspid.evaluation.spans import Station, slope_ppm, spans
 from cuspid.geometry import Rigid3
@@ -121,6 +122,15 @@ def test_a_place_without_a_body_is_refused():
     body = Mesh(jaw.vertices * 0.1, jaw.faces)
     with pytest.raises(InputError):
         fit_body(jaw, SignedDistance(body), np.array([200.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+
+
+def test_growth_does_not_shift_where_a_tooth_is_found(jaw):
+    tooth = jaw.mesh.submesh(jaw.tooth_faces(46))
+    points, _ = tooth.sample(3000, np.random.default_rng(0))
+    surface, middle = SignedDistance(jaw.mesh), points.mean(axis=0)
+    pose = refine(1.001 * points, surface, Rigid3.identity(), RegistrationOptions())
+    assert 1000 * np.linalg.norm(located(1.001 * points, surface, pose, middle) - 1.001 * middle) < 0.5
+    assert 1000 * np.linalg.norm(pose.inverse().apply(middle) - 1.001 * middle) > 0.5
 
 
 def test_spans_do_not_depend_on_the_alignment():
