@@ -85,6 +85,7 @@ BENCHMARKS = (
     Benchmark("rolling", "rolling.py {boards} --work {work} --out {out}"),
     Benchmark("mean_shape", "mean_shape.py --work {work} --out {out}"),
     Benchmark("grid", "grid.py --out {out}"),
+    Benchmark("study", "study.py {jaws} --work {work} --out {out}"),
     Benchmark("stereo_pairs", "stereo_pairs.py {pairs} --out {out}"),
     Benchmark("real_gloss", "real_gloss.py {ball} --out {out}"),
     Benchmark("real", "real.py --data {photographs} --work {work} --out {out}"),

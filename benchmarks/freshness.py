@@ -86,6 +86,7 @@ MAKERS: Mapping[str, Maker] = {
     "calibrations": Maker("calibrations"),
     "rolling": Maker("rolling"),
     "grid": Maker("grid"),
+    "study": Maker("study", ("study",)),
     "fuzz": Maker("fuzz", ("*",), plain=True, release=True),
     "kill": Maker("kill", ("*",), plain=True, release=True),
     "large": Maker("large", ("*",), plain=True, release=True),

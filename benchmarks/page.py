@@ -20,6 +20,7 @@ import anatomy_sections
 import handpiece_sections
 import panorama_sections
 import real_sections
+import study_sections
 import trust_sections
 from freshness import changes, maker_of
 
@@ -194,6 +195,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
         handpiece_sections.manufacturing,
     ),
     "manufacturing_phantom": ("Handpieces not built exactly as drawn: an arch", handpiece_sections.manufacturing),
+    "study": ("Studies of scanners", study_sections.study),
     "expectations": ("What to expect of a scan", trust_sections.expectations),
     "grid": ("Running many cases", handpiece_sections.grid),
     "qualities": ("Draft, standard and fine", trust_sections.qualities),

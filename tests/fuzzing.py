@@ -48,6 +48,8 @@ from cuspid.jaw import Jaw, Landmark
 from cuspid.motion.colmap import read_model
 from cuspid.pipeline import RenderOptions, take_images
 from cuspid.rig import Rig
+from cuspid.studies.scanners.files import find_files
+from cuspid.studies.scanners.specimen import load_specimen
 from report_folders import (
     TOOTH,
     write_calibrated,
@@ -148,6 +150,21 @@ def _evaluate(folder: Path) -> None:
     """As the verb does, but for its pictures, which take the most time."""
     scan, against = storage.read_mesh(folder / "binary.stl"), pipeline.load_reference(folder / "text.ply")
     pipeline.evaluate(scan, against, EvaluationOptions(align=False, samples=2000))
+
+
+def _study(folder: Path) -> None:
+    """A manifest, and a reference with what lies beside it."""
+    storage.write_mesh(folder / "m.stl", arch(1.6).mesh)
+    (folder / "m.spheres.csv").write_text("label,x,y,z,radius\n36,1.5,-2,0.25,2.5\n46,20,3,1,2.5\n")
+    (folder / "study.csv").write_text(
+        "scanner,specimen,operator,file,reference\nA,m,x,1.stl,m.stl\nB,m,y,2.stl,m.stl\n"
+    )
+
+
+def _read_study(folder: Path) -> None:
+    """As the verb does before it aligns scans."""
+    found = find_files(folder / "study.csv")
+    load_specimen("m", folder / "m.stl" if "m" not in found.references else found.references["m"])
 
 
 def _units(folder: Path) -> None:
@@ -615,6 +632,7 @@ SCENARIOS: Mapping[str, Scenario] = {
     "colmap": Scenario(_colmap, lambda folder: read_model(folder / "model", storage.read_capture(folder / "capture"))),
     "shape": Scenario(_shape, lambda folder: storage.read_shape_model(folder / "shape")),
     "arrays": Scenario(_arrays, lambda folder: storage.files.read_arrays(folder / "a.npz", remedy="make it again")),
+    "study files": Scenario(_study, _read_study),
     "report of a scan": Scenario(_scan, verb("report", "@scan")),
     "report of an evaluation": Scenario(_evaluation, verb("report", "@evaluation", "--reference", "@reference.ply")),
     "report of a panorama": Scenario(_panorama, verb("report", "@panorama")),

@@ -18,6 +18,7 @@ FEWER = {
     **dict.fromkeys(("box", "design", "live", "stitch", "stitch of a mesh", "stitch-eval", "visibility"), 2),
     **dict.fromkeys(("mean shape", "resume"), 2),
     "rescale": 8,
+    "study files": 5,
     **dict.fromkeys(("exchanged cameras", "strange files beside", "long names"), 2),
     **{name: 2 for name in SCENARIOS if name.startswith(("terminal", "full", "folder in use"))},
     **dict.fromkeys(("face directions", "tiny scans", "files of others", "cameras at one place"), 4),

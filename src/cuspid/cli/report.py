@@ -27,8 +27,8 @@ def report(
     The page is one file that opens without a network.
 
     Args:
-        folder: Folder that run, reconstruct, evaluate, shape, sweep, compare, repeat, stitch, rescale, stitch-eval or
-            calibrate wrote.
+        folder: Folder that run, reconstruct, evaluate, shape, sweep, compare, repeat, study, stitch, rescale,
+            stitch-eval or calibrate wrote.
         out: The page (default: report.html in the folder).
         reference: Mesh that the scan was compared with, if the folder does not contain it (after evaluate).
         unit: Length unit of the reference.

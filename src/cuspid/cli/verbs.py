@@ -79,6 +79,7 @@ GROUPS: Mapping[str, Group] = MappingProxyType(
         "study": Group(
             "Studies",
             {
+                "scanners": Verb("study", "trueness and precision of any scanners, from folders of meshes", "study"),
                 "repeat": Verb("repeat", "trueness and precision of repeated scans"),
                 "compare": Verb("comparison", "compare handpieces on the same teeth"),
                 "sweep": Verb("studies", "the best baseline and angle of a camera pair"),

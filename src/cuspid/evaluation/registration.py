@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from cuspid.errors import InputError
 from cuspid.evaluation.distance import ClosestPoints, SignedDistance
@@ -59,6 +59,8 @@ class Alignment:
     """Weighted RMS distance where the two surfaces overlap."""
     overlap: float
     """Share of the smaller surface that lies within ``outlier_mm`` of the larger one."""
+    mirrored: bool = False
+    """Whether the mirror image of the scan fits far better."""
     notes: tuple[str, ...] = ()
     """Why the alignment is doubtful; empty if it is not."""
 
@@ -86,7 +88,11 @@ def _lay(scan: Mesh, surface: SignedDistance, options: RegistrationOptions, rng:
         )
     alignment = fit(scan.sample(options.samples, rng)[0], surface, found.best, options)
     notes = tuple(f"alignment: doubtful{note}" for note in mirrored)
-    return replace(alignment, notes=(*notes, *_doubts(alignment), *_rivals(found.poses, found.misfits_mm, found.few)))
+    return replace(
+        alignment,
+        mirrored=bool(mirrored),
+        notes=(*notes, *_doubts(alignment), *_rivals(found.poses, found.misfits_mm, found.few)),
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -182,6 +188,23 @@ def best_scale(
     return float(1 / shrinking)
 
 
+def located(
+    points: Float[np.ndarray, "n 3"],
+    surface: SignedDistance,
+    reference_from_scan: Rigid3,
+    place: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, "3"]:
+    """Where a place of the reference lies in a scan, by the similarity next to a rigid alignment of points around it.
+
+    Where a piece of surface has grown, what is open of it would shift a rigid fit by a share of its growth.
+    """
+    moved = reference_from_scan.apply(points)
+    closest, centre = surface.closest_points(moved), moved.mean(axis=0)
+    step = _gauss_newton(moved - centre, closest, _weights(closest), with_scale=True)
+    offset = np.cross(step[:3], place - centre) + step[3:6] + step[6] * (place - centre)
+    return reference_from_scan.inverse().apply(place - offset)
+
+
 def _about(centre: Float[np.ndarray, "3"], step: Float[np.ndarray, "6"]) -> Rigid3:
     """The motion that turns about a centre and shifts."""
     turn = Rigid3.from_rotation_vector(step[:3], np.zeros(3))
@@ -207,12 +230,16 @@ def _gauss_newton(
 
 
 def _weights(closest: ClosestPoints) -> Float[np.ndarray, "n"]:
-    """Tukey's biweight, wide enough to leave normal errors nearly their full weight; none at the border of the
-    reference. It is as wide as the errors ask for and no wider: errors far beyond the usual ones mostly lie on one
+    """:func:`biweights`, and none at the border of the reference."""
+    return biweights(closest.signed_mm, ~closest.on_border)
+
+
+def biweights(signed_mm: Float[np.ndarray, "n"], inside: Bool[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Tukey's biweight of distances, wide enough to leave normal errors nearly their full weight; none where they are
+    not ``inside``. It is as wide as the errors ask for and no wider: errors far beyond the usual ones mostly lie on one
     side, as where a wall flares out at the border of a scan, and a few per cent of them would shift, turn and swell
     all."""
-    distances = np.abs(closest.signed_mm)
-    inside = ~closest.on_border
+    distances = np.abs(signed_mm)
     if not inside.any():
         return np.zeros_like(distances)
     sigma = 1.4826 * np.median(distances[inside])

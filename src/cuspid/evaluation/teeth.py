@@ -7,7 +7,7 @@ arch.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,7 @@ from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions, refine
 from cuspid.geometry import Rigid3
 
-_ARCH_ORDER = (*range(48, 40, -1), *range(31, 39), *range(18, 10, -1), *range(21, 29))
+ARCH_ORDER = (*range(48, 40, -1), *range(31, 39), *range(18, 10, -1), *range(21, 29))
 """FDI numbers along the lower and the upper arch."""
 MOLARS = ((46, 36), (16, 26), (47, 37), (17, 27))
 """Pairs of molars for the inter-molar distance; the first pair that was scanned is used."""
@@ -50,13 +50,16 @@ def find_teeth(
     centroids: Mapping[int, Float[np.ndarray, "3"]],
     surface: SignedDistance,
     options: RegistrationOptions,
+    *,
+    order: Sequence[int] = ARCH_ORDER,
 ) -> dict[int, ScannedTooth]:
     """Teeth with enough samples in an aligned scan, in order along the arch.
 
-    ``labels`` are the FDI numbers of the samples; ``centroids`` are those of the teeth that may be evaluated.
+    ``labels`` are the FDI numbers of the samples; ``centroids`` are those of the teeth that may be evaluated. Other
+    pieces of surface are found likewise where their numbers are given as the ``order``.
     """
     teeth = {}
-    for fdi in (tooth for tooth in _ARCH_ORDER if tooth in centroids):
+    for fdi in (tooth for tooth in order if tooth in centroids):
         on_tooth = points[labels == fdi]
         if len(on_tooth) >= LEAST_SAMPLES:
             few = on_tooth[:: max(1, len(on_tooth) // _MOST_SAMPLES)]

@@ -55,15 +55,17 @@ from cuspid.storage.results import (
     CalibrationResult,
     PanoramaResult,
     Result,
+    ScannerStudyResult,
     ScanResult,
     ScoreResult,
     ShapeResult,
+    SpecimenView,
     StudyResult,
     read_result,
 )
 from cuspid.storage.sequences import hash_source, images_in, read_sequence, read_sequences, rig_sources
 from cuspid.storage.shapes import read_shape_model, write_shape_model
-from cuspid.storage.tables import csv_table, write_table
+from cuspid.storage.tables import csv_table, read_table, write_table, write_workbook
 from cuspid.storage.trueness import trueness_summary, write_trueness
 from cuspid.storage.truths import read_truth, write_path, write_truth
 from cuspid.storage.units import MM_PER_UNIT, MeasuredFile, Unit, require_one_unit, require_size
@@ -86,8 +88,10 @@ __all__ = [
     "PanoramaResult",
     "Result",
     "ScanResult",
+    "ScannerStudyResult",
     "ScoreResult",
     "ShapeResult",
+    "SpecimenView",
     "StudyResult",
     "Unit",
     "claim_folder",
@@ -124,6 +128,7 @@ __all__ = [
     "read_sequence",
     "read_sequences",
     "read_shape_model",
+    "read_table",
     "read_truth",
     "reading",
     "require_one_unit",
@@ -154,4 +159,5 @@ __all__ = [
     "write_trueness",
     "write_truth",
     "write_video",
+    "write_workbook",
 ]

@@ -20,14 +20,14 @@ from cuspid.errors import InputError
 from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
 from cuspid.inputs import read_text
-from cuspid.jaw import FDI_FROM_UNIVERSAL, GUM, Jaw
+from cuspid.jaw import FDI_FROM_UNIVERSAL, GUM, Arch, Jaw
 from cuspid.mesh import Mesh
 from cuspid.panorama import Panorama
 from cuspid.reconstruction import Reconstruction
 from cuspid.rig import Rig
 from cuspid.shape_model import ShapeModel
 from cuspid.storage.captures import read_capture
-from cuspid.storage.files import hash_file, read_json, read_manifest, reading
+from cuspid.storage.files import hash_file, read_arrays, read_json, read_manifest, reading
 from cuspid.storage.handpieces import read_handpiece
 from cuspid.storage.jaws import is_jaw, read_jaw, read_labelled_mesh
 from cuspid.storage.meshes import SIGMA, MeshFile, read_mesh_file
@@ -108,6 +108,33 @@ class StudyResult(_Result):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class SpecimenView:
+    """A specimen of a study of scanners, as it is shown."""
+
+    name: str
+    mesh: Mesh
+    """A light mesh of the reference, in its occlusal frame."""
+    full_faces: int
+    """Faces of the reference itself."""
+    arch: Arch | None
+    frames: Mapping[str, Float[np.ndarray, "v"]]
+    """Deviations in um at its vertices, by what they are of: the means of the scanners, then the scans. NaN is not
+    known."""
+    means: int
+    """Number of means among them."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScannerStudyResult(_Result):
+    """A folder of ``study``."""
+
+    summary: Mapping[str, Any]
+    """``study.json``."""
+    views: tuple[SpecimenView, ...]
+    """What is shown in 3-D."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PanoramaResult(_Result):
     """A folder of ``stitch``."""
 
@@ -139,12 +166,12 @@ class CalibrationResult(_Result):
     """The calibrated cameras."""
 
 
-Result = ScanResult | ShapeResult | StudyResult | PanoramaResult | ScoreResult | CalibrationResult
+Result = ScanResult | ShapeResult | StudyResult | ScannerStudyResult | PanoramaResult | ScoreResult | CalibrationResult
 
 
 def read_result(folder: Path, reference: Path | None = None, unit: Unit = "mm") -> Result:
-    """What lies in a folder that ``run``, ``evaluate``, ``shape``, ``sweep``, ``compare``, ``repeat``, ``stitch``,
-    ``rescale``, ``stitch-eval`` or ``calibrate`` wrote.
+    """What lies in a folder that ``run``, ``evaluate``, ``shape``, ``sweep``, ``compare``, ``repeat``, ``study``,
+    ``stitch``, ``rescale``, ``stitch-eval`` or ``calibrate`` wrote.
 
     ``reference``: the mesh (in a unit) with which a scan was compared, or the folder ``truth`` of a simulation, where
     the folder does not hold it. Raises InputError where there is nothing to report, a file is damaged, or the reference
@@ -161,7 +188,7 @@ def read_result(folder: Path, reference: Path | None = None, unit: Unit = "mm") 
     made = f"; it holds only {', '.join(run)}" if run else ""
     raise InputError(
         f"{folder}: nothing to report{made}; give the --out folder of run, reconstruct, evaluate, shape, sweep, "
-        "compare, repeat, stitch, rescale, stitch-eval or calibrate"
+        "compare, repeat, study, stitch, rescale, stitch-eval or calibrate"
     )
 
 
@@ -339,6 +366,48 @@ def _rows(folder: Path) -> list[Mapping[str, str]]:
     return found
 
 
+_STUDY_FIGURES: Mapping[str, str] = {
+    "trueness.png": "Trueness and precision: each point is a scan; boxes from the first to the third quartile, "
+    "whiskers to the last scan within 1.5 of that range",
+    "modes.png": "Deformation of the arch, a point for each scan: scale, and how far its ends move while the "
+    "middle is held",
+    "spans.png": "Error against span: each point is a distance of a scan; lines through zero by least squares",
+    "agreement.png": "Two scanners on the same distances (Bland and Altman): bias and limits of agreement with their "
+    "95 % intervals",
+    "means.png": "Mean deviation of each scanner on each specimen, on one scale",
+    "maps.png": "All scans, on one scale",
+}
+
+
+def _read_scanner_study(folder: Path, run: Mapping[str, Any]) -> ScannerStudyResult:
+    summary = read_json(folder / "study.json")
+    views = [_specimen_view(path) for path in (folder / "specimens").glob("*/view.npz")]
+    return ScannerStudyResult(
+        name=folder.resolve().name,
+        run=run,
+        summary=summary,
+        views=tuple(sorted(views, key=lambda view: view.name)),
+        missing=() if views else ("the 3-D view: run cuspid study scanners again",),
+        pictures=_pictures(folder / "figures", _STUDY_FIGURES),
+    )
+
+
+def _specimen_view(path: Path) -> SpecimenView:
+    arrays = read_arrays(path, remedy="run cuspid study scanners again")
+    about = read_json(path.with_suffix(".json"))
+    with reading(path):
+        steps = arrays["steps"].astype(np.float64)
+        values = np.where(steps == steps.dtype.type(-32768), np.nan, steps * 0.1)
+        return SpecimenView(
+            name=about["specimen"],
+            mesh=Mesh(arrays["vertices"], arrays["faces"]),
+            full_faces=about["faces"],
+            arch=about["arch"],
+            frames=dict(zip(about["frames"], values, strict=True)),
+            means=int(arrays["means"]),
+        )
+
+
 def _is_panorama(folder: Path, run: Mapping[str, Any]) -> bool:
     return bool(run.keys() & {"stitch", "rescale"}) or (folder / "panorama.json").exists()
 
@@ -402,6 +471,7 @@ _READERS: tuple[tuple[Callable[[Path, Mapping[str, Any]], bool], Callable[[Path,
     (_holds("shape.json"), _read_shape),
     (_holds("score.json"), _read_score),
     (_holds("calibration.json"), _read_calibration),
+    (_holds("study.json"), _read_scanner_study),
     (_is_panorama, _read_panorama),
     (_is_study, _read_study),
 )

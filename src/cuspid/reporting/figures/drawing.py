@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_mixed import MixedModeRenderer
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
@@ -259,9 +260,9 @@ def save_expected_picture(path: Path, mesh: Mesh, sigma_um: Float[np.ndarray, "v
 class _Page(Figure):
     """A figure with all texts as they are: a dollar in a name begins no formula, but powers along an axis are ones."""
 
-    def draw(self, renderer: RendererBase) -> None:
+    def draw(self, renderer: RendererBase | MixedModeRenderer) -> None:
         self._take_texts_as_they_are()
-        super().draw(renderer)
+        super().draw(renderer)  # type: ignore[arg-type]  # a mixed one passes on what it does not draw itself
 
     def tight_layout(self, **options: Any) -> None:
         self._take_texts_as_they_are()

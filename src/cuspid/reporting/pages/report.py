@@ -7,12 +7,14 @@ from typing import assert_never
 from cuspid.reporting.pages.calibration import calibration_page
 from cuspid.reporting.pages.panorama import panorama_page, score_page
 from cuspid.reporting.pages.scan import ReportOptions, scan_page
+from cuspid.reporting.pages.scanner_study import scanner_study_page
 from cuspid.reporting.pages.shape import shape_page
 from cuspid.reporting.pages.study import study_page
 from cuspid.storage import (
     CalibrationResult,
     PanoramaResult,
     Result,
+    ScannerStudyResult,
     ScanResult,
     ScoreResult,
     ShapeResult,
@@ -29,6 +31,8 @@ def report_page(result: Result, options: ReportOptions = ReportOptions()) -> str
             return shape_page(result)
         case StudyResult():
             return study_page(result)
+        case ScannerStudyResult():
+            return scanner_study_page(result)
         case PanoramaResult():
             return panorama_page(result)
         case ScoreResult():

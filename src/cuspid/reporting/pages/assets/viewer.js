@@ -196,7 +196,8 @@
 
   // How far the main surface, and all that is shown besides, reach along some directions.
   function extents(axes) {
-    const shown = [...layers.values(), chosen].filter((each) => each && (each.visible || each === main()));
+    const kept = scene.frames ? null : main(); // Of frames, each has its own surface.
+    const shown = [...layers.values(), chosen].filter((each) => each && (each.visible || each === kept));
     const lows = axes.map(() => Infinity);
     const highs = axes.map(() => -Infinity);
     for (const { array } of shown.map((each) => each.geometry.attributes.position)) {
@@ -435,6 +436,30 @@
     move();
   }
 
+  // --- one surface after the other ---------------------------------------------------------------------------------------
+
+  // Each frame colours one of the surfaces, which alone is seen then.
+  function bindFrames() {
+    if (!scene.frames) return;
+    const [slider, list] = [find("[data-frame-at]"), find("[data-frame-named]")];
+    const [{ name }] = scene.scales;
+    const go = async (at) => {
+      [slider.value, list.value] = [at, at];
+      const frame = scene.frames[at];
+      frame.unpacked ??= await unpack(frame.values);
+      if (Number(slider.value) !== at) return; // Another one was asked for meanwhile.
+      layers.forEach((layer, key) => (layer.visible = key === frame.layer));
+      const surface = layers.get(frame.layer);
+      surface.userData.values[name] = frame.unpacked;
+      paint(surface);
+      find(".readout").hidden = true;
+      if (home) whole(home);
+      change();
+    };
+    slider.addEventListener("input", () => go(Number(slider.value)));
+    list.addEventListener("change", () => go(Number(list.value)));
+  }
+
   // --- start ---------------------------------------------------------------------------------------------------------
 
   for (const layer of scene.layers) {
@@ -445,6 +470,7 @@
     if (object.isMesh) paint(object);
   }
   await bindModes();
+  bindFrames();
   bind();
   showTicks();
   whole();

@@ -1,0 +1,1 @@
+"""Studies of any scanner: trueness and precision from folders of meshes."""
