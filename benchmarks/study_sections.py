@@ -31,7 +31,8 @@ def study(result: Result) -> str:
         [
             f"Real jaws ({jaws}, half of them looked at only when all was done) with errors that other code put in, "
             "each moved at random, through the files and the flow of `cuspid study scanners`. Largest difference from "
-            "the truth over the jaws; the truth of mean |d| and RMS is what plain least squares leave of the displacements. "
+            "the truth over the jaws; the truth of mean |d| and RMS is what plain least squares leave of the "
+            "displacements. "
             f"Bars: global figures within {GLOBAL_SHARE:.0%} or {GLOBAL_UM:g} um, spans within {SPANS_UM:g} um, modes "
             f"within {MODES_SHARE:.0%} or {_SMALL['scale']:g} ppm (0.6 um at 25 mm) and {_SMALL['lift']:g} um, which "
             "noise of 10 um on these coarse meshes takes for itself. Smoothing shrinks crowns, which is no mode. "
