@@ -9,7 +9,7 @@ WHEEL  := build/wheel
 # Containers often ask Python to keep no bytecode. Each of the many processes of the tests would compile all modules.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test lint format docs wheel benchmarks blender clean
+.PHONY: demo test test-all lint format docs wheel benchmarks blender clean
 
 demo: $(STAMP)
 	$(BIN)/cuspid run --tooth 46 --out demo
@@ -17,6 +17,10 @@ demo: $(STAMP)
 # Three workers for two cores: those that wait for processes and disks would leave a fifth of the time unused. One BLAS
 # thread for each: more would only wait for one another.
 test: $(STAMP)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile -m "not documentation and not long"
+
+# With the long closed loops, those of Blender and of a browser, and all of the fuzzer's scenarios.
+test-all: $(STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile -m "not documentation"
 
 lint: $(STAMP)

@@ -23,6 +23,7 @@ def lone_camera() -> Handpiece:
     return replace(handpiece, rig=Rig({"west": handpiece.rig["west"]}))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sensors", [{}, {"west": Sensor(gamma=1.8), "east": Sensor(gamma=2.0)}])
 def test_one_moving_camera_measures_depth(sensors: dict[str, Sensor]) -> None:
     """Also of a handpiece of which the sensor of every camera is known."""

@@ -182,6 +182,7 @@ def with_other_lenses(rig: Rig, rng: np.random.Generator) -> Rig:
     return Rig(cameras)
 
 
+@pytest.mark.long
 @settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), mixed=st.booleans(), rolling=st.booleans())
 def test_jacobian_agrees_with_finite_differences(seed: int, mixed: bool, rolling: bool) -> None:
@@ -367,6 +368,7 @@ def test_points_follow_each_of_many_steps_as_that_step_alone_and_in_proportion(c
     assert min(np.abs(each).mean() for each in (by_one, by_other)) > 1e-4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sigma_px", [1e-3, 1e-6])
 def test_sharp_images_do_not_drown_what_the_prior_alone_knows(sigma_px: float) -> None:
     """Of the scale; rounding in what the images tell made it some ten times as uncertain for an arch."""
@@ -405,6 +407,7 @@ def test_perfect_observations_give_the_truth() -> None:
     assert len(found.tracks.pixels) == len(scene.tracks.pixels)
 
 
+@pytest.mark.long
 def test_poses_are_as_uncertain_as_their_covariance_says() -> None:
     """Mean normalised error squared (NEES) over seeds is that of chi-square with six degrees of freedom."""
     scene = make_scene(points=150)
@@ -419,6 +422,7 @@ def test_poses_are_as_uncertain_as_their_covariance_says() -> None:
     assert 4.6 < np.mean(squares) < 7.6
 
 
+@pytest.mark.long
 def test_errors_that_hang_together_within_a_track_are_accounted_for() -> None:
     """A keypoint slides over the surface from frame to frame, in all cameras alike: a walk for each point."""
     scene = make_scene(frames=8, points=300)
@@ -463,6 +467,7 @@ def as_the_motion_has_it(found: Reconstruction, scene: Scene) -> np.ndarray:
     return normal_equations.settle(state, observations, normal_equations.Weighting(1.0, np.inf, False)).points
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("free", [False, True])
 def test_the_surface_is_as_uncertain_as_is_expected(free: bool) -> None:
     nominal = with_priors(make_rig()) if free else make_rig()
@@ -494,6 +499,7 @@ def fitted(points: np.ndarray, onto: np.ndarray) -> np.ndarray:
     return turn.apply(points - points.mean(axis=0)) + onto.mean(axis=0)
 
 
+@pytest.mark.long
 def test_calibration_is_as_uncertain_as_its_covariance_says() -> None:
     """Truth drawn from the priors: poses, extrinsics and intrinsics are recovered within their covariance."""
     nominal = with_priors(make_rig())
@@ -518,6 +524,7 @@ def test_calibration_is_as_uncertain_as_its_covariance_says() -> None:
     assert np.std(after, axis=(0, 1))[4] < 0.5 * np.std(before, axis=(0, 1))[4]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [0.97, 1.03])
 def test_the_start_does_not_decide_the_scale(size: float) -> None:
     """Only the prior knows the scale of a free rig; the size of poses and points at the start is no news."""

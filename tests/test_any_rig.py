@@ -194,6 +194,7 @@ def check_mesh(found: Mesh, expected: Mesh, factor: float = 1.0) -> None:
 # --- lengths ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_depth_is_dense_at_the_size_of_a_handpiece() -> None:
     for depth_map in measured():
         assert np.isfinite(depth_map.depth_mm).mean() > 0.6
@@ -205,6 +206,7 @@ def test_the_same_images_of_a_larger_rig_give_larger_depths(factor: float) -> No
         check_depths(found, expected, factor)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("factor", FACTORS)
 def test_the_same_images_of_a_larger_rig_give_a_larger_scan(factor: float, folder: Path) -> None:
     (found, mesh), (expected, reference) = reconstructed(factor, folder), reconstructed(1.0, folder)
@@ -214,6 +216,7 @@ def test_the_same_images_of_a_larger_rig_give_a_larger_scan(factor: float, folde
     check_mesh(mesh, reference, factor)
 
 
+@pytest.mark.long
 def test_a_rig_held_far_away_shows_what_its_pixels_see(folder: Path) -> None:
     """Hills 4 mm apart under pixels of 0.15 mm: fused at half a pixel of disparity, 0.6 mm, they would be lost."""
     capture, hills = far_scan()
@@ -300,6 +303,7 @@ def depths_of(capture: Capture) -> tuple[DepthMap, ...]:
     return DepthEstimator(capture.handpiece).measure(capture.images(capture.frames[0]), capture.frames[0].name)
 
 
+@pytest.mark.long
 def test_a_longer_lens_gives_the_same_scan_of_smaller_hills(folder: Path) -> None:
     """From the same distance, twelve times as small: a surface of 0.6 mm is no piece to be removed."""
     factor = 12.0
@@ -345,6 +349,7 @@ def test_a_larger_rig_is_calibrated_alike() -> None:
         assert np.abs((one.covariance - other.covariance) / np.outer(sigmas, sigmas)).max() < 0.002
 
 
+@pytest.mark.long
 def test_what_is_known_of_a_handpiece_decides_what_is_refined(folder: Path) -> None:
     """Nobody has said: taken as nominal. Said to be exact, or asked to be held: as it is, and the same bits."""
     capture = scan()
@@ -416,6 +421,7 @@ def test_order_and_names_do_not_change_the_depth(change: str) -> None:
         check_depths(depth_map, expected[place(depth_map)])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("change", ["reversed", "with one covered"])
 def test_order_and_names_do_not_change_the_scan(change: str, folder: Path) -> None:
     capture = CHANGES[change](scan())
@@ -444,6 +450,7 @@ def test_a_draft_is_the_same_scan_at_a_glance(folder: Path) -> None:
     assert 0.0003 < np.median(distance) < 0.01
 
 
+@pytest.mark.long
 def test_fine_is_the_same_scan_with_more_faces(folder: Path) -> None:
     """The same path, for only depth and fusion differ, and a surface that lies where that of the usual quality does."""
     found, mesh = pipeline.reconstruct(scan(), folder / "fine", replace(FIXED, quality="fine"))

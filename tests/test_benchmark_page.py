@@ -47,6 +47,7 @@ def add(repository: Path, file: str, text: str) -> None:
         stream.write(text)
 
 
+@pytest.mark.long
 def test_a_result_of_the_same_code_holds(freshness, repository):
     result = {"commit": commit_of(repository)}
     assert all(freshness.changes(pattern.replace("*", "x"), result) == () for pattern in freshness.MAKERS)
@@ -58,6 +59,7 @@ def test_what_is_only_read_changes_no_result(freshness, repository, text):
     assert freshness.changes("jaws_half", {"commit": commit_of(repository)}) == ()
 
 
+@pytest.mark.long
 def test_a_module_that_is_moved_changes_no_result(freshness, repository):
     """Its folder, its name and all that import it."""
     moved = repository / "src/cuspid/stereo/depth_refinement.py"

@@ -135,6 +135,7 @@ def test_what_blender_cannot_do_is_refused(monkeypatch: pytest.MonkeyPatch) -> N
         render(replace(scene_of([(box((1, 1, 1), (0, 0, 5)), 11)]), appearance=APPEARANCES["natural"]))
 
 
+@pytest.mark.long
 def test_a_blender_that_fails_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     fake = tmp_path / "python"
     fake.write_text('#!/bin/sh\n[ "$1" = -c ] && exit 0\necho "out of memory" >&2\nexit 3\n')

@@ -107,6 +107,7 @@ def test_what_no_board_can_be_is_refused(given: dict, told: str) -> None:
 # --- what is found -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("tilt_deg", [0.0, 40.0])
 @pytest.mark.parametrize("inverted", [False, True])
 @pytest.mark.parametrize("board", BOARDS)
@@ -179,6 +180,7 @@ def focal_sigmas(cameras: Sequence[tuple[Camera, Camera]]) -> float:
     return float(np.sqrt(np.mean([d @ np.linalg.solve(covariance, d) / 4 for d, covariance in off])))
 
 
+@pytest.mark.long
 def test_the_middle_of_what_is_seen_of_a_circle_is_not_its_centre() -> None:
     """With the middles of the ellipses, lenses are off by many sigmas; corrected, by about one."""
     board = Board(kind="asymmetric-circles", columns=4, rows=11, square_mm=1.5, circle_share=0.7)
@@ -210,6 +212,7 @@ def test_the_shift_of_a_centre_is_that_of_an_ellipse() -> None:
     assert np.allclose(camera.project(pose.apply(CIRCLES.corners[:1]))[0] + shift, middle, atol=1e-4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("board", BOARDS)
 def test_photographs_become_a_handpiece(tmp_path: Path, board: Board) -> None:
     """From the command line: images of a known camera, and its focal length from them."""
@@ -223,6 +226,7 @@ def test_photographs_become_a_handpiece(tmp_path: Path, board: Board) -> None:
     assert storage.read_json(tmp_path / "rig" / "calibration.json")["sigma_px"] < 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("board", [CIRCLES, SHIFTED])
 def test_circles_of_another_size_are_told(tmp_path: Path, board: Board) -> None:
     camera = undistorted(scene(0).cameras["cam0"]).resized(320, 240)

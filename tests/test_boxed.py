@@ -23,6 +23,7 @@ def solid(mesh: Mesh) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
+@pytest.mark.long
 def test_the_boxed_jaw_is_one_closed_surface(coarse_phantom: Jaw, result: Jaw) -> None:
     surface = solid(result.mesh)
     assert surface.is_watertight

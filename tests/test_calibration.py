@@ -116,6 +116,7 @@ def test_a_page_is_as_large_as_it_says(tmp_path, square_mm):
 # --- closed loops ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("exposure", ["together", "apart", "rolling"])
 def test_jacobian_agrees_with_finite_differences(exposure):
     truth = scene(0, cameras=2, instants=4) if exposure == "together" else moving(0, instants=6)
@@ -139,6 +140,7 @@ def test_jacobian_agrees_with_finite_differences(exposure):
         assert np.allclose(jacobian[:, column], numeric, atol=1e-4 * max(1, np.abs(numeric).max())), column
 
 
+@pytest.mark.long
 def test_without_noise_the_cameras_are_found_exactly():
     truth = replace(scene(1), bending_mm=np.zeros(3))
     middle = np.array(SIZE) / 2  # where the prior has it
@@ -151,6 +153,7 @@ def test_without_noise_the_cameras_are_found_exactly():
     assert found.notes == ()
 
 
+@pytest.mark.long
 def test_errors_are_what_the_covariance_states():
     """Over ten rigs: of the lenses, and what is left over is the noise."""
     errors, held_out, apart = [], [], []
@@ -166,6 +169,7 @@ def test_errors_are_what_the_covariance_states():
     assert 0.1 < np.mean(held_out) < 0.11
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scale", [0.01, 50.0])
 def test_a_larger_board_gives_a_larger_rig(scale):
     found = []
@@ -179,6 +183,7 @@ def test_a_larger_board_gives_a_larger_rig(scale):
         )
 
 
+@pytest.mark.long
 def test_cameras_that_saw_it_one_after_the_other_are_chained():
     """Each pair of neighbours at instants of its own."""
     truth = scene(3, cameras=4, instants=24)
@@ -192,6 +197,7 @@ def test_cameras_that_saw_it_one_after_the_other_are_chained():
         calibrated(truth, apart)
 
 
+@pytest.mark.long
 def test_a_chessboard_is_numbered_alike_in_all_cameras():
     truth = scene(4, CHESS)
     rng = np.random.default_rng(0)
@@ -205,6 +211,7 @@ def test_a_chessboard_is_numbered_alike_in_all_cameras():
     assert all(np.linalg.norm(between(found, truth, name).translation) < 0.05 for name in truth.cameras)
 
 
+@pytest.mark.long
 def test_a_view_of_another_instant_is_left_out_and_named():
     truth = scene(5)
     views = views_of(truth, BOARD, 0.1, np.random.default_rng(0))
@@ -235,6 +242,7 @@ def test_a_lens_that_the_model_does_not_have_is_known_less_well():
     assert (wider[1:] < 1.6).all()
 
 
+@pytest.mark.long
 def test_a_view_that_no_board_explains_is_left_out_and_named():
     truth = scene(5)
     rng = np.random.default_rng(0)
@@ -247,6 +255,7 @@ def test_a_view_that_no_board_explains_is_left_out_and_named():
     assert max(lens_error(found, truth, name) for name in truth.cameras) < 2.5
 
 
+@pytest.mark.long
 def test_a_camera_that_saw_no_board_is_refused_by_name():
     truth = scene(5)
     rng = np.random.default_rng(0)
@@ -265,6 +274,7 @@ def test_a_camera_that_saw_no_board_is_refused_by_name():
         calibrated(truth, {key: BoardView(view.corner[:8], view.pixels[:8]) for key, view in views.items()})
 
 
+@pytest.mark.long
 def test_cameras_that_were_not_triggered_together_are_refused():
     """The second saw the board one instant later than its names say."""
     truth = scene(5)
@@ -287,6 +297,7 @@ def shaken():
     }
 
 
+@pytest.mark.long
 def test_cameras_that_moved_against_each_other_are_told_of():
     """The second saw each board a little aside: less than what makes a view odd, more than its own views leave."""
     truth, views = shaken()
@@ -311,6 +322,7 @@ def freely_running(
     return views
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(2))
 def test_cameras_that_run_freely_are_calibrated_along_the_path_of_the_board(seed):
     """One is 0.7 frames late, and none keeps time."""
@@ -327,6 +339,7 @@ def test_cameras_that_run_freely_are_calibrated_along_the_path_of_the_board(seed
         assert f"{name} {check.delay_frames:+.2f} ± {check.delay_spread_frames:.2f}" in told
 
 
+@pytest.mark.long
 def test_without_an_order_of_time_cameras_that_run_freely_are_doubted():
     """As if they were together, errors are many times what is stated."""
     truth = moving(0)
@@ -348,6 +361,7 @@ def test_halves_are_runs_of_time_where_cameras_do_not_expose_together():
     assert {instant for _, instant in calibrate._halves(views, None)[0]} == set(sorted(timing.frame)[::2])
 
 
+@pytest.mark.long
 def test_cameras_that_expose_together_have_no_delays():
     truth = moving(0)
     found = calibrated(truth, freely_running(truth, 0, dict.fromkeys(truth.cameras, 0.0), 0.0, 0.1))
@@ -362,6 +376,7 @@ def test_a_few_views_judge_no_calibration():
     assert not any("standard deviations" in note for note in found.notes)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("worse", ["undetermined", "no better", "few views", "no halves"])
 def test_delays_that_explain_nothing_are_not_taken(monkeypatch, worse):
     """Doubtful views are tried with delays; the calibration without stays where these fail, or leave much out."""
@@ -400,6 +415,7 @@ def test_a_polynomial_goes_through_what_it_is_of():
     assert np.allclose(slopes, (ahead - back) / 2e-6, atol=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("facing", "told"), [(True, {"cam0", "cam1", "cam2"}), (False, set())])
 def test_boards_that_always_faced_the_cameras_leave_the_focal_length_open(facing, told):
     truth = scene(0)
@@ -412,6 +428,7 @@ def test_boards_that_always_faced_the_cameras_leave_the_focal_length_open(facing
         assert lens_error(found, truth, name) < 2.5
 
 
+@pytest.mark.long
 def test_halves_without_common_boards_give_no_cross_validation():
     """The third camera shares only every fourth instant with the others, so that the odd half has none."""
     truth = scene(4, instants=16)
@@ -424,6 +441,7 @@ def test_halves_without_common_boards_give_no_cross_validation():
     assert all(lens_error(found, truth, name) < 2.5 for name in truth.cameras)
 
 
+@pytest.mark.long
 def test_covariances_are_widened_by_the_square_of_how_far_halves_are_apart_beyond_chance(monkeypatch):
     truth = scene(6)
     views = views_of(truth, BOARD, 0.1, np.random.default_rng(0))
@@ -438,6 +456,7 @@ def test_covariances_are_widened_by_the_square_of_how_far_halves_are_apart_beyon
         assert np.allclose(wide.rig[name].covariance / 5**2, plain.rig[name].covariance)
 
 
+@pytest.mark.long
 def test_a_search_that_did_not_end_is_told_of(monkeypatch):
     truth = scene(6)
     views = views_of(truth, BOARD, 0.1, np.random.default_rng(0))
@@ -487,6 +506,7 @@ def test_one_camera_begins_near_the_truth():
 # --- from images -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["charuco", "chessboard"])
 def test_photographs_of_a_board_become_a_handpiece(tmp_path, capsys, kind):
     board = Board(kind=kind, columns=8, rows=8, square_mm=2.0)
@@ -523,6 +543,7 @@ def test_what_cannot_be_calibrated_is_one_line(tmp_path, capsys):
     assert "a board is written as .pdf" in refused(capsys, "rig", "target", "--out", tmp_path / "board.txt")
 
 
+@pytest.mark.long
 def test_a_calibration_that_fails_leaves_the_one_before(tmp_path, capsys):
     board = Board(columns=8, rows=8, square_mm=2.0)
     flat = replace(scene(11, board, cameras=1, instants=4), bending_mm=np.zeros(3))
@@ -550,6 +571,7 @@ def test_photographs_that_are_there_are_not_taken_again(tmp_path):
     assert [k for k, file in enumerate(files) if file.stat().st_mtime_ns != times[k]] == [4, 7]
 
 
+@pytest.mark.long
 def test_a_rehearsed_calibration_finds_the_handpiece_that_was_built(tmp_path):
     """Four cameras of an intra-oral size, off from the drawn ones, with lenses that distort."""
     board = ("--columns", 9, "--rows", 7, "--square-mm", 0.7)

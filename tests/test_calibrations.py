@@ -705,6 +705,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return texts
 
 
+@pytest.mark.long
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damaged_files_are_refused_in_one_line(data: st.DataObject, written: dict[str, str], tmp_path: Path) -> None:

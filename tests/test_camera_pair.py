@@ -53,6 +53,7 @@ def test_the_axes_meet_where_the_convergence_is_their_angle(baseline, angle):
             np.testing.assert_allclose(seen, [256, 256], atol=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("surface", ["occlusal", "buccal", "lingual"])
 def test_a_pair_faces_the_middle_of_a_surface_from_outside(coarse_phantom, surface):
     mesh, mask = coarse_phantom.mesh, tooth_surfaces(coarse_phantom, 47)[surface]

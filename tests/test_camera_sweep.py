@@ -57,6 +57,7 @@ def outcome(baseline, angle, seed, failure=None, **figures):
 # --- Where the pair works
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("surface", "tooth", "along"), [("occlusal", 47, False), ("incisal", 41, True), ("buccal", 36, False)]
 )
@@ -117,6 +118,7 @@ def test_every_setting_of_the_thesis_is_taken_for_a_pair(site, baseline, angle):
     assert stereo_pairs(handpiece.rig, handpiece.working_distance_mm, SMALL.pairing) == (("left", "right"),)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -154,6 +156,7 @@ def test_options_that_make_no_sense(change):
 # --- A sweep
 
 
+@pytest.mark.long
 def test_a_real_sweep_measures_the_surface_alone(swept):
     outcomes, folder, seen = swept
     assert [each.failure for each in outcomes] == [None, None]
@@ -174,6 +177,7 @@ def test_a_real_sweep_measures_the_surface_alone(swept):
     assert float(rows[0]["mean_abs_um"]) == narrow["mean_abs_um"]
 
 
+@pytest.mark.long
 def test_a_killed_sweep_goes_on(coarse_phantom, swept, tmp_path, monkeypatch):
     outcomes, folder, _ = swept
     (tmp_path / "cases").mkdir()
@@ -188,6 +192,7 @@ def test_a_killed_sweep_goes_on(coarse_phantom, swept, tmp_path, monkeypatch):
     assert [each.figures for each in again] == [each.figures for each in outcomes]
 
 
+@pytest.mark.long
 def test_contenders_are_repeated_with_other_seeds(coarse_phantom, tmp_path, monkeypatch):
     """The grid in this process, with invented figures: 2 mm is best, 1 mm and 4 mm fail or are far behind."""
     calls = []
@@ -276,6 +281,7 @@ def jaw_file(tmp_path, coarse_phantom):
     return tmp_path / "jaw.ply"
 
 
+@pytest.mark.long
 def test_bad_input_is_one_line_and_leaves_nothing(jaw_file, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
     absent = refused(capsys, "study", "sweep", jaw_file, "--surface", "incisal", "--tooth", 47, "--out", out)
@@ -290,6 +296,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(jaw_file, tmp_path, capsys, mo
     assert not out.exists()
 
 
+@pytest.mark.long
 def test_the_verb_writes_its_results_and_does_not_mix_them(jaw_file, tmp_path, capsys, swept):
     outcomes, folder, _ = swept
     out = tmp_path / "out"

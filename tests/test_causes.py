@@ -210,6 +210,7 @@ def shots() -> Callable[[Board], list[np.ndarray]]:
     return taken
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("shown", "asked", "told"),
     [
@@ -248,6 +249,7 @@ def test_mirrored_prints_of_other_kinds_are_told(shots: Callable[[Board], list[n
     assert "mirrored" in str(cause_of_absence(images, board))
 
 
+@pytest.mark.long
 def test_the_layout_of_one_of_several_boards_is_told(shots: Callable[[Board], list[np.ndarray]]) -> None:
     images = shots(replace(BOARD, first_id=30, legacy=True))
     assert "board 2: the board has the old layout of OpenCV: give --legacy" in str(cause_of_absence(images, BOTH))

@@ -111,6 +111,7 @@ def test_nothing_stays_nothing() -> None:
     assert report.holes == ()
 
 
+@pytest.mark.long
 @given(factor=st.floats(1e-3, 1e3), radius=st.floats(0.01, 0.3))
 def test_a_surface_is_never_removed_whole_however_small(factor: float, radius: float) -> None:
     """What is small is so beside the rest. At any scale the same is removed."""

@@ -47,6 +47,7 @@ def test_a_tooth_that_is_not_there(tmp_path, capsys, coarse_phantom):
     assert not (tmp_path / "scan").exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("existed", [False, True])
 def test_without_blender_nothing_is_written(tmp_path, capsys, monkeypatch, coarse_phantom, existed):
     monkeypatch.delenv("CUSPID_BLENDER_PYTHON", raising=False)
@@ -118,6 +119,7 @@ def test_a_folder_that_holds_another_run(tmp_path, capsys):
     assert "holds another run of 'simulate'" in message
 
 
+@pytest.mark.long
 def test_evaluate_works_on_meshes_that_cuspid_never_saw(tmp_path, capsys, jaw_like):
     storage.write_mesh(tmp_path / "reference.stl", jaw_like)
     turned = jaw_like.transformed(Rigid3.from_rotation_vector(np.array([1.0, 2, 0.5]), np.array([100.0, 5, -30])))
@@ -163,6 +165,7 @@ def test_the_version(capsys):
     assert capsys.readouterr().out == f"cuspid {__version__}\n"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("asked", "modules"), [(["view"], {"shared", "verbs", "view"}), (["--help"], {"verbs"})])
 def test_only_what_is_asked_for_is_loaded(asked, modules):
     """To load everything takes seconds."""
@@ -172,6 +175,7 @@ def test_only_what_is_asked_for_is_loaded(asked, modules):
     assert ("numpy" in loaded) == ("view" in asked)
 
 
+@pytest.mark.long
 def test_an_evaluation_keeps_nothing_of_another_one(tmp_path, monkeypatch):
     """Of another mesh, errors of poses, spheres and margins would look like those of this one."""
     for costly in ("save_deviation_picture", "report"):

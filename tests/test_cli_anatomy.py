@@ -28,6 +28,7 @@ def test_a_jaw_and_a_broken_one_are_measured(tmp_path, capsys, phantom_file, coa
     assert "broken" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_landmarks_in_the_frame_of_a_turned_mesh_are_found_beside_it(tmp_path, coarse_phantom):
     """3D Slicer's points lie in the frame of the mesh, which is brought into the occlusal frame, and they with it."""
     landmarks = {label: coarse_phantom.landmarks[label] for label in ("33.cusp_tip", "43.cusp_tip")}
@@ -53,6 +54,7 @@ def test_no_jaws_to_measure(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 def test_a_prepared_jaw_keeps_labels_and_has_its_line(tmp_path, phantom_file):
     run(
         "jaw", "prepare", phantom_file, "--tooth", 46, "--out", tmp_path / "cracked.ply", "crack", "--width-um", "200.0"

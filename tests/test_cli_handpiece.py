@@ -36,6 +36,7 @@ def test_optics_refuses_a_surface_in_the_lens(capsys):
     assert "--distance-mm" in refused(capsys, "rig", "optics", "--distance-mm", 0)
 
 
+@pytest.mark.long
 def test_visibility_of_a_tooth(tmp_path, phantom_file):
     out = tmp_path / "seen"
     run("rig", "visibility", phantom_file, "--tooth", 46, "--design", "four", "--out", out)
@@ -49,6 +50,7 @@ def test_visibility_of_a_tooth(tmp_path, phantom_file):
     assert (out / "visibility.png").stat().st_size > 10_000
 
 
+@pytest.mark.long
 def test_a_rig_of_colmap_is_simulated_and_what_is_assumed_is_said(tmp_path, phantom_file, capsys):
     probe, scan = tmp_path / "probe", tmp_path / "scan"
     run("rig", "build", "--design", "two", "--width-px", 48, "--height-px", 48, "--out", probe)
@@ -77,6 +79,7 @@ def test_a_working_distance_is_not_given_twice(tmp_path, phantom_file, capsys):
     assert "must lie between" in refused(capsys, *command, "--working-distance-mm", 0)
 
 
+@pytest.mark.long
 def test_precision_of_a_tooth_follows_the_noise(tmp_path, phantom_file):
     medians = []
     for sigma_px in (0.5, 1.0):
@@ -92,6 +95,7 @@ def test_precision_of_a_tooth_that_is_not_there(tmp_path, capsys, phantom_file):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 def test_a_handpiece_for_a_brief(tmp_path, capsys, phantom_file):
     (tmp_path / "brief.toml").write_text(BRIEF.format(thickness=7.0))
     out = tmp_path / "found"

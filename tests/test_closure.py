@@ -72,6 +72,7 @@ def test_only_what_sees_the_same_from_the_same_side_is_paired():
     assert closing_pairs(handpiece, poses, every_frame_once(len(poses))) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("calibrated", [True, False])
 def test_a_way_back_is_tied_to_the_way_there(monkeypatch: pytest.MonkeyPatch, calibrated: bool):
     """The frames of the end come to those of the beginning much better than by the chain alone."""

@@ -261,6 +261,7 @@ def take_images(folder: Path, found: Reconstruction, texture: np.ndarray) -> Cap
     return capture
 
 
+@pytest.mark.long
 def test_colmap_maps_with_the_rig(tmp_path: Path) -> None:
     """One metric model, poses to some micrometres, and the seconds that it took."""
     found = make_found(frames=3)

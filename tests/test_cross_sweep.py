@@ -98,6 +98,7 @@ def test_where_nothing_lies_between_the_sides_there_is_none() -> None:
     assert crossing_of(horseshoe()) is None
 
 
+@pytest.mark.long
 def test_of_a_vault_too_deep_to_see_there_is_none_either() -> None:
     """Seen from where the handpiece fits between the teeth, its middle is out of focus."""
     deep = with_palate(horseshoe(), 6.0)
@@ -106,6 +107,7 @@ def test_of_a_vault_too_deep_to_see_there_is_none_either() -> None:
     assert plan_crossing(deep.mesh, room, wide, arch_curve(deep), 0.0) is None
 
 
+@pytest.mark.long
 def test_the_frames_of_the_sweep_are_the_last_and_overlap(upper: Jaw, path: ScanPath, tmp_path: Path) -> None:
     names = list(path.rig_from_world)
     assert 10 < len(path.cross_sweep) < len(names) / 2
@@ -127,6 +129,7 @@ def test_the_hand_comes_from_the_passes_to_both_sides(path: ScanPath) -> None:
     assert apart(swept[0], swept[-1])[0] > 25
 
 
+@pytest.mark.long
 def test_a_jaw_without_it_is_scanned_all_the_same(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "cuspid")
     lower = horseshoe()

@@ -35,6 +35,7 @@ def overlap(mesh: Mesh, one: np.ndarray, other: np.ndarray) -> float:
     return float(mesh.face_areas[one & other].sum() / mesh.face_areas[one | other].sum())
 
 
+@pytest.mark.long
 def test_labels_tell_crowns_where_there_are_any():
     crowns = crowns_of(phantom())
     assert not crowns.estimated
@@ -42,6 +43,7 @@ def test_labels_tell_crowns_where_there_are_any():
     assert crowns_of(replace(phantom(), face_labels=None)).estimated
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("arch", ["lower", "upper"])
 def test_crowns_of_a_phantom_are_found_by_shape(arch: Arch):
     assert overlap(phantom(arch).mesh, estimate(arch), true_crowns(phantom(arch))) > 0.9
@@ -82,6 +84,7 @@ def test_the_pose_of_a_jaw_does_not_matter():
     assert overlap(mesh, crowns_by_shape(upright), estimate()) > 0.93
 
 
+@pytest.mark.long
 def test_a_flat_plate_has_no_crowns():
     mesh = plate(0.0, 20.0)
     assert not crowns_by_shape(mesh).any()
@@ -89,6 +92,7 @@ def test_a_flat_plate_has_no_crowns():
     assert find_occlusal_frame(mesh).notes
 
 
+@pytest.mark.long
 def test_without_labels_open_crown_is_an_estimate_and_nothing_is_said_tooth_by_tooth():
     jaw = phantom()
     named, unnamed = pipeline.crown_surface(jaw), pipeline.crown_surface(replace(jaw, face_labels=None))

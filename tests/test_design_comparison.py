@@ -116,6 +116,7 @@ def test_way_and_data_follow_from_the_frames():
     assert data_mb(handpiece, 4) == pytest.approx(4 * 4 * 200 * 100 / 1e6)
 
 
+@pytest.mark.long
 @given(scale=st.floats(0.1, 1.0))
 def test_smaller_images_show_the_same(scale):
     handpiece = twelve_cameras(DesignOptions(width_px=400, height_px=300))
@@ -208,6 +209,7 @@ def files(coarse_phantom, tmp_path_factory):
     return folder
 
 
+@pytest.mark.long
 def test_a_scan_is_simulated_reconstructed_and_evaluated(files, tmp_path):
     options = ComparisonOptions(designs=(str(files / "tiny.json"),), jaws=(str(files / "jaw.ply"),), samples=5000)
     trial = TrialOptions(

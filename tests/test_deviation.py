@@ -146,6 +146,7 @@ def test_noise_is_measured_as_what_it_is():
     assert abs(found.accuracy.signed_mean_um) < 0.5
 
 
+@pytest.mark.long
 def test_what_a_scan_expects_of_itself_is_held_against_it():
     rng = np.random.default_rng(3)
     mesh = jaw().mesh
@@ -159,6 +160,7 @@ def test_what_a_scan_expects_of_itself_is_held_against_it():
     assert trueness(noisy).within_sigmas_pct is None
 
 
+@pytest.mark.long
 def test_a_scaled_scan_from_any_pose_has_its_scale_error_and_nothing_is_scaled_away():
     mesh = jaw().mesh
     scan = Mesh(1.001 * mesh.vertices, mesh.faces).transformed(

@@ -55,6 +55,7 @@ def refused(arguments: list[str], capsys) -> str | None:
     return None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("page", pages(), ids=name)
 def test_the_parser_takes_every_command(page, parsed, capsys):
     found = list(commands(page))
@@ -196,6 +197,7 @@ def own_options(command) -> list[str]:
     return [name for name, hint in get_type_hints(command).items() if hint in plain]
 
 
+@pytest.mark.long
 def test_every_public_module_has_its_docstrings_on_a_page(monkeypatch):
     module_pages = generator("module_pages", monkeypatch)
     text = "\n".join(module_pages.pages().values())

@@ -50,6 +50,7 @@ print(time.process_time(), sorted({"numpy", "scipy", "numba", "cv2"} & set(sys.m
     assert rest.strip() == "[] True"
 
 
+@pytest.mark.long
 def test_loading_all_of_it_leaves_the_warning_filters_of_the_host_alone() -> None:
     code = "import warnings; import cuspid, numba, cv2, scipy.stats, igl, matplotlib.figure, trimesh, pycolmap\n"
     code += "before = list(warnings.filters)\nfor name in cuspid.__all__: getattr(cuspid, name)\n"
@@ -126,6 +127,7 @@ def test_what_could_be_seen_follows_from_the_truth(found: Trueness, scan: cuspid
     assert alone.scannable_pct == 100
 
 
+@pytest.mark.long
 def test_a_mesh_may_be_the_reference_and_may_face_inwards(truth: GroundTruth) -> None:
     mesh = truth.jaw.mesh
     inwards = cuspid.Mesh(mesh.vertices + 0.01 * mesh.vertex_normals, mesh.faces[:, ::-1])

@@ -68,6 +68,7 @@ def test_a_band_with_one_side_is_told() -> None:
     assert facing_outwards(band)[0] is band
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("share", [0.5, 1.0])
 @pytest.mark.parametrize("mesh", [CLOSED, OPEN])
 def test_a_jaw_with_wrong_faces_is_loaded_as_the_right_one(tmp_path: Path, mesh: Mesh, share: float) -> None:

@@ -132,6 +132,7 @@ def test_a_long_title_is_not_cut_off(tmp_path: Path):
     assert drawn[:60, -4:].min() == 255
 
 
+@pytest.mark.long
 def test_pictures_are_written_whole(tmp_path: Path):
     jaw = horseshoe(120, 40)
     moved = Rigid3.from_rotation_vector(np.array([0.0, 0.001, 0.0]), np.array([0.0, 0.0, 0.02]))

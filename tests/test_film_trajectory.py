@@ -29,6 +29,7 @@ def test_it_turns_back_where_it_does(curve: ArchCurve, turn: float, frames: int,
     assert abs(frames_there(places) - there) < 0.08 * frames
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("path", ["arch", "s-shape"])
 def test_a_shaky_hand_that_only_goes_on_never_turns_back(path: str, seed: int) -> None:

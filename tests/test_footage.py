@@ -119,6 +119,7 @@ def told(out: Path) -> dict:
 # --- synchronising ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sync", ["flash", "motion"])
 def test_cameras_that_began_one_after_the_other_are_brought_together(sync, tmp_path, probe):
     films = filmed()

@@ -175,6 +175,7 @@ def test_impossible_hands_are_refused(wrong: dict[str, float]) -> None:
 SMALL = ("--camera.width-px", "64", "--camera.height-px", "48", "--supersampling", "1", "--frames", "3")
 
 
+@pytest.mark.long
 def test_film_writes_what_stitch_and_its_evaluation_read(coarse_phantom: Jaw, tmp_path: Path) -> None:
     storage.write_jaw(tmp_path / "jaw.ply", coarse_phantom)
     main(["pano", "film", str(tmp_path / "jaw.ply"), "--out", str(tmp_path / "film"), "--video", *SMALL])

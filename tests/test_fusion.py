@@ -329,6 +329,7 @@ def seen_from(*turns: float) -> dict[str, Rigid3]:
     return {f"{k:05d}": Rigid3(rotation, middle - rotation @ middle) for k, rotation in enumerate(turned)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("turns", "most_um"), [((0.0, 0.9), 0.25), ((-0.7, 0.7), 0.78), ((0.0, 0.9, -0.2), 0.2)])
 def test_a_flank_is_not_pulled_to_the_other_one_of_its_edge(turns: tuple[float, ...], most_um: float) -> None:
     """A camera that looks along a flank sees it coarsely: its pixels there show mostly the other flank. Without one of
@@ -350,6 +351,7 @@ def test_the_mesh_is_finer_where_it_bends() -> None:
     assert 1 <= (~finer).sum() / (~coarse).sum() < 1.4
 
 
+@pytest.mark.long
 def test_the_mesh_of_a_scan_has_its_sharp_edges(tmp_path: Path) -> None:
     """The stage moves vertices onto them, and tells how many; the same depth maps without that cut them off."""
     maps = depth_maps(height_field(lambda x, y: 5 + 0.8 * np.abs(x + 0.3 * y + 0.013), count=401))

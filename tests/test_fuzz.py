@@ -35,6 +35,7 @@ ALONE = {"little memory"}
 """What depends on what the process held before: only benchmarks/fuzz.py runs it."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [name for name in SCENARIOS if name not in ALONE])
 def test_damaged_input_is_read_or_refused_in_one_line(fuzzer: Fuzzer, name: str) -> None:
     """And undamaged input is taken, without which all would be refused at once."""

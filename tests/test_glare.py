@@ -119,6 +119,7 @@ def matte_um() -> float:
     return rms_um(lit(), of_one_frame(photographs(lit(), FRAME)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("leak", "most"), [(0.03, 1.3), (LEAK, 2.0)])
 def test_polarisers_that_leak_do_little_harm(leak: float, most: float) -> None:
     images = of_one_frame(photographs(lit(glare=leak), FRAME))

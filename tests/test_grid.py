@@ -26,6 +26,7 @@ def test_a_grid_is_the_product_of_its_axes_and_keeps_their_order(tmp_path):
     assert points[0].name == "baseline_mm-1.0_angle_deg-0"
 
 
+@pytest.mark.long
 def test_a_failed_case_is_recorded_and_stops_nobody(tmp_path):
     """Refused, broken, or killed; results are in order, however long a case takes, with units in their columns."""
     outcomes = run_grid(cases([5, 2, 3, 0, 1]), grid_cases.square_unless, tmp_path, workers=2)
@@ -39,6 +40,7 @@ def test_a_failed_case_is_recorded_and_stops_nobody(tmp_path):
     assert [row["failure"] for row in rows] == [outcome.failure or "" for outcome in outcomes]
 
 
+@pytest.mark.long
 def test_what_is_finished_is_not_run_again(tmp_path):
     few = run_grid(cases([1, 2], folder=str(tmp_path)), grid_cases.leaves_a_mark, tmp_path / "out", workers=1)
     assert len(few) == 2
@@ -54,6 +56,7 @@ def test_what_is_finished_is_not_run_again(tmp_path):
     assert seen == [("cases", 2, 3), ("cases", 3, 3)]
 
 
+@pytest.mark.long
 def test_failed_cases_are_run_again_where_asked(tmp_path):
     run_grid(cases([2], folder=str(tmp_path)), grid_cases.is_killed_once, tmp_path / "out", workers=1)
     kept = run_grid(cases([2], folder=str(tmp_path)), grid_cases.is_killed_once, tmp_path / "out", workers=1)
@@ -77,6 +80,7 @@ def test_no_workers_are_refused(tmp_path):
         run_grid(cases([1]), grid_cases.square, tmp_path, workers=0)
 
 
+@pytest.mark.long
 def test_the_processes_of_a_killed_study_end_with_it(tmp_path):
     study = subprocess.Popen([sys.executable, grid_cases.__file__, str(tmp_path)])
     mark = tmp_path / "process"
@@ -105,6 +109,7 @@ def cluster():
         yield made.scheduler_address
 
 
+@pytest.mark.long
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
 def test_each_worker_of_a_cluster_has_a_core_of_its_own(tmp_path, cluster):
     outcomes = run_grid(cases(range(6)), grid_cases.starts_a_child, tmp_path, cluster=cluster)
@@ -112,6 +117,7 @@ def test_each_worker_of_a_cluster_has_a_core_of_its_own(tmp_path, cluster):
     assert len({outcome.figures["core"] for outcome in outcomes}) == 2
 
 
+@pytest.mark.long
 def test_a_cluster_that_loses_a_worker_gives_the_serial_table(tmp_path, cluster):
     for name in ("serial", "cluster"):
         (tmp_path / name).mkdir()

@@ -38,6 +38,7 @@ def corners(meshes: list[Mesh]) -> np.ndarray:
     return each[np.lexsort(each.T)]
 
 
+@pytest.mark.long
 def test_parts_are_together_the_whole_whenever_they_are_asked_for() -> None:
     """Also where surfaces lie over each other, so that one changes the other beyond its own blocks."""
     surface, parts = GrowingSurface(DETAIL_MM), dict[int, Mesh]()
@@ -62,6 +63,7 @@ def test_only_what_changed_is_told() -> None:
     assert not before.keys() & after.keys()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("out", [0, 1, 2])
 def test_what_is_taken_out_leaves_what_it_would_have_been_without(out: int) -> None:
     surface, never = GrowingSurface(DETAIL_MM), GrowingSurface(DETAIL_MM)

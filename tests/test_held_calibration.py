@@ -30,6 +30,7 @@ def beside(baseline: float, distance: float) -> Handpiece:
     return Handpiece(name="two", rig=Rig(cameras), working_distance_mm=distance, depth_range_mm=near_far)
 
 
+@pytest.mark.long
 @given(share=st.floats(0.1, 0.4), distance=st.floats(2.0, 50.0), place_um=st.floats(1, 50))
 def test_places_of_cameras_move_depth_as_their_baseline_says(share: float, distance: float, place_um: float) -> None:
     """Z / B times the difference of two places, and what both move forwards."""
@@ -44,6 +45,7 @@ def test_turns_of_cameras_move_depth_with_the_square_of_the_distance(turn_deg: f
     assert depth_sigma_mm(handpiece) == pytest.approx(8.0**2 / 2.0 * np.sqrt(2) * np.deg2rad(turn_deg), rel=0.1)
 
 
+@pytest.mark.long
 def test_an_exact_handpiece_measures_exactly_and_a_larger_one_errs_in_proportion() -> None:
     drawn = held(twelve_cameras())
     assert depth_sigma_mm(drawn) == 0

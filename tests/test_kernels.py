@@ -60,6 +60,7 @@ def test_code_of_older_sources_does_not_count(tmp_path: Path, monkeypatch: pytes
     assert cache_file(tmp_path, "new").load("whole") is None
 
 
+@pytest.mark.long
 def test_a_kernel_is_compiled_again_when_one_that_it_calls_has_changed(tmp_path: Path) -> None:
     (tmp_path / "outer.py").write_text(
         "from cuspid.kernels import kernel\nfrom inner import grown\n\n"
@@ -136,6 +137,7 @@ def test_a_forked_process_may_be_the_first_to_use_a_kernel(tmp_path: Path) -> No
     assert ended.stdout.split() == ["56"], ended.stderr
 
 
+@pytest.mark.long
 def test_processes_that_need_kernels_at_once_compile_them_once(tmp_path: Path) -> None:
     (tmp_path / "slow.py").write_text(SLOW)
     running = [

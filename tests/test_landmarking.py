@@ -39,6 +39,7 @@ def errors_mm(jaw: Jaw, found: dict[str, Landmark]) -> dict[str, np.ndarray]:
     return {label: point.position - jaw.landmarks[label].position for label, point in found.items()}
 
 
+@pytest.mark.long
 def test_every_landmark_is_found_and_marked_as_estimated(phantom: Jaw):
     found = estimated(phantom)
     assert missing(found, phantom.teeth) == ()

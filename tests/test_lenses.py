@@ -23,6 +23,7 @@ def error_sigmas(found: Camera, truth: Camera) -> float:
     return float(np.sqrt(off @ np.linalg.pinv(found.covariance, hermitian=True) @ off / len(off)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("model", LENSES_OF)
 def test_the_model_of_a_lens_is_found(model: str) -> None:
     truth = before_lens(model, 1, instants=12)
@@ -52,6 +53,7 @@ def test_views_of_no_camera_are_refused() -> None:
         choose_lens(scattered, BOARD, SIZE)
 
 
+@pytest.mark.long
 def test_cameras_of_a_rig_may_have_different_lenses() -> None:
     """Side by side, each with its own number of parameters."""
     narrow, wide = before_lens("OPENCV", 2), before_lens("THIN_PRISM_FISHEYE", 2)

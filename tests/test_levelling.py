@@ -62,6 +62,7 @@ def angle_degrees(a: np.ndarray, b: np.ndarray) -> float:
 tilts = pytest.mark.parametrize("world_from_new", [tilt(*each) for each in [(0.5, 10), (2, 130), (3.5, 250), (5, 340)]])
 
 
+@pytest.mark.long
 @tilts
 def test_a_tilted_surface_is_levelled(world_from_new: Rigid3):
     surface = seen_from(world_from_new)
@@ -73,6 +74,7 @@ def test_a_tilted_surface_is_levelled(world_from_new: Rigid3):
     assert angle_degrees(unprejudiced.rotation[2], world_from_new.rotation[2]) < 0.15
 
 
+@pytest.mark.long
 @tilts
 def test_a_turned_surface_lies_where_it_lay(world_from_new: Rigid3):
     tilted, upright_there = seen_from(world_from_new), seen_from(Rigid3.identity())

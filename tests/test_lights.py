@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 
 from cuspid import pipeline
 from cuspid.handpiece.designs import DesignOptions, essential_four
@@ -43,6 +44,7 @@ def test_a_handpiece_without_lights_is_simulated(coarse_phantom, tmp_path):
         assert image.std() > 10
 
 
+@pytest.mark.long
 def test_light_that_cannot_go_below_the_surface_is_told(coarse_phantom, tmp_path, caplog):
     poses = {"00000": steady_poses(coarse_phantom, ScanPathOptions(tooth=46), per_pass=1)[0]}
     told = {}

@@ -38,6 +38,7 @@ def write(folder: Path, frames: tuple[Frame, ...], pause_s: float = 0.0, black: 
             time.sleep(pause_s)
 
 
+@pytest.mark.long
 def test_a_capture_is_replayed_and_reconstructed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     frames = scan().frames[:3]
     storage.write_capture(tmp_path / "capture", replace(scan(), frames=frames))
@@ -53,6 +54,7 @@ def test_a_capture_is_replayed_and_reconstructed(tmp_path: Path, capsys: pytest.
     assert (tmp_path / "live" / "mesh.ply").stat().st_mtime_ns == made, "it is the same reconstruction"
 
 
+@pytest.mark.long
 def test_a_folder_is_followed_while_images_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The third frame is black: the surface stays, and the scan goes on."""
     storage.write_handpiece(tmp_path / "capture" / "handpiece.json", scan().handpiece)

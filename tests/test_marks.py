@@ -55,6 +55,7 @@ def marked(coarse_phantom: Jaw) -> list[np.ndarray]:
     return [natural_marks(coarse_phantom, seed).shares for seed in range(12)]
 
 
+@pytest.mark.long
 def test_shares_are_shares_and_seeds_choose_stains_and_fillings(marked: list[np.ndarray]) -> None:
     for shares in marked:
         assert shares.min() >= 0
@@ -130,6 +131,7 @@ def test_gum_is_stippled_beside_teeth_but_not_at_their_margin(coarse_phantom: Ja
         assert not natural_marks(replace(coarse_phantom, face_labels=without), 0).stippled.any()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scattering", [0.0, 1.0])
 def test_stippling_looks_as_if_the_surface_had_that_height(scattering: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """A plane with stippled normals beside a mesh that has the relief."""

@@ -135,6 +135,7 @@ def test_a_picture_too_large_is_refused() -> None:
         draw_mesh(ridge(), middle(), MeshViewOptions(mm_per_px=0.02, strip=StripOptions(half_width_mm=100.0)))
 
 
+@pytest.mark.long
 def test_how_a_jaw_lies_in_its_file_makes_no_difference(coarse_phantom: Jaw) -> None:
     moved = Rigid3.from_rotation_vector(np.array([0.6, -0.9, 1.3]), np.array([12.0, -40.0, 7.0]))
     options = MeshViewOptions(mm_per_px=0.2)
@@ -150,6 +151,7 @@ def test_how_a_jaw_lies_in_its_file_makes_no_difference(coarse_phantom: Jaw) -> 
         assert turned.strips[name].covered.mean() == pytest.approx(strip.covered.mean(), abs=0.05)
 
 
+@pytest.mark.long
 def test_a_scan_is_drawn_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scan, out = tmp_path / "scan", tmp_path / "views"
     scan.mkdir()

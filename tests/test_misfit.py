@@ -47,6 +47,7 @@ def sliding(start: Reconstruction, sigma_px: float, rng: np.random.Generator) ->
     return replace(start, tracks=replace(tracks, pixels=pixels))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("slide_px", [0.0, 0.3])
 def test_a_right_calibration_is_never_told(slide_px: float) -> None:
     scene = make_scene(points=200)
@@ -64,6 +65,7 @@ def test_small_scans_are_not_either(frames: int) -> None:
             assert not adjust(disturbed(scene, np.random.default_rng(seed))).notes, (len(rig.names), seed)
 
 
+@pytest.mark.long
 def test_the_pull_is_chi_squared_where_nothing_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     """So what is told is what the keypoints' own scatter cannot explain, neither more nor less."""
     seen = []
@@ -83,6 +85,7 @@ def test_the_pull_is_chi_squared_where_nothing_is_allowed(monkeypatch: pytest.Mo
     assert 0.8 < mean < 1.25
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "change"),
     [
@@ -108,6 +111,7 @@ def test_what_is_smaller_than_what_is_allowed_is_not_told() -> None:
     assert not adjust(start).notes
 
 
+@pytest.mark.long
 def test_neither_the_order_of_the_cameras_nor_the_unit_of_length_decides() -> None:
     start = held_wrongly("c4", {"motion": np.array([0, 0, 0, 0, 0.02, 0])})
     names = start.rig.names
@@ -147,6 +151,7 @@ def part_held(start: Reconstruction) -> Reconstruction:
     )
 
 
+@pytest.mark.long
 def test_of_a_calibration_that_is_partly_held_that_part_is_tested() -> None:
     right = held_wrongly("c1", {"motion": np.array([0, 2e-3, 0, 0.02, 0, 0])})
     wrong = held_wrongly("c1", {"lens": np.array([0, 0, 0, 0, 0.05, 0, 0, 0])})

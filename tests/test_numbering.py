@@ -104,6 +104,7 @@ def test_of_a_part_the_numbers_tell() -> None:
             number_teeth("jaw.ply", given, mesh, sure=False, arch="upper")
 
 
+@pytest.mark.long
 def test_a_map_says_what_labels_are(tmp_path: Path) -> None:
     table = {fdi: 100 + n for fdi, n in ALONG.items()}
     storage.write_mesh(
@@ -121,6 +122,7 @@ def test_a_map_says_what_labels_are(tmp_path: Path) -> None:
         load_jaw(tmp_path / "jaw.ply", labelling=Labelling(label_map=tmp_path / "map.json"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["jaw_lower.ply", "jaw.ply"])
 def test_the_verb_measures_the_right_teeth(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
     """Labels 1-14 of a lower jaw were measured as upper teeth from 12 to 24."""

@@ -388,6 +388,7 @@ def make_capture(folder: Path, rig: Rig, path: dict[str, Rigid3]) -> Capture:
     return capture
 
 
+@pytest.mark.long
 def test_images_are_located(tmp_path: Path) -> None:
     """Speckled plane, three cameras with distortion, three frames: poses to a few micrometres; stages are reported."""
     rig = Rig({name: m for name, m in make_handpiece().rig.cameras.items() if name != "side"})
@@ -407,6 +408,7 @@ def test_images_are_located(tmp_path: Path) -> None:
     assert {"features_s", "odometry_s", "adjustment_s", "observations"} <= set(found.log)
 
 
+@pytest.mark.long
 def test_where_no_patch_is_found_keypoints_are_taken(tmp_path: Path) -> None:
     """As behind glare that comes up after the keypoints were found: nothing is lost but exactness, and that is said."""
     rig = Rig({name: m for name, m in make_handpiece().rig.cameras.items() if name != "side"})

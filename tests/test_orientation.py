@@ -20,6 +20,7 @@ def jaw() -> Jaw:
     return horseshoe()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("closed", [True, False])
 def test_the_frame_is_found_from_any_orientation(seed: int, closed: bool):
@@ -33,6 +34,7 @@ def test_the_frame_is_found_from_any_orientation(seed: int, closed: bool):
     assert 0 < crowns[:, 2].max() < 2.5
 
 
+@pytest.mark.long
 def test_where_there_is_no_arch_the_frame_is_unsure():
     notes = find_occlusal_frame(sphere(25.0)).notes
     assert any("unsure" in note for note in notes)
@@ -40,6 +42,7 @@ def test_where_there_is_no_arch_the_frame_is_unsure():
     assert any("anterior" in note for note in find_occlusal_frame(quadrant).notes)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_a_quadrant_with_its_base_lies_crowns_up_and_is_doubted(seed: int):
     quadrant = jaw().mesh.submesh(jaw().mesh.face_centres[:, 0] > 1)

@@ -15,7 +15,7 @@ from cuspid.handpiece.designs import twelve_cameras
 from cuspid.jaw import GUM, Jaw
 from cuspid.room import Room
 from cuspid.simulation.path.coverage import CrownPoints, crown_points
-from cuspid.simulation.path.detour import _APART, _UNITS, _shortest, plan_detour
+from cuspid.simulation.path.detour import _APART, _UNITS, _motion, _shortest, plan_detour
 from cuspid.simulation.path.further import _largest_sum, _Trial, _woven, further_legs, seen_from
 from cuspid.simulation.path.legs import Leg, steady_path
 from cuspid.simulation.path.overlap import frame_overlap
@@ -88,6 +88,7 @@ def test_a_path_around_an_obstacle_fits_and_still_sees(
 # --- parts ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "teeth",
     [(41, 42, 43, 44, 45, 46, 47), (43, 42, 41, 31, 32, 33), (46,), (45,), (31,), (34, 35, 36), (44, 42, 31)],

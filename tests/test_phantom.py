@@ -79,6 +79,7 @@ def quadrants(options: PhantomOptions) -> tuple[int, int]:
     return (30, 40) if options.arch == "lower" else (10, 20)
 
 
+@pytest.mark.long
 def test_the_surface_is_closed_and_consistently_oriented(jaw: Jaw) -> None:
     edges = edges_of(jaw)
     directed = edges[:, 0] * len(jaw.mesh.vertices) + edges[:, 1]
@@ -129,6 +130,7 @@ def test_right_and_left_are_where_the_frame_says(jaw: Jaw, options: PhantomOptio
         assert surface_of(jaw, positive + k)[:, 0].mean() > 1.5
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_mesh_and_another_seed_another() -> None:
     one, same, other = (build_phantom(PhantomOptions(seed=seed, edge_mm=1.2)) for seed in (1, 1, 2))
     again = phantom_landmarks(PhantomOptions(seed=1))

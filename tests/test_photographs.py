@@ -49,6 +49,7 @@ def centres(poses):
     return np.array([pose.inverse().translation for pose in poses])
 
 
+@pytest.mark.long
 def test_poses_and_lens_are_those_of_the_camera(model):
     true = scene().poses
     assert model.frames == tuple(true)
@@ -166,6 +167,7 @@ def test_without_a_scale_nothing_is_in_millimetres(model, photographs, tmp_path,
     assert np.array_equal(again.capture.image(again.capture.frames[0], "camera"), scene().images["IMG_00"])
 
 
+@pytest.mark.long
 def test_names_do_not_matter(model, tmp_path):
     names = list(scene().images)
     renamed = dict(zip(names, [f"z{k}" for k in (3, 0, 7, 1, 6, 2, 5, 4)], strict=True))
@@ -176,6 +178,7 @@ def test_names_do_not_matter(model, tmp_path):
         assert np.allclose(other.cam_from_world[renamed[name]].matrix, first[name].matrix, atol=1e-9)
 
 
+@pytest.mark.long
 def test_twice_the_size_has_twice_the_focal_length(model, tmp_path):
     for name, image in scene().images.items():
         cv2.imwrite(str(tmp_path / f"{name}.png"), cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC))

@@ -154,6 +154,7 @@ def rms(errors: list[np.ndarray]) -> float:
 # --- closed loops ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("lit", "known"), [("evenly", False), ("together", False), ("together", True)])
 def test_cameras_are_as_far_off_as_is_stated(lit, known):
     """Over three handpieces, under a light that is known or not."""
@@ -166,6 +167,7 @@ def test_cameras_are_as_far_off_as_is_stated(lit, known):
     assert 0.6 < rms(errors) < 1.5
 
 
+@pytest.mark.long
 def test_lights_one_by_one_are_as_far_off_as_is_stated():
     cameras, lights, before, after = [], [], [], []
     for seed in range(3):
@@ -372,6 +374,7 @@ def test_sensors_and_covariances_are_written_only_where_they_are(tmp_path):
         storage.read_handpiece(tmp_path / "broken.json")
 
 
+@pytest.mark.long
 def test_a_calibration_with_lights_is_rehearsed(tmp_path, capsys):
     """From images to files, with the geometry found, too."""
     drawn = tmp_path / "drawn.json"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from cuspid import pipeline
 from cuspid.handpiece.designs import DesignOptions, essential_four
@@ -14,6 +15,7 @@ from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.storage import read_json
 
 
+@pytest.mark.long
 def test_a_plain_tooth_is_scanned_and_resumed(tmp_path: Path, coarse_phantom: Jaw) -> None:
     handpiece = essential_four(DesignOptions(width_px=160, height_px=160, lights="colour-coded"))
     path = ScanPathOptions(tooth=46, length_mm=3.0, frames=4)

@@ -115,6 +115,7 @@ def grid(x: tuple[float, float], y: tuple[float, float] = (-7.0, 2.5)) -> np.nda
     return np.stack(np.meshgrid(np.arange(*x, 0.1), np.arange(*y, 0.1)), axis=-1)
 
 
+@pytest.mark.long
 def test_the_step_is_found_where_it_is(surface: HeightMap) -> None:
     top, floor = surface.at(grid((-2.3, 2.3))), surface.at(grid((4.2, 6.0)))
     assert np.percentile(np.abs(top), 95) < 0.15
@@ -164,6 +165,7 @@ def test_a_better_path_lies_where_the_one_before_lay(scene: Scene, metric: bool)
         np.testing.assert_allclose(again.motion.tracks.points, shown.motion.tracks.points, atol=1e-6)
 
 
+@pytest.mark.long
 def test_a_known_width_sets_the_scale_of_the_better_path_and_of_its_surface(scene: Scene) -> None:
     """It finds the bar and the floor a twentieth wider than the path before did."""
     options = OrthoOptions(scale=ScaleOptions(width_mm=30.0))
@@ -189,6 +191,7 @@ def test_what_is_textured_is_known_and_what_is_plain_or_beyond_is_not(surface: H
     assert not surface.known_at(grid((50.0, 51.0))).any()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gain", [1.0, 0.8])
 def test_cameras_of_one_instant_find_the_step_however_bright_they_show_it(scene: Scene, gain: float) -> None:
     """Every frame with the third one after it, as if two cameras had taken both at once."""
@@ -231,6 +234,7 @@ def test_a_plain_spot_in_a_crown_is_bridged(scene: Scene) -> None:
     assert np.abs(found.at(inside)).max() < 0.2
 
 
+@pytest.mark.long
 def test_highlights_that_go_along_with_the_camera_do_not_raise_the_surface(scene: Scene, surface: HeightMap) -> None:
     """A spot in the middle of each picture is by itself best explained at the camera's own height."""
     lit = {name: cv2.circle(image.copy(), (120, 90), 8, (255, 255, 255), -1) for name, image in scene.images.items()}
@@ -239,6 +243,7 @@ def test_highlights_that_go_along_with_the_camera_do_not_raise_the_surface(scene
     assert np.percentile(np.abs(found.at(grid((-2.3, 2.3)))), 95) < 0.25
 
 
+@pytest.mark.long
 def test_distortion_is_taken_out(scene: Scene, surface: HeightMap) -> None:
     bent = replace(CAMERA, distortion=np.array([-0.2, 0.05, 0.0, 0.0]))
     where = CAMERA.project(bent.rays(bent.pixel_centres())).astype(np.float32) - np.float32(0.5)
@@ -249,6 +254,7 @@ def test_distortion_is_taken_out(scene: Scene, surface: HeightMap) -> None:
     assert np.median(np.abs(found.at(middle) - surface.at(middle))) < 0.05
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("most_bytes", [0, 6 * 240 * 180 * 3])
 def test_how_many_images_fit_in_memory_does_not_change_the_surface(
     scene: Scene, surface: HeightMap, monkeypatch: pytest.MonkeyPatch, most_bytes: int
@@ -459,6 +465,7 @@ def shaded(places: np.ndarray) -> np.ndarray:
     return 0.35 + 0.1 * np.cos(x / 1.5) + 0.05 * np.sin(y / 2 + x)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("index", [1.0, 1.5])
 def test_plain_flanks_are_found_once_the_light_that_they_lose_is_made_up_for(index: float) -> None:
     scene = instants(index, shaded)

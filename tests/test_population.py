@@ -45,6 +45,7 @@ def irregularity_of(landmarks: dict[str, Landmark], arch: Arch) -> float:
     return float(np.linalg.norm(points[1::2] - points[::2], axis=1).sum())
 
 
+@pytest.mark.long
 @settings(max_examples=2)
 @given(
     a=st.floats(25.0, 29.0),
@@ -87,6 +88,7 @@ def test_missing_teeth_are_missing_and_their_space_is_closed(missing: tuple[int,
     assert np.all(apart < 1.15 * (half[1:] + half[:-1]))
 
 
+@pytest.mark.long
 def test_crowding_raises_the_irregularity(coarse_phantom: Jaw, crowded: Jaw) -> None:
     before, after = (irregularity_of(jaw.landmarks, "lower") for jaw in (coarse_phantom, crowded))
     assert before < 3.0
@@ -136,6 +138,7 @@ def unusual(request: pytest.FixtureRequest) -> Jaw:
     return request.getfixturevalue(request.param)
 
 
+@pytest.mark.long
 def test_an_unusual_jaw_is_closed_and_each_tooth_one_patch(unusual: Jaw) -> None:
     faces, count = unusual.mesh.faces, len(unusual.mesh.vertices)
     edges = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
@@ -156,6 +159,7 @@ def test_the_landmarks_of_an_unusual_jaw_lie_on_its_surface(unusual: Jaw) -> Non
     assert away.max() < 0.7
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("options", "word"),
     [
@@ -186,6 +190,7 @@ def drawn_of(jaw: PhantomOptions) -> list[float | None]:
     return [jaw.inter_canine_mm, jaw.inter_first_molar_mm, jaw.inter_second_molar_mm, jaw.arch_length_mm]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "count"), [("lower-14", 30), ("upper-14", 30), ("upper-12", 12)])
 def test_a_population_has_the_spread_of_its_sources(name: GroupName, count: int) -> None:
     jaws, _ = draw_and_count(name, count, np.random.default_rng(5))
@@ -197,6 +202,7 @@ def test_a_population_has_the_spread_of_its_sources(name: GroupName, count: int)
     assert np.isnan(drawn[:, 3]).all() == (name == "upper-12")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["upper-14", "lower-12"])
 def test_a_drawn_jaw_has_the_dimensions_drawn(name: GroupName) -> None:
     (jaw,) = draw_population(name, 1, np.random.default_rng(2))

@@ -22,6 +22,7 @@ import sys
 from importlib import import_module
 from pkgutil import walk_packages
 import cuspid
+import pytest
 from cuspid import workers
 
 if __name__ == "__main__":
@@ -42,6 +43,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.long
 def test_all_modules_load_and_a_small_scan_runs_in_processes_that_begin_anew(tmp_path: Path) -> None:
     """Which lack what is hidden, too."""
     (tmp_path / "sitecustomize.py").write_text(HIDDEN)

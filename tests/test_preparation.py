@@ -67,6 +67,7 @@ def walls(prepared: Jaw, site: ToothSite) -> tuple[np.ndarray, np.ndarray, np.nd
     return distance[steep], rise[steep], normals[steep], mesh.face_areas[mine][steep]
 
 
+@pytest.mark.long
 def test_the_result_is_one_closed_surface_with_every_tooth(jaw: Jaw, prepared: Jaw) -> None:
     assert len(open_edges(prepared.mesh.faces)) == 0
     assert prepared.teeth == jaw.teeth

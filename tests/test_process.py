@@ -16,6 +16,7 @@ from verbs import refused
 CUSPID = (sys.executable, "-m", "cuspid")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("how", "after_s"), [(signal.SIGINT, 0.5), (signal.SIGINT, 1.2), (signal.SIGTERM, 2.0), (signal.SIGTERM, 6.0)]
 )
@@ -37,6 +38,7 @@ def test_it_ends_at_once_and_without_a_trace_of_where_it_was(tmp_path: Path, how
     assert not any(word in said for word in ("Traceback", "***", "@     0x", 'File "'))
 
 
+@pytest.mark.long
 def test_an_interrupt_that_is_passed_over_stays_so(tmp_path: Path) -> None:
     """As a shell has it for what runs in the background."""
     begun = subprocess.Popen(

@@ -420,6 +420,7 @@ def test_light_does_not_depend_on_what_is_shaded_at_once(
     assert whole.any()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_processes_give_the_same_images_as_one(
     scene: Scene, poses: dict[str, Rigid3], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str

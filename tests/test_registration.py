@@ -55,6 +55,7 @@ def test_an_identical_surface_is_laid_exactly():
     assert abs(found.scale - 1) < 1e-7
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("fdi", "seed"), [(46, 3), (31, 4), (35, 5)])
 def test_a_noisy_tooth_finds_its_place_in_the_arch(fdi: int, seed: int):
     scan_from_reference = any_pose(seed, 200)
@@ -111,6 +112,7 @@ def test_two_poses_that_fit_alike_are_told_and_chosen_from_alike():
     assert found.rms_um < 0.01
 
 
+@pytest.mark.long
 def test_surfaces_that_do_not_belong_together_are_refused():
     with pytest.raises(InputError, match="same teeth, in the same unit"):
         register(sphere(25.0), surface(), FAST, rng=np.random.default_rng(0))
@@ -132,6 +134,7 @@ def test_a_flaring_rim_neither_moves_nor_swells_the_rest(most_mm: float):
     assert abs(found.scale - 1) < 2e-4
 
 
+@pytest.mark.long
 def test_a_plate_that_slides_but_for_two_posts_finds_its_place():
     """All that holds it are their walls, a thirtieth of it, which lie far beyond the usual errors at first."""
 
@@ -148,6 +151,7 @@ def mirrored(mesh: Mesh) -> Mesh:
     return Mesh(mesh.vertices * [1.0, 1.0, -1.0], mesh.faces[:, ::-1])
 
 
+@pytest.mark.long
 def test_a_mirror_image_is_named():
     """An arch that is nearly its own mirror image is laid onto the other side; a part of it is refused."""
     scan = mirrored(jaw().mesh).transformed(any_pose(2, 100))
@@ -157,6 +161,7 @@ def test_a_mirror_image_is_named():
     assert not any("mirror" in note for note in right.notes)
 
 
+@pytest.mark.long
 def test_a_bad_scan_is_no_mirror_image():
     bad = jaw().mesh.vertices + 0.3 * np.sin(jaw().mesh.vertices[:, [1, 2, 0]] / 2)
     found = register(Mesh(bad, jaw().mesh.faces), surface(), FAST, rng=np.random.default_rng(0))

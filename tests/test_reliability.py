@@ -142,6 +142,7 @@ def test_kernels_work_where_nothing_can_be_kept(monkeypatch: pytest.MonkeyPatch)
     assert kernels.kernel(twice)(21.0) == 42.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("encoding", ["latin-1", "cp437", "cp850", "ascii"])
 def test_any_terminal_shows_tables(tmp_path: Path, encoding: str) -> None:
     said = subprocess.run(
@@ -154,6 +155,7 @@ def test_any_terminal_shows_tables(tmp_path: Path, encoding: str) -> None:
     assert b"Traceback" not in said.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", [">&-", "> /dev/full", ">&- 2>&-"])
 def test_output_may_go_nowhere(tmp_path: Path, how: str) -> None:
     command = f"{sys.executable} -m cuspid rig optics --out {tmp_path / 'table.csv'} {how}"

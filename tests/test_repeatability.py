@@ -145,6 +145,7 @@ def small_trial(**path: float) -> TrialOptions:
     return TrialOptions(simulation=simulation, evaluation=few)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("new_texture", [False, True])
 def test_hand_and_noise_differ_but_the_object_stays(tmp_path, coarse_phantom, new_texture):
     """With a hand that does not shake, two scans differ by the noise of their images alone, or by the texture, too."""
@@ -158,6 +159,7 @@ def test_hand_and_noise_differ_but_the_object_stays(tmp_path, coarse_phantom, ne
     assert difference > 10 if new_texture else 0.5 < difference < 3
 
 
+@pytest.mark.long
 def test_two_scans_to_a_report(tmp_path, coarse_phantom):
     """Each step of the study as its grids call it."""
     options = RepeatOptions(scans=2, pair_samples=5000)

@@ -474,7 +474,7 @@ def test_the_page_of_a_sweep(tmp_path):
     ("column", "label"),
     [
         ("baseline_mm", "baseline, mm"),
-        ("complete_50_um_pct", "complete 50 µm, %"),
+        ("complete_50_um_pct", "within 50 µm, %"),
         ("case", "case"),
         ("tooth_p95_um", "tooth P95, µm"),
     ],

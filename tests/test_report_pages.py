@@ -132,6 +132,7 @@ def fresh(scan: Visit) -> Visit:
     return scan
 
 
+@pytest.mark.long
 def test_the_surface_is_drawn(fresh):
     seen = fresh.picture()
     fresh.press("[data-layer=scan]")
@@ -409,6 +410,7 @@ def write_wide(folder: Path) -> Panorama:
     return wide
 
 
+@pytest.mark.long
 def test_the_thesis_beside_ours_is_read_on_a_phone(browser, tmp_path):
     results = Path(__file__).parent.parent / "benchmarks" / "results"
     cli.main(

@@ -56,6 +56,7 @@ def pano(film: tuple[Capture, GroundTruth], tmp_path_factory: pytest.TempPathFac
     return out
 
 
+@pytest.mark.long
 def test_the_cameras_were_where_they_are_found_in_true_millimetres(
     pano: Path, film: tuple[Capture, GroundTruth]
 ) -> None:
@@ -69,6 +70,7 @@ def test_the_cameras_were_where_they_are_found_in_true_millimetres(
     assert length == pytest.approx(true_length, rel=0.01)
 
 
+@pytest.mark.long
 def test_laid_over_the_surface_points_hold_the_path_nearer_to_the_truth(
     pano: Path, film: tuple[Capture, GroundTruth]
 ) -> None:
@@ -90,6 +92,7 @@ def test_laid_over_the_surface_points_hold_the_path_nearer_to_the_truth(
     assert 0.002 < median(refined) < 0.95 * median(before.motion.cam_from_world.values())
 
 
+@pytest.mark.long
 def test_over_the_true_surface_the_path_is_right_and_what_agrees_on_no_poses_changes_nothing(
     film: tuple[Capture, GroundTruth], coarse_phantom: Jaw
 ) -> None:

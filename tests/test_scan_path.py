@@ -235,6 +235,7 @@ def test_jitter_has_the_asked_deviation_and_is_smooth() -> None:
     assert 0.02 < change < 0.2 * np.sqrt(2) * 0.4, "white noise would change by sqrt(2) of its deviation"
 
 
+@pytest.mark.long
 def test_the_hand_moves_the_same_whatever_the_number_of_frames(coarse_phantom: Jaw) -> None:
     few = Handpiece(rig=Rig({"o1": twelve_cameras().rig["o1"]}))
     first, second, other = (

@@ -208,6 +208,7 @@ def in_place(monkeypatch):
     monkeypatch.setattr("cuspid.studies.scanners.study.run_grid", done)
 
 
+@pytest.mark.long
 def test_known_errors_come_back_and_the_rest_is_left_out(tmp_path, jaw, specimen, cases, in_place):
     mesh, rng = jaw.mesh, np.random.default_rng(0)
     probe = without_base(mesh)
@@ -272,6 +273,7 @@ def test_what_is_kept_is_used_again_until_a_file_changes(tmp_path, jaw, in_place
     assert "changed while" in storage.read_json(out / "scans" / f"{changed.key}.json")["failure"]
 
 
+@pytest.mark.long
 def test_the_command_writes_the_page_figures_and_tables(tmp_path, jaw, in_place, capsys):
     pytest.importorskip("statsmodels", reason="statsmodels is not installed: pip install 'cuspid[study]'")
     openpyxl = pytest.importorskip("openpyxl", reason="openpyxl is not installed: pip install 'cuspid[study]'")

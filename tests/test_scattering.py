@@ -40,6 +40,7 @@ def test_no_light_is_lost_and_even_light_stays_even(length_mm: float, seed: int)
     assert np.ptp(leaving[:, 0]) <= np.ptp(entering[:, 0])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("wave_mm", "length_mm"), [(4.0, 0.5), (4.0, 1.0), (2.0, 0.4)])
 def test_waves_of_shade_fade_by_their_length(wave_mm: float, length_mm: float) -> None:
     plane = height_field(lambda x, y: 0 * x, half_width_mm=12.0)
@@ -76,6 +77,7 @@ def photographs(scattering: float) -> dict[str, np.ndarray]:
     return {name: render_image(scene, frames[0], name, poses["0"], gain) for name in lit().rig.names}
 
 
+@pytest.mark.long
 def test_softened_shade_still_tells_depth() -> None:
     sharp, soft = photographs(0.0), photographs(1.0)
     for name, image in sharp.items():

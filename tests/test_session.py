@@ -78,6 +78,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Session, list[Step]
     return session, *followed(session, scan().frames), folder
 
 
+@pytest.mark.long
 def test_every_frame_has_a_pose_and_the_surface_grows(whole) -> None:
     session, steps, parts, _ = whole
     assert [step.frame for step in steps] == list(WAY)
@@ -94,6 +95,7 @@ def test_every_frame_has_a_pose_and_the_surface_grows(whole) -> None:
     assert set(session.rig_from_world) == set(WAY)
 
 
+@pytest.mark.long
 def test_at_its_end_a_session_is_a_reconstruction(whole, tmp_path: Path) -> None:
     """With the same figures to the last bit, from what was kept on the way."""
     session, _, _, folder = whole
@@ -131,6 +133,7 @@ def test_a_frame_that_cannot_be_read_is_left_out_and_told_of(tmp_path: Path) -> 
     assert [each.what for each in found.dropped] == ["frame 00001"]
 
 
+@pytest.mark.long
 def test_a_correction_puts_the_surface_where_it_belongs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A frame that was placed 0.3 mm too far away shows its surface twice, until all poses are adjusted."""
     usual = Tracker.push

@@ -121,6 +121,7 @@ def test_jacobian_by_the_places_of_boards() -> None:
         assert np.allclose(jacobian[:, column], numeric, atol=1e-4 * max(1, np.abs(numeric).max())), column
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(2))
 def test_boards_that_are_fixed_to_one_another_are_placed(seed: int) -> None:
     truth = on_a_body(seed)
@@ -132,6 +133,7 @@ def test_boards_that_are_fixed_to_one_another_are_placed(seed: int) -> None:
     assert not any("never saw" in note for note in found.notes)
 
 
+@pytest.mark.long
 def test_boards_that_only_some_cameras_see_join_the_others() -> None:
     """The first camera sees the first board, the last one the third, and the one between them all."""
     truth = on_a_body(2)
@@ -176,6 +178,7 @@ def test_cameras_that_never_share_a_board_are_joined_by_their_motion(seed: int) 
     assert 0.3 < np.sqrt(np.mean(rig_errors(found, truth) ** 2)) < 1.7
 
 
+@pytest.mark.long
 def test_places_of_cameras_joined_by_motion_are_as_uncertain_as_they_state() -> None:
     """Over six rigs: the pose of one beside the other, in the standard deviations that both state."""
     errors = []

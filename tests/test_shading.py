@@ -231,6 +231,7 @@ def test_what_is_plain_beside_texture_is_measured_by_its_shade(images: dict[str,
     assert choose_signal(one, OPTIONS) == "shading"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("grain_dn", "signal"), [(0.0, "shading"), (3.0, "texture")])
 def test_faint_grain_on_large_images_is_texture(grain_dn: float, signal: str) -> None:
     """Spray, seen through the lens and the compression of a small camera, has a detail of 0.6 to 1."""

@@ -93,6 +93,7 @@ def test_a_surface_may_bend_where_its_colour_changes() -> None:
     assert same == pytest.approx(without, abs=1e-6)
 
 
+@pytest.mark.long
 @given(
     factor=st.floats(1e-3, 1e3),
     slope=st.floats(-2, 2),

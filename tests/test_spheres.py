@@ -243,6 +243,7 @@ def test_the_rough_alignment_does_not_enter_the_result(
     assert max(abs(straight[pair] - off[pair]) for pair in straight) < 0.5
 
 
+@pytest.mark.long
 def test_a_best_fit_hides_a_bent_arch_that_the_spacing_shows(coarse_arch: Jaw) -> None:
     per_mm = 0.001
     scan = replace(coarse_arch.mesh, vertices=bend(coarse_arch.mesh.vertices, per_mm))

@@ -86,6 +86,7 @@ def seen_points(
     return here[known], true[known]
 
 
+@pytest.mark.long
 def test_every_frame_is_placed_and_pixels_show_what_lies_there(
     stitched: Stitched, film: tuple[Capture, GroundTruth], sequence: ImageSequence
 ) -> None:
@@ -135,6 +136,7 @@ def test_overlaps_inliers_and_notes_are_told(stitched: Stitched) -> None:
     assert not any("found again on the surface" in note for note in stitched.panorama.notes)
 
 
+@pytest.mark.long
 def test_a_path_that_the_surface_does_not_hold_stays_and_a_note_tells(
     sequence: ImageSequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -158,6 +160,7 @@ def test_the_strip_is_as_long_as_the_way_of_the_camera(stitched: Stitched) -> No
     assert np.all((strip.zone >= 0) == strip.covered)
 
 
+@pytest.mark.long
 def test_two_runs_on_the_same_frames_are_alike(stitched: Stitched, sequence: ImageSequence) -> None:
     (again,) = stitch(sequence, StitchOptions())
     assert stitched.motion is not None
@@ -168,6 +171,7 @@ def test_two_runs_on_the_same_frames_are_alike(stitched: Stitched, sequence: Ima
     np.testing.assert_array_equal(again.panorama.frame_pixel, stitched.panorama.frame_pixel)
 
 
+@pytest.mark.long
 def test_a_video_is_stitched_from_the_command_line_and_its_folder_takes_no_other(
     film: tuple[Capture, GroundTruth], sequence: ImageSequence, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -185,6 +189,7 @@ def test_a_video_is_stitched_from_the_command_line_and_its_folder_takes_no_other
     assert "another run of 'decode'" in refused(capsys, "pano", "stitch", video("other.avi", range(4, 12)), *command)
 
 
+@pytest.mark.long
 def test_one_camera_without_a_calibration_finds_its_focal_length(sequence: ImageSequence) -> None:
     motion = locate_single(replace(sequence, camera=None, working_distance_mm=None), SingleOptions())
     assert len(motion.parts) == 1
@@ -203,6 +208,7 @@ def images_in(folder: Path, images: list[np.ndarray]) -> ImageSequence:
     return storage.read_sequence(folder, folder / "decoded")
 
 
+@pytest.mark.long
 def test_a_way_back_is_tied_to_the_way_there(coarse_phantom: Jaw, tmp_path: Path) -> None:
     camera = intra_oral_camera(IntraOralOptions(width_px=320, height_px=240))
     path = FreePathOptions(path="return", frames=60, shake=0.3)
@@ -249,6 +255,7 @@ def test_frames_that_have_nothing_in_common_are_named(tmp_path: Path) -> None:
         locate_single(images_in(tmp_path, noise), SingleOptions())
 
 
+@pytest.mark.long
 def test_two_films_are_stitched_as_two_parts(sequence: ImageSequence, tmp_path: Path) -> None:
     """The two ends of the film, mirrored and turned for the second: no verified pair joins them."""
     first = [sequence.image(index) for index in range(5)]

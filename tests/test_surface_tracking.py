@@ -143,6 +143,7 @@ def of_chance(rng: np.random.Generator) -> Errors:
     return lambda x, y: rng.normal(0, 0.01, len(x))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("errors", [of_the_cameras, of_chance])
 def test_what_a_path_is_off_by_is_expected(errors: Callable[[np.random.Generator], Errors]) -> None:
     """Also where errors go along with the cameras, and so add up from frame to frame."""
@@ -175,12 +176,14 @@ def held_back(trust: float) -> list[DepthMap]:
     return made
 
 
+@pytest.mark.long
 def test_what_is_hardly_known_does_not_hold_a_path_back() -> None:
     trusted, distrusted = (errors_um(tracked(held_back(trust)), OUT).max() for trust in (1.0, 0.02))
     assert trusted > 2 * distrusted
     assert 0.1 < distrusted < 15
 
 
+@pytest.mark.long
 def test_only_relative_trust_matters() -> None:
     maps = depth_maps(dict(list(OUT.items())[:3]))
     some = [replace(each, confidence=np.float32(0.25) * each.confidence) for each in maps]
@@ -188,6 +191,7 @@ def test_only_relative_trust_matters() -> None:
         assert tracked(some).rig_from_world[name].matrix == pytest.approx(pose.matrix, abs=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wide_px", [0.0, 3.0])
 def test_the_error_of_a_path_is_expected(wide_px: float) -> None:
     """Also where the errors of a surface hang together, so that its points tell less than they are many."""
@@ -216,6 +220,7 @@ def test_exact_surfaces_give_an_exact_path() -> None:
     assert errors_um(tracked(depth_maps(OUT, noise_mm=0.0)), OUT).max() < 2
 
 
+@pytest.mark.long
 def test_what_an_uncertain_calibration_does_is_told() -> None:
     """Exact: nothing. 0.2 degrees and 30 um of each camera: tenths of a millimetre."""
     maps, drawn = depth_maps(OUT), held(diamond(SIZE_PX))
@@ -228,11 +233,13 @@ def test_what_an_uncertain_calibration_does_is_told() -> None:
     assert 0.03 < depth_sigma_mm(nominal) < 0.3
 
 
+@pytest.mark.long
 def test_a_path_that_comes_back_is_closed() -> None:
     back = OUT | {f"{5 + k:05d}": OUT[f"{5 - k:05d}"] for k in range(1, 6)}
     assert errors_um(tracked(depth_maps(back)), back)[-1] < 8
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("factor", [0.1, 100.0])
 def test_all_lengths_scale(factor: float) -> None:
     maps = depth_maps(OUT)
@@ -252,6 +259,7 @@ def test_all_lengths_scale(factor: float) -> None:
         assert there == pytest.approx(one.rig_from_world[name].translation, abs=2e-3)
 
 
+@pytest.mark.long
 def test_frames_that_show_nothing_or_something_else_are_left_out() -> None:
     maps = depth_maps(OUT)
     nothing = [
@@ -271,6 +279,7 @@ def test_frames_that_show_nothing_or_something_else_are_left_out() -> None:
     assert errors_um(found, OUT).max() < 15
 
 
+@pytest.mark.long
 def test_tracking_goes_on_where_the_surface_is_seen_again() -> None:
     away = Rigid3(np.eye(3), np.array([0.0, 30.0, 0.0]))  # beside the surface
     way = {**OUT, "00003": away, "00004": away}
@@ -279,6 +288,7 @@ def test_tracking_goes_on_where_the_surface_is_seen_again() -> None:
     assert errors_um(found, way).max() < 15
 
 
+@pytest.mark.long
 def test_a_first_frame_from_elsewhere_does_not_lose_all_others() -> None:
     elsewhere = Rigid3(np.eye(3), np.array([8.0, 8.0, 0.0]))
     found = tracked(depth_maps(OUT | {"00000": elsewhere}))
@@ -287,6 +297,7 @@ def test_a_first_frame_from_elsewhere_does_not_lose_all_others() -> None:
     assert errors_um(found, OUT).max() < 15
 
 
+@pytest.mark.long
 def test_two_pieces_are_joined_where_a_later_frame_shows_both() -> None:
     """Two frames, then from the other end back to them: what was elsewhere lay on nothing before."""
     order = (0, 1, *range(7, 1, -1))
@@ -307,6 +318,7 @@ def twins(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return 5 + np.where(x < 0, hills(x, y), share * hills(x - 18, y) + (1 - share) * hills(y + 3, 0.8 * x))
 
 
+@pytest.mark.long
 def test_what_looks_like_a_place_is_not_taken_for_it() -> None:
     """One frame of the way to the right lies on the way to the left; its neighbours do not."""
     left, right = np.linspace(-14, -4, 10), np.linspace(4, 14, 9)
@@ -348,6 +360,7 @@ def test_polarisers_are_asked_for_where_there_are_none() -> None:
         assert ("cross polarisers" in str(caught.value)) == said
 
 
+@pytest.mark.long
 def test_a_plane_holds_nothing_in_place() -> None:
     plane = height_field(lambda x, y: 5 + 0 * x, half_width_mm=14.0)
     with pytest.raises(ReconstructionError, match=r"only 1 of 6 frames could be placed .* too flat"):

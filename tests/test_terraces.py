@@ -188,6 +188,7 @@ def calibrated(
     return found, [float(np.sqrt(each)) for each in solved]
 
 
+@pytest.mark.long
 def test_errors_are_what_the_covariance_states():
     """Also those of the steps, which are 1 % off."""
     errors = []
@@ -200,6 +201,7 @@ def test_errors_are_what_the_covariance_states():
     assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.3
 
 
+@pytest.mark.long
 def test_the_focal_lengths_are_known_as_well_as_the_steps_are():
     """Of boards that face the cameras, from which a flat one tells no focal length."""
     known = []
@@ -219,6 +221,7 @@ def test_one_camera_begins_near_the_truth():
     assert np.abs(start.focal_px / truth.cameras["cam0"].focal_px - 1).max() < 0.05
 
 
+@pytest.mark.long
 def test_photographs_of_terraces_become_a_handpiece(tmp_path):
     board = (*options(SMALL), "--terraces", 3, "--step-mm", 1, "--step-sigma-um", 1)
     storage.write_handpiece(tmp_path / "four.json", essential_four(DesignOptions(width_px=240, height_px=240)))

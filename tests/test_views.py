@@ -142,6 +142,7 @@ def test_weak_texture_gives_depth_that_is_less_certain() -> None:
         assert 0 < np.median(depth_map.confidence[depth_map.known]) < 0.7
 
 
+@pytest.mark.long
 @given(st.floats(20.0, 40.0))
 def test_a_sweep_finds_a_plane_within_a_pixel_of_disparity(disparity: float) -> None:
     camera = diamond().rig["west"].camera
@@ -210,6 +211,7 @@ def test_an_empty_surface_is_refused_with_what_took_it(tmp_path: Path) -> None:
     assert not (tmp_path / "mesh.ply").exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("off_px", "held"), [(0.0, True), (4.0, False)])
 def test_one_instant_refines_only_a_calibration_that_it_contradicts(tmp_path: Path, off_px: float, held: bool) -> None:
     """One of the cameras looks so many pixels higher than its file says."""

@@ -221,6 +221,7 @@ def test_a_result_that_lacks_a_field_is_named():
 # --- What is computed -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("content", [[], {}, "x", 1, {"0": "x"}])
 def test_fields_of_another_kind_are_one_line(content):
     """Whatever stands for any field of a result: it is judged or refused, here and on the page."""
@@ -380,6 +381,7 @@ def wait_until_gone(pid: int) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.long
 def test_a_killed_run_goes_on_and_loses_nothing(tmp_path):
     first = start(tmp_path)
     wait_for(tmp_path / "waiting")
@@ -394,6 +396,7 @@ def test_a_killed_run_goes_on_and_loses_nothing(tmp_path):
     assert (tmp_path / "calls").read_text() == "populations\n"
 
 
+@pytest.mark.long
 def test_a_run_that_fails_is_named_and_left_to_be_tried_again(tmp_path):
     assert "ZeroDivisionError" in start(tmp_path, "fails").communicate(timeout=300)[0]
     results = gather(tmp_path, None)
@@ -403,9 +406,9 @@ def test_a_run_that_fails_is_named_and_left_to_be_tried_again(tmp_path):
 
 def test_what_cannot_be_stitched_is_a_result_and_the_next_method_is_tried(tmp_path, monkeypatch):
     def pretend(*arguments: str, log: Path) -> dict[str, float]:
-        if arguments[0] == "stitch" and "ortho" in arguments:
+        if arguments[:2] == ("pano", "stitch") and "ortho" in arguments:
             raise CuspidError("cuspid pano stitch failed with status 1: no frame could be placed")
-        if arguments[0] == "stitch-eval":
+        if arguments[:2] == ("pano", "evaluate"):
             storage.write_json(Path(arguments[-1]) / "score.json", panorama("x")["score"])
         return {"wall_s": 1.0, "cpu_s": 1.0, "peak_gib": 1.0}
 
