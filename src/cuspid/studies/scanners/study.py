@@ -28,8 +28,8 @@ from cuspid.studies.scanners.scan import StudyOptions, measure_file, write_measu
 from cuspid.studies.scanners.specimen import Specimen, load_specimen, read_specimen, write_specimen
 from cuspid.studies.scanners.summary import Compared, Group, Tables, coverage_remarks, summarise
 
-CODE = ("anatomy", "evaluation", "geometry", "storage", "studies/scanners")
-"""What of cuspid makes the results."""
+CODE = ("cuspid.studies.scanners.specimen", "cuspid.studies.scanners.scan")
+"""What makes the results of a scan."""
 _SHARE = 5
 """Scans that one process measures after another: to start it and to read the specimen takes as long as one of them."""
 
