@@ -463,22 +463,27 @@ def test_fine_is_the_same_scan_with_more_faces(folder: Path) -> None:
 
 def test_what_was_asked_for_goes_before_the_quality() -> None:
     asked = ReconstructionOptions(quality="draft", across=AcrossOptions(left_share=0.2))
-    assert pipeline.settled(asked).across.left_share == 0.2
-    assert pipeline.settled(asked).tracking.features.count == 500
-    assert pipeline.settled(asked).tracking.features.size_for(640, 480) == (160, 120)
-    assert pipeline.settled(asked).left_share == 1
-    assert pipeline.settled(replace(asked, left_share=0.3)).left_share == 0.3
-    assert pipeline.settled(asked).stereo.refinement.bend_px == 1000
-    assert pipeline.settled(asked).fusion.finer_bends is False
-    assert pipeline.settled(replace(asked, fusion=FusionOptions(finer_bends=True))).fusion.finer_bends is True
+    assert pipeline.resolve_options(asked).across.left_share == 0.2
+    assert pipeline.resolve_options(asked).tracking.features.count == 500
+    assert pipeline.resolve_options(asked).tracking.features.size_for(640, 480) == (160, 120)
+    assert pipeline.resolve_options(asked).left_share == 1
+    assert pipeline.resolve_options(replace(asked, left_share=0.3)).left_share == 0.3
+    assert pipeline.resolve_options(asked).stereo.refinement.bend_px == 1000
+    assert pipeline.resolve_options(asked).fusion.finer_bends is False
+    assert pipeline.resolve_options(replace(asked, fusion=FusionOptions(finer_bends=True))).fusion.finer_bends is True
     fine = ReconstructionOptions(quality="fine")
-    assert pipeline.settled(fine).stereo.grid_px < pipeline.settled(ReconstructionOptions()).stereo.grid_px
-    assert pipeline.settled(replace(fine, stereo=StereoOptions(spacing_px=5))).stereo.grid_px == 5
-    assert (pipeline.settled(fine).left_share, pipeline.settled(replace(fine, left_share=0.3)).left_share) == (0, 0.3)
+    assert (
+        pipeline.resolve_options(fine).stereo.grid_px < pipeline.resolve_options(ReconstructionOptions()).stereo.grid_px
+    )
+    assert pipeline.resolve_options(replace(fine, stereo=StereoOptions(spacing_px=5))).stereo.grid_px == 5
+    assert (
+        pipeline.resolve_options(fine).left_share,
+        pipeline.resolve_options(replace(fine, left_share=0.3)).left_share,
+    ) == (0, 0.3)
     handpiece = diamond(SIZE_PX)
     usual = ReconstructionOptions().fusion.voxel_for(detail_mm(handpiece))
     assert pipeline.fusion_for(handpiece, fine).voxel_mm == usual / 2
     assert pipeline.fusion_for(handpiece, replace(fine, fusion=FusionOptions(voxel_mm=0.2))).voxel_mm == 0.2
     standard = ReconstructionOptions()
-    assert pipeline.settled(standard).tracking.features.size_for(640, 480) == (320, 240)
-    assert pipeline.settled(standard) == replace(standard, left_share=pipeline._LEFT_SHARE)
+    assert pipeline.resolve_options(standard).tracking.features.size_for(640, 480) == (320, 240)
+    assert pipeline.resolve_options(standard) == replace(standard, left_share=pipeline._LEFT_SHARE)

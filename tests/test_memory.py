@@ -10,7 +10,7 @@ GLIBC = sys.platform == "linux" and hasattr(ctypes.CDLL(None), "mallopt")
 CODE = """
 from pathlib import Path
 import numpy as np
-from cuspid.memory import give_back, keep_freed
+from cuspid.memory import trim_heap, keep_freed
 
 def held_mib():
     return int(Path("/proc/self/statm").read_text().split()[1]) // 256
@@ -22,7 +22,7 @@ one = np.ones(1 << 10)
 most = held_mib()
 del arrays
 kept = held_mib()
-give_back()
+trim_heap()
 print(most - before, kept - before, held_mib() - before)
 """
 

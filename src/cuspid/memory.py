@@ -24,7 +24,7 @@ def keep_freed() -> None:
         _LIBC.mallopt(_M_TRIM_THRESHOLD, _KEPT)
 
 
-def give_back() -> None:
+def trim_heap() -> None:
     """Return to the system what is kept, as at the end of a stage."""
     if _LIBC is not None and hasattr(_LIBC, "malloc_trim"):
         _LIBC.malloc_trim(0)

@@ -31,7 +31,7 @@ from cuspid.evaluation.deviation import evaluate as measure_deviation
 from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
 from cuspid.jaw import GUM, Arch, Jaw
-from cuspid.memory import give_back
+from cuspid.memory import trim_heap
 from cuspid.mesh import Mesh
 from cuspid.motion.epipolar_check import epipolar_offset_px
 from cuspid.motion.exchanged import require_own_images
@@ -154,7 +154,7 @@ def reconstruct(
     Raises ReconstructionError where too few frames can be located, or no surface is left.
     """
     folder = Path(folder)
-    options = replace(options, signal=matched(capture, options))
+    options = replace(options, signal=resolve_signal(capture, options))
     found = find_poses(capture, folder, options, colmap_model=colmap_model, progress=progress)
     return found, surface(capture, found, folder, options, progress=progress)[0]
 
@@ -168,12 +168,12 @@ def find_poses(
     progress: Progress = silent,
 ) -> Reconstruction:
     """The poses of the frames, and the calibration adjusted to the images (first part of :func:`reconstruct`)."""
-    options = settled(options)
+    options = resolve_options(options)
     nominal = options.calibration == "refined" and is_nominal(capture.handpiece)
     capture = replace(capture, handpiece=as_known(capture.handpiece, options))
     if colmap_model is not None:
         return take_poses(capture, colmap_model, folder / "motion")
-    if matched(capture, options) == "shading":
+    if resolve_signal(capture, options) == "shading":
         depths = _shaded_depth(capture, folder, options, progress)
         made_from, how = depths.digest, options.surfaces
         found = locate_by_surfaces(capture, depths, made_from, folder / "motion", how, progress=progress)
@@ -229,15 +229,15 @@ def surface(
 ) -> tuple[Mesh, Float[np.ndarray, "v"]]:
     """The mesh, given the poses of the frames (second part of :func:`reconstruct`), and how well each of its vertices
     is known: standard deviation along the normal, um."""
-    give_back()
-    options, capture = settled(options), unrolled(capture, found)
-    of_size = sized(replace(capture, handpiece=replace(capture.handpiece, rig=found.rig)), options)
+    trim_heap()
+    options, capture = resolve_options(options), unrolled(capture, found)
+    of_size = resize_for_quality(replace(capture, handpiece=replace(capture.handpiece, rig=found.rig)), options)
     detail = detail_mm(of_size.handpiece)
-    if matched(capture, options) == "shading":
+    if resolve_signal(capture, options) == "shading":
         depths = _shaded_depth(capture, folder, options, progress)
     else:
         depths = _textured_depth(of_size, found, detail, folder, options, progress)
-    give_back()
+    trim_heap()
     how = fusion_for(of_size.handpiece, options), options.cleaning, options.sharp_edges
     return fuse(
         *(depths, depths.digest, _poses(found, depths), detail, folder, *how),
@@ -247,12 +247,16 @@ def surface(
     )
 
 
-def matched(capture: Capture, options: ReconstructionOptions) -> Signal:
+def resolve_signal(capture: Capture, options: ReconstructionOptions) -> Signal:
     """What the images of a capture are matched by."""
-    return choose_signal(sized(capture, options), options.stereo) if options.signal == "auto" else options.signal
+    return (
+        choose_signal(resize_for_quality(capture, options), options.stereo)
+        if options.signal == "auto"
+        else options.signal
+    )
 
 
-def sized(capture: Capture, options: ReconstructionOptions) -> Capture:
+def resize_for_quality(capture: Capture, options: ReconstructionOptions) -> Capture:
     """With images of the size that depth is measured from: photographs of many megapixels are reduced."""
     if options.quality == "draft":
         capture = capture.halved()
@@ -278,7 +282,9 @@ def _shaded_depth(
     capture: Capture, folder: Path, options: ReconstructionOptions, progress: Progress
 ) -> StoredDepthMaps:
     """Depth within frames, before anything is known of their poses."""
-    return measure_depth(sized(capture, options), folder / "depth", options.stereo, "shading", progress=progress)
+    return measure_depth(
+        resize_for_quality(capture, options), folder / "depth", options.stereo, "shading", progress=progress
+    )
 
 
 def _textured_depth(
@@ -330,7 +336,7 @@ def fusion_for(handpiece: Handpiece, options: ReconstructionOptions) -> FusionOp
     return replace(fusion, voxel_mm=_FINE_VOXELS * fusion.voxel_for(detail))
 
 
-def settled(options: ReconstructionOptions) -> ReconstructionOptions:
+def resolve_options(options: ReconstructionOptions) -> ReconstructionOptions:
     """With what the quality decides, where nothing else was asked for."""
     if options.left_share is None:
         left = {"draft": _DRAFT_LEFT_SHARE, "standard": _LEFT_SHARE, "fine": 0.0}

@@ -78,12 +78,12 @@ class Session:
         """``source`` gives the images of the frames that will be pushed; ``folder`` is that of the results. Raises
         InputError where no two cameras see the same surface."""
         self._options = options or ReconstructionOptions(quality="draft")
-        settled = pipeline.settled(self._options)
+        settled = pipeline.resolve_options(self._options)
         require_stereo(handpiece, settled.stereo.pairing)
         self._settled, self._folder = settled, Path(folder)
         self._capture = Capture(handpiece=pipeline.as_known(handpiece, settled), frames=(), source=source)
         self._given = handpiece
-        self._sized = pipeline.sized(self._capture, settled)
+        self._sized = pipeline.resize_for_quality(self._capture, settled)
         self._estimator = DepthEstimator(self._sized.handpiece, settled.stereo)
         detail, fusion = detail_mm(self._sized.handpiece), pipeline.fusion_for(self._sized.handpiece, settled)
         self._surface, self._voxel_mm = GrowingSurface(detail, fusion), fusion.voxel_for(detail)

@@ -153,7 +153,7 @@ def reconstruct_capture(capture: Capture, out: Path, options: ReconstructionOpti
     settings = {"reconstruction": options, "from_poses": model}
     inputs = storage.hash_capture(capture) | ({} if model is None else {"poses": hash_model(model)})
     with storage.claimed_folder(out, "reconstruct", settings, inputs):
-        options = replace(options, signal=pipeline.matched(capture, options))
+        options = replace(options, signal=pipeline.resolve_signal(capture, options))
         if options.signal == "shading":
             console.print(
                 "the images show no texture: their light and shade are matched, and the frames are located by their "
