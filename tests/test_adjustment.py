@@ -347,7 +347,7 @@ def seen_change(state, observations, prior, step: np.ndarray) -> float:
         moved = normal_equations.with_poses_moved(state, sign * 1e-5 * step[:poses])
         whitened = state.whitened + sign * 1e-5 * step[poses:].reshape(state.whitened.shape)
         moved = adjustment._with_calibration(moved, prior, whitened)
-        settled = normal_equations.settle(moved, observations, weighting)
+        settled = normal_equations.refine_points(moved, observations, weighting)
         change.append(normal_equations.residual_vectors(settled, observations))
     return float(np.abs(change[0] - change[1]).max() / 2e-5)
 
@@ -464,7 +464,7 @@ def as_the_motion_has_it(found: Reconstruction, scene: Scene) -> np.ndarray:
     """Where the true points come to lie when they are seen without error from the poses and cameras that were found."""
     observations, points = adjustment._sorted_by_point(scene.tracks, np.ones(len(scene.tracks.pixels), dtype=bool))
     state = adjustment._initial_state(poses_of(found), scene.tracks.points[points], adjustment._Prior.of(found.rig))
-    return normal_equations.settle(state, observations, normal_equations.Weighting(1.0, np.inf, False)).points
+    return normal_equations.refine_points(state, observations, normal_equations.Weighting(1.0, np.inf, False)).points
 
 
 @pytest.mark.long
@@ -697,7 +697,7 @@ def test_the_minimum_is_that_of_a_general_solver(knee: float, points_mm: float) 
     exactly = AdjustmentOptions(
         sigma_px=SIGMA_PX, huber_sigmas=knee, rounds=1, iterations=500, tolerance=1e-12, start_px=1e9
     )
-    found = adjust(given, exactly, judge=False)
+    found = adjust(given, exactly, covariance=False)
     rotations, translations, points, whitened = by_general_least_squares(given, SIGMA_PX, knee)
     assert found.tracks is not None
     np.testing.assert_allclose([pose.rotation for pose in poses_of(found)], rotations, atol=1e-6)

@@ -69,13 +69,13 @@ def test_small_scans_are_not_either(frames: int) -> None:
 def test_the_pull_is_chi_squared_where_nothing_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     """So what is told is what the keypoints' own scatter cannot explain, neither more nor less."""
     seen = []
-    wanted = misfit.Pull.wanted
+    wanted = misfit.ScoreTest.one_step_estimate
 
-    def noted(pull: misfit.Pull) -> tuple[np.ndarray, float, int]:
+    def noted(pull: misfit.ScoreTest) -> tuple[np.ndarray, float, int]:
         seen.append(wanted(pull._replace(curvature=1e-9 * pull.curvature)))
         return wanted(pull)
 
-    monkeypatch.setattr(misfit.Pull, "wanted", noted)
+    monkeypatch.setattr(misfit.ScoreTest, "one_step_estimate", noted)
     monkeypatch.setattr(misfit, "_TOLD", 1e-11)
     scene = make_scene(points=400)
     for seed in range(5):

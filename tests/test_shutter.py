@@ -147,7 +147,7 @@ def test_a_film_of_rolling_shutters_is_located_as_well_as_one_of_others():
     rig, path, tracks = film()
     start = rough(rig, path, tracks)
     plain = with_all(rig, lambda shutter: PLAIN)
-    known, ignored = (adjust(replace(start, rig=each), judge=False) for each in (rig, plain))
+    known, ignored = (adjust(replace(start, rig=each), covariance=False) for each in (rig, plain))
     errors, wrong = (np.sqrt(np.mean(pose_errors(each, path)[1:, 3:] ** 2)) for each in (known, ignored))
     assert 0 < errors < 0.3 * wrong, (errors, wrong)
     assert known.reprojection_rms_px < 0.6 < ignored.reprojection_rms_px
@@ -171,8 +171,8 @@ def test_unknown_readouts_are_found_with_their_standard_deviations():
 def test_shutters_of_frames_that_are_no_film_change_nothing():
     rig, path, tracks = film()
     start = rough(rig, {f"{name}a": pose for name, pose in path.items()}, tracks)
-    found = adjust(start, judge=False)
-    plain = adjust(replace(start, rig=with_all(rig, lambda shutter: PLAIN)), judge=False)
+    found = adjust(start, covariance=False)
+    plain = adjust(replace(start, rig=with_all(rig, lambda shutter: PLAIN)), covariance=False)
     for name in start.frames:
         np.testing.assert_array_equal(found.rig_from_world[name].matrix, plain.rig_from_world[name].matrix)
 

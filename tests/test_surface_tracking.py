@@ -16,7 +16,7 @@ from cuspid.mesh import Mesh
 from cuspid.motion.expectation import expectation_of
 from cuspid.motion.held_calibration import depth_sigma_mm
 from cuspid.motion.surface_tracking import SurfaceTrackingOptions, _drift, _register_icp, adjusted, track_surfaces
-from cuspid.motion.surfaces import Shown, Surface, surface_of
+from cuspid.motion.surfaces import OrientedPoints, Surface, surface_of
 from cuspid.progress import silent
 from cuspid.reconstruction import DepthMap, Reconstruction
 from cuspid.rig import Handpiece, Light
@@ -109,7 +109,9 @@ def strip(frames: int, rng: np.random.Generator, error: Errors) -> tuple[list[Su
         slope_y = -0.75 * np.sin(1.8 * u) * np.sin(1.5 * y + 0.3 * u)
         surfaces.append(
             Surface(
-                Shown(np.stack([x, y, z], axis=1), unit(np.stack([-slope_x, -slope_y, 1 + 0 * x], axis=1)), 1 + 0 * x)
+                OrientedPoints(
+                    np.stack([x, y, z], axis=1), unit(np.stack([-slope_x, -slope_y, 1 + 0 * x], axis=1)), 1 + 0 * x
+                )
             )
         )
         way.append(Rigid3(np.eye(3), np.array([-k, 0.0, 0.0])))

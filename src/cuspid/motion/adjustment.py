@@ -47,9 +47,9 @@ from cuspid.motion.normal_equations import (
     Weighting,
     influence,
     normal_equations,
+    refine_points,
     residual_vectors,
     scatter_of_tracks,
-    settle,
     substitute,
     with_poses_moved,
 )
@@ -225,7 +225,7 @@ def _apply_step(state: State, observations: Observations, weighting: Weighting, 
     moved = with_poses_moved(state, step[:size])._replace(points=points)
     if weighting.calibrated:
         moved = _with_calibration(moved, prior, state.whitened + step[size:].reshape(state.whitened.shape))
-    return _in_front(settle(moved, observations, weighting), state.points, observations)
+    return _in_front(refine_points(moved, observations, weighting), state.points, observations)
 
 
 def _in_front(state: State, before: Float[np.ndarray, "p 3"], observations: Observations) -> State:
@@ -569,19 +569,24 @@ class _Adjusted:
 
 
 def adjust(
-    reconstruction: Reconstruction, options: AdjustmentOptions | None = None, *, judge: bool = True
+    reconstruction: Reconstruction, options: AdjustmentOptions | None = None, *, covariance: bool = True
 ) -> Reconstruction:
     """Refine poses, points and free calibration together; the tracks are returned without outliers.
 
     The covariance of the poses is relative to the first frame; that of the calibration replaces its prior. Both assume
-    that tracks are independent of each other, but not the keypoints within a track. Without ``judge`` there is neither
-    a covariance nor a note on a calibration that does not fit, which saves half of the time. Raises ReconstructionError
+    that tracks are independent of each other, but not the keypoints within a track. Without ``covariance`` there is
+    neither one nor a note on a calibration that does not fit, which saves half of the time. Raises ReconstructionError
     where the observations do not determine every pose.
     """
     poses = tuple(reconstruction.rig_from_world.values())
     times = _times(reconstruction.rig, reconstruction.frames)
     found = _minimize(
-        reconstruction.rig, poses, reconstruction.tracks, options or AdjustmentOptions(), times=times, judge=judge
+        reconstruction.rig,
+        poses,
+        reconstruction.tracks,
+        options or AdjustmentOptions(),
+        times=times,
+        covariance=covariance,
     )
     return replace(
         reconstruction,
@@ -603,7 +608,7 @@ def adjust_model(model: SparseModel, options: AdjustmentOptions | None = None) -
     name = "camera"
     rig = Rig({name: MountedCamera(model.camera, Rigid3.identity())})
     poses = tuple(model.cam_from_world.values())
-    found = _minimize(rig, poses, model.tracks, options or AdjustmentOptions(), judge=False)
+    found = _minimize(rig, poses, model.tracks, options or AdjustmentOptions(), covariance=False)
     return replace(
         model,
         camera=found.rig[name].camera,
@@ -620,7 +625,7 @@ def _minimize(
     options: AdjustmentOptions,
     *,
     times: Sequence[float] | None = None,
-    judge: bool,
+    covariance: bool,
 ) -> _Adjusted:
     """The adjustment itself; to be judged it needs a scale. ``times``: of the frames, where shutters matter."""
     if tracks is None or len(tracks.point_index) == 0:
@@ -640,8 +645,8 @@ def _minimize(
         unknowns = state.points.size + POSE * (len(state.frame_rotation) - 1)
         sigma_px = _sigma_px(state, observations, weighting, unknowns)
         limit_px = options.outlier_sigmas * sigma_px
-    posterior = _known_posterior(state, observations, weighting) if judge else None
-    misfits = _misfits(tracks, state, weighting, prior, options) if judge else ()
+    posterior = _known_posterior(state, observations, weighting) if covariance else None
+    misfits = _misfits(tracks, state, weighting, prior, options) if covariance else ()
     residuals = residual_vectors(state, observations)
     return _Adjusted(
         rig=_adjusted_rig(state, prior, None if posterior is None else posterior.calibration),
@@ -668,10 +673,10 @@ def _misfits(
     observations, points = _sorted_by_point(tracks, np.ones(len(tracks.point_index), dtype=bool))
     state = found._replace(points=tracks.points[points])
     for _ in range(2):
-        state = _in_front(settle(state, observations, weighting), state.points, observations)
+        state = _in_front(refine_points(state, observations, weighting), state.points, observations)
         keep = _good(state, observations, options.start_px, options.minimum_angle_deg)
         state, observations, _ = _select(state, observations, np.zeros((len(state.points), 3), np.uint8), keep)
-    return held_misfit(settle(state, observations, weighting), observations, weighting, prior.rig.names)
+    return held_misfit(refine_points(state, observations, weighting), observations, weighting, prior.rig.names)
 
 
 def _is_unconverged(minimum: _Minimum, options: AdjustmentOptions) -> tuple[str, ...]:

@@ -437,7 +437,7 @@ def _adjust_and_reconnect(
         matches = [*_within_frames(scan), *_across_frames(scan, images, options, "matching", progress)]
         tracks = _tracks(scan, matches, cell_px)
     with _log_time(log, "adjustment"):
-        adjusted = adjust(replace(start, tracks=tracks), first, judge=read is None)
+        adjusted = adjust(replace(start, tracks=tracks), first, covariance=read is None)
     with _log_time(log, "closure"):
         scan = replace(scan, poses=list(adjusted.rig_from_world.values()))
         closing = closing_pairs(scan.handpiece, scan.poses, adjusted.tracks or tracks)
@@ -446,7 +446,7 @@ def _adjust_and_reconnect(
         if log["closing_matches"]:
             tracks = _tracks(scan, [*matches, *again], cell_px)
             joined = replace(start, rig_from_world=adjusted.rig_from_world, tracks=tracks)
-            adjusted = adjust(joined, first, judge=read is None)
+            adjusted = adjust(joined, first, covariance=read is None)
     if read is None:
         return adjusted
     with _log_time(log, "patches"):

@@ -32,9 +32,9 @@ from cuspid.motion.normal_equations import (
     Weighting,
     influence,
     normal_equations,
+    refine_points,
     residual_vectors,
     scatter_of_tracks,
-    settle,
     substitute,
     with_poses_moved,
 )
@@ -47,11 +47,11 @@ _ALLOWED_PX = 0.03
 camera."""
 _GENEROUS = 50.0
 """Factor by which each parameter may go farther when determining what would be left."""
-_TOLD = 1e-3
+_OBSERVABLE = 1e-3
 """The images determine a direction of the parameters that is known to 1 / sqrt(this) of what is allowed."""
 
 
-class Pull(NamedTuple):
+class ScoreTest(NamedTuple):
     """How the images pull at the parameters that are held fixed, once the rest has followed."""
 
     score: Float[np.ndarray, "k"]
@@ -59,17 +59,17 @@ class Pull(NamedTuple):
     scatter: Float[np.ndarray, "k k"]
 
     @property
-    def told(self) -> Float[np.ndarray, "k t"]:
+    def observable_basis(self) -> Float[np.ndarray, "k t"]:
         """Directions that the images determine."""
         values, vectors = np.linalg.eigh(self.curvature)
-        return np.asarray(vectors[:, values > _TOLD])
+        return np.asarray(vectors[:, values > _OBSERVABLE])
 
-    def wanted(self) -> tuple[Float[np.ndarray, "k"], float, int]:
+    def one_step_estimate(self) -> tuple[Float[np.ndarray, "k"], float, int]:
         """The parameters that the images favour, how far away they are (chi-squared), and in how many directions."""
-        told = self.told
-        covariance = told.T @ (self.scatter + self.curvature @ self.curvature) @ told
-        weighed = told @ np.linalg.solve(covariance, told.T @ self.score)
-        return -self.curvature @ weighed, float(self.score @ weighed), told.shape[1]
+        basis = self.observable_basis
+        covariance = basis.T @ (self.scatter + self.curvature @ self.curvature) @ basis
+        weighed = basis @ np.linalg.solve(covariance, basis.T @ self.score)
+        return -self.curvature @ weighed, float(self.score @ weighed), basis.shape[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,11 +98,11 @@ class _Numbers:
         onto[:, self.held], onto[:, ~self.held] = np.eye(len(onto)), -following.T
         return onto
 
-    def pull(self, raw_scatter: Float[np.ndarray, "n n"]) -> Pull:
+    def score_test(self, raw_scatter: Float[np.ndarray, "n n"]) -> ScoreTest:
         """With how the gradients of the tracks scatter."""
         onto, turn = self._onto_held, self.raw_from_numbers
         scatter = turn.T @ raw_scatter @ turn + self.prior
-        return Pull(onto @ self.gradient, onto @ self.hessian @ onto.T, onto @ scatter @ onto.T)
+        return ScoreTest(onto @ self.gradient, onto @ self.hessian @ onto.T, onto @ scatter @ onto.T)
 
     def raw_step(self) -> Float[np.ndarray, "n"]:
         """To where the images want all unknowns, the held ones within generous tolerances."""
@@ -130,13 +130,15 @@ def held_misfit(
     )
     numbers = _numbers(state, _curvature(raw, observations, free), observations, weighting, held)
     left = _apply_step(raw, observations, free, numbers.raw_step())
-    wanted, square, directions = numbers.pull(scatter_of_tracks(left, observations, free)).wanted()
+    test = numbers.score_test(scatter_of_tracks(left, observations, free))
+    estimate, square, directions = test.one_step_estimate()
     if tracks <= directions or square * (1 - directions / tracks) <= chdtri(directions, CHANCE):
         return ()
     return (
         f"calibration: held fixed, but the images would move it {np.sqrt(square / directions):.1f} standard deviations "
         f"of {_ALLOWED_PX:g} px (root mean square of {directions} numbers) away from the file, camera "
-        f"{_farthest(wanted, held, names)} the most; the reprojection error is {_typical_px(state, observations):.2f} "
+        f"{_farthest(estimate, held, names)} the most; the reprojection error is "
+        f"{_typical_px(state, observations):.2f} "
         f"px (median) where about {_typical_px(left, observations):.2f} px is expected. Is this the file of another "
         "handpiece, or of one built with errors? Calibrate the handpiece (cuspid calibrate), or let the calibration "
         "be refined, as it is for a file without covariances",
@@ -181,10 +183,10 @@ def _numbers(
     )
 
 
-def _farthest(wanted: Float[np.ndarray, "k"], held: Bool[np.ndarray, "c n"], names: Sequence[str]) -> str:
+def _farthest(estimate: Float[np.ndarray, "k"], held: Bool[np.ndarray, "c n"], names: Sequence[str]) -> str:
     """The camera whose numbers have the largest sum of squares."""
     squares = np.zeros(held.shape)
-    squares[held] = wanted**2
+    squares[held] = estimate**2
     return names[int(np.argmax(squares.sum(axis=1)))]
 
 
@@ -199,7 +201,7 @@ def _apply_step(raw: State, observations: Observations, weighting: Weighting, st
         intrinsics=raw.intrinsics + numbers[:, POSE : POSE + raw.intrinsics.shape[1]],
         points=substitute(raw, observations, weighting, step[:, None])[0],
     )
-    return settle(moved, observations, weighting)
+    return refine_points(moved, observations, weighting)
 
 
 def _typical_px(state: State, observations: Observations) -> float:

@@ -589,7 +589,7 @@ def substitute(
     return moved
 
 
-def settle(state: State, observations: Observations, weighting: Weighting) -> State:
+def refine_points(state: State, observations: Observations, weighting: Weighting) -> State:
     """The state with each point where its rays meet best, with poses and calibration held fixed."""
     settled = state._replace(points=state.points.copy())
     held = weighting._replace(calibrated=False)

@@ -109,7 +109,7 @@ def locate_photographs(
         assert best is not None
         if not best.models:
             raise ReconstructionError(_why_nothing(photographs, order, best))
-        return _as_noun(photographs, order, best)
+        return _to_sparse_model(photographs, order, best)
 
 
 def check_enough(photographs: Photographs) -> None:
@@ -350,7 +350,7 @@ def adjusted_rms(model: pycolmap.Reconstruction) -> float:
 # --- models as values --------------------------------------------------------------------------------------------
 
 
-def _as_noun(photographs: Photographs, order: Sequence[Photograph], found: _Attempt) -> PhotoModel:
+def _to_sparse_model(photographs: Photographs, order: Sequence[Photograph], found: _Attempt) -> PhotoModel:
     numbered = enumerate(photographs.cameras.values(), start=1)
     held = frozenset(number for number, known in numbered if known.calibrated is not None)
     model, rms = refined(found.models[0], held & set(found.models[0].cameras))

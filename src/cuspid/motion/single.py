@@ -406,7 +406,9 @@ def _join_all(models: Sequence[_Model], least: int) -> list[_Model]:
     return sorted(parts, key=lambda part: -len(part.poses))
 
 
-def _as_noun(model: _Model, camera: Camera, names: Sequence[str], features: Mapping[int, Features]) -> SparseModel:
+def _to_sparse_model(
+    model: _Model, camera: Camera, names: Sequence[str], features: Mapping[int, Features]
+) -> SparseModel:
     """A model as the noun; points that fewer than two frames still see are left out."""
     order = sorted(model.poses)
     place = {frame: index for index, frame in enumerate(order)}
@@ -504,7 +506,7 @@ def _refine_part(
     """A part with its poses made precise: by keypoints, then by patches too; ``again``: frames of the same place."""
     place = {frame: index for index, frame in enumerate(sorted(part.poses))}
     own = [features[index] for index in place]
-    start = _as_noun(part, camera, sequence.names, features)
+    start = _to_sparse_model(part, camera, sequence.names, features)
     within = [(place[one], place[other]) for one, other in again if one in place and other in place]
     by_keypoints = refine(start, own, options.guided, again=within, progress=progress)
     number = {name: index for index, name in enumerate(sequence.names)}

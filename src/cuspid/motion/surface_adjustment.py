@@ -21,7 +21,7 @@ from scipy import sparse
 
 from cuspid.geometry import Rigid3
 from cuspid.motion.expectation import MOST_POINTS, expectation_of, steps_drawn
-from cuspid.motion.surfaces import Laid, Shown, Surface, lay, moved, solved
+from cuspid.motion.surfaces import Correspondences, OrientedPoints, Surface, match_point_to_plane, moved, solved
 from cuspid.progress import Progress
 from cuspid.reconstruction import Expectation
 from cuspid.workers import map_in_threads
@@ -73,7 +73,7 @@ def neighbours(
 
 def lay_together(
     surfaces: Sequence[Surface],
-    some: Sequence[Shown],
+    some: Sequence[OrientedPoints],
     poses: Sequence[Rigid3],
     pairs: Sequence[tuple[int, int]],
     distance_mm: float,
@@ -82,7 +82,7 @@ def lay_together(
 ) -> tuple[list[Rigid3], float, Expectation | None]:
     """The poses with which some points of each surface lie best on those that it is paired with, their mean scatter,
     mm, and what follows for the surface."""
-    found, laid = list(poses), list[Laid | None]()
+    found, laid = list(poses), list[Correspondences | None]()
     for number in range(rounds):
         laid = map_in_threads(partial(_compare_surfaces, some, surfaces, found, distance_mm), pairs)
         step = _step(_in_world(pairs, laid, found), len(found))
@@ -96,22 +96,24 @@ def lay_together(
 
 
 def _compare_surfaces(
-    some: Sequence[Shown],
+    some: Sequence[OrientedPoints],
     surfaces: Sequence[Surface],
     poses: Sequence[Rigid3],
     distance_mm: float,
     pair: tuple[int, int],
-) -> Laid | None:
+) -> Correspondences | None:
     """Some points of one frame on the surface of another."""
     one, other = pair
-    return lay(some[one], surfaces[other], poses[other] @ poses[one].inverse(), _REACH, distance_mm)
+    return match_point_to_plane(some[one], surfaces[other], poses[other] @ poses[one].inverse(), _REACH, distance_mm)
 
 
-_Pair = tuple[int, int, Laid]
+_Pair = tuple[int, int, Correspondences]
 """Two frames, and how the surface of the first lies on that of the second, in the world."""
 
 
-def _in_world(pairs: Sequence[tuple[int, int]], laid: Sequence[Laid | None], poses: Sequence[Rigid3]) -> list[_Pair]:
+def _in_world(
+    pairs: Sequence[tuple[int, int]], laid: Sequence[Correspondences | None], poses: Sequence[Rigid3]
+) -> list[_Pair]:
     """The pairs that lie on each other."""
     world_from_rig = [pose.inverse() for pose in poses]
     return [
@@ -158,13 +160,13 @@ def _covariance(pairs: Sequence[_Pair], poses: Sequence[Rigid3], distance_mm: fl
     """
     matrix, _ = _equations(pairs, len(poses))
 
-    def in_space(one: int, laid: Laid) -> Float[np.ndarray, "n 3"]:
+    def in_space(one: int, laid: Correspondences) -> Float[np.ndarray, "n 3"]:
         return np.floor(laid.points / (_IN_SPACE * distance_mm))
 
-    def in_view(one: int, laid: Laid) -> Float[np.ndarray, "n 3"]:
+    def in_view(one: int, laid: Correspondences) -> Float[np.ndarray, "n 3"]:
         return np.floor(poses[one].apply(laid.points) / (_IN_VIEW * distance_mm))
 
-    def in_both(one: int, laid: Laid) -> Float[np.ndarray, "n 6"]:
+    def in_both(one: int, laid: Correspondences) -> Float[np.ndarray, "n 6"]:
         return np.concatenate([in_space(one, laid), in_view(one, laid)], axis=1)
 
     scatter = (
@@ -179,7 +181,7 @@ def _covariance(pairs: Sequence[_Pair], poses: Sequence[Rigid3], distance_mm: fl
 
 
 def _scatter(
-    pairs: Sequence[_Pair], blocks_of: Callable[[int, Laid], Float[np.ndarray, "n k"]], count: int, used: int
+    pairs: Sequence[_Pair], blocks_of: Callable[[int, Correspondences], Float[np.ndarray, "n k"]], count: int, used: int
 ) -> Float[np.ndarray, "m m"]:
     """How the gradients scatter from block to block of points, of which the motions use up so many."""
     gradients, blocks, frames = [], [], []
@@ -200,7 +202,7 @@ def _scatter(
 
 
 def _expected_error(
-    some: Sequence[Shown], pairs: Sequence[_Pair], poses: Sequence[Rigid3], distance_mm: float
+    some: Sequence[OrientedPoints], pairs: Sequence[_Pair], poses: Sequence[Rigid3], distance_mm: float
 ) -> Expectation | None:
     """How far the surface may be off by its poses; None for a single frame, and where none lies on another."""
     if not pairs:

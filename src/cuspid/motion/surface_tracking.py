@@ -19,7 +19,16 @@ from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.motion.held_calibration import depth_sigma_mm
 from cuspid.motion.surface_adjustment import lay_together, neighbours
-from cuspid.motion.surfaces import LEAST_MATCHES, Laid, Shown, Surface, lay, moved, solved, surface_of
+from cuspid.motion.surfaces import (
+    LEAST_MATCHES,
+    Correspondences,
+    OrientedPoints,
+    Surface,
+    match_point_to_plane,
+    moved,
+    solved,
+    surface_of,
+)
 from cuspid.options import SEED, SHARE, Options, Range
 from cuspid.progress import Progress, silent
 from cuspid.reconstruction import DepthMap, Expectation, Reconstruction
@@ -88,7 +97,7 @@ class _Step:
     """A frame laid onto another one."""
 
     this_from_other: Rigid3
-    laid: Laid | None
+    laid: Correspondences | None
 
     @property
     def rank(self) -> float:
@@ -100,7 +109,7 @@ class _Step:
 
 
 def _register_icp(
-    one: Surface | Shown,
+    one: Surface | OrientedPoints,
     other: Surface,
     start: Rigid3,
     distance_mm: float,
@@ -109,13 +118,13 @@ def _register_icp(
     """Lay a surface onto another one, from a pose nearby."""
     pose = start
     for reach in reaches:
-        laid = lay(one, other, pose, reach, distance_mm)
+        laid = match_point_to_plane(one, other, pose, reach, distance_mm)
         if laid is None:
             return _Step(pose, None)
         pose = moved(-solved(*laid.normal_equations(), _DAMPING)) @ pose
     # A start that was made of other poses is a rotation only up to rounding, which would double from frame to frame.
     pose = Rigid3.from_rotation_vector(pose.rotation_vector, pose.translation)
-    return _Step(pose, lay(one, other, pose, reaches[-1], distance_mm))
+    return _Step(pose, match_point_to_plane(one, other, pose, reaches[-1], distance_mm))
 
 
 def _doubt(step: _Step, overlap: float, options: SurfaceTrackingOptions, distance_mm: float) -> str | None:

@@ -34,7 +34,7 @@ LEAST_MATCHES = 100
 """Points that must lie on another surface to say anything."""
 
 
-class Shown(NamedTuple):
+class OrientedPoints(NamedTuple):
     """Points of a surface that a frame shows, in its rig frame."""
 
     points: Float[np.ndarray, "n 3"]
@@ -46,7 +46,7 @@ class Shown(NamedTuple):
 class Surface:
     """What a frame shows, ready to be asked for the nearest point."""
 
-    def __init__(self, shown: Shown) -> None:
+    def __init__(self, shown: OrientedPoints) -> None:
         self.points, self.normals, self.trust = shown
         self._tree = cKDTree(self.points)
 
@@ -61,13 +61,13 @@ class Surface:
         near = np.isfinite(distance)
         return near, np.where(near, index, 0)
 
-    def some(self, count: int, rng: np.random.Generator) -> Shown:
+    def some(self, count: int, rng: np.random.Generator) -> OrientedPoints:
         """A random choice of the points."""
         chosen = rng.permutation(len(self))[:count]
-        return Shown(self.points[chosen], self.normals[chosen], self.trust[chosen])
+        return OrientedPoints(self.points[chosen], self.normals[chosen], self.trust[chosen])
 
 
-class Laid(NamedTuple):
+class Correspondences(NamedTuple):
     """How one surface lies on another."""
 
     points: np.ndarray
@@ -115,7 +115,7 @@ class Laid(NamedTuple):
         return float(np.linalg.eigvalsh(self.normals.T @ self.normals / len(self.normals))[0])
 
 
-def _oriented_points(depth_map: DepthMap, jump_mm: float, border_px: int) -> Shown:
+def _oriented_points(depth_map: DepthMap, jump_mm: float, border_px: int) -> OrientedPoints:
     """The points of a depth map that have neighbours on all sides, in the rig frame."""
     camera = depth_map.camera
     rays = camera.rays(camera.pixel_centres().reshape(-1, 2)).reshape(camera.height, camera.width, 3)
@@ -129,7 +129,7 @@ def _oriented_points(depth_map: DepthMap, jump_mm: float, border_px: int) -> Sho
         smooth = np.maximum(np.linalg.norm(right, axis=-1), np.linalg.norm(down, axis=-1)) < jump_mm
         good = smooth & (facing > _LEAST_COSINE) & _away_from_border(depth_map.known, border_px)
     rig_from_cam = depth_map.cam_from_rig.inverse()
-    return Shown(
+    return OrientedPoints(
         rig_from_cam.apply(points[good]), rig_from_cam.rotate(normals[good]), depth_map.confidence[good].astype(float)
     )
 
@@ -147,7 +147,7 @@ def surface_of(depth_maps: Iterable[DepthMap], distance_mm: float, *, thinning: 
     depth that is not known is left out.
     """
     parts = [_oriented_points(each, _JUMP * distance_mm, border_px) for each in depth_maps]
-    nothing = Shown(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    nothing = OrientedPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
     points, normals, trust = (np.concatenate(each) for each in zip(nothing, *parts, strict=True))
     cubes = np.floor(points / (thinning * distance_mm)).astype(np.int64)
     sides = np.abs(normals).argmax(axis=1, keepdims=True) if len(normals) else np.zeros((0, 1), int)
@@ -162,10 +162,12 @@ def surface_of(depth_maps: Iterable[DepthMap], distance_mm: float, *, thinning: 
         sums = [np.bincount(cell, trust * values[:, axis], len(members)) for axis in range(3)]
         return (np.stack(sums, axis=1) / total[:, None])[enough]
 
-    return Surface(Shown(mean(points), unit(mean(normals)), (total / members)[enough]))
+    return Surface(OrientedPoints(mean(points), unit(mean(normals)), (total / members)[enough]))
 
 
-def lay(one: Surface | Shown, other: Surface, other_from_one: Rigid3, reach: float, distance_mm: float) -> Laid | None:
+def match_point_to_plane(
+    one: Surface | OrientedPoints, other: Surface, other_from_one: Rigid3, reach: float, distance_mm: float
+) -> Correspondences | None:
     """One surface on another, as far as both lie within reach, a share of the working distance, and face one way; None
     where hardly anything does."""
     points, normals = other_from_one.apply(one.points), other_from_one.rotate(one.normals)
@@ -179,7 +181,7 @@ def lay(one: Surface | Shown, other: Surface, other_from_one: Rigid3, reach: flo
     uncertain = np.sqrt(1 / one.trust[near] + 1 / other.trust[index])
     uncertain /= np.median(uncertain)
     sigma = max(1.4826 * float(np.median(np.abs(distances) / uncertain)), _LEAST_SIGMA * distance_mm)
-    return Laid(points, normals, distances, sigma * uncertain, sigma, float(near.mean()))
+    return Correspondences(points, normals, distances, sigma * uncertain, sigma, float(near.mean()))
 
 
 def moved(motion: Float[np.ndarray, "6"]) -> Rigid3:
