@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 HIDDEN = """
 import os, signal, sys
 import filelock  # which has locks of its own on each system
@@ -22,7 +24,6 @@ import sys
 from importlib import import_module
 from pkgutil import walk_packages
 import cuspid
-import pytest
 from cuspid import workers
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ from cuspid.studies.scanners.statistics import summary as summarised
 from cuspid.studies.scanners.study import Intake, Prepared, Study, compare, foreseen, prepare
 from cuspid.studies.scanners.text import ANCHORS, checklist, methods
 from cuspid.studies.scanners.views import write_views
+from cuspid.trueness import METRICS
 
 _MOST_LINES = 40
 _NEEDED = {"statsmodels": "statistics", "openpyxl": "XLSX tables"}
@@ -203,7 +204,8 @@ def _range(ordered: Sequence[str]) -> str:
 
 def _print(told: Mapping[str, Any]) -> None:
     table = Table(title="Trueness and precision / µm, with 95 % intervals", title_justify="left")
-    for column in ("scanner", "scans", "trueness: mean |d|", "signed mean", "precision: mean |d|", "s_r"):
+    mean, signed_mean = METRICS["mean_abs_um"].heading, METRICS["signed_mean_um"].heading
+    for column in ("scanner", "scans", f"trueness: {mean}", signed_mean, f"precision: {mean}", "s_r"):
         table.add_column(column, justify="left" if column == "scanner" else "right")
     for name, found in told["scanners"].items():
         table.add_row(

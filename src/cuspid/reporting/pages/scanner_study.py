@@ -16,6 +16,7 @@ from cuspid.reporting.pages.page import jpeg_uri, number, photo_uri, provenance,
 from cuspid.reporting.pages.scene import mesh_layer, standard_views
 from cuspid.reporting.pages.shown_mesh import pack_um
 from cuspid.storage import ScannerStudyResult, SpecimenView
+from cuspid.trueness import METRICS
 
 _LARGEST_FRAMES_BYTES = 9_000_000
 """Room for the deviations of scans in a page; of more, the first are shown."""
@@ -185,7 +186,8 @@ def _trueness_table(scanners: Mapping[str, Any]) -> Table:
                 _estimate(true["complete_pct"]),
             ]
         )
-    heads = ["scanner", "scans", "trueness: mean |d|", "signed mean", "RMS", "precision: mean |d|", "precision: RMS"]
+    mean, signed_mean, rms = (METRICS[name].heading for name in ("mean_abs_um", "signed_mean_um", "rms_um"))
+    heads = ["scanner", "scans", f"trueness: {mean}", signed_mean, rms, f"precision: {mean}", f"precision: {rms}"]
     return {
         "title": "Trueness and precision",
         "caption": "In µm, means over specimens with 95 % intervals; from scan to reference. Precision: repeats "

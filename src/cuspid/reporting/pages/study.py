@@ -241,7 +241,7 @@ def _repeat_tables(summary: Mapping[str, Any]) -> list[Table]:
             + [number(pair["p95_um"], 2), signed(pair["signed_mean_um"], 2)]
             for pair in summary["pairs"]
         ]
-        heads = ["pair", "mean |d|", "RMS", "P95", "signed mean"]
+        heads = ["pair", *(METRICS[name].heading for name in ("mean_abs_um", "rms_um", "p95_um", "signed_mean_um"))]
         tables.append({"title": "All pairs", "caption": "In µm.", "heads": heads, "rows": rows})
     return tables
 
