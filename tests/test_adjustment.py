@@ -390,7 +390,7 @@ def test_a_point_behind_a_camera_holds_up_no_other(monkeypatch: pytest.MonkeyPat
     nothing = np.zeros(6 * (len(state.frame_rotation) - 1) + state.whitened.size)
     thrown = state.points + 0.01
     thrown[[3, 7]] *= -1
-    monkeypatch.setattr(adjustment, "settle", lambda moved, *_: moved._replace(points=thrown))
+    monkeypatch.setattr(adjustment, "refine_points", lambda moved, *_: moved._replace(points=thrown))
     found = adjustment._apply_step(state, observations, weighting, prior, nothing)
     assert np.flatnonzero(np.any(found.points != thrown, axis=1)).tolist() == [3, 7]
     np.testing.assert_array_equal(found.points[[3, 7]], state.points[[3, 7]])
