@@ -76,7 +76,7 @@ def test_the_pull_is_chi_squared_where_nothing_is_allowed(monkeypatch: pytest.Mo
         return wanted(pull)
 
     monkeypatch.setattr(misfit.ScoreTest, "one_step_estimate", noted)
-    monkeypatch.setattr(misfit, "_TOLD", 1e-11)
+    monkeypatch.setattr(misfit, "_OBSERVABLE", 1e-11)
     scene = make_scene(points=400)
     for seed in range(5):
         adjust(disturbed(scene, np.random.default_rng(seed)))
