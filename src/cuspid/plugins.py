@@ -19,4 +19,4 @@ def load_plugin(group: Literal["cuspid.verbs", "cuspid.stitching"], name: str, *
     """
     for entry in entry_points(group=group, name=name):
         return entry.load()
-    raise InputError(f"{asked}: comes with the distribution {distribution}; pip install {distribution}")
+    raise InputError(f"{asked}: comes with the distribution {distribution}, which is not installed (see the README)")
