@@ -20,7 +20,7 @@ from cuspid.camera import Camera
 from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.rig import Rig
-from cuspid.shutter import PLAIN, numbered
+from cuspid.shutter import PLAIN, frame_numbers
 from verbs import refused, run
 
 CHESS = Board(kind="chessboard", columns=8, rows=8, square_mm=2.0)
@@ -122,7 +122,7 @@ def test_jacobian_agrees_with_finite_differences(exposure):
     truth = scene(0, cameras=2, instants=4) if exposure == "together" else moving(0, instants=6)
     views = views_of(truth, BOARD, 1.0, np.random.default_rng(0))
     if exposure != "together":
-        frame, rng = numbered(truth.rig_from_board), np.random.default_rng(1)
+        frame, rng = frame_numbers(truth.rig_from_board), np.random.default_rng(1)
         truth = untied(truth, frame, views)
         truth = rolling(truth, frame, views) if exposure == "rolling" else truth
         later = [rng.normal(0, 0.2, count) for count in (3, len(truth.timing.readout), len(views))]

@@ -21,9 +21,9 @@ from cuspid.geometry import Rigid3
 from cuspid.motion.adjustment import adjust, residuals_px
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
-from cuspid.shutter import PLAIN, Shutter, film_times, motions, moved
+from cuspid.shutter import PLAIN, Shutter, displace_points, film_times, motions
 from cuspid.simulation.optics import OpticsOptions, with_shutters
-from cuspid.unrolling import unrolled, unrollings
+from cuspid.unrolling import unroll_capture, unrollings
 from test_adjustment import Scene, disturbed, make_rig, make_scene, observe, pose_errors
 
 FRAMES = 7
@@ -123,7 +123,7 @@ def rolled(tracks: Tracks, rig: Rig, path: dict[str, Rigid3]) -> Tracks:
             in_rig = pose.apply(tracks.points[tracks.point_index[own]])
             for _ in range(30):
                 late = mounted.shutter.late(pixels[own, 1] / mounted.camera.height)
-                then = moved(in_rig, moving[f], late)
+                then = displace_points(in_rig, moving[f], late)
                 pixels[own] = mounted.camera.project(mounted.cam_from_rig.apply(then))
     return replace(tracks, pixels=pixels)
 
@@ -214,13 +214,13 @@ def test_images_are_set_right(tmp_path):
     source = ImageFolder(tmp_path)
     storage.write_image(source.path("00001", "cam"), np.dstack([taken] * 3))
     capture = Capture(handpiece=replace(handpiece("cam"), rig=rig), frames=(frame,), source=source)
-    right = unrolled(capture, found)
+    right = unroll_capture(capture, found)
     image, mask = right.image(frame, "cam")[..., 0], right.masks(frame)["cam"] > 0
     off, left = (np.abs(each.astype(float) - pattern(centres))[mask] for each in (taken, image))
     assert left.mean() < 1.0 < 10 < off.mean()
     assert 0.75 < mask.mean() < 0.97
     assert right.source.digest("00001", "cam") != source.digest("00001", "cam")
-    assert unrolled(capture, replace(found, rig=with_all(rig, lambda shutter: PLAIN))) is capture
+    assert unroll_capture(capture, replace(found, rig=with_all(rig, lambda shutter: PLAIN))) is capture
 
 
 def test_keypoints_move_to_where_the_image_that_is_set_right_shows_them():

@@ -61,7 +61,7 @@ from cuspid.stitching.ortho import (
     orthophoto,
 )
 from cuspid.tolerances import NominalOptions
-from cuspid.unrolling import unrolled
+from cuspid.unrolling import unroll_capture
 from cuspid.workers import computed_once
 
 __all__ = [
@@ -189,7 +189,7 @@ def stitch_rig(capture: Capture, options: StitchOptions = StitchOptions(), *, pr
         raise InputError("stitch: the cameras of the handpiece tell the scale; leave out --scale")
     capture = replace(capture, handpiece=NominalOptions().of(capture.handpiece).fill(capture.handpiece))
     found = locate_rig_film(capture, options.rig, options.motion, progress=progress)
-    scene = _RigScene(unrolled(capture, found), found, options)
+    scene = _RigScene(unroll_capture(capture, found), found, options)
     shown, notes = scene.surface(progress), tuple[str, ...]()
     if options.motion.on_surface and shown.dense is not None:
         refined = scene.on_surface(shown, progress)

@@ -60,7 +60,7 @@ from cuspid.surface.sharp_edges import SharpEdgeOptions
 from cuspid.surface.stage import find_holes, fuse
 from cuspid.tolerances import NominalOptions, held, is_nominal
 from cuspid.trueness import GroundTruth, Trueness
-from cuspid.unrolling import is_rolling, unrolled
+from cuspid.unrolling import is_rolling, unroll_capture
 from cuspid.visibility import VisibilityOptions, scannable_faces
 
 __all__ = [
@@ -230,7 +230,7 @@ def surface(
     """The mesh, given the poses of the frames (second part of :func:`reconstruct`), and how well each of its vertices
     is known: standard deviation along the normal, um."""
     trim_heap()
-    options, capture = resolve_options(options), unrolled(capture, found)
+    options, capture = resolve_options(options), unroll_capture(capture, found)
     of_size = resize_for_quality(replace(capture, handpiece=replace(capture.handpiece, rig=found.rig)), options)
     detail = detail_mm(of_size.handpiece)
     if resolve_signal(capture, options) == "shading":

@@ -60,7 +60,7 @@ PLAIN = Shutter()
 """All rows at the instant of the frame."""
 
 
-def numbered(names: Iterable[str]) -> dict[str, int] | None:
+def frame_numbers(names: Iterable[str]) -> dict[str, int] | None:
     """The number of each frame, from its name: frames follow each other at equal times. None unless all have different
     ones."""
     frames = list(names)
@@ -72,7 +72,7 @@ def numbered(names: Iterable[str]) -> dict[str, int] | None:
 
 def film_times(names: Sequence[str]) -> tuple[float, ...] | None:
     """When the frames of a film were taken, in frames; None where their names do not tell, or not in order."""
-    number = numbered(names)
+    number = frame_numbers(names)
     times = () if number is None else tuple(map(float, number.values()))
     return times if len(times) > 1 and all(before < after for before, after in pairwise(times)) else None
 
@@ -102,7 +102,7 @@ def screw_of(motion: Rigid3) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, 
     return turn, shift - across / 2 + np.cross(turn, across) / 12
 
 
-def moved(
+def displace_points(
     points: Float[np.ndarray, "n 3"], motion: Float[np.ndarray, "6"], late: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n 3"]:
     """Points of the rig where they are so many frames later, to first order."""

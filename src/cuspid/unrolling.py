@@ -21,7 +21,7 @@ from cuspid.capture import Capture, ImageSource
 from cuspid.image_files import Pixels
 from cuspid.reconstruction import Reconstruction, Tracks
 from cuspid.rig import MountedCamera, Rig
-from cuspid.shutter import PLAIN, film_times, motions, moved
+from cuspid.shutter import PLAIN, displace_points, film_times, motions
 from cuspid.workers import computed_once
 
 _FEWEST = 4
@@ -62,7 +62,7 @@ class Unrolling:
         camera, cam_from_rig = self.mounted.camera, self.mounted.cam_from_rig
         late = self.mounted.shutter.late(pixels[:, 1] / camera.height)
         in_cam = camera.rays(pixels) * self.depth_mm(pixels)[:, None]
-        in_rig = moved(cam_from_rig.inverse().apply(in_cam), self.motion, -late)
+        in_rig = displace_points(cam_from_rig.inverse().apply(in_cam), self.motion, -late)
         there = camera.project(cam_from_rig.apply(in_rig))
         return np.where(np.isfinite(there), there, pixels)
 
@@ -170,11 +170,11 @@ def _unrolling(
     mounted, pixels = found.rig[camera], tracks.pixels[seen]
     in_rig = found.rig_from_world[frame].apply(tracks.points[tracks.point_index[seen]])
     late = mounted.shutter.late(pixels[:, 1] / mounted.camera.height)
-    depth = mounted.cam_from_rig.apply(moved(in_rig, motion, late))[:, 2]
+    depth = mounted.cam_from_rig.apply(displace_points(in_rig, motion, late))[:, 2]
     return Unrolling(mounted=mounted, motion=motion, places=pixels, nearness=1 / np.maximum(depth, 1e-9))
 
 
-def unrolled(capture: Capture, found: Reconstruction) -> Capture:
+def unroll_capture(capture: Capture, found: Reconstruction) -> Capture:
     """A capture whose images show what they would if all rows had been exposed at the instants of their frames, and
     whose handpiece says so; the capture itself where they are."""
     made = unrollings(found)

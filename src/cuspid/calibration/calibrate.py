@@ -39,7 +39,7 @@ from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.options import Options, Range
 from cuspid.rig import MountedCamera, Rig
-from cuspid.shutter import Shutter, numbered
+from cuspid.shutter import Shutter, frame_numbers
 
 _DOUBTFUL = 2.0
 """Difference between two halves, in standard deviations, that chance hardly explains."""
@@ -215,7 +215,7 @@ def _calibrate_once(
         return _Trial(found, _describe(found, chosen, board, choices, (*how, *notes)))
 
     best = tried(start)
-    frame = numbered(start.rig_from_board)
+    frame = frame_numbers(start.rig_from_board)
     if frame is None or not follow_each_other(frame):
         return best.described
 
