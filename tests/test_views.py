@@ -23,7 +23,8 @@ from cuspid.pipeline import ReconstructionOptions, _hold_what_fits
 from cuspid.reconstruction import DepthMap, Funnel, Reconstruction, sum_funnels
 from cuspid.rig import Handpiece, MountedCamera, Rig
 from cuspid.stereo import DepthEstimator, StereoOptions
-from cuspid.stereo.matching import group_geometry
+from cuspid.stereo.confidence import ConfidenceOptions, Resolution, without_speckle
+from cuspid.stereo.matching import find_weak_texture, group_geometry
 from cuspid.stereo.rectification import IdealView
 from cuspid.stereo.refinement import image_noise
 from cuspid.stereo.regularised import even_out, sweep
@@ -140,6 +141,31 @@ def test_weak_texture_gives_depth_that_is_less_certain() -> None:
         assert np.isfinite(error).mean() > 0.25
         assert 5 < np.nanmedian(error) < 75  # a pixel of disparity of the widest pair
         assert 0 < np.median(depth_map.confidence[depth_map.known]) < 0.7
+
+
+@given(st.floats(0.0, 82.0), st.integers(0, 9))
+def test_a_surface_is_one_piece_however_steep_and_what_stands_alone_is_none(tilt_deg: float, seed: int) -> None:
+    resolution, options = Resolution(0.012, 5.0), ConfidenceOptions()
+    depth = 5 / (1 + np.tan(np.deg2rad(tilt_deg)) * np.linspace(-0.06, 0.06, 60))[None].repeat(40, axis=0)
+    depth[:, :3] = np.nan
+    depth[20, 30] += 1.0
+    depth[5:8, 5:8] = 3 + 0.1 * np.random.default_rng(seed).random((3, 3))
+    kept = without_speckle(depth, resolution, options)
+    expected = np.isfinite(depth)
+    expected[20, 30] = False
+    expected[5:8, 5:8] = False
+    assert np.array_equal(kept, expected)
+
+
+def test_only_the_part_of_a_view_that_has_weak_texture_is_made_smooth() -> None:
+    begun = np.ones((90, 120), dtype=bool)
+    agreed = np.ones_like(begun)
+    agreed[:, 80:] = np.random.default_rng(0).random((90, 40)) < 0.2
+    weak_part = find_weak_texture(agreed, begun)
+    assert weak_part[:, 90:].all()
+    assert not weak_part[:, :70].any()
+    assert find_weak_texture(agreed & (np.arange(120) > 60), begun).all()
+    assert not find_weak_texture(begun, begun).any()
 
 
 @pytest.mark.long

@@ -47,7 +47,7 @@ class PairingOptions(Options):
 
     minimum_overlap: Annotated[float, SHARE] = 0.4
     """Share (0 to 1) of what either camera sees at the working distance that the other must see too."""
-    maximum_angle_deg: Annotated[float, Range(0, 180)] = 45.0
+    maximum_angle_deg: Annotated[float, Range(0, 180)] = 60.0
     """Largest angle between their optical axes."""
     maximum_sources: Annotated[int, Range(1, 100)] = 6
     """Each view is matched with no more than this many others, the best ones."""

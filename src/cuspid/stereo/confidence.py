@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
+from cuspid.graph import parts_of
 from cuspid.options import Options, Range
 
 GRADIENT_LIMIT = 2 / 3
@@ -55,7 +55,8 @@ class ConfidenceOptions(Options):
     """Connected pieces of fewer depths are dropped, where every third pixel has one; of depths that are farther apart,
     pieces that are as small in pixels of the image."""
     speckle_jump: Annotated[float, Range(0.01, 10_000)] = 5.0
-    """Neighbours that differ by more resolutions (0.06 mm at 12 um), scaled with their depth, are not connected."""
+    """Neighbours that differ by more resolutions (0.06 mm at 12 um), scaled with their depth, and not as a slope does,
+    are not connected."""
 
 
 @dataclass(frozen=True)
@@ -201,14 +202,33 @@ def sure_enough(one: Measured, resolution: Resolution, options: ConfidenceOption
 def without_speckle(
     depth_mm: Float[np.ndarray, "h w"], resolution: Resolution, options: ConfidenceOptions
 ) -> Bool[np.ndarray, "h w"]:
-    """True where a known depth belongs to a connected piece that is large enough."""
+    """True where a known depth belongs to a connected piece that is large enough. Neighbours are connected if they
+    differ by little, or by as much as one of them does from its neighbour on the other side: a surface that falls away
+    from the camera is one piece, however steep."""
     known = np.isfinite(depth_mm)
-    # cv2.filterSpeckles connects 16-bit values: count tenths of the jump, which leaves room for 2000 jumps.
-    share = np.log(np.where(known, depth_mm, resolution.working_distance_mm) / resolution.working_distance_mm)
     jump = options.speckle_jump * resolution.mm / resolution.working_distance_mm
-    levels = np.where(known, (share / jump * 10).clip(-9e3, 3e4), -1e4).astype(np.int16)
-    cv2.filterSpeckles(levels, -10000, options.speckle_px, 10)
-    return known & (levels != -10000)
+    level = np.log(depth_mm)
+    number = np.arange(depth_mm.size).reshape(depth_mm.shape)
+    joined = [
+        np.stack([one[connected], other[connected]], axis=1)
+        for levels, one, other in (
+            (level, number[:, :-1], number[:, 1:]),
+            (level.T, number[:-1].T, number[1:].T),
+        )
+        for connected in [_continues(np.diff(levels, axis=1), jump)]
+    ]
+    part = parts_of(np.concatenate(joined), depth_mm.size)
+    return known & (np.bincount(part)[part] >= options.speckle_px).reshape(depth_mm.shape)
+
+
+def _continues(step: Float[np.ndarray, "h w"], jump: float) -> Bool[np.ndarray, "h w"]:
+    """Whether steps along rows are small or go on as the one before or the one behind; not where they are NaN."""
+    with np.errstate(invalid="ignore"):
+        alike = np.abs(np.diff(step, axis=1)) <= jump
+        found = np.abs(step) <= jump
+    found[:, 1:] |= alike
+    found[:, :-1] |= alike
+    return found
 
 
 def confidence(

@@ -58,7 +58,11 @@ _MOST_DISPARITIES = 800
 """Of the initial matching, px."""
 MOST_AGREED, WEAKLY_AGREED = 0.8, 0.6
 """Shares of the pixels with an initial depth that views should agree on: with less than the first they are matched in
-wider windows, with less than the second, after that, the rest is made smooth."""
+wider windows; where it is less than the second after that, the rest is made smooth."""
+_LEAST_WEAK = 0.02
+"""Share of a view with weak texture that makes it worth a smooth surface."""
+_WEAK_WINDOW = 25
+"""Side of the windows in which depths that agree are counted, in depths."""
 WIDENINGS = (2, 3)
 """How many times wider these are, one after the other."""
 
@@ -458,10 +462,12 @@ class Match:
         cam_from_rig = self._views.views[index].cam_from_rig
         return Measured(self._views.grids[index], cam_from_rig, depth, sigma, begun, planes.astype(np.float32))
 
-    def regularise(self, index: int, one: Measured, agreed: Float[np.ndarray, "h w 6"]) -> Measured:
+    def regularise(
+        self, index: int, one: Measured, agreed: Float[np.ndarray, "h w 6"], weak: Bool[np.ndarray, "h w"]
+    ) -> Measured:
         """What was measured of a view where other views agree with it (planes) and a smooth surface through the same
-        images does, too (:mod:`cuspid.stereo.regularised`); elsewhere that surface: where texture is weak, much agrees
-        by chance."""
+        images does, too (:mod:`cuspid.stereo.regularised`); elsewhere that surface: where texture is ``weak``, much
+        agrees by chance. What is not weak stays as it is."""
         geometry = self._views.geometry[index]
         assert geometry is not None
         near, far = self._range_mm
@@ -477,10 +483,12 @@ class Match:
         )
         with np.errstate(invalid="ignore"):
             smooth = (agreed[..., SCORE] == 0) | (np.abs(agreed[..., Q] - q) > _OUTLYING_SIGMAS * sigma_q)
+        smooth &= weak
         depth = np.where(smooth, geometry.scale / q, one.depth_mm)
         step_mm = depth**2 / geometry.scale
-        sigma = np.where(smooth, sigma_q * step_mm, np.maximum(one.sigma_mm, _WEAK_SIGMA_PX * step_mm))
-        depth = even_out(depth, sigma, float(one.camera.focal_px.mean()))
+        least_mm = np.where(weak, _WEAK_SIGMA_PX * step_mm, 0)
+        sigma = np.where(smooth, sigma_q * step_mm, np.maximum(one.sigma_mm, least_mm))
+        depth = np.where(weak, even_out(depth, sigma, float(one.camera.focal_px.mean())), depth)
         return replace(one, depth_mm=depth, sigma_mm=sigma, smooth=smooth & np.isfinite(depth))
 
 
@@ -516,10 +524,10 @@ def measure_views(
     matched = measured
 
     def regularise(index: int) -> Measured:
-        agreed = agreed_planes(
-            matched[index], sources_of(views, index, matched), resolution, options.confidence, WEAKLY_AGREED
-        )
-        return matched[index] if agreed is None else match.regularise(index, matched[index], agreed)
+        one = matched[index]
+        agreed = agreeing(one, sources_of(views, index, matched), resolution, options.confidence)
+        weak = find_weak_texture(agreed, one.begun)
+        return match.regularise(index, one, planes_of(one, agreed), weak) if weak.mean() > _LEAST_WEAK else one
 
     return dict(zip(views.references, work(regularise, views.references), strict=True))
 
@@ -530,20 +538,39 @@ def sources_of(views: ViewSet, index: int, measured: Mapping[int, Measured]) -> 
 
 
 def agreed_planes(
-    one: Measured,
-    others: Sequence[Measured],
-    resolution: Resolution,
-    checks: ConfidenceOptions,
-    enough: float = MOST_AGREED,
+    one: Measured, others: Sequence[Measured], resolution: Resolution, checks: ConfidenceOptions
 ) -> Float[np.ndarray, "h w 6"] | None:
-    """The planes of a view that others agree with; None where these are ``enough`` (a share) of what it began with, so
-    that it is not worth looking for more."""
-    assert one.planes is not None
+    """The planes of a view that others agree with; None where these are most of what it began with, so that it is not
+    worth looking for more."""
     assert one.begun is not None
-    agreed = (agreement(one, others, resolution, checks) > 0) & sure_enough(one, resolution, checks)
-    if agreed.sum() >= enough * one.begun.sum():
-        return None
-    return np.asarray(one.planes * agreed[..., None], dtype=np.float64)
+    agreed = agreeing(one, others, resolution, checks)
+    return None if agreed.sum() >= MOST_AGREED * one.begun.sum() else planes_of(one, agreed)
+
+
+def planes_of(one: Measured, where: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 6"]:
+    """The planes of a view in some places; 0 elsewhere."""
+    assert one.planes is not None
+    return np.asarray(one.planes * where[..., None], dtype=np.float64)
+
+
+def agreeing(
+    one: Measured, others: Sequence[Measured], resolution: Resolution, checks: ConfidenceOptions
+) -> Bool[np.ndarray, "h w"]:
+    """Where other views agree with the depth of a view, and it is sure enough of it."""
+    return (agreement(one, others, resolution, checks) > 0) & sure_enough(one, resolution, checks)
+
+
+def find_weak_texture(
+    agreed: Bool[np.ndarray, "h w"], begun: Bool[np.ndarray, "h w"] | None
+) -> Bool[np.ndarray, "h w"]:
+    """Where other views agree with few of the depths that a view began with: in wide windows around each pixel, or
+    everywhere, if they do so in the view as a whole."""
+    assert begun is not None
+    if agreed.sum() < WEAKLY_AGREED * begun.sum():
+        return np.ones_like(agreed)
+    window = (_WEAK_WINDOW, _WEAK_WINDOW)
+    count, tried = (cv2.boxFilter(each.astype(np.float32), -1, window) for each in (agreed & begun, begun))
+    return np.asarray((count < WEAKLY_AGREED * tried) & (tried > 0.5))
 
 
 def depth_maps_of(
@@ -591,7 +618,7 @@ def checked_depth_map(
     counts = np.ones(one.depth_mm.shape, dtype=bool)
     if mask is not None:
         counts = _grid_of(view.resample_mask(mask), grid_px) > 0
-    agreed = counts & (agreement(one, others, resolution, checks) > 0) & sure_enough(one, resolution, checks)
+    agreed = counts & agreeing(one, others, resolution, checks)
     if len(others) == 1:
         agreed &= ~at_near_borders(one, others[0], -(-checks.border_px // grid_px), resolution, checks)
     speckle = replace(
